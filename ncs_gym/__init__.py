@@ -1,0 +1,43 @@
+"""Linear plants behind imperfect networks as Gymnasium environments; importing registers the ids."""
+
+from ncs_gym.channel import Channel, GilbertElliott, Packet
+from ncs_gym.disturbance import (
+    AdversarialDisturbance,
+    BallDisturbance,
+    BoxDisturbance,
+    Disturbance,
+    SinusoidDisturbance,
+    SphereDisturbance,
+)
+from ncs_gym.ellipsoid import Ellipsoid
+from ncs_gym.env import NCSEnv
+from ncs_gym.error_set import ErrorSet, UnstablePlantError, certified_error_set
+from ncs_gym.estimator import Estimator
+from ncs_gym.plant import LinearPlant, truck_trailer
+from ncs_gym.scenarios import register_all
+from ncs_gym.task import Regulation, SpeedTracking, Task
+
+register_all()
+
+__all__ = [
+    "AdversarialDisturbance",
+    "BallDisturbance",
+    "BoxDisturbance",
+    "Channel",
+    "Disturbance",
+    "Ellipsoid",
+    "ErrorSet",
+    "Estimator",
+    "GilbertElliott",
+    "LinearPlant",
+    "NCSEnv",
+    "Packet",
+    "Regulation",
+    "SinusoidDisturbance",
+    "SpeedTracking",
+    "SphereDisturbance",
+    "Task",
+    "UnstablePlantError",
+    "certified_error_set",
+    "truck_trailer",
+]

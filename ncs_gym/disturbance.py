@@ -1,0 +1,225 @@
+"""What nature does to the plant, inside the bound the certificates assume.
+
+`begin` draws what stays fixed for an episode, `draw` the disturbance of one step; neither stores
+anything in the settings, so one object serves any number of environments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ncs_gym.ellipsoid import Ellipsoid
+from ncs_gym.frozen import FrozenArrays, as_covariance, as_number
+from ncs_gym.plant import LinearPlant
+
+# Extreme points are pulled in, and points out by rounding pushed in, by this much.
+ROUNDING = 1e-12
+# A disturbance outside E(D) by no more than this is taken for rounding and scaled back onto it.
+TOLERANCE = 1e-9
+
+
+class Disturbance(FrozenArrays):
+    """A disturbance in {d : d'd <= gamma}; truncated process noise is added to it.
+
+    Subclasses with `replaces_process_noise` use the whole of E(D), process noise included.
+    """
+
+    replaces_process_noise: ClassVar[bool] = False
+
+    def begin(self, rng: np.random.Generator, plant: LinearPlant) -> Any:
+        """Returns what stays fixed for one episode (None unless overridden)."""
+        return None
+
+    def draw(
+        self, rng: np.random.Generator, plant: LinearPlant, nominal_next: np.ndarray, step: int, memory: Any
+    ) -> np.ndarray:
+        """Returns d, shape (n,).
+
+        Args:
+            rng: Source of randomness.
+            plant: The plant.
+            nominal_next: A x + B u, shape (n,).
+            step: Number of steps taken before this one.
+            memory: What `begin` returned.
+        """
+        raise NotImplementedError
+
+    def check(self, plant: LinearPlant) -> str:
+        """Returns why this disturbance does not suit the plant's bound, or an empty string."""
+        return ""
+
+
+@dataclass(frozen=True, eq=False)
+class BallDisturbance(Disturbance):
+    """Uniform in the ball of squared radius gamma."""
+
+    def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
+        direction = rng.standard_normal(plant.n)
+        radius = np.sqrt(plant.gamma) * rng.random() ** (1.0 / plant.n)
+        return direction * (radius / np.linalg.norm(direction))
+
+
+@dataclass(frozen=True, eq=False)
+class BoxDisturbance(Disturbance):
+    """Uniform in a box (`paper.tex` Section 5).
+
+    Attributes:
+        half_widths: Shape (n,); the box must lie in {d'd <= gamma}. None: sqrt(gamma / n) each.
+
+    Raises:
+        ValueError: If a half-width is negative or not finite.
+    """
+
+    half_widths: Sequence[float] | np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        if self.half_widths is None:
+            return
+        widths = np.array([as_number(w, "half_widths", low=0.0) for w in self.half_widths])
+        object.__setattr__(self, "half_widths", widths)
+        self._freeze_arrays()
+
+    def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
+        widths = np.sqrt(plant.gamma / plant.n) if self.half_widths is None else self.half_widths
+        return rng.uniform(-1.0, 1.0, plant.n) * widths
+
+    def check(self, plant):  # noqa: D102
+        if self.half_widths is None:
+            return ""
+        widths = np.asarray(self.half_widths)
+        if widths.shape != (plant.n,):
+            return f"half_widths must have {plant.n} entries, got {widths.size}"
+        corner = float(widths @ widths)
+        if corner > plant.gamma * (1.0 + ROUNDING):
+            return f"the corner of the box has squared length {corner:g} > gamma = {plant.gamma:g}"
+        return ""
+
+
+@dataclass(frozen=True, eq=False)
+class SinusoidDisturbance(Disturbance):
+    """sqrt(gamma) a sin(2 pi k / period + phase), with a random axis a and phase each episode.
+
+    Attributes:
+        period: In steps.
+
+    Raises:
+        ValueError: If the period is not positive.
+    """
+
+    period: float = 20.0
+
+    def __post_init__(self) -> None:
+        as_number(self.period, "period", low=0.0, low_open=True)
+
+    def begin(self, rng, plant):  # noqa: D102
+        axis = rng.standard_normal(plant.n)
+        return axis / np.linalg.norm(axis), rng.uniform(0.0, 2.0 * np.pi)
+
+    def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
+        axis, phase = memory
+        return np.sqrt(plant.gamma) * axis * np.sin(2.0 * np.pi * step / self.period + phase)
+
+
+@dataclass(frozen=True, eq=False)
+class SphereDisturbance(Disturbance):
+    """A random boundary point of E(D): always as large as allowed."""
+
+    replaces_process_noise: ClassVar[bool] = True
+
+    def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
+        return (1.0 - ROUNDING) * plant.disturbance.sample_boundary(rng)
+
+
+@dataclass(frozen=True, eq=False)
+class AdversarialDisturbance(Disturbance):
+    """The point of E(D) that does the most harm to the next state.
+
+    Attributes:
+        M: Shape (n, n): maximize (x+)' M (x+). None: maximize the largest |c_j x+|.
+
+    Raises:
+        ValueError: If M is not symmetric positive semidefinite.
+    """
+
+    M: np.ndarray | None = None
+    replaces_process_noise: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if self.M is not None:
+            object.__setattr__(self, "M", as_covariance(self.M, len(self.M), "M"))
+        self._freeze_arrays()
+
+    def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
+        if self.M is not None:
+            return (1.0 - ROUNDING) * plant.disturbance.farthest_point(nominal_next, self.M)
+        values = plant.C @ nominal_next
+        worst = int(np.argmax(np.abs(values) + plant.disturbance.support(plant.C)))
+        direction = plant.C[worst] * (1.0 if values[worst] >= 0.0 else -1.0)
+        return (1.0 - ROUNDING) * plant.disturbance.extreme_point(direction)
+
+    def check(self, plant):  # noqa: D102
+        if self.M is not None and self.M.shape != (plant.n, plant.n):
+            return f"M must have shape ({plant.n}, {plant.n}), got {self.M.shape}"
+        return ""
+
+
+@dataclass(frozen=True, eq=False)
+class CallableDisturbance(Disturbance):
+    """A user's function (rng, plant, nominal_next) -> d, checked against E(D) at every step.
+
+    Attributes:
+        function: Returns shape (n,).
+        allow_assumption_violation: Lets d outside E(D) pass.
+    """
+
+    function: Callable[[np.random.Generator, LinearPlant, np.ndarray], np.ndarray]
+    allow_assumption_violation: bool = False
+    replaces_process_noise: ClassVar[bool] = True
+
+    def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
+        d = np.array(self.function(rng, plant, nominal_next.copy()), dtype=np.float64)
+        if d.shape != (plant.n,) or not np.isfinite(d).all():
+            raise ValueError(f"the disturbance must be finite with shape ({plant.n},), got {d!r}")
+        return d if self.allow_assumption_violation else _into(plant.disturbance, d)
+
+
+def _into(bound: Ellipsoid, d: np.ndarray) -> np.ndarray:
+    """Returns d, scaled back by no more than TOLERANCE if rounding put it outside the bound."""
+    size = bound.gauge(d)
+    if size > 1.0 + TOLERANCE:
+        raise ValueError(
+            f"the disturbance {d.tolist()} lies outside its bound E(D): sqrt(d' D^-1 d) = {size:.6g} > 1 "
+            "(allow_assumption_violation=True lets it pass)"
+        )
+    return d if size <= 1.0 - ROUNDING else d * ((1.0 - ROUNDING) / size)
+
+
+BY_NAME: dict[str, type[Disturbance]] = {
+    "ball": BallDisturbance,
+    "box": BoxDisturbance,
+    "sinusoid": SinusoidDisturbance,
+    "sphere": SphereDisturbance,
+    "adversarial": AdversarialDisturbance,
+}
+
+
+def as_disturbance(value: Any, plant: LinearPlant, allow_assumption_violation: bool) -> Disturbance:
+    """Returns the settings for a name, a `Disturbance` or a callable (rng, plant, nominal_next) -> d.
+
+    Raises:
+        ValueError: If the name is unknown, the value is none of these, or it does not suit the plant.
+    """
+    if isinstance(value, str) and value in BY_NAME:
+        value = BY_NAME[value]()
+    elif not isinstance(value, Disturbance) and callable(value):
+        value = CallableDisturbance(value, allow_assumption_violation)
+    if not isinstance(value, Disturbance):
+        raise ValueError(f"disturbance must be one of {sorted(BY_NAME)}, a Disturbance or a callable, got {value!r}")
+    problem = value.check(plant)
+    if problem and not (allow_assumption_violation and "gamma" in problem):
+        raise ValueError(f"{type(value).__name__}: {problem}")
+    return value

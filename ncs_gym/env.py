@@ -1,0 +1,258 @@
+"""The Gymnasium environment: plant -> sensor -> channel -> estimator -> observation."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, TypeVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box
+
+from ncs_gym.channel import Channel, Link
+from ncs_gym.disturbance import as_disturbance
+from ncs_gym.ellipsoid import Ellipsoid
+from ncs_gym.error_set import certified_error_set
+from ncs_gym.estimator import Estimator
+from ncs_gym.frozen import as_count
+from ncs_gym.plant import LinearPlant
+from ncs_gym.task import Regulation, Task
+
+T = TypeVar("T")
+
+# The default start covers this share of the half-width of the safe box in every direction.
+START_SHARE = 0.1
+# Widens the observation box: float32 rounding, and estimates a little off the reachable set.
+OBSERVATION_MARGIN = 1.01
+
+
+class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
+    """A linear plant behind an imperfect network; the controller sees a Kalman estimate.
+
+    ## Action space
+    `Box(-1, 1, (m,), float32)`: the input in units of its limit, u = u_max * action [physical units].
+    Finite actions outside the box are clipped.
+
+    ## Observation space
+    A finite `Box` of float32, sized by what the plant and the task can reach within `horizon` steps:
+
+    | entries | meaning | unit |
+    |---|---|---|
+    | first n | Kalman estimate x_hat | those of the state |
+    | rest | the task's own, perfectly known entries | those of the task |
+
+    ## Step
+    x+ = A x + B u + d. The sensor measures y = H x+ + v; the channel quantizes, rations, loses and delays it;
+    the estimator predicts with the input really applied and takes in what arrived (`theory.md` section 1).
+
+    ## Rewards
+    The task's; see `Regulation` and `SpeedTracking`.
+
+    ## Starting state
+    Uniform in `initial_set`, or `options={"state": x0}`. The first estimate is off by truncated Gaussian noise.
+
+    ## Episode end
+    Terminates on a violation of the safe box only with `terminate_on_violation`. Truncation is `TimeLimit`'s.
+
+    ## Info (the same keys from reset and step, every array a fresh copy)
+    | key | meaning |
+    |---|---|
+    | `state`, `estimate` | x and x_hat, float64, shape (n,) |
+    | `estimation_error` | estimate - state |
+    | `error_shape` | running Sigma_k, shape (n, n): the error lies in E(Sigma_k) |
+    | `input` | applied input, shape (m,) [physical units]; zeros at reset |
+    | `constraint_values` | abs(c_j x) - 1 per row of the safe box; positive is violated |
+    | `cost` | 1.0 if the true state violates the box now, else 0.0 |
+    | `measurement_age` | steps since the newest sample used was taken (the first estimate is step 0's) |
+    | `packet_arrived` | whether a packet arrived at this step |
+    | `assumption_violated` | latched alarm of the estimator's innovation monitor |
+    | `episode_violations` | running sum of `cost` in this episode |
+    | `is_success` | 1.0 while there was none |
+
+    Args:
+        plant: The plant with its bounds.
+        channel: The network; a perfect one by default.
+        task: The reward; `Regulation` by default.
+        disturbance: "ball", "box", "sinusoid" (truncated process noise is added), "sphere", "adversarial" (in
+            its place), a `Disturbance`, or a callable (rng, plant, nominal_next) -> d.
+        initial_set: Ellipsoid of starting states; by default a tenth of the safe box.
+        terminate_on_violation: End the episode when the true state leaves the safe box.
+        allow_assumption_violation: Let disturbances outside the certified bound pass instead of raising.
+        render_mode: None; there is no rendering yet.
+        horizon: Steps the observation space is sized for.
+
+    Raises:
+        UnstablePlantError: If the plant is not Schur stable.
+        ValueError: If a setting is of the wrong kind or does not fit the plant.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+
+    def __init__(
+        self,
+        plant: LinearPlant,
+        channel: Channel | None = None,
+        task: Task | None = None,
+        disturbance: Any = "ball",
+        initial_set: Ellipsoid | None = None,
+        terminate_on_violation: bool = False,
+        allow_assumption_violation: bool = False,
+        render_mode: str | None = None,
+        horizon: int = 200,
+    ) -> None:
+        self.plant = _expect(plant, LinearPlant, "plant")
+        self.channel = Channel() if channel is None else _expect(channel, Channel, "channel")
+        self.task = Regulation() if task is None else _expect(task, Task, "task")
+        self.disturbance = as_disturbance(disturbance, plant, allow_assumption_violation)
+        self.initial_set = default_initial_set(plant) if initial_set is None else initial_set
+        _expect(self.initial_set, Ellipsoid, "initial_set")
+        if self.initial_set.dim != plant.n:
+            raise ValueError(f"initial_set must have dimension {plant.n}, got {self.initial_set.dim}")
+        if problem := self.task.check(plant):
+            raise ValueError(f"{type(self.task).__name__}: {problem}")
+        if render_mode is not None:
+            raise ValueError(f"render_mode must be None, got {render_mode!r}")
+        self.render_mode = render_mode
+        self.terminate_on_violation = bool(terminate_on_violation)
+        self.error_set = certified_error_set(plant)
+        self.estimator = Estimator(plant, self.channel, self.error_set)
+        self.horizon = as_count(horizon, "horizon", low=1)
+        self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)
+        bound = observation_bound(self).astype(np.float32)
+        self.observation_space = Box(-bound, bound, dtype=np.float32)
+        self.steps = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Starts an episode.
+
+        Args:
+            seed: Seeds `np_random`, the only source of randomness.
+            options: {"state": x0} starts at x0, shape (n,).
+
+        Raises:
+            ValueError: If an option is unknown or x0 has a wrong shape or is not finite.
+        """
+        super().reset(seed=seed)
+        rng = self.np_random
+        start = _start_option(options, self.plant.n)
+        self._state = self.initial_set.sample(rng) if start is None else start
+        self._task_memory = self.task.begin(rng, self.plant)
+        self._disturbance_memory = self.disturbance.begin(rng, self.plant)
+        self._link = Link(self.channel, rng)
+        self.estimator.reset(self._state + self.plant.initial_noise.sample(rng))
+        self.steps = 0
+        self._violations = 0.0
+        info = self._info(np.zeros(self.plant.m), packet_arrived=False)
+        return self._observation(), info
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Applies u = u_max * action for one step.
+
+        Raises:
+            ValueError: If the action is not finite or wrongly shaped; nothing has moved then.
+        """
+        u = applied_input(self.plant, action)
+        rng = self.np_random
+        nominal_next = self.plant.A @ self._state + self.plant.B @ u
+        self._state = nominal_next + self._draw_disturbance(nominal_next)
+        self._task_memory = self.task.advance(rng, self.plant, self._task_memory, u)
+        self.steps += 1
+        sample = self._measure() if self._link.sends_at(self.steps) else None
+        packets = self._link.exchange(rng, self.steps, sample)
+        self.estimator.advance(u, packets)
+        reward = self.task.reward(self.plant, self._task_memory, self._state, u)
+        info = self._info(u, packet_arrived=bool(packets))
+        terminated = self.terminate_on_violation and info["cost"] > 0.0
+        return self._observation(), float(reward), terminated, False, info
+
+    def _draw_disturbance(self, nominal_next: np.ndarray) -> np.ndarray:
+        rng, source = self.np_random, self.disturbance
+        d = source.draw(rng, self.plant, nominal_next, self.steps, self._disturbance_memory)
+        return d if source.replaces_process_noise else d + self.plant.process_noise.sample(rng)
+
+    def _measure(self) -> np.ndarray:
+        return self.plant.H @ self._state + self.plant.sensor_noise.sample(self.np_random)
+
+    def _observation(self) -> np.ndarray:
+        entries = np.concatenate([self.estimator.belief.mean, self.task.observe(self._task_memory)])
+        space = self.observation_space
+        return np.clip(entries.astype(np.float32), space.low, space.high)
+
+    def _info(self, u: np.ndarray, *, packet_arrived: bool) -> dict[str, Any]:
+        belief = self.estimator.belief
+        values = self.plant.constraint_values(self._state)
+        cost = float(values.max() > 0.0)
+        self._violations += cost
+        return {
+            "state": self._state.copy(),
+            "estimate": belief.mean.copy(),
+            "estimation_error": belief.mean - self._state,
+            "error_shape": belief.shape.copy(),
+            "input": u,
+            "constraint_values": values,
+            "cost": cost,
+            "measurement_age": self.estimator.age,
+            "packet_arrived": packet_arrived,
+            "assumption_violated": self.estimator.alarm,
+            "episode_violations": self._violations,
+            "is_success": float(self._violations == 0.0),
+        }
+
+
+def applied_input(plant: LinearPlant, action: Any) -> np.ndarray:
+    """Returns the float64 input u = u_max * clip(action, -1, 1), shape (m,), that an action stands for.
+
+    Raises:
+        ValueError: If the action is not finite or does not have shape (m,).
+    """
+    try:
+        normalized = np.asarray(action, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"the action must be finite numbers of shape ({plant.m},), got {action!r}") from error
+    if normalized.shape != (plant.m,) or not np.isfinite(normalized).all():
+        raise ValueError(f"the action must be finite with shape ({plant.m},), got {action!r}")
+    return plant.u_max * np.clip(normalized, -1.0, 1.0)
+
+
+def default_initial_set(plant: LinearPlant) -> Ellipsoid:
+    """Returns the starts {x : |C x|^2 <= 0.1^2}, well inside the safe box; W bounds directions C leaves free."""
+    return Ellipsoid(START_SHARE**2 * np.linalg.inv(plant.weight))
+
+
+def observation_bound(env: NCSEnv) -> np.ndarray:
+    """Returns the largest absolute value of each observation entry, shape (n + extra,).
+
+    The reach of x_hat is that of x from the initial set under every input and disturbance within the horizon,
+    plus the certified error.
+    """
+    plant = env.plant
+    reach = np.zeros(plant.n)
+    power = np.eye(plant.n)
+    largest = env.initial_set.support(power)
+    for _ in range(env.horizon):
+        reach += np.abs(power @ plant.B) @ plant.u_max + plant.disturbance.support(power)
+        power = power @ plant.A
+        largest = np.maximum(largest, reach + env.initial_set.support(power))
+    estimate = largest + np.sqrt(np.diag(env.error_set.Sigma))
+    bound = np.concatenate([estimate, env.task.observation_bound(plant, env.horizon)])
+    return OBSERVATION_MARGIN * bound
+
+
+def _start_option(options: dict[str, Any] | None, n: int) -> np.ndarray | None:
+    """Returns options["state"] as a finite array of shape (n,), or None without one."""
+    options = options or {}
+    if unknown := sorted(set(options) - {"state"}):
+        raise ValueError(f"reset knows the option 'state' only, got {unknown}")
+    if "state" not in options:
+        return None
+    state = np.array(options["state"], dtype=np.float64)
+    if state.shape != (n,) or not np.isfinite(state).all():
+        raise ValueError(f"options['state'] must be finite with shape ({n},), got {options['state']!r}")
+    return state
+
+
+def _expect(value: Any, kind: type[T], name: str) -> T:
+    if not isinstance(value, kind):
+        raise ValueError(f"{name} must be a {kind.__name__}, got {value!r}")
+    return value

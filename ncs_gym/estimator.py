@@ -1,0 +1,210 @@
+"""The delay-aware Kalman filter with a running hard ellipsoid around its error."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+
+from ncs_gym.channel import Channel, Packet
+from ncs_gym.ellipsoid import is_inside, outer_sum, sum_gauge
+from ncs_gym.error_set import ErrorSet, certified_error_set
+from ncs_gym.plant import LinearPlant
+
+# The diagonal of every computed shape grows by this much: more than the rounding of the computation, in any units.
+ROUNDING = 1e-12
+# An innovation this far beyond its exact bound counts as rounding, not as an alarm.
+ALARM_TOLERANCE = 1e-9
+# Shares mu that the set-membership gain is chosen from; any share is sound.
+SHARES = np.linspace(0.01, 0.99, 99)
+
+
+class Belief(NamedTuple):
+    """What is known about the state at one step.
+
+    Attributes:
+        mean: x_hat, shape (n,).
+        covariance: P, shape (n, n); picks gains and is never used for safety.
+        shape: Sigma_k, shape (n, n): x_hat - x lies in E(Sigma_k).
+        newest: Step of the newest sample used (0: the first estimate).
+    """
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    shape: np.ndarray
+    newest: int
+
+
+class Estimator:
+    """Estimates the state from time-stamped packets that may be lost, late, reordered or duplicated.
+
+    A packet is applied at its own step and everything after it is replayed. Next to mean and covariance
+    runs a hard ellipsoid E(Sigma_k) that holds the error at every step and never leaves the certified
+    E(Sigma) (theory.md section 3): predictions and updates are accepted only inside it.
+
+    Args:
+        plant: The plant, whose inputs the estimator knows exactly.
+        channel: Gives the quantizer's error and the longest delay, hence the replay buffer.
+        error_set: E(Sigma) with its rate; computed from the plant by default.
+
+    Raises:
+        UnstablePlantError: If no error set is given and the plant is not Schur stable.
+    """
+
+    def __init__(self, plant: LinearPlant, channel: Channel, error_set: ErrorSet | None = None) -> None:
+        self.plant = plant
+        self.error_set = certified_error_set(plant) if error_set is None else error_set
+        self.buffer = channel.longest_delay
+        D, Sigma = plant.disturbance.shape, self.error_set.Sigma
+        self._fallback = D / (1.0 - self.error_set.rate)
+        noise = plant.sensor_error_with(channel.quantization_step).shape
+        self._noise = noise + ROUNDING * np.diag(np.diag(plant.H @ Sigma @ plant.H.T))
+        self._information = plant.H.T @ np.linalg.solve(self._noise, plant.H)
+        self._identity = np.eye(plant.n)
+        self._filter = _kalman_filter(plant, channel.quantization_step)
+        self.reset(np.zeros(plant.n))
+
+    def reset(self, mean: np.ndarray) -> None:
+        """Starts an episode at step 0 with a first estimate, shape (n,), whose error lies in E(r0^2 I)."""
+        self.step = 0
+        self.alarm = False
+        first = self.plant.initial_error.shape
+        self.belief = Belief(np.array(mean, dtype=np.float64), self.plant.initial_cov.copy(), first.copy(), 0)
+        self._priors: dict[int, Belief] = {}
+        self._inputs: dict[int, np.ndarray] = {}
+        self._samples: dict[int, np.ndarray] = {}
+
+    @property
+    def age(self) -> int:
+        """Steps since the newest sample used was taken; the first estimate counts as a sample at step 0."""
+        return self.step - self.belief.newest
+
+    def advance(self, u: np.ndarray, packets: Iterable[Packet]) -> None:
+        """Moves one step on: predicts with the input really applied, then takes in what arrived.
+
+        Args:
+            u: Applied input, shape (m,) [physical units].
+            packets: In any order. Stamps from the future, from before the first step, older than the
+                replay buffer or seen before are discarded.
+        """
+        self._inputs[self.step] = u
+        self.step += 1
+        self.belief = self._priors[self.step] = self._predict(self.belief, u)
+        for packet in packets:
+            self._receive(packet)
+        expired = self.step - self.buffer - 1
+        for history in (self._priors, self._inputs, self._samples):
+            history.pop(expired, None)
+
+    def _receive(self, packet: Packet) -> None:
+        """Replays from the packet's stamp and keeps whichever history ends with the smaller ellipsoid."""
+        stamp = packet.stamp
+        if stamp not in self._priors or stamp in self._samples:
+            return
+        if not np.isfinite(packet.measurement).all():
+            self.alarm = True  # no sensor within the assumptions sends this
+            return
+        self._samples[stamp] = packet.measurement
+        priors = {stamp: self._priors[stamp]}
+        for step in range(stamp, self.step + 1):
+            belief = priors[step]
+            if step in self._samples:
+                belief = self._update(belief, self._samples[step], step)
+            if step < self.step:
+                priors[step + 1] = self._predict(belief, self._inputs[step])
+        weight = self.plant.weight
+        if np.vdot(weight, belief.shape) <= np.vdot(weight, self.belief.shape):
+            self.belief = belief
+            self._priors.update(priors)
+
+    def _predict(self, belief: Belief, u: np.ndarray) -> Belief:
+        """Returns the belief one step later: mean A x_hat + B u, shape A Sigma_k A'/lam + D/(1-lam)."""
+        kalman = self._filter
+        kalman.x, kalman.P = belief.mean, belief.covariance
+        kalman.predict(u)
+        return Belief(kalman.x, kalman.P, self._predicted_shape(belief.shape), belief.newest)
+
+    def _predicted_shape(self, shape: np.ndarray) -> np.ndarray:
+        """Returns the first of: trace-optimal lam, certified rate, Sigma itself, that lies inside E(Sigma).
+
+        Sigma itself is sound: E(shape) lies inside E(Sigma), which (E1) maps into itself.
+        """
+        A, D, Sigma = self.plant.A, self.plant.disturbance.shape, self.error_set.Sigma
+        moved = A @ shape @ A.T
+        predicted = _rounded_up(outer_sum(moved, D, self.plant.weight))
+        if is_inside(predicted, Sigma):
+            return predicted
+        predicted = _rounded_up(moved / self.error_set.rate + self._fallback)
+        return predicted if is_inside(predicted, Sigma) else Sigma
+
+    def _update(self, belief: Belief, measurement: np.ndarray, step: int) -> Belief:
+        """Returns the belief after a measurement, unchanged if no gain keeps its ellipsoid inside E(Sigma)."""
+        H = self.plant.H
+        residual = measurement - H @ belief.mean
+        self._monitor(residual, H @ belief.shape @ H.T)
+        kalman = self._filter
+        kalman.x, kalman.P = belief.mean, belief.covariance
+        kalman.update(measurement)
+        shape = self._updated_shape(belief.shape, kalman.K)
+        if is_inside(shape, self.error_set.Sigma):
+            return Belief(kalman.x, kalman.P, shape, step)
+        gain = self._membership_gain(belief.shape)
+        shape = self._updated_shape(belief.shape, gain)
+        if not is_inside(shape, self.error_set.Sigma):
+            return belief
+        kept = self._identity - gain @ H
+        covariance = kept @ belief.covariance @ kept.T + gain @ kalman.R @ gain.T
+        return Belief(belief.mean + gain @ residual, covariance, shape, step)
+
+    def _updated_shape(self, shape: np.ndarray, gain: np.ndarray) -> np.ndarray:
+        """Returns (I-TH) Sigma_k (I-TH)'/mu + T N T'/(1-mu) with the trace-optimal mu: sound for any gain T."""
+        kept = self._identity - gain @ self.plant.H
+        noise = gain @ self._noise @ gain.T
+        return _rounded_up(outer_sum(kept @ shape @ kept.T, noise, self.plant.weight))
+
+    def _membership_gain(self, shape: np.ndarray) -> np.ndarray:
+        """Returns T_mu = S H'/mu (H S H'/mu + N/(1-mu))^-1, shape (n, p), with the trace-optimal mu.
+
+        Its updated shape is (mu S^-1 + (1-mu) H' N^-1 H)^-1 (theory.md section 3); with S = G G' and
+        G'H'N^-1HG = V diag(j) V' the weighted trace is a sum of w_i / (mu + (1-mu) j_i).
+        """
+        H = self.plant.H
+        values, vectors = np.linalg.eigh(shape)
+        factor = vectors * np.sqrt(np.maximum(values, 0.0))
+        gains, basis = np.linalg.eigh(factor.T @ self._information @ factor)
+        axes = factor @ basis
+        weights = (axes * (self.plant.weight @ axes)).sum(axis=0)
+        traces = (weights / (SHARES[:, None] + (1.0 - SHARES[:, None]) * np.maximum(gains, 0.0))).sum(axis=1)
+        mu = SHARES[int(np.argmin(traces))]
+        spread = shape @ H.T / mu
+        return np.linalg.solve(H @ spread + self._noise / (1.0 - mu), spread.T).T
+
+    def _monitor(self, residual: np.ndarray, spread: np.ndarray) -> None:
+        """Latches the alarm if a residual y - H x_hat lies outside E(H Sigma H') + E(N).
+
+        The ellipsoid of shape H Sigma H' + N lies inside that sum, so passing it settles the matter.
+        """
+        if residual @ np.linalg.solve(spread + self._noise, residual) > 1.0:
+            self.alarm |= sum_gauge(residual, spread, self._noise) > 1.0 + ALARM_TOLERANCE
+
+
+def _rounded_up(shape: np.ndarray) -> np.ndarray:
+    """Returns a computed shape with its diagonal grown by ROUNDING (in place)."""
+    shape.flat[:: shape.shape[0] + 1] *= 1.0 + ROUNDING
+    return shape
+
+
+def _kalman_filter(plant: LinearPlant, quantization_step: float) -> KalmanFilter:
+    """Returns filterpy's filter with every matrix set: process covariance Q + gamma I (`paper.tex` Definition 3),
+    sensor covariance R plus the variance q^2/12 of a quantizer.
+    """
+    kalman = KalmanFilter(dim_x=plant.n, dim_z=plant.p, dim_u=plant.m)
+    kalman.x = np.zeros(plant.n)
+    kalman.F, kalman.B, kalman.H = plant.A, plant.B, plant.H
+    kalman.Q = plant.process_noise_cov + plant.gamma * np.eye(plant.n)
+    kalman.R = plant.measurement_noise_cov + quantization_step**2 / 12.0 * np.eye(plant.p)
+    if np.linalg.eigvalsh(kalman.R)[0] <= 0.0:
+        kalman.inv = np.linalg.pinv  # perfect sensors: the innovation covariance may be singular
+    return kalman

@@ -1,0 +1,123 @@
+"""Immutable settings: dataclasses whose arrays cannot be written to."""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+import numpy as np
+
+
+class FrozenArrays:
+    """Mixin that keeps the array fields of a frozen dataclass read-only.
+
+    `dataclass(frozen=True)` stops assignment to a field but not writing into an array. `gym.make`
+    deep-copies keyword arguments, and both copies and pickles of a read-only array are writable
+    again; so a copy is the object itself, and unpickling freezes anew.
+    """
+
+    def _freeze_arrays(self) -> None:
+        """Replaces every array attribute by a read-only copy of its own."""
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                object.__setattr__(self, name, read_only(value))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._freeze_arrays()
+
+    def __copy__(self) -> Self:
+        return self
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return self
+
+
+def read_only(array: np.ndarray) -> np.ndarray:
+    """Returns a read-only copy of `array`."""
+    frozen = array.copy()
+    frozen.setflags(write=False)
+    return frozen
+
+
+def as_matrix(value: Any, shape: tuple[int | None, int | None], name: str) -> np.ndarray:
+    """Returns `value` as a finite float64 matrix of the expected shape.
+
+    Args:
+        value: Anything numpy can turn into a two-dimensional array.
+        shape: Expected (rows, columns); None accepts any positive number.
+        name: What the error message calls it.
+
+    Raises:
+        ValueError: If it is not numeric, has another shape, or holds a NaN or an infinity.
+    """
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be a matrix of numbers, got {value!r}") from error
+    expected = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"
+    fits = matrix.ndim == 2 and all(
+        have > 0 and (want is None or have == want)
+        for have, want in zip(matrix.shape, shape, strict=True)
+    )
+    if not fits:
+        raise ValueError(f"{name} must have shape {expected}, got {matrix.shape}")
+    if not np.isfinite(matrix).all():
+        raise ValueError(f"{name} must be finite, got {matrix.tolist()}")
+    return matrix
+
+
+def as_covariance(value: Any, size: int, name: str) -> np.ndarray:
+    """Returns `value` as a symmetric positive semidefinite (size, size) matrix.
+
+    Raises:
+        ValueError: If it has another shape, is not finite, not symmetric or has a negative
+            eigenvalue beyond rounding.
+    """
+    matrix = as_matrix(value, (size, size), name)
+    scale = np.abs(matrix).max()
+    if not np.allclose(matrix, matrix.T, rtol=0.0, atol=1e-12 * scale):
+        raise ValueError(f"{name} must be symmetric, got {matrix.tolist()}")
+    matrix = 0.5 * (matrix + matrix.T)
+    smallest = float(np.linalg.eigvalsh(matrix)[0])
+    if smallest < -1e-12 * scale:
+        raise ValueError(f"{name} must be positive semidefinite, its smallest eigenvalue is {smallest:.3g}")
+    return matrix
+
+
+def as_number(
+    value: Any,
+    name: str,
+    *,
+    low: float = -np.inf,
+    high: float = np.inf,
+    low_open: bool = False,
+    high_open: bool = False,
+) -> float:
+    """Returns `value` as a finite float inside an interval.
+
+    Raises:
+        ValueError: If it is not a finite real number or lies outside the interval.
+    """
+    wanted = f"{'>' if low_open else '>='} {low:g}" if np.isfinite(low) else "finite"
+    if np.isfinite(high):
+        wanted += f" and {'<' if high_open else '<='} {high:g}"
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be a number {wanted}, got {value!r}") from error
+    above = number > low if low_open else number >= low
+    below = number < high if high_open else number <= high
+    if not (np.isfinite(number) and above and below):
+        raise ValueError(f"{name} must be a number {wanted}, got {value!r}")
+    return number
+
+
+def as_count(value: Any, name: str, *, low: int) -> int:
+    """Returns `value` as an int of at least `low`.
+
+    Raises:
+        ValueError: If it is not a whole number (a bool is not one) or is below `low`.
+    """
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < low:
+        raise ValueError(f"{name} must be a whole number >= {low}, got {value!r}")
+    return int(value)

@@ -1,0 +1,251 @@
+"""The linear plant and the hard bounds on everything uncertain about it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.linalg import expm
+
+from ncs_gym.ellipsoid import Ellipsoid
+from ncs_gym.frozen import FrozenArrays, as_covariance, as_matrix, as_number
+from ncs_gym.noise import SMALLEST_KEPT, TruncatedGaussian, chi2_quantile
+
+# Relative growth of every hard bound, so that rounding in sampling and quantizing stays inside (theory.md section 1).
+INFLATION = 1.0 + 1e-9
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LinearPlant(FrozenArrays):
+    """x+ = A x + B u + d, y = H x + v, with limits and bounds (theory.md section 1).
+
+    Attributes:
+        A: State matrix, shape (n, n).
+        B: Input matrix, shape (n, m).
+        C: Rows c_j of the safe box |c_j x| <= 1, shape (k, n).
+        u_max: Input limits |u_i| <= u_max_i, a positive number or shape (m,).
+        dt: Duration of a step [s].
+        gamma: Squared radius of the unknown disturbance, d'd <= gamma.
+        H: Output matrix, shape (p, n); the identity by default.
+        process_noise_cov: Q, shape (n, n), truncated at chi2_{n,1-delta}; zero by default.
+        measurement_noise_cov: R, shape (p, p), truncated at chi2_{p,1-delta}; zero by default.
+        initial_cov: P0 of the first estimate, shape (n, n), truncated alike; zero by default.
+        delta: Probability mass that the truncation of each Gaussian removes, in (0, 0.999].
+        state_names, state_units, input_names, input_units: For tables and figures.
+
+    Raises:
+        ValueError: If a matrix has a wrong shape, is not finite or not a covariance, or a bound is
+            negative.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    u_max: np.ndarray | float
+    dt: float
+    gamma: float
+    H: np.ndarray | None = None
+    process_noise_cov: np.ndarray | None = None
+    measurement_noise_cov: np.ndarray | None = None
+    initial_cov: np.ndarray | None = None
+    delta: float = 0.05
+    state_names: Sequence[str] = field(default=())
+    state_units: Sequence[str] = field(default=())
+    input_names: Sequence[str] = field(default=())
+    input_units: Sequence[str] = field(default=())
+
+    def __post_init__(self) -> None:
+        A = as_matrix(self.A, (None, None), "A")
+        n = A.shape[0]
+        A = as_matrix(A, (n, n), "A")
+        B = as_matrix(self.B, (n, None), "B")
+        m = B.shape[1]
+        H = np.eye(n) if self.H is None else as_matrix(self.H, (None, n), "H")
+        self._set("A", A)
+        self._set("B", B)
+        self._set("C", as_matrix(self.C, (None, n), "C"))
+        self._set("H", H)
+        self._set("u_max", _as_limits(self.u_max, m))
+        self._set("dt", as_number(self.dt, "dt", low=0.0, low_open=True))
+        self._set("gamma", as_number(self.gamma, "gamma", low=0.0))
+        self._set("delta", as_number(self.delta, "delta", low=0.0, high=1.0 - SMALLEST_KEPT, low_open=True))
+        for name, size in (("process_noise_cov", n), ("measurement_noise_cov", H.shape[0]), ("initial_cov", n)):
+            value = getattr(self, name)
+            self._set(name, np.zeros((size, size)) if value is None else as_covariance(value, size, name))
+        for name, size, letter in (("state", n, "x"), ("input", m, "u")):
+            names = tuple(getattr(self, f"{name}_names")) or tuple(f"{letter}{i + 1}" for i in range(size))
+            units = tuple(getattr(self, f"{name}_units")) or ("",) * size
+            if len(names) != size or len(units) != size:
+                raise ValueError(f"{name}_names and {name}_units must have {size} entries, got {names} and {units}")
+            self._set(f"{name}_names", names)
+            self._set(f"{name}_units", units)
+        self._freeze_arrays()
+
+    def _set(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return self.A.shape[0]
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return self.B.shape[1]
+
+    @property
+    def p(self) -> int:
+        """Number of outputs."""
+        return self.H.shape[0]
+
+    @cached_property
+    def spectral_radius(self) -> float:
+        """Largest absolute eigenvalue of A; below 1 exactly when the plant is Schur stable."""
+        return float(np.abs(np.linalg.eigvals(self.A)).max())
+
+    @cached_property
+    def weight(self) -> np.ndarray:
+        """Positive definite W, shape (n, n), that measures ellipsoids in units of the safe box: C'C, regularized."""
+        gram = self.C.T @ self.C
+        return gram + 1e-6 * np.diag(np.diag(gram) + np.trace(gram) / self.n * (np.diag(gram) == 0.0))
+
+    @cached_property
+    def process_noise(self) -> TruncatedGaussian:
+        """w ~ N(0, Q) truncated at chi2_{n,1-delta}."""
+        return TruncatedGaussian(self.process_noise_cov, chi2_quantile(1.0 - self.delta, self.n))
+
+    @cached_property
+    def sensor_noise(self) -> TruncatedGaussian:
+        """v ~ N(0, R) truncated at chi2_{p,1-delta}."""
+        return TruncatedGaussian(self.measurement_noise_cov, chi2_quantile(1.0 - self.delta, self.p))
+
+    @cached_property
+    def initial_noise(self) -> TruncatedGaussian:
+        """Error of the first estimate, e_0 ~ N(0, P0) truncated at chi2_{n,1-delta}."""
+        return TruncatedGaussian(self.initial_cov, chi2_quantile(1.0 - self.delta, self.n))
+
+    @cached_property
+    def disturbance(self) -> Ellipsoid:
+        """D, shape (n, n): holds d (with d'd <= gamma) plus the truncated process noise (theory.md section 1)."""
+        ball = Ellipsoid(self.gamma * np.eye(self.n))
+        return Ellipsoid(INFLATION * _sum_or_other(ball, self.process_noise.bound).shape)
+
+    @cached_property
+    def sensor_error(self) -> Ellipsoid:
+        """Holds the sensor noise v, shape (p, p), without the channel's quantizer (see `sensor_error_with`)."""
+        return Ellipsoid(INFLATION * self.sensor_noise.bound.shape)
+
+    def sensor_error_with(self, quantization_step: float) -> Ellipsoid:
+        """Returns N, shape (p, p): sensor noise plus the ball of squared radius p q^2/4 around a quantizer's box."""
+        ball = Ellipsoid(self.p * quantization_step**2 / 4.0 * np.eye(self.p))
+        return Ellipsoid(INFLATION * _sum_or_other(ball, self.sensor_noise.bound).shape)
+
+    @cached_property
+    def initial_error(self) -> Ellipsoid:
+        """r0^2 I, shape (n, n): holds the error of the first estimate, r0^2 = lambda_max(P0) chi2_{n,1-delta}."""
+        r0_squared = float(np.linalg.eigvalsh(self.initial_noise.bound.shape)[-1])
+        return Ellipsoid(INFLATION * max(r0_squared, 0.0) * np.eye(self.n))
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 over every number of the plant, to bind certificates and models to it."""
+        digest = hashlib.sha256()
+        for name in ("A", "B", "C", "H", "u_max", "process_noise_cov", "measurement_noise_cov", "initial_cov"):
+            array = getattr(self, name)
+            digest.update(f"{name}{array.shape}".encode() + array.astype("<f8").tobytes())
+        digest.update(np.array([self.dt, self.gamma, self.delta], dtype="<f8").tobytes())
+        return digest.hexdigest()
+
+    def constraint_values(self, state: np.ndarray) -> np.ndarray:
+        """Returns |c_j x| - 1 for each row of the safe box, shape (k,); positive means violated."""
+        return np.abs(self.C @ state) - 1.0
+
+
+def truck_trailer(
+    mass: float = 1000.0,
+    stiffness: float = 4500.0,
+    damping: float = 4600.0,
+    dt: float = 0.5,
+    *,
+    u_max: float = 4.0,
+    gamma: float = 5e-4,
+    process_noise_cov: np.ndarray | None = None,
+    measurement_noise_cov: np.ndarray | None = None,
+    initial_cov: np.ndarray | None = None,
+    delta: float = 0.05,
+    C: np.ndarray | None = None,
+    H: np.ndarray | None = None,
+) -> LinearPlant:
+    """Returns the truck with a spring-damper-coupled trailer of `paper.tex` Section 5.
+
+    The exact zero-order hold of x1' = x2, x2' = -(stiffness/mass) x1 - (damping/mass) x2 + u, with x1
+    the stretch of the coupling [m], x2 its rate [m/s] and u the truck's acceleration [m/s^2].
+
+    Args:
+        mass: Of the trailer [kg].
+        stiffness: Of the coupling [N/m].
+        damping: Of the coupling [N s/m].
+        dt: Duration of a step [s].
+        u_max: Limit of the acceleration [m/s^2].
+        gamma: Squared radius of the disturbance.
+        process_noise_cov: Q, shape (2, 2); 1e-4 I by default, as in the paper.
+        measurement_noise_cov: R, shape (p, p); 1e-4 I by default (the paper prints none).
+        initial_cov: P0, shape (2, 2); 1e-4 I by default, as in the paper.
+        delta: Probability mass removed by each truncation.
+        C: Rows of the safe box, shape (k, 2); |x1| <= 2 m and |x2| <= 2 m/s by default.
+        H: Output matrix, shape (p, 2); both states by default.
+
+    Raises:
+        ValueError: If mass, stiffness or dt is not positive, damping is negative, or a bound is wrong.
+    """
+    mass = as_number(mass, "mass", low=0.0, low_open=True)
+    stiffness = as_number(stiffness, "stiffness", low=0.0, low_open=True)
+    damping = as_number(damping, "damping", low=0.0)
+    dt = as_number(dt, "dt", low=0.0, low_open=True)
+    continuous = np.zeros((3, 3))
+    continuous[0, 1] = 1.0
+    continuous[1] = [-stiffness / mass, -damping / mass, 1.0]
+    step = expm(continuous * dt)
+    p = 2 if H is None else np.shape(H)[0]
+    return LinearPlant(
+        A=step[:2, :2],
+        B=step[:2, 2:],
+        C=np.eye(2) / 2.0 if C is None else C,
+        H=H,
+        u_max=u_max,
+        dt=dt,
+        gamma=gamma,
+        process_noise_cov=1e-4 * np.eye(2) if process_noise_cov is None else process_noise_cov,
+        measurement_noise_cov=1e-4 * np.eye(p) if measurement_noise_cov is None else measurement_noise_cov,
+        initial_cov=1e-4 * np.eye(2) if initial_cov is None else initial_cov,
+        delta=delta,
+        state_names=("coupling stretch", "stretch rate"),
+        state_units=("m", "m/s"),
+        input_names=("truck acceleration",),
+        input_units=("m/s^2",),
+    )
+
+
+def _as_limits(value: Any, size: int) -> np.ndarray:
+    """Returns input limits as a positive finite array of shape (size,)."""
+    try:
+        limits = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"u_max must be a positive number or shape ({size},), got {value!r}") from error
+    if limits.shape not in ((), (size,)) or not np.isfinite(limits).all() or (limits <= 0.0).any():
+        raise ValueError(f"u_max must be a positive number or shape ({size},), got {value!r}")
+    return np.broadcast_to(limits, (size,)).copy()
+
+
+def _sum_or_other(first: Ellipsoid, second: Ellipsoid) -> Ellipsoid:
+    """Returns an ellipsoid around the sum; where one of them is a point, the other alone."""
+    if not np.any(first.shape):
+        return second
+    if not np.any(second.shape):
+        return first
+    return first.outer_sum(second)

@@ -1,0 +1,147 @@
+"""What the agent is paid for, and the extra states that belong to it.
+
+`begin` draws the task's memory for an episode, `advance` moves it one step; neither stores anything in
+the settings, so one object serves any number of environments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ncs_gym.frozen import FrozenArrays, as_count, as_covariance, as_number
+from ncs_gym.plant import LinearPlant
+
+
+class Task(FrozenArrays):
+    """A reward, and perfectly known extra entries of the observation."""
+
+    def begin(self, rng: np.random.Generator, plant: LinearPlant) -> Any:
+        """Returns the task's memory at the start of an episode (None unless overridden)."""
+        return None
+
+    def advance(self, rng: np.random.Generator, plant: LinearPlant, memory: Any, u: np.ndarray) -> Any:
+        """Returns the memory after input u, shape (m,), was applied for one step."""
+        return memory
+
+    def observe(self, memory: Any) -> np.ndarray:
+        """Returns the extra observation entries, shape (extra,)."""
+        return np.zeros(0)
+
+    def observation_bound(self, plant: LinearPlant, horizon: int) -> np.ndarray:
+        """Returns the largest absolute value of each extra entry within `horizon` steps, shape (extra,)."""
+        return np.zeros(0)
+
+    def reward(self, plant: LinearPlant, memory: Any, state: np.ndarray, u: np.ndarray) -> float:
+        """Returns the reward of a step that applied u (m,) and ended in `state` (n,) and `memory`."""
+        raise NotImplementedError
+
+    def check(self, plant: LinearPlant) -> str:
+        """Returns why this task does not suit the plant, or an empty string."""
+        return ""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Regulation(Task):
+    """Keep the state near zero: reward -(x'Qx + u'Ru) with the true next state x and the input applied.
+
+    Attributes:
+        state_cost: Q, shape (n, n); None: C'C, so that the edge of the safe box costs about 1.
+        input_cost: R, shape (m, m); None: 0.01 diag(1 / u_max^2).
+
+    Raises:
+        ValueError: If a cost is not symmetric positive semidefinite.
+    """
+
+    state_cost: np.ndarray | None = None
+    input_cost: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("state_cost", "input_cost"):
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, as_covariance(value, len(value), name))
+        self._freeze_arrays()
+
+    def reward(self, plant, memory, state, u):  # noqa: D102
+        if self.state_cost is None:
+            output = plant.C @ state
+            cost = float(output @ output)
+        else:
+            cost = float(state @ self.state_cost @ state)
+        if self.input_cost is None:
+            effort = u / plant.u_max
+            return -cost - 0.01 * float(effort @ effort)
+        return -cost - float(u @ self.input_cost @ u)
+
+    def check(self, plant):  # noqa: D102
+        for name, size in (("state_cost", plant.n), ("input_cost", plant.m)):
+            value = getattr(self, name)
+            if value is not None and value.shape != (size, size):
+                return f"{name} must have shape ({size}, {size}), got {value.shape}"
+        return ""
+
+
+class SpeedProfile(NamedTuple):
+    """Memory of `SpeedTracking`: the vehicle's speed and the speed it should have [m/s]."""
+
+    speed: float
+    target: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SpeedTracking(Task):
+    """Follow a random piecewise-constant speed profile with a vehicle whose acceleration is an input.
+
+    The speed moves by v+ = v + dt u. The observation gains the speed error, target - v [m/s]. The reward is
+    -error_weight min(|error| / 5, 5) - input_weight u^2, at the end of the step.
+
+    Attributes:
+        fastest: Targets (and the first speed) are uniform in [0, fastest] [m/s].
+        change_probability: Per step, to draw a new target.
+        error_weight: Per 5 m/s of error.
+        input_weight: Per (m/s^2)^2.
+        input_index: Which input is the acceleration [m/s^2].
+
+    Raises:
+        ValueError: If a value is out of range.
+    """
+
+    fastest: float = 25.0
+    change_probability: float = 0.02
+    error_weight: float = 0.2
+    input_weight: float = 0.002
+    input_index: int = 0
+
+    def __post_init__(self) -> None:
+        as_number(self.fastest, "fastest", low=0.0, low_open=True)
+        as_number(self.change_probability, "change_probability", low=0.0, high=1.0)
+        as_number(self.error_weight, "error_weight", low=0.0)
+        as_number(self.input_weight, "input_weight", low=0.0)
+        as_count(self.input_index, "input_index", low=0)
+
+    def begin(self, rng, plant):  # noqa: D102
+        return SpeedProfile(rng.uniform(0.0, self.fastest), rng.uniform(0.0, self.fastest))
+
+    def advance(self, rng, plant, memory, u):  # noqa: D102
+        speed = memory.speed + plant.dt * float(u[self.input_index])
+        changes, target = rng.random() < self.change_probability, rng.uniform(0.0, self.fastest)
+        return SpeedProfile(speed, target if changes else memory.target)
+
+    def observe(self, memory):  # noqa: D102
+        return np.array([memory.target - memory.speed])
+
+    def observation_bound(self, plant, horizon):  # noqa: D102
+        return np.array([self.fastest + horizon * plant.dt * plant.u_max[self.input_index]])
+
+    def reward(self, plant, memory, state, u):  # noqa: D102
+        error = memory.target - memory.speed
+        effort = float(u[self.input_index])
+        return -self.error_weight * min(abs(error) / 5.0, 5.0) - self.input_weight * effort**2
+
+    def check(self, plant):  # noqa: D102
+        if self.input_index >= plant.m:
+            return f"input_index must be < {plant.m}, got {self.input_index}"
+        return ""

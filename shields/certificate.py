@@ -1,0 +1,169 @@
+"""The certificate: an invariant ellipsoid, its gain and the numbers that prove it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from dataclasses import asdict, dataclass, field, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ncs_gym import Ellipsoid
+from ncs_gym.frozen import FrozenArrays, as_matrix, as_number, read_only
+
+FORMAT = "ncs-gym certificate 1"
+ARRAYS = ("L", "K", "Sigma", "D")
+
+
+class CertificateError(ValueError):
+    """A certificate is damaged, belongs to another plant, or does not verify."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Multipliers:
+    """The shares that the conditions of theory.md section 3 are verified with.
+
+    Attributes:
+        error: lam_e of (E1).
+        state: lx of (I).
+        estimate: le of (I).
+        disturbance: ld of (I).
+        inputs: mu_i of (U), one per input.
+        rounding: s of D_u, the growth of D that makes room for actions rounded to float32.
+    """
+
+    error: float
+    state: float
+    estimate: float
+    disturbance: float
+    inputs: tuple[float, ...]
+    rounding: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Certificate(FrozenArrays):
+    """A robust safety invariant set S = {x : x'Mx <= 1} with gain K, and the proof's numbers.
+
+    Nothing here is trusted until `shields.verify` has checked it in exact arithmetic.
+
+    Attributes:
+        L: Shape of the safe set, (n, n); S = E(L).
+        K: Gain of the fallback input u = K x_hat, (m, n) [input per state].
+        Sigma: Shape of the certified error set, (n, n).
+        D: Shape of the disturbance set it was made for, (n, n).
+        multipliers: See `Multipliers`.
+        method: "certified".
+        fingerprint: Of the plant it belongs to.
+        provenance: How it was made (solver, versions, volume); informative only.
+    """
+
+    L: np.ndarray
+    K: np.ndarray
+    Sigma: np.ndarray
+    D: np.ndarray
+    multipliers: Multipliers
+    method: str
+    fingerprint: str
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        try:
+            n = len(np.atleast_2d(self.L))
+            for name, rows in (("L", n), ("K", None), ("Sigma", n), ("D", n)):
+                object.__setattr__(self, name, as_matrix(getattr(self, name), (rows, n), name))
+        except ValueError as error:
+            raise CertificateError(f"not a certificate: {error}") from error
+        self._freeze_arrays()
+
+    @cached_property
+    def M(self) -> np.ndarray:
+        """L^-1, shape (n, n)."""
+        inverse = np.linalg.inv(self.L)
+        return read_only(0.5 * (inverse + inverse.T))
+
+    @cached_property
+    def safe_set(self) -> Ellipsoid:
+        """S = E(L)."""
+        return Ellipsoid(self.L)
+
+    @cached_property
+    def error_set(self) -> Ellipsoid:
+        """E(Sigma)."""
+        return Ellipsoid(self.Sigma)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes JSON in which every float is exact; a reader never sees half a file.
+
+        Raises:
+            OSError: If the file cannot be written.
+        """
+        content = self._content()
+        document = {"format": FORMAT, "sha256": _digest(content), "certificate": content}
+        write_atomically(Path(path), json.dumps(document, indent=1) + "\n")
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Certificate:
+        """Returns the certificate in a file; its conditions are not verified by this.
+
+        Raises:
+            CertificateError: If the file is missing, not a certificate, truncated or altered.
+        """
+        try:
+            document = json.loads(Path(path).read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError) as error:
+            reason = getattr(error, "strerror", None) or "it is not valid JSON"
+            raise CertificateError(f"cannot read certificate {path}: {reason}") from error
+        try:
+            if document["format"] != FORMAT:
+                raise CertificateError(f"{path} is not a certificate of format {FORMAT!r}")
+            content = document["certificate"]
+            if document["sha256"] != _digest(content):
+                raise CertificateError(f"certificate {path} was altered: its checksum does not match")
+            return cls(**_from_content(content))
+        except (KeyError, TypeError, ValueError) as error:
+            if isinstance(error, CertificateError):
+                raise
+            raise CertificateError(f"{path} is not a certificate: {error}") from error
+
+    def _content(self) -> dict[str, Any]:
+        values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        for name in ARRAYS:
+            values[name] = values[name].tolist()
+        values["multipliers"] = asdict(self.multipliers)
+        return values
+
+
+def _from_content(content: dict[str, Any]) -> dict[str, Any]:
+    values = {entry.name: content[entry.name] for entry in fields(Certificate)}
+    shares = values["multipliers"]
+    inputs = tuple(as_number(share, "inputs") for share in shares["inputs"])
+    others = {name: as_number(shares[name], name) for name in shares if name != "inputs"}
+    values["multipliers"] = Multipliers(inputs=inputs, **others)
+    return values
+
+
+def _digest(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Writes a text file under a temporary name beside its place and renames it there.
+
+    Raises:
+        OSError: If it cannot be written; nothing is left behind.
+    """
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise

@@ -1,0 +1,83 @@
+"""Rational matrices: every float is a dyadic rational, so what is computed here is exact."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+
+Matrix = list[list[Fraction]]
+
+
+def rational(array: np.ndarray) -> Matrix:
+    """Returns the exact rational value of a finite float matrix, shape (r, c)."""
+    return [[Fraction(float(entry)) for entry in row] for row in np.atleast_2d(array)]
+
+
+def add(*terms: Matrix) -> Matrix:
+    """Returns the sum of matrices of equal shape."""
+    return [[sum(entries, Fraction(0)) for entries in zip(*rows, strict=True)] for rows in zip(*terms, strict=True)]
+
+
+def subtract(left: Matrix, right: Matrix) -> Matrix:
+    """Returns left - right."""
+    return add(left, scale(Fraction(-1), right))
+
+
+def scale(factor: Fraction, matrix: Matrix) -> Matrix:
+    """Returns factor * matrix."""
+    return [[factor * entry for entry in row] for row in matrix]
+
+
+def multiply(left: Matrix, right: Matrix) -> Matrix:
+    """Returns left @ right."""
+    columns = list(zip(*right, strict=True))
+    return [[sum((a * b for a, b in zip(row, column, strict=True)), Fraction(0)) for column in columns] for row in left]
+
+
+def transpose(matrix: Matrix) -> Matrix:
+    """Returns the transpose."""
+    return [list(column) for column in zip(*matrix, strict=True)]
+
+
+def congruence(factor: Matrix, matrix: Matrix) -> Matrix:
+    """Returns factor @ matrix @ factor'."""
+    return multiply(multiply(factor, matrix), transpose(factor))
+
+
+def quadratic(row: Matrix, matrix: Matrix) -> Fraction:
+    """Returns the number row @ matrix @ row' for a row of shape (1, n)."""
+    return congruence(row, matrix)[0][0]
+
+
+def is_positive_semidefinite(matrix: Matrix, *, strict: bool = False) -> bool:
+    """Returns whether a symmetric rational matrix is positive semidefinite (definite if `strict`).
+
+    By the exact LDL' factorization: it is semidefinite exactly if no pivot is negative and every zero pivot has a
+    zero column below it.
+    """
+    rest = [row[:] for row in matrix]
+    size = len(rest)
+    if any(rest[i][j] != rest[j][i] for i in range(size) for j in range(i)):
+        return False
+    for k in range(size):
+        pivot = rest[k][k]
+        if pivot < 0 or (strict and pivot == 0):
+            return False
+        below = range(k + 1, size)
+        if pivot == 0:
+            if any(rest[i][k] != 0 for i in below):
+                return False
+            continue
+        for i in below:
+            factor = rest[i][k] / pivot
+            if factor:
+                for j in range(i, size):
+                    rest[i][j] -= factor * rest[k][j]
+                    rest[j][i] = rest[i][j]
+    return True
+
+
+def to_float(matrix: Matrix) -> np.ndarray:
+    """Returns the nearest float64 matrix."""
+    return np.array([[float(entry) for entry in row] for row in matrix])

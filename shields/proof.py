@@ -1,0 +1,96 @@
+"""Tracks whether the proof of safety holds, step by step."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ncs_gym import Ellipsoid
+from ncs_gym.ellipsoid import is_inside
+from shields.certificate import Certificate
+from shields.exact import is_positive_semidefinite, rational, subtract
+from shields.filter import Decision, SafetyFilter
+
+ALARM = "a measurement contradicts the assumed bounds"
+OTHER_INPUT = "the input applied is not the one decided"
+OTHER_STEPS = "the environment did not move exactly one step"
+LARGE_ERROR = "the error ellipsoid is not inside the certified one"
+NOT_KNOWN_INSIDE = "the state is not known to be in the safe set"
+
+
+class ProofTracker:
+    """Whether x in S is proved now, and why not (theory.md section 4, "When the proof holds").
+
+    An alarm of the innovation monitor and an input other than the decided one break the error bound for the rest of
+    the episode. The other two reasons are recoverable: a passed test proves the next state in S without x in S, and
+    a running ellipsoid outside E(Sigma) is still a bound, only K x_hat is not proved safe with it.
+    """
+
+    def __init__(self, safety_filter: SafetyFilter) -> None:
+        self._filter = safety_filter
+        self._broken = ""
+        self._error_certified = False
+        self._inside = False
+
+    @property
+    def reason(self) -> str:
+        """Why the proof does not hold now; empty while it does."""
+        if self._broken:
+            return self._broken
+        if not self._inside:
+            return NOT_KNOWN_INSIDE
+        return "" if self._error_certified else LARGE_ERROR
+
+    def start(self, known_inside: bool, info: dict[str, Any]) -> None:
+        """Begins an episode.
+
+        Args:
+            known_inside: Whether every possible start lies in S (`starts_inside`).
+            info: The environment's, from reset.
+        """
+        self._broken = ""
+        self._inside = known_inside
+        self._observe(info)
+
+    def step(self, decision: Decision, steps_moved: int, info: dict[str, Any]) -> None:
+        """Moves one step on.
+
+        Args:
+            decision: What was decided before the step.
+            steps_moved: How many steps the environment moved.
+            info: The environment's, from step.
+        """
+        carried = self._inside and self._error_certified and decision.fallback
+        self._inside = decision.passed or carried
+        if steps_moved != 1:
+            self._broken = self._broken or OTHER_STEPS
+        elif not np.array_equal(info["input"], decision.input):
+            self._broken = self._broken or OTHER_INPUT
+        self._observe(info)
+
+    def _observe(self, info: dict[str, Any]) -> None:
+        """Takes in the alarm, the running ellipsoid, and what the estimate alone proves."""
+        estimate, error_shape = info["estimate"], info["error_shape"]
+        if info["assumption_violated"]:
+            self._broken = self._broken or ALARM
+        finite = bool(np.isfinite(error_shape).all())
+        self._error_certified = finite and is_inside(error_shape, self._filter.certificate.Sigma)
+        if not self._inside:
+            self._inside = self._filter.knows_inside(estimate, error_shape)
+
+
+def starts_inside(certificate: Certificate, initial: Ellipsoid | np.ndarray) -> bool:
+    """Returns whether all possible starts lie in S, decided in exact arithmetic.
+
+    Args:
+        certificate: Gives S = E(L).
+        initial: An ellipsoid E(P), inside S exactly if L - P >= 0; or a single state, shape (n,), inside S exactly if
+            [1, x'; x, L] >= 0.
+    """
+    L = rational(certificate.L)
+    if isinstance(initial, Ellipsoid):
+        return is_positive_semidefinite(subtract(L, rational(initial.shape)))
+    state = rational(initial)[0]
+    one = rational(np.ones(1))[0]
+    return is_positive_semidefinite([one + state] + [[x, *row] for x, row in zip(state, L, strict=True)])

@@ -1,0 +1,234 @@
+"""The semidefinite programs of the certified synthesis, in coordinates where the box ellipsoid is the unit ball."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import cvxpy as cp
+import numpy as np
+from scipy.optimize import minimize
+
+from ncs_gym import LinearPlant
+from shields.certificate import Multipliers
+from shields.verification import ACTION_ROUNDING
+
+USABLE = (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScaledProblem:
+    """The design problem in scaled coordinates z = T^-1 x, u / u_max, with T T' the largest ellipsoid in the box.
+
+    Attributes:
+        A, B, C: Scaled plant, shapes (n, n), (n, m), (k, n).
+        D: D_u, shape (n, n): disturbance plus the rounding of actions.
+        Sigma: Error set, shape (n, n).
+        transform: T, shape (n, n).
+        u_max: Shape (m,).
+        growth: s of D_u.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
+    Sigma: np.ndarray
+    transform: np.ndarray
+    u_max: np.ndarray
+    growth: float
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return self.A.shape[0]
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return self.B.shape[1]
+
+    def physical(self, L: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns L and K in physical units."""
+        shape = self.transform @ L @ self.transform.T
+        return 0.5 * (shape + shape.T), np.diag(self.u_max) @ np.linalg.solve(self.transform.T, K.T).T
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """A candidate in scaled coordinates: L (n, n), K (m, n), its shares and log det L."""
+
+    L: np.ndarray
+    K: np.ndarray
+    shares: tuple[float, float, float]
+    inputs: np.ndarray
+    log_det: float
+
+
+def scaled_problem(plant: LinearPlant, Sigma: np.ndarray, box: np.ndarray) -> ScaledProblem:
+    """Returns the design problem for an error set Sigma (n, n) and the largest ellipsoid in the box (n, n)."""
+    T = np.linalg.cholesky(box)
+    D = plant.disturbance.shape
+    step = plant.B * (float(ACTION_ROUNDING) * plant.u_max)
+    rounding = plant.m * step @ step.T
+    weight = np.linalg.inv(box)
+    ratio = np.vdot(weight, rounding) / max(float(np.vdot(weight, D)), 1e-30)
+    growth = float(np.sqrt(np.clip(ratio, 1e-16, 1.0)))
+    inverse = np.linalg.inv(T)
+    D_u = (1.0 + growth) * D + (1.0 + 1.0 / growth) * rounding
+    return ScaledProblem(
+        A=inverse @ plant.A @ T,
+        B=inverse @ plant.B @ np.diag(plant.u_max),
+        C=plant.C @ T,
+        D=inverse @ D_u @ inverse.T,
+        Sigma=inverse @ Sigma @ inverse.T,
+        transform=T,
+        u_max=plant.u_max,
+        growth=growth,
+    )
+
+
+def largest_box_ellipsoid(C: np.ndarray) -> np.ndarray:
+    """Returns the shape of the largest ellipsoid in {|c_j x| <= 1}, (n, n), for C (k, n) of full column rank."""
+    k, n = C.shape
+    if k == n:
+        inverse = np.linalg.inv(C)
+        return inverse @ inverse.T
+    scale = np.linalg.cholesky(np.linalg.inv(C.T @ C))
+    L = cp.Variable((n, n), symmetric=True)
+    problem = cp.Problem(cp.Maximize(cp.log_det(L)), [cp.diag((C @ scale) @ L @ (C @ scale).T) <= 1])
+    problem.solve(solver=cp.CLARABEL)
+    return scale @ L.value @ scale.T
+
+
+class InvariantSetProgram:
+    """Maximizes log det L over (L, K) for fixed shares, with X <= L Sigma^-1 L linearized at a given L0.
+
+    With F = K L the conditions (I), (U), (S) of theory.md section 3 are linear matrix inequalities. The problem is
+    canonicalized once; shares and linearization are parameters.
+
+    Args:
+        problem: The scaled design problem.
+        slack: Relative growth of every disturbance and shrinkage of every limit, the room that exact
+            verification needs.
+    """
+
+    def __init__(self, problem: ScaledProblem, slack: float) -> None:
+        n, m = problem.n, problem.m
+        self.problem, self.slack = problem, slack
+        self._L, self._F = cp.Variable((n, n), symmetric=True), cp.Variable((m, n))
+        L, F = self._L, self._F
+        self._state, self._estimate = cp.Parameter(nonneg=True), cp.Parameter(nonneg=True)
+        self._D, self._slope, self._offset = cp.Parameter((n, n), symmetric=True), cp.Parameter((n, n)), cp.Parameter((n, n), symmetric=True)
+        self._mu = cp.Parameter(m, nonneg=True)
+        # le X and (1 - mu_i) X need products of parameters, so each scaled X gets parameters of its own.
+        self._slopes = [cp.Parameter((n, n)) for _ in range(m + 1)]
+        self._offsets = [cp.Parameter((n, n), symmetric=True) for _ in range(m + 1)]
+        scaled_X = [L @ slope.T + slope @ L - offset for slope, offset in zip(self._slopes, self._offsets, strict=True)]
+        zero = np.zeros((n, n))
+        moved, gain = problem.A @ L + problem.B @ F, problem.B @ F
+        constraints = [
+            cp.bmat([[L - self._D, moved, gain], [moved.T, self._state * L, zero], [gain.T, zero, scaled_X[0]]]) >> 0,
+            cp.diag(problem.C @ L @ problem.C.T) <= 1.0 - slack,
+        ]
+        for i in range(m):
+            row = F[i : i + 1, :]
+            corner = np.array([[1.0 - slack - 2.0 * float(ACTION_ROUNDING)]])
+            constraints.append(
+                cp.bmat([[corner, row, row], [row.T, self._mu[i] * L, zero], [row.T, zero, scaled_X[i + 1]]]) >> 0
+            )
+        self._program = cp.Problem(cp.Maximize(cp.log_det(L)), constraints)
+
+    def solve(self, shares: tuple[float, float, float], inputs: np.ndarray, linearize_at: np.ndarray) -> Design | None:
+        """Returns the best design for shares (lx, le, ld) and mu, shape (m,); None if there is none.
+
+        Args:
+            shares: lx, le, ld > 0 that sum to 1.
+            inputs: mu_i in (0, 1).
+            linearize_at: L0, shape (n, n).
+        """
+        lx, le, ld = shares
+        self._state.value = lx * (1.0 - self.slack)
+        self._D.value = self.problem.D * ((1.0 + self.slack) / ld)
+        self._mu.value = inputs
+        slope = linearize_at @ np.linalg.inv(self.problem.Sigma) / (1.0 + self.slack)
+        offset = slope @ linearize_at
+        for share, P, R in zip((le, *(1.0 - inputs)), self._slopes, self._offsets, strict=True):
+            P.value = share * slope
+            R.value = share * 0.5 * (offset + offset.T)
+        if not _solve(self._program) or self._L.value is None:
+            return None
+        L = 0.5 * (self._L.value + self._L.value.T)
+        sign, log_det = np.linalg.slogdet(L)
+        if sign <= 0 or np.linalg.eigvalsh(L)[0] <= 0.0:
+            return None
+        return Design(L, np.linalg.solve(L, self._F.value.T).T, shares, inputs, float(log_det))
+
+
+def best_gain(problem: ScaledProblem, design: Design) -> np.ndarray:
+    """Returns the gain, shape (m, n), that leaves (I) the most room for the design's L; its own if none is better."""
+    n, m = problem.n, problem.m
+    L, Sigma, (lx, le, ld) = design.L, problem.Sigma, design.shares
+    K, room = cp.Variable((m, n)), cp.Variable()
+    zero = np.zeros((n, n))
+    moved, gain = (problem.A + problem.B @ K) @ L, problem.B @ K @ Sigma
+    constraints = [
+        cp.bmat([[room * L - problem.D / ld, moved, gain], [moved.T, lx * L, zero], [gain.T, zero, le * Sigma]]) >> 0
+    ]
+    for i in range(m):
+        row, err = K[i : i + 1, :] @ L, K[i : i + 1, :] @ Sigma
+        mu = design.inputs[i]
+        corner = np.array([[1.0 - 4.0 * float(ACTION_ROUNDING)]])
+        constraints.append(
+            cp.bmat([[corner, row, err], [row.T, mu * L, zero], [err.T, zero, (1.0 - mu) * Sigma]]) >> 0
+        )
+    if not _solve(cp.Problem(cp.Minimize(room), constraints)) or K.value is None:
+        return design.K
+    return K.value
+
+
+def best_shares(problem: ScaledProblem, L: np.ndarray, K: np.ndarray, start: tuple[float, float, float]) -> tuple[tuple[float, float, float], float]:
+    """Returns shares (lx, le, ld), and the largest generalized eigenvalue of (I)'s right side against L.
+
+    The right side is matrix-convex in the shares, so its largest eigenvalue is a convex function of two numbers.
+    """
+    root = np.linalg.inv(np.linalg.cholesky(L))
+    closed, gain = root @ (problem.A + problem.B @ K), root @ problem.B @ K
+    parts = np.stack([closed @ L @ closed.T, gain @ problem.Sigma @ gain.T, root @ problem.D @ root.T])
+
+    def shares_of(logits: np.ndarray) -> np.ndarray:
+        weights = np.exp(np.clip(np.append(logits, 0.0), -30.0, 30.0))
+        return weights / weights.sum()
+
+    def worst(logits: np.ndarray) -> float:
+        return float(np.linalg.eigvalsh(np.tensordot(1.0 / shares_of(logits), parts, 1))[-1])
+
+    logits = np.log(np.array(start[:2]) / start[2])
+    found = minimize(worst, logits, method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-12, "maxiter": 400})
+    lx, le, ld = shares_of(found.x)
+    return (float(lx), float(le), float(ld)), float(found.fun)
+
+
+def best_input_shares(problem: ScaledProblem, L: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Returns mu_i = a / (a + b), a = sqrt(K_i L K_i'), b = sqrt(K_i Sigma K_i'), shape (m,), kept inside (0, 1)."""
+    a = np.sqrt(np.maximum(((K @ L) * K).sum(axis=1), 0.0))
+    b = np.sqrt(np.maximum(((K @ problem.Sigma) * K).sum(axis=1), 0.0))
+    return np.clip(a / np.maximum(a + b, 1e-300), 1e-6, 1.0 - 1e-6)
+
+
+def as_multipliers(problem: ScaledProblem, design: Design, rate: float) -> Multipliers:
+    """Returns the design's multipliers, scaled so that rounding cannot lift lx + le + ld above 1."""
+    lx, le, ld = (share * (1.0 - 1e-15) for share in design.shares)
+    inputs = tuple(float(mu) for mu in design.inputs)
+    return Multipliers(error=rate, state=lx, estimate=le, disturbance=ld, inputs=inputs, rounding=problem.growth)
+
+
+def _solve(program: cp.Problem) -> bool:
+    """Returns whether the solver found something to work with; exact verification judges it later."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # "solution may be inaccurate": verified exactly afterwards
+            program.solve(solver=cp.CLARABEL)
+    except cp.SolverError:
+        return False
+    return program.status in USABLE

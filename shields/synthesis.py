@@ -1,0 +1,209 @@
+"""The certified method: the largest verified invariant ellipsoid, with its gain."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from importlib.metadata import version
+
+import numpy as np
+
+from ncs_gym import LinearPlant, UnstablePlantError, certified_error_set
+from shields.certificate import Certificate
+from shields.semidefinite import (
+    Design,
+    InvariantSetProgram,
+    ScaledProblem,
+    as_multipliers,
+    best_gain,
+    best_input_shares,
+    best_shares,
+    largest_box_ellipsoid,
+    scaled_problem,
+)
+from shields.verification import verify
+
+# (lx, le / (1 - lx)) to start from; without good starts the alternation stalls (theory.md section 3).
+STARTS = ((0.85, 0.3), (0.85, 0.1), (0.92, 0.3), (0.92, 0.1), (0.75, 0.3), (0.6, 0.2), (0.97, 0.2))
+START_INPUT_SHARE = 0.8
+ALTERNATIONS = 10
+# Within this of the box ellipsoid's log det nothing is left to gain.
+CLOSE_ENOUGH = 1e-3
+# An alternation that gains less than this in log det has converged.
+SMALLEST_GAIN = 1e-4
+# Room for exact verification, tried in turn.
+SLACKS = (1e-6, 1e-5, 1e-4, 1e-3)
+# The certificate's Sigma is larger than the environment's by this, so that another machine's rounding stays inside.
+SIGMA_GROWTH = 1.0 + 1e-9
+
+Progress = Callable[[str], None]
+
+
+class Infeasible(ValueError):
+    """No certificate was found.
+
+    Attributes:
+        binding: What stands in the way: "E1" (no error bound), "S" (the box is unbounded), "U" (input limits) or
+            "I" (invariance).
+        shortfall: By how much: for "E1" the excess of the spectral radius over 1; for "I" and "U" the share by
+            which the uncertainty (disturbance and error radii) is too large, in (0, 1]; for "S" the number of
+            directions without a limit.
+    """
+
+    def __init__(self, message: str, binding: str, shortfall: float) -> None:
+        super().__init__(message)
+        self.binding = binding
+        self.shortfall = shortfall
+
+    def __reduce__(self):
+        return type(self), (self.args[0], self.binding, self.shortfall)
+
+
+def synthesize(plant: LinearPlant, method: str = "certified", *, progress: Progress | None = None) -> Certificate:
+    """Returns a verified certificate with the largest ellipsoid found (theory.md section 3).
+
+    Args:
+        plant: The plant with its bounds, Schur stable.
+        method: "certified".
+        progress: Called with one line of text per solved program.
+
+    Raises:
+        Infeasible: If no certificate is found; says what binds and by how much.
+        ValueError: If the method is unknown.
+    """
+    if method != "certified":
+        raise ValueError(f"method must be 'certified', got {method!r}")
+    free = plant.n - int(np.linalg.matrix_rank(plant.C))
+    if free:
+        raise Infeasible(
+            f"the safe box leaves {free} of {plant.n} directions unbounded: add rows to C with generous limits", "S", free
+        )
+    try:
+        errors = certified_error_set(plant)
+    except UnstablePlantError as error:
+        raise Infeasible(f"(E1) cannot hold: {error}", "E1", plant.spectral_radius - 1.0) from error
+    Sigma = SIGMA_GROWTH * errors.Sigma
+    problem = scaled_problem(plant, Sigma, largest_box_ellipsoid(plant.C))
+    for slack in SLACKS:
+        design = _largest_set(problem, slack, progress or (lambda line: None))
+        if design is None:
+            break
+        certificate = _certificate(plant, problem, design, Sigma, errors.rate, slack)
+        if verify(certificate, plant).valid:
+            return certificate
+    raise _diagnosis(problem)
+
+
+def _largest_set(problem: ScaledProblem, slack: float, progress: Progress) -> Design | None:
+    """Returns the best design of several starts, improved by alternation and finished; None if no start works."""
+    program = InvariantSetProgram(problem, slack)
+    best = _best_start(problem, program, progress)
+    if best is None:
+        return None
+    step = 0.3
+    for turn in range(ALTERNATIONS):
+        if -best.log_det < CLOSE_ENOUGH:
+            break
+        better = _alternate(problem, program, best, step)
+        progress(f"alternation {turn + 1}: volume {np.exp(0.5 * better.log_det):.4f} of the box ellipsoid")
+        if better.log_det - best.log_det < SMALLEST_GAIN:
+            step /= 3.0
+            if step < 0.03:
+                break
+        best = better
+    return _finish(problem, best)
+
+
+def _best_start(problem: ScaledProblem, program: InvariantSetProgram, progress: Progress) -> Design | None:
+    """Returns the best design over a handful of shares and two linearizations."""
+    near = 2.0 / float(np.linalg.eigvalsh(problem.Sigma)[-1]) * problem.Sigma
+    inputs = np.full(problem.m, START_INPUT_SHARE)
+    best = None
+    for state, part in STARTS:
+        for linearize_at in (np.eye(problem.n), near):
+            design = program.solve(_shares(state, part), inputs, linearize_at)
+            if design is not None and (best is None or design.log_det > best.log_det):
+                best = design
+                progress(f"start {state, part}: volume {np.exp(0.5 * design.log_det):.4f} of the box ellipsoid")
+            if best is not None and -best.log_det < CLOSE_ENOUGH:
+                return best
+    return best
+
+
+def _alternate(problem: ScaledProblem, program: InvariantSetProgram, best: Design, step: float) -> Design:
+    """Linearizes at the best L, then tries its own, re-optimized and shifted shares; never returns a worse design."""
+    K = best.K
+    inputs = best_input_shares(problem, best.L, K)
+    tuned, _ = best_shares(problem, best.L, K, best.shares)
+    anchor = best.L
+    for shares, mu in ((best.shares, best.inputs), (tuned, inputs)):
+        best = _better(best, program.solve(shares, mu, anchor))
+    lx, le, _ = best.shares
+    part = le / (1.0 - lx)
+    for factor, shift in ((1.0 + step, 0.0), (1.0 / (1.0 + step), 0.0), (1.0, step), (1.0, -step)):
+        state = 1.0 - np.clip((1.0 - lx) * factor, 1e-4, 0.99)
+        share = np.clip(part * (1.0 + shift), 1e-3, 0.99)
+        best = _better(best, program.solve(_shares(state, share), best.inputs, best.L))
+    return best
+
+
+def _finish(problem: ScaledProblem, best: Design) -> Design:
+    """Keeps L, chooses the gain with the most room, and polishes all shares for it."""
+    gains = (best_gain(problem, best), best.K)
+    finished = []
+    for K in gains:
+        shares, worst = best_shares(problem, best.L, K, best.shares)
+        inputs = best_input_shares(problem, best.L, K)
+        effort = (np.sqrt(np.einsum("ij,jk,ik->i", K, best.L, K)) + np.sqrt(np.einsum("ij,jk,ik->i", K, problem.Sigma, K))).max()
+        finished.append((max(worst, effort), replace(best, K=K, shares=shares, inputs=inputs)))
+    return min(finished, key=lambda pair: pair[0])[1]
+
+
+def _certificate(
+    plant: LinearPlant, problem: ScaledProblem, design: Design, Sigma: np.ndarray, rate: float, slack: float
+) -> Certificate:
+    L, K = problem.physical(design.L, design.K)
+    return Certificate(
+        L=L,
+        K=K,
+        Sigma=Sigma,
+        D=plant.disturbance.shape,
+        multipliers=as_multipliers(problem, design, rate),
+        method="certified",
+        fingerprint=plant.fingerprint,
+        provenance={
+            "source": "theory.md section 3",
+            "solver": f"Clarabel {version('clarabel')} through cvxpy {version('cvxpy')}",
+            "slack": slack,
+            "volume_of_box_ellipsoid": float(np.exp(0.5 * design.log_det)),
+        },
+    )
+
+
+def _diagnosis(problem: ScaledProblem) -> Infeasible:
+    """Returns the exception that says what binds, from feasibility at reduced uncertainty and without input limits."""
+
+    def feasible(scale: float, limit: float = 1.0) -> bool:
+        trial = replace(problem, D=scale**2 * problem.D, Sigma=scale**2 * problem.Sigma, B=limit * problem.B)
+        return _best_start(trial, InvariantSetProgram(trial, SLACKS[0]), lambda line: None) is not None
+
+    low, high = 0.0, 1.0
+    for _ in range(7):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if feasible(middle) else (low, middle)
+    binding = "U" if feasible(1.0, limit=100.0) else "I"
+    what = "(U) the input limits are too tight" if binding == "U" else "(I) no ellipsoid in the box is invariant"
+    return Infeasible(
+        f"{what}: a certificate exists only if disturbance and error radii shrink to {low:.1%} of those given",
+        binding,
+        1.0 - low,
+    )
+
+
+def _shares(state: float, part: float) -> tuple[float, float, float]:
+    """Returns (lx, le, ld) from lx and le / (1 - lx)."""
+    return float(state), float((1.0 - state) * part), float((1.0 - state) * (1.0 - part))
+
+
+def _better(best: Design, other: Design | None) -> Design:
+    return other if other is not None and other.log_det > best.log_det else best

@@ -1,0 +1,192 @@
+"""Exact verification of a certificate, independent of how it was made."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+
+from ncs_gym import LinearPlant
+from shields.certificate import Certificate, CertificateError
+from shields.exact import Matrix, add, congruence, is_positive_semidefinite, multiply, quadratic, rational, scale, subtract, to_float
+
+# Rounding an action in [-1, 1] to float32 moves it by at most this.
+ACTION_ROUNDING = Fraction(1, 2**24)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One checked condition.
+
+    Attributes:
+        name: Its name in theory.md section 3, and what it says.
+        margin: Signed and rounded to float: the smallest eigenvalue of a matrix inequality or the slack of a
+            scalar one; at least 0 exactly if it holds.
+        holds: Decided in exact arithmetic.
+    """
+
+    name: str
+    margin: float
+    holds: bool
+
+
+@dataclass(frozen=True)
+class Report:
+    """The outcome of a verification.
+
+    Attributes:
+        conditions: Every condition, in order.
+    """
+
+    conditions: tuple[Condition, ...]
+
+    @property
+    def valid(self) -> bool:
+        """Whether every condition holds."""
+        return all(condition.holds for condition in self.conditions)
+
+    def __str__(self) -> str:
+        rows = (f"{'holds ' if c.holds else 'BROKEN'}  {c.margin:+.3e}  {c.name}" for c in self.conditions)
+        return "\n".join(rows)
+
+
+def verify(certificate: Certificate, plant: LinearPlant) -> Report:
+    """Returns whether a certificate proves what it claims for a plant, in exact rational arithmetic.
+
+    The conditions are (E0), (E1), (I), (S), (U) of theory.md section 3, and that D, N and r0^2 I contain what
+    section 1 says they contain. No tolerance, no solver, no float decides; the margins are for people.
+
+    Args:
+        certificate: The certificate.
+        plant: The plant, with its bounds.
+    """
+    conditions = [_flag("plant: the certificate belongs to it", certificate.fingerprint == plant.fingerprint)]
+    fits = certificate.L.shape == (plant.n, plant.n) and certificate.K.shape == (plant.m, plant.n)
+    conditions.append(_flag("shapes: L (n, n), K (m, n), one input share per input", fits and _shares_fit(certificate)))
+    if not conditions[-1].holds:
+        return Report(tuple(conditions))
+    conditions += _shares(certificate)
+    if all(condition.holds for condition in conditions[2:]):
+        conditions += _bounds(certificate, plant)
+        conditions += _error_set(certificate, plant)
+        conditions += _safe_set(certificate, plant)
+    return Report(tuple(conditions))
+
+
+def require_valid(certificate: Certificate, plant: LinearPlant) -> None:
+    """Raises unless a certificate verifies for a plant.
+
+    Raises:
+        CertificateError: Naming the first condition that does not hold.
+    """
+    for condition in verify(certificate, plant).conditions:
+        if not condition.holds:
+            if condition.name.startswith("plant"):
+                raise CertificateError("the certificate was made for another plant: their fingerprints differ")
+            raise CertificateError(
+                f"the certificate does not verify: {condition.name} does not hold (margin {condition.margin:.3g})"
+            )
+
+
+def _shares_fit(certificate: Certificate) -> bool:
+    return len(certificate.multipliers.inputs) == certificate.K.shape[0]
+
+
+def _shares(certificate: Certificate) -> Iterator[Condition]:
+    """Checks the ranges of all multipliers."""
+    shares = certificate.multipliers
+    finite = all(np.isfinite([shares.error, shares.state, shares.estimate, shares.disturbance, shares.rounding]))
+    finite = finite and all(np.isfinite(shares.inputs))
+    yield _flag("multipliers: finite", finite)
+    if not finite:
+        return
+    inside = all(0.0 < share < 1.0 for share in (shares.error, *shares.inputs))
+    yield _flag("multipliers: 0 < lam_e < 1 and 0 < mu_i < 1", inside)
+    parts = [Fraction(share) for share in (shares.state, shares.estimate, shares.disturbance)]
+    positive = min(*parts, Fraction(shares.rounding)) > 0
+    yield _flag("multipliers: lx, le, ld, s > 0", positive)
+    yield _scalar("multipliers: lx + le + ld <= 1", 1 - sum(parts))
+
+
+def _bounds(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
+    """Checks that D, N and r0^2 I contain what theory.md section 1 says."""
+    identity = rational(np.eye(plant.n))
+    noise = rational(plant.process_noise_cov)
+    energy = Fraction(plant.process_noise.energy)
+    ball = scale(Fraction(plant.gamma), identity)
+    ellipsoid = scale(energy, noise)
+    share = _trace_share(ball, ellipsoid)
+    need = add(ball, ellipsoid) if share is None else add(scale(1 / share, ball), scale(1 / (1 - share), ellipsoid))
+    yield _matrix("D: holds the disturbance and the process noise", subtract(rational(certificate.D), need))
+    sensor = scale(Fraction(plant.sensor_noise.energy), rational(plant.measurement_noise_cov))
+    yield _matrix("N: holds the sensor noise", subtract(rational(plant.sensor_error.shape), sensor))
+    first = scale(Fraction(plant.initial_noise.energy), rational(plant.initial_cov))
+    yield _matrix("r0: holds the error of the first estimate", subtract(rational(plant.initial_error.shape), first))
+
+
+def _error_set(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
+    """(E0) and (E1): the error starts in E(Sigma) and never leaves it."""
+    Sigma, D = rational(certificate.Sigma), rational(certificate.D)
+    rate = Fraction(certificate.multipliers.error)
+    yield _matrix("(E0) Sigma - r0^2 I >= 0", subtract(Sigma, rational(plant.initial_error.shape)))
+    grown = add(scale(1 / rate, congruence(rational(plant.A), Sigma)), scale(1 / (1 - rate), D))
+    yield _matrix("(E1) Sigma - A Sigma A'/lam_e - D/(1-lam_e) >= 0", subtract(Sigma, grown))
+
+
+def _safe_set(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
+    """(I), (S), (U): the safe set is invariant, lies in the box, and its input respects the limits."""
+    shares = certificate.multipliers
+    L, K, Sigma = rational(certificate.L), rational(certificate.K), rational(certificate.Sigma)
+    B = rational(plant.B)
+    yield _matrix("L > 0", L, strict=True)
+    gain = multiply(B, K)
+    D_u = _with_action_rounding(rational(certificate.D), B, plant.u_max, Fraction(shares.rounding))
+    grown = add(
+        scale(1 / Fraction(shares.state), congruence(add(rational(plant.A), gain), L)),
+        scale(1 / Fraction(shares.estimate), congruence(gain, Sigma)),
+        scale(1 / Fraction(shares.disturbance), D_u),
+    )
+    yield _matrix("(I) L - (A+BK) L (A+BK)'/lx - BK Sigma K'B'/le - D_u/ld >= 0", subtract(L, grown))
+    for j, row in enumerate(plant.C):
+        yield _scalar(f"(S) c_{j + 1} L c_{j + 1}' <= 1", 1 - quadratic(rational(row), L))
+    for i, (limit, share) in enumerate(zip(plant.u_max, shares.inputs, strict=True)):
+        mu = Fraction(share)
+        used = quadratic([K[i]], L) / mu + quadratic([K[i]], Sigma) / (1 - mu)
+        allowed = (Fraction(float(limit)) * (1 - ACTION_ROUNDING)) ** 2
+        yield _scalar(f"(U) input {i + 1} stays within u_max (1 - 2^-24)", allowed - used)
+
+
+def _with_action_rounding(D: Matrix, B: Matrix, u_max: np.ndarray, growth: Fraction) -> Matrix:
+    """Returns D_u = (1+s) D + (1+1/s) m B diag((2^-24 u_max)^2) B'."""
+    m = len(u_max)
+    spread = [[Fraction(0)] * m for _ in range(m)]
+    for i, limit in enumerate(u_max):
+        spread[i][i] = m * (ACTION_ROUNDING * Fraction(float(limit))) ** 2
+    return add(scale(1 + growth, D), scale(1 + 1 / growth, congruence(B, spread)))
+
+
+def _trace_share(first: Matrix, second: Matrix) -> Fraction | None:
+    """Returns a near trace-optimal share nu as a rational (any nu in (0, 1) proves containment); None if one is zero."""
+    a, b = (sum(matrix[i][i] for i in range(len(matrix))) for matrix in (first, second))
+    if a == 0 or b == 0:
+        return None
+    a, b = Fraction(float(a) ** 0.5), Fraction(float(b) ** 0.5)
+    return a / (a + b)
+
+
+def _flag(name: str, holds: bool) -> Condition:
+    return Condition(name, 0.0 if holds else -1.0, holds)
+
+
+def _scalar(name: str, slack: Fraction) -> Condition:
+    return Condition(name, float(slack), slack >= 0)
+
+
+def _matrix(name: str, matrix: Matrix, *, strict: bool = False) -> Condition:
+    holds = is_positive_semidefinite(matrix, strict=strict)
+    smallest = float(np.linalg.eigvalsh(to_float(matrix))[0])
+    # Rounding may give the float the wrong sign; the exact verdict rules.
+    margin = max(smallest, 0.0) if holds else min(smallest, -5e-324)
+    return Condition(name, margin, holds)

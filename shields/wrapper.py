@@ -1,0 +1,146 @@
+"""The shield as a Gymnasium wrapper."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, StickyAction
+
+from ncs_gym import LinearPlant, NCSEnv
+from ncs_gym.env import applied_input
+from ncs_gym.frozen import as_number
+from shields.certificate import Certificate
+from shields.filter import SafetyFilter
+from shields.proof import ProofTracker, starts_inside
+from shields.synthesis import synthesize
+
+# What changes, repeats or swallows actions between the shield and the plant.
+REFUSED = (gym.ActionWrapper, RepeatAction, StickyAction, MaxAndSkipObservation, Autoreset)
+
+_synthesized: dict[str, Certificate] = {}
+
+
+class SafetyShield(gym.Wrapper, RecordConstructorArgs):
+    """Overrides an action whenever the safe set could be left (theory.md section 4).
+
+    The action passes unchanged if every state the estimate allows stays in S; otherwise "project" applies the closest
+    input that keeps it there, "switch" (and "project" where there is none) the certified u = K x_hat. From a start in S
+    the true state then stays in S for ever, for any policy, disturbance and channel within the assumptions;
+    `info["shield_guaranteed"]` says whether they still hold as far as can be seen.
+
+    Wrap it directly around what `gym.make` returns; wrappers that change or repeat actions go outside it.
+
+    ## Info (added to the environment's, at reset too)
+    | key | meaning |
+    |---|---|
+    | `shield_intervened` | whether the action was overridden |
+    | `input_proposed` | the agent's input, shape (m,) [physical units]; zeros at reset |
+    | `shield_correction` | Euclidean norm of input - input_proposed |
+    | `shield_margin` | 1 - h - abs(A x_hat + B u)_M of the input applied, before it moved the plant; at reset for u = 0 |
+    | `shield_guaranteed` | whether x in S is proved now |
+    | `shield_reason` | why not; empty while guaranteed |
+    | `episode_interventions` | running number in this episode |
+
+    Args:
+        env: An `NCSEnv`, possibly wrapped.
+        certificate: None synthesizes one for the environment's plant, once per process and plant.
+        mode: "project" or "switch".
+        penalty: Subtracted from the reward per intervention, >= 0.
+
+    Raises:
+        CertificateError: If the certificate does not verify for the environment's plant.
+        Infeasible: If none is given and none is found.
+        ValueError: If the environment is not an `NCSEnv`, an inner wrapper changes or repeats actions, or a setting
+            is wrong.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        certificate: Certificate | None = None,
+        mode: str = "project",
+        penalty: float = 0.0,
+    ) -> None:
+        RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty)
+        gym.Wrapper.__init__(self, env)
+        plant = _plant_behind(env)
+        self.penalty = as_number(penalty, "penalty", low=0.0)
+        if certificate is not None and not isinstance(certificate, Certificate):
+            raise ValueError(f"certificate must be a Certificate or None, got {certificate!r}")
+        self.certificate = certificate_for(plant) if certificate is None else certificate
+        self.filter = SafetyFilter(self.certificate, plant, mode)
+        self._proof = ProofTracker(self.filter)
+        self._starts_inside = starts_inside(self.certificate, env.unwrapped.initial_set)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Starts an episode; see `NCSEnv.reset`."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        given = (options or {}).get("state")
+        known = self._starts_inside if given is None else starts_inside(self.certificate, np.asarray(given, dtype=float))
+        self._proof.start(known, info)
+        self._estimate, self._error_shape = info["estimate"].copy(), info["error_shape"].copy()
+        self._interventions = 0
+        u = np.zeros(self.filter.plant.m)
+        margin = self.filter.margin(self._estimate, self._error_shape, u)
+        return observation, info | self._info(u, u, margin, intervened=False)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Applies the action, or what the shield puts in its place.
+
+        Raises:
+            ValueError: If the action is not finite or wrongly shaped; nothing has moved then.
+        """
+        proposed = applied_input(self.filter.plant, action)
+        decision = self.filter.decide(self._estimate, self._error_shape, proposed)
+        if decision.intervened:
+            action = (decision.input / self.filter.plant.u_max).astype(np.float32)
+        before = self.env.unwrapped.steps
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._proof.step(decision, self.env.unwrapped.steps - before, info)
+        self._estimate, self._error_shape = info["estimate"].copy(), info["error_shape"].copy()
+        self._interventions += decision.intervened
+        info = info | self._info(proposed, decision.input, decision.margin, intervened=decision.intervened)
+        return observation, float(reward) - self.penalty * decision.intervened, terminated, truncated, info
+
+    def _info(self, proposed: np.ndarray, applied: np.ndarray, margin: float, *, intervened: bool) -> dict[str, Any]:
+        reason = self._proof.reason
+        return {
+            "shield_intervened": intervened,
+            "input_proposed": proposed.copy(),
+            "shield_correction": float(np.linalg.norm(applied - proposed)),
+            "shield_margin": margin,
+            "shield_guaranteed": not reason,
+            "shield_reason": reason,
+            "episode_interventions": self._interventions,
+        }
+
+
+def certificate_for(plant: LinearPlant) -> Certificate:
+    """Returns a synthesized certificate, made once per process and plant.
+
+    Raises:
+        Infeasible: If none is found.
+    """
+    if plant.fingerprint not in _synthesized:
+        _synthesized[plant.fingerprint] = synthesize(plant)
+    return _synthesized[plant.fingerprint]
+
+
+def _plant_behind(env: gym.Env) -> LinearPlant:
+    """Returns the plant of the innermost environment after looking at every wrapper around it."""
+    layer = env
+    while isinstance(layer, gym.Wrapper):
+        if isinstance(layer, (*REFUSED, SafetyShield)):
+            raise ValueError(
+                f"the shield must be inside {type(layer).__name__}, which changes or repeats actions: wrap the shield "
+                "around the environment first"
+            )
+        layer = layer.env
+    if not isinstance(layer, NCSEnv):
+        raise ValueError(f"the shield needs an NCSEnv inside, got {type(layer).__name__}")
+    if env.action_space != layer.action_space:
+        raise ValueError(f"a wrapper inside the shield changes the action space to {env.action_space}")
+    return layer.plant
