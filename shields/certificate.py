@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import tempfile
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 
 from ncs_gym import Ellipsoid
 from ncs_gym.frozen import FrozenArrays, as_matrix, as_number, read_only
+from shields.storage import write_atomically
 
 FORMAT = "ncs-gym certificate 1"
 ARRAYS = ("L", "K", "Sigma", "D")
@@ -150,20 +150,3 @@ def _from_content(content: dict[str, Any]) -> dict[str, Any]:
 def _digest(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
-
-def write_atomically(path: Path, text: str) -> None:
-    """Writes a text file under a temporary name beside its place and renames it there.
-
-    Raises:
-        OSError: If it cannot be written; nothing is left behind.
-    """
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise

@@ -1,0 +1,149 @@
+"""Trains PPO on an environment, shielded or not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.utils import LinearSchedule, configure_logger
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+import ncs_gym  # noqa: F401  (registers the environments)
+from agents.callbacks import SafetyCallback, TrainingPoint
+from agents.settings import PPOSettings
+from shields import Certificate, SafetyShield
+
+# What Monitor keeps of an episode's last step: running totals, so these are the episode's.
+EPISODE_KEYS = ("episode_violations", "is_success")
+
+
+@dataclass(frozen=True)
+class Shielding:
+    """How an environment is shielded.
+
+    Attributes:
+        certificate: Verified when the shield is built.
+        mode: Of `SafetyShield`.
+        penalty: Subtracted from the reward per intervention.
+    """
+
+    certificate: Certificate
+    mode: str = "project"
+    penalty: float = 0.0
+
+
+@dataclass(frozen=True)
+class Agent:
+    """A trained policy with the statistics its observations are normalized by.
+
+    Attributes:
+        model: PPO.
+        normalizer: VecNormalize, no longer updated.
+    """
+
+    model: PPO
+    normalizer: VecNormalize
+
+    def act(self, observations: np.ndarray) -> np.ndarray:
+        """Returns deterministic actions, shape (N, m), for raw observations, shape (N, entries)."""
+        return self.model.predict(self.normalizer.normalize_obs(observations), deterministic=True)[0]
+
+    def save(self, folder: Path) -> None:
+        """Writes `model.zip` and `normalizer.pkl` into an existing folder."""
+        self.model.save(folder / "model.zip")
+        self.normalizer.save(str(folder / "normalizer.pkl"))
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """What a training run leaves.
+
+    Attributes:
+        agent: The trained policy.
+        history: Totals after each rollout.
+        steps: Environment steps taken (whole rollouts: at least what was asked for).
+        violation_steps: Steps whose true state violated the safe box, all of training.
+        interventions: Steps in which the shield intervened, all of training.
+    """
+
+    agent: Agent
+    history: list[TrainingPoint]
+    steps: int
+    violation_steps: int
+    interventions: int
+
+
+def make_env(env_id: str, shielding: Shielding | None = None) -> gym.Env:
+    """Returns an environment, shielded if asked for."""
+    env = gym.make(env_id)
+    if shielding is None:
+        return env
+    return SafetyShield(env, shielding.certificate, mode=shielding.mode, penalty=shielding.penalty)
+
+
+def train(
+    env_id: str,
+    steps: int,
+    seed: int,
+    shielding: Shielding | None = None,
+    settings: PPOSettings | None = None,
+    *,
+    log_folder: Path | None = None,
+    on_progress: Callable[[int], None] | None = None,
+) -> TrainingResult:
+    """Returns a trained agent and what happened on the way; the same seed gives the same result on one machine.
+
+    Args:
+        env_id: A registered `ncs_gym` id.
+        steps: Environment steps to train for, rounded up to whole rollouts.
+        seed: Seeds environments, network and sampling; arms with the same seed meet the same draws of nature.
+        shielding: None trains unshielded.
+        settings: Of PPO; the defaults if None.
+        log_folder: Where TensorBoard's events go.
+        on_progress: Called with the number of steps taken since its last call.
+    """
+    settings = settings or PPOSettings()
+    env = VecNormalize(
+        DummyVecEnv([lambda: _monitored(env_id, shielding) for _ in range(settings.envs)]), gamma=settings.discount
+    )
+    model = _ppo(env, settings, seed)
+    model.set_logger(configure_logger(0, str(log_folder) if log_folder else None, "ppo"))
+    callback = SafetyCallback(on_progress)
+    model.learn(steps, callback=callback)
+    env.training = False
+    return TrainingResult(
+        Agent(model, env), callback.history, model.num_timesteps, callback.violation_steps, callback.interventions
+    )
+
+
+def untrained(env_id: str, seed: int, settings: PPOSettings | None = None) -> Agent:
+    """Returns a policy with the random weights that training starts from."""
+    env = VecNormalize(DummyVecEnv([lambda: _monitored(env_id, None)]), training=False)
+    return Agent(_ppo(env, settings or PPOSettings(), seed), env)
+
+
+def _monitored(env_id: str, shielding: Shielding | None) -> Monitor:
+    return Monitor(make_env(env_id, shielding), info_keywords=EPISODE_KEYS)
+
+
+def _ppo(env: VecNormalize, settings: PPOSettings, seed: int) -> PPO:
+    torch.set_num_threads(1)  # more threads only pay off at batches of 16384 and make results depend on their number
+    return PPO(
+        "MlpPolicy",
+        env,
+        learning_rate=LinearSchedule(settings.learning_rate, 0.0, 1.0),
+        n_steps=settings.rollout,
+        batch_size=min(settings.batch_size, settings.rollout * env.num_envs),
+        n_epochs=settings.epochs,
+        gamma=settings.discount,
+        gae_lambda=settings.gae_lambda,
+        policy_kwargs={"net_arch": [settings.width] * 2, "log_std_init": settings.log_std},
+        seed=seed,
+        device="cpu",
+    )

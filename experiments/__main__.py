@@ -1,0 +1,97 @@
+"""The `ncs` command."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+from pathlib import Path
+
+COMMANDS = ("compare", "synthesize", "verify")
+ERROR = 2
+INTERRUPTED = 130
+
+
+def main() -> None:
+    """Parses the command line and runs the command; errors become one sentence on stderr and exit code 2."""
+    try:
+        _require_own_agents()
+        settings = _parse()
+        _run(settings)
+    except KeyboardInterrupt:
+        sys.exit(_complain("interrupted", INTERRUPTED))
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(ERROR)
+    except Exception as error:
+        if os.environ.get("NCS_DEBUG"):
+            raise
+        sys.exit(_complain(_sentence(error), ERROR))
+
+
+def _parse() -> object:
+    import tyro
+
+    from experiments.certificates import SynthesizeSettings, VerifySettings
+
+    commands: dict = {"synthesize": SynthesizeSettings, "verify": VerifySettings}
+    missing = _missing_for_training()
+    if not missing:
+        from experiments.compare import CompareSettings
+
+        commands = {"compare": CompareSettings} | commands
+    elif sys.argv[1:2] == ["compare"]:
+        raise ModuleNotFoundError(
+            f"ncs compare needs {', '.join(missing)}: install the training extra, pip install 'ncs-gym[train]'"
+        )
+    return tyro.extras.subcommand_cli_from_dict(
+        commands, prog="ncs", description="Safe learning control over imperfect networks."
+    )
+
+
+def _run(settings: object) -> None:
+    from experiments.certificates import SynthesizeSettings, VerifySettings, synthesize_file, verify_file
+
+    if isinstance(settings, SynthesizeSettings):
+        synthesize_file(settings)
+    elif isinstance(settings, VerifySettings):
+        verify_file(settings)
+    else:
+        from experiments.compare import compare
+
+        compare(settings)
+
+
+def _require_own_agents() -> None:
+    """Refuses to run with another distribution's `agents` package, whose generic name ours shares."""
+    spec = importlib.util.find_spec("agents")
+    here = Path(__file__).resolve().parent.parent
+    if spec is None or spec.origin is None or Path(spec.origin).resolve().parent.parent != here:
+        raise ImportError(
+            f"the package 'agents' found is not this project's ({spec.origin if spec else 'none'}): install ncs-gym in a "
+            "virtual environment of its own"
+        )
+
+
+def _missing_for_training() -> list[str]:
+    packages = ("stable_baselines3", "torch", "tensorboard", "pyarrow")
+    return [name for name in packages if importlib.util.find_spec(name) is None]
+
+
+def _sentence(error: Exception) -> str:
+    """Returns an error as one line; only the unexpected ones show their type."""
+    expected = isinstance(error, (ValueError, OSError, ImportError))
+    if isinstance(error, OSError) and error.strerror:
+        text = f"{error.strerror}: {error.filename}" if error.filename else error.strerror
+    else:
+        text = str(error) if expected else f"{type(error).__name__}: {error} (NCS_DEBUG=1 shows the traceback)"
+    return " ".join(text.split())
+
+
+def _complain(sentence: str, code: int) -> int:
+    print(f"ncs: {sentence}", file=sys.stderr)
+    return code
+
+
+if __name__ == "__main__":
+    main()

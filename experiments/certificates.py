@@ -1,0 +1,108 @@
+"""Making and checking certificates from the command line."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import gymnasium as gym
+import tyro
+
+from ncs_gym import LinearPlant
+from ncs_gym.scenarios import ENTRY_POINTS
+from shields import Certificate, CertificateError, Report, synthesize, verify
+from shields.storage import write_atomically
+
+
+@dataclass(frozen=True, kw_only=True)
+class SynthesizeSettings:
+    """Synthesizes a certificate for an environment's plant, verifies it exactly and saves it.
+
+    Attributes:
+        env: Id of a registered environment.
+        out: File for the certificate (JSON).
+        seed: Accepted by every command; the synthesis is deterministic and does not use it.
+    """
+
+    env: str = "ncs_gym/TruckTrailerCruise-v0"
+    out: Path = Path("certificate.json")
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerifySettings:
+    """Verifies a certificate in exact rational arithmetic against the plant it was made for.
+
+    Attributes:
+        file: The certificate (JSON).
+        env: Id of a registered environment; without it, the one whose plant has the certificate's fingerprint.
+        out: File for the verdicts (JSON).
+        seed: Accepted by every command; the verification is deterministic and does not use it.
+    """
+
+    file: tyro.conf.Positional[Path]
+    env: str | None = None
+    out: Path | None = None
+    seed: int = 0
+
+
+def synthesize_file(settings: SynthesizeSettings) -> None:
+    """Runs `ncs synthesize`.
+
+    Raises:
+        Infeasible: If no certificate is found.
+        OSError: If the file cannot be written.
+    """
+    plant = plant_of(settings.env)
+    certificate = synthesize(plant, progress=lambda line: print(line, flush=True))
+    certificate.save(settings.out)
+    print(verify(certificate, plant))
+    print(f"valid; saved to {settings.out}")
+
+
+def verify_file(settings: VerifySettings) -> None:
+    """Runs `ncs verify`.
+
+    Raises:
+        CertificateError: If the certificate is damaged, of an unknown plant or does not verify.
+        OSError: If the verdicts cannot be written.
+    """
+    certificate = Certificate.load(settings.file)
+    env_id = settings.env or _matching_env(certificate)
+    report = verify(certificate, plant_of(env_id))
+    print(f"against the plant of {env_id}:\n{report}")
+    if settings.out is not None:
+        write_atomically(settings.out, json.dumps(_as_json(report, env_id), indent=1) + "\n")
+    if not report.valid:
+        broken = sum(not condition.holds for condition in report.conditions)
+        raise CertificateError(f"{settings.file} does not verify: {broken} of {len(report.conditions)} conditions broken")
+    print("valid")
+
+
+def plant_of(env_id: str) -> LinearPlant:
+    """Returns the plant of a registered environment.
+
+    Raises:
+        ValueError: If the id is not one of ours, or needs a plant of the user's.
+    """
+    if env_id not in ENTRY_POINTS:
+        raise ValueError(f"unknown environment {env_id!r}; known are {', '.join(_with_plant())}")
+    return gym.make(env_id).unwrapped.plant
+
+
+def _with_plant() -> list[str]:
+    return [env_id for env_id in ENTRY_POINTS if env_id != "ncs_gym/LinearNCS-v0"]
+
+
+def _matching_env(certificate: Certificate) -> str:
+    for env_id in _with_plant():
+        if plant_of(env_id).fingerprint == certificate.fingerprint:
+            return env_id
+    raise CertificateError(
+        "the certificate belongs to no registered environment's plant; for one of your own call shields.verify(certificate, plant)"
+    )
+
+
+def _as_json(report: Report, env_id: str) -> dict:
+    return {"env": env_id, "valid": report.valid, "conditions": [asdict(condition) for condition in report.conditions]}

@@ -1,0 +1,102 @@
+"""From episodes to the numbers people read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from experiments.statistics import clopper_pearson, mean_interval
+from experiments.unit import UnitResult
+
+# Reference policies are evaluated without a shield and without training.
+REFERENCES = ("zero input", "K x_hat", "untrained")
+
+
+def summarize_arm(results: Sequence[UnitResult]) -> dict[str, Any]:
+    """Returns the summary of one arm's runs, JSON values only.
+
+    `eval_violation_rate_ci95` is Clopper-Pearson's interval on violating episodes given the trained policies;
+    `eval_violation_steps` is a plain count, because steps of one episode are dependent; `eval_return_ci95` is Student's
+    interval over the runs' mean returns (null for a single run).
+    """
+    episodes = [episode for result in results for episode in result.episodes]
+    violating = sum(episode.violation_steps > 0 for episode in episodes)
+    eval_steps = sum(episode.steps for episode in episodes)
+    means = [float(np.mean([episode.episode_return for episode in result.episodes])) for result in results]
+    interval = mean_interval(means)
+    train_steps = sum(result.train_steps for result in results)
+    return {
+        "runs": len(results),
+        "train_steps": train_steps,
+        "train_violation_steps": sum(result.train_violation_steps for result in results),
+        "train_intervention_rate": _rate(sum(result.train_interventions for result in results), train_steps),
+        "eval_episodes": len(episodes),
+        "eval_steps": eval_steps,
+        "eval_violation_steps": sum(episode.violation_steps for episode in episodes),
+        "eval_violating_episodes": violating,
+        "eval_violation_rate": violating / len(episodes),
+        "eval_violation_rate_ci95": list(clopper_pearson(violating, len(episodes))),
+        "eval_return_mean": float(np.mean(means)),
+        "eval_return_ci95": None if interval is None else list(interval),
+        "eval_return_by_run": means,
+        "intervention_rate": sum(episode.interventions for episode in episodes) / eval_steps,
+        "guaranteed_episodes": sum(episode.guaranteed for episode in episodes),
+        "largest_level": max(episode.largest_level for episode in episodes),
+    }
+
+
+def way_covered(summary: dict[str, Any]) -> float:
+    """Returns how far the shielded return is on the way from the zero input's (0) to the unshielded agent's (1)."""
+    arms, references = summary["arms"], summary["references"]
+    start = references["zero input"]["eval_return_mean"]
+    goal = arms["unshielded"]["eval_return_mean"]
+    return (arms["shielded"]["eval_return_mean"] - start) / (goal - start) if goal != start else float("nan")
+
+
+def table_rows(summary: dict[str, Any]) -> list[list[str]]:
+    """Returns the header and one row of text per arm and reference policy."""
+    rows = [
+        ["", "training:", "evaluation:", "", "evaluation:", "", ""],
+        ["", "violating steps", "violating episodes", "exact 95 % CI", "violating steps", "return [95 % CI]", "overridden"],
+    ]
+    for name, arm in (summary["arms"] | summary["references"]).items():
+        low, high = arm["eval_violation_rate_ci95"]
+        trained = arm["train_steps"] > 0
+        rows.append(
+            [
+                name,
+                f"{arm['train_violation_steps']:,} of {arm['train_steps']:,}" if trained else "-",
+                f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,}",
+                f"{100 * low:.1f} to {100 * high:.1f} %",
+                f"{arm['eval_violation_steps']:,}",
+                _return_text(arm),
+                f"{100 * arm['intervention_rate']:.1f} %" if arm["shielded"] else "-",
+            ]
+        )
+    return rows
+
+
+def table_text(summary: dict[str, Any]) -> str:
+    """Returns the table for a terminal."""
+    rows = table_rows(summary)
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    lines = [
+        "  ".join([row[0].ljust(widths[0])] + [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)])
+        for row in rows
+    ]
+    rule = "-" * len(lines[0])
+    arms = 2 + len(summary["arms"])
+    return "\n".join([*lines[:2], rule, *lines[2:arms], rule, *lines[arms:]])
+
+
+def _return_text(arm: dict[str, Any]) -> str:
+    interval = arm["eval_return_ci95"]
+    if interval is None:
+        return f"{arm['eval_return_mean']:.2f} [n/a]"
+    return f"{arm['eval_return_mean']:.2f} [{interval[0]:.2f}, {interval[1]:.2f}]"
+
+
+def _rate(events: int, trials: int) -> float:
+    return events / trials if trials else 0.0
