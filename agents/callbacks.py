@@ -15,7 +15,7 @@ class TrainingPoint:
 
     Attributes:
         steps: Environment steps so far.
-        episode_return: Mean over the last finished episodes (NaN before the first), without shield penalties' scaling.
+        episode_return: Mean over the last finished episodes, shield penalties included (NaN before the first).
         violation_steps: Steps so far whose true state violated the safe box.
         interventions: Steps so far in which the shield intervened.
     """
@@ -30,8 +30,8 @@ class SafetyCallback(BaseCallback):
     """Counts violations of the true state and interventions in every training step, and logs their rates.
 
     The counts come from each step's info; `Monitor` alone would see the last step of each episode only. Works with any
-    stable-baselines3 algorithm. TensorBoard gets `safety/violation_rate`, `safety/intervention_rate` (per step since the
-    last log) and `safety/violation_steps` (total).
+    stable-baselines3 algorithm. TensorBoard gets `safety/violation_rate`, `safety/intervention_rate` (per step since
+    the last log) and `safety/violation_steps` (total).
 
     Args:
         on_progress: Called with the number of steps taken since its last call.

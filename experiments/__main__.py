@@ -68,8 +68,8 @@ def _require_own_agents() -> None:
     here = Path(__file__).resolve().parent.parent
     if spec is None or spec.origin is None or Path(spec.origin).resolve().parent.parent != here:
         raise ImportError(
-            f"the package 'agents' found is not this project's ({spec.origin if spec else 'none'}): install ncs-gym in a "
-            "virtual environment of its own"
+            f"the package 'agents' found is not this project's ({spec.origin if spec else 'none'}): "
+            "install ncs-gym in a virtual environment of its own"
         )
 
 

@@ -76,7 +76,9 @@ def verify_file(settings: VerifySettings) -> None:
         write_atomically(settings.out, json.dumps(_as_json(report, env_id), indent=1) + "\n")
     if not report.valid:
         broken = sum(not condition.holds for condition in report.conditions)
-        raise CertificateError(f"{settings.file} does not verify: {broken} of {len(report.conditions)} conditions broken")
+        raise CertificateError(
+            f"{settings.file} does not verify: {broken} of {len(report.conditions)} conditions broken"
+        )
     print("valid")
 
 
@@ -100,7 +102,8 @@ def _matching_env(certificate: Certificate) -> str:
         if plant_of(env_id).fingerprint == certificate.fingerprint:
             return env_id
     raise CertificateError(
-        "the certificate belongs to no registered environment's plant; for one of your own call shields.verify(certificate, plant)"
+        "the certificate belongs to no registered environment's plant; "
+        "for one of your own call shields.verify(certificate, plant)"
     )
 
 

@@ -176,8 +176,8 @@ def _findings(summary: dict[str, Any]) -> list[str]:
     return [
         f"The proof held in {shielded['guaranteed_episodes']:,} of {shielded['eval_episodes']:,} shielded evaluation "
         f"episodes; the largest x'Mx was {shielded['largest_level']:.3f} (the safe set ends at 1).",
-        f"Shielded violating episodes: {shielded['eval_violating_episodes']:,} of {shielded['eval_episodes']:,}, at most "
-        f"{upper:.2f} % with 95 % confidence from these episodes alone.",
+        f"Shielded violating episodes: {shielded['eval_violating_episodes']:,} of {shielded['eval_episodes']:,}; "
+        f"from these episodes alone at most {upper:.2f} % with 95 % confidence.",
         f"The shielded return covers {100 * way_covered(summary):.0f} % of the way from the zero input to the "
         "unshielded agent.",
     ]
@@ -196,8 +196,14 @@ def _write(
     arms = {name: [result for result in results if result.arm == name] for name in summary["arms"]}
     figures = {
         "training": ("Training: every line is one run.", as_png(training_figure(arms))),
-        "phase": ("True states of the first evaluation episode of each run.", as_png(phase_figure(plant, certificate, arms))),
-        "episode": ("One evaluation episode of the first runs, same draws of nature.", as_png(episode_figure(plant, arms))),
+        "phase": (
+            "True states of the first evaluation episode of each run.",
+            as_png(phase_figure(plant, certificate, arms)),
+        ),
+        "episode": (
+            "One evaluation episode of the first runs, same draws of nature.",
+            as_png(episode_figure(plant, arms)),
+        ),
     }
     for name, (_, png) in figures.items():
         write_atomically(out / "figures" / f"{name}.png", png)

@@ -37,8 +37,12 @@ def training_figure(arms: dict[str, Sequence[UnitResult]]) -> Figure:
                 label = name if i == 0 else None
                 steps = np.array([point.steps for point in result.history])
                 color = COLORS[name]
-                axes[0].plot(steps, [point.episode_return for point in result.history], color=color, label=label, lw=1.4)
-                axes[1].plot(steps, [point.violation_steps for point in result.history], color=color, label=label, lw=1.4)
+                axes[0].plot(
+                    steps, [point.episode_return for point in result.history], color=color, label=label, lw=1.4
+                )
+                axes[1].plot(
+                    steps, [point.violation_steps for point in result.history], color=color, label=label, lw=1.4
+                )
                 overridden = np.array([point.interventions for point in result.history])
                 rate = np.diff(overridden, prepend=0) / np.diff(steps, prepend=0)
                 if name == "shielded":
@@ -62,12 +66,22 @@ def phase_figure(plant: LinearPlant, certificate: Certificate, arms: dict[str, S
         for axis, (name, results) in zip(axes, arms.items(), strict=True):
             for i, result in enumerate(results):
                 states = result.trajectory.states
-                axis.plot(states[:, 0], states[:, 1], color=COLORS[name], lw=0.9, alpha=0.85, label=None if i else "true state")
+                axis.plot(
+                    states[:, 0],
+                    states[:, 1],
+                    color=COLORS[name],
+                    lw=0.9,
+                    alpha=0.85,
+                    label=None if i else "true state",
+                )
                 outside = plant.constraint_values(states.T).max(axis=0) > 0.0
                 if outside.any():
                     axis.plot(*states[outside, :2].T, "x", color="black", ms=5, label=None if i else "violation")
             _draw_sets(axis, plant, certificate)
-            titles = [f"{label} [{unit}]" if unit else label for label, unit in zip(plant.state_names, plant.state_units, strict=True)]
+            titles = [
+                f"{label} [{unit}]" if unit else label
+                for label, unit in zip(plant.state_names, plant.state_units, strict=True)
+            ]
             _label(axis, titles[0], titles[1] if axis is axes[0] else "", f"{name}: one evaluation episode per run")
             axis.legend(loc="upper left", fontsize=8.5)
         return figure
@@ -82,10 +96,14 @@ def episode_figure(plant: LinearPlant, arms: dict[str, Sequence[UnitResult]]) ->
             path = results[0].trajectory
             time = plant.dt * np.arange(len(path.states))
             top.plot(time, np.abs(path.states @ plant.C.T).max(axis=1), color=COLORS[name], lw=1.3, label=name)
-            bottom.step(time[:-1], path.inputs[:, 0], where="post", color=COLORS[name], lw=1.2, label=f"applied, {name}")
+            bottom.step(
+                time[:-1], path.inputs[:, 0], where="post", color=COLORS[name], lw=1.2, label=f"applied, {name}"
+            )
             changed = np.any(path.inputs != path.proposed, axis=1)
             if changed.any():
-                bottom.plot(time[:-1][changed], path.proposed[changed, 0], ".", color=GREY, ms=4, label="proposed, overridden")
+                bottom.plot(
+                    time[:-1][changed], path.proposed[changed, 0], ".", color=GREY, ms=4, label="proposed, overridden"
+                )
         top.axhline(1.0, color="black", lw=1.0, ls="--")
         top.annotate("limit", (0.0, 1.0), xytext=(2, 3), textcoords="offset points", fontsize=8.5)
         _label(top, "", "largest |c_j x|", "The same episode with and without the shield")

@@ -59,7 +59,15 @@ def table_rows(summary: dict[str, Any]) -> list[list[str]]:
     """Returns the header and one row of text per arm and reference policy."""
     rows = [
         ["", "training:", "evaluation:", "", "evaluation:", "", ""],
-        ["", "violating steps", "violating episodes", "exact 95 % CI", "violating steps", "return [95 % CI]", "overridden"],
+        [
+            "",
+            "violating steps",
+            "violating episodes",
+            "exact 95 % CI",
+            "violating steps",
+            "return [95 % CI]",
+            "overridden",
+        ],
     ]
     for name, arm in (summary["arms"] | summary["references"]).items():
         low, high = arm["eval_violation_rate_ci95"]
@@ -83,7 +91,9 @@ def table_text(summary: dict[str, Any]) -> str:
     rows = table_rows(summary)
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = [
-        "  ".join([row[0].ljust(widths[0])] + [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)])
+        "  ".join(
+            [row[0].ljust(widths[0])] + [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)]
+        )
         for row in rows
     ]
     rule = "-" * len(lines[0])

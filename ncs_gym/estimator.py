@@ -197,8 +197,9 @@ def _rounded_up(shape: np.ndarray) -> np.ndarray:
 
 
 def _kalman_filter(plant: LinearPlant, quantization_step: float) -> KalmanFilter:
-    """Returns filterpy's filter with every matrix set: process covariance Q + gamma I (`paper.tex` Definition 3),
-    sensor covariance R plus the variance q^2/12 of a quantizer.
+    """Returns filterpy's filter with every matrix set.
+
+    The process covariance is Q + gamma I (`paper.tex` Definition 3), the sensor's R plus q^2/12 of a quantizer.
     """
     kalman = KalmanFilter(dim_x=plant.n, dim_z=plant.p, dim_u=plant.m)
     kalman.x = np.zeros(plant.n)

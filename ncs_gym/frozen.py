@@ -56,8 +56,7 @@ def as_matrix(value: Any, shape: tuple[int | None, int | None], name: str) -> np
         raise ValueError(f"{name} must be a matrix of numbers, got {value!r}") from error
     expected = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"
     fits = matrix.ndim == 2 and all(
-        have > 0 and (want is None or have == want)
-        for have, want in zip(matrix.shape, shape, strict=True)
+        have > 0 and (want is None or have == want) for have, want in zip(matrix.shape, shape, strict=True)
     )
     if not fits:
         raise ValueError(f"{name} must have shape {expected}, got {matrix.shape}")

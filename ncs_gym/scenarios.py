@@ -140,6 +140,4 @@ def register_all() -> None:
     for env_id, factory in ENTRY_POINTS.items():
         factory.metadata = NCSEnv.metadata
         if env_id not in gym.registry:
-            gym.register(
-                id=env_id, entry_point=f"{__name__}:{factory.__name__}", max_episode_steps=EPISODE_STEPS
-            )
+            gym.register(id=env_id, entry_point=f"{__name__}:{factory.__name__}", max_episode_steps=EPISODE_STEPS)

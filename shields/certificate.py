@@ -149,4 +149,3 @@ def _from_content(content: dict[str, Any]) -> dict[str, Any]:
 
 def _digest(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from ncs_gym import LinearPlant
 from ncs_gym.ellipsoid import outer_sum
-from ncs_gym.frozen import FrozenArrays
+from ncs_gym.frozen import FrozenArrays, read_only
 from shields.certificate import Certificate
 from shields.projection import closest_admissible
 from shields.verification import ACTION_ROUNDING, require_valid
@@ -66,19 +67,32 @@ class SafetyFilter(FrozenArrays):
         if self.mode not in MODES:
             raise ValueError(f"mode must be one of {list(MODES)}, got {self.mode!r}")
         require_valid(self.certificate, self.plant)
-        plant, M = self.plant, self.certificate.M
-        root = np.linalg.cholesky(M).T
-        for name, value in (
-            ("_root", root),  # |z|_M = |root z|
-            ("_moved", root @ plant.A),
-            ("_effect", root @ plant.B),
-            ("_D", root @ plant.disturbance.shape @ root.T),
-            # How far rounding an action to float32 can move the next state, in the norm of the test.
-            ("_rounding", np.linalg.norm(root @ plant.B, axis=0) @ plant.u_max * float(ACTION_ROUNDING)),
-            ("_identity", np.eye(plant.n)),
-        ):
-            object.__setattr__(self, name, value)
-        self._freeze_arrays()
+
+    @cached_property
+    def _root(self) -> np.ndarray:
+        """G with |z|_M = |G z|, shape (n, n)."""
+        return read_only(np.linalg.cholesky(self.certificate.M).T)
+
+    @cached_property
+    def _moved(self) -> np.ndarray:
+        return read_only(self._root @ self.plant.A)
+
+    @cached_property
+    def _effect(self) -> np.ndarray:
+        return read_only(self._root @ self.plant.B)
+
+    @cached_property
+    def _D(self) -> np.ndarray:
+        return read_only(self._root @ self.plant.disturbance.shape @ self._root.T)
+
+    @cached_property
+    def _identity(self) -> np.ndarray:
+        return read_only(np.eye(self.plant.n))
+
+    @cached_property
+    def _rounding(self) -> float:
+        """How far rounding an action to float32 can move the next state, in the norm of the test."""
+        return float(np.linalg.norm(self._effect, axis=0) @ self.plant.u_max) * float(ACTION_ROUNDING)
 
     def decide(self, estimate: np.ndarray, error_shape: np.ndarray, input_proposed: np.ndarray) -> Decision:
         """Returns the input to apply.
@@ -166,4 +180,3 @@ class SafetyFilter(FrozenArrays):
         n = self.plant.n
         fits = np.shape(estimate) == (n,) and np.shape(error_shape) == (n, n)
         return fits and bool(np.isfinite(estimate).all()) and bool(np.isfinite(error_shape).all())
-

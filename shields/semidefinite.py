@@ -119,7 +119,11 @@ class InvariantSetProgram:
         self._L, self._F = cp.Variable((n, n), symmetric=True), cp.Variable((m, n))
         L, F = self._L, self._F
         self._state, self._estimate = cp.Parameter(nonneg=True), cp.Parameter(nonneg=True)
-        self._D, self._slope, self._offset = cp.Parameter((n, n), symmetric=True), cp.Parameter((n, n)), cp.Parameter((n, n), symmetric=True)
+        self._D, self._slope, self._offset = (
+            cp.Parameter((n, n), symmetric=True),
+            cp.Parameter((n, n)),
+            cp.Parameter((n, n), symmetric=True),
+        )
         self._mu = cp.Parameter(m, nonneg=True)
         # le X and (1 - mu_i) X need products of parameters, so each scaled X gets parameters of its own.
         self._slopes = [cp.Parameter((n, n)) for _ in range(m + 1)]
@@ -179,15 +183,15 @@ def best_gain(problem: ScaledProblem, design: Design) -> np.ndarray:
         row, err = K[i : i + 1, :] @ L, K[i : i + 1, :] @ Sigma
         mu = design.inputs[i]
         corner = np.array([[1.0 - 4.0 * float(ACTION_ROUNDING)]])
-        constraints.append(
-            cp.bmat([[corner, row, err], [row.T, mu * L, zero], [err.T, zero, (1.0 - mu) * Sigma]]) >> 0
-        )
+        constraints.append(cp.bmat([[corner, row, err], [row.T, mu * L, zero], [err.T, zero, (1.0 - mu) * Sigma]]) >> 0)
     if not _solve(cp.Problem(cp.Minimize(room), constraints)) or K.value is None:
         return design.K
     return K.value
 
 
-def best_shares(problem: ScaledProblem, L: np.ndarray, K: np.ndarray, start: tuple[float, float, float]) -> tuple[tuple[float, float, float], float]:
+def best_shares(
+    problem: ScaledProblem, L: np.ndarray, K: np.ndarray, start: tuple[float, float, float]
+) -> tuple[tuple[float, float, float], float]:
     """Returns shares (lx, le, ld), and the largest generalized eigenvalue of (I)'s right side against L.
 
     The right side is matrix-convex in the shares, so its largest eigenvalue is a convex function of two numbers.

@@ -76,7 +76,9 @@ def synthesize(plant: LinearPlant, method: str = "certified", *, progress: Progr
     free = plant.n - int(np.linalg.matrix_rank(plant.C))
     if free:
         raise Infeasible(
-            f"the safe box leaves {free} of {plant.n} directions unbounded: add rows to C with generous limits", "S", free
+            f"the safe box leaves {free} of {plant.n} directions unbounded: add rows to C with generous limits",
+            "S",
+            free,
         )
     try:
         errors = certified_error_set(plant)
@@ -154,7 +156,9 @@ def _finish(problem: ScaledProblem, best: Design) -> Design:
     for K in gains:
         shares, worst = best_shares(problem, best.L, K, best.shares)
         inputs = best_input_shares(problem, best.L, K)
-        effort = (np.sqrt(np.einsum("ij,jk,ik->i", K, best.L, K)) + np.sqrt(np.einsum("ij,jk,ik->i", K, problem.Sigma, K))).max()
+        effort = (
+            np.sqrt(np.einsum("ij,jk,ik->i", K, best.L, K)) + np.sqrt(np.einsum("ij,jk,ik->i", K, problem.Sigma, K))
+        ).max()
         finished.append((max(worst, effort), replace(best, K=K, shares=shares, inputs=inputs)))
     return min(finished, key=lambda pair: pair[0])[1]
 

@@ -10,7 +10,18 @@ import numpy as np
 
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate, CertificateError
-from shields.exact import Matrix, add, congruence, is_positive_semidefinite, multiply, quadratic, rational, scale, subtract, to_float
+from shields.exact import (
+    Matrix,
+    add,
+    congruence,
+    is_positive_semidefinite,
+    multiply,
+    quadratic,
+    rational,
+    scale,
+    subtract,
+    to_float,
+)
 
 # Rounding an action in [-1, 1] to float32 moves it by at most this.
 ACTION_ROUNDING = Fraction(1, 2**24)
@@ -168,7 +179,7 @@ def _with_action_rounding(D: Matrix, B: Matrix, u_max: np.ndarray, growth: Fract
 
 
 def _trace_share(first: Matrix, second: Matrix) -> Fraction | None:
-    """Returns a near trace-optimal share nu as a rational (any nu in (0, 1) proves containment); None if one is zero."""
+    """Returns a rational nu near the trace-optimal one (any in (0, 1) proves containment); None if a term is zero."""
     a, b = (sum(matrix[i][i] for i in range(len(matrix))) for matrix in (first, second))
     if a == 0 or b == 0:
         return None

@@ -39,7 +39,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
     | `shield_intervened` | whether the action was overridden |
     | `input_proposed` | the agent's input, shape (m,) [physical units]; zeros at reset |
     | `shield_correction` | Euclidean norm of input - input_proposed |
-    | `shield_margin` | 1 - h - abs(A x_hat + B u)_M of the input applied, before it moved the plant; at reset for u = 0 |
+    | `shield_margin` | 1 - h - norm(A x_hat + B u)_M for the input applied; at reset for u = 0 |
     | `shield_guaranteed` | whether x in S is proved now |
     | `shield_reason` | why not; empty while guaranteed |
     | `episode_interventions` | running number in this episode |
@@ -79,7 +79,9 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         """Starts an episode; see `NCSEnv.reset`."""
         observation, info = self.env.reset(seed=seed, options=options)
         given = (options or {}).get("state")
-        known = self._starts_inside if given is None else starts_inside(self.certificate, np.asarray(given, dtype=float))
+        known = (
+            self._starts_inside if given is None else starts_inside(self.certificate, np.asarray(given, dtype=float))
+        )
         self._proof.start(known, info)
         self._estimate, self._error_shape = info["estimate"].copy(), info["error_shape"].copy()
         self._interventions = 0

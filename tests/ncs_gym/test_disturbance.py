@@ -1,0 +1,102 @@
+import numpy as np
+import pytest
+
+from ncs_gym import AdversarialDisturbance, BoxDisturbance, SinusoidDisturbance
+from ncs_gym.disturbance import BY_NAME, as_disturbance
+from tests.plants import random_plant
+
+
+def draws(source, plant, count=400, seed=0):
+    rng = np.random.default_rng(seed)
+    memory = source.begin(rng, plant)
+    return np.array([source.draw(rng, plant, rng.standard_normal(plant.n), k, memory) for k in range(count)])
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+@pytest.mark.parametrize("n", [1, 2, 4])
+def test_every_kind_stays_in_its_bound(name, n):
+    plant = random_plant(n, n, 1)
+    source = as_disturbance(name, plant, False)
+    samples = draws(source, plant)
+    if source.replaces_process_noise:
+        assert all(plant.disturbance.contains(d) for d in samples)
+    else:
+        assert (samples**2).sum(axis=1).max() <= plant.gamma * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("name", ["sphere", "adversarial"])
+def test_extremal_kinds_use_the_whole_bound(name, plant):
+    samples = draws(as_disturbance(name, plant, False), plant)
+    assert min(plant.disturbance.gauge(d) for d in samples) > 1.0 - 1e-9
+
+
+def test_process_noise_is_part_of_what_extremal_kinds_use(plant):
+    radius = np.sqrt((draws(as_disturbance("sphere", plant, False), plant) ** 2).sum(axis=1)).max()
+    assert radius > 1.5 * np.sqrt(plant.gamma)
+
+
+def test_adversary_maximizes_the_largest_constraint(plant):
+    rng = np.random.default_rng(1)
+    for _ in range(50):
+        nominal = rng.uniform(-2, 2, 2)
+        worst = AdversarialDisturbance().draw(rng, plant, nominal, 0, None)
+        value = np.abs(plant.C @ (nominal + worst)).max()
+        others = [np.abs(plant.C @ (nominal + plant.disturbance.sample_boundary(rng))).max() for _ in range(300)]
+        assert value >= max(others) - 1e-12
+
+
+def test_adversary_with_a_matrix_maximizes_its_level(plant):
+    rng = np.random.default_rng(2)
+    M = np.array([[0.5, 0.1], [0.1, 0.2]])
+    for _ in range(50):
+        nominal = rng.uniform(-2, 2, 2)
+        end = nominal + AdversarialDisturbance(M).draw(rng, plant, nominal, 0, None)
+        others = [nominal + plant.disturbance.sample_boundary(rng) for _ in range(300)]
+        assert end @ M @ end >= max(other @ M @ other for other in others) - 1e-9
+
+
+def test_sinusoid_repeats_with_its_period(plant):
+    samples = draws(SinusoidDisturbance(period=8.0), plant, 64)
+    np.testing.assert_allclose(samples[:8], samples[8:16], atol=1e-12)
+    assert np.linalg.norm(samples, axis=1).max() > 0.9 * np.sqrt(plant.gamma)
+
+
+def test_callable_on_the_bound_passes_and_beyond_it_raises(plant):
+    def at(size):
+        return as_disturbance(
+            lambda rng, plant, nominal: size * plant.disturbance.extreme_point(np.ones(2)), plant, False
+        )
+
+    d = at(1.0).draw(np.random.default_rng(0), plant, np.zeros(2), 0, None)
+    assert plant.disturbance.contains(d)
+    with pytest.raises(ValueError, match=r"outside its bound E\(D\): .* = 1.001"):
+        at(1.001).draw(np.random.default_rng(0), plant, np.zeros(2), 0, None)
+
+
+def test_callable_beyond_the_bound_passes_if_allowed(plant):
+    source = as_disturbance(lambda rng, plant, nominal: np.array([1.0, 1.0]), plant, True)
+    np.testing.assert_array_equal(source.draw(np.random.default_rng(0), plant, np.zeros(2), 0, None), [1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ("gusts", "disturbance must be one of"),
+        (3, "disturbance must be one of"),
+        (BoxDisturbance([0.1, 0.1]), "squared length"),
+        (BoxDisturbance([0.1]), "2 entries"),
+        (AdversarialDisturbance(np.eye(3)), "M must have shape"),
+        (lambda rng, plant, nominal: np.array([np.nan, 0.0]), None),
+    ],
+)
+def test_bad_disturbances_are_refused(value, words, plant):
+    if words is None:
+        with pytest.raises(ValueError, match="must be finite"):
+            as_disturbance(value, plant, False).draw(np.random.default_rng(0), plant, np.zeros(2), 0, None)
+    else:
+        with pytest.raises(ValueError, match=words):
+            as_disturbance(value, plant, False)
+
+
+def test_box_beyond_the_bound_is_possible_on_purpose(plant):
+    assert as_disturbance(BoxDisturbance([0.1, 0.1]), plant, True).half_widths[0] == 0.1

@@ -1,0 +1,159 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+
+from ncs_gym import Ellipsoid
+from ncs_gym.ellipsoid import is_inside, outer_sum, sum_gauge
+
+seeds = st.integers(0, 10_000)
+
+
+def random_shape(rng: np.random.Generator, n: int, rank: int | None = None) -> np.ndarray:
+    factor = rng.standard_normal((n, n if rank is None else rank))
+    return factor @ factor.T
+
+
+@given(seeds, st.integers(1, 6))
+@settings(max_examples=50, deadline=None)
+def test_extreme_point_attains_support_and_no_sample_exceeds_it(seed, n):
+    rng = np.random.default_rng(seed)
+    ellipsoid = Ellipsoid(random_shape(rng, n))
+    direction = rng.standard_normal(n)
+    best = ellipsoid.extreme_point(direction)
+    assert direction @ best == pytest.approx(ellipsoid.support(direction))
+    assert ellipsoid.gauge(best) == pytest.approx(1.0, abs=1e-6)
+    assert all(direction @ ellipsoid.sample(rng) <= ellipsoid.support(direction) for _ in range(50))
+
+
+def test_gauge_is_the_mahalanobis_norm():
+    rng = np.random.default_rng(1)
+    shape = random_shape(rng, 3)
+    point = rng.standard_normal(3)
+    assert Ellipsoid(shape).gauge(point) == pytest.approx(np.sqrt(point @ np.linalg.inv(shape) @ point))
+
+
+def test_gauge_is_independent_of_units():
+    rng = np.random.default_rng(2)
+    shape, point = random_shape(rng, 3), rng.standard_normal(3)
+    units = np.array([1e-6, 1.0, 1e6])
+    scaled = Ellipsoid(shape * np.outer(units, units)).gauge(point * units)
+    assert scaled == pytest.approx(Ellipsoid(shape).gauge(point))
+
+
+def test_flat_ellipsoid_contains_only_its_plane():
+    flat = Ellipsoid(np.outer([1.0, 2.0], [1.0, 2.0]))
+    assert flat.contains([0.5, 1.0])
+    assert not flat.contains([0.5, 1.0 + 1e-9])
+    point = Ellipsoid(np.zeros((2, 2)))
+    assert point.contains([0.0, 0.0])
+    assert not point.contains([0.0, 1e-300])
+
+
+def test_uniform_samples_fill_the_ellipsoid_evenly():
+    rng = np.random.default_rng(3)
+    ellipsoid = Ellipsoid(np.array([[4.0, 1.0], [1.0, 1.0]]))
+    inner = np.mean([ellipsoid.gauge(ellipsoid.sample(rng)) <= 0.5 for _ in range(4000)])
+    assert inner == pytest.approx(0.25, abs=0.03)  # area share of the half-size ellipse
+
+
+@given(seeds, st.integers(1, 5))
+@settings(max_examples=40, deadline=None)
+def test_farthest_point_beats_local_search_from_many_starts(seed, n):
+    rng = np.random.default_rng(seed)
+    ellipsoid, weight = Ellipsoid(random_shape(rng, n)), random_shape(rng, n)
+    center = rng.standard_normal(n) * rng.choice([0.0, 1e-9, 1.0, 10.0])
+
+    def value(point: np.ndarray) -> float:
+        return float((center + point) @ weight @ (center + point))
+
+    found = ellipsoid.farthest_point(center, weight)
+    assert ellipsoid.gauge(found) <= 1.0 + 1e-9
+
+    def on_boundary(s: np.ndarray) -> np.ndarray:
+        return ellipsoid.factor @ (s / np.linalg.norm(s))
+
+    for _ in range(6):
+        local = minimize(lambda s: -value(on_boundary(s)), rng.standard_normal(n))
+        assert value(found) >= -local.fun * (1.0 - 1e-7) - 1e-12
+
+
+def test_farthest_point_solves_the_hard_case():
+    # The center pulls along the short axis only; the long one must still be used.
+    ellipsoid, weight = Ellipsoid(np.diag([1.0, 4.0])), np.eye(2)
+    found = ellipsoid.farthest_point(np.array([0.1, 0.0]), weight)
+    assert abs(found[1]) == pytest.approx(2.0, abs=0.01)
+    assert ellipsoid.gauge(found) == pytest.approx(1.0, abs=1e-6)
+
+
+@given(seeds, st.integers(1, 5))
+@settings(max_examples=50, deadline=None)
+def test_outer_sum_holds_the_minkowski_sum(seed, n):
+    rng = np.random.default_rng(seed)
+    first, second = (Ellipsoid(random_shape(rng, n)) for _ in range(2))
+    total = first.outer_sum(second)
+    for _ in range(30):
+        direction = rng.standard_normal(n)
+        assert total.support(direction) >= (first.support(direction) + second.support(direction)) * (1.0 - 1e-12)
+
+
+def test_plain_sum_of_shapes_would_not_hold_the_minkowski_sum():
+    one = Ellipsoid(np.eye(2))
+    assert Ellipsoid(one.shape + one.shape).support([1.0, 0.0]) < 2.0 * one.support([1.0, 0.0])
+
+
+def distance_to_sum(point: np.ndarray, first: Ellipsoid, second: Ellipsoid) -> float:
+    """Smallest gauge in `second` of point - z over z in `first`: at most 1 exactly if the point is in the sum."""
+
+    def gauge(s: np.ndarray) -> float:
+        return second.gauge(point - first.factor @ (s / max(1.0, np.linalg.norm(s)))) ** 2
+
+    starts = np.random.default_rng(0).standard_normal((6, first.dim))
+    return min(
+        minimize(gauge, start, method="Nelder-Mead", options={"fatol": 1e-12, "maxiter": 4000}).fun for start in starts
+    )
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_membership_in_a_sum_agrees_with_searching_for_the_two_parts(seed):
+    rng = np.random.default_rng(seed)
+    first, second = Ellipsoid(random_shape(rng, 2)), Ellipsoid(random_shape(rng, 2))
+    direction = rng.standard_normal(2)
+    boundary = first.extreme_point(direction) + second.extreme_point(direction)
+    for factor, inside in ((0.98, True), (1.02, False)):
+        point = factor * boundary
+        assert bool(sum_gauge(point, first.shape, second.shape) <= 1.0) is inside
+        assert bool(distance_to_sum(point, first, second) <= 1.0) is inside
+
+
+def test_membership_in_a_sum_is_exact_at_its_boundary():
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        first, second = Ellipsoid(random_shape(rng, 3)), Ellipsoid(random_shape(rng, 3))
+        direction = rng.standard_normal(3)
+        boundary = first.extreme_point(direction) + second.extreme_point(direction)
+        assert sum_gauge(boundary, first.shape, second.shape) == pytest.approx(1.0, abs=1e-7)
+
+
+def test_inclusion_has_no_tolerance():
+    for n in (2, 3):
+        assert is_inside(np.eye(n), np.eye(n))
+        assert not is_inside(np.eye(n) * (1.0 + 1e-15), np.eye(n))
+        sheared = np.eye(n)
+        sheared[0, 1] = sheared[1, 0] = 0.5
+        assert not is_inside(sheared, np.eye(n))
+
+
+def test_outer_sum_with_a_point_is_the_other():
+    shape = np.diag([1.0, 4.0])
+    np.testing.assert_allclose(outer_sum(shape, np.zeros((2, 2)), np.eye(2)), shape)
+    np.testing.assert_allclose(outer_sum(np.zeros((2, 2)), shape, np.eye(2)), shape, rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "shape", [np.diag([1.0, -1.0]), np.array([[1.0, 2.0], [0.0, 1.0]]), [[np.nan]], np.ones((2, 3))]
+)
+def test_bad_shapes_are_refused(shape):
+    with pytest.raises(ValueError, match="shape"):
+        Ellipsoid(shape)

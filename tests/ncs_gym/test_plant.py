@@ -1,0 +1,118 @@
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.stats import chi2
+
+from ncs_gym import LinearPlant, truck_trailer
+from ncs_gym.noise import TruncatedGaussian, chi2_quantile
+
+
+def test_truck_trailer_reproduces_the_printed_matrices():
+    plant = truck_trailer()
+    np.testing.assert_allclose(plant.A, [[0.7247, 0.1636], [-0.7361, -0.0278]], atol=5e-5)
+    np.testing.assert_allclose(plant.B, [[0.0612], [0.1636]], atol=5e-5)
+
+
+def test_zero_order_hold_agrees_with_integrating_the_differential_equation():
+    plant = truck_trailer(mass=3000.0, stiffness=4000.0, damping=900.0, dt=0.7)
+
+    def rate(_, x):
+        return [x[1], -4000.0 / 3000.0 * x[0] - 900.0 / 3000.0 * x[1] + 1.7]
+
+    start = np.array([0.4, -0.9])
+    end = solve_ivp(rate, (0.0, 0.7), start, rtol=1e-11, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose(plant.A @ start + plant.B @ [1.7], end, atol=1e-8)
+
+
+def test_disturbance_bound_holds_ball_plus_truncated_noise():
+    plant = truck_trailer()
+    rng = np.random.default_rng(0)
+    for _ in range(500):
+        direction = rng.standard_normal(2)
+        direction /= np.linalg.norm(direction)
+        need = np.sqrt(plant.gamma) + np.sqrt(chi2.ppf(0.95, 2) * direction @ plant.process_noise_cov @ direction)
+        assert plant.disturbance.support(direction) >= need
+
+
+def test_case_study_bounds_have_the_measured_radii():
+    plant = truck_trailer()
+    assert np.sqrt(plant.disturbance.shape[0, 0]) == pytest.approx(0.0468, abs=5e-5)
+    assert plant.initial_error.shape[0, 0] == pytest.approx(1e-4 * 5.9915, rel=1e-4)
+
+
+def test_sensor_bound_with_quantizer_holds_corners_of_the_rounding_box():
+    plant = truck_trailer()
+    step = 0.05
+    noise, bound = plant.sensor_error.shape, plant.sensor_error_with(step)
+    corner = np.array([step / 2, -step / 2])
+    extreme = corner + np.sqrt(noise[0, 0]) * corner / np.linalg.norm(corner) * (1 - 1e-9)
+    assert bound.contains(extreme)
+    assert not bound.contains(1.01 * extreme)
+
+
+def test_quantile_is_of_the_kept_mass_not_of_the_removed_one():
+    assert chi2_quantile(0.95, 2) == pytest.approx(-2.0 * np.log(0.05), rel=1e-9)
+    assert chi2_quantile(0.95, 2) >= -2.0 * np.log(0.05)
+
+
+def test_truncated_noise_stays_in_its_bound_and_keeps_its_mass():
+    rng = np.random.default_rng(4)
+    covariance = np.array([[2.0, 0.3], [0.3, 0.5]])
+    noise = TruncatedGaussian(covariance, chi2_quantile(0.5, 2))
+    samples = np.array([noise.sample(rng) for _ in range(4000)])
+    assert all(noise.bound.gauge(sample) <= 1.0 + 1e-12 for sample in samples)
+    # A Gaussian truncated at its median energy keeps 1 - log 2 of its covariance in two dimensions.
+    np.testing.assert_allclose(np.cov(samples.T), (1.0 - np.log(2.0)) * covariance, atol=0.05)
+
+
+def test_fingerprint_changes_with_every_number():
+    base = truck_trailer()
+    others = [
+        truck_trailer(mass=1000.0001),
+        truck_trailer(gamma=5.0000001e-4),
+        truck_trailer(delta=0.051),
+        truck_trailer(u_max=4.0000001),
+        truck_trailer(initial_cov=2e-4 * np.eye(2)),
+        truck_trailer(H=np.array([[1.0, 0.0]])),
+    ]
+    prints = {plant.fingerprint for plant in (base, *others)}
+    assert len(prints) == 1 + len(others)
+    assert truck_trailer().fingerprint == base.fingerprint
+
+
+def good() -> dict:
+    return {"A": np.eye(2) * 0.5, "B": np.ones((2, 1)), "C": np.eye(2), "u_max": 1.0, "dt": 0.1, "gamma": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"A": np.ones((2, 3))}, r"A must have shape \(2, 2\), got \(2, 3\)"),
+        ({"A": [[np.nan, 0], [0, 0]]}, "A must be finite"),
+        ({"A": "no"}, "A must be a matrix"),
+        ({"B": np.ones((3, 1))}, "B must have shape"),
+        ({"C": np.ones((1, 3))}, "C must have shape"),
+        ({"H": np.ones((1, 3))}, "H must have shape"),
+        ({"u_max": -1.0}, "u_max must be a positive number"),
+        ({"u_max": [1.0, 2.0]}, "u_max must be a positive number"),
+        ({"dt": 0.0}, "dt must be a number > 0"),
+        ({"gamma": -1e-9}, "gamma must be a number >= 0, got -1e-09"),
+        ({"gamma": np.inf}, "gamma"),
+        ({"delta": 0.0}, "delta"),
+        ({"delta": 1.0}, "delta"),
+        ({"process_noise_cov": -np.eye(2)}, "process_noise_cov must be positive semidefinite"),
+        ({"initial_cov": [[1.0, 0.5], [0.0, 1.0]]}, "initial_cov must be symmetric"),
+        ({"measurement_noise_cov": np.eye(3)}, "measurement_noise_cov must have shape"),
+        ({"state_names": ["one"]}, "state_names"),
+    ],
+)
+def test_bad_numbers_are_refused_in_one_sentence(change, words):
+    with pytest.raises(ValueError, match=words) as caught:
+        LinearPlant(**(good() | change))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("change", [{"mass": 0.0}, {"stiffness": -1.0}, {"damping": -1.0}, {"dt": np.nan}])
+def test_bad_truck_is_refused(change):
+    with pytest.raises(ValueError, match=next(iter(change))):
+        truck_trailer(**change)
