@@ -9,7 +9,7 @@ from pathlib import Path
 import gymnasium as gym
 import tyro
 
-from ncs_gym import LinearPlant
+from ncs_gym import LinearPlant, scenarios
 from ncs_gym.scenarios import ENTRY_POINTS
 from shields import Certificate, CertificateError, Report, synthesize, verify
 from shields.storage import write_atomically
@@ -94,7 +94,7 @@ def plant_of(env_id: str) -> LinearPlant:
 
 
 def _with_plant() -> list[str]:
-    return [env_id for env_id in ENTRY_POINTS if env_id != "ncs_gym/LinearNCS-v0"]
+    return [env_id for env_id, name in ENTRY_POINTS.items() if getattr(scenarios, name).plant is not None]
 
 
 def _matching_env(certificate: Certificate) -> str:

@@ -254,5 +254,5 @@ def _start_option(options: dict[str, Any] | None, n: int) -> np.ndarray | None:
 
 def _expect(value: Any, kind: type[T], name: str) -> T:
     if not isinstance(value, kind):
-        raise ValueError(f"{name} must be a {kind.__name__}, got {value!r}")
+        raise ValueError(f"{name} must be of type {kind.__name__}, got {type(value).__name__}")
     return value

@@ -58,19 +58,22 @@ def certified_error_set(plant: LinearPlant) -> ErrorSet:
         raise UnstablePlantError(
             f"no error bound exists without packets: the spectral radius of A is {radius:.6g}, it must be < 1"
         )
-    box = np.linalg.inv(plant.weight)
-    D = plant.disturbance.shape
-    D = D + THICKENING * float(np.vdot(plant.weight, D)) / plant.n * box
-    first = plant.initial_error.shape + THINNEST**2 * box
+    # In coordinates z = T^-1 x, with W = (T T')^-1, the weight is the identity and units do not matter.
+    T = np.linalg.cholesky(np.linalg.inv(plant.weight))
+    inverse, identity = np.linalg.inv(T), np.eye(plant.n)
+    A = inverse @ plant.A @ T
+    D = inverse @ plant.disturbance.shape @ inverse.T
+    D = D + THICKENING * float(np.trace(D)) / plant.n * identity
+    first = inverse @ plant.initial_error.shape @ inverse.T + THINNEST**2 * identity
 
     def size(rate: float) -> float:
-        return float(np.vdot(plant.weight, _smallest_solution(plant.A, D, first, rate)))
+        return float(np.trace(_smallest_solution(A, D, first, rate)))
 
     slowest = max(radius**2, 1e-6)
     margin = 1e-4 * (1.0 - slowest)
     best = minimize_scalar(size, bounds=(slowest + margin, 1.0 - margin), method="bounded", options={"xatol": margin})
-    Sigma = GROWTH * _smallest_solution(plant.A, D, first, float(best.x))
-    return ErrorSet(Sigma=Sigma, rate=float(best.x))
+    Sigma = T @ (GROWTH * _smallest_solution(A, D, first, float(best.x))) @ T.T
+    return ErrorSet(Sigma=0.5 * (Sigma + Sigma.T), rate=float(best.x))
 
 
 def _smallest_solution(A: np.ndarray, D: np.ndarray, first: np.ndarray, rate: float) -> np.ndarray:

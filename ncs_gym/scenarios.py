@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -12,132 +14,104 @@ from ncs_gym.disturbance import BoxDisturbance
 from ncs_gym.ellipsoid import Ellipsoid
 from ncs_gym.env import NCSEnv
 from ncs_gym.plant import LinearPlant, truck_trailer
-from ncs_gym.task import SpeedTracking, Task
+from ncs_gym.task import Regulation, SpeedTracking, Task
 
 # Steps per episode of every registered environment (`paper.tex` Section 5).
 EPISODE_STEPS = 200
-# Mass of the loaded trailer [kg]: full throttle stretches the coupling beyond its limit (theory.md section 5).
-LOADED_MASS = 4000.0
-# Half-widths of the disturbance box and starting radius of the case study [m, m/s].
-BOX = (0.02, 0.01)
-CASE_STUDY_START = 1.9
-# Starts of the cruise are this near rest of the coupling [m, m/s].
-CRUISE_START = 0.2
+# The four impairments of `paper.tex` Section 5, all at once.
+CASE_STUDY_CHANNEL = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
+# The disturbance box of `paper.tex` Section 5 [m, m/s]; its corner has squared length gamma = 5e-4.
+CASE_STUDY_BOX = BoxDisturbance((0.02, 0.01))
 
 
-def case_study_channel() -> Channel:
-    """Returns the four impairments of `paper.tex` Section 5, all at once."""
-    return Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
+@dataclass(frozen=True, kw_only=True)
+class Scenario:
+    """Defaults of a registered environment; calling it makes the environment.
 
-
-def make_truck_trailer(
-    plant: LinearPlant | None = None,
-    channel: Channel | None = None,
-    task: Task | None = None,
-    disturbance: Any = None,
-    initial_set: Ellipsoid | None = None,
-    terminate_on_violation: bool = False,
-    allow_assumption_violation: bool = False,
-    render_mode: str | None = None,
-) -> NCSEnv:
-    """Returns `ncs_gym/TruckTrailer-v0`: the case study of `paper.tex` Section 5, task Regulation.
-
-    1000 kg, dt 0.5 s, disturbance uniform in [-0.02, 0.02] x [-0.01, 0.01] (gamma 5e-4) plus process noise
-    Q = 1e-4 I, P0 = R = 1e-4 I (the paper prints no R), delta 0.05; loss 0.3, quantization step 0.05, a sample
-    every 2 steps, delay 2 steps; starts uniformly in the disc of radius 1.9. See `NCSEnv` for the arguments.
+    Attributes:
+        plant: Makes the default plant; None if the user has to give one.
+        channel: Default channel.
+        task: Default task.
+        box: Default disturbance where it suits the plant; "ball" elsewhere.
+        start: Radius of the disc of starts, for plants of two states; None and elsewhere: `NCSEnv`'s default.
     """
-    return NCSEnv(
-        plant=truck_trailer() if plant is None else plant,
-        channel=case_study_channel() if channel is None else channel,
-        task=task,
-        disturbance=_default_disturbance(plant) if disturbance is None else disturbance,
-        initial_set=_disc(CASE_STUDY_START) if initial_set is None else initial_set,
-        terminate_on_violation=terminate_on_violation,
-        allow_assumption_violation=allow_assumption_violation,
-        render_mode=render_mode,
-        horizon=EPISODE_STEPS,
-    )
+
+    plant: Callable[[], LinearPlant] | None
+    channel: Channel
+    task: Task
+    box: BoxDisturbance | None = None
+    start: float | None = None
+    metadata: ClassVar[dict[str, Any]] = NCSEnv.metadata
+
+    def __call__(
+        self,
+        plant: LinearPlant | None = None,
+        channel: Channel | None = None,
+        task: Task | None = None,
+        disturbance: Any = None,
+        initial_set: Ellipsoid | None = None,
+        terminate_on_violation: bool = False,
+        allow_assumption_violation: bool = False,
+        render_mode: str | None = None,
+    ) -> NCSEnv:
+        """Returns the environment; None stands for the scenario's own value, see `NCSEnv` for the arguments.
+
+        Raises:
+            ValueError: If the scenario has no plant of its own and none is given, or a setting is wrong.
+        """
+        if plant is None:
+            if self.plant is None:
+                raise ValueError("this environment has no plant of its own: give plant=LinearPlant(...)")
+            plant = self.plant()
+        if initial_set is None and self.start is not None and getattr(plant, "n", 0) == 2:
+            initial_set = Ellipsoid(self.start**2 * np.eye(2))
+        return NCSEnv(
+            plant=plant,
+            channel=self.channel if channel is None else channel,
+            task=self.task if task is None else task,
+            disturbance=self._disturbance(plant) if disturbance is None else disturbance,
+            initial_set=initial_set,
+            terminate_on_violation=terminate_on_violation,
+            allow_assumption_violation=allow_assumption_violation,
+            render_mode=render_mode,
+            horizon=EPISODE_STEPS,
+        )
+
+    def _disturbance(self, plant: LinearPlant) -> Any:
+        suits = self.box is not None and isinstance(plant, LinearPlant) and not self.box.check(plant)
+        return self.box if suits else "ball"
 
 
-def make_truck_trailer_cruise(
-    plant: LinearPlant | None = None,
-    channel: Channel | None = None,
-    task: Task | None = None,
-    disturbance: Any = None,
-    initial_set: Ellipsoid | None = None,
-    terminate_on_violation: bool = False,
-    allow_assumption_violation: bool = False,
-    render_mode: str | None = None,
-) -> NCSEnv:
-    """Returns `ncs_gym/TruckTrailerCruise-v0`: the loaded trailer, task SpeedTracking.
-
-    4000 kg on the same coupling, noise and channel as the case study; the truck follows a random piecewise-constant
-    speed profile, and starts within 0.2 of rest of the coupling. See `NCSEnv` for the arguments.
-    """
-    return NCSEnv(
-        plant=truck_trailer(mass=LOADED_MASS) if plant is None else plant,
-        channel=case_study_channel() if channel is None else channel,
-        task=SpeedTracking() if task is None else task,
-        disturbance=_default_disturbance(plant) if disturbance is None else disturbance,
-        initial_set=_disc(CRUISE_START) if initial_set is None else initial_set,
-        terminate_on_violation=terminate_on_violation,
-        allow_assumption_violation=allow_assumption_violation,
-        render_mode=render_mode,
-        horizon=EPISODE_STEPS,
-    )
+# `paper.tex` Section 5: 1000 kg, dt 0.5 s, gamma 5e-4, Q = P0 = R = 1e-4 I (the paper prints no R), delta 0.05; starts
+# uniformly in the disc of radius 1.9.
+TRUCK_TRAILER = Scenario(
+    plant=truck_trailer, channel=CASE_STUDY_CHANNEL, task=Regulation(), box=CASE_STUDY_BOX, start=1.9
+)
 
 
-def make_linear_ncs(
-    plant: LinearPlant | None = None,
-    channel: Channel | None = None,
-    task: Task | None = None,
-    disturbance: Any = "ball",
-    initial_set: Ellipsoid | None = None,
-    terminate_on_violation: bool = False,
-    allow_assumption_violation: bool = False,
-    render_mode: str | None = None,
-) -> NCSEnv:
-    """Returns `ncs_gym/LinearNCS-v0`: any `plant`, behind a perfect channel and with task Regulation unless given.
-
-    See `NCSEnv` for the arguments.
-
-    Raises:
-        ValueError: If no plant is given.
-    """
-    if plant is None:
-        raise ValueError("LinearNCS-v0 needs plant=LinearPlant(...)")
-    return NCSEnv(
-        plant=plant,
-        channel=channel,
-        task=task,
-        disturbance=disturbance,
-        initial_set=initial_set,
-        terminate_on_violation=terminate_on_violation,
-        allow_assumption_violation=allow_assumption_violation,
-        render_mode=render_mode,
-        horizon=EPISODE_STEPS,
-    )
+def loaded_truck_trailer() -> LinearPlant:
+    """Returns the truck with a trailer of 4000 kg: full throttle overstretches its coupling (theory.md section 5)."""
+    return truck_trailer(mass=4000.0)
 
 
-def _default_disturbance(plant: LinearPlant | None) -> BoxDisturbance:
-    """Returns the paper's box; for a plant of the user's the box that its own gamma allows."""
-    return BoxDisturbance(BOX if plant is None else None)
+# The loaded trailer on the same coupling, noise and channel; the truck follows a random speed profile and starts within
+# 0.2 of rest of the coupling.
+TRUCK_TRAILER_CRUISE = Scenario(
+    plant=loaded_truck_trailer, channel=CASE_STUDY_CHANNEL, task=SpeedTracking(), box=CASE_STUDY_BOX, start=0.2
+)
 
-
-def _disc(radius: float) -> Ellipsoid:
-    return Ellipsoid(radius**2 * np.eye(2))
-
+# Any plant of the user's, behind a perfect channel unless given.
+LINEAR_NCS = Scenario(plant=None, channel=Channel(), task=Regulation())
 
 ENTRY_POINTS = {
-    "ncs_gym/TruckTrailer-v0": make_truck_trailer,
-    "ncs_gym/TruckTrailerCruise-v0": make_truck_trailer_cruise,
-    "ncs_gym/LinearNCS-v0": make_linear_ncs,
+    "ncs_gym/TruckTrailer-v0": "TRUCK_TRAILER",
+    "ncs_gym/TruckTrailerCruise-v0": "TRUCK_TRAILER_CRUISE",
+    "ncs_gym/LinearNCS-v0": "LINEAR_NCS",
 }
 
 
 def register_all() -> None:
     """Registers the ids with gymnasium; `import ncs_gym` calls it."""
-    for env_id, factory in ENTRY_POINTS.items():
-        factory.metadata = NCSEnv.metadata
+    for env_id, name in ENTRY_POINTS.items():
         if env_id not in gym.registry:
-            gym.register(id=env_id, entry_point=f"{__name__}:{factory.__name__}", max_episode_steps=EPISODE_STEPS)
+            gym.register(id=env_id, entry_point=f"{__name__}:{name}", max_episode_steps=EPISODE_STEPS)

@@ -1,0 +1,90 @@
+import numpy as np
+import pytest
+
+from ncs_gym import Ellipsoid, LinearPlant, UnstablePlantError, certified_error_set, truck_trailer
+from tests.plants import random_plant
+
+
+@pytest.mark.parametrize(
+    ("plant", "radius"),
+    [
+        (truck_trailer(process_noise_cov=np.zeros((2, 2))), 0.0801),
+        (truck_trailer(), 0.168),
+        (truck_trailer(mass=4000.0), 0.262),
+    ],
+)
+def test_radius_before_growth_is_the_measured_one(plant, radius):
+    errors = certified_error_set(plant)
+    assert np.sqrt(np.linalg.eigvalsh(errors.Sigma / 1.1)[-1]) == pytest.approx(radius, rel=5e-3)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_error_never_leaves_the_set_without_any_packet(seed):
+    plant = random_plant(seed, 1 + seed % 5, 1)
+    errors = Ellipsoid(certified_error_set(plant).Sigma)
+    rng = np.random.default_rng(seed)
+    axis = rng.standard_normal(plant.n)
+    weight = np.outer(axis, axis)  # push the error along one axis as far as it goes
+    e = plant.initial_error.extreme_point(axis)
+    largest = 0.0
+    for _ in range(200):
+        e = plant.A @ e
+        e = e + plant.disturbance.farthest_point(e, weight)
+        largest = max(largest, errors.gauge(e))
+    assert largest <= 1.0
+
+
+def test_set_covers_a_bad_first_estimate():
+    plant = truck_trailer(initial_cov=0.2 * np.eye(2))
+    errors = certified_error_set(plant)
+    slack = np.linalg.eigvalsh(errors.Sigma - plant.initial_error.shape)[0]
+    grown = plant.A @ errors.Sigma @ plant.A.T / errors.rate + plant.disturbance.shape / (1.0 - errors.rate)
+    assert slack > 0.0
+    assert np.linalg.eigvalsh(errors.Sigma - grown)[0] > 0.0
+
+
+def test_covering_a_bad_first_estimate_costs_less_than_scaling_would():
+    plant = truck_trailer(mass=4000.0, initial_cov=np.diag([0.0, 0.05]))
+    errors, plain = certified_error_set(plant), certified_error_set(truck_trailer(mass=4000.0))
+    factor = plant.initial_error.shape[0, 0] / np.linalg.eigvalsh(plain.Sigma / 1.1)[0]
+    assert factor > 1.0
+    assert np.trace(errors.Sigma) < factor * np.trace(plain.Sigma)
+
+
+def test_perfectly_known_plant_has_a_thin_but_full_set():
+    zero = np.zeros((2, 2))
+    plant = truck_trailer(gamma=0.0, process_noise_cov=zero, measurement_noise_cov=zero, initial_cov=zero)
+    values = np.linalg.eigvalsh(certified_error_set(plant).Sigma)
+    assert values[0] > 0.0
+    assert values[1] < 1e-9
+
+
+def test_flat_disturbance_leaves_slack_in_every_direction():
+    plant = truck_trailer(gamma=0.0, process_noise_cov=np.diag([0.0, 1e-4]))
+    errors = certified_error_set(plant)
+    grown = plant.A @ errors.Sigma @ plant.A.T / errors.rate + plant.disturbance.shape / (1.0 - errors.rate)
+    assert np.linalg.eigvalsh(errors.Sigma - grown)[0] > 0.0
+
+
+def test_units_do_not_change_the_set():
+    units = np.diag([1e-3, 1e4])
+    base = truck_trailer()
+    inverse = np.linalg.inv(units)
+    scaled = LinearPlant(
+        A=units @ base.A @ inverse, B=units @ base.B, C=base.C @ inverse, u_max=4.0, dt=0.5, gamma=0.0,
+        process_noise_cov=units @ (1e-4 * np.eye(2)) @ units, measurement_noise_cov=np.eye(2),
+    )  # fmt: skip
+    same = truck_trailer(gamma=0.0, initial_cov=np.zeros((2, 2)))
+    expected = units @ certified_error_set(same).Sigma @ units
+    np.testing.assert_allclose(
+        certified_error_set(scaled).Sigma,
+        expected,
+        rtol=1e-3,
+        atol=1e-3 * np.sqrt(np.outer(*[np.diag(expected)] * 2)).max() * 1e-3,
+    )
+
+
+def test_unstable_plant_is_refused_with_its_spectral_radius():
+    plant = LinearPlant(A=[[1.02]], B=[[1.0]], C=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-3)
+    with pytest.raises(UnstablePlantError, match=r"spectral radius of A is 1\.02"):
+        certified_error_set(plant)

@@ -1,0 +1,241 @@
+import copy
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ncs_gym import Channel, Ellipsoid, ErrorSet, Estimator, Packet, certified_error_set, truck_trailer
+from ncs_gym.channel import GilbertElliott, Link
+from tests.plants import random_plant
+
+
+def roomy(plant, factor=1e4):
+    """An error set so large that the guard accepts every Kalman update."""
+    errors = certified_error_set(plant)
+    return ErrorSet(Sigma=factor * errors.Sigma, rate=errors.rate)
+
+
+def batch_estimate(plant, first, inputs, packets, noise_cov):
+    """The last state's mean and covariance from the joint precision of all states: no recursion, no gains."""
+    n, steps = plant.n, len(inputs)
+    Q = plant.process_noise_cov + plant.gamma * np.eye(n)
+    precision = np.zeros((n * (steps + 1), n * (steps + 1)))
+    vector = np.zeros(n * (steps + 1))
+    start = np.linalg.inv(plant.initial_cov)
+    precision[:n, :n] += start
+    vector[:n] += start @ first
+    Q_inverse, R_inverse = np.linalg.inv(Q), np.linalg.inv(noise_cov)
+    for k, u in enumerate(inputs):
+        rows = slice(n * k, n * (k + 2))
+        difference = np.hstack([-plant.A, np.eye(n)])
+        precision[rows, rows] += difference.T @ Q_inverse @ difference
+        vector[rows] += difference.T @ Q_inverse @ (plant.B @ u)
+    for stamp, y in packets:
+        rows = slice(n * stamp, n * (stamp + 1))
+        precision[rows, rows] += plant.H.T @ R_inverse @ plant.H
+        vector[rows] += plant.H.T @ R_inverse @ y
+    covariance = np.linalg.inv(precision)
+    return (covariance @ vector)[-n:], covariance[-n:, -n:]
+
+
+@pytest.mark.parametrize("p", [None, 1])
+@pytest.mark.parametrize("seed", range(5))
+def test_estimate_equals_batch_least_squares_with_late_and_reordered_packets(seed, p):
+    plant = random_plant(seed, 3, 1, p)
+    # Good sensors, so that every Kalman update also shrinks the hard ellipsoid and none is turned down.
+    plant = replace(plant, measurement_noise_cov=1e-7 * np.eye(plant.p))
+    channel = Channel(loss=0.3, quantization_step=0.001, delay=1, jitter=3)
+    rng = np.random.default_rng(seed)
+    estimator = Estimator(plant, channel, roomy(plant))
+    first = rng.standard_normal(3)
+    estimator.reset(first)
+    link, inputs, used = Link(channel, rng), [], []
+    # The samples are the truth's; the hard bound on them keeps the monitor silent.
+    x = first + plant.initial_noise.sample(rng)
+    for step in range(1, 31):
+        inputs.append(rng.uniform(-1, 1, 1))
+        x = plant.A @ x + plant.B @ inputs[-1] + plant.disturbance.sample(rng) * 0.3
+        packets = link.exchange(rng, step, plant.H @ x + plant.sensor_noise.sample(rng))
+        used += [(packet.stamp, packet.measurement) for packet in packets]
+        estimator.advance(inputs[-1], packets)
+        noise_cov = plant.measurement_noise_cov + 0.001**2 / 12 * np.eye(plant.p)
+        mean, covariance = batch_estimate(plant, first, inputs, used, noise_cov)
+        np.testing.assert_allclose(estimator.belief.mean, mean, atol=1e-9)
+        np.testing.assert_allclose(estimator.belief.covariance, covariance, atol=1e-10)
+
+
+def test_order_of_arrival_does_not_matter():
+    plant = truck_trailer()
+    rng = np.random.default_rng(0)
+    samples = {stamp: 0.05 * rng.standard_normal(2) for stamp in (1, 2, 3, 4)}
+    ends = []
+    for order in itertools.permutations(samples):
+        estimator = Estimator(plant, Channel(delay=8), roomy(plant))
+        for _ in range(4):
+            estimator.advance(np.zeros(1), [])
+        estimator.advance(np.array([0.5]), [Packet(stamp, samples[stamp]) for stamp in order])
+        ends.append(estimator.belief)
+    for end in ends:
+        np.testing.assert_allclose(end.mean, ends[0].mean, atol=1e-12)
+        np.testing.assert_allclose(end.covariance, ends[0].covariance, atol=1e-14)
+
+
+def test_mean_predicts_with_the_applied_input():
+    plant = truck_trailer()
+    estimator = Estimator(plant, Channel())
+    estimator.reset(np.array([0.3, -0.2]))
+    estimator.advance(np.array([1.5]), [])
+    np.testing.assert_allclose(estimator.belief.mean, plant.A @ [0.3, -0.2] + plant.B @ [1.5])
+
+
+@pytest.mark.parametrize("stamp", [0, -3, 2, 99, 4 - 3])
+def test_packets_from_nowhere_are_discarded(stamp):
+    # At step 4 with a buffer of 2, stamps 2..4 could be used; 2 is sent twice here.
+    plant = truck_trailer()
+    estimator = Estimator(plant, Channel(delay=2))
+    for packets in ([], [Packet(2, np.full(2, 0.01))], [], []):
+        estimator.advance(np.zeros(1), packets)
+    belief = estimator.belief
+    estimator._receive(Packet(stamp, np.full(2, 0.02)))
+    assert estimator.belief is belief
+
+
+def test_age_counts_from_the_newest_sample_used():
+    plant = truck_trailer()
+    estimator = Estimator(plant, Channel(delay=5))
+    ages = []
+    for packets in ([], [], [Packet(2, np.zeros(2))], [Packet(1, np.zeros(2))], [], [Packet(6, np.zeros(2))]):
+        estimator.advance(np.zeros(1), packets)
+        ages.append(estimator.age)
+    assert ages == [1, 2, 1, 2, 3, 0]
+
+
+def worst_noise(rng, plant):
+    """Sensor noise on the boundary of its bound."""
+    return plant.sensor_noise.bound.sample_boundary(rng)
+
+
+def drive(plant, channel, seed, steps, push):
+    """Runs an estimator against a disturbance that pushes the error outwards; yields (estimator, true state)."""
+    rng = np.random.default_rng(seed)
+    estimator = Estimator(plant, channel)
+    x = rng.uniform(-0.5, 0.5, plant.n)
+    e0 = plant.initial_noise.bound.sample_boundary(rng)
+    estimator.reset(x + e0)
+    link = Link(channel, rng)
+    for step in range(1, steps + 1):
+        u = rng.uniform(-1, 1, plant.m) * plant.u_max
+        e = estimator.belief.mean - x
+        d = -plant.disturbance.farthest_point(plant.A @ e, push(rng)) * (1 - 1e-12)
+        x = plant.A @ x + plant.B @ u + d
+        sample = plant.H @ x + worst_noise(rng, plant) if link.sends_at(step) else None
+        estimator.advance(u, link.exchange(rng, step, sample))
+        yield estimator, x
+
+
+CHANNELS = [
+    Channel(loss=1.0),
+    Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2),
+    Channel(quantization_step=0.02, delay=1, jitter=4),
+    Channel(loss=GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.2), send_period=1, jitter=2),
+]
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+@pytest.mark.parametrize("seed", range(6))
+def test_error_stays_in_its_running_ellipsoid_under_adversarial_noise(channel, seed):
+    plant = random_plant(seed, 2 + seed % 3, 1, p=1 + seed % 2) if seed else truck_trailer(mass=4000.0)
+
+    def push(rng):
+        axis = rng.standard_normal(plant.n)
+        return np.outer(axis, axis)
+
+    Sigma = certified_error_set(plant).Sigma
+    largest = 0.0
+    for estimator, x in drive(plant, channel, seed, 400, push):
+        shape = estimator.belief.shape
+        largest = max(largest, Ellipsoid(shape).gauge(estimator.belief.mean - x))
+        assert np.linalg.eigvalsh(Sigma - shape)[0] >= -1e-15
+        assert not estimator.alarm
+    assert 0.5 < largest <= 1.0
+
+
+def test_partial_measurements_keep_being_used():
+    plant = truck_trailer(H=np.array([[1.0, 0.0]]))
+    channel = Channel(quantization_step=0.05)
+    ages = [estimator.age for estimator, _ in drive(plant, channel, 0, 500, lambda rng: np.eye(2))]
+    assert np.mean(np.array(ages) == 0) > 0.99
+
+
+def test_updates_shrink_the_running_ellipsoid():
+    plant = truck_trailer(mass=4000.0)
+    Sigma = certified_error_set(plant).Sigma
+    ends = [estimator.belief.shape for estimator, _ in drive(plant, Channel(), 0, 200, lambda rng: np.eye(2))]
+    assert np.trace(ends[-1]) < 0.3 * np.trace(Sigma)
+
+
+def test_guard_rejects_a_gain_that_would_leave_the_certified_set():
+    plant = truck_trailer()
+    errors = certified_error_set(plant)
+    tight = Estimator(plant, Channel(quantization_step=3.0), errors)  # sensor far worse than the plant's own bound
+    tight.advance(np.zeros(1), [Packet(1, np.zeros(2))])
+    for _ in range(30):
+        tight.advance(np.zeros(1), [Packet(tight.step + 1, np.zeros(2))])
+        assert np.linalg.eigvalsh(errors.Sigma - tight.belief.shape)[0] >= 0.0
+
+
+def test_forged_packet_raises_a_latched_alarm():
+    plant = truck_trailer()
+    estimator = Estimator(plant, Channel())
+    estimator.advance(np.zeros(1), [Packet(1, np.array([0.0, 0.0]))])
+    assert not estimator.alarm
+    estimator.advance(np.zeros(1), [Packet(2, np.array([0.5, 0.5]))])
+    assert estimator.alarm
+    estimator.advance(np.zeros(1), [Packet(3, plant.H @ estimator.belief.mean)])
+    assert estimator.alarm
+    estimator.reset(np.zeros(2))
+    assert not estimator.alarm
+
+
+def test_damaged_packet_is_not_used_and_raises_the_alarm():
+    estimator = Estimator(truck_trailer(), Channel())
+    estimator.advance(np.zeros(1), [Packet(1, np.array([np.nan, 0.0]))])
+    assert estimator.alarm
+    assert np.isfinite(estimator.belief.mean).all()
+
+
+def test_innovation_at_the_edge_of_both_bounds_is_no_alarm():
+    # The test against E(H Sigma H' + N) would raise it; the exact Minkowski test must not.
+    plant = truck_trailer()
+    estimator = Estimator(plant, Channel())
+    prior = plant.A @ plant.initial_error.shape @ plant.A.T
+    estimator.advance(np.zeros(1), [])
+    spread = Ellipsoid(plant.H @ estimator.belief.shape @ plant.H.T)
+    direction = np.array([1.0, 0.3])
+    noise = Ellipsoid(estimator._noise)
+    edge = spread.extreme_point(direction) + noise.extreme_point(direction)
+    naive = Ellipsoid(spread.shape + noise.shape)
+    assert not naive.contains(edge)
+    assert np.trace(prior) > 0.0
+    estimator._monitor(edge, spread.shape)
+    assert not estimator.alarm
+    estimator._monitor(1.001 * edge, spread.shape)
+    assert estimator.alarm
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=25, deadline=None)
+def test_a_packet_never_leaves_a_larger_ellipsoid_than_ignoring_it(seed):
+    plant = random_plant(seed, 2, 1, p=1)
+    rng = np.random.default_rng(seed)
+    estimator = Estimator(plant, Channel(delay=6))
+    for step in range(1, 20):
+        u = rng.uniform(-1, 1, 1)
+        stamp = int(rng.integers(max(1, step - 5), step + 1))
+        ignoring = copy.deepcopy(estimator)
+        estimator.advance(u, [Packet(stamp, np.zeros(1))])
+        ignoring.advance(u, [])
+        assert np.vdot(plant.weight, estimator.belief.shape) <= np.vdot(plant.weight, ignoring.belief.shape)

@@ -1,0 +1,69 @@
+import numpy as np
+import pytest
+
+from ncs_gym import Regulation, SpeedTracking, truck_trailer
+from ncs_gym.task import SpeedProfile
+
+
+def test_regulation_costs_about_one_at_the_edge_of_the_box(plant):
+    assert Regulation().reward(plant, None, np.array([2.0, 0.0]), np.zeros(1)) == pytest.approx(-1.0)
+    assert Regulation().reward(plant, None, np.zeros(2), np.array([4.0])) == pytest.approx(-0.01)
+
+
+def test_regulation_takes_the_users_costs(plant):
+    task = Regulation(state_cost=np.diag([1.0, 2.0]), input_cost=np.array([[0.5]]))
+    assert task.reward(plant, None, np.array([1.0, 3.0]), np.array([2.0])) == pytest.approx(-(1 + 18 + 2))
+
+
+def test_speed_integrates_the_acceleration(plant):
+    task = SpeedTracking(change_probability=0.0)
+    memory = task.advance(np.random.default_rng(0), plant, SpeedProfile(10.0, 20.0), np.array([3.0]))
+    assert memory == SpeedProfile(10.0 + plant.dt * 3.0, 20.0)
+    assert task.observe(memory) == pytest.approx([8.5])
+
+
+def test_speed_reward_is_the_documented_one(plant):
+    task = SpeedTracking()
+    assert task.reward(plant, SpeedProfile(10.0, 15.0), np.zeros(2), np.array([2.0])) == pytest.approx(-0.2 - 0.008)
+    assert task.reward(plant, SpeedProfile(0.0, 500.0), np.zeros(2), np.zeros(1)) == pytest.approx(-1.0)
+
+
+def test_profile_is_piecewise_constant_in_range_and_changes_at_its_rate(plant):
+    task, rng = SpeedTracking(), np.random.default_rng(0)
+    memory = task.begin(rng, plant)
+    targets = []
+    for _ in range(20_000):
+        memory = task.advance(rng, plant, memory, np.zeros(1))
+        targets.append(memory.target)
+    changes = np.mean(np.diff(targets) != 0.0)
+    assert changes == pytest.approx(0.02, abs=0.004)
+    assert 0.0 <= min(targets) < 1.0
+    assert 24.0 < max(targets) <= 25.0
+
+
+def test_observation_bound_is_never_exceeded_at_full_throttle():
+    plant, task = truck_trailer(), SpeedTracking()
+    rng = np.random.default_rng(0)
+    memory = SpeedProfile(25.0, 0.0)
+    for _ in range(200):
+        memory = task.advance(rng, plant, memory, plant.u_max)
+        assert abs(task.observe(memory)[0]) <= task.observation_bound(plant, 200)[0]
+
+
+@pytest.mark.parametrize(
+    ("make", "word"),
+    [
+        (lambda: SpeedTracking(fastest=0.0), "fastest"),
+        (lambda: SpeedTracking(change_probability=1.5), "change_probability"),
+        (lambda: SpeedTracking(input_index=-1), "input_index"),
+        (lambda: Regulation(state_cost=-np.eye(2)), "state_cost"),
+    ],
+)
+def test_bad_tasks_are_refused(make, word):
+    with pytest.raises(ValueError, match=word):
+        make()
+
+
+def test_tasks_that_do_not_fit_the_plant_say_so(plant):
+    assert "input_index" in SpeedTracking(input_index=1).check(plant)
+    assert "state_cost" in Regulation(state_cost=np.eye(3)).check(plant)
