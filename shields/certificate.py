@@ -103,7 +103,8 @@ class Certificate(FrozenArrays):
             OSError: If the file cannot be written.
         """
         content = self._content()
-        document = {"format": FORMAT, "sha256": _digest(content), "certificate": content}
+        literal = json.loads(json.dumps(content), parse_float=str, parse_int=str)
+        document = {"format": FORMAT, "sha256": _digest(literal), "certificate": content}
         write_atomically(Path(path), json.dumps(document, indent=1) + "\n")
 
     @classmethod
@@ -114,7 +115,8 @@ class Certificate(FrozenArrays):
             CertificateError: If the file is missing, not a certificate, truncated or altered.
         """
         try:
-            document = json.loads(Path(path).read_text(encoding="utf-8"))
+            text = Path(path).read_text(encoding="utf-8")
+            document, literal = json.loads(text), json.loads(text, parse_float=str, parse_int=str)
         except (OSError, ValueError, RecursionError) as error:
             reason = getattr(error, "strerror", None) or "it is not valid JSON"
             raise CertificateError(f"cannot read certificate {path}: {reason}") from error
@@ -122,7 +124,7 @@ class Certificate(FrozenArrays):
             if document["format"] != FORMAT:
                 raise CertificateError(f"{path} is not a certificate of format {FORMAT!r}")
             content = document["certificate"]
-            if document["sha256"] != _digest(content):
+            if document["sha256"] != _digest(literal["certificate"]):
                 raise CertificateError(f"certificate {path} was altered: its checksum does not match")
             return cls(**_from_content(content))
         except (KeyError, TypeError, ValueError) as error:
@@ -148,4 +150,5 @@ def _from_content(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def _digest(content: Any) -> str:
+    """Returns the checksum of a content whose numbers are their literal digits, whatever the white space."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -111,37 +111,41 @@ class InvariantSetProgram:
         problem: The scaled design problem.
         slack: Relative growth of every disturbance and shrinkage of every limit, the room that exact
             verification needs.
+        limited: False drops (U), to find out what binds.
     """
 
-    def __init__(self, problem: ScaledProblem, slack: float) -> None:
+    def __init__(self, problem: ScaledProblem, slack: float, *, limited: bool = True) -> None:
         n, m = problem.n, problem.m
         self.problem, self.slack = problem, slack
+        self._root = np.linalg.cholesky((1.0 + slack) * problem.Sigma)
         self._L, self._F = cp.Variable((n, n), symmetric=True), cp.Variable((m, n))
-        L, F = self._L, self._F
-        self._state, self._estimate = cp.Parameter(nonneg=True), cp.Parameter(nonneg=True)
-        self._D, self._slope, self._offset = (
-            cp.Parameter((n, n), symmetric=True),
-            cp.Parameter((n, n)),
-            cp.Parameter((n, n), symmetric=True),
-        )
-        self._mu = cp.Parameter(m, nonneg=True)
-        # le X and (1 - mu_i) X need products of parameters, so each scaled X gets parameters of its own.
+        self._state, self._mu = cp.Parameter(nonneg=True), cp.Parameter(m, nonneg=True)
+        self._D = cp.Parameter((n, n), symmetric=True)
+        # The blocks le X and (1 - mu_i) X, in coordinates where Sigma is the identity (else its smallness spoils the
+        # solver's accuracy); each has parameters of its own, because products of parameters are not allowed.
         self._slopes = [cp.Parameter((n, n)) for _ in range(m + 1)]
         self._offsets = [cp.Parameter((n, n), symmetric=True) for _ in range(m + 1)]
-        scaled_X = [L @ slope.T + slope @ L - offset for slope, offset in zip(self._slopes, self._offsets, strict=True)]
-        zero = np.zeros((n, n))
-        moved, gain = problem.A @ L + problem.B @ F, problem.B @ F
-        constraints = [
-            cp.bmat([[L - self._D, moved, gain], [moved.T, self._state * L, zero], [gain.T, zero, scaled_X[0]]]) >> 0,
-            cp.diag(problem.C @ L @ problem.C.T) <= 1.0 - slack,
+        self._program = cp.Problem(cp.Maximize(cp.log_det(self._L)), self._constraints(limited))
+
+    def _constraints(self, limited: bool) -> list[cp.Constraint]:
+        """Returns (I), (S) and (U) as linear matrix inequalities."""
+        problem, L, F, root = self.problem, self._L, self._F, self._root
+        X = [
+            root.T @ L @ slope + slope.T @ L @ root - offset
+            for slope, offset in zip(self._slopes, self._offsets, strict=True)
         ]
-        for i in range(m):
+        zero = np.zeros((problem.n, problem.n))
+        moved, gain = problem.A @ L + problem.B @ F, problem.B @ F @ root
+        constraints = [
+            cp.bmat([[L - self._D, moved, gain], [moved.T, self._state * L, zero], [gain.T, zero, X[0]]]) >> 0,
+            cp.diag(problem.C @ L @ problem.C.T) <= 1.0 - self.slack,
+        ]
+        corner = np.array([[1.0 - self.slack - 2.0 * float(ACTION_ROUNDING)]])
+        for i in range(problem.m if limited else 0):
             row = F[i : i + 1, :]
-            corner = np.array([[1.0 - slack - 2.0 * float(ACTION_ROUNDING)]])
-            constraints.append(
-                cp.bmat([[corner, row, row], [row.T, self._mu[i] * L, zero], [row.T, zero, scaled_X[i + 1]]]) >> 0
-            )
-        self._program = cp.Problem(cp.Maximize(cp.log_det(L)), constraints)
+            blocks = [[corner, row, row @ root], [row.T, self._mu[i] * L, zero], [(row @ root).T, zero, X[i + 1]]]
+            constraints.append(cp.bmat(blocks) >> 0)
+        return constraints
 
     def solve(self, shares: tuple[float, float, float], inputs: np.ndarray, linearize_at: np.ndarray) -> Design | None:
         """Returns the best design for shares (lx, le, ld) and mu, shape (m,); None if there is none.
@@ -155,11 +159,12 @@ class InvariantSetProgram:
         self._state.value = lx * (1.0 - self.slack)
         self._D.value = self.problem.D * ((1.0 + self.slack) / ld)
         self._mu.value = inputs
-        slope = linearize_at @ np.linalg.inv(self.problem.Sigma) / (1.0 + self.slack)
-        offset = slope @ linearize_at
+        # With Sigma = G G' the linearized G'XG is G'L (Sigma^-1 L0 G) + its transpose - (G^-1 L0 G)'(G^-1 L0 G).
+        inner = np.linalg.solve(self._root, linearize_at @ self._root)
+        slope = np.linalg.solve(self._root.T, inner)
+        offset = inner.T @ inner
         for share, P, R in zip((le, *(1.0 - inputs)), self._slopes, self._offsets, strict=True):
-            P.value = share * slope
-            R.value = share * 0.5 * (offset + offset.T)
+            P.value, R.value = share * slope, share * 0.5 * (offset + offset.T)
         if not _solve(self._program) or self._L.value is None:
             return None
         L = 0.5 * (self._L.value + self._L.value.T)
@@ -173,17 +178,17 @@ def best_gain(problem: ScaledProblem, design: Design) -> np.ndarray:
     """Returns the gain, shape (m, n), that leaves (I) the most room for the design's L; its own if none is better."""
     n, m = problem.n, problem.m
     L, Sigma, (lx, le, ld) = design.L, problem.Sigma, design.shares
+    root, identity = np.linalg.cholesky(Sigma), np.eye(n)
     K, room = cp.Variable((m, n)), cp.Variable()
     zero = np.zeros((n, n))
-    moved, gain = (problem.A + problem.B @ K) @ L, problem.B @ K @ Sigma
-    constraints = [
-        cp.bmat([[room * L - problem.D / ld, moved, gain], [moved.T, lx * L, zero], [gain.T, zero, le * Sigma]]) >> 0
-    ]
-    for i in range(m):
-        row, err = K[i : i + 1, :] @ L, K[i : i + 1, :] @ Sigma
-        mu = design.inputs[i]
-        corner = np.array([[1.0 - 4.0 * float(ACTION_ROUNDING)]])
-        constraints.append(cp.bmat([[corner, row, err], [row.T, mu * L, zero], [err.T, zero, (1.0 - mu) * Sigma]]) >> 0)
+    moved, gain = (problem.A + problem.B @ K) @ L, problem.B @ K @ root
+    blocks = [[room * L - problem.D / ld, moved, gain], [moved.T, lx * L, zero], [gain.T, zero, le * identity]]
+    constraints = [cp.bmat(blocks) >> 0]
+    corner = np.array([[1.0 - 4.0 * float(ACTION_ROUNDING)]])
+    for i, mu in enumerate(design.inputs):
+        row, err = K[i : i + 1, :] @ L, K[i : i + 1, :] @ root
+        blocks = [[corner, row, err], [row.T, mu * L, zero], [err.T, zero, (1.0 - mu) * identity]]
+        constraints.append(cp.bmat(blocks) >> 0)
     if not _solve(cp.Problem(cp.Minimize(room), constraints)) or K.value is None:
         return design.K
     return K.value

@@ -118,7 +118,7 @@ def _largest_set(problem: ScaledProblem, slack: float, progress: Progress) -> De
 
 def _best_start(problem: ScaledProblem, program: InvariantSetProgram, progress: Progress) -> Design | None:
     """Returns the best design over a handful of shares and two linearizations."""
-    near = 2.0 / float(np.linalg.eigvalsh(problem.Sigma)[-1]) * problem.Sigma
+    near = problem.Sigma / float(np.linalg.eigvalsh(problem.Sigma)[-1])
     inputs = np.full(problem.m, START_INPUT_SHARE)
     best = None
     for state, part in STARTS:
@@ -187,18 +187,19 @@ def _certificate(
 def _diagnosis(problem: ScaledProblem) -> Infeasible:
     """Returns the exception that says what binds, from feasibility at reduced uncertainty and without input limits."""
 
-    def feasible(scale: float, limit: float = 1.0) -> bool:
-        trial = replace(problem, D=scale**2 * problem.D, Sigma=scale**2 * problem.Sigma, B=limit * problem.B)
-        return _best_start(trial, InvariantSetProgram(trial, SLACKS[0]), lambda line: None) is not None
+    def feasible(scale: float, *, limited: bool = True) -> bool:
+        trial = replace(problem, D=scale**2 * problem.D, Sigma=scale**2 * problem.Sigma)
+        program = InvariantSetProgram(trial, SLACKS[0], limited=limited)
+        return _best_start(trial, program, lambda line: None) is not None
 
     low, high = 0.0, 1.0
     for _ in range(7):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if feasible(middle) else (low, middle)
-    binding = "U" if feasible(1.0, limit=100.0) else "I"
-    what = "(U) the input limits are too tight" if binding == "U" else "(I) no ellipsoid in the box is invariant"
+    binding = "U" if feasible(1.0, limited=False) else "I"
+    what = "(U) the input limits are too tight" if binding == "U" else "(I) no invariant ellipsoid in the box was found"
     return Infeasible(
-        f"{what}: a certificate exists only if disturbance and error radii shrink to {low:.1%} of those given",
+        f"{what}: one is found once disturbance and error radii shrink to {low:.1%} of those given",
         binding,
         1.0 - low,
     )

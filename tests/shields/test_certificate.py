@@ -1,0 +1,98 @@
+import json
+import pickle
+
+import numpy as np
+import pytest
+
+from ncs_gym import Ellipsoid
+from shields import Certificate, CertificateError
+
+
+@pytest.fixture
+def path(certificate, tmp_path):
+    certificate.save(tmp_path / "certificate.json")
+    return tmp_path / "certificate.json"
+
+
+def test_saving_and_loading_is_exact(certificate, path):
+    loaded = Certificate.load(path)
+    for name in ("L", "K", "Sigma", "D"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(certificate, name))
+    assert loaded.multipliers == certificate.multipliers
+    assert (loaded.method, loaded.fingerprint) == (certificate.method, certificate.fingerprint)
+    assert loaded.provenance == certificate.provenance
+
+
+def test_matrix_and_sets_are_derived_from_L(certificate):
+    np.testing.assert_allclose(certificate.M @ certificate.L, np.eye(2), atol=1e-12)
+    assert isinstance(certificate.safe_set, Ellipsoid)
+    np.testing.assert_array_equal(certificate.error_set.shape, certificate.Sigma)
+
+
+def test_arrays_are_read_only_even_after_pickling(certificate):
+    for twin in (certificate, pickle.loads(pickle.dumps(certificate))):
+        for name in ("L", "M", "K", "Sigma", "D"):
+            assert not getattr(twin, name).flags.writeable
+
+
+def test_every_changed_digit_is_noticed(path):
+    text = path.read_text()
+    digits = [i for i, letter in enumerate(text) if letter.isdigit()]
+    for i in digits[:: max(1, len(digits) // 200)]:
+        changed = text[:i] + str((int(text[i]) + 1) % 10) + text[i + 1 :]
+        path.write_text(changed)
+        with pytest.raises(CertificateError):
+            Certificate.load(path)
+
+
+def test_every_truncation_is_noticed(path):
+    data = path.read_bytes()
+    for length in range(0, len(data) - 2, 37):
+        path.write_bytes(data[:length])
+        with pytest.raises(CertificateError):
+            Certificate.load(path)
+
+
+@pytest.mark.parametrize(
+    "content", ["", "{}", "[]", "null", '"text"', '{"format": "other"}', "[" * 100_000, "\x00\xff"]
+)
+def test_files_of_another_kind_are_refused_in_one_sentence(content, tmp_path):
+    path = tmp_path / "file.json"
+    path.write_text(content, encoding="latin-1")
+    with pytest.raises(CertificateError) as caught:
+        Certificate.load(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_file_is_named(tmp_path):
+    with pytest.raises(CertificateError, match=r"nowhere.json: No such file"):
+        Certificate.load(tmp_path / "nowhere.json")
+
+
+def test_numbers_that_are_not_finite_are_refused_even_with_a_fitting_checksum(certificate, path):
+    from shields.certificate import _digest
+
+    for change in (
+        {"L": [[float("nan"), 0.0], [0.0, 1.0]]},
+        {"K": "no"},
+        {"Sigma": [[1.0]]},
+        {"multipliers": {}},
+        {"multipliers": 3},
+    ):
+        document = json.loads(path.read_text())
+        document["certificate"] |= change
+        literal = json.loads(json.dumps(document["certificate"]), parse_float=str, parse_int=str)
+        document["sha256"] = _digest(literal)
+        path.write_text(json.dumps(document))
+        with pytest.raises(CertificateError):
+            Certificate.load(path)
+        certificate.save(path)
+
+
+def test_a_failed_save_leaves_nothing_behind(certificate, tmp_path):
+    with pytest.raises(FileNotFoundError):
+        certificate.save(tmp_path / "no" / "such" / "folder.json")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(IsADirectoryError):
+        certificate.save(tmp_path / "folder")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["folder"]

@@ -1,0 +1,142 @@
+import pickle
+
+import numpy as np
+import pytest
+
+from ncs_gym import LinearPlant, truck_trailer
+from shields import Infeasible, synthesize, verify
+from shields.semidefinite import largest_box_ellipsoid
+from tests.plants import random_plant
+
+
+def area_share(certificate, plant):
+    return np.sqrt(np.linalg.det(certificate.L) / np.linalg.det(largest_box_ellipsoid(plant.C)))
+
+
+def test_without_process_noise_the_paper_plant_reaches_the_largest_ellipsoid_in_the_box():
+    plant = truck_trailer(process_noise_cov=np.zeros((2, 2)))
+    certificate = synthesize(plant)
+    assert verify(certificate, plant).valid
+    assert np.sqrt(np.linalg.det(certificate.L)) / 4.0 >= 0.999
+
+
+@pytest.mark.parametrize(
+    ("mass", "gamma", "share"), [(1000.0, 5e-4, 0.9999), (4000.0, 5e-4, 0.9995), (4000.0, 2e-3, 0.997)]
+)
+def test_truck_trailers_reach_the_measured_volumes(mass, gamma, share):
+    plant = truck_trailer(mass=mass, gamma=gamma)
+    certificate = synthesize(plant)
+    assert verify(certificate, plant).valid
+    assert area_share(certificate, plant) >= share
+
+
+@pytest.mark.parametrize("m", [1, 2])
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+@pytest.mark.parametrize("seed", range(3))
+def test_random_stable_plants_get_a_certificate_that_verifies(seed, n, m):
+    plant = random_plant(seed, n, m, p=max(1, n - 1))
+    certificate = synthesize(plant)
+    assert verify(certificate, plant).valid
+    assert 0.3 < area_share(certificate, plant) <= 1.0
+
+
+def test_closed_loop_stays_inside_for_the_worst_state_error_and_disturbance():
+    # By another route than the condition: projected ascent over (x, e, d) on x+' M x+.
+    plant = random_plant(3, 2, 1)
+    certificate = synthesize(plant)
+    M, closed, gain = certificate.M, plant.A + plant.B @ certificate.K, plant.B @ certificate.K
+    rng = np.random.default_rng(0)
+    worst = 0.0
+    for _ in range(200):
+        x, e, d = (s.sample_boundary(rng) for s in (certificate.safe_set, certificate.error_set, plant.disturbance))
+        for _ in range(100):
+            slope = M @ (closed @ x + gain @ e + d)
+            x = certificate.safe_set.extreme_point(closed.T @ slope)
+            e = certificate.error_set.extreme_point(gain.T @ slope)
+            d = plant.disturbance.extreme_point(slope)
+        end = closed @ x + gain @ e + d
+        worst = max(worst, end @ M @ end)
+    assert 0.9 < worst <= 1.0
+
+
+def test_box_with_more_rows_than_states_is_respected():
+    angle = np.linspace(0.0, np.pi, 7)[:-1]
+    plant = truck_trailer(C=np.stack([np.cos(angle), np.sin(angle)], axis=1) / 2.0)
+    certificate = synthesize(plant)
+    assert verify(certificate, plant).valid
+    assert max(row @ certificate.L @ row for row in plant.C) <= 1.0
+    assert area_share(certificate, plant) > 0.99
+
+
+def test_units_do_not_change_what_is_found():
+    base = truck_trailer(mass=4000.0)
+    units = np.diag([1e3, 1e-2])
+    inverse = np.linalg.inv(units)
+    plant = LinearPlant(
+        A=units @ base.A @ inverse,
+        B=units @ base.B,
+        C=base.C @ inverse,
+        u_max=4.0,
+        dt=0.5,
+        gamma=0.0,
+        process_noise_cov=units @ (2e-4 * np.eye(2)) @ units,
+        measurement_noise_cov=1e-4 * np.eye(2),
+    )
+    same = truck_trailer(mass=4000.0, gamma=0.0, process_noise_cov=2e-4 * np.eye(2), initial_cov=np.zeros((2, 2)))
+    assert area_share(synthesize(plant), plant) == pytest.approx(area_share(synthesize(same), same), abs=2e-3)
+
+
+def test_too_large_disturbance_is_infeasible_and_says_by_how_much():
+    plant = truck_trailer(gamma=0.5)
+    with pytest.raises(Infeasible, match=r"disturbance and error radii shrink to .*%") as caught:
+        synthesize(plant)
+    assert caught.value.binding == "I"
+    assert 0.0 < caught.value.shortfall < 1.0
+    factor = (1.0 - caught.value.shortfall) ** 2 * 0.9
+    zero = np.zeros((2, 2))
+    assert synthesize(truck_trailer(gamma=factor * 0.5, process_noise_cov=zero, initial_cov=zero)) is not None
+    copy = pickle.loads(pickle.dumps(caught.value))
+    assert (copy.binding, copy.shortfall) == (caught.value.binding, caught.value.shortfall)
+
+
+def test_unstable_plant_is_infeasible_for_want_of_an_error_bound():
+    plant = LinearPlant(A=[[1.1]], B=[[1.0]], C=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-4)
+    with pytest.raises(Infeasible, match="spectral radius") as caught:
+        synthesize(plant)
+    assert caught.value.binding == "E1"
+    assert caught.value.shortfall == pytest.approx(0.1)
+
+
+def test_unbounded_box_is_infeasible():
+    with pytest.raises(Infeasible, match="unbounded") as caught:
+        synthesize(truck_trailer(C=np.array([[0.5, 0.0]])))
+    assert caught.value.binding == "S"
+
+
+def test_weak_input_is_what_binds():
+    # Disturbances that the plant alone cannot stand inside the box, but a strong input can.
+    def with_limit(u_max):
+        return LinearPlant(
+            A=[[0.9, 0.35], [0.0, 0.8]], B=[[0.0], [1.0]], C=np.eye(2), u_max=u_max, dt=0.1, gamma=1.95e-3,
+            measurement_noise_cov=1e-6 * np.eye(2), initial_cov=1e-8 * np.eye(2),
+        )  # fmt: skip
+
+    assert verify(synthesize(with_limit(5.0)), with_limit(5.0)).valid
+    with pytest.raises(Infeasible) as caught:
+        synthesize(with_limit(1e-4))
+    assert caught.value.binding == "U"
+
+
+def test_unknown_method_is_refused(plant):
+    with pytest.raises(ValueError, match="method must be"):
+        synthesize(plant, method="magic")
+
+
+def test_synthesis_is_deterministic(loaded, certificate):
+    np.testing.assert_array_equal(synthesize(loaded).L, certificate.L)
+
+
+def test_progress_is_told(loaded):
+    lines = []
+    synthesize(loaded, progress=lines.append)
+    assert any("volume" in line for line in lines)

@@ -1,0 +1,102 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ncs_gym import truck_trailer
+from shields import CertificateError, synthesize, verify
+from shields.verification import require_valid
+from tests.plants import random_plant
+
+
+def broken(certificate, plant) -> list[str]:
+    return [condition.name for condition in verify(certificate, plant).conditions if not condition.holds]
+
+
+def shares(certificate, **change):
+    return replace(certificate, multipliers=replace(certificate.multipliers, **change))
+
+
+def test_synthesized_certificate_is_valid(certificate, loaded):
+    report = verify(certificate, loaded)
+    assert report.valid
+    assert all(condition.margin >= 0.0 for condition in report.conditions)
+    names = " ".join(condition.name for condition in report.conditions)
+    assert all(mark in names for mark in ("(E0)", "(E1)", "(I)", "(S) c_1", "(S) c_2", "(U)", "D:", "N:", "r0:"))
+
+
+MUTATIONS = {
+    "shrunken M": (lambda c: replace(c, L=1.01 * c.L), ["(S)"]),
+    "slightly enlarged L": (lambda c: replace(c, L=(1 + 1e-5) * c.L), ["(S)"]),
+    "shrunken L": (lambda c: replace(c, L=0.002 * c.L), ["(I)"]),
+    "wrong sign of K": (lambda c: replace(c, K=-40.0 * c.K - 1.0), ["(I)", "(U)"]),
+    "large K": (lambda c: replace(c, K=c.K + 4.0), ["(I)", "(U)"]),
+    "shrunken Sigma": (lambda c: replace(c, Sigma=0.5 * c.Sigma), ["(E1)"]),
+    "tiny Sigma": (lambda c: replace(c, Sigma=1e-4 * c.Sigma), ["(E0)", "(E1)"]),
+    "small D": (lambda c: replace(c, D=0.9 * c.D), ["D:"]),
+    "D a hair too small": (lambda c: replace(c, D=(1 - 2e-9) * c.D), ["D:"]),
+    "swapped shares": (lambda c: shares(c, state=c.multipliers.disturbance, disturbance=c.multipliers.state), ["(I)"]),
+    "wrong rate": (lambda c: shares(c, error=0.999), ["(E1)"]),
+    "shares above one": (lambda c: shares(c, state=0.99, estimate=0.5), ["lx + le + ld"]),
+    "negative share": (lambda c: shares(c, estimate=-0.1), ["lx, le, ld, s > 0"]),
+    "zero share": (lambda c: shares(c, disturbance=0.0), ["lx, le, ld, s > 0"]),
+    "rate of one": (lambda c: shares(c, error=1.0), ["0 < lam_e < 1"]),
+    "input share of one": (lambda c: shares(c, inputs=(1.0,)), ["0 < lam_e < 1"]),
+    "no input share": (lambda c: shares(c, inputs=()), ["shapes"]),
+    "infinite share": (lambda c: shares(c, rounding=float("inf")), ["finite"]),
+    "NaN share": (lambda c: shares(c, state=float("nan")), ["finite"]),
+    "lopsided L": (lambda c: replace(c, L=c.L + 1e-12 * np.eye(2, k=1)), ["L > 0", "(I)"]),
+    "flat L": (lambda c: replace(c, L=np.diag([3.9, 0.0])), ["L > 0", "(I)"]),
+    "negative L": (lambda c: replace(c, L=-c.L), ["L > 0", "(I)"]),
+    "other plant": (lambda c: replace(c, fingerprint="0" * 64), ["plant"]),
+    "other size": (lambda c: replace(c, L=np.eye(3), K=np.ones((1, 3)), Sigma=np.eye(3), D=np.eye(3)), ["shapes"]),
+}
+
+
+@pytest.mark.parametrize("name", MUTATIONS)
+def test_mutation_is_rejected_for_the_right_condition(name, certificate, loaded):
+    mutate, expected = MUTATIONS[name]
+    found = broken(mutate(certificate), loaded)
+    assert len(found) >= 1
+    for mark in expected:
+        assert any(mark in condition for condition in found), (mark, found)
+    with pytest.raises(CertificateError):
+        require_valid(mutate(certificate), loaded)
+
+
+def test_failed_conditions_have_a_negative_margin(certificate, loaded):
+    for mutate, _ in MUTATIONS.values():
+        assert all(c.margin < 0.0 for c in verify(mutate(certificate), loaded).conditions if not c.holds)
+
+
+def test_float32_rounding_of_actions_is_part_of_the_condition():
+    # Without room for it a certificate that is tight in (I) would pass; the exact D_u must reject it.
+    plant = random_plant(3, 2, 1)
+    certificate = synthesize(plant)
+    assert verify(certificate, plant).valid
+    assert broken(shares(certificate, rounding=1e-30), plant) != []
+
+
+def test_plant_with_a_looser_bound_rejects_the_certificate(certificate, loaded):
+    looser = truck_trailer(mass=4000.0, gamma=6e-4)
+    assert not verify(replace(certificate, fingerprint=looser.fingerprint), looser).valid
+    worse_start = truck_trailer(mass=4000.0, initial_cov=0.1 * np.eye(2))
+    found = broken(replace(certificate, fingerprint=worse_start.fingerprint), worse_start)
+    assert any("(E0)" in name for name in found)
+
+
+def test_margins_agree_with_floating_point(certificate, loaded):
+    margins = {condition.name.split()[0]: condition.margin for condition in verify(certificate, loaded).conditions}
+    c, p, shares_ = certificate, loaded, certificate.multipliers
+    grown = p.A @ c.Sigma @ p.A.T / shares_.error + c.D / (1 - shares_.error)
+    assert margins["(E1)"] == pytest.approx(np.linalg.eigvalsh(c.Sigma - grown)[0], rel=1e-6)
+    closed, gain = p.A + p.B @ c.K, p.B @ c.K
+    grown = closed @ c.L @ closed.T / shares_.state + gain @ c.Sigma @ gain.T / shares_.estimate
+    D_u = (1 + shares_.rounding) * c.D + (1 + 1 / shares_.rounding) * p.B @ p.B.T * (4.0 * 2**-24) ** 2
+    assert margins["(I)"] == pytest.approx(np.linalg.eigvalsh(c.L - grown - D_u / shares_.disturbance)[0], rel=1e-5)
+
+
+def test_report_prints_one_line_per_condition(certificate, loaded):
+    lines = str(verify(replace(certificate, K=certificate.K + 4.0), loaded)).splitlines()
+    assert any(line.startswith("BROKEN") and "(U)" in line for line in lines)
+    assert any(line.startswith("holds") and "(E1)" in line for line in lines)
