@@ -10,8 +10,9 @@ import gymnasium as gym
 import numpy as np
 import torch
 from stable_baselines3 import PPO
+from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.utils import LinearSchedule, configure_logger
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import ncs_gym  # noqa: F401  (registers the environments)
@@ -113,7 +114,7 @@ def train(
         DummyVecEnv([lambda: _monitored(env_id, shielding) for _ in range(settings.envs)]), gamma=settings.discount
     )
     model = _ppo(env, settings, seed)
-    model.set_logger(configure_logger(0, str(log_folder) if log_folder else None, "ppo"))
+    model.set_logger(configure(str(log_folder), ["tensorboard"]) if log_folder else Logger(None, []))
     callback = SafetyCallback(on_progress)
     model.learn(steps, callback=callback)
     env.training = False

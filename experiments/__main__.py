@@ -7,7 +7,6 @@ import os
 import sys
 from pathlib import Path
 
-COMMANDS = ("compare", "synthesize", "verify")
 ERROR = 2
 INTERRUPTED = 130
 
@@ -32,34 +31,28 @@ def main() -> None:
 def _parse() -> object:
     import tyro
 
-    from experiments.certificates import SynthesizeSettings, VerifySettings
+    from experiments.settings import CompareSettings, SynthesizeSettings, VerifySettings
 
-    commands: dict = {"synthesize": SynthesizeSettings, "verify": VerifySettings}
-    missing = _missing_for_training()
-    if not missing:
-        from experiments.compare import CompareSettings
-
-        commands = {"compare": CompareSettings} | commands
-    elif sys.argv[1:2] == ["compare"]:
-        raise ModuleNotFoundError(
-            f"ncs compare needs {', '.join(missing)}: install the training extra, pip install 'ncs-gym[train]'"
-        )
     return tyro.extras.subcommand_cli_from_dict(
-        commands, prog="ncs", description="Safe learning control over imperfect networks."
+        {"compare": CompareSettings, "synthesize": SynthesizeSettings, "verify": VerifySettings},
+        prog="ncs",
+        description="Safe learning control over imperfect networks.",
     )
 
 
 def _run(settings: object) -> None:
-    from experiments.certificates import SynthesizeSettings, VerifySettings, synthesize_file, verify_file
+    from experiments.settings import CompareSettings, SynthesizeSettings
 
-    if isinstance(settings, SynthesizeSettings):
-        synthesize_file(settings)
-    elif isinstance(settings, VerifySettings):
-        verify_file(settings)
-    else:
+    if isinstance(settings, CompareSettings):
+        _require_training_extra()
         from experiments.compare import compare
 
         compare(settings)
+        return
+    from experiments.certificates import synthesize_file, verify_file
+
+    run = synthesize_file if isinstance(settings, SynthesizeSettings) else verify_file
+    run(settings)
 
 
 def _require_own_agents() -> None:
@@ -73,9 +66,13 @@ def _require_own_agents() -> None:
         )
 
 
-def _missing_for_training() -> list[str]:
+def _require_training_extra() -> None:
     packages = ("stable_baselines3", "torch", "tensorboard", "pyarrow")
-    return [name for name in packages if importlib.util.find_spec(name) is None]
+    missing = [name for name in packages if importlib.util.find_spec(name) is None]
+    if missing:
+        raise ModuleNotFoundError(
+            f"this command needs {', '.join(missing)}: install the training extra, pip install 'ncs-gym[train]'"
+        )
 
 
 def _sentence(error: Exception) -> str:

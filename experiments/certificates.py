@@ -3,48 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import asdict
 
 import gymnasium as gym
-import tyro
 
+from experiments.settings import SynthesizeSettings, VerifySettings
 from ncs_gym import LinearPlant, scenarios
 from ncs_gym.scenarios import ENTRY_POINTS
 from shields import Certificate, CertificateError, Report, synthesize, verify
 from shields.storage import write_atomically
-
-
-@dataclass(frozen=True, kw_only=True)
-class SynthesizeSettings:
-    """Synthesizes a certificate for an environment's plant, verifies it exactly and saves it.
-
-    Attributes:
-        env: Id of a registered environment.
-        out: File for the certificate (JSON).
-        seed: Accepted by every command; the synthesis is deterministic and does not use it.
-    """
-
-    env: str = "ncs_gym/TruckTrailerCruise-v0"
-    out: Path = Path("certificate.json")
-    seed: int = 0
-
-
-@dataclass(frozen=True, kw_only=True)
-class VerifySettings:
-    """Verifies a certificate in exact rational arithmetic against the plant it was made for.
-
-    Attributes:
-        file: The certificate (JSON).
-        env: Id of a registered environment; without it, the one whose plant has the certificate's fingerprint.
-        out: File for the verdicts (JSON).
-        seed: Accepted by every command; the verification is deterministic and does not use it.
-    """
-
-    file: tyro.conf.Positional[Path]
-    env: str | None = None
-    out: Path | None = None
-    seed: int = 0
 
 
 def synthesize_file(settings: SynthesizeSettings) -> None:
@@ -86,9 +53,9 @@ def plant_of(env_id: str) -> LinearPlant:
     """Returns the plant of a registered environment.
 
     Raises:
-        ValueError: If the id is not one of ours, or needs a plant of the user's.
+        ValueError: If the id is not one of ours that has a plant of its own.
     """
-    if env_id not in ENTRY_POINTS:
+    if env_id not in _with_plant():
         raise ValueError(f"unknown environment {env_id!r}; known are {', '.join(_with_plant())}")
     return gym.make(env_id).unwrapped.plant
 

@@ -6,20 +6,20 @@ import io
 import json
 import platform
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium as gym
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from agents.settings import PPOSettings
 from experiments.certificates import plant_of
 from experiments.figures import as_png, episode_figure, phase_figure, training_figure
 from experiments.pool import run_all
 from experiments.report import html_report
+from experiments.settings import CompareSettings
 from experiments.summary import summarize_arm, table_text, way_covered
 from experiments.unit import Unit, UnitResult
 from ncs_gym import LinearPlant
@@ -30,43 +30,6 @@ from shields.verification import require_valid
 
 # What `--smoke` shrinks the run to: enough to pass through every part.
 SMOKE_STEPS, SMOKE_EPISODES, SMOKE_RUNS = 4_096, 10, 2
-
-
-@dataclass(frozen=True, kw_only=True)
-class CompareSettings:
-    """Trains PPO with and without the shield and compares violations, return and interventions.
-
-    Synthesizes and exactly verifies a certificate, trains paired runs (equal seeds meet the same draws of nature),
-    evaluates each on the same episodes, prints a table and leaves summary.json, episodes.parquet, report.html, figures,
-    models, TensorBoard events and the certificate in the output folder.
-
-    Attributes:
-        env: Id of a registered environment.
-        out: Output folder; created if it does not exist, results in it are replaced.
-        seed: Of the experiment; runs use seed, seed + 1, ...
-        runs: Paired runs (training seeds) per arm.
-        steps: Training steps per run.
-        episodes: Evaluation episodes per run.
-        mode: What the shield does with an unsafe action: the closest safe input, or the certified u = K x_hat.
-        penalty: Subtracted from the training reward per intervention.
-        certificate: File to use instead of synthesizing one.
-        jobs: Worker processes.
-        smoke: Shrink the run to a minute, to see that everything works.
-        ppo: Settings of PPO.
-    """
-
-    env: str = "ncs_gym/TruckTrailerCruise-v0"
-    out: Path = Path("runs/compare")
-    seed: int = 0
-    runs: int = 3
-    steps: int = 150_000
-    episodes: int = 200
-    mode: Literal["project", "switch"] = "project"
-    penalty: float = 0.0
-    certificate: Path | None = None
-    jobs: int = 2
-    smoke: bool = False
-    ppo: PPOSettings = field(default_factory=PPOSettings)
 
 
 def compare(settings: CompareSettings) -> None:

@@ -1,0 +1,80 @@
+"""What each command can be told; importing this is cheap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from agents.settings import PPOSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareSettings:
+    """Trains PPO with and without the shield and compares violations, return and interventions.
+
+    Synthesizes and exactly verifies a certificate, trains paired runs (equal seeds meet the same draws of nature),
+    evaluates each on the same episodes, prints a table and leaves summary.json, episodes.parquet, report.html, figures,
+    models, TensorBoard events and the certificate in the output folder.
+
+    Attributes:
+        env: Id of a registered environment.
+        out: Output folder; created if it does not exist, results in it are replaced.
+        seed: Of the experiment; runs use seed, seed + 1, ...
+        runs: Paired runs (training seeds) per arm.
+        steps: Training steps per run.
+        episodes: Evaluation episodes per run.
+        mode: What the shield does with an unsafe action: the closest safe input, or the certified u = K x_hat.
+        penalty: Subtracted from the training reward per intervention.
+        certificate: File to use instead of synthesizing one.
+        jobs: Worker processes.
+        smoke: Shrink the run to a minute, to see that everything works.
+        ppo: Settings of PPO.
+    """
+
+    env: str = "ncs_gym/TruckTrailerCruise-v0"
+    out: Path = Path("runs/compare")
+    seed: int = 0
+    runs: int = 3
+    steps: int = 150_000
+    episodes: int = 200
+    mode: Literal["project", "switch"] = "project"
+    penalty: float = 0.0
+    certificate: Path | None = None
+    jobs: int = 2
+    smoke: bool = False
+    ppo: PPOSettings = field(default_factory=PPOSettings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SynthesizeSettings:
+    """Synthesizes a certificate for an environment's plant, verifies it exactly and saves it.
+
+    Attributes:
+        env: Id of a registered environment.
+        out: File for the certificate (JSON).
+        seed: Accepted by every command; the synthesis is deterministic and does not use it.
+    """
+
+    env: str = "ncs_gym/TruckTrailerCruise-v0"
+    out: Path = Path("certificate.json")
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerifySettings:
+    """Verifies a certificate in exact rational arithmetic against the plant it was made for.
+
+    Attributes:
+        file: The certificate (JSON).
+        env: Id of a registered environment; without it, the one whose plant has the certificate's fingerprint.
+        out: File for the verdicts (JSON).
+        seed: Accepted by every command; the verification is deterministic and does not use it.
+    """
+
+    file: tyro.conf.Positional[Path]
+    env: str | None = None
+    out: Path | None = None
+    seed: int = 0

@@ -1,0 +1,178 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ncs_gym import Ellipsoid
+from shields import CertificateError, SafetyFilter, synthesize
+from tests.plants import random_plant
+
+
+def worst_next_level(certificate, plant, estimate, shape, u, rng, tries=20):
+    """Largest x+' M x+ over the states the estimate allows and all disturbances, by ascent from many starts."""
+    M, errors = certificate.M, Ellipsoid(shape)
+    center = plant.A @ estimate + plant.B @ u
+    worst = 0.0
+    for _ in range(tries):
+        e, d = errors.sample_boundary(rng), plant.disturbance.sample_boundary(rng)
+        for _ in range(40):
+            slope = M @ (center - plant.A @ e + d)
+            e, d = errors.extreme_point(-plant.A.T @ slope), plant.disturbance.extreme_point(slope)
+        end = center - plant.A @ e + d
+        worst = max(worst, float(end @ M @ end))
+    return worst
+
+
+@pytest.fixture(scope="module", params=[(2, 1), (3, 2), (4, 3)], ids=str)
+def case(request):
+    n, m = request.param
+    plant = random_plant(3, n, m)
+    return plant, synthesize(plant)
+
+
+@pytest.mark.parametrize("mode", ["project", "switch"])
+def test_a_passed_test_keeps_every_possible_next_state_inside(case, mode):
+    plant, certificate = case
+    shield, rng = SafetyFilter(certificate, plant, mode), np.random.default_rng(0)
+    passed = projected = 0
+    for _ in range(150):
+        estimate = 1.4 * certificate.safe_set.sample(rng)
+        shape = certificate.Sigma * rng.uniform(0.05, 1.0)
+        decision = shield.decide(estimate, shape, rng.uniform(-1, 1, plant.m) * plant.u_max)
+        projected += decision.reason == "projected"
+        assert (np.abs(decision.input) <= plant.u_max).all()
+        if decision.passed:
+            passed += 1
+            assert worst_next_level(certificate, plant, estimate, shape, decision.input, rng) <= 1.0
+    assert passed > 20
+    assert (projected > 5) is (mode == "project")
+
+
+def test_an_input_that_passes_is_returned_untouched(case):
+    plant, certificate = case
+    shield = SafetyFilter(certificate, plant)
+    u = 1e-3 * plant.u_max
+    decision = shield.decide(np.zeros(plant.n), 0.01 * certificate.Sigma, u)
+    assert not decision.intervened
+    assert decision.input is u
+    assert decision.reason == "safe"
+
+
+def test_projected_input_is_expressible_in_float32_and_the_closest(case):
+    plant, certificate = case
+    shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(1)
+    root = np.linalg.cholesky(certificate.M).T
+    checked = 0
+    for _ in range(200):
+        estimate = 1.2 * certificate.safe_set.sample(rng)
+        wanted = rng.uniform(-1, 1, plant.m) * plant.u_max
+        shape = 0.3 * certificate.Sigma
+        decision = shield.decide(estimate, shape, wanted)
+        if decision.reason != "projected":
+            continue
+        checked += 1
+        action = (decision.input / plant.u_max).astype(np.float32)
+        np.testing.assert_array_equal(plant.u_max * action.astype(np.float64), decision.input)
+        # No random admissible input is closer by more than the rounding.
+        radius = 1.0 - shield.spread(shape)
+        others = rng.uniform(-1, 1, (4000, plant.m)) * plant.u_max
+        near = decision.input + (wanted - decision.input) * rng.uniform(0, 1, (500, 1))
+        others = np.vstack([others, near])
+        norms = np.linalg.norm((root @ (plant.A @ estimate))[:, None] + root @ plant.B @ others.T, axis=0)
+        distances = np.linalg.norm(others - wanted, axis=1)
+        best = distances[norms <= radius].min(initial=np.inf)
+        assert np.linalg.norm(decision.input - wanted) <= best + 1e-5
+    assert checked > 10
+
+
+def test_switch_falls_back_to_the_gain(case):
+    plant, certificate = case
+    shield, rng = SafetyFilter(certificate, plant, "switch"), np.random.default_rng(2)
+    seen = 0
+    for _ in range(100):
+        estimate = 1.3 * certificate.safe_set.sample(rng)
+        decision = shield.decide(estimate, certificate.Sigma, plant.u_max * np.sign(rng.standard_normal(plant.m)))
+        if decision.fallback:
+            seen += 1
+            expected = np.clip(certificate.K @ estimate, -plant.u_max, plant.u_max)
+            np.testing.assert_allclose(decision.input, expected, atol=1e-6 * plant.u_max.max())
+    assert seen > 10
+
+
+def test_fallback_within_the_assumptions_needs_no_clipping(case):
+    plant, certificate = case
+    rng = np.random.default_rng(3)
+    for _ in range(300):
+        x, e = certificate.safe_set.sample_boundary(rng), certificate.error_set.sample_boundary(rng)
+        assert (np.abs(certificate.K @ (x + e)) <= plant.u_max).all()
+
+
+@pytest.mark.parametrize(
+    "proposed", [np.array([np.nan]), np.array([np.inf]), np.zeros(2), np.array([4.0000001]), np.zeros((1, 1))]
+)
+def test_invalid_input_becomes_the_fallback(certificate, loaded, proposed):
+    estimate = np.array([0.5, 0.1])
+    decision = SafetyFilter(certificate, loaded).decide(estimate, certificate.Sigma, proposed)
+    assert decision.reason == "invalid"
+    assert decision.intervened
+    assert decision.fallback
+    np.testing.assert_allclose(decision.input, certificate.K @ estimate, atol=1e-6)
+
+
+@pytest.mark.parametrize("estimate", [np.array([np.nan, 0.0]), np.zeros(3), np.array([np.inf, 0.0])])
+def test_unusable_estimate_gives_zero_and_no_promise(certificate, loaded, estimate):
+    decision = SafetyFilter(certificate, loaded).decide(estimate, certificate.Sigma, np.ones(1))
+    assert decision.reason == "invalid"
+    assert not decision.passed
+    assert not decision.fallback
+    assert (decision.input == 0.0).all()
+
+
+def test_unusable_error_shape_gives_zero_and_no_promise(certificate, loaded):
+    decision = SafetyFilter(certificate, loaded).decide(np.zeros(2), np.full((2, 2), np.nan), np.ones(1))
+    assert not decision.passed
+    assert not decision.fallback
+
+
+@given(st.integers(0, 100_000))
+@settings(max_examples=100, deadline=None)
+def test_known_inside_is_never_claimed_wrongly(seed):
+    plant = random_plant(3, 2, 1)
+    certificate = (
+        CERTIFICATES.setdefault("two", synthesize(plant)) if "two" not in CERTIFICATES else CERTIFICATES["two"]
+    )
+    shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(seed)
+    estimate, shape = 1.1 * certificate.safe_set.sample(rng), certificate.Sigma * rng.uniform(0, 1)
+    if shield.knows_inside(estimate, shape):
+        errors = Ellipsoid(shape)
+        assert all(certificate.safe_set.gauge(estimate - errors.sample_boundary(rng)) <= 1.0 for _ in range(50))
+
+
+CERTIFICATES: dict = {}
+
+
+def test_margin_is_the_slack_of_the_test(certificate, loaded):
+    shield = SafetyFilter(certificate, loaded)
+    estimate, u = np.array([0.4, -0.3]), np.array([1.0])
+    center = loaded.A @ estimate + loaded.B @ u
+    expected = 1.0 - shield.spread(certificate.Sigma) - np.sqrt(center @ certificate.M @ center)
+    decision = shield.decide(estimate, certificate.Sigma, u)
+    assert decision.margin == pytest.approx(expected, abs=1e-12)
+    assert shield.margin(estimate, certificate.Sigma, u) == decision.margin
+
+
+def test_spread_is_an_upper_bound_on_what_error_and_disturbance_can_do(certificate, loaded):
+    shield, rng = SafetyFilter(certificate, loaded), np.random.default_rng(0)
+    level = worst_next_level(certificate, loaded, np.zeros(2), certificate.Sigma, np.zeros(1), rng)
+    assert np.sqrt(level) <= shield.spread(certificate.Sigma) <= 1.2 * np.sqrt(level)
+
+
+def test_filter_refuses_what_does_not_verify(certificate, loaded, plant):
+    with pytest.raises(CertificateError, match=r"\(S\)"):
+        SafetyFilter(replace(certificate, L=1.1 * certificate.L), loaded)
+    with pytest.raises(CertificateError, match="another plant"):
+        SafetyFilter(certificate, plant)
+    with pytest.raises(ValueError, match="mode must be one of"):
+        SafetyFilter(certificate, loaded, "hope")

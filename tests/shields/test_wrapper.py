@@ -1,0 +1,364 @@
+import pickle
+import warnings
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import (
+    Autoreset,
+    ClipAction,
+    FrameStackObservation,
+    MaxAndSkipObservation,
+    NormalizeObservation,
+    RecordEpisodeStatistics,
+    RepeatAction,
+    RescaleAction,
+    StickyAction,
+    TimeLimit,
+    TransformAction,
+)
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+from stable_baselines3.common.monitor import Monitor
+
+from ncs_gym import AdversarialDisturbance, Channel, Ellipsoid
+from shields import Certificate, CertificateError, SafetyShield, synthesize
+from shields.proof import ALARM, LARGE_ERROR, NOT_KNOWN_INSIDE, OTHER_INPUT, OTHER_STEPS
+from tests.plants import random_plant
+
+CRUISE = "ncs_gym/TruckTrailerCruise-v0"
+KEYS = {
+    "shield_intervened": bool,
+    "input_proposed": np.ndarray,
+    "shield_correction": float,
+    "shield_margin": float,
+    "shield_guaranteed": bool,
+    "shield_reason": str,
+    "episode_interventions": int,
+}
+
+
+def shielded(certificate, mode="project", penalty=0.0, **kwargs) -> SafetyShield:
+    return SafetyShield(gym.make(CRUISE, **kwargs), certificate, mode=mode, penalty=penalty)
+
+
+def play(env, policy, steps=200, **reset):
+    """All infos of one episode, the reset's first."""
+    infos = [env.reset(**reset)[1]]
+    for _ in range(steps):
+        *_, truncated, info = env.step(policy(infos[-1]))
+        infos.append(info)
+        if truncated:
+            break
+    return infos
+
+
+def full(info):
+    return np.ones(1, np.float32)
+
+
+def test_checkers_pass_on_the_shielded_environment(certificate):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", ".*is different from the unwrapped version.*")
+        check_env(SafetyShield(gym.make(CRUISE).unwrapped, certificate))
+        check_env_sb3(SafetyShield(gym.make(CRUISE).unwrapped, certificate))
+
+
+def test_info_gains_the_same_keys_and_types_always(certificate):
+    plain = gym.make(CRUISE).reset(seed=0)[1]
+    for info in play(shielded(certificate), full, seed=0):
+        assert set(info) == set(plain) | set(KEYS)
+        assert {key: type(info[key]) for key in KEYS} == KEYS
+        assert info["shield_correction"] == pytest.approx(np.linalg.norm(info["input"] - info["input_proposed"]))
+        assert info["shield_guaranteed"] is (info["shield_reason"] == "")
+
+
+@pytest.mark.parametrize("mode", ["project", "switch"])
+def test_full_throttle_is_overridden_and_stays_inside(certificate, mode):
+    infos = play(shielded(certificate, mode), full, seed=0)
+    assert infos[-1]["episode_interventions"] == sum(info["shield_intervened"] for info in infos) > 50
+    assert infos[-1]["is_success"] == 1.0
+    assert all(info["shield_guaranteed"] for info in infos)
+    assert max(info["state"] @ certificate.M @ info["state"] for info in infos) <= 1.0
+    bare = play(gym.make(CRUISE), full, seed=0)
+    assert bare[-1]["is_success"] == 0.0
+
+
+def test_projection_corrects_less_than_switching(certificate):
+    total = {
+        mode: sum(info["shield_correction"] for info in play(shielded(certificate, mode), full, seed=0)[1:10])
+        for mode in ("project", "switch")
+    }
+    assert total["project"] < total["switch"]
+
+
+def test_idle_shield_is_the_identity_bit_for_bit(certificate):
+    actions = np.random.default_rng(0).uniform(-0.05, 0.05, (200, 1)).astype(np.float32)
+    plain, shield = gym.make(CRUISE), shielded(certificate)
+    first, second = plain.reset(seed=1), shield.reset(seed=1)
+    np.testing.assert_array_equal(first[0], second[0])
+    for action in actions:
+        one, other = plain.step(action), shield.step(action)
+        np.testing.assert_array_equal(one[0], other[0])
+        assert one[1:4] == other[1:4]
+        for key, value in one[4].items():
+            np.testing.assert_array_equal(value, other[4][key])
+        assert not other[4]["shield_intervened"]
+
+
+def test_the_callers_own_action_is_passed_on(certificate):
+    seen = []
+
+    class Spy(gym.Wrapper):
+        def step(self, action):
+            seen.append(action)
+            return self.env.step(action)
+
+    env = SafetyShield(Spy(gym.make(CRUISE)), certificate)
+    env.reset(seed=0)
+    action = np.array([0.01], np.float64)
+    env.step(action)
+    assert seen[0] is action
+    for _ in range(5):
+        env.step(np.ones(1, np.float32))
+    assert all(env.action_space.contains(a) for a in seen[1:])
+
+
+def test_float64_actions_are_judged_at_full_precision(certificate):
+    infos = play(shielded(certificate), lambda info: np.array([1.0]), seed=0)
+    assert all(info["shield_guaranteed"] for info in infos)
+
+
+def test_penalty_is_paid_per_intervention_only(certificate):
+    free, paid = shielded(certificate), shielded(certificate, penalty=0.5)
+    free.reset(seed=0)
+    paid.reset(seed=0)
+    for _ in range(30):
+        _, reward, *_, info = free.step(full(None))
+        _, other, *_ = paid.step(full(None))
+        assert other == pytest.approx(reward - 0.5 * info["shield_intervened"])
+
+
+def test_certificate_is_synthesized_once_per_plant(monkeypatch):
+    from shields import wrapper
+
+    calls = []
+    monkeypatch.setattr(wrapper, "_synthesized", {})
+    monkeypatch.setattr(wrapper, "synthesize", lambda plant: calls.append(plant) or synthesize(plant))
+    one, other = SafetyShield(gym.make(CRUISE)), SafetyShield(gym.make(CRUISE))
+    assert one.certificate is other.certificate
+    assert len(calls) == 1
+
+
+def test_wrong_certificates_are_refused(certificate, tmp_path):
+    with pytest.raises(CertificateError, match="another plant"):
+        SafetyShield(gym.make("ncs_gym/TruckTrailer-v0"), certificate)
+    with pytest.raises(CertificateError, match="does not verify"):
+        shielded(replace(certificate, L=1.5 * certificate.L))
+    with pytest.raises(ValueError, match="must be a Certificate"):
+        shielded("certificate.json")
+    certificate.save(tmp_path / "c.json")
+    shielded(Certificate.load(tmp_path / "c.json"))
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "word"), [({"mode": "hope"}, "mode"), ({"penalty": -1.0}, "penalty"), ({"penalty": np.nan}, "penalty")]
+)
+def test_bad_settings_are_refused(certificate, kwargs, word):
+    with pytest.raises(ValueError, match=f"{word} must be"):
+        shielded(certificate, **kwargs)
+
+
+@pytest.mark.parametrize("action", [np.array([np.nan]), np.zeros(2), None, "left"])
+def test_bad_action_raises_before_anything_moves(certificate, action):
+    env = shielded(certificate)
+    env.reset(seed=0)
+    before = env.unwrapped.steps
+    with pytest.raises(ValueError, match="the action must be finite"):
+        env.step(action)
+    assert env.unwrapped.steps == before
+
+
+@pytest.mark.parametrize(
+    "inner",
+    [
+        ClipAction,
+        lambda env: RescaleAction(env, np.float32(-0.5), np.float32(0.5)),
+        lambda env: StickyAction(env, 0.5),
+        lambda env: RepeatAction(env, 2),
+        lambda env: MaxAndSkipObservation(env, 2),
+        lambda env: TransformAction(env, lambda a: -a, env.action_space),
+        Autoreset,
+        SafetyShield,
+    ],
+)
+def test_wrappers_that_change_actions_are_refused_inside(inner):
+    with pytest.raises(ValueError, match="the shield must be inside"):
+        SafetyShield(inner(gym.make(CRUISE)))
+
+
+def test_other_environments_are_refused():
+    with pytest.raises(ValueError, match="needs an NCSEnv"):
+        SafetyShield(gym.make("Pendulum-v1"))
+
+
+@pytest.mark.parametrize(
+    "outer",
+    [
+        lambda env: RescaleAction(env, np.float32(-0.5), np.float32(0.5)),
+        lambda env: FrameStackObservation(env, 3),
+        NormalizeObservation,
+        RecordEpisodeStatistics,
+        Monitor,
+        lambda env: TimeLimit(env, 50),
+        lambda env: StickyAction(env, 0.5),
+    ],
+)
+def test_wrappers_outside_work(certificate, outer):
+    env = outer(shielded(certificate))
+    env.reset(seed=0)
+    for _ in range(40):
+        *_, info = env.step(env.action_space.sample())
+        assert info["shield_guaranteed"]
+
+
+def test_wrappers_that_only_look_may_be_inside(certificate):
+    env = SafetyShield(RecordEpisodeStatistics(NormalizeObservation(gym.make(CRUISE))), certificate)
+    assert all(info["shield_guaranteed"] for info in play(env, full, seed=0))
+
+
+def test_spec_recreates_the_shielded_environment(certificate):
+    env = gym.make(shielded(certificate, "switch", 0.25).spec)
+    assert isinstance(env, SafetyShield)
+    assert (env.filter.mode, env.penalty) == ("switch", 0.25)
+
+
+def test_shielded_environment_survives_pickling(certificate):
+    env = shielded(certificate)
+    play(env, full, 20, seed=0)
+    twin = pickle.loads(pickle.dumps(env))
+    for _ in range(20):
+        np.testing.assert_array_equal(env.step(full(None))[4]["state"], twin.step(full(None))[4]["state"])
+
+
+def test_shield_never_reads_the_true_state(certificate):
+    class Blind(gym.Wrapper):
+        def reset(self, **kwargs):
+            observation, info = self.env.reset(**kwargs)
+            return observation, {key: value for key, value in info.items() if key in SEEN}
+
+        def step(self, action):
+            observation, reward, terminated, truncated, info = self.env.step(action)
+            return observation, reward, terminated, truncated, {key: info[key] for key in SEEN}
+
+    SEEN = ("estimate", "error_shape", "input", "assumption_violated")
+    inputs = [play(SafetyShield(layer(gym.make(CRUISE)), certificate), full, seed=0) for layer in (Blind, gym.Wrapper)]
+    for one, other in zip(*inputs, strict=True):
+        np.testing.assert_array_equal(one["input"], other["input"])
+
+
+# The proof and its assumptions, each broken on purpose.
+
+
+def test_start_outside_the_safe_set_is_reported_and_recovers(certificate):
+    env = shielded(certificate)
+    infos = play(env, lambda info: np.zeros(1, np.float32), 60, seed=0, options={"state": [2.2, 0.0]})
+    assert infos[0]["shield_reason"] == NOT_KNOWN_INSIDE
+    for info in infos:
+        if info["shield_guaranteed"]:
+            assert info["state"] @ certificate.M @ info["state"] <= 1.0
+    assert infos[-1]["shield_guaranteed"]
+
+
+def test_start_on_the_boundary_of_the_safe_set_is_known(certificate):
+    edge = (1 - 1e-12) * certificate.safe_set.extreme_point(np.array([1.0, 0.4]))
+    infos = play(
+        shielded(certificate, disturbance=AdversarialDisturbance(certificate.M)), full, options={"state": edge}
+    )
+    assert all(info["shield_guaranteed"] for info in infos)
+    assert max(info["state"] @ certificate.M @ info["state"] for info in infos) <= 1.0
+
+
+def test_initial_set_that_leaves_the_safe_set_is_not_trusted(certificate):
+    env = shielded(certificate, initial_set=Ellipsoid(4.5 * np.eye(2)))
+    reasons = {env.reset(seed=seed)[1]["shield_reason"] for seed in range(40)}
+    assert reasons == {"", NOT_KNOWN_INSIDE}
+
+
+def test_too_large_disturbance_is_noticed_and_latched(certificate):
+    def gust(rng, plant, nominal_next):
+        return 2.5 * plant.disturbance.extreme_point(rng.standard_normal(2))
+
+    env = shielded(certificate, disturbance=gust, allow_assumption_violation=True, channel=Channel())
+    infos = play(env, full, seed=0)
+    broken = [info["shield_reason"] == ALARM for info in infos]
+    assert any(broken)
+    assert all(broken[broken.index(True) :])
+
+
+def test_changed_input_is_noticed_and_latched(certificate):
+    class Meddler(gym.Wrapper):
+        calls = 0
+
+        def step(self, action):
+            self.calls += 1
+            return self.env.step(action * 0.9 if self.calls == 3 else action)
+
+    infos = play(SafetyShield(Meddler(gym.make(CRUISE)), certificate), full, 10, seed=0)
+    assert [info["shield_reason"] for info in infos] == [""] * 3 + [OTHER_INPUT] * 8
+
+
+def test_repeated_step_is_noticed(certificate):
+    class Twice(gym.Wrapper):
+        def step(self, action):
+            self.env.step(action)
+            return self.env.step(action)
+
+    infos = play(SafetyShield(Twice(gym.make(CRUISE)), certificate), full, 3, seed=0)
+    assert [info["shield_reason"] for info in infos] == ["", OTHER_STEPS, OTHER_STEPS, OTHER_STEPS]
+
+
+def test_forged_packet_is_noticed(certificate):
+    env = shielded(certificate, channel=Channel())
+    env.reset(seed=0)
+    core = env.unwrapped
+    honest = core._measure
+    core._measure = lambda: honest() + 0.6
+    assert env.step(full(None))[4]["shield_reason"] == ALARM
+
+
+def test_error_ellipsoid_outside_the_certified_one_is_reported(certificate, loaded):
+    # A certificate for better sensors at the start, whose Sigma is smaller than the running ellipsoid may become.
+    env = shielded(certificate, channel=Channel(loss=1.0))
+    smaller = replace(certificate, Sigma=0.3 * certificate.Sigma)
+    object.__setattr__(env.filter, "certificate", smaller)
+    infos = play(env, full, 30, seed=0)
+    assert infos[0]["shield_guaranteed"]
+    assert LARGE_ERROR in {info["shield_reason"] for info in infos}
+
+
+def test_alarm_is_cleared_by_a_new_episode(certificate):
+    env = shielded(certificate, channel=Channel())
+    core = env.unwrapped
+    env.reset(seed=0)
+    honest = core._measure
+    core._measure = lambda: honest() + 0.6
+    env.step(full(None))
+    core._measure = honest
+    assert env.reset()[1]["shield_guaranteed"]
+
+
+def test_several_inputs_with_partial_measurements_are_shielded():
+    plant = random_plant(1, 3, 2, p=2)
+    channel = Channel(loss=0.4, quantization_step=0.01, delay=1, jitter=2)
+    rng = np.random.default_rng(0)
+    for mode in ("project", "switch"):
+        env = SafetyShield(
+            gym.make("ncs_gym/LinearNCS-v0", plant=plant, channel=channel, disturbance="adversarial"), mode=mode
+        )
+        infos = play(env, lambda info: np.sign(rng.standard_normal(2)).astype(np.float32), seed=0)
+        assert all(info["shield_guaranteed"] for info in infos)
+        assert infos[-1]["is_success"] == 1.0
+        assert infos[-1]["episode_interventions"] > 10
