@@ -53,7 +53,9 @@ def compare(settings: CompareSettings) -> None:
     print(f"certificate: {len(verification.conditions)} conditions hold in exact arithmetic{size}", flush=True)
     units = _units(settings, certificate)
     length = gym.spec(settings.env).max_episode_steps or 1
-    total = sum((unit.steps if unit.learner == "ppo" else 0) + unit.episodes * length for unit in units)
+    rollout = settings.ppo.rollout * settings.ppo.envs
+    training = -(-settings.steps // rollout) * rollout  # whole rollouts
+    total = sum((training if unit.learner == "ppo" else 0) + unit.episodes * length for unit in units)
     results = run_all(units, settings.jobs, total)
     summary = _summary(settings, plant, units, results)
     findings = _findings(summary)

@@ -9,6 +9,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from experiments.unit import UnitResult
 from ncs_gym import LinearPlant
@@ -28,62 +29,48 @@ STYLE = {
 
 
 def training_figure(arms: dict[str, Sequence[UnitResult]]) -> Figure:
-    """Returns return, violating steps so far and intervention rate against training steps; a line per run."""
+    """Returns return, violating steps so far and intervention rate against training steps; a thin line per run."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11, 3.4), layout="constrained")
         axes = figure.subplots(1, 3)
         for name, results in arms.items():
-            for i, result in enumerate(results):
-                label = name if i == 0 else None
-                steps = np.array([point.steps for point in result.history])
-                color = COLORS[name]
-                axes[0].plot(
-                    steps, [point.episode_return for point in result.history], color=color, label=label, lw=1.4
-                )
-                axes[1].plot(
-                    steps, [point.violation_steps for point in result.history], color=color, label=label, lw=1.4
-                )
-                overridden = np.array([point.interventions for point in result.history])
-                rate = np.diff(overridden, prepend=0) / np.diff(steps, prepend=0)
-                if name == "shielded":
-                    axes[2].plot(steps, 100.0 * rate, color=color, label=label, lw=1.4)
+            steps = np.array([point.steps for point in results[0].history])
+            overridden = _per_run(results, "interventions")
+            rates = 100.0 * np.diff(overridden, axis=1, prepend=0) / np.diff(steps, prepend=0)
+            curves = [_per_run(results, "episode_return"), _per_run(results, "violation_steps"), rates]
+            for axis, values in zip(axes, curves, strict=True):
+                if axis is axes[2] and not overridden.any():
+                    continue
+                axis.plot(steps, values.T, color=COLORS[name], lw=0.8, alpha=0.4)
+                axis.plot(steps, values.mean(axis=0), color=COLORS[name], lw=2.0, label=name)
         _label(axes[0], "training steps", "mean return of recent episodes", "Return")
         _label(axes[1], "training steps", "violating steps so far", "Violations of the true state")
         _label(axes[2], "training steps", "actions overridden [%]", "Interventions of the shield")
         axes[2].set_ylim(bottom=0.0)
-        for axis in axes[:2]:
-            axis.legend()
+        axes[1].yaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
         for axis in axes:
-            axis.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:.0f}k")
+            axis.legend()
+            axis.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k")
         return figure
 
 
 def phase_figure(plant: LinearPlant, certificate: Certificate, arms: dict[str, Sequence[UnitResult]]) -> Figure:
     """Returns the first two states of the first evaluation episode of each run, with safe box and safe set."""
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(9.6, 4.8), layout="constrained")
+        figure = Figure(figsize=(9.6, 5.0), layout="constrained")
         axes = figure.subplots(1, len(arms), sharex=True, sharey=True, squeeze=False)[0]
+        x, y = (_with_unit(*pair) for pair in zip(plant.state_names[:2], plant.state_units[:2], strict=True))
+        handles = {}
         for axis, (name, results) in zip(axes, arms.items(), strict=True):
-            for i, result in enumerate(results):
+            for result in results:
                 states = result.trajectory.states
-                axis.plot(
-                    states[:, 0],
-                    states[:, 1],
-                    color=COLORS[name],
-                    lw=0.9,
-                    alpha=0.85,
-                    label=None if i else "true state",
-                )
+                (handles[name],) = axis.plot(states[:, 0], states[:, 1], color=COLORS[name], lw=0.9, alpha=0.85)
                 outside = plant.constraint_values(states.T).max(axis=0) > 0.0
                 if outside.any():
-                    axis.plot(*states[outside, :2].T, "x", color="black", ms=5, label=None if i else "violation")
-            _draw_sets(axis, plant, certificate)
-            titles = [
-                f"{label} [{unit}]" if unit else label
-                for label, unit in zip(plant.state_names, plant.state_units, strict=True)
-            ]
-            _label(axis, titles[0], titles[1] if axis is axes[0] else "", f"{name}: one evaluation episode per run")
-            axis.legend(loc="upper left", fontsize=8.5)
+                    (handles["violation"],) = axis.plot(*states[outside, :2].T, "x", color="black", ms=5)
+            handles |= _draw_sets(axis, plant, certificate)
+            _label(axis, x, y if axis is axes[0] else "", f"{name}: one evaluation episode per run")
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
         return figure
 
 
@@ -107,8 +94,7 @@ def episode_figure(plant: LinearPlant, arms: dict[str, Sequence[UnitResult]]) ->
         top.axhline(1.0, color="black", lw=1.0, ls="--")
         top.annotate("limit", (0.0, 1.0), xytext=(2, 3), textcoords="offset points", fontsize=8.5)
         _label(top, "", "largest |c_j x|", "The same episode with and without the shield")
-        unit = f" [{plant.input_units[0]}]" if plant.input_units[0] else ""
-        _label(bottom, "time [s]", f"{plant.input_names[0]}{unit}", "")
+        _label(bottom, "time [s]", _with_unit(plant.input_names[0], plant.input_units[0]), "")
         top.legend(loc="upper right", ncols=2)
         bottom.legend(loc="upper right", ncols=3, fontsize=8.5)
         bottom.set_ylim(-1.1 * plant.u_max[0], 1.55 * plant.u_max[0])
@@ -122,15 +108,25 @@ def as_png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def _draw_sets(axis: Axes, plant: LinearPlant, certificate: Certificate) -> None:
-    """Draws the safe set's and the safe box's extent in the plane of the first two states."""
+def _per_run(results: Sequence[UnitResult], name: str) -> np.ndarray:
+    """Returns one quantity of the training history, shape (runs, rollouts)."""
+    return np.array([[getattr(point, name) for point in result.history] for result in results])
+
+
+def _draw_sets(axis: Axes, plant: LinearPlant, certificate: Certificate) -> dict[str, Line2D]:
+    """Draws the extent of safe set and safe box in the plane of the first two states."""
     angle = np.linspace(0.0, 2.0 * np.pi, 361)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     plane = certificate.L[:2, :2]
-    axis.plot(*(np.linalg.cholesky(plane) @ circle), color="black", lw=1.3, label="safe set S")
+    handles = {"safe set S": axis.plot(*(np.linalg.cholesky(plane) @ circle), color="black", lw=1.3)[0]}
     if plant.C.shape == (2, 2):
         corners = np.linalg.solve(plant.C, np.array([[1, 1, -1, -1, 1], [1, -1, -1, 1, 1]], dtype=float))
-        axis.plot(*corners, color="black", lw=1.0, ls="--", label="safe box")
+        handles["safe box"] = axis.plot(*corners, color="black", lw=1.0, ls="--")[0]
+    return handles
+
+
+def _with_unit(name: str, unit: str) -> str:
+    return f"{name} [{unit}]" if unit else name
 
 
 def _label(axis: Axes, x: str, y: str, title: str) -> None:
