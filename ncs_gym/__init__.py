@@ -11,7 +11,7 @@ from ncs_gym.disturbance import (
 )
 from ncs_gym.ellipsoid import Ellipsoid
 from ncs_gym.env import NCSEnv
-from ncs_gym.error_set import ErrorSet, UnstablePlantError, certified_error_set
+from ncs_gym.error_set import ErrorSet, ErrorSetError, UnstablePlantError, certified_error_set
 from ncs_gym.estimator import Estimator
 from ncs_gym.plant import LinearPlant, truck_trailer
 from ncs_gym.scenarios import register_all
@@ -27,6 +27,7 @@ __all__ = [
     "Disturbance",
     "Ellipsoid",
     "ErrorSet",
+    "ErrorSetError",
     "Estimator",
     "GilbertElliott",
     "LinearPlant",

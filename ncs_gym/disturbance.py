@@ -12,7 +12,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ncs_gym.ellipsoid import Ellipsoid
 from ncs_gym.frozen import FrozenArrays, as_covariance, as_number
 from ncs_gym.plant import LinearPlant
 
@@ -25,7 +24,8 @@ TOLERANCE = 1e-9
 class Disturbance(FrozenArrays):
     """A disturbance in {d : d'd <= gamma}; truncated process noise is added to it.
 
-    Subclasses with `replaces_process_noise` use the whole of E(D), process noise included.
+    Subclasses with `replaces_process_noise` use the whole of E(D), process noise included. The environment checks what
+    does not come from a class of this module at every step.
     """
 
     replaces_process_noise: ClassVar[bool] = False
@@ -131,7 +131,7 @@ class SphereDisturbance(Disturbance):
     replaces_process_noise: ClassVar[bool] = True
 
     def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
-        return (1.0 - ROUNDING) * plant.disturbance.sample_boundary(rng)
+        return (1.0 - ROUNDING) * plant.nominal_disturbance.sample_boundary(rng)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,11 +155,11 @@ class AdversarialDisturbance(Disturbance):
 
     def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
         if self.M is not None:
-            return (1.0 - ROUNDING) * plant.disturbance.farthest_point(nominal_next, self.M)
+            return (1.0 - ROUNDING) * plant.nominal_disturbance.farthest_point(nominal_next, self.M)
         values = plant.C @ nominal_next
-        worst = int(np.argmax(np.abs(values) + plant.disturbance.support(plant.C)))
+        worst = int(np.argmax(np.abs(values) + plant.nominal_disturbance.support(plant.C)))
         direction = plant.C[worst] * (1.0 if values[worst] >= 0.0 else -1.0)
-        return (1.0 - ROUNDING) * plant.disturbance.extreme_point(direction)
+        return (1.0 - ROUNDING) * plant.nominal_disturbance.extreme_point(direction)
 
     def check(self, plant):  # noqa: D102
         if self.M is not None and self.M.shape != (plant.n, plant.n):
@@ -169,27 +169,34 @@ class AdversarialDisturbance(Disturbance):
 
 @dataclass(frozen=True, eq=False)
 class CallableDisturbance(Disturbance):
-    """A user's function (rng, plant, nominal_next) -> d, checked against E(D) at every step.
+    """A user's function (rng, plant, nominal_next) -> d, shape (n,).
 
     Attributes:
-        function: Returns shape (n,).
-        allow_assumption_violation: Lets d outside E(D) pass.
+        function: Called once a step.
     """
 
     function: Callable[[np.random.Generator, LinearPlant, np.ndarray], np.ndarray]
-    allow_assumption_violation: bool = False
     replaces_process_noise: ClassVar[bool] = True
 
     def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
-        d = np.array(self.function(rng, plant, nominal_next.copy()), dtype=np.float64)
-        if d.shape != (plant.n,) or not np.isfinite(d).all():
-            raise ValueError(f"the disturbance must be finite with shape ({plant.n},), got {d!r}")
-        return d if self.allow_assumption_violation else _into(plant.disturbance, d)
+        return self.function(rng, plant, nominal_next.copy())
 
 
-def _into(bound: Ellipsoid, d: np.ndarray) -> np.ndarray:
-    """Returns d, scaled back by no more than TOLERANCE if rounding put it outside the bound."""
-    size = bound.gauge(d)
+def checked(plant: LinearPlant, d: Any, *, allow_assumption_violation: bool) -> np.ndarray:
+    """Returns a disturbance as an array of shape (n,) inside E(D), scaled back if rounding put it outside.
+
+    Raises:
+        ValueError: If it is not finite, wrongly shaped, or further outside than TOLERANCE and that is not allowed.
+    """
+    try:
+        d = np.array(d, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"the disturbance must be finite with shape ({plant.n},), got {d!r}") from error
+    if d.shape != (plant.n,) or not np.isfinite(d).all():
+        raise ValueError(f"the disturbance must be finite with shape ({plant.n},), got {d!r}")
+    if allow_assumption_violation:
+        return d
+    size = plant.disturbance.gauge(d)
     if size > 1.0 + TOLERANCE:
         raise ValueError(
             f"the disturbance {d.tolist()} lies outside its bound E(D): sqrt(d' D^-1 d) = {size:.6g} > 1 "
@@ -207,6 +214,11 @@ BY_NAME: dict[str, type[Disturbance]] = {
 }
 
 
+def stays_inside(source: Disturbance) -> bool:
+    """Returns whether a disturbance lies in E(D) by construction: that of this module's own classes does."""
+    return type(source) in BY_NAME.values()
+
+
 def as_disturbance(value: Any, plant: LinearPlant, allow_assumption_violation: bool) -> Disturbance:
     """Returns the settings for a name, a `Disturbance` or a callable (rng, plant, nominal_next) -> d.
 
@@ -216,7 +228,7 @@ def as_disturbance(value: Any, plant: LinearPlant, allow_assumption_violation: b
     if isinstance(value, str) and value in BY_NAME:
         value = BY_NAME[value]()
     elif not isinstance(value, Disturbance) and callable(value):
-        value = CallableDisturbance(value, allow_assumption_violation)
+        value = CallableDisturbance(value)
     if not isinstance(value, Disturbance):
         raise ValueError(f"disturbance must be one of {sorted(BY_NAME)}, a Disturbance or a callable, got {value!r}")
     problem = value.check(plant)

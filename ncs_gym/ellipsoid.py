@@ -147,7 +147,10 @@ def is_inside(inner: np.ndarray, outer: np.ndarray) -> bool:
     if difference.shape == (2, 2):  # four times faster than an eigenvalue call, and the common case
         a, b, d = difference.item(0), difference.item(1), difference.item(3)
         return a >= 0.0 and d >= 0.0 and a * d - b * b >= 0.0
-    return bool(np.linalg.eigvalsh(difference)[0] >= 0.0)
+    # In coordinates where the outer shape has unit diagonal: an eigenvalue's rounding then does not depend on units.
+    extent = np.sqrt(np.maximum(np.diag(outer), 0.0))
+    extent[extent == 0.0] = 1.0
+    return bool(np.linalg.eigvalsh(difference / np.outer(extent, extent))[0] >= 0.0)
 
 
 def outer_sum(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -182,7 +185,8 @@ def sum_gauge(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> float
     """
 
     def gauge(share: float) -> float:
-        return Ellipsoid(first / share + second / (1.0 - share)).gauge(point)
+        shape = first / share + second / (1.0 - share)
+        return Ellipsoid(0.5 * (shape + shape.T)).gauge(point)
 
     if not np.any(second):
         return Ellipsoid(first).gauge(point)

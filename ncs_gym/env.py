@@ -9,11 +9,11 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from ncs_gym.channel import Channel, Link
-from ncs_gym.disturbance import as_disturbance
+from ncs_gym.disturbance import as_disturbance, checked, stays_inside
 from ncs_gym.ellipsoid import Ellipsoid
 from ncs_gym.error_set import certified_error_set
 from ncs_gym.estimator import Estimator
-from ncs_gym.frozen import as_count
+from ncs_gym.frozen import as_count, read_only
 from ncs_gym.plant import LinearPlant
 from ncs_gym.task import Regulation, Task
 
@@ -80,8 +80,14 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         render_mode: None; there is no rendering yet.
         horizon: Steps the observation space is sized for.
 
+    Attributes:
+        steps: Steps taken in this episode.
+        episodes: Episodes begun.
+        start: What the start of this episode is known to lie in: `initial_set`, or the state given as an option.
+
     Raises:
         UnstablePlantError: If the plant is not Schur stable.
+        ErrorSetError: If it is too ill-conditioned.
         ValueError: If a setting is of the wrong kind or does not fit the plant.
     """
 
@@ -113,13 +119,16 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             raise ValueError(f"render_mode must be None, got {render_mode!r}")
         self.render_mode = render_mode
         self.terminate_on_violation = bool(terminate_on_violation)
+        self.allow_assumption_violation = bool(allow_assumption_violation)
         self.error_set = certified_error_set(plant)
         self.estimator = Estimator(plant, self.channel, self.error_set)
         self.horizon = as_count(horizon, "horizon", low=1)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)
         bound = observation_bound(self).astype(np.float32)
         self.observation_space = Box(-bound, bound, dtype=np.float32)
-        self.steps = 0
+        self.steps = self.episodes = 0
+        self.start: Ellipsoid | np.ndarray = self.initial_set
+        self._consistent = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -136,13 +145,16 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         rng = self.np_random
         start = _start_option(options, self.plant.n)
+        self.start = self.initial_set if start is None else read_only(start)
         self._state = self.initial_set.sample(rng) if start is None else start
         self._task_memory = self.task.begin(rng, self.plant)
         self._disturbance_memory = self.disturbance.begin(rng, self.plant)
         self._link = Link(self.channel, rng)
         self.estimator.reset(self._state + self.plant.initial_noise.sample(rng))
         self.steps = 0
+        self.episodes += 1
         self._violations = 0.0
+        self._consistent = True
         info = self._info(np.zeros(self.plant.m), packet_arrived=False)
         return self._observation(), info
 
@@ -151,8 +163,12 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
 
         Raises:
             ValueError: If the action is not finite or wrongly shaped; nothing has moved then.
+            gymnasium.error.ResetNeeded: If there was no reset, or an earlier step failed half-way.
         """
         u = applied_input(self.plant, action)
+        if not self._consistent:
+            raise gym.error.ResetNeeded("call reset: there was none, or an earlier step failed half-way")
+        self._consistent = False
         rng = self.np_random
         nominal_next = self.plant.A @ self._state + self.plant.B @ u
         self._state = nominal_next + self._draw_disturbance(nominal_next)
@@ -164,12 +180,17 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         reward = self.task.reward(self.plant, self._task_memory, self._state, u)
         info = self._info(u, packet_arrived=bool(packets))
         terminated = self.terminate_on_violation and info["cost"] > 0.0
+        self._consistent = True
         return self._observation(), float(reward), terminated, False, info
 
     def _draw_disturbance(self, nominal_next: np.ndarray) -> np.ndarray:
         rng, source = self.np_random, self.disturbance
         d = source.draw(rng, self.plant, nominal_next, self.steps, self._disturbance_memory)
-        return d if source.replaces_process_noise else d + self.plant.process_noise.sample(rng)
+        if not source.replaces_process_noise:
+            d = d + self.plant.process_noise.sample(rng)
+        if stays_inside(source):
+            return d
+        return checked(self.plant, d, allow_assumption_violation=self.allow_assumption_violation)
 
     def _measure(self) -> np.ndarray:
         return self.plant.H @ self._state + self.plant.sensor_noise.sample(self.np_random)
@@ -189,7 +210,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             "estimate": belief.mean.copy(),
             "estimation_error": belief.mean - self._state,
             "error_shape": belief.shape.copy(),
-            "input": u,
+            "input": u.copy(),
             "constraint_values": values,
             "cost": cost,
             "measurement_age": self.estimator.age,

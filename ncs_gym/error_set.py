@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_discrete_lyapunov
+from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov
 from scipy.optimize import minimize_scalar
 
 from ncs_gym.frozen import FrozenArrays
@@ -13,6 +14,8 @@ from ncs_gym.plant import LinearPlant
 
 # Growth c of the optimal set: gives (E1) slack that an exact check can see, and updates room (theory.md section 3).
 GROWTH = 1.1
+# Beyond this many roundings of its largest entry a checked inequality is taken to hold.
+ROUNDINGS = 100.0
 # Flat disturbances are thickened by this share of their mean extent, so that (E1) has slack in every direction.
 THICKENING = 1e-9
 # No set is thinner than this, in half-widths of the safe box (a perfectly known plant has no error at all).
@@ -21,6 +24,10 @@ THINNEST = 1e-6
 
 class UnstablePlantError(ValueError):
     """Without a promise from the channel no error bound exists for a plant that is not Schur stable."""
+
+
+class ErrorSetError(ValueError):
+    """No error set could be computed accurately enough."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -52,6 +59,7 @@ def certified_error_set(plant: LinearPlant) -> ErrorSet:
 
     Raises:
         UnstablePlantError: If the spectral radius of A is 1 or more.
+        ErrorSetError: If the plant is so ill-conditioned that the result fails (E0) or (E1).
     """
     radius = plant.spectral_radius
     if not radius < 1.0:
@@ -72,16 +80,45 @@ def certified_error_set(plant: LinearPlant) -> ErrorSet:
     slowest = max(radius**2, 1e-6)
     margin = 1e-4 * (1.0 - slowest)
     best = minimize_scalar(size, bounds=(slowest + margin, 1.0 - margin), method="bounded", options={"xatol": margin})
-    Sigma = T @ (GROWTH * _smallest_solution(A, D, first, float(best.x))) @ T.T
-    return ErrorSet(Sigma=0.5 * (Sigma + Sigma.T), rate=float(best.x))
+    rate = float(best.x)
+    scaled = GROWTH * _smallest_solution(A, D, first, rate)
+    _check(scaled, A, D, first, rate)
+    Sigma = T @ scaled @ T.T
+    return ErrorSet(Sigma=0.5 * (Sigma + Sigma.T), rate=rate)
+
+
+def _check(Sigma: np.ndarray, A: np.ndarray, D: np.ndarray, first: np.ndarray, rate: float) -> None:
+    """Raises unless (E0) and (E1) hold by more than rounding, in scaled coordinates.
+
+    Raises:
+        ErrorSetError: Naming the condition.
+    """
+    needs = {"(E0)": first, "(E1)": A @ Sigma @ A.T / rate + D / (1.0 - rate)}
+    for name, need in needs.items():
+        finite = np.isfinite(Sigma).all() and np.isfinite(need).all()
+        rounding = ROUNDINGS * len(A) * np.finfo(float).eps * np.abs(Sigma).max()
+        if not (finite and np.linalg.eigvalsh(Sigma - need)[0] > rounding):
+            raise ErrorSetError(f"no error set found: the plant is too ill-conditioned for {name} to hold in float64")
 
 
 def _smallest_solution(A: np.ndarray, D: np.ndarray, first: np.ndarray, rate: float) -> np.ndarray:
-    """Returns the Lyapunov solution of (E1) for one rate, enlarged until it covers `first`, shape (n, n)."""
-    scaled = A / np.sqrt(rate)
-    solution = solve_discrete_lyapunov(scaled, D / (1.0 - rate))
-    values, vectors = np.linalg.eigh(first - solution)
-    if values[-1] > 0.0:
-        missing = (vectors * np.maximum(values, 0.0)) @ vectors.T
-        solution = solution + solve_discrete_lyapunov(scaled, missing)
+    """Returns the Lyapunov solution of (E1) for one rate, enlarged until it covers `first`, shape (n, n).
+
+    What cannot be solved is infinite; what is solved badly, `_check` sees.
+    """
+    try:
+        solution = _lyapunov(A / np.sqrt(rate), D / (1.0 - rate))
+        values, vectors = np.linalg.eigh(first - solution)
+        if values[-1] > 0.0:
+            missing = (vectors * np.maximum(values, 0.0)) @ vectors.T
+            solution = solution + _lyapunov(A / np.sqrt(rate), missing)
+    except np.linalg.LinAlgError:
+        return np.full_like(A, np.inf)
     return 0.5 * (solution + solution.T)
+
+
+def _lyapunov(A: np.ndarray, source: np.ndarray) -> np.ndarray:
+    """Returns X = A X A' + source by the direct method (the other fails silently)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LinAlgWarning)
+        return solve_discrete_lyapunov(A, source, method="direct")

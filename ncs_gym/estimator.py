@@ -11,10 +11,10 @@ from filterpy.kalman import KalmanFilter
 from ncs_gym.channel import Channel, Packet
 from ncs_gym.ellipsoid import is_inside, outer_sum, sum_gauge
 from ncs_gym.error_set import ErrorSet, certified_error_set
-from ncs_gym.plant import LinearPlant
+from ncs_gym.plant import FLAT_INFLATION, LinearPlant
 
-# The diagonal of every computed shape grows by this much: more than the rounding of the computation, in any units.
-ROUNDING = 1e-12
+# Per dimension, the growth of computed shapes that covers the rounding of F S F' (see `_grown`).
+ROUNDING = 1e-13
 # An innovation this far beyond its exact bound counts as rounding, not as an alarm.
 ALARM_TOLERANCE = 1e-9
 # Shares mu that the set-membership gain is chosen from; any share is sound.
@@ -60,7 +60,10 @@ class Estimator:
         D, Sigma = plant.disturbance.shape, self.error_set.Sigma
         self._fallback = D / (1.0 - self.error_set.rate)
         noise = plant.sensor_error_with(channel.quantization_step).shape
-        self._noise = noise + ROUNDING * np.diag(np.diag(plant.H @ Sigma @ plant.H.T))
+        # Perfect sensors get a little noise, relative to what they measure: a larger bound is a bound.
+        self._noise = noise + FLAT_INFLATION * np.diag(np.diag(plant.H @ Sigma @ plant.H.T))
+        self._noise_extent = np.sqrt(np.diag(self._noise))
+        self._abs_A, self._abs_H = np.abs(plant.A), np.abs(plant.H)
         self._information = plant.H.T @ np.linalg.solve(self._noise, plant.H)
         self._identity = np.eye(plant.n)
         self._filter = _kalman_filter(plant, channel.quantization_step)
@@ -89,7 +92,7 @@ class Estimator:
             packets: In any order. Stamps from the future, from before the first step, older than the
                 replay buffer or seen before are discarded.
         """
-        self._inputs[self.step] = u
+        self._inputs[self.step] = np.array(u, dtype=np.float64)
         self.step += 1
         self.belief = self._priors[self.step] = self._predict(self.belief, u)
         for packet in packets:
@@ -132,11 +135,12 @@ class Estimator:
         Sigma itself is sound: E(shape) lies inside E(Sigma), which (E1) maps into itself.
         """
         A, D, Sigma = self.plant.A, self.plant.disturbance.shape, self.error_set.Sigma
-        moved = A @ shape @ A.T
-        predicted = _rounded_up(outer_sum(moved, D, self.plant.weight))
+        extent = self._abs_A @ np.sqrt(np.diag(shape))
+        moved = _grown(A @ shape @ A.T, extent)
+        predicted = outer_sum(moved, D, self.plant.weight)
         if is_inside(predicted, Sigma):
             return predicted
-        predicted = _rounded_up(moved / self.error_set.rate + self._fallback)
+        predicted = moved / self.error_set.rate + self._fallback
         return predicted if is_inside(predicted, Sigma) else Sigma
 
     def _update(self, belief: Belief, measurement: np.ndarray, step: int) -> Belief:
@@ -161,8 +165,11 @@ class Estimator:
     def _updated_shape(self, shape: np.ndarray, gain: np.ndarray) -> np.ndarray:
         """Returns (I-TH) Sigma_k (I-TH)'/mu + T N T'/(1-mu) with the trace-optimal mu: sound for any gain T."""
         kept = self._identity - gain @ self.plant.H
-        noise = gain @ self._noise @ gain.T
-        return _rounded_up(outer_sum(kept @ shape @ kept.T, noise, self.plant.weight))
+        size = np.abs(gain)
+        extent = np.sqrt(np.diag(shape))
+        carried = _grown(kept @ shape @ kept.T, extent + size @ (self._abs_H @ extent))
+        noise = _grown(gain @ self._noise @ gain.T, size @ self._noise_extent)
+        return outer_sum(carried, noise, self.plant.weight)
 
     def _membership_gain(self, shape: np.ndarray) -> np.ndarray:
         """Returns T_mu = S H'/mu (H S H'/mu + N/(1-mu))^-1, shape (n, p), with the trace-optimal mu.
@@ -190,10 +197,20 @@ class Estimator:
             self.alarm |= sum_gauge(residual, spread, self._noise) > 1.0 + ALARM_TOLERANCE
 
 
-def _rounded_up(shape: np.ndarray) -> np.ndarray:
-    """Returns a computed shape with its diagonal grown by ROUNDING (in place)."""
-    shape.flat[:: shape.shape[0] + 1] *= 1.0 + ROUNDING
-    return shape
+def _grown(product: np.ndarray, extent: np.ndarray) -> np.ndarray:
+    """Returns a computed F S F', symmetric and enlarged by its rounding in whatever units (in place).
+
+    With a = |F| sqrt(diag S) entry (i, j) is off by at most c eps a_i a_j, c of the order of n, and by Cauchy-Schwarz
+    such a matrix is at most n c eps diag(a^2). The few roundings of what follows are covered by D's own inflation.
+
+    Args:
+        product: F S F' as computed, shape (n, n).
+        extent: a, shape (n,).
+    """
+    size = len(extent)
+    product = 0.5 * (product + product.T)
+    product.flat[:: size + 1] += ROUNDING * size * extent**2
+    return product
 
 
 def _kalman_filter(plant: LinearPlant, quantization_step: float) -> KalmanFilter:

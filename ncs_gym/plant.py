@@ -12,11 +12,18 @@ import numpy as np
 from scipy.linalg import expm
 
 from ncs_gym.ellipsoid import Ellipsoid
-from ncs_gym.frozen import FrozenArrays, as_covariance, as_matrix, as_number
+from ncs_gym.frozen import FrozenArrays, as_covariance, as_matrix, as_number, read_only
 from ncs_gym.noise import SMALLEST_KEPT, TruncatedGaussian, chi2_quantile
 
 # Relative growth of every hard bound, so that rounding in sampling and quantizing stays inside (theory.md section 1).
 INFLATION = 1.0 + 1e-9
+# The same for directions in which a bound is flat: growth of its diagonal alone.
+FLAT_INFLATION = 1e-12
+# No disturbance set is thinner than this, in squared half-widths of the safe box. With (1+s) D + (1+1/s) F, s = 1e-9,
+# it makes room for F = (1e-14)^2: the rounding of a simulation in float64.
+SIMULATION_ROUNDING = 1e-19
+# Smaller truncation levels have no finite quantile in float64.
+SMALLEST_DELTA = 1e-12
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -34,7 +41,7 @@ class LinearPlant(FrozenArrays):
         process_noise_cov: Q, shape (n, n), truncated at chi2_{n,1-delta}; zero by default.
         measurement_noise_cov: R, shape (p, p), truncated at chi2_{p,1-delta}; zero by default.
         initial_cov: P0 of the first estimate, shape (n, n), truncated alike; zero by default.
-        delta: Probability mass that the truncation of each Gaussian removes, in (0, 0.999].
+        delta: Probability mass that the truncation of each Gaussian removes, in [1e-12, 0.999].
         state_names, state_units, input_names, input_units: For tables and figures.
 
     Raises:
@@ -68,11 +75,13 @@ class LinearPlant(FrozenArrays):
         self._set("A", A)
         self._set("B", B)
         self._set("C", as_matrix(self.C, (None, n), "C"))
+        if not np.abs(H).max(axis=1).all():
+            raise ValueError(f"every row of H must measure something, got {H.tolist()}")
         self._set("H", H)
         self._set("u_max", _as_limits(self.u_max, m))
         self._set("dt", as_number(self.dt, "dt", low=0.0, low_open=True))
         self._set("gamma", as_number(self.gamma, "gamma", low=0.0))
-        self._set("delta", as_number(self.delta, "delta", low=0.0, high=1.0 - SMALLEST_KEPT, low_open=True))
+        self._set("delta", as_number(self.delta, "delta", low=SMALLEST_DELTA, high=1.0 - SMALLEST_KEPT))
         for name, size in (("process_noise_cov", n), ("measurement_noise_cov", H.shape[0]), ("initial_cov", n)):
             value = getattr(self, name)
             self._set(name, np.zeros((size, size)) if value is None else as_covariance(value, size, name))
@@ -112,7 +121,7 @@ class LinearPlant(FrozenArrays):
     def weight(self) -> np.ndarray:
         """Positive definite W, shape (n, n), that measures ellipsoids in units of the safe box: C'C, regularized."""
         gram = self.C.T @ self.C
-        return gram + 1e-6 * np.diag(np.diag(gram) + np.trace(gram) / self.n * (np.diag(gram) == 0.0))
+        return read_only(gram + 1e-6 * np.diag(np.diag(gram) + np.trace(gram) / self.n * (np.diag(gram) == 0.0)))
 
     @cached_property
     def process_noise(self) -> TruncatedGaussian:
@@ -132,18 +141,24 @@ class LinearPlant(FrozenArrays):
     @cached_property
     def disturbance(self) -> Ellipsoid:
         """D, shape (n, n): holds d (with d'd <= gamma) plus the truncated process noise (theory.md section 1)."""
+        box = np.linalg.inv(self.weight)
+        return Ellipsoid(_inflated(self.nominal_disturbance.shape) + SIMULATION_ROUNDING * 0.5 * (box + box.T))
+
+    @cached_property
+    def nominal_disturbance(self) -> Ellipsoid:
+        """D before inflation: where extremal disturbances are drawn, so that their rounding stays inside E(D)."""
         ball = Ellipsoid(self.gamma * np.eye(self.n))
-        return Ellipsoid(INFLATION * _sum_or_other(ball, self.process_noise.bound).shape)
+        return _sum_or_other(ball, self.process_noise.bound)
 
     @cached_property
     def sensor_error(self) -> Ellipsoid:
         """Holds the sensor noise v, shape (p, p), without the channel's quantizer (see `sensor_error_with`)."""
-        return Ellipsoid(INFLATION * self.sensor_noise.bound.shape)
+        return Ellipsoid(_inflated(self.sensor_noise.bound.shape))
 
     def sensor_error_with(self, quantization_step: float) -> Ellipsoid:
         """Returns N, shape (p, p): sensor noise plus the ball of squared radius p q^2/4 around a quantizer's box."""
         ball = Ellipsoid(self.p * quantization_step**2 / 4.0 * np.eye(self.p))
-        return Ellipsoid(INFLATION * _sum_or_other(ball, self.sensor_noise.bound).shape)
+        return Ellipsoid(_inflated(_sum_or_other(ball, self.sensor_noise.bound).shape))
 
     @cached_property
     def initial_error(self) -> Ellipsoid:
@@ -240,6 +255,11 @@ def _as_limits(value: Any, size: int) -> np.ndarray:
     if limits.shape not in ((), (size,)) or not np.isfinite(limits).all() or (limits <= 0.0).any():
         raise ValueError(f"u_max must be a positive number or shape ({size},), got {value!r}")
     return np.broadcast_to(limits, (size,)).copy()
+
+
+def _inflated(shape: np.ndarray) -> np.ndarray:
+    """Returns a bound with room for the rounding of sampling it."""
+    return INFLATION * shape + FLAT_INFLATION * np.diag(np.diag(shape))
 
 
 def _sum_or_other(first: Ellipsoid, second: Ellipsoid) -> Ellipsoid:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import Ellipsoid
-from ncs_gym.frozen import FrozenArrays, as_matrix, as_number, read_only
+from ncs_gym.frozen import FrozenArrays, as_matrix, read_only
 from shields.storage import write_atomically
 
 FORMAT = "ncs-gym certificate 1"
@@ -43,6 +43,15 @@ class Multipliers:
     disturbance: float
     inputs: tuple[float, ...]
     rounding: float
+
+    def __post_init__(self) -> None:
+        """Raises CertificateError if a share is not a number."""
+        try:
+            for name in ("error", "state", "estimate", "disturbance", "rounding"):
+                object.__setattr__(self, name, float(getattr(self, name)))
+            object.__setattr__(self, "inputs", tuple(float(share) for share in self.inputs))
+        except (TypeError, ValueError) as error:
+            raise CertificateError(f"not a certificate: its multipliers must be numbers, {error}") from error
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -142,10 +151,7 @@ class Certificate(FrozenArrays):
 
 def _from_content(content: dict[str, Any]) -> dict[str, Any]:
     values = {entry.name: content[entry.name] for entry in fields(Certificate)}
-    shares = values["multipliers"]
-    inputs = tuple(as_number(share, "inputs") for share in shares["inputs"])
-    others = {name: as_number(shares[name], name) for name in shares if name != "inputs"}
-    values["multipliers"] = Multipliers(inputs=inputs, **others)
+    values["multipliers"] = Multipliers(**values["multipliers"])
     return values
 
 

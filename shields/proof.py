@@ -42,28 +42,29 @@ class ProofTracker:
             return NOT_KNOWN_INSIDE
         return "" if self._error_certified else LARGE_ERROR
 
-    def start(self, known_inside: bool, info: dict[str, Any]) -> None:
+    def start(self, known_inside: bool, at_start: bool, info: dict[str, Any]) -> None:
         """Begins an episode.
 
         Args:
             known_inside: Whether every possible start lies in S (`starts_inside`).
+            at_start: Whether the environment has not moved since.
             info: The environment's, from reset.
         """
-        self._broken = ""
+        self._broken = "" if at_start else OTHER_STEPS
         self._inside = known_inside
         self._observe(info)
 
-    def step(self, decision: Decision, steps_moved: int, info: dict[str, Any]) -> None:
+    def step(self, decision: Decision, one_step: bool, info: dict[str, Any]) -> None:
         """Moves one step on.
 
         Args:
             decision: What was decided before the step.
-            steps_moved: How many steps the environment moved.
+            one_step: Whether the environment moved exactly one step since the last call.
             info: The environment's, from step.
         """
         carried = self._inside and self._error_certified and decision.fallback
         self._inside = decision.passed or carried
-        if steps_moved != 1:
+        if not one_step:
             self._broken = self._broken or OTHER_STEPS
         elif not np.array_equal(info["input"], decision.input):
             self._broken = self._broken or OTHER_INPUT

@@ -8,7 +8,7 @@ from importlib.metadata import version
 
 import numpy as np
 
-from ncs_gym import LinearPlant, UnstablePlantError, certified_error_set
+from ncs_gym import ErrorSetError, LinearPlant, UnstablePlantError, certified_error_set
 from shields.certificate import Certificate
 from shields.semidefinite import (
     Design,
@@ -33,8 +33,9 @@ CLOSE_ENOUGH = 1e-3
 SMALLEST_GAIN = 1e-4
 # Room for exact verification, tried in turn.
 SLACKS = (1e-6, 1e-5, 1e-4, 1e-3)
-# The certificate's Sigma is larger than the environment's by this, so that another machine's rounding stays inside.
-SIGMA_GROWTH = 1.0 + 1e-9
+# The certificate's Sigma and D are larger than the environment's by this, so that another machine's rounding (of a
+# Lyapunov solution, of a chi-square quantile) stays inside.
+GROWTH = 1.0 + 1e-9
 
 Progress = Callable[[str], None]
 
@@ -84,16 +85,26 @@ def synthesize(plant: LinearPlant, method: str = "certified", *, progress: Progr
         errors = certified_error_set(plant)
     except UnstablePlantError as error:
         raise Infeasible(f"(E1) cannot hold: {error}", "E1", plant.spectral_radius - 1.0) from error
-    Sigma = SIGMA_GROWTH * errors.Sigma
+    except ErrorSetError as error:
+        raise Infeasible(str(error), "E1", 0.0) from error
+    Sigma = GROWTH * errors.Sigma
     problem = scaled_problem(plant, Sigma, largest_box_ellipsoid(plant.C))
+    failure = None
     for slack in SLACKS:
         design = _largest_set(problem, slack, progress or (lambda line: None))
         if design is None:
             break
         certificate = _certificate(plant, problem, design, Sigma, errors.rate, slack)
-        if verify(certificate, plant).valid:
+        report = verify(certificate, plant)
+        if report.valid:
             return certificate
-    raise _diagnosis(problem)
+        failed = next(condition for condition in report.conditions if not condition.holds)
+        failure = Infeasible(
+            f"a candidate was found, but in exact arithmetic {failed.name} fails by {-failed.margin:.3g}",
+            failed.name.split()[0].strip("():"),
+            -failed.margin,
+        )
+    raise failure or _diagnosis(problem)
 
 
 def _largest_set(problem: ScaledProblem, slack: float, progress: Progress) -> Design | None:
@@ -171,7 +182,7 @@ def _certificate(
         L=L,
         K=K,
         Sigma=Sigma,
-        D=plant.disturbance.shape,
+        D=GROWTH * plant.disturbance.shape,
         multipliers=as_multipliers(problem, design, rate),
         method="certified",
         fingerprint=plant.fingerprint,

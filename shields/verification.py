@@ -130,7 +130,9 @@ def _bounds(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]
     ellipsoid = scale(energy, noise)
     share = _trace_share(ball, ellipsoid)
     need = add(ball, ellipsoid) if share is None else add(scale(1 / share, ball), scale(1 / (1 - share), ellipsoid))
-    yield _matrix("D: holds the disturbance and the process noise", subtract(rational(certificate.D), need))
+    bound = rational(plant.disturbance.shape)
+    yield _matrix("D: the plant's holds the disturbance and the process noise", subtract(bound, need))
+    yield _matrix("D: the certificate's holds the plant's", subtract(rational(certificate.D), bound))
     sensor = scale(Fraction(plant.sensor_noise.energy), rational(plant.measurement_noise_cov))
     yield _matrix("N: holds the sensor noise", subtract(rational(plant.sensor_error.shape), sensor))
     first = scale(Fraction(plant.initial_noise.energy), rational(plant.initial_cov))
@@ -192,12 +194,19 @@ def _flag(name: str, holds: bool) -> Condition:
 
 
 def _scalar(name: str, slack: Fraction) -> Condition:
-    return Condition(name, float(slack), slack >= 0)
+    try:
+        margin = float(slack)
+    except OverflowError:
+        margin = np.inf if slack >= 0 else -np.inf
+    return Condition(name, margin, slack >= 0)
 
 
 def _matrix(name: str, matrix: Matrix, *, strict: bool = False) -> Condition:
     holds = is_positive_semidefinite(matrix, strict=strict)
-    smallest = float(np.linalg.eigvalsh(to_float(matrix))[0])
+    try:
+        smallest = float(np.linalg.eigvalsh(to_float(matrix))[0])
+    except OverflowError:  # exact, but beyond any float
+        smallest = np.inf if holds else -np.inf
     # Rounding may give the float the wrong sign; the exact verdict rules.
     margin = max(smallest, 0.0) if holds else min(smallest, -5e-324)
     return Condition(name, margin, holds)

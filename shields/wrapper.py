@@ -73,16 +73,12 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         self.certificate = certificate_for(plant) if certificate is None else certificate
         self.filter = SafetyFilter(self.certificate, plant, mode)
         self._proof = ProofTracker(self.filter)
-        self._starts_inside = starts_inside(self.certificate, env.unwrapped.initial_set)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode; see `NCSEnv.reset`."""
         observation, info = self.env.reset(seed=seed, options=options)
-        given = (options or {}).get("state")
-        known = (
-            self._starts_inside if given is None else starts_inside(self.certificate, np.asarray(given, dtype=float))
-        )
-        self._proof.start(known, info)
+        self._clock = self._read_clock()
+        self._proof.start(starts_inside(self.certificate, self.env.unwrapped.start), self._clock[1] == 0, info)
         self._estimate, self._error_shape = info["estimate"].copy(), info["error_shape"].copy()
         self._interventions = 0
         u = np.zeros(self.filter.plant.m)
@@ -99,13 +95,18 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         decision = self.filter.decide(self._estimate, self._error_shape, proposed)
         if decision.intervened:
             action = (decision.input / self.filter.plant.u_max).astype(np.float32)
-        before = self.env.unwrapped.steps
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._proof.step(decision, self.env.unwrapped.steps - before, info)
+        episode, step = self._clock
+        self._clock = self._read_clock()
+        self._proof.step(decision, self._clock == (episode, step + 1), info)
         self._estimate, self._error_shape = info["estimate"].copy(), info["error_shape"].copy()
         self._interventions += decision.intervened
         info = info | self._info(proposed, decision.input, decision.margin, intervened=decision.intervened)
         return observation, float(reward) - self.penalty * decision.intervened, terminated, truncated, info
+
+    def _read_clock(self) -> tuple[int, int]:
+        """Returns the number of episodes begun and of steps taken in this one."""
+        return self.env.unwrapped.episodes, self.env.unwrapped.steps
 
     def _info(self, proposed: np.ndarray, applied: np.ndarray, margin: float, *, intervened: bool) -> dict[str, Any]:
         reason = self._proof.reason

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import AdversarialDisturbance, BoxDisturbance, SinusoidDisturbance
-from ncs_gym.disturbance import BY_NAME, as_disturbance
+from ncs_gym.disturbance import BY_NAME, as_disturbance, checked
 from tests.plants import random_plant
 
 
@@ -61,21 +61,18 @@ def test_sinusoid_repeats_with_its_period(plant):
     assert np.linalg.norm(samples, axis=1).max() > 0.9 * np.sqrt(plant.gamma)
 
 
-def test_callable_on_the_bound_passes_and_beyond_it_raises(plant):
-    def at(size):
-        return as_disturbance(
-            lambda rng, plant, nominal: size * plant.disturbance.extreme_point(np.ones(2)), plant, False
-        )
-
-    d = at(1.0).draw(np.random.default_rng(0), plant, np.zeros(2), 0, None)
-    assert plant.disturbance.contains(d)
-    with pytest.raises(ValueError, match=r"outside its bound E\(D\): .* = 1.001"):
-        at(1.001).draw(np.random.default_rng(0), plant, np.zeros(2), 0, None)
+def test_a_point_on_the_bound_passes_and_one_beyond_it_raises(plant):
+    edge = plant.disturbance.extreme_point(np.ones(2))
+    assert plant.disturbance.contains(checked(plant, edge, allow_assumption_violation=False))
+    with pytest.raises(ValueError, match=r"outside its bound E\(D\): .* = 1\.001"):
+        checked(plant, 1.001 * edge, allow_assumption_violation=False)
+    np.testing.assert_array_equal(checked(plant, 9 * edge, allow_assumption_violation=True), 9 * edge)
 
 
-def test_callable_beyond_the_bound_passes_if_allowed(plant):
-    source = as_disturbance(lambda rng, plant, nominal: np.array([1.0, 1.0]), plant, True)
-    np.testing.assert_array_equal(source.draw(np.random.default_rng(0), plant, np.zeros(2), 0, None), [1.0, 1.0])
+@pytest.mark.parametrize("d", [[np.nan, 0.0], [0.0], "gust", None])
+def test_what_is_no_disturbance_is_refused(d, plant):
+    with pytest.raises(ValueError, match="the disturbance must be finite with shape"):
+        checked(plant, d, allow_assumption_violation=True)
 
 
 @pytest.mark.parametrize(
@@ -86,16 +83,11 @@ def test_callable_beyond_the_bound_passes_if_allowed(plant):
         (BoxDisturbance([0.1, 0.1]), "squared length"),
         (BoxDisturbance([0.1]), "2 entries"),
         (AdversarialDisturbance(np.eye(3)), "M must have shape"),
-        (lambda rng, plant, nominal: np.array([np.nan, 0.0]), None),
     ],
 )
 def test_bad_disturbances_are_refused(value, words, plant):
-    if words is None:
-        with pytest.raises(ValueError, match="must be finite"):
-            as_disturbance(value, plant, False).draw(np.random.default_rng(0), plant, np.zeros(2), 0, None)
-    else:
-        with pytest.raises(ValueError, match=words):
-            as_disturbance(value, plant, False)
+    with pytest.raises(ValueError, match=words):
+        as_disturbance(value, plant, False)
 
 
 def test_box_beyond_the_bound_is_possible_on_purpose(plant):

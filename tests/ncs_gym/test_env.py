@@ -81,14 +81,15 @@ def test_writing_into_an_info_changes_nothing(plant):
     for vandal in (False, True):
         env = make(IDS[0])
         _, info = env.reset(seed=3)
-        for _ in range(30):
+        for k in range(60):
             if vandal:
                 for value in info.values():
                     if isinstance(value, np.ndarray):
                         value[...] = 1e6
-            *_, info = env.step(np.array([0.3], np.float32))
-        runs.append(info["state"].copy())
-    np.testing.assert_array_equal(*runs)
+            *_, info = env.step(np.array([(-1) ** (k // 7) * 0.8], np.float32))
+        runs.append({key: np.copy(info[key]) for key in ("state", "estimate", "error_shape")})
+    for key in runs[0]:
+        np.testing.assert_array_equal(runs[0][key], runs[1][key])
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -228,6 +229,45 @@ def test_full_throttle_under_the_worst_disturbance_stays_in_the_observation_spac
             for _ in range(200):
                 *_, info = env.step(np.full(1, sign, np.float32))
                 assert (np.abs(info["estimate"]) <= env.observation_space.high[:2]).all()
+
+
+class Clumsy(Regulation):
+    """A task that fails once, in the middle of a step."""
+
+    def reward(self, plant, memory, state, u):
+        if u[0] > 3.9:
+            raise RuntimeError("clumsy")
+        return 0.0
+
+
+def test_a_step_that_failed_half_way_needs_a_reset():
+    env = make(IDS[0], task=Clumsy()).unwrapped
+    env.reset(seed=0)
+    with pytest.raises(RuntimeError, match="clumsy"):
+        env.step(np.ones(1, np.float32))
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(np.zeros(1, np.float32))
+    env.reset()
+    env.step(np.zeros(1, np.float32))
+
+
+def test_stepping_before_the_first_reset_says_so():
+    with pytest.raises(gym.error.ResetNeeded):
+        make(IDS[0]).unwrapped.step(np.zeros(1, np.float32))
+
+
+class Wild(ncs_gym.BoxDisturbance):
+    """A user's class with a draw outside every bound."""
+
+    def draw(self, rng, plant, nominal_next, step, memory):
+        return np.full(plant.n, 5.0)
+
+
+def test_disturbance_classes_of_the_users_are_checked():
+    env = make(IDS[0], disturbance=Wild())
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="outside its bound"):
+        env.step(np.zeros(1, np.float32))
 
 
 def test_one_settings_object_serves_many_environments():

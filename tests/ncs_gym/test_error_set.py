@@ -1,7 +1,10 @@
+from fractions import Fraction
+
 import numpy as np
 import pytest
 
-from ncs_gym import Ellipsoid, LinearPlant, UnstablePlantError, certified_error_set, truck_trailer
+from ncs_gym import Ellipsoid, ErrorSetError, LinearPlant, UnstablePlantError, certified_error_set, truck_trailer
+from shields.exact import add, congruence, is_positive_semidefinite, rational, scale, subtract
 from tests.plants import random_plant
 
 
@@ -82,6 +85,24 @@ def test_units_do_not_change_the_set():
         rtol=1e-3,
         atol=1e-3 * np.sqrt(np.outer(*[np.diag(expected)] * 2)).max() * 1e-3,
     )
+
+
+@pytest.mark.parametrize("n", [4, 10, 12])
+@pytest.mark.parametrize("radius", [0.5, 0.99, 0.9999])
+@pytest.mark.parametrize("seed", range(3))
+def test_strongly_coupled_plants_get_a_true_set_or_an_error(seed, radius, n):
+    rng = np.random.default_rng(seed)
+    basis = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    A = basis @ np.triu(3.0 * rng.standard_normal((n, n)), 1) @ basis.T + radius * np.eye(n)
+    plant = LinearPlant(A=A, B=np.ones((n, 1)), C=np.eye(n), u_max=1.0, dt=0.1, gamma=1e-6)
+    try:
+        errors = certified_error_set(plant)
+    except (ErrorSetError, UnstablePlantError):
+        return
+    rate, Sigma = Fraction(errors.rate), rational(errors.Sigma)
+    moved = congruence(rational(plant.A), Sigma)
+    grown = add(scale(1 / rate, moved), scale(1 / (1 - rate), rational(plant.disturbance.shape)))
+    assert is_positive_semidefinite(subtract(Sigma, grown))
 
 
 def test_unstable_plant_is_refused_with_its_spectral_radius():

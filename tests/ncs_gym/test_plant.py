@@ -100,6 +100,8 @@ def good() -> dict:
         ({"gamma": np.inf}, "gamma"),
         ({"delta": 0.0}, "delta"),
         ({"delta": 1.0}, "delta"),
+        ({"delta": 1e-17}, "delta"),
+        ({"H": [[1.0, 0.0], [0.0, 0.0]]}, "every row of H must measure something"),
         ({"process_noise_cov": -np.eye(2)}, "process_noise_cov must be positive semidefinite"),
         ({"initial_cov": [[1.0, 0.5], [0.0, 1.0]]}, "initial_cov must be symmetric"),
         ({"measurement_noise_cov": np.eye(3)}, "measurement_noise_cov must have shape"),

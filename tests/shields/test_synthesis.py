@@ -127,6 +127,21 @@ def test_weak_input_is_what_binds():
     assert caught.value.binding == "U"
 
 
+@pytest.mark.parametrize(
+    "bounds",
+    [
+        {"measurement_noise_cov": 1e-4 * np.outer([0.3, 0.7], [0.3, 0.7])},
+        {"gamma": 0.0, "process_noise_cov": 1e-4 * np.outer([0.3, 0.7], [0.3, 0.7])},
+        {"gamma": 0.0, "process_noise_cov": 1e-4 * np.outer([0.1, -0.3], [0.1, -0.3])},
+        {"initial_cov": 1e-4 * np.outer([0.3, 0.7], [0.3, 0.7])},
+        {"gamma": 0.0} | dict.fromkeys(("process_noise_cov", "measurement_noise_cov", "initial_cov"), np.zeros((2, 2))),
+    ],
+)
+def test_flat_and_absent_uncertainty_gets_a_certificate(bounds):
+    plant = truck_trailer(**bounds)
+    assert verify(synthesize(plant), plant).valid
+
+
 def test_unknown_method_is_refused(plant):
     with pytest.raises(ValueError, match="method must be"):
         synthesize(plant, method="magic")

@@ -34,7 +34,9 @@ MUTATIONS = {
     "shrunken Sigma": (lambda c: replace(c, Sigma=0.5 * c.Sigma), ["(E1)"]),
     "tiny Sigma": (lambda c: replace(c, Sigma=1e-4 * c.Sigma), ["(E0)", "(E1)"]),
     "small D": (lambda c: replace(c, D=0.9 * c.D), ["D:"]),
-    "D a hair too small": (lambda c: replace(c, D=(1 - 2e-9) * c.D), ["D:"]),
+    "D a hair too small": (lambda c: replace(c, D=(1 - 1.1e-9) * c.D), ["D: the certificate's"]),
+    "denormal share": (lambda c: shares(c, state=1e-320), ["(I)"]),
+    "denormal rate": (lambda c: shares(c, error=1e-320), ["(E1)"]),
     "swapped shares": (lambda c: shares(c, state=c.multipliers.disturbance, disturbance=c.multipliers.state), ["(I)"]),
     "wrong rate": (lambda c: shares(c, error=0.999), ["(E1)"]),
     "shares above one": (lambda c: shares(c, state=0.99, estimate=0.5), ["lx + le + ld"]),
@@ -83,6 +85,12 @@ def test_plant_with_a_looser_bound_rejects_the_certificate(certificate, loaded):
     worse_start = truck_trailer(mass=4000.0, initial_cov=0.1 * np.eye(2))
     found = broken(replace(certificate, fingerprint=worse_start.fingerprint), worse_start)
     assert any("(E0)" in name for name in found)
+
+
+@pytest.mark.parametrize("change", [{"error": "x"}, {"inputs": 0.5}, {"inputs": None}, {"state": None}])
+def test_multipliers_that_are_not_numbers_are_refused(certificate, change):
+    with pytest.raises(CertificateError):
+        shares(certificate, **change)
 
 
 def test_margins_agree_with_floating_point(certificate, loaded):

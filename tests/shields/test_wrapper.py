@@ -320,6 +320,60 @@ def test_repeated_step_is_noticed(certificate):
     assert [info["shield_reason"] for info in infos] == ["", OTHER_STEPS, OTHER_STEPS, OTHER_STEPS]
 
 
+def test_environment_moved_behind_the_shields_back_is_noticed(certificate):
+    env = shielded(certificate)
+    far = {"state": [1.9, 1.8]}
+    for meddle in (
+        lambda: env.unwrapped.reset(options=far),
+        lambda: env.unwrapped.step(full(None)),
+        lambda: env.env.reset(options=far),
+    ):
+        env.reset(seed=0)
+        meddle()
+        assert env.step(full(None))[4]["shield_reason"] == OTHER_STEPS
+
+
+def test_inner_wrapper_that_chooses_the_start_is_not_trusted(certificate):
+    class Elsewhere(gym.Wrapper):
+        def reset(self, *, seed=None, options=None):
+            return self.env.reset(seed=seed, options={"state": [1.99, 1.9]})
+
+    class WarmUp(gym.Wrapper):
+        def reset(self, *, seed=None, options=None):
+            self.env.reset(seed=seed)
+            observation, *_, info = self.env.step(full(None))
+            return observation, info
+
+    reasons = [
+        SafetyShield(layer(gym.make(CRUISE)), certificate).reset(seed=0)[1]["shield_reason"]
+        for layer in (Elsewhere, WarmUp)
+    ]
+    assert reasons == [NOT_KNOWN_INSIDE, OTHER_STEPS]
+
+
+def test_initial_set_changed_after_wrapping_is_looked_at_again(certificate):
+    env = shielded(certificate)
+    env.unwrapped.initial_set = Ellipsoid(100.0 * np.eye(2))
+    reasons = {env.reset(seed=seed)[1]["shield_reason"] for seed in range(10)}
+    assert NOT_KNOWN_INSIDE in reasons
+
+
+def test_writing_into_the_infos_changes_no_decision(certificate):
+    runs = []
+    for vandal in (False, True):
+        env = shielded(certificate)
+        _, info = env.reset(seed=1)
+        for _ in range(60):
+            if vandal:
+                for value in info.values():
+                    if isinstance(value, np.ndarray):
+                        value[...] = 0.0
+            *_, info = env.step(full(None))
+            assert info["shield_guaranteed"]
+        runs.append(info["input"].copy())
+    np.testing.assert_array_equal(*runs)
+
+
 def test_forged_packet_is_noticed(certificate):
     env = shielded(certificate, channel=Channel())
     env.reset(seed=0)
