@@ -65,7 +65,7 @@ class BallDisturbance(Disturbance):
 
 @dataclass(frozen=True, eq=False)
 class BoxDisturbance(Disturbance):
-    """Uniform in a box (`paper.tex` Section 5).
+    """Uniform in a box (Liu et al. Section 5).
 
     Attributes:
         half_widths: Shape (n,); the box must lie in {d'd <= gamma}. None: sqrt(gamma / n) each.

@@ -216,7 +216,7 @@ def _grown(product: np.ndarray, extent: np.ndarray) -> np.ndarray:
 def _kalman_filter(plant: LinearPlant, quantization_step: float) -> KalmanFilter:
     """Returns filterpy's filter with every matrix set.
 
-    The process covariance is Q + gamma I (`paper.tex` Definition 3), the sensor's R plus q^2/12 of a quantizer.
+    The process covariance is Q + gamma I (Liu et al. Definition 3), the sensor's R plus q^2/12 of a quantizer.
     """
     kalman = KalmanFilter(dim_x=plant.n, dim_z=plant.p, dim_u=plant.m)
     kalman.x = np.zeros(plant.n)

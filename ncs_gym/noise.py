@@ -54,7 +54,7 @@ class TruncatedGaussian(FrozenArrays):
 def chi2_quantile(probability: float, degrees: int) -> float:
     """Returns the chi-square quantile chi2_{degrees, probability}, rounded up.
 
-    `paper.tex` Theorem 5 needs the 1 - delta quantile, so `probability` is 1 - delta.
+    Liu et al. Theorem 5 needs the 1 - delta quantile, so `probability` is 1 - delta.
 
     Args:
         probability: In [0.001, 1).

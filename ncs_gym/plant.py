@@ -196,7 +196,7 @@ def truck_trailer(
     C: np.ndarray | None = None,
     H: np.ndarray | None = None,
 ) -> LinearPlant:
-    """Returns the truck with a spring-damper-coupled trailer of `paper.tex` Section 5.
+    """Returns the truck with a spring-damper-coupled trailer of Liu et al. Section 5.
 
     The exact zero-order hold of x1' = x2, x2' = -(stiffness/mass) x1 - (damping/mass) x2 + u, with x1
     the stretch of the coupling [m], x2 its rate [m/s] and u the truck's acceleration [m/s^2].

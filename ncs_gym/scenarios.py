@@ -16,11 +16,11 @@ from ncs_gym.env import NCSEnv
 from ncs_gym.plant import LinearPlant, truck_trailer
 from ncs_gym.task import Regulation, SpeedTracking, Task
 
-# Steps per episode of every registered environment (`paper.tex` Section 5).
+# Steps per episode of every registered environment (Liu et al. Section 5).
 EPISODE_STEPS = 200
-# The four impairments of `paper.tex` Section 5, all at once.
+# The four impairments of Liu et al. Section 5, all at once.
 CASE_STUDY_CHANNEL = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
-# The disturbance box of `paper.tex` Section 5 [m, m/s]; its corner has squared length gamma = 5e-4.
+# The disturbance box of Liu et al. Section 5 [m, m/s]; its corner has squared length gamma = 5e-4.
 CASE_STUDY_BOX = BoxDisturbance((0.02, 0.01))
 
 
@@ -82,7 +82,7 @@ class Scenario:
         return self.box if suits else "ball"
 
 
-# `paper.tex` Section 5: 1000 kg, dt 0.5 s, gamma 5e-4, Q = P0 = R = 1e-4 I (the paper prints no R), delta 0.05; starts
+# Liu et al. Section 5: 1000 kg, dt 0.5 s, gamma 5e-4, Q = P0 = R = 1e-4 I (the paper prints no R), delta 0.05; starts
 # uniformly in the disc of radius 1.9.
 TRUCK_TRAILER = Scenario(
     plant=truck_trailer, channel=CASE_STUDY_CHANNEL, task=Regulation(), box=CASE_STUDY_BOX, start=1.9
