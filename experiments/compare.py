@@ -160,7 +160,7 @@ def _write(
     """Writes every file; summary.json comes last, so that it stands for a complete run."""
     arms = {name: [result for result in results if result.arm == name] for name in summary["arms"]}
     figures = {
-        "training": ("Training: every line is one run.", as_png(training_figure(arms))),
+        "training": ("Training: thin lines are single runs, thick ones their mean.", as_png(training_figure(arms))),
         "phase": (
             "True states of the first evaluation episode of each run.",
             as_png(phase_figure(plant, certificate, arms)),

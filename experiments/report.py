@@ -13,9 +13,10 @@ from shields import Report
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #222; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
-table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; }
+table { border-collapse: collapse; font-size: .85rem; font-variant-numeric: tabular-nums; }
 th, td { padding: .35rem .7rem; border-bottom: 1px solid #ddd; text-align: right; }
-th:first-child, td:first-child { text-align: left; }
+th:first-child, td:first-child { text-align: left; } td { white-space: nowrap; }
+figure { margin: 1.5rem 0; } figcaption { font-size: .9rem; color: #555; }
 img { max-width: 100%; } code, pre { font-size: .8rem; } pre { background: #f6f6f6; padding: 1rem; overflow-x: auto; }
 .holds { color: #14713f; } .broken { color: #b3261e; font-weight: bold; }
 """
