@@ -25,7 +25,7 @@ class Episode:
         seed: The environment was reset with it.
         steps: Length.
         episode_return: Sum of the environment's rewards, without shield penalties.
-        violation_steps: Steps whose true state violated the safe box (the start included).
+        violation_steps: Steps after which the true state violated the safe box.
         interventions: Steps in which the shield intervened.
         guaranteed: Whether the shield's proof held at every step; False without a shield.
         largest_level: Largest x'Mx of the true state; NaN without a certificate.
@@ -96,11 +96,13 @@ class _Tally:
         self._seed, self._level_matrix = seed, level_matrix
         self._return, self._steps = 0.0, 0
         self._guaranteed, self._level = True, 0.0
+        self._violations = 0
         self._observe(info)
 
     def add(self, reward: float, info: dict) -> None:
         self._return += reward
         self._steps += 1
+        self._violations += info["cost"] > 0.0
         self._observe(info)
 
     def episode(self) -> Episode:
@@ -109,7 +111,7 @@ class _Tally:
             seed=self._seed,
             steps=self._steps,
             episode_return=self._return,
-            violation_steps=int(info["episode_violations"]),
+            violation_steps=self._violations,
             interventions=int(info.get("episode_interventions", 0)),
             guaranteed=self._guaranteed,
             largest_level=self._level if self._level_matrix is not None else float("nan"),

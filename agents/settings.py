@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 
@@ -44,7 +45,9 @@ class PPOSettings:
             value = getattr(self, name)
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must be in [0, 1], got {value!r}")
-        if not 0.0 < self.learning_rate < float("inf"):
+        if not 0.0 < self.learning_rate < math.inf:
             raise ValueError(f"learning_rate must be positive, got {self.learning_rate!r}")
+        if not math.isfinite(self.log_std):
+            raise ValueError(f"log_std must be finite, got {self.log_std!r}")
         if self.rollout * self.envs < 2:
             raise ValueError("rollout * envs must be at least 2")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import platform
+import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from importlib.metadata import version
@@ -83,11 +84,14 @@ def _certificate(settings: CompareSettings, plant: LinearPlant) -> Certificate:
 
 
 def _prepare(out: Path) -> None:
-    """Creates the output folder and removes the summary of an earlier run: a summary always belongs to its files."""
+    """Creates the output folder and removes an earlier run's summary, models and events: a summary fits its files."""
     (out / "figures").mkdir(parents=True, exist_ok=True)
-    (out / "summary.json").unlink(missing_ok=True)
     write_atomically(out / ".writable", "")
     (out / ".writable").unlink()
+    (out / "summary.json").unlink(missing_ok=True)
+    for folder in ("models", "tensorboard"):
+        for stale in [*out.glob(f"{folder}/shielded-*"), *out.glob(f"{folder}/unshielded-*")]:
+            shutil.rmtree(stale, ignore_errors=True)
 
 
 def _units(settings: CompareSettings, certificate: Certificate) -> list[Unit]:
@@ -118,7 +122,9 @@ def _summary(
 ) -> dict[str, Any]:
     def arm(name: str) -> dict[str, Any]:
         chosen = [(unit, result) for unit, result in zip(units, results, strict=True) if unit.arm == name]
-        return {"shielded": chosen[0][0].mode is not None} | summarize_arm([result for _, result in chosen])
+        unit = chosen[0][0]
+        fixed = unit.learner in ("zero", "gain")
+        return {"shielded": unit.mode is not None} | summarize_arm([result for _, result in chosen], fixed_policy=fixed)
 
     packages = ("ncs-gym", "gymnasium", "stable-baselines3", "torch", "cvxpy", "clarabel", "numpy", "filterpy")
     content = asdict(settings) | {

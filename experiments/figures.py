@@ -17,6 +17,8 @@ from shields import Certificate
 
 COLORS = {"unshielded": "#c8553d", "shielded": "#1f6f8b"}
 GREY = "#555555"
+# Curves of fewer points show them.
+FEW_POINTS = 5
 STYLE = {
     "font.size": 10,
     "axes.spines.top": False,
@@ -42,7 +44,8 @@ def training_figure(arms: dict[str, Sequence[UnitResult]]) -> Figure:
                 if axis is axes[2] and not overridden.any():
                     continue
                 axis.plot(steps, values.T, color=COLORS[name], lw=0.8, alpha=0.4)
-                axis.plot(steps, values.mean(axis=0), color=COLORS[name], lw=2.0, label=name)
+                marker = "o" if len(steps) < FEW_POINTS else None
+                axis.plot(steps, values.mean(axis=0), color=COLORS[name], lw=2.0, marker=marker, label=name)
         _label(axes[0], "training steps", "mean return of recent episodes", "Return")
         _label(axes[1], "training steps", "violating steps so far", "Violations of the true state")
         _label(axes[2], "training steps", "actions overridden [%]", "Interventions of the shield")
@@ -97,7 +100,9 @@ def episode_figure(plant: LinearPlant, arms: dict[str, Sequence[UnitResult]]) ->
         _label(bottom, "time [s]", _with_unit(plant.input_names[0], plant.input_units[0]), "")
         top.legend(loc="upper right", ncols=2)
         bottom.legend(loc="upper right", ncols=3, fontsize=8.5)
-        bottom.set_ylim(-1.1 * plant.u_max[0], 1.55 * plant.u_max[0])
+        for limit in (-plant.u_max[0], plant.u_max[0]):
+            bottom.axhline(limit, color="black", lw=1.0, ls="--")
+        bottom.set_ylim(-1.1 * plant.u_max[0], 1.6 * plant.u_max[0])
         return figure
 
 

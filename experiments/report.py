@@ -21,6 +21,12 @@ img { max-width: 100%; } code, pre { font-size: .8rem; } pre { background: #f6f6
 .holds { color: #14713f; } .broken { color: #b3261e; font-weight: bold; }
 """
 
+EXPLANATION = """The same task learned by PPO twice: <b>unshielded</b>, where the agent's action is applied, and
+<b>shielded</b>, where an action that could drive the state out of the safe set is replaced (mode {mode}). Runs with
+equal numbers meet the same initial states, disturbances and packet losses. Below the arms stand policies for reference,
+without training and without a shield. Violations are those of the true state, which neither agent nor shield sees.
+Intervals of the return are over runs for learned policies and over episodes for fixed ones."""
+
 
 def html_report(summary: dict[str, Any], verification: Report, figures: dict[str, bytes], findings: list[str]) -> str:
     """Returns the page: result table, findings, figures, certificate and settings; opens offline.
@@ -41,6 +47,7 @@ def html_report(summary: dict[str, Any], verification: Report, figures: dict[str
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title><style>{STYLE}</style></head><body>
 <h1>{escape(title)}</h1>
+<p>{EXPLANATION.format(mode=escape(settings["mode"]))}</p>
 {_table(table_rows(summary))}
 <ul>{"".join(f"<li>{escape(line)}</li>" for line in findings)}</ul>
 {images}

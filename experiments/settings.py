@@ -22,7 +22,7 @@ class CompareSettings:
     Attributes:
         env: Id of a registered environment.
         out: Output folder; created if it does not exist, results in it are replaced.
-        seed: Of the experiment; runs use seed, seed + 1, ...
+        seed: Of the experiment, >= 0; all runs derive theirs from it.
         runs: Paired runs (training seeds) per arm.
         steps: Training steps per run.
         episodes: Evaluation episodes per run.

@@ -10,22 +10,20 @@ import numpy as np
 from experiments.statistics import clopper_pearson, mean_interval
 from experiments.unit import UnitResult
 
-# Reference policies are evaluated without a shield and without training.
-REFERENCES = ("zero input", "K x_hat", "untrained")
 
-
-def summarize_arm(results: Sequence[UnitResult]) -> dict[str, Any]:
+def summarize_arm(results: Sequence[UnitResult], *, fixed_policy: bool) -> dict[str, Any]:
     """Returns the summary of one arm's runs, JSON values only.
 
     `eval_violation_rate_ci95` is Clopper-Pearson's interval on violating episodes given the trained policies;
     `eval_violation_steps` is a plain count, because steps of one episode are dependent; `eval_return_ci95` is Student's
-    interval over the runs' mean returns (null for a single run).
+    interval over the runs' mean returns (null for a single run), because training differs from run to run; for a policy
+    that is the same in all runs (`fixed_policy`) it is over the episodes.
     """
     episodes = [episode for result in results for episode in result.episodes]
     violating = sum(episode.violation_steps > 0 for episode in episodes)
     eval_steps = sum(episode.steps for episode in episodes)
     means = [float(np.mean([episode.episode_return for episode in result.episodes])) for result in results]
-    interval = mean_interval(means)
+    interval = mean_interval([episode.episode_return for episode in episodes] if fixed_policy else means)
     train_steps = sum(result.train_steps for result in results)
     return {
         "runs": len(results),
@@ -40,6 +38,7 @@ def summarize_arm(results: Sequence[UnitResult]) -> dict[str, Any]:
         "eval_violation_rate_ci95": list(clopper_pearson(violating, len(episodes))),
         "eval_return_mean": float(np.mean(means)),
         "eval_return_ci95": None if interval is None else list(interval),
+        "eval_return_ci95_over": "episodes" if fixed_policy else "runs",
         "eval_return_by_run": means,
         "intervention_rate": sum(episode.interventions for episode in episodes) / eval_steps,
         "guaranteed_episodes": sum(episode.guaranteed for episode in episodes),
@@ -58,15 +57,16 @@ def way_covered(summary: dict[str, Any]) -> float:
 def table_rows(summary: dict[str, Any]) -> list[list[str]]:
     """Returns the header and one row of text per arm and reference policy."""
     rows = [
-        ["", "training:", "evaluation:", "", "evaluation:", "", ""],
+        ["", "training:", "training:", "evaluation:", "evaluation:", "evaluation:", "evaluation:", "evaluation:"],
         [
             "",
             "violating steps",
+            "overridden",
             "violating episodes",
             "exact 95 % CI",
             "violating steps",
-            "return [95 % CI]",
             "overridden",
+            "return [95 % CI]",
         ],
     ]
     for name, arm in (summary["arms"] | summary["references"]).items():
@@ -76,11 +76,12 @@ def table_rows(summary: dict[str, Any]) -> list[list[str]]:
             [
                 name,
                 f"{arm['train_violation_steps']:,} of {arm['train_steps']:,}" if trained else "-",
+                f"{100 * arm['train_intervention_rate']:.1f} %" if arm["shielded"] else "-",
                 f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,}",
                 f"{100 * low:.1f} to {100 * high:.1f} %",
                 f"{arm['eval_violation_steps']:,}",
-                _return_text(arm),
                 f"{100 * arm['intervention_rate']:.1f} %" if arm["shielded"] else "-",
+                _return_text(arm),
             ]
         )
     return rows

@@ -19,11 +19,6 @@ from agents.training import Shielding, TrainingResult, train, untrained
 from experiments.trajectory import Trajectory, record
 from shields import Certificate
 
-# Evaluation episodes are seeded from here on, far from every training seed, alike in all arms.
-FIRST_EVALUATION_SEED = 10_000_000
-# Distance between the training seeds of two runs: each environment of a run takes the next one.
-SEED_STRIDE = 1_000
-
 Learner = Literal["ppo", "untrained", "gain", "zero"]
 
 
@@ -71,13 +66,17 @@ class Unit:
 
     @property
     def training_seed(self) -> int:
-        """Seed of the first training environment and of the network."""
-        return (self.seed + self.index) * SEED_STRIDE
+        """Seed of the first training environment (the others take the next ones) and of the network."""
+        return self._seeds()[0]
 
     @property
     def evaluation_seed(self) -> int:
-        """Seed of the first evaluation episode."""
-        return FIRST_EVALUATION_SEED + (self.seed + self.index) * max(self.episodes, SEED_STRIDE)
+        """Seed of the first evaluation episode; alike in all arms, as is the training seed."""
+        return self._seeds()[1]
+
+    def _seeds(self) -> list[int]:
+        """Returns two 31-bit numbers that depend on the experiment's seed and the run, not on the arm."""
+        return [int(word >> 1) for word in np.random.SeedSequence([self.seed, self.index]).generate_state(2)]
 
 
 @dataclass(frozen=True)

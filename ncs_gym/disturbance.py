@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ncs_gym.frozen import FrozenArrays, as_covariance, as_number
+from ncs_gym.frozen import FrozenArrays, as_covariance, as_number, as_vector
 from ncs_gym.plant import LinearPlant
 
 # Extreme points are pulled in, and points out by rounding pushed in, by this much.
@@ -49,7 +49,11 @@ class Disturbance(FrozenArrays):
         raise NotImplementedError
 
     def check(self, plant: LinearPlant) -> str:
-        """Returns why this disturbance does not suit the plant's bound, or an empty string."""
+        """Returns why this disturbance does not fit the plant, or an empty string."""
+        return ""
+
+    def excess(self, plant: LinearPlant) -> str:
+        """Returns why it may go beyond the plant's bound (which can be allowed), or an empty string."""
         return ""
 
 
@@ -79,7 +83,9 @@ class BoxDisturbance(Disturbance):
     def __post_init__(self) -> None:
         if self.half_widths is None:
             return
-        widths = np.array([as_number(w, "half_widths", low=0.0) for w in self.half_widths])
+        widths = as_vector(self.half_widths, None, "half_widths")
+        if (widths < 0.0).any():
+            raise ValueError(f"half_widths must be >= 0, got {widths.tolist()}")
         object.__setattr__(self, "half_widths", widths)
         self._freeze_arrays()
 
@@ -93,7 +99,10 @@ class BoxDisturbance(Disturbance):
         widths = np.asarray(self.half_widths)
         if widths.shape != (plant.n,):
             return f"half_widths must have {plant.n} entries, got {widths.size}"
-        corner = float(widths @ widths)
+        return ""
+
+    def excess(self, plant):  # noqa: D102
+        corner = float(np.sum(np.square(self.half_widths))) if self.half_widths is not None else 0.0
         if corner > plant.gamma * (1.0 + ROUNDING):
             return f"the corner of the box has squared length {corner:g} > gamma = {plant.gamma:g}"
         return ""
@@ -113,7 +122,7 @@ class SinusoidDisturbance(Disturbance):
     period: float = 20.0
 
     def __post_init__(self) -> None:
-        as_number(self.period, "period", low=0.0, low_open=True)
+        object.__setattr__(self, "period", as_number(self.period, "period", low=0.0, low_open=True))
 
     def begin(self, rng, plant):  # noqa: D102
         axis = rng.standard_normal(plant.n)
@@ -150,7 +159,7 @@ class AdversarialDisturbance(Disturbance):
 
     def __post_init__(self) -> None:
         if self.M is not None:
-            object.__setattr__(self, "M", as_covariance(self.M, len(self.M), "M"))
+            object.__setattr__(self, "M", as_covariance(self.M, None, "M"))
         self._freeze_arrays()
 
     def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
@@ -188,12 +197,7 @@ def checked(plant: LinearPlant, d: Any, *, allow_assumption_violation: bool) -> 
     Raises:
         ValueError: If it is not finite, wrongly shaped, or further outside than TOLERANCE and that is not allowed.
     """
-    try:
-        d = np.array(d, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"the disturbance must be finite with shape ({plant.n},), got {d!r}") from error
-    if d.shape != (plant.n,) or not np.isfinite(d).all():
-        raise ValueError(f"the disturbance must be finite with shape ({plant.n},), got {d!r}")
+    d = as_vector(d, plant.n, "the disturbance")
     if allow_assumption_violation:
         return d
     size = plant.disturbance.gauge(d)
@@ -232,6 +236,8 @@ def as_disturbance(value: Any, plant: LinearPlant, allow_assumption_violation: b
     if not isinstance(value, Disturbance):
         raise ValueError(f"disturbance must be one of {sorted(BY_NAME)}, a Disturbance or a callable, got {value!r}")
     problem = value.check(plant)
-    if problem and not (allow_assumption_violation and "gamma" in problem):
+    if not problem and not allow_assumption_violation:
+        problem = value.excess(plant)
+    if problem:
         raise ValueError(f"{type(value).__name__}: {problem}")
     return value

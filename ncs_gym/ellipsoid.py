@@ -35,8 +35,7 @@ class Ellipsoid(FrozenArrays):
     shape: np.ndarray
 
     def __post_init__(self) -> None:
-        size = np.shape(self.shape)[0] if np.ndim(self.shape) == 2 else 1
-        object.__setattr__(self, "shape", as_covariance(self.shape, size, "shape"))
+        object.__setattr__(self, "shape", as_covariance(self.shape, None, "shape"))
         self._freeze_arrays()
 
     @property
@@ -86,10 +85,6 @@ class Ellipsoid(FrozenArrays):
     def contains(self, point: np.ndarray) -> bool:
         """Returns whether a point, shape (n,), lies inside or on the boundary (in float64, no tolerance)."""
         return self.gauge(point) <= 1.0
-
-    def includes(self, other: Ellipsoid) -> bool:
-        """Returns whether `other` is a subset: P - P_other >= 0 (in float64, no tolerance)."""
-        return is_inside(other.shape, self.shape)
 
     def sample(self, rng: np.random.Generator) -> np.ndarray:
         """Returns a uniformly distributed point, shape (n,)."""

@@ -13,7 +13,7 @@ from ncs_gym.disturbance import as_disturbance, checked, stays_inside
 from ncs_gym.ellipsoid import Ellipsoid
 from ncs_gym.error_set import certified_error_set
 from ncs_gym.estimator import Estimator
-from ncs_gym.frozen import as_count, read_only
+from ncs_gym.frozen import as_count, as_flag, as_vector, read_only
 from ncs_gym.plant import LinearPlant
 from ncs_gym.task import Regulation, Task
 
@@ -23,6 +23,10 @@ T = TypeVar("T")
 START_SHARE = 0.1
 # Widens the observation box: float32 rounding, and estimates a little off the reachable set.
 OBSERVATION_MARGIN = 1.01
+
+
+class RenderModeError(ValueError, TypeError):
+    """An unknown render mode; a TypeError too, because stable-baselines3 asks for "rgb_array" and retries on that."""
 
 
 class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -108,7 +112,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self.plant = _expect(plant, LinearPlant, "plant")
         self.channel = Channel() if channel is None else _expect(channel, Channel, "channel")
         self.task = Regulation() if task is None else _expect(task, Task, "task")
-        self.disturbance = as_disturbance(disturbance, plant, allow_assumption_violation)
+        self.disturbance = as_disturbance(disturbance, plant, bool(allow_assumption_violation))
         self.initial_set = default_initial_set(plant) if initial_set is None else initial_set
         _expect(self.initial_set, Ellipsoid, "initial_set")
         if self.initial_set.dim != plant.n:
@@ -116,10 +120,10 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         if problem := self.task.check(plant):
             raise ValueError(f"{type(self.task).__name__}: {problem}")
         if render_mode is not None:
-            raise ValueError(f"render_mode must be None, got {render_mode!r}")
+            raise RenderModeError(f"render_mode must be None, got {render_mode!r}")
         self.render_mode = render_mode
-        self.terminate_on_violation = bool(terminate_on_violation)
-        self.allow_assumption_violation = bool(allow_assumption_violation)
+        self.terminate_on_violation = as_flag(terminate_on_violation, "terminate_on_violation")
+        self.allow_assumption_violation = as_flag(allow_assumption_violation, "allow_assumption_violation")
         self.error_set = certified_error_set(plant)
         self.estimator = Estimator(plant, self.channel, self.error_set)
         self.horizon = as_count(horizon, "horizon", low=1)
@@ -142,9 +146,10 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         Raises:
             ValueError: If an option is unknown or x0 has a wrong shape or is not finite.
         """
+        start = _start_option(options, self.plant.n)
+        self._consistent = False
         super().reset(seed=seed)
         rng = self.np_random
-        start = _start_option(options, self.plant.n)
         self.start = self.initial_set if start is None else read_only(start)
         self._state = self.initial_set.sample(rng) if start is None else start
         self._task_memory = self.task.begin(rng, self.plant)
@@ -267,10 +272,7 @@ def _start_option(options: dict[str, Any] | None, n: int) -> np.ndarray | None:
         raise ValueError(f"reset knows the option 'state' only, got {unknown}")
     if "state" not in options:
         return None
-    state = np.array(options["state"], dtype=np.float64)
-    if state.shape != (n,) or not np.isfinite(state).all():
-        raise ValueError(f"options['state'] must be finite with shape ({n},), got {options['state']!r}")
-    return state
+    return as_vector(options["state"], n, "options['state']")
 
 
 def _expect(value: Any, kind: type[T], name: str) -> T:

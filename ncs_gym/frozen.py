@@ -6,6 +6,9 @@ from typing import Any, Self
 
 import numpy as np
 
+# Entries beyond this would overflow when squared twice.
+LARGEST = 1e75
+
 
 class FrozenArrays:
     """Mixin that keeps the array fields of a frozen dataclass read-only.
@@ -60,19 +63,37 @@ def as_matrix(value: Any, shape: tuple[int | None, int | None], name: str) -> np
     )
     if not fits:
         raise ValueError(f"{name} must have shape {expected}, got {matrix.shape}")
-    if not np.isfinite(matrix).all():
-        raise ValueError(f"{name} must be finite, got {matrix.tolist()}")
+    if not (np.abs(matrix) < LARGEST).all():
+        raise ValueError(f"{name} must be finite and below {LARGEST:g} in size, got {matrix.tolist()}")
     return matrix
 
 
-def as_covariance(value: Any, size: int, name: str) -> np.ndarray:
-    """Returns `value` as a symmetric positive semidefinite (size, size) matrix.
+def as_vector(value: Any, size: int | None, name: str) -> np.ndarray:
+    """Returns `value` as a finite float64 vector of the expected size (None: any).
+
+    Raises:
+        ValueError: If it is not numeric, has another shape, or holds a NaN or an infinity.
+    """
+    try:
+        vector = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be a vector of numbers, got {value!r}") from error
+    if vector.ndim != 1 or vector.size == 0 or size not in (None, vector.size):
+        raise ValueError(f"{name} must have shape ({'any' if size is None else size},), got {vector.shape}")
+    if not (np.abs(vector) < LARGEST).all():
+        raise ValueError(f"{name} must be finite with shape {vector.shape}, got {value!r}")
+    return vector
+
+
+def as_covariance(value: Any, size: int | None, name: str) -> np.ndarray:
+    """Returns `value` as a symmetric positive semidefinite (size, size) matrix (None: of any size).
 
     Raises:
         ValueError: If it has another shape, is not finite, not symmetric or has a negative
             eigenvalue beyond rounding.
     """
     matrix = as_matrix(value, (size, size), name)
+    matrix = as_matrix(matrix, (len(matrix), len(matrix)), name)
     scale = np.abs(matrix).max()
     if not np.allclose(matrix, matrix.T, rtol=0.0, atol=1e-12 * scale):
         raise ValueError(f"{name} must be symmetric, got {matrix.tolist()}")
@@ -101,6 +122,8 @@ def as_number(
     if np.isfinite(high):
         wanted += f" and {'<' if high_open else '<='} {high:g}"
     try:
+        if isinstance(value, (str, bytes, bool, np.bool_)):
+            raise TypeError("text and truth values are no numbers")
         number = float(value)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be a number {wanted}, got {value!r}") from error
@@ -109,6 +132,17 @@ def as_number(
     if not (np.isfinite(number) and above and below):
         raise ValueError(f"{name} must be a number {wanted}, got {value!r}")
     return number
+
+
+def as_flag(value: Any, name: str) -> bool:
+    """Returns `value` if it is a bool.
+
+    Raises:
+        ValueError: If it is anything else.
+    """
+    if not isinstance(value, (bool, np.bool_)):
+        raise ValueError(f"{name} must be True or False, got {value!r}")
+    return bool(value)
 
 
 def as_count(value: Any, name: str, *, low: int) -> int:

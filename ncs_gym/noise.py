@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from scipy.stats import chi2
@@ -51,6 +51,7 @@ class TruncatedGaussian(FrozenArrays):
                 return factor @ direction
 
 
+@cache
 def chi2_quantile(probability: float, degrees: int) -> float:
     """Returns the chi-square quantile chi2_{degrees, probability}, rounded up.
 

@@ -226,7 +226,7 @@ def truck_trailer(
     continuous[0, 1] = 1.0
     continuous[1] = [-stiffness / mass, -damping / mass, 1.0]
     step = expm(continuous * dt)
-    p = 2 if H is None else np.shape(H)[0]
+    p = 2 if H is None else len(as_matrix(H, (None, 2), "H"))
     return LinearPlant(
         A=step[:2, :2],
         B=step[:2, 2:],

@@ -78,8 +78,9 @@ class Scenario:
         )
 
     def _disturbance(self, plant: LinearPlant) -> Any:
-        suits = self.box is not None and isinstance(plant, LinearPlant) and not self.box.check(plant)
-        return self.box if suits else "ball"
+        if self.box is None or not isinstance(plant, LinearPlant) or self.box.check(plant) or self.box.excess(plant):
+            return "ball"
+        return self.box
 
 
 # Liu et al. Section 5: 1000 kg, dt 0.5 s, gamma 5e-4, Q = P0 = R = 1e-4 I (the paper prints no R), delta 0.05; starts

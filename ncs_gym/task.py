@@ -62,7 +62,7 @@ class Regulation(Task):
         for name in ("state_cost", "input_cost"):
             value = getattr(self, name)
             if value is not None:
-                object.__setattr__(self, name, as_covariance(value, len(value), name))
+                object.__setattr__(self, name, as_covariance(value, None, name))
         self._freeze_arrays()
 
     def reward(self, plant, memory, state, u):  # noqa: D102
@@ -116,11 +116,16 @@ class SpeedTracking(Task):
     input_index: int = 0
 
     def __post_init__(self) -> None:
-        as_number(self.fastest, "fastest", low=0.0, low_open=True)
-        as_number(self.change_probability, "change_probability", low=0.0, high=1.0)
-        as_number(self.error_weight, "error_weight", low=0.0)
-        as_number(self.input_weight, "input_weight", low=0.0)
-        as_count(self.input_index, "input_index", low=0)
+        fastest = as_number(self.fastest, "fastest", low=0.0, low_open=True)
+        probability = as_number(self.change_probability, "change_probability", low=0.0, high=1.0)
+        for name, value in (
+            ("fastest", fastest),
+            ("change_probability", probability),
+            ("error_weight", as_number(self.error_weight, "error_weight", low=0.0)),
+            ("input_weight", as_number(self.input_weight, "input_weight", low=0.0)),
+            ("input_index", as_count(self.input_index, "input_index", low=0)),
+        ):
+            object.__setattr__(self, name, value)
 
     def begin(self, rng, plant):  # noqa: D102
         return SpeedProfile(rng.uniform(0.0, self.fastest), rng.uniform(0.0, self.fastest))

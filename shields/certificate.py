@@ -126,12 +126,12 @@ class Certificate(FrozenArrays):
         try:
             text = Path(path).read_text(encoding="utf-8")
             document, literal = json.loads(text), json.loads(text, parse_float=str, parse_int=str)
-        except (OSError, ValueError, RecursionError) as error:
+        except (OSError, TypeError, ValueError, RecursionError) as error:
             reason = getattr(error, "strerror", None) or "it is not valid JSON"
             raise CertificateError(f"cannot read certificate {path}: {reason}") from error
+        if not isinstance(document, dict) or document.get("format") != FORMAT:
+            raise CertificateError(f"{path} is not a certificate of format {FORMAT!r}")
         try:
-            if document["format"] != FORMAT:
-                raise CertificateError(f"{path} is not a certificate of format {FORMAT!r}")
             content = document["certificate"]
             if document["sha256"] != _digest(literal["certificate"]):
                 raise CertificateError(f"certificate {path} was altered: its checksum does not match")
@@ -139,7 +139,7 @@ class Certificate(FrozenArrays):
         except (KeyError, TypeError, ValueError) as error:
             if isinstance(error, CertificateError):
                 raise
-            raise CertificateError(f"{path} is not a certificate: {error}") from error
+            raise CertificateError(f"{path} is not a certificate: an entry is missing or of a wrong kind") from error
 
     def _content(self) -> dict[str, Any]:
         values = {entry.name: getattr(self, entry.name) for entry in fields(self)}

@@ -45,10 +45,10 @@ class Infeasible(ValueError):
 
     Attributes:
         binding: What stands in the way: "E1" (no error bound), "S" (the box is unbounded), "U" (input limits) or
-            "I" (invariance).
+            "I" (invariance); where only exact verification failed, the name of its condition.
         shortfall: By how much: for "E1" the excess of the spectral radius over 1; for "I" and "U" the share by
             which the uncertainty (disturbance and error radii) is too large, in (0, 1]; for "S" the number of
-            directions without a limit.
+            directions without a limit; where only exact verification failed, its margin.
     """
 
     def __init__(self, message: str, binding: str, shortfall: float) -> None:
@@ -72,6 +72,8 @@ def synthesize(plant: LinearPlant, method: str = "certified", *, progress: Progr
         Infeasible: If no certificate is found; says what binds and by how much.
         ValueError: If the method is unknown.
     """
+    if not isinstance(plant, LinearPlant):
+        raise ValueError(f"plant must be a LinearPlant, got {type(plant).__name__}")
     if method != "certified":
         raise ValueError(f"method must be 'certified', got {method!r}")
     free = plant.n - int(np.linalg.matrix_rank(plant.C))

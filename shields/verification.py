@@ -72,7 +72,13 @@ def verify(certificate: Certificate, plant: LinearPlant) -> Report:
     Args:
         certificate: The certificate.
         plant: The plant, with its bounds.
+
+    Raises:
+        ValueError: If an argument is of another kind.
     """
+    if not isinstance(certificate, Certificate) or not isinstance(plant, LinearPlant):
+        kinds = f"{type(certificate).__name__} and {type(plant).__name__}"
+        raise ValueError(f"verify takes a Certificate and a LinearPlant, got {kinds}")
     conditions = [_flag("plant: the certificate belongs to it", certificate.fingerprint == plant.fingerprint)]
     fits = certificate.L.shape == (plant.n, plant.n) and certificate.K.shape == (plant.m, plant.n)
     conditions.append(_flag("shapes: L (n, n), K (m, n), one input share per input", fits and _shares_fit(certificate)))

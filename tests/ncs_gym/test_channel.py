@@ -61,6 +61,12 @@ def test_gilbert_elliott_loses_in_bursts_at_its_stationary_rate():
     assert np.mean(bursts) == pytest.approx(5.0, rel=0.1)  # 1 / p_bad_to_good
 
 
+def test_gilbert_elliott_starts_from_its_stationary_distribution():
+    loss = GilbertElliott(p_good_to_bad=1e-9, p_bad_to_good=1e-9)
+    first = [bool(transmit(Channel(loss=loss), 1, seed)[1]) for seed in range(400)]
+    assert np.mean(first) == pytest.approx(0.5, abs=0.1)
+
+
 def test_gilbert_elliott_with_equal_losses_is_bernoulli():
     loss = GilbertElliott(p_good_to_bad=0.3, p_bad_to_good=0.3, loss_good=0.4, loss_bad=0.4)
     delivered = sum(len(stamps) for stamps in transmit(Channel(loss=loss), 20_000).values())
@@ -106,6 +112,8 @@ def test_random_draws_do_not_depend_on_the_measurement():
         ({"loss": 1.1}, "loss"),
         ({"loss": -0.1}, "loss"),
         ({"loss": "often"}, "loss"),
+        ({"loss": True}, "loss"),
+        ({"quantization_step": "0.1"}, "quantization_step"),
         ({"quantization_step": -0.05}, "quantization_step"),
         ({"quantization_step": np.nan}, "quantization_step"),
         ({"send_period": 0}, "send_period"),

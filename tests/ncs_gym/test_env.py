@@ -1,12 +1,15 @@
 import json
 import pickle
 import warnings
+from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
+from stable_baselines3.common.env_util import make_vec_env
 
 import ncs_gym
 from ncs_gym import BoxDisturbance, Channel, Ellipsoid, GilbertElliott, LinearPlant, NCSEnv, Regulation, SpeedTracking
@@ -164,10 +167,38 @@ def test_start_state_can_be_chosen():
     np.testing.assert_array_equal(env.reset(options={"state": [0.5, -1.0]})[1]["state"], [0.5, -1.0])
 
 
-@pytest.mark.parametrize("options", [{"state": [1.0]}, {"state": [np.nan, 0.0]}, {"sate": [0.0, 0.0]}])
-def test_bad_options_are_refused(options):
+@pytest.mark.parametrize(
+    "options", [{"state": [1.0]}, {"state": [np.nan, 0.0]}, {"state": "a"}, {"state": None}, {"sate": [0.0, 0.0]}]
+)
+def test_bad_options_are_refused_before_anything_changes(options):
+    env, twin = make(IDS[0]), make(IDS[0])
+    env.reset(seed=0)
+    twin.reset(seed=0)
     with pytest.raises(ValueError, match="state"):
-        make(IDS[0]).reset(options=options)
+        env.reset(seed=7, options=options)
+    np.testing.assert_array_equal(env.step(np.ones(1))[4]["state"], twin.step(np.ones(1))[4]["state"])
+
+
+def test_sb3_makes_the_environment_by_its_id():
+    assert make_vec_env("ncs_gym/TruckTrailerCruise-v0", n_envs=2, seed=0).reset().shape == (2, 3)
+    PPO("MlpPolicy", "ncs_gym/TruckTrailer-v0", n_steps=32, batch_size=32).learn(32)
+
+
+def test_rendering_is_refused_in_a_way_sb3_understands():
+    for kind in (ValueError, TypeError):
+        with pytest.raises(kind, match="render_mode must be None"):
+            NCSEnv(ncs_gym.truck_trailer(), render_mode="rgb_array")
+
+
+def test_actions_are_taken_in_float64():
+    env = make(IDS[0])
+    env.reset(seed=0)
+    assert env.step(np.array([0.1]))[4]["input"][0] == 4.0 * 0.1
+
+
+def test_observation_box_leaves_room_for_the_disturbance():
+    quiet = make(IDS[0], plant=ncs_gym.truck_trailer(gamma=0.0, process_noise_cov=np.zeros((2, 2))), disturbance="ball")
+    assert (make(IDS[0]).observation_space.high > quiet.observation_space.high + 0.05).all()
 
 
 def test_starts_fill_the_disc_of_radius_1_9():
@@ -256,6 +287,26 @@ def test_stepping_before_the_first_reset_says_so():
         make(IDS[0]).unwrapped.step(np.zeros(1, np.float32))
 
 
+class Moody(Regulation):
+    """A task that fails in its second episode."""
+
+    calls: ClassVar = [0]
+
+    def begin(self, rng, plant):
+        self.calls[0] += 1
+        if self.calls[0] == 2:
+            raise RuntimeError("moody")
+
+
+def test_a_reset_that_failed_half_way_needs_another():
+    env = make(IDS[0], task=Moody()).unwrapped
+    env.reset(seed=0)
+    with pytest.raises(RuntimeError, match="moody"):
+        env.reset(options={"state": [1.9, 1.9]})
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(np.zeros(1, np.float32))
+
+
 class Wild(ncs_gym.BoxDisturbance):
     """A user's class with a draw outside every bound."""
 
@@ -312,6 +363,7 @@ def test_too_large_disturbance_raises_or_is_allowed_and_noticed():
     ("kwargs", "words"),
     [
         ({"plant": 3}, "plant must be of type LinearPlant"),
+        ({"terminate_on_violation": "no"}, "terminate_on_violation must be True or False"),
         ({"channel": {"loss": 0.3}}, "channel must be of type Channel"),
         ({"task": "drive"}, "task must be of type Task"),
         ({"initial_set": np.eye(2)}, "initial_set must be of type Ellipsoid"),

@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 
 from ncs_gym import Channel, Ellipsoid, ErrorSet, Estimator, Packet, certified_error_set, truck_trailer
 from ncs_gym.channel import GilbertElliott, Link
+from ncs_gym.estimator import _grown
+from shields.exact import congruence, is_positive_semidefinite, rational, subtract
 from tests.plants import random_plant
 
 
@@ -211,7 +213,6 @@ def test_innovation_at_the_edge_of_both_bounds_is_no_alarm():
     # The test against E(H Sigma H' + N) would raise it; the exact Minkowski test must not.
     plant = truck_trailer()
     estimator = Estimator(plant, Channel())
-    prior = plant.A @ plant.initial_error.shape @ plant.A.T
     estimator.advance(np.zeros(1), [])
     spread = Ellipsoid(plant.H @ estimator.belief.shape @ plant.H.T)
     direction = np.array([1.0, 0.3])
@@ -219,7 +220,6 @@ def test_innovation_at_the_edge_of_both_bounds_is_no_alarm():
     edge = spread.extreme_point(direction) + noise.extreme_point(direction)
     naive = Ellipsoid(spread.shape + noise.shape)
     assert not naive.contains(edge)
-    assert np.trace(prior) > 0.0
     estimator._monitor(edge, spread.shape)
     assert not estimator.alarm
     estimator._monitor(1.001 * edge, spread.shape)
@@ -239,3 +239,17 @@ def test_a_packet_never_leaves_a_larger_ellipsoid_than_ignoring_it(seed):
         estimator.advance(u, [Packet(stamp, np.zeros(1))])
         ignoring.advance(u, [])
         assert np.vdot(plant.weight, estimator.belief.shape) <= np.vdot(plant.weight, ignoring.belief.shape)
+
+
+def test_computed_shapes_hold_the_exact_ones():
+    # In a thin tilted box rounding is large against the thin direction; the enlargement must cover it exactly.
+    angle = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
+    for aspect in (1.0, 1e3, 1e5):
+        T = angle @ np.diag([1.0, 1.0 / aspect])
+        A = T @ np.array([[0.8, 0.1], [-0.05, 0.7]]) @ np.linalg.inv(T)
+        shape = T @ T.T
+        shape = 0.5 * (shape + shape.T)
+        grown = _grown(A @ shape @ A.T, np.abs(A) @ np.sqrt(np.diag(shape)))
+        exact = congruence(rational(A), rational(shape))
+        assert is_positive_semidefinite(subtract(rational(grown), exact))
+        assert np.trace(grown) <= np.trace(A @ shape @ A.T) * (1 + 1e-7)

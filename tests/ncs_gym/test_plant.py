@@ -90,6 +90,8 @@ def good() -> dict:
         ({"A": np.ones((2, 3))}, r"A must have shape \(2, 2\), got \(2, 3\)"),
         ({"A": [[np.nan, 0], [0, 0]]}, "A must be finite"),
         ({"A": "no"}, "A must be a matrix"),
+        ({"C": [[1e150, 0.0], [0.0, 1.0]]}, "C must be finite and below 1e"),
+        ({"gamma": "0"}, "gamma"),
         ({"B": np.ones((3, 1))}, "B must have shape"),
         ({"C": np.ones((1, 3))}, "C must have shape"),
         ({"H": np.ones((1, 3))}, "H must have shape"),
@@ -114,7 +116,7 @@ def test_bad_numbers_are_refused_in_one_sentence(change, words):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("change", [{"mass": 0.0}, {"stiffness": -1.0}, {"damping": -1.0}, {"dt": np.nan}])
+@pytest.mark.parametrize("change", [{"mass": 0.0}, {"stiffness": -1.0}, {"damping": -1.0}, {"dt": np.nan}, {"H": 3}])
 def test_bad_truck_is_refused(change):
     with pytest.raises(ValueError, match=next(iter(change))):
         truck_trailer(**change)

@@ -56,6 +56,8 @@ def test_observation_bound_is_never_exceeded_at_full_throttle():
         (lambda: SpeedTracking(fastest=0.0), "fastest"),
         (lambda: SpeedTracking(change_probability=1.5), "change_probability"),
         (lambda: SpeedTracking(input_index=-1), "input_index"),
+        (lambda: SpeedTracking(fastest="25"), "fastest"),
+        (lambda: Regulation(state_cost=1.0), "state_cost"),
         (lambda: Regulation(state_cost=-np.eye(2)), "state_cost"),
     ],
 )

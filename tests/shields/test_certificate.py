@@ -96,3 +96,19 @@ def test_a_failed_save_leaves_nothing_behind(certificate, tmp_path):
     with pytest.raises(IsADirectoryError):
         certificate.save(tmp_path / "folder")
     assert [entry.name for entry in tmp_path.iterdir()] == ["folder"]
+
+
+def test_a_reader_never_sees_half_a_file(certificate, tmp_path, monkeypatch):
+    path = tmp_path / "c.json"
+    certificate.save(path)
+    before = path.read_bytes()
+
+    def fail(handle):
+        assert path.read_bytes() == before  # the old file stands while the new one is written
+        raise OSError("disk full")
+
+    monkeypatch.setattr("shields.storage.os.fsync", fail)
+    with pytest.raises(OSError, match="disk full"):
+        certificate.save(path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]

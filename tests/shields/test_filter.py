@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from ncs_gym import Ellipsoid
 from shields import CertificateError, SafetyFilter, synthesize
+from shields.filter import MARGIN
 from tests.plants import random_plant
 
 
@@ -176,3 +177,28 @@ def test_filter_refuses_what_does_not_verify(certificate, loaded, plant):
         SafetyFilter(certificate, plant)
     with pytest.raises(ValueError, match="mode must be one of"):
         SafetyFilter(certificate, loaded, "hope")
+
+
+def test_the_test_is_passed_with_a_margin_or_not_at_all(certificate, loaded):
+    shield = SafetyFilter(certificate, loaded, "switch")
+    shape = 0.1 * certificate.Sigma
+    low, high = 0.0, 4.0  # bisect to the last input that passes
+    for _ in range(80):
+        middle = 0.5 * (low + high)
+        passed = shield.decide(np.array([1.6, 0.0]), shape, np.array([middle])).reason == "safe"
+        low, high = (middle, high) if passed else (low, middle)
+    margin = shield.margin(np.array([1.6, 0.0]), shape, np.array([low]))
+    assert MARGIN <= margin <= 2 * MARGIN
+    assert MARGIN >= 1e-10
+
+
+def test_projection_leaves_room_for_float32():
+    # Coarse actions: a limit so large that float32 steps are visible in the test.
+    plant = replace(random_plant(3, 2, 1), u_max=1e4)
+    certificate = synthesize(plant)
+    shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(0)
+    reasons = []
+    for _ in range(300):
+        estimate = 0.8 * certificate.safe_set.sample(rng)
+        reasons.append(shield.decide(estimate, 1e-3 * certificate.Sigma, np.array([1e4])).reason)
+    assert set(reasons) == {"projected"}

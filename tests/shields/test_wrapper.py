@@ -24,7 +24,8 @@ from stable_baselines3.common.monitor import Monitor
 
 from ncs_gym import AdversarialDisturbance, Channel, Ellipsoid
 from shields import Certificate, CertificateError, SafetyShield, synthesize
-from shields.proof import ALARM, LARGE_ERROR, NOT_KNOWN_INSIDE, OTHER_INPUT, OTHER_STEPS
+from shields.filter import Decision, SafetyFilter
+from shields.proof import ALARM, LARGE_ERROR, NOT_KNOWN_INSIDE, OTHER_INPUT, OTHER_STEPS, ProofTracker
 from tests.plants import random_plant
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -391,6 +392,24 @@ def test_error_ellipsoid_outside_the_certified_one_is_reported(certificate, load
     infos = play(env, full, 30, seed=0)
     assert infos[0]["shield_guaranteed"]
     assert LARGE_ERROR in {info["shield_reason"] for info in infos}
+
+
+def test_fallback_proves_nothing_while_the_error_is_not_certified(certificate):
+    tracker = ProofTracker(SafetyFilter(certificate, gym.make(CRUISE).unwrapped.plant))
+    info = {
+        "estimate": np.array([1.9, 0.0]),
+        "error_shape": certificate.Sigma,
+        "assumption_violated": False,
+        "input": np.zeros(1),
+    }
+    fallback = Decision(np.zeros(1), True, False, True, -0.1, "fallback")
+    tracker.start(True, True, info)
+    tracker.step(fallback, True, info | {"error_shape": 1.01 * certificate.Sigma})
+    assert tracker.reason == LARGE_ERROR  # the step itself still began with a certified error
+    tracker.step(fallback, True, info)
+    assert tracker.reason == NOT_KNOWN_INSIDE
+    tracker.step(fallback._replace(passed=True), True, info)
+    assert tracker.reason == ""
 
 
 def test_alarm_is_cleared_by_a_new_episode(certificate):
