@@ -55,30 +55,20 @@ def way_covered(summary: dict[str, Any]) -> float:
 
 
 def table_rows(summary: dict[str, Any]) -> list[list[str]]:
-    """Returns the header and one row of text per arm and reference policy."""
+    """Returns two header rows, then one row of text per arm and reference policy."""
     rows = [
-        ["", "training:", "training:", "evaluation:", "evaluation:", "evaluation:", "evaluation:", "evaluation:"],
-        [
-            "",
-            "violating steps",
-            "overridden",
-            "violating episodes",
-            "exact 95 % CI",
-            "violating steps",
-            "overridden",
-            "return [95 % CI]",
-        ],
+        ["", "training:", "", "evaluation, exact 95 % CI:", "violating", "", ""],
+        ["", "violating steps", "overridden", "violating episodes", "steps", "overridden", "return [95 % CI]"],
     ]
     for name, arm in (summary["arms"] | summary["references"]).items():
         low, high = arm["eval_violation_rate_ci95"]
-        trained = arm["train_steps"] > 0
+        steps = f"{arm['train_violation_steps']:,} of {arm['train_steps']:,}"
         rows.append(
             [
                 name,
-                f"{arm['train_violation_steps']:,} of {arm['train_steps']:,}" if trained else "-",
+                steps if arm["train_steps"] else "-",
                 f"{100 * arm['train_intervention_rate']:.1f} %" if arm["shielded"] else "-",
-                f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,}",
-                f"{100 * low:.1f} to {100 * high:.1f} %",
+                f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,} [{100 * low:.1f}, {100 * high:.1f} %]",
                 f"{arm['eval_violation_steps']:,}",
                 f"{100 * arm['intervention_rate']:.1f} %" if arm["shielded"] else "-",
                 _return_text(arm),
@@ -105,8 +95,8 @@ def table_text(summary: dict[str, Any]) -> str:
 def _return_text(arm: dict[str, Any]) -> str:
     interval = arm["eval_return_ci95"]
     if interval is None:
-        return f"{arm['eval_return_mean']:.2f} [n/a]"
-    return f"{arm['eval_return_mean']:.2f} [{interval[0]:.2f}, {interval[1]:.2f}]"
+        return f"{arm['eval_return_mean']:.1f} [n/a]"
+    return f"{arm['eval_return_mean']:.1f} [{interval[0]:.1f}, {interval[1]:.1f}]"
 
 
 def _rate(events: int, trials: int) -> float:
