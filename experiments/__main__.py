@@ -31,28 +31,36 @@ def main() -> None:
 def _parse() -> object:
     import tyro
 
-    from experiments.settings import CompareSettings, SynthesizeSettings, VerifySettings
+    from experiments import settings
 
     return tyro.extras.subcommand_cli_from_dict(
-        {"compare": CompareSettings, "synthesize": SynthesizeSettings, "verify": VerifySettings},
+        {
+            "compare": settings.CompareSettings,
+            "synthesize": settings.SynthesizeSettings,
+            "verify": settings.VerifySettings,
+            "audit": settings.AuditSettings,
+            "reproduce": settings.ReproduceSettings,
+        },
         prog="ncs",
         description="Safe learning control over imperfect networks.",
     )
 
 
-def _run(settings: object) -> None:
-    from experiments.settings import CompareSettings, SynthesizeSettings
+def _run(chosen: object) -> None:
+    from experiments import settings
 
-    if isinstance(settings, CompareSettings):
+    if isinstance(chosen, settings.CompareSettings):
         _require_training_extra()
-        from experiments.compare import compare
-
-        compare(settings)
-        return
-    from experiments.certificates import synthesize_file, verify_file
-
-    run = synthesize_file if isinstance(settings, SynthesizeSettings) else verify_file
-    run(settings)
+        from experiments.compare import compare as run
+    elif isinstance(chosen, settings.AuditSettings):
+        from experiments.audit import audit as run
+    elif isinstance(chosen, settings.ReproduceSettings):
+        from experiments.reproduce import reproduce as run
+    elif isinstance(chosen, settings.SynthesizeSettings):
+        from experiments.certificates import synthesize_file as run
+    else:
+        from experiments.certificates import verify_file as run
+    run(chosen)
 
 
 def _require_own_agents() -> None:

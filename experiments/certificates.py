@@ -22,7 +22,7 @@ def synthesize_file(settings: SynthesizeSettings) -> None:
         OSError: If the file cannot be written.
     """
     plant = plant_of(settings.env)
-    certificate = synthesize(plant, progress=lambda line: print(line, flush=True))
+    certificate = synthesize(plant, settings.method, progress=lambda line: print(line, flush=True))
     certificate.save(settings.out)
     print(verify(certificate, plant))
     print(f"valid; saved to {settings.out}")

@@ -17,7 +17,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from experiments.certificates import plant_of
-from experiments.figures import as_png, episode_figure, phase_figure, training_figure
+from experiments.figures import episode_figure, phase_figure, training_figure
+from experiments.plotting import as_png
 from experiments.pool import run_all
 from experiments.report import html_report
 from experiments.settings import CompareSettings

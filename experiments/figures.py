@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 
 import matplotlib
@@ -11,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from experiments.plotting import STYLE
 from experiments.unit import UnitResult
 from ncs_gym import LinearPlant
 from shields import Certificate
@@ -19,15 +19,6 @@ COLORS = {"unshielded": "#c8553d", "shielded": "#1f6f8b"}
 GREY = "#555555"
 # Curves of fewer points show them.
 FEW_POINTS = 5
-STYLE = {
-    "font.size": 10,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#e4e4e4",
-    "legend.frameon": False,
-    "figure.dpi": 130,
-}
 
 
 def training_figure(arms: dict[str, Sequence[UnitResult]]) -> Figure:
@@ -98,19 +89,13 @@ def episode_figure(plant: LinearPlant, arms: dict[str, Sequence[UnitResult]]) ->
         top.annotate("limit", (0.0, 1.0), xytext=(2, 3), textcoords="offset points", fontsize=8.5)
         _label(top, "", "largest |c_j x|", "The same episode with and without the shield")
         _label(bottom, "time [s]", _with_unit(plant.input_names[0], plant.input_units[0]), "")
+        top.set_ylim(top=1.2 * top.get_ylim()[1])  # room for the legend
         top.legend(loc="upper right", ncols=2)
         bottom.legend(loc="upper right", ncols=3, fontsize=8.5)
         for limit in (-plant.u_max[0], plant.u_max[0]):
             bottom.axhline(limit, color="black", lw=1.0, ls="--")
         bottom.set_ylim(-1.1 * plant.u_max[0], 1.6 * plant.u_max[0])
         return figure
-
-
-def as_png(figure: Figure) -> bytes:
-    """Returns a figure as a PNG file's bytes."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": ""})
-    return buffer.getvalue()
 
 
 def _per_run(results: Sequence[UnitResult], name: str) -> np.ndarray:

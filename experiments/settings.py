@@ -54,11 +54,13 @@ class SynthesizeSettings:
 
     Attributes:
         env: Id of a registered environment.
+        method: The certified method, or the published one as printed.
         out: File for the certificate (JSON).
         seed: Accepted by every command; the synthesis is deterministic and does not use it.
     """
 
     env: str = "ncs_gym/TruckTrailerCruise-v0"
+    method: Literal["certified", "paper"] = "certified"
     out: Path = Path("certificate.json")
     seed: int = 0
 
@@ -77,4 +79,38 @@ class VerifySettings:
     file: tyro.conf.Positional[Path]
     env: str | None = None
     out: Path | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class AuditSettings:
+    """Checks the printed numbers of the paper (Liu et al. Section 5) claim by claim, from its own data.
+
+    Attributes:
+        json: Print JSON instead of the table.
+        out: File for the rows (JSON).
+        seed: Accepted by every command; the audit is deterministic and does not use it.
+    """
+
+    json: bool = False
+    out: Path | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReproduceSettings:
+    """Simulates Section 5 of Liu et al.: printed (K, M), certified (K, M), and OP's at the nearest feasible bounds.
+
+    Random starts in each safe set, all four impairments; prints a table and leaves figures and summary.json.
+
+    Attributes:
+        out: Output folder.
+        starts: Random initial states per design.
+        steps: Steps of each simulation.
+        seed: Of starts, disturbances and channel, alike for all designs.
+    """
+
+    out: Path = Path("runs/reproduce")
+    starts: int = 100
+    steps: int = 200
     seed: int = 0

@@ -1,9 +1,11 @@
 """Robust safety invariant sets, their exact verification, and shields made of them."""
 
 from shields.certificate import Certificate, CertificateError, Multipliers
+from shields.condition import Condition
 from shields.filter import Decision, SafetyFilter
-from shields.synthesis import Infeasible, synthesize
-from shields.verification import Condition, Report, verify
+from shields.infeasible import Infeasible
+from shields.synthesis import synthesize
+from shields.verification import Report, verify
 from shields.wrapper import SafetyShield
 
 __all__ = [

@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import Ellipsoid
-from ncs_gym.frozen import FrozenArrays, as_matrix, read_only
+from ncs_gym.frozen import FrozenArrays, as_matrix, as_number, read_only
 from shields.storage import write_atomically
 
 FORMAT = "ncs-gym certificate 1"
-ARRAYS = ("L", "K", "Sigma", "D")
+# What a certificate of each method carries besides L and K.
+PROOF = ("Sigma", "D", "multipliers")
+CONSTANTS = ("kappa", "rho", "epsilon", "epsilon_up")
 
 
 class CertificateError(ValueError):
@@ -63,28 +65,43 @@ class Certificate(FrozenArrays):
     Attributes:
         L: Shape of the safe set, (n, n); S = E(L).
         K: Gain of the fallback input u = K x_hat, (m, n) [input per state].
-        Sigma: Shape of the certified error set, (n, n).
-        D: Shape of the disturbance set it was made for, (n, n).
-        multipliers: See `Multipliers`.
-        method: "certified".
+        Sigma: Shape of the certified error set, (n, n); None for "paper".
+        D: Shape of the disturbance set it was made for, (n, n); None for "paper".
+        multipliers: See `Multipliers`; None for "paper".
+        method: "certified" or "paper".
         fingerprint: Of the plant it belongs to.
+        kappa, rho, epsilon, epsilon_up: Constants of OP ("paper" only).
         provenance: How it was made (solver, versions, volume); informative only.
     """
 
     L: np.ndarray
     K: np.ndarray
-    Sigma: np.ndarray
-    D: np.ndarray
-    multipliers: Multipliers
+    Sigma: np.ndarray | None = None
+    D: np.ndarray | None = None
+    multipliers: Multipliers | None = None
     method: str
     fingerprint: str
+    kappa: float | None = None
+    rho: float | None = None
+    epsilon: float | None = None
+    epsilon_up: float | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         try:
             n = len(np.atleast_2d(self.L))
-            for name, rows in (("L", n), ("K", None), ("Sigma", n), ("D", n)):
+            own, foreign = (PROOF, CONSTANTS) if self.method == "certified" else (CONSTANTS, PROOF)
+            if self.method not in ("certified", "paper"):
+                raise ValueError(f"its method must be 'certified' or 'paper', got {self.method!r}")
+            wrong = [name for name in own if getattr(self, name) is None]
+            wrong += [name for name in foreign if getattr(self, name) is not None]
+            if wrong:
+                raise ValueError(f"one of method {self.method!r} has other entries: {', '.join(wrong)}")
+            matrices = [("L", n), ("K", None)] + [(name, n) for name in ("Sigma", "D") if name in own]
+            for name, rows in matrices:
                 object.__setattr__(self, name, as_matrix(getattr(self, name), (rows, n), name))
+            for name in CONSTANTS if own is CONSTANTS else ():
+                object.__setattr__(self, name, as_number(getattr(self, name), name))
         except ValueError as error:
             raise CertificateError(f"not a certificate: {error}") from error
         self._freeze_arrays()
@@ -101,9 +118,9 @@ class Certificate(FrozenArrays):
         return Ellipsoid(self.L)
 
     @cached_property
-    def error_set(self) -> Ellipsoid:
-        """E(Sigma)."""
-        return Ellipsoid(self.Sigma)
+    def error_set(self) -> Ellipsoid | None:
+        """E(Sigma); None for "paper"."""
+        return None if self.Sigma is None else Ellipsoid(self.Sigma)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes JSON in which every float is exact; a reader never sees half a file.
@@ -143,15 +160,17 @@ class Certificate(FrozenArrays):
 
     def _content(self) -> dict[str, Any]:
         values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        for name in ARRAYS:
-            values[name] = values[name].tolist()
-        values["multipliers"] = asdict(self.multipliers)
+        for name, value in values.items():
+            if isinstance(value, np.ndarray):
+                values[name] = value.tolist()
+        values["multipliers"] = None if self.multipliers is None else asdict(self.multipliers)
         return values
 
 
 def _from_content(content: dict[str, Any]) -> dict[str, Any]:
     values = {entry.name: content[entry.name] for entry in fields(Certificate)}
-    values["multipliers"] = Multipliers(**values["multipliers"])
+    if values["multipliers"] is not None:
+        values["multipliers"] = Multipliers(**values["multipliers"])
     return values
 
 

@@ -16,6 +16,7 @@ ALARM = "a measurement contradicts the assumed bounds"
 OTHER_INPUT = "the input applied is not the one decided"
 OTHER_STEPS = "the environment did not move exactly one step"
 LARGE_ERROR = "the error ellipsoid is not inside the certified one"
+NO_ERROR_SET = "a certificate of the published method carries no error set"
 NOT_KNOWN_INSIDE = "the state is not known to be in the safe set"
 
 
@@ -38,6 +39,8 @@ class ProofTracker:
         """Why the proof does not hold now; empty while it does."""
         if self._broken:
             return self._broken
+        if self._filter.certificate.Sigma is None:
+            return NO_ERROR_SET
         if not self._inside:
             return NOT_KNOWN_INSIDE
         return "" if self._error_certified else LARGE_ERROR
@@ -75,8 +78,9 @@ class ProofTracker:
         estimate, error_shape = info["estimate"], info["error_shape"]
         if info["assumption_violated"]:
             self._broken = self._broken or ALARM
-        finite = bool(np.isfinite(error_shape).all())
-        self._error_certified = finite and is_inside(error_shape, self._filter.certificate.Sigma)
+        Sigma = self._filter.certificate.Sigma
+        usable = Sigma is not None and bool(np.isfinite(error_shape).all())
+        self._error_certified = usable and is_inside(error_shape, Sigma)
         if not self._inside:
             self._inside = self._filter.knows_inside(estimate, error_shape)
 

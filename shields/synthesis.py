@@ -10,6 +10,8 @@ import numpy as np
 
 from ncs_gym import ErrorSetError, LinearPlant, UnstablePlantError, certified_error_set
 from shields.certificate import Certificate
+from shields.infeasible import Infeasible
+from shields.paper import paper_certificate
 from shields.semidefinite import (
     Design,
     InvariantSetProgram,
@@ -40,42 +42,89 @@ GROWTH = 1.0 + 1e-9
 Progress = Callable[[str], None]
 
 
-class Infeasible(ValueError):
-    """No certificate was found.
+def synthesize(
+    plant: LinearPlant,
+    method: str = "certified",
+    *,
+    progress: Progress | None = None,
+    dkappa: float = 0.02,
+    drho: float = 0.05,
+    search: str = "first",
+) -> Certificate:
+    """Returns a verified certificate.
 
-    Attributes:
-        binding: What stands in the way: "E1" (no error bound), "S" (the box is unbounded), "U" (input limits) or
-            "I" (invariance); where only exact verification failed, the name of its condition.
-        shortfall: By how much: for "E1" the excess of the spectral radius over 1; for "I" and "U" the share by
-            which the uncertainty (disturbance and error radii) is too large, in (0, 1]; for "S" the number of
-            directions without a limit; where only exact verification failed, its margin.
-    """
-
-    def __init__(self, message: str, binding: str, shortfall: float) -> None:
-        super().__init__(message)
-        self.binding = binding
-        self.shortfall = shortfall
-
-    def __reduce__(self):
-        return type(self), (self.args[0], self.binding, self.shortfall)
-
-
-def synthesize(plant: LinearPlant, method: str = "certified", *, progress: Progress | None = None) -> Certificate:
-    """Returns a verified certificate with the largest ellipsoid found (theory.md section 3).
+    "certified" (docs/theory.md section 3) looks for the largest ellipsoid with hard bounds; "paper" solves OP of Liu et
+    al. as printed with their Algorithm 1, whose certificate carries no error set (docs/paper.md).
 
     Args:
-        plant: The plant with its bounds, Schur stable.
-        method: "certified".
-        progress: Called with one line of text per solved program.
+        plant: The plant with its bounds, Schur stable for "certified".
+        method: "certified" or "paper".
+        progress: Called with one line of text per solved program ("certified").
+        dkappa: Step of kappa ("paper").
+        drho: Step of rho ("paper").
+        search: "first" feasible pair, as printed, or "largest" volume over the grid ("paper").
 
     Raises:
         Infeasible: If no certificate is found; says what binds and by how much.
-        ValueError: If the method is unknown.
+        ValueError: If an argument is out of range.
     """
     if not isinstance(plant, LinearPlant):
         raise ValueError(f"plant must be a LinearPlant, got {type(plant).__name__}")
+    if method == "paper":
+        return paper_certificate(plant, dkappa=dkappa, drho=drho, search=search)
     if method != "certified":
-        raise ValueError(f"method must be 'certified', got {method!r}")
+        raise ValueError(f"method must be 'certified' or 'paper', got {method!r}")
+    return _certified(plant, progress or (lambda line: None))
+
+
+def _certified(plant: LinearPlant, progress: Progress) -> Certificate:
+    """Returns the certificate of the certified method."""
+    problem, Sigma, rate = _design_problem(plant)
+    failure = None
+    for slack in SLACKS:
+        design = _largest_set(problem, slack, progress)
+        if design is None:
+            break
+        certificate = _certificate(plant, problem, design, Sigma, rate, slack)
+        report = verify(certificate, plant)
+        if report.valid:
+            return certificate
+        failed = next(condition for condition in report.conditions if not condition.holds)
+        failure = Infeasible(
+            f"a candidate was found, but in exact arithmetic {failed.name} fails by {-failed.margin:.3g}",
+            failed.name.split()[0].strip("():"),
+            -failed.margin,
+        )
+    raise failure or _diagnosis(problem)
+
+
+def certify(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> Certificate | None:
+    """Returns a verified certificate for a given set and gain, or None if no multipliers were found that prove it.
+
+    Args:
+        plant: The plant with its bounds.
+        L: Shape of the safe set, (n, n).
+        K: Gain, (m, n).
+
+    Raises:
+        Infeasible: If the plant has no error set or its box is unbounded.
+    """
+    problem, Sigma, rate = _design_problem(plant)
+    inverse = np.linalg.inv(problem.transform)
+    scaled_L, scaled_K = inverse @ L @ inverse.T, (K @ problem.transform) / problem.u_max[:, None]
+    shares, _ = best_shares(problem, scaled_L, scaled_K, (0.9, 0.03, 0.07))
+    inputs = best_input_shares(problem, scaled_L, scaled_K)
+    design = Design(scaled_L, scaled_K, shares, inputs, float(np.linalg.slogdet(scaled_L)[1]))
+    certificate = _certificate(plant, problem, design, Sigma, rate, 0.0, shape=L, gain=K)
+    return certificate if verify(certificate, plant).valid else None
+
+
+def _design_problem(plant: LinearPlant) -> tuple[ScaledProblem, np.ndarray, float]:
+    """Returns the scaled problem, Sigma and lam_e.
+
+    Raises:
+        Infeasible: If the plant has no error set or its box is unbounded.
+    """
     free = plant.n - int(np.linalg.matrix_rank(plant.C))
     if free:
         raise Infeasible(
@@ -90,23 +139,7 @@ def synthesize(plant: LinearPlant, method: str = "certified", *, progress: Progr
     except ErrorSetError as error:
         raise Infeasible(str(error), "E1", 0.0) from error
     Sigma = GROWTH * errors.Sigma
-    problem = scaled_problem(plant, Sigma, largest_box_ellipsoid(plant.C))
-    failure = None
-    for slack in SLACKS:
-        design = _largest_set(problem, slack, progress or (lambda line: None))
-        if design is None:
-            break
-        certificate = _certificate(plant, problem, design, Sigma, errors.rate, slack)
-        report = verify(certificate, plant)
-        if report.valid:
-            return certificate
-        failed = next(condition for condition in report.conditions if not condition.holds)
-        failure = Infeasible(
-            f"a candidate was found, but in exact arithmetic {failed.name} fails by {-failed.margin:.3g}",
-            failed.name.split()[0].strip("():"),
-            -failed.margin,
-        )
-    raise failure or _diagnosis(problem)
+    return scaled_problem(plant, Sigma, largest_box_ellipsoid(plant.C)), Sigma, errors.rate
 
 
 def _largest_set(problem: ScaledProblem, slack: float, progress: Progress) -> Design | None:
@@ -177,19 +210,28 @@ def _finish(problem: ScaledProblem, best: Design) -> Design:
 
 
 def _certificate(
-    plant: LinearPlant, problem: ScaledProblem, design: Design, Sigma: np.ndarray, rate: float, slack: float
+    plant: LinearPlant,
+    problem: ScaledProblem,
+    design: Design,
+    Sigma: np.ndarray,
+    rate: float,
+    slack: float,
+    *,
+    shape: np.ndarray | None = None,
+    gain: np.ndarray | None = None,
 ) -> Certificate:
+    """Returns the certificate of a design; `shape` and `gain` replace its own L and K where they were given."""
     L, K = problem.physical(design.L, design.K)
     return Certificate(
-        L=L,
-        K=K,
+        L=L if shape is None else shape,
+        K=K if gain is None else gain,
         Sigma=Sigma,
         D=GROWTH * plant.disturbance.shape,
         multipliers=as_multipliers(problem, design, rate),
         method="certified",
         fingerprint=plant.fingerprint,
         provenance={
-            "source": "theory.md section 3",
+            "source": "docs/theory.md section 3",
             "solver": f"Clarabel {version('clarabel')} through cvxpy {version('cvxpy')}",
             "slack": slack,
             "volume_of_box_ellipsoid": float(np.exp(0.5 * design.log_det)),

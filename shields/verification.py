@@ -10,37 +10,21 @@ import numpy as np
 
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate, CertificateError
+from shields.condition import Condition, flag, matrix_condition, scalar
 from shields.exact import (
     Matrix,
     add,
     congruence,
-    is_positive_semidefinite,
     multiply,
     quadratic,
     rational,
     scale,
     subtract,
-    to_float,
 )
+from shields.paper_conditions import paper_conditions
 
 # Rounding an action in [-1, 1] to float32 moves it by at most this.
 ACTION_ROUNDING = Fraction(1, 2**24)
-
-
-@dataclass(frozen=True)
-class Condition:
-    """One checked condition.
-
-    Attributes:
-        name: Its name in theory.md section 3, and what it says.
-        margin: Signed and rounded to float: the smallest eigenvalue of a matrix inequality or the slack of a
-            scalar one; at least 0 exactly if it holds.
-        holds: Decided in exact arithmetic.
-    """
-
-    name: str
-    margin: float
-    holds: bool
 
 
 @dataclass(frozen=True)
@@ -67,7 +51,8 @@ def verify(certificate: Certificate, plant: LinearPlant) -> Report:
     """Returns whether a certificate proves what it claims for a plant, in exact rational arithmetic.
 
     The conditions are (E0), (E1), (I), (S), (U) of theory.md section 3, and that D, N and r0^2 I contain what
-    section 1 says they contain. No tolerance, no solver, no float decides; the margins are for people.
+    section 1 says they contain; for a certificate of method "paper" the constraints of OP instead (docs/paper.md). No
+    tolerance, no solver, no float decides; the margins are for people.
 
     Args:
         certificate: The certificate.
@@ -79,9 +64,12 @@ def verify(certificate: Certificate, plant: LinearPlant) -> Report:
     if not isinstance(certificate, Certificate) or not isinstance(plant, LinearPlant):
         kinds = f"{type(certificate).__name__} and {type(plant).__name__}"
         raise ValueError(f"verify takes a Certificate and a LinearPlant, got {kinds}")
-    conditions = [_flag("plant: the certificate belongs to it", certificate.fingerprint == plant.fingerprint)]
+    conditions = [flag("plant: the certificate belongs to it", certificate.fingerprint == plant.fingerprint)]
     fits = certificate.L.shape == (plant.n, plant.n) and certificate.K.shape == (plant.m, plant.n)
-    conditions.append(_flag("shapes: L (n, n), K (m, n), one input share per input", fits and _shares_fit(certificate)))
+    if certificate.method == "paper":
+        conditions.append(flag("shapes: L (n, n), K (m, n)", fits))
+        return Report(tuple(conditions + (list(paper_conditions(certificate, plant)) if fits else [])))
+    conditions.append(flag("shapes: L (n, n), K (m, n), one input share per input", fits and _shares_fit(certificate)))
     if not conditions[-1].holds:
         return Report(tuple(conditions))
     conditions += _shares(certificate)
@@ -116,15 +104,15 @@ def _shares(certificate: Certificate) -> Iterator[Condition]:
     shares = certificate.multipliers
     finite = all(np.isfinite([shares.error, shares.state, shares.estimate, shares.disturbance, shares.rounding]))
     finite = finite and all(np.isfinite(shares.inputs))
-    yield _flag("multipliers: finite", finite)
+    yield flag("multipliers: finite", finite)
     if not finite:
         return
     inside = all(0.0 < share < 1.0 for share in (shares.error, *shares.inputs))
-    yield _flag("multipliers: 0 < lam_e < 1 and 0 < mu_i < 1", inside)
+    yield flag("multipliers: 0 < lam_e < 1 and 0 < mu_i < 1", inside)
     parts = [Fraction(share) for share in (shares.state, shares.estimate, shares.disturbance)]
     positive = min(*parts, Fraction(shares.rounding)) > 0
-    yield _flag("multipliers: lx, le, ld, s > 0", positive)
-    yield _scalar("multipliers: lx + le + ld <= 1", 1 - sum(parts))
+    yield flag("multipliers: lx, le, ld, s > 0", positive)
+    yield scalar("multipliers: lx + le + ld <= 1", 1 - sum(parts))
 
 
 def _bounds(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
@@ -137,21 +125,23 @@ def _bounds(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]
     share = _trace_share(ball, ellipsoid)
     need = add(ball, ellipsoid) if share is None else add(scale(1 / share, ball), scale(1 / (1 - share), ellipsoid))
     bound = rational(plant.disturbance.shape)
-    yield _matrix("D: the plant's holds the disturbance and the process noise", subtract(bound, need))
-    yield _matrix("D: the certificate's holds the plant's", subtract(rational(certificate.D), bound))
+    yield matrix_condition("D: the plant's holds the disturbance and the process noise", subtract(bound, need))
+    yield matrix_condition("D: the certificate's holds the plant's", subtract(rational(certificate.D), bound))
     sensor = scale(Fraction(plant.sensor_noise.energy), rational(plant.measurement_noise_cov))
-    yield _matrix("N: holds the sensor noise", subtract(rational(plant.sensor_error.shape), sensor))
+    yield matrix_condition("N: holds the sensor noise", subtract(rational(plant.sensor_error.shape), sensor))
     first = scale(Fraction(plant.initial_noise.energy), rational(plant.initial_cov))
-    yield _matrix("r0: holds the error of the first estimate", subtract(rational(plant.initial_error.shape), first))
+    yield matrix_condition(
+        "r0: holds the error of the first estimate", subtract(rational(plant.initial_error.shape), first)
+    )
 
 
 def _error_set(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
     """(E0) and (E1): the error starts in E(Sigma) and never leaves it."""
     Sigma, D = rational(certificate.Sigma), rational(certificate.D)
     rate = Fraction(certificate.multipliers.error)
-    yield _matrix("(E0) Sigma - r0^2 I >= 0", subtract(Sigma, rational(plant.initial_error.shape)))
+    yield matrix_condition("(E0) Sigma - r0^2 I >= 0", subtract(Sigma, rational(plant.initial_error.shape)))
     grown = add(scale(1 / rate, congruence(rational(plant.A), Sigma)), scale(1 / (1 - rate), D))
-    yield _matrix("(E1) Sigma - A Sigma A'/lam_e - D/(1-lam_e) >= 0", subtract(Sigma, grown))
+    yield matrix_condition("(E1) Sigma - A Sigma A'/lam_e - D/(1-lam_e) >= 0", subtract(Sigma, grown))
 
 
 def _safe_set(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
@@ -159,7 +149,7 @@ def _safe_set(certificate: Certificate, plant: LinearPlant) -> Iterator[Conditio
     shares = certificate.multipliers
     L, K, Sigma = rational(certificate.L), rational(certificate.K), rational(certificate.Sigma)
     B = rational(plant.B)
-    yield _matrix("L > 0", L, strict=True)
+    yield matrix_condition("L > 0", L, strict=True)
     gain = multiply(B, K)
     D_u = _with_action_rounding(rational(certificate.D), B, plant.u_max, Fraction(shares.rounding))
     grown = add(
@@ -167,14 +157,14 @@ def _safe_set(certificate: Certificate, plant: LinearPlant) -> Iterator[Conditio
         scale(1 / Fraction(shares.estimate), congruence(gain, Sigma)),
         scale(1 / Fraction(shares.disturbance), D_u),
     )
-    yield _matrix("(I) L - (A+BK) L (A+BK)'/lx - BK Sigma K'B'/le - D_u/ld >= 0", subtract(L, grown))
+    yield matrix_condition("(I) L - (A+BK) L (A+BK)'/lx - BK Sigma K'B'/le - D_u/ld >= 0", subtract(L, grown))
     for j, row in enumerate(plant.C):
-        yield _scalar(f"(S) c_{j + 1} L c_{j + 1}' <= 1", 1 - quadratic(rational(row), L))
+        yield scalar(f"(S) c_{j + 1} L c_{j + 1}' <= 1", 1 - quadratic(rational(row), L))
     for i, (limit, share) in enumerate(zip(plant.u_max, shares.inputs, strict=True)):
         mu = Fraction(share)
         used = quadratic([K[i]], L) / mu + quadratic([K[i]], Sigma) / (1 - mu)
         allowed = (Fraction(float(limit)) * (1 - ACTION_ROUNDING)) ** 2
-        yield _scalar(f"(U) input {i + 1} stays within u_max (1 - 2^-24)", allowed - used)
+        yield scalar(f"(U) input {i + 1} stays within u_max (1 - 2^-24)", allowed - used)
 
 
 def _with_action_rounding(D: Matrix, B: Matrix, u_max: np.ndarray, growth: Fraction) -> Matrix:
@@ -193,26 +183,3 @@ def _trace_share(first: Matrix, second: Matrix) -> Fraction | None:
         return None
     a, b = Fraction(float(a) ** 0.5), Fraction(float(b) ** 0.5)
     return a / (a + b)
-
-
-def _flag(name: str, holds: bool) -> Condition:
-    return Condition(name, 0.0 if holds else -1.0, holds)
-
-
-def _scalar(name: str, slack: Fraction) -> Condition:
-    try:
-        margin = float(slack)
-    except OverflowError:
-        margin = np.inf if slack >= 0 else -np.inf
-    return Condition(name, margin, slack >= 0)
-
-
-def _matrix(name: str, matrix: Matrix, *, strict: bool = False) -> Condition:
-    holds = is_positive_semidefinite(matrix, strict=strict)
-    try:
-        smallest = float(np.linalg.eigvalsh(to_float(matrix))[0])
-    except OverflowError:  # exact, but beyond any float
-        smallest = np.inf if holds else -np.inf
-    # Rounding may give the float the wrong sign; the exact verdict rules.
-    margin = max(smallest, 0.0) if holds else min(smallest, -5e-324)
-    return Condition(name, margin, holds)

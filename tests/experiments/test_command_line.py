@@ -123,7 +123,7 @@ def test_synthesize_then_verify(tmp_path):
     assert_one_sentence(other, "does not verify")
 
 
-@pytest.mark.parametrize("command", ["compare", "synthesize", "verify"])
+@pytest.mark.parametrize("command", ["compare", "synthesize", "verify", "audit", "reproduce"])
 def test_every_command_has_help_seed_and_out(command):
     run = ncs(command, "--help")
     assert run.returncode == 0
@@ -149,6 +149,10 @@ def test_usage_errors_are_the_parsers(arguments):
         (["compare", "--jobs", "-1"], ["--jobs must be at least 1"]),
         (["compare", "--seed", "-1"], ["--seed must be >= 0"]),
         (["compare", "--penalty", "nan"], ["--penalty must be >= 0"]),
+        (
+            ["synthesize", "--env", "ncs_gym/TruckTrailer-v0", "--method", "paper"],
+            ["OP is infeasible", "(C2) binds", "0.034"],
+        ),
         (["compare", "--certificate", "nowhere.json"], ["cannot read certificate nowhere.json"]),
         (["verify", "nowhere.json"], ["cannot read certificate nowhere.json"]),
         (["synthesize", "--out", "no/such/folder/c.json"], ["No such file or directory"]),

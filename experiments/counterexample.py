@@ -1,0 +1,82 @@
+"""Looks for a state, disturbance and error that leave a set in one step, and confirms it exactly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+
+from ncs_gym import Ellipsoid
+from shields.exact import add, multiply, quadratic, rational, transpose
+
+# Pulls the points found inside their sets by more than rounding.
+INSIDE = 1.0 - 1e-9
+STARTS, ASCENT_STEPS = 200, 200
+
+
+@dataclass(frozen=True, eq=False)
+class OneStep:
+    """The worst step found.
+
+    Attributes:
+        state, disturbance, error, following: x, d, e and x+ = (A+BK) x + d + e, shape (n,) each.
+        level: x+'M x+ in floating point.
+        confirmed: Whether exact arithmetic confirms x in S, d'd <= gamma, e'e <= eps and x+ outside S.
+    """
+
+    state: np.ndarray
+    disturbance: np.ndarray
+    error: np.ndarray
+    following: np.ndarray
+    level: float
+    confirmed: bool
+
+
+def worst_step(
+    closed: np.ndarray, M: np.ndarray, gamma: float, epsilon: float, direction: np.ndarray | None = None
+) -> OneStep:
+    """Returns the step from {x'Mx <= 1} with d'd <= gamma, e'e <= epsilon that ends at the largest x+'M x+.
+
+    By ascent: for a fixed slope M x+ each of x, d, e is the extreme point of its own set; many random starts.
+
+    Args:
+        closed: A + B K, shape (n, n).
+        M: Shape (n, n).
+        gamma: Squared radius of d.
+        epsilon: Squared radius of e.
+        direction: Only e along this vector, shape (n,); None: every e in the ball.
+    """
+    n = len(M)
+    inverse = np.linalg.inv(M)
+    states, disturbances = Ellipsoid(0.5 * (inverse + inverse.T)), Ellipsoid(gamma * np.eye(n))
+    spread = np.eye(n) if direction is None else np.outer(direction, direction) / (direction @ direction)
+    errors = Ellipsoid(epsilon * spread)
+    rng, best = np.random.default_rng(0), None
+    for _ in range(STARTS):
+        x, d, e = (source.sample_boundary(rng) for source in (states, disturbances, errors))
+        for _ in range(ASCENT_STEPS):
+            slope = M @ (closed @ x + d + e)
+            x, d, e = (
+                states.extreme_point(closed.T @ slope),
+                disturbances.extreme_point(slope),
+                errors.extreme_point(slope),
+            )
+        end = closed @ x + d + e
+        if best is None or end @ M @ end > best[0]:
+            best = (float(end @ M @ end), INSIDE * x, INSIDE * d, INSIDE * e)
+    level, x, d, e = best
+    return OneStep(x, d, e, closed @ x + d + e, level, _confirmed(closed, M, gamma, epsilon, x, d, e))
+
+
+def _confirmed(closed, M, gamma, epsilon, x, d, e) -> bool:
+    """Returns whether the step starts inside all bounds and ends outside S, in rational arithmetic."""
+    x_, d_, e_, M_ = (rational(value) for value in (x, d, e, M))
+    following = add(multiply(x_, transpose(rational(closed))), d_, e_)
+    identity = rational(np.eye(len(M)))
+    return (
+        quadratic(x_, M_) <= 1
+        and quadratic(d_, identity) <= Fraction(gamma)
+        and quadratic(e_, identity) <= Fraction(epsilon)
+        and quadratic(following, M_) > 1
+    )

@@ -1,0 +1,89 @@
+"""The certificate of the published method, or the reason why there is none."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ncs_gym import LinearPlant
+from shields.certificate import Certificate
+from shields.codesign import codesign
+from shields.feasibility import FeasibilityScan, largest_gamma, largest_noise_scale, largest_scale
+from shields.infeasible import Infeasible
+
+
+def paper_certificate(plant: LinearPlant, *, dkappa: float, drho: float, search: str) -> Certificate:
+    """Returns the certificate of OP and Algorithm 1 (Liu et al. Definition 2), as printed.
+
+    It carries the guarantee of the paper's own definitions, which assumes e'e <= eps; no error set, so a shield made of
+    it is never guaranteed.
+
+    Args:
+        plant: The plant with its bounds.
+        dkappa: Step of kappa, > 0.
+        drho: Step of rho, > 0.
+        search: "first" or "largest".
+
+    Raises:
+        Infeasible: If OP has no solution on the grid.
+        ValueError: If an argument is out of range.
+    """
+    try:
+        design = codesign(plant, dkappa=dkappa, drho=drho, search=search)
+    except LookupError:
+        raise paper_diagnosis(plant) from None
+    return Certificate(
+        L=design.L,
+        K=design.K,
+        method="paper",
+        fingerprint=plant.fingerprint,
+        kappa=design.bounds.kappa,
+        rho=design.bounds.rho,
+        epsilon=design.bounds.epsilon,
+        epsilon_up=design.bounds.epsilon_up,
+        provenance={
+            "source": "Liu et al. Definition 2 and Algorithm 1",
+            "search": search,
+            "dkappa": dkappa,
+            "drho": drho,
+            "alpha": design.bounds.alpha,
+            "guarantee": "the paper's own: invariance if e'e <= epsilon at every step",
+        },
+    )
+
+
+def paper_diagnosis(plant: LinearPlant) -> Infeasible:
+    """Returns the exception that says which constraint binds, how far off it is and what would be feasible."""
+    scan = FeasibilityScan(plant)
+    try:
+        best = scan.best(plant)
+    except LookupError as error:
+        return Infeasible(f"OP is infeasible: {error}", "C1", np.inf)
+    if best.ratio >= 1.0:
+        return Infeasible(
+            f"OP has no solution on this grid, but has one near kappa = {best.kappa:.3f}, rho = {best.rho:.3f}: use "
+            "smaller steps dkappa and drho",
+            "grid",
+            0.0,
+        )
+    gamma, noise, scale = largest_gamma(scan, plant), largest_noise_scale(scan, plant), largest_scale(scan, plant)
+    return Infeasible(
+        f"OP is infeasible, (C2) binds: over the whole domain the largest lambda_min(L)/alpha is {best.ratio:.3g} (at "
+        f"kappa = {best.kappa:.3f}, rho = {best.rho:.3f}) and must be at least 1; it is feasible for "
+        f"{_tolerated(gamma, noise)}, or with gamma, Q and P0 all scaled by {scale:.3g}",
+        "C2",
+        1.0 - best.ratio,
+        {
+            "ratio": best.ratio,
+            "kappa": best.kappa,
+            "rho": best.rho,
+            "largest_gamma": gamma,
+            "largest_noise_scale": noise,
+            "largest_scale": scale,
+        },
+    )
+
+
+def _tolerated(gamma: float, noise: float) -> str:
+    by_gamma = f"gamma up to {gamma:.3g}" if gamma > 0.0 else "no gamma"
+    by_noise = f"Q scaled by up to {noise:.3g}" if noise > 0.0 else "no scale of Q"
+    return f"{by_gamma} alone, {by_noise} alone"

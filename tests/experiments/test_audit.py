@@ -1,0 +1,119 @@
+"""The audit's figures, against those a second, independent computation found."""
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from experiments.audit import FAILS, HOLDS, ROUNDED, audit_rows, audit_text
+from experiments.counterexample import worst_step
+from experiments.printed_case import PrintedCase
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return list(audit_rows(PrintedCase()))
+
+
+EXPECTED = [
+    ("A and B", HOLDS, ["4.0e-05"]),
+    ("(C1)", HOLDS, ["0.90298"]),
+    ("(C2)", FAILS, ["5.743", "3.984", "5.9e-06", "3.83"]),
+    ("(C3)", ROUNDED, ["1.000016"]),
+    ("(C5)", FAILS, ["17.99"]),
+    ("the input", FAILS, ["4.24"]),
+    ("the set is", FAILS, ["1.0197", "confirmed in exact arithmetic"]),
+    ("the same", HOLDS, ["0.932"]),
+    ("epsilon", FAILS, ["0.149", "0.371", "0.0052 to 0.0056"]),
+    ("the largest simulated", FAILS, ["0.0124", "0.0024", "norm"]),
+    ("OP is feasible", FAILS, ["0.034", "0.21", "1.6e-05", "0.0040", "0.0224", "0.84"]),
+]
+
+
+@pytest.mark.parametrize("index", range(len(EXPECTED)))
+def test_every_claim_has_its_verdict_and_figures(rows, index):
+    claim, verdict, figures = EXPECTED[index]
+    row = rows[index]
+    assert row.claim.startswith(claim)
+    assert row.verdict == verdict
+    for figure in figures:
+        assert figure in row.computed + row.charitable
+
+
+def test_no_claim_is_left_out(rows):
+    assert len(rows) == len(EXPECTED)
+
+
+def test_verdicts_follow_the_numbers():
+    # With a smaller printed epsilon and gain other claims would hold: nothing is a constant.
+    other = replace(PrintedCase(), K=0.5 * PrintedCase().K, epsilon=0.2)
+    verdicts = {row.claim.split(" ")[0]: row.verdict for row in audit_rows(other)}
+    assert verdicts["(C1)"] == FAILS
+    assert verdicts["(C5)"] == HOLDS
+    assert verdicts["epsilon"] == HOLDS
+
+
+def test_counterexample_is_one_in_exact_arithmetic():
+    case = PrintedCase()
+    step = worst_step(case.closed, case.M, 5e-4, case.epsilon)
+
+    def exact(vector):
+        return [Fraction(float(v)) for v in vector]
+
+    x, d, e = exact(step.state), exact(step.disturbance), exact(step.error)
+    M = [exact(row) for row in case.M]
+    closed = [exact(row) for row in case.closed]
+
+    def level(v):
+        return sum(v[i] * M[i][j] * v[j] for i in range(2) for j in range(2))
+
+    end = [sum(closed[i][j] * x[j] for j in range(2)) + d[i] + e[i] for i in range(2)]
+    assert level(x) <= 1
+    assert sum(v * v for v in d) <= Fraction(5e-4)
+    assert sum(v * v for v in e) <= Fraction(case.epsilon)
+    assert level(end) > 1
+    assert step.confirmed
+
+
+def test_worst_step_beats_random_search():
+    case = PrintedCase()
+    found = worst_step(case.closed, case.M, 5e-4, case.epsilon)
+    rng = np.random.default_rng(1)
+    root = np.linalg.inv(np.linalg.cholesky(case.M).T)
+    best = 0.0
+    for _ in range(20_000):
+        x, d, e = (v / np.linalg.norm(v) for v in rng.standard_normal((3, 2)))
+        end = case.closed @ root @ x + 5e-4**0.5 * d + case.epsilon**0.5 * e
+        best = max(best, end @ case.M @ end)
+    assert best <= found.level
+    assert best > 0.98 * found.level
+
+
+def test_text_is_readable_and_complete(rows):
+    text = audit_text(rows)
+    assert all(len(line) <= 100 for line in text.splitlines())
+    assert text.endswith("4 of 11 claims hold.")
+
+
+def test_command_prints_json_and_writes_it(rows, tmp_path):
+    command = [sys.executable, "-m", "experiments", "audit", "--json", "--out", str(tmp_path / "audit.json")]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert run.returncode == 0, run.stderr
+    assert json.loads(run.stdout) == json.loads((tmp_path / "audit.json").read_text())
+    assert [row["verdict"] for row in json.loads(run.stdout)] == [row.verdict for row in rows]
+
+
+def test_printed_numbers_are_nowhere_else_in_the_code():
+    from pathlib import Path
+
+    root = Path(__file__).resolve().parent.parent.parent
+    printed = re.compile(r"0\.9029|0\.0094|0\.0017|2\.0927|0\.3514|9\.8426")
+    for package in ("ncs_gym", "shields", "agents", "experiments"):
+        for path in (root / package).rglob("*.py"):
+            if path.name != "printed_case.py":
+                assert not printed.search(path.read_text()), path

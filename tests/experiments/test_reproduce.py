@@ -1,0 +1,57 @@
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from experiments.printed_case import PrintedCase
+from experiments.reproduce import StateFeedback, _outcome
+from ncs_gym.scenarios import CASE_STUDY_BOX
+
+
+def test_outcome_counts_what_left_the_set_the_box_and_the_limit():
+    case = PrintedCase()
+    design = StateFeedback("printed", case.plant, CASE_STUDY_BOX, 4.0 * np.eye(2), case.K, 0.01)
+    states = np.array([[[0.0, 0.0], [1.9, 1.9], [2.1, 0.0]]])
+    errors = np.array([[[0.1, 0.0], [0.0, 0.0]]])
+    outcome, _, _ = _outcome(design, states, np.array([[4.5, -1.0]]), errors)
+    assert (outcome.steps, outcome.outside_set, outcome.outside_box, outcome.input_asked_beyond) == (2, 2, 1, 1)
+    assert outcome.largest_level == pytest.approx(2 * 1.9**2 / 4)
+    expected = np.square(case.plant.B @ case.K @ [0.1, 0.0]).sum()
+    assert outcome.largest_error == pytest.approx(expected)
+    assert outcome.largest_estimation_error == pytest.approx(0.01)
+
+
+def test_command_leaves_figures_and_summary(tmp_path):
+    command = [
+        sys.executable,
+        "-m",
+        "experiments",
+        "reproduce",
+        "--starts",
+        "4",
+        "--steps",
+        "50",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    assert run.returncode == 0, run.stderr
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert len(summary) == 3
+    assert all(outcome["steps"] == 200 for outcome in summary.values())
+    assert summary["certified"]["outside_set"] == 0
+    assert summary["certified"]["input_asked_beyond"] == 0
+    assert (tmp_path / "out" / "figures" / "states.png").stat().st_size > 10_000
+    assert (tmp_path / "out" / "figures" / "inputs.png").stat().st_size > 10_000
+    assert "claimed epsilon" in run.stdout
+
+
+@pytest.mark.parametrize("arguments", [["--starts", "0"], ["--steps", "-1"], ["--seed", "-1"]])
+def test_bad_settings_are_one_sentence(arguments, tmp_path):
+    command = [sys.executable, "-m", "experiments", "reproduce", *arguments, "--out", str(tmp_path / "out")]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    assert run.returncode == 2
+    assert run.stderr.startswith(f"ncs: {arguments[0]} must be")
+    assert not (tmp_path / "out").exists()

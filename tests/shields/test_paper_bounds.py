@@ -1,0 +1,91 @@
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from ncs_gym import truck_trailer
+from shields.paper_bounds import (
+    PaperModel,
+    covariance_bound,
+    process_bound,
+    safety_margin,
+    state_error_bound,
+    uplink_error_bound,
+)
+
+Q, P0 = np.diag([1e-4, 3e-5]), np.diag([2e-4, 1e-4])
+
+
+def test_covariance_bound_is_the_recursion_p_plus_is_g2_p_plus_q():
+    p = 2e-4
+    for k in range(30):
+        assert covariance_bound(k, 2e-4, 0.8, 6e-4) == pytest.approx(p)
+        p = 0.8 * p + 6e-4
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_covariance_bound_bounds_a_covariance_that_is_only_predicted(seed):
+    rng = np.random.default_rng(seed)
+    G = rng.standard_normal((2, 2))
+    G *= 0.9 / np.linalg.norm(G, 2)
+    P, q_bar = P0, process_bound(5e-4, Q)
+    for k in range(40):
+        assert np.linalg.eigvalsh(P)[-1] <= covariance_bound(k, 2e-4, 0.81, q_bar) * (1 + 1e-12)
+        P = G @ P @ G.T + Q + 5e-4 * np.eye(2)
+
+
+def test_uplink_bound_is_theorem_5_with_the_kept_quantile():
+    expected = (2e-4 * 0.9 + (1e-4 + 5e-4) / 0.1) * chi2.ppf(0.95, 2)
+    assert uplink_error_bound(5e-4, Q, P0, 0.05, 0.9) == pytest.approx(expected)
+
+
+def test_uplink_bound_is_the_limit_of_the_recursion_times_the_quantile():
+    far = covariance_bound(3000, 0.0, 0.9, 6e-4) * chi2.ppf(0.95, 2)
+    assert uplink_error_bound(5e-4, Q, np.zeros((2, 2)), 0.05, 0.9) == pytest.approx(far)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_state_bound_holds_for_every_gain_with_that_closed_loop_norm(seed):
+    rng = np.random.default_rng(seed)
+    plant = truck_trailer()
+    K = rng.uniform(-2, 2, (1, 2))
+    g2 = np.linalg.norm(plant.A + plant.B @ K, 2) ** 2
+    e_up = rng.standard_normal(2)
+    bound = state_error_bound(plant.A, g2, float(e_up @ e_up))
+    assert np.square(plant.B @ K @ e_up).sum() <= bound
+
+
+def test_safety_margin_is_the_distance_argument_of_the_paper():
+    alpha = safety_margin(5e-4, 0.0094, 0.9029)
+    assert alpha**0.5 - (0.9029 * alpha) ** 0.5 == pytest.approx(5e-4**0.5 + 0.0094**0.5)
+    assert safety_margin(1.0, 1.0, 1.0) == 0.0
+
+
+def test_model_of_a_plant_agrees_with_the_single_formulas():
+    plant = truck_trailer(gamma=1e-5, process_noise_cov=Q, initial_cov=P0)
+    bounds = PaperModel(plant).at(0.8, 1.1)
+    epsilon_up = uplink_error_bound(1e-5, Q, P0, 0.05, 0.88)
+    assert bounds.epsilon_up == pytest.approx(epsilon_up)
+    assert bounds.epsilon == pytest.approx(state_error_bound(plant.A, 0.88, epsilon_up))
+    assert bounds.alpha == pytest.approx(safety_margin(1e-5, bounds.epsilon, 0.8))
+
+
+@pytest.mark.parametrize(
+    ("call", "word"),
+    [
+        (lambda: uplink_error_bound(-1e-9, Q, P0, 0.05, 0.9), "gamma"),
+        (lambda: uplink_error_bound(5e-4, -Q, P0, 0.05, 0.9), "process_noise_cov"),
+        (lambda: uplink_error_bound(5e-4, Q, [[1, 2], [2, 1]], 0.05, 0.9), "initial_cov"),
+        (lambda: uplink_error_bound(5e-4, Q, np.eye(3), 0.05, 0.9), "initial_cov"),
+        (lambda: uplink_error_bound(5e-4, Q, P0, 0.0, 0.9), "delta"),
+        (lambda: uplink_error_bound(5e-4, Q, P0, 1.0, 0.9), "delta"),
+        (lambda: uplink_error_bound(5e-4, Q, P0, 0.05, 1.0), "g2"),
+        (lambda: uplink_error_bound(5e-4, [[np.nan, 0], [0, 1]], P0, 0.05, 0.5), "process_noise_cov"),
+        (lambda: state_error_bound(np.eye(2), -0.1, 1.0), "g2"),
+        (lambda: safety_margin(5e-4, 0.1, 0.0), "kappa"),
+        (lambda: covariance_bound(-1, 1.0, 0.5, 1.0), "k must be"),
+        (lambda: covariance_bound(1, 1.0, -0.5, 1.0), "g2"),
+    ],
+)
+def test_bad_arguments_are_refused(call, word):
+    with pytest.raises(ValueError, match=word):
+        call()
