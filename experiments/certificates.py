@@ -25,6 +25,9 @@ def synthesize_file(settings: SynthesizeSettings) -> None:
     certificate = synthesize(plant, settings.method, progress=lambda line: print(line, flush=True))
     certificate.save(settings.out)
     print(verify(certificate, plant))
+    if certificate.method == "paper":
+        also = "hold" if certificate.provenance["exact_conditions_hold"] else "were not shown to hold"
+        print(f"guarantee: {certificate.provenance['guarantee']}; our exact conditions {also} for it too")
     print(f"valid; saved to {settings.out}")
 
 

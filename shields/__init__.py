@@ -4,7 +4,7 @@ from shields.certificate import Certificate, CertificateError, Multipliers
 from shields.condition import Condition
 from shields.filter import Decision, SafetyFilter
 from shields.infeasible import Infeasible
-from shields.synthesis import synthesize
+from shields.synthesis import certify, synthesize
 from shields.verification import Report, verify
 from shields.wrapper import SafetyShield
 
@@ -18,6 +18,7 @@ __all__ = [
     "Report",
     "SafetyFilter",
     "SafetyShield",
+    "certify",
     "synthesize",
     "verify",
 ]

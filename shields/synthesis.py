@@ -71,7 +71,9 @@ def synthesize(
     if not isinstance(plant, LinearPlant):
         raise ValueError(f"plant must be a LinearPlant, got {type(plant).__name__}")
     if method == "paper":
-        return paper_certificate(plant, dkappa=dkappa, drho=drho, search=search)
+        certificate = paper_certificate(plant, dkappa=dkappa, drho=drho, search=search)
+        exact = {"exact_conditions_hold": _is_certifiable(plant, certificate.L, certificate.K)}
+        return replace(certificate, provenance=certificate.provenance | exact)
     if method != "certified":
         raise ValueError(f"method must be 'certified' or 'paper', got {method!r}")
     return _certified(plant, progress or (lambda line: None))
@@ -117,6 +119,14 @@ def certify(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> Certificate | N
     design = Design(scaled_L, scaled_K, shares, inputs, float(np.linalg.slogdet(scaled_L)[1]))
     certificate = _certificate(plant, problem, design, Sigma, rate, 0.0, shape=L, gain=K)
     return certificate if verify(certificate, plant).valid else None
+
+
+def _is_certifiable(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> bool:
+    """Returns whether our exact conditions hold for a set and gain, as far as multipliers were found."""
+    try:
+        return certify(plant, L, K) is not None
+    except Infeasible:
+        return False
 
 
 def _design_problem(plant: LinearPlant) -> tuple[ScaledProblem, np.ndarray, float]:
