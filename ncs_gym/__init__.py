@@ -13,9 +13,10 @@ from ncs_gym.ellipsoid import Ellipsoid
 from ncs_gym.env import NCSEnv
 from ncs_gym.error_set import ErrorSet, ErrorSetError, UnstablePlantError, certified_error_set
 from ncs_gym.estimator import Estimator
-from ncs_gym.plant import LinearPlant, truck_trailer
+from ncs_gym.plant import LinearPlant
 from ncs_gym.scenarios import register_all
 from ncs_gym.task import Regulation, SpeedTracking, Task
+from ncs_gym.truck import truck_trailer
 
 register_all()
 

@@ -13,8 +13,9 @@ from ncs_gym.channel import Channel
 from ncs_gym.disturbance import BoxDisturbance
 from ncs_gym.ellipsoid import Ellipsoid
 from ncs_gym.env import NCSEnv
-from ncs_gym.plant import LinearPlant, truck_trailer
+from ncs_gym.plant import LinearPlant
 from ncs_gym.task import Regulation, SpeedTracking, Task
+from ncs_gym.truck import truck_trailer
 
 # Steps per episode of every registered environment (Liu et al. Section 5).
 EPISODE_STEPS = 200
