@@ -8,7 +8,17 @@ from fractions import Fraction
 import numpy as np
 
 from ncs_gym import Ellipsoid
-from shields.exact import add, multiply, quadratic, rational, transpose
+from shields.exact import (
+    add,
+    congruence,
+    is_positive_semidefinite,
+    multiply,
+    quadratic,
+    rational,
+    scale,
+    subtract,
+    transpose,
+)
 
 # Pulls the points found inside their sets by more than rounding.
 INSIDE = 1.0 - 1e-9
@@ -67,6 +77,36 @@ def worst_step(
             best = (float(end @ M @ end), INSIDE * x, INSIDE * d, INSIDE * e)
     level, x, d, e = best
     return OneStep(x, d, e, closed @ x + d + e, level, _confirmed(closed, M, gamma, epsilon, x, d, e))
+
+
+def stays_inside(
+    closed: np.ndarray, M: np.ndarray, gamma: float, epsilon: float, direction: np.ndarray | None = None
+) -> bool:
+    """Returns whether exact arithmetic proves that no such step leaves the set (False: not proved).
+
+    With P the closed loop's image of M^-1, e's shape and gamma I, any shares that sum to 1 give an ellipsoid around the
+    sum of the three; it lies in {x'Mx <= 1} if M - M (sum of P_i / share_i) M >= 0. Arguments as in `worst_step`.
+    """
+    n = len(M)
+    inverse = np.linalg.inv(M)
+    spread = np.eye(n) if direction is None else np.outer(direction, direction)
+    shapes = [closed @ inverse @ closed.T, epsilon * spread / (1.0 if direction is None else direction @ direction)]
+    sizes = np.sqrt([np.trace(M @ shape) for shape in (*shapes, gamma * np.eye(n))])
+    shares = [Fraction(float(size)) for size in sizes]
+    total = sum(shares)
+    M_, closed_ = rational(M), multiply(rational(M), rational(closed))
+    # M (closed M^-1 closed') M <= share_1 (M - rest): by Schur, in M and closed alone.
+    square = Fraction(1) if direction is None else quadratic(rational(direction), rational(np.eye(n)))
+    terms = [
+        (Fraction(epsilon) / square, rational(spread), shares[1]),
+        (Fraction(gamma), rational(np.eye(n)), shares[2]),
+    ]
+    rest = M_
+    for factor, shape, share in terms:
+        rest = subtract(rest, scale(factor * total / share, congruence(M_, shape)))
+    top = [left + right for left, right in zip(scale(shares[0] / total, M_), transpose(closed_), strict=True)]
+    bottom = [left + right for left, right in zip(closed_, rest, strict=True)]
+    return is_positive_semidefinite(top + bottom)
 
 
 def _confirmed(closed, M, gamma, epsilon, x, d, e) -> bool:

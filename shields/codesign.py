@@ -6,7 +6,7 @@ docs/paper.md says what was found about them.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import cvxpy as cp
@@ -16,13 +16,15 @@ from ncs_gym import LinearPlant
 from ncs_gym.frozen import as_number
 from shields.cone_program import ConeProgram
 from shields.paper_bounds import PaperBounds, PaperModel
+from shields.paper_conditions import SMALLEST_GAP
+from shields.semidefinite import largest_box_ellipsoid
 
-# kappa * rho this near to 1 makes the error bound infinite: the point is skipped.
-SMALLEST_GAP = 1e-9
 # Tightens every constraint, so that what the solver returns meets the printed ones in exact arithmetic.
 SLACK = 1e-7
 # (C2) must have this much room before the tightened problem is tried.
 ROOM = 1e-6
+# In units of the box, lambda_min(L) below this is the solver's noise, and a weight above that is no limit.
+SMALLEST_MARGIN, LARGEST_WEIGHT = 1e-7, 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,34 +37,61 @@ class PaperDesign:
     log_det: float
 
 
+@dataclass(frozen=True, eq=False)
+class Units:
+    """OP in units where the safe box is of size 1 and the inputs are limited by 1.
+
+    One unit for all states keeps OP's identity matrices what they are: with x = size x', L = size^2 L', and alpha, eps
+    and eps_up are divided by size^2.
+
+    Attributes:
+        A, B, C: Plant in these units.
+        size: Unit of the states.
+        u_max: Units of the inputs, shape (m,).
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    size: float
+    u_max: np.ndarray
+
+    @classmethod
+    def of(cls, plant: LinearPlant) -> Units:
+        """Returns the units of a plant; its box must be bounded."""
+        size = float(np.linalg.det(largest_box_ellipsoid(plant.C))) ** (0.5 / plant.n)
+        return cls(plant.A, plant.B * plant.u_max / size, plant.C * size, size, plant.u_max)
+
+
 def solve_op(plant: LinearPlant, bounds: PaperBounds, *, slack: float = 0.0) -> PaperDesign | None:
     """Returns the solution of OP at one (kappa, rho), or None if the solver finds none: OP as printed, readably.
 
     Args:
-        plant: The plant; its input limits must all be those of (C5).
+        plant: The plant.
         bounds: kappa, rho and the constants.
         slack: Relative tightening of the constraints.
     """
-    n, m = plant.n, plant.m
+    n, m, units = plant.n, plant.m, Units.of(plant)
+    alpha, epsilon_up = bounds.alpha / units.size**2, bounds.epsilon_up / units.size**2
     L, U = cp.Variable((n, n), symmetric=True), cp.Variable((n, n), symmetric=True)
     F, tau, beta = cp.Variable((m, n)), cp.Variable(m), cp.Variable()
-    identity, closed = np.eye(n), plant.A @ L + plant.B @ F
+    identity, closed = np.eye(n), units.A @ L + units.B @ F
     less, more = 1.0 - slack, 1.0 + slack
     constraints = [
         cp.bmat([[less * bounds.kappa * L, closed.T], [closed, L]]) >> 0,  # (C1)
-        L >> more * bounds.alpha * identity,  # (C2)
-        cp.diag(plant.C @ L @ plant.C.T) <= less,  # (C3)
-        bounds.epsilon_up * U << less * bounds.alpha**2 * identity,  # (C4)
+        L >> more * alpha * identity,  # (C2)
+        cp.diag(units.C @ L @ units.C.T) <= less,  # (C3)
+        epsilon_up * U << less * alpha**2 * identity,  # (C4)
         U >> 0,
     ]
     if bounds.rho == 1.0:
         constraints.append(beta * identity == L)  # (C7)
     else:
         constraints += [more * beta * identity << L, L << less * bounds.rho * beta * identity]
-    for i, limit in enumerate(plant.u_max):
+    for i in range(m):
         row = F[i : i + 1, :]
         constraints += [
-            cp.bmat([[cp.reshape(less * 0.5 * limit**2 - tau[i], (1, 1), order="C"), row], [row.T, L]]) >> 0,  # (C5)
+            cp.bmat([[cp.reshape(less * 0.5 - tau[i], (1, 1), order="C"), row], [row.T, L]]) >> 0,  # (C5), u_max = 1
             cp.bmat([[cp.reshape(tau[i], (1, 1), order="C"), row], [row.T, U]]) >> 0,  # (C6)
         ]
     problem = cp.Problem(cp.Maximize(cp.log_det(L)), constraints)
@@ -77,30 +106,34 @@ def solve_op(plant: LinearPlant, bounds: PaperBounds, *, slack: float = 0.0) -> 
     shape = 0.5 * (L.value + L.value.T)
     if bounds.rho == 1.0:
         shape = float(shape[0, 0]) * identity
-    return PaperDesign(shape, np.linalg.solve(shape, F.value.T).T, bounds, float(np.linalg.slogdet(shape)[1]))
+    if np.linalg.eigvalsh(shape)[0] <= 0.0:
+        return None
+    K = units.u_max[:, None] * np.linalg.solve(shape, F.value.T).T / units.size
+    shape = units.size**2 * shape
+    return PaperDesign(shape, K, bounds, float(np.linalg.slogdet(shape)[1]))
 
 
-def _eliminated(plant: LinearPlant, *, volume: bool, with_error: bool) -> ConeProgram:
+def _eliminated(units: Units, *, volume: bool, with_error: bool) -> ConeProgram:
     """Returns OP with U and tau eliminated exactly, to be updated in place.
 
     The best U is (alpha^2 / eps_up) I, and (C5) with (C6) become one matrix inequality. The parameters are kappa, rho,
-    then alpha^2 / eps_up (`with_error`; without it the limit is K_i L K_i' <= u_max^2 / 2), then alpha (`volume`: the
+    then alpha^2 / eps_up (`with_error`; without it the limit is K_i L K_i' <= 1/2), then alpha (`volume`: the
     objective is log det L; without it, the largest lambda_min(L), (C2) is left out).
     """
-    n = plant.n
-    L, F = cp.Variable((n, n), symmetric=True), cp.Variable((plant.m, n))
+    n, m = units.B.shape
+    L, F = cp.Variable((n, n), symmetric=True), cp.Variable((m, n))
     margin, beta = cp.Variable(), cp.Variable()
     kappa, rho, weight, alpha = (cp.Parameter(nonneg=True) for _ in range(4))
-    closed, identity, zero = plant.A @ L + plant.B @ F, np.eye(n), np.zeros((n, n))
+    closed, identity, zero = units.A @ L + units.B @ F, np.eye(n), np.zeros((n, n))
     constraints = [
         cp.bmat([[kappa * L, closed.T], [closed, L]]) >> 0,
         L >> (alpha if volume else margin) * identity,
-        cp.diag(plant.C @ L @ plant.C.T) <= 1,
+        cp.diag(units.C @ L @ units.C.T) <= 1,
         beta * identity << L,
         L << rho * beta * identity,
     ]
-    for i, limit in enumerate(plant.u_max):
-        row, corner = F[i : i + 1, :], np.array([[0.5 * limit**2]])
+    for i in range(m):
+        row, corner = F[i : i + 1, :], np.array([[0.5]])
         blocks = [[corner, row], [row.T, L]]
         if with_error:
             blocks = [[corner, row, row], [row.T, L, zero], [row.T, zero, weight * identity]]
@@ -120,13 +153,39 @@ class MarginProgram:
     """
 
     def __init__(self, plant: LinearPlant, *, with_error: bool = True) -> None:
-        self._with_error = with_error
-        self._program = _eliminated(plant, volume=False, with_error=with_error)
+        self._units, self._with_error = Units.of(plant), with_error
+        self._program = _eliminated(self._units, volume=False, with_error=with_error)
 
     def largest(self, bounds: PaperBounds) -> float:
-        """Returns the largest lambda_min(L); minus infinity if the other constraints have no solution."""
-        weight = [bounds.alpha**2 / bounds.epsilon_up] * self._with_error
-        return self._program.maximum([bounds.kappa, bounds.rho, *weight])
+        """Returns the largest lambda_min(L); minus infinity if there is none beyond the solver's accuracy."""
+        weight = [_weight(bounds, self._units)] * self._with_error
+        margin = self._program.maximum([bounds.kappa, bounds.rho, *weight])
+        return self._units.size**2 * margin if margin > SMALLEST_MARGIN else -np.inf
+
+
+def _weight(bounds: PaperBounds, units: Units) -> float:
+    """Returns alpha^2 / eps_up in the given units, capped where it no longer matters (smaller is conservative)."""
+    if bounds.epsilon_up == 0.0:
+        return LARGEST_WEIGHT
+    return min(bounds.alpha / units.size**2 * bounds.alpha / bounds.epsilon_up, LARGEST_WEIGHT)
+
+
+class VolumeProgram:
+    """OP with U and tau eliminated, updated in place: its largest log det L at any (kappa, rho).
+
+    Args:
+        plant: The plant.
+    """
+
+    def __init__(self, plant: LinearPlant) -> None:
+        self._units, self._n = Units.of(plant), plant.n
+        self._program = _eliminated(self._units, volume=True, with_error=True)
+
+    def largest(self, bounds: PaperBounds) -> float:
+        """Returns the largest log det L; minus infinity if the solver finds none."""
+        alpha = bounds.alpha / self._units.size**2
+        volume = self._program.maximum([bounds.kappa, bounds.rho, _weight(bounds, self._units), alpha])
+        return volume + 2.0 * self._n * float(np.log(self._units.size))
 
 
 def grid(dkappa: float, drho: float) -> Iterator[tuple[float, float]]:
@@ -149,23 +208,14 @@ def grid(dkappa: float, drho: float) -> Iterator[tuple[float, float]]:
         kappa = 1.0 - i * dkappa
 
 
-class VolumeProgram:
-    """OP with U and tau eliminated, updated in place: its largest log det L at any (kappa, rho).
-
-    Args:
-        plant: The plant.
-    """
-
-    def __init__(self, plant: LinearPlant) -> None:
-        self._program = _eliminated(plant, volume=True, with_error=True)
-
-    def largest(self, bounds: PaperBounds) -> float:
-        """Returns the largest log det L; minus infinity if the solver finds none."""
-        weight = bounds.alpha**2 / bounds.epsilon_up
-        return self._program.maximum([bounds.kappa, bounds.rho, weight, bounds.alpha])
-
-
-def codesign(plant: LinearPlant, *, dkappa: float = 0.02, drho: float = 0.05, search: str = "first") -> PaperDesign:
+def codesign(
+    plant: LinearPlant,
+    *,
+    dkappa: float = 0.02,
+    drho: float = 0.05,
+    search: str = "first",
+    accept: Callable[[PaperDesign], bool] = lambda design: True,
+) -> PaperDesign:
     """Returns the solution of OP that Algorithm 1 finds.
 
     Args:
@@ -173,26 +223,28 @@ def codesign(plant: LinearPlant, *, dkappa: float = 0.02, drho: float = 0.05, se
         dkappa: Step of kappa, > 0.
         drho: Step of rho, > 0.
         search: "first" (as printed: the first feasible pair wins) or "largest" (the largest log det over the grid).
+        accept: Judges a solution; the search goes on past one that is not accepted.
 
     Raises:
-        LookupError: If OP has no solution anywhere on the grid.
+        LookupError: If OP has no accepted solution anywhere on the grid.
         ValueError: If a step is not positive or the search is unknown.
     """
     if search not in ("first", "largest"):
         raise ValueError(f"search must be 'first' or 'largest', got {search!r}")
     model, margin, volume = PaperModel(plant), MarginProgram(plant), VolumeProgram(plant)
-    best: tuple[float, PaperBounds | None] = (-np.inf, None)
+    feasible: list[tuple[float, PaperBounds]] = []
     for kappa, rho in grid(dkappa, drho):
         bounds = model.at(kappa, rho)
         if margin.largest(bounds) < bounds.alpha * (1.0 + ROOM):
             continue
         if search == "first":
             design = solve_op(plant, bounds, slack=SLACK)
-            if design is not None:
+            if design is not None and accept(design):
                 return design
         else:
-            best = max(best, (volume.largest(bounds), bounds), key=lambda pair: pair[0])
-    design = None if best[1] is None else solve_op(plant, best[1], slack=SLACK)
-    if design is None:
-        raise LookupError("OP has no solution on the grid")
-    return design
+            feasible.append((volume.largest(bounds), bounds))
+    for _, bounds in sorted(feasible, key=lambda pair: -pair[0]):
+        design = solve_op(plant, bounds, slack=SLACK)
+        if design is not None and accept(design):
+            return design
+    raise LookupError("OP has no solution on the grid")

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 from cvxpy.reductions.solvers.conic_solvers.clarabel_conif import dims_to_solver_cones
 
-SOLVED = (clarabel.SolverStatus.Solved, clarabel.SolverStatus.AlmostSolved)
+SOLVED = clarabel.SolverStatus.Solved
 
 
 class ConeProgram:
@@ -51,4 +51,4 @@ class ConeProgram:
             b += (value - 1.0) * db
         self._solver.update(A=A, b=b)
         solution = self._solver.solve()
-        return -float(solution.obj_val) if solution.status in SOLVED else -np.inf
+        return -float(solution.obj_val) if solution.status == SOLVED else -np.inf

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ncs_gym import LinearPlant
-from shields.codesign import SMALLEST_GAP, MarginProgram
+from shields.codesign import MarginProgram
 from shields.paper_bounds import PaperBounds, PaperModel
+from shields.paper_conditions import SMALLEST_GAP
 
 # The domain {0 < kappa < 1, 1 <= rho < 1 / kappa} is scanned with this many points each way, denser near rho = 1.
 KAPPAS = np.linspace(0.01, 0.995, 120)
@@ -18,6 +19,8 @@ RHO_SHARES = np.linspace(0.0, 1.0, 40) ** 2
 BISECTIONS = 50
 # What is reported as feasible was confirmed after shrinking by this, at most this often.
 SHRINK, ATTEMPTS = 0.99, 20
+# Points of the scan that are tried with the communication error in the input limit.
+CONFIRMED_POINTS = 100
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,20 @@ class FeasibilityScan:
         Raises:
             LookupError: If no gain contracts any ellipsoid at any point: (C1) alone has no solution.
         """
+        return self._ranked(plant, model)[0]
+
+    def full_ratio(self, plant: LinearPlant) -> float:
+        """Returns the largest lambda_min(L)/alpha on all of OP over the most promising points; at least 1: feasible."""
+        program, model, best = MarginProgram(plant), PaperModel(plant), 0.0
+        for point in self._ranked(plant)[:CONFIRMED_POINTS]:
+            bounds = model.at(point.kappa, point.rho)
+            best = max(best, program.largest(bounds) / bounds.alpha if bounds.alpha > 0.0 else np.inf)
+            if best >= 1.0:
+                break
+        return best
+
+    def _ranked(self, plant: LinearPlant, model: PaperModel | None = None) -> list[Feasibility]:
+        """Returns all points of the scan, the best first."""
         found, model = [], model or PaperModel(plant)
         for kappa, rho, margin in self._points:
             alpha = model.at(kappa, rho).alpha
@@ -75,7 +92,7 @@ class FeasibilityScan:
             found.append(Feasibility(ratio, kappa, rho, margin, alpha))
         if not found:
             raise LookupError("(C1) has no solution at any (kappa, rho)")
-        return max(found, key=lambda point: point.ratio)
+        return sorted(found, key=lambda point: -point.ratio)
 
     def largest(self, plant_at: Callable[[float], LinearPlant], high: float) -> float:
         """Returns the largest t in [0, high] with OP feasible for plant_at(t), confirmed on all of OP; 0.0 if none is.
@@ -91,16 +108,10 @@ class FeasibilityScan:
             middle = 0.5 * (low + high)
             low, high = (middle, high) if self.best(plant_at(middle)).ratio >= 1.0 else (low, middle)
         for _ in range(ATTEMPTS):
-            if self._confirmed(plant_at(low)):
+            if self.full_ratio(plant_at(low)) >= 1.0:
                 return low
             low *= SHRINK
         return 0.0
-
-    def _confirmed(self, plant: LinearPlant) -> bool:
-        """Returns whether OP with its communication error in the input limit is feasible at the best point."""
-        point = self.best(plant)
-        bounds = PaperModel(plant).at(point.kappa, point.rho)
-        return MarginProgram(plant).largest(bounds) >= bounds.alpha
 
 
 def largest_gamma(scan: FeasibilityScan, plant: LinearPlant) -> float:

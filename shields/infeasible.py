@@ -9,7 +9,7 @@ class Infeasible(ValueError):
     Attributes:
         binding: What stands in the way: "E1" (no error bound), "S" (the box is unbounded), "U" (input limits) or
             "I" (invariance); where only exact verification failed, the name of its condition.
-            Of OP: "C2", "C1", or "grid" where only the search's steps are too coarse.
+            Of OP: "C2", "C1", "C5" (input limit), or "grid" where only the search's steps are too coarse.
         shortfall: By how much: for "E1" the excess of the spectral radius over 1; for "I" and "U" the share by
             which the uncertainty (disturbance and error radii) is too large, in (0, 1]; for "S" the number of
             directions without a limit; where only exact verification failed, its margin; for "C2"

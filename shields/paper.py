@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
-from shields.codesign import codesign
+from shields.codesign import PaperDesign, codesign
 from shields.feasibility import FeasibilityScan, largest_gamma, largest_noise_scale, largest_scale
 from shields.infeasible import Infeasible
+from shields.paper_conditions import paper_conditions
 
 
 def paper_certificate(plant: LinearPlant, *, dkappa: float, drho: float, search: str) -> Certificate:
@@ -24,13 +27,29 @@ def paper_certificate(plant: LinearPlant, *, dkappa: float, drho: float, search:
         search: "first" or "largest".
 
     Raises:
-        Infeasible: If OP has no solution on the grid.
+        Infeasible: If OP has no solution on the grid that meets (C1)-(C7) exactly.
         ValueError: If an argument is out of range.
     """
+    free = plant.n - int(np.linalg.matrix_rank(plant.C))
+    if free:
+        raise Infeasible(f"the safe box leaves {free} of {plant.n} directions unbounded: add rows to C", "S", free)
+    provenance = {"search": search, "dkappa": dkappa, "drho": drho}
+    found: list[Certificate] = []
+
+    def accept(design: PaperDesign) -> bool:
+        certificate = _certificate(plant, design, provenance)
+        if all(condition.holds for condition in paper_conditions(certificate, plant)):
+            found.append(certificate)
+        return bool(found)
+
     try:
-        design = codesign(plant, dkappa=dkappa, drho=drho, search=search)
+        codesign(plant, dkappa=dkappa, drho=drho, search=search, accept=accept)
     except LookupError:
         raise paper_diagnosis(plant) from None
+    return found[0]
+
+
+def _certificate(plant: LinearPlant, design: PaperDesign, provenance: dict[str, Any]) -> Certificate:
     return Certificate(
         L=design.L,
         K=design.K,
@@ -42,9 +61,7 @@ def paper_certificate(plant: LinearPlant, *, dkappa: float, drho: float, search:
         epsilon_up=design.bounds.epsilon_up,
         provenance={
             "source": "Liu et al. Definition 2 and Algorithm 1",
-            "search": search,
-            "dkappa": dkappa,
-            "drho": drho,
+            **provenance,
             "alpha": design.bounds.alpha,
             "guarantee": "the paper's own: invariance if e'e <= epsilon at every step",
         },
@@ -58,7 +75,15 @@ def paper_diagnosis(plant: LinearPlant) -> Infeasible:
         best = scan.best(plant)
     except LookupError as error:
         return Infeasible(f"OP is infeasible: {error}", "C1", np.inf)
-    if best.ratio >= 1.0:
+    full = scan.full_ratio(plant) if best.ratio >= 1.0 else best.ratio
+    if best.ratio >= 1.0 > full:
+        return Infeasible(
+            f"OP is infeasible, the input limit with the communication error (C4)-(C6) binds: with it the largest "
+            f"lambda_min(L)/alpha found is {full:.3g} (without it {best.ratio:.3g}) and must be at least 1",
+            "C5",
+            1.0 - full,
+        )
+    if full >= 1.0:
         return Infeasible(
             f"OP has no solution on this grid, but has one near kappa = {best.kappa:.3f}, rho = {best.rho:.3f}: use "
             "smaller steps dkappa and drho",

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from fractions import Fraction
 
 import numpy as np
 
 from ncs_gym import LinearPlant
-from ncs_gym.frozen import as_covariance, as_number
+from ncs_gym.frozen import as_covariance, as_matrix, as_number
 from ncs_gym.noise import SMALLEST_KEPT, chi2_quantile
 from ncs_gym.plant import SMALLEST_DELTA
 
@@ -29,7 +30,10 @@ def covariance_bound(k: int, p0: float, g2: float, q_bar: float) -> float:
     if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or k < 0:
         raise ValueError(f"k must be a whole number >= 0, got {k!r}")
     p0, g2, q_bar = (as_number(v, name, low=0.0) for v, name in ((p0, "p0"), (g2, "g2"), (q_bar, "q_bar")))
-    return p0 * g2**k + q_bar * sum(g2**i for i in range(k))
+    try:
+        return p0 * g2**k + q_bar * sum(g2**i for i in range(k))
+    except OverflowError as error:
+        raise ValueError(f"p_bar_k is too large for k = {k} and g2 = {g2:g}") from error
 
 
 def process_bound(gamma: float, process_noise_cov: np.ndarray) -> float:
@@ -68,7 +72,7 @@ def uplink_error_bound(
     delta = as_number(delta, "delta", low=SMALLEST_DELTA, high=1.0 - SMALLEST_KEPT)
     Q = as_covariance(process_noise_cov, len(np.atleast_1d(process_noise_cov)), "process_noise_cov")
     P0 = as_covariance(initial_cov, len(Q), "initial_cov")
-    return _uplink(_largest(P0), process_bound(gamma, Q), chi2_quantile(1.0 - delta, len(Q)), g2)
+    return _uplink(_largest(P0), process_bound(gamma, Q), chi2_quantile(1.0 - delta, len(Q)), g2, 1.0 - g2)
 
 
 def state_error_bound(A: np.ndarray, g2: float, epsilon_up: float) -> float:
@@ -77,10 +81,10 @@ def state_error_bound(A: np.ndarray, g2: float, epsilon_up: float) -> float:
     It uses |BK|_2 <= |A + BK|_2 + |A|_2 <= g_bar + |A|_2.
 
     Raises:
-        ValueError: If g2 or eps_up is negative.
+        ValueError: If g2 or eps_up is negative, or A is no finite matrix.
     """
     g2, epsilon_up = as_number(g2, "g2", low=0.0), as_number(epsilon_up, "epsilon_up", low=0.0)
-    return _state(float(np.linalg.norm(A, 2)), g2, epsilon_up)
+    return _state(float(np.linalg.norm(as_matrix(A, (None, None), "A"), 2)), g2, epsilon_up)
 
 
 def safety_margin(gamma: float, epsilon: float, kappa: float) -> float:
@@ -133,7 +137,8 @@ class PaperModel:
     def at(self, kappa: float, rho: float) -> PaperBounds:
         """Returns the constants of OP with g_bar = sqrt(kappa rho), kappa rho < 1."""
         g2 = kappa * rho
-        epsilon_up = _uplink(self._p0, self._q_bar, self._quantile, g2)
+        rest = float(1 - Fraction(kappa) * Fraction(rho))
+        epsilon_up = _uplink(self._p0, self._q_bar, self._quantile, g2, rest)
         epsilon = _state(self._norm, g2, epsilon_up)
         return PaperBounds(kappa, rho, epsilon_up, epsilon, _margin(self._gamma, epsilon, kappa))
 
@@ -142,8 +147,9 @@ def _largest(covariance: np.ndarray) -> float:
     return max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0)
 
 
-def _uplink(p0: float, q_bar: float, quantile: float, g2: float) -> float:
-    return (p0 * g2 + q_bar / (1.0 - g2)) * quantile
+def _uplink(p0: float, q_bar: float, quantile: float, g2: float, rest: float) -> float:
+    """Returns Theorem 5 from g2 and rest = 1 - g2, which loses its digits if computed from a rounded g2."""
+    return (p0 * g2 + q_bar / rest) * quantile
 
 
 def _state(norm: float, g2: float, epsilon_up: float) -> float:
@@ -151,4 +157,7 @@ def _state(norm: float, g2: float, epsilon_up: float) -> float:
 
 
 def _margin(gamma: float, epsilon: float, kappa: float) -> float:
-    return 0.0 if kappa == 1.0 else ((gamma**0.5 + epsilon**0.5) / (1.0 - kappa**0.5)) ** 2
+    if kappa == 1.0:
+        return 0.0
+    # 1 - sqrt(kappa) = (1 - kappa) / (1 + sqrt(kappa)) keeps its digits near kappa = 1.
+    return ((gamma**0.5 + epsilon**0.5) * (1.0 + kappa**0.5) / (1.0 - kappa)) ** 2

@@ -15,6 +15,8 @@ from shields.paper_bounds import PaperModel
 
 # alpha and eps_up are square roots and quantiles; they are rounded by this, always against the certificate.
 ROUNDING = Fraction(1, 10**12)
+# kappa rho nearer to 1 than this makes the error bound infinite for practical purposes.
+SMALLEST_GAP = 1e-9
 
 
 def paper_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
@@ -24,8 +26,8 @@ def paper_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[C
     u_max^2 / 2 - K_i L K_i' - |K_i L|^2 eps_up / alpha^2 >= 0.
     """
     kappa, rho = Fraction(certificate.kappa), Fraction(certificate.rho)
-    inside = 0 < kappa <= 1 and rho >= 1 and kappa * rho < 1
-    yield flag("0 < kappa <= 1 <= rho, kappa rho < 1", inside)
+    inside = kappa > 0 and rho >= 1 and 1 - kappa * rho >= SMALLEST_GAP
+    yield flag("0 < kappa, 1 <= rho, kappa rho < 1", inside)
     if not inside:
         return
     bounds = PaperModel(plant).at(certificate.kappa, certificate.rho)
@@ -44,7 +46,7 @@ def paper_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[C
     for i, limit in enumerate(plant.u_max):
         F = multiply([K[i]], L)
         used = quadratic([K[i]], L)
-        if alpha > 0:
+        if bounds.epsilon_up > 0.0:
             error = Fraction(bounds.epsilon_up) * (1 + ROUNDING) / (alpha * (1 - ROUNDING)) ** 2
             used += error * multiply(F, transpose(F))[0][0]
         yield scalar(f"(C4)-(C6) input {i + 1}", Fraction(float(limit)) ** 2 / 2 - used)

@@ -5,7 +5,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import truck_trailer
+from ncs_gym import LinearPlant, truck_trailer
 from shields import Certificate, CertificateError, Infeasible, SafetyShield, certify, synthesize, verify
 from shields.feasibility import FeasibilityScan, largest_gamma, largest_scale
 from shields.paper_bounds import PaperModel
@@ -62,7 +62,7 @@ def test_saving_and_loading_is_exact(paper, tmp_path):
         (lambda c: {"K": np.zeros((1, 2))}, "(C1)"),
         (lambda c: {"K": 3.0 * c.K}, "(C4)-(C6)"),
         (lambda c: {"kappa": 0.7}, "eps_up and eps"),
-        (lambda c: {"rho": 2.0}, "0 < kappa"),
+        (lambda c: {"rho": 2.0}, "0 < kappa, 1"),
         (lambda c: {"epsilon": 0.1 * c.epsilon}, "eps_up and eps"),
         (lambda c: {"fingerprint": "0" * 64}, "plant"),
     ],
@@ -140,3 +140,54 @@ def test_too_coarse_a_grid_says_so():
     with pytest.raises(Infeasible, match="use smaller steps") as caught:
         synthesize(SMALL, method="paper", dkappa=0.4, drho=1.0)
     assert caught.value.binding == "grid"
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e-2, 1.0, 1e2, 1e4])
+def test_units_of_the_state_change_nothing(unit, paper):
+    scaled = replace(
+        SMALL,
+        B=SMALL.B * unit,
+        C=SMALL.C / unit,
+        gamma=SMALL.gamma * unit**2,
+        process_noise_cov=SMALL.process_noise_cov * unit**2,
+        measurement_noise_cov=SMALL.measurement_noise_cov * unit**2,
+        initial_cov=SMALL.initial_cov * unit**2,
+    )
+    certificate = synthesize(scaled, method="paper")
+    assert verify(certificate, scaled).valid
+    assert (certificate.kappa, certificate.rho) == (paper.kappa, paper.rho)
+    np.testing.assert_allclose(certificate.L / unit**2, paper.L, rtol=1e-4)
+
+
+def one_state(A, B, u_max, gamma, Q, P0):
+    return LinearPlant(
+        A=[[A]], B=[[B]], C=[[1.0]], u_max=u_max, dt=0.1, gamma=gamma, process_noise_cov=[[Q]], initial_cov=[[P0]]
+    )
+
+
+def test_a_plant_no_gain_can_contract_is_infeasible_not_falsely_certified():
+    with pytest.raises(Infeasible):
+        synthesize(one_state(0.999, 1e-6, 1.0, 1e-12, 1e-13, 1e-12), method="paper")
+
+
+def test_an_input_limit_that_binds_is_named():
+    with pytest.raises(Infeasible, match="input limit") as caught:
+        synthesize(one_state(1.5, 1.0, 0.4, 9.985e-4, 9.985e-4, 9.985e-4), method="paper")
+    assert caught.value.binding == "C5"
+    assert 0.0 < caught.value.shortfall < 1.0
+
+
+def test_no_uncertainty_at_all_is_no_division_by_zero():
+    zero = np.zeros((2, 2))
+    plant = truck_trailer(gamma=0.0, process_noise_cov=zero, initial_cov=zero)
+    assert verify(synthesize(plant, method="paper"), plant).valid
+
+
+@pytest.mark.parametrize("kappa", [float(np.nextafter(1.0, 0.0)), 1.0 - 1e-12, 0.0, -1.0, 1e300])
+def test_constants_at_the_edge_are_rejected_without_an_error(paper, kappa):
+    assert not verify(replace(paper, kappa=kappa, rho=1.0), SMALL).valid
+
+
+def test_unbounded_box_is_infeasible():
+    with pytest.raises(Infeasible, match="unbounded"):
+        synthesize(truck_trailer(C=np.array([[0.5, 0.0]])), method="paper")

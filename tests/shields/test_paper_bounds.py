@@ -84,8 +84,19 @@ def test_model_of_a_plant_agrees_with_the_single_formulas():
         (lambda: safety_margin(5e-4, 0.1, 0.0), "kappa"),
         (lambda: covariance_bound(-1, 1.0, 0.5, 1.0), "k must be"),
         (lambda: covariance_bound(1, 1.0, -0.5, 1.0), "g2"),
+        (lambda: covariance_bound(2000, 1.0, 10.0, 1.0), "too large"),
+        (lambda: state_error_bound([[np.nan, 0.0], [0.0, 1.0]], 0.5, 1.0), "A must be finite"),
+        (lambda: state_error_bound([1.0, 2.0], 0.5, 1.0), "A must have shape"),
     ],
 )
 def test_bad_arguments_are_refused(call, word):
     with pytest.raises(ValueError, match=word):
         call()
+
+
+def test_safety_margin_keeps_its_digits_near_one():
+    from fractions import Fraction
+
+    kappa = 0.9999999998726
+    exact = (Fraction(1) - Fraction(kappa)) / 2  # 1 - sqrt(kappa) to first order
+    assert safety_margin(1.0, 0.0, kappa) == pytest.approx(float(1 / exact) ** 2, rel=1e-9)
