@@ -140,7 +140,7 @@ def _eliminated(units: Units, *, volume: bool, with_error: bool) -> ConeProgram:
         constraints.append(cp.bmat(blocks) >> 0)
     objective = cp.log_det(L) if volume else margin
     parameters = [kappa, rho] + [weight] * with_error + [alpha] * volume
-    return ConeProgram(cp.Problem(cp.Maximize(objective), constraints), parameters)
+    return ConeProgram(cp.Problem(cp.Maximize(objective), constraints), parameters, almost=volume)
 
 
 class MarginProgram:

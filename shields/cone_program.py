@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 from cvxpy.reductions.solvers.conic_solvers.clarabel_conif import dims_to_solver_cones
 
-SOLVED = clarabel.SolverStatus.Solved
+SOLVED, ALMOST = clarabel.SolverStatus.Solved, clarabel.SolverStatus.AlmostSolved
 
 
 class ConeProgram:
@@ -21,9 +21,11 @@ class ConeProgram:
     Args:
         problem: A maximization that follows cvxpy's rules for parametrized programs.
         parameters: Its scalar parameters, in the order `maximum` takes their values.
+        almost: Take values of reduced accuracy too: good enough to rank by, not to decide by.
     """
 
-    def __init__(self, problem: cp.Problem, parameters: Sequence[cp.Parameter]) -> None:
+    def __init__(self, problem: cp.Problem, parameters: Sequence[cp.Parameter], *, almost: bool = False) -> None:
+        self._accepted = (SOLVED, ALMOST) if almost else (SOLVED,)
         base = self._data(problem, parameters, np.full(len(parameters), 1.0))
         steps = [self._data(problem, parameters, 1.0 + np.eye(len(parameters))[i]) for i in range(len(parameters))]
         self._base = base
@@ -51,4 +53,4 @@ class ConeProgram:
             b += (value - 1.0) * db
         self._solver.update(A=A, b=b)
         solution = self._solver.solve()
-        return -float(solution.obj_val) if solution.status == SOLVED else -np.inf
+        return -float(solution.obj_val) if solution.status in self._accepted else -np.inf
