@@ -6,6 +6,7 @@ anything in the settings, so one object serves any number of environments.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -21,7 +22,7 @@ ROUNDING = 1e-12
 TOLERANCE = 1e-9
 
 
-class Disturbance(FrozenArrays):
+class Disturbance(FrozenArrays, ABC):
     """A disturbance in {d : d'd <= gamma}; truncated process noise is added to it.
 
     Subclasses with `replaces_process_noise` use the whole of E(D), process noise included. The environment checks what
@@ -34,6 +35,7 @@ class Disturbance(FrozenArrays):
         """Returns what stays fixed for one episode (None unless overridden)."""
         return None
 
+    @abstractmethod
     def draw(
         self, rng: np.random.Generator, plant: LinearPlant, nominal_next: np.ndarray, step: int, memory: Any
     ) -> np.ndarray:
@@ -46,7 +48,6 @@ class Disturbance(FrozenArrays):
             step: Number of steps taken before this one.
             memory: What `begin` returned.
         """
-        raise NotImplementedError
 
     def check(self, plant: LinearPlant) -> str:
         """Returns why this disturbance does not fit the plant, or an empty string."""

@@ -6,6 +6,7 @@ the settings, so one object serves any number of environments.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ from ncs_gym.frozen import FrozenArrays, as_count, as_covariance, as_number
 from ncs_gym.plant import LinearPlant
 
 
-class Task(FrozenArrays):
+class Task(FrozenArrays, ABC):
     """A reward, and perfectly known extra entries of the observation."""
 
     def begin(self, rng: np.random.Generator, plant: LinearPlant) -> Any:
@@ -34,9 +35,9 @@ class Task(FrozenArrays):
         """Returns the largest absolute value of each extra entry within `horizon` steps, shape (extra,)."""
         return np.zeros(0)
 
+    @abstractmethod
     def reward(self, plant: LinearPlant, memory: Any, state: np.ndarray, u: np.ndarray) -> float:
         """Returns the reward of a step that applied u (m,) and ended in `state` (n,) and `memory`."""
-        raise NotImplementedError
 
     def check(self, plant: LinearPlant) -> str:
         """Returns why this task does not suit the plant, or an empty string."""
