@@ -26,7 +26,8 @@ class CompareSettings:
         runs: Paired runs (training seeds) per arm.
         steps: Training steps per run.
         episodes: Evaluation episodes per run.
-        mode: What the shield does with an unsafe action: the closest safe input, or the certified u = K x_hat.
+        mode: What the shield does with an unsafe action: the closest safe input ("project"), or the certified u = K x_hat
+            ("switch"; "boundary" applies it unless every action would be safe).
         penalty: Subtracted from the training reward per intervention.
         certificate: File to use instead of synthesizing one.
         jobs: Worker processes.
@@ -40,7 +41,7 @@ class CompareSettings:
     runs: int = 3
     steps: int = 150_000
     episodes: int = 200
-    mode: Literal["project", "switch"] = "project"
+    mode: Literal["project", "switch", "boundary"] = "project"
     penalty: float = 0.0
     certificate: Path | None = None
     jobs: int = 2

@@ -11,6 +11,18 @@ NEWTON_STEPS = 60
 RELATIVE_TOLERANCE = 1e-12
 
 
+def closest_on_line(wanted: float, a: float, b: float, c: float, radius: float, limit: float) -> float | None:
+    """Returns argmin |u - wanted| over c + 2 b u + a u^2 <= radius^2, |u| <= limit, or None; |wanted| <= limit."""
+    square = b * b - a * (c - radius * radius)
+    if radius < 0.0 or square < 0.0 or a <= 0.0:
+        return None
+    half = square**0.5
+    low, high = (-b - half) / a, (-b + half) / a
+    if low > limit or high < -limit:
+        return None
+    return low if wanted < low else high if wanted > high else wanted
+
+
 def closest_admissible(
     wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, radius: float, limit: np.ndarray
 ) -> np.ndarray | None:
@@ -23,9 +35,11 @@ def closest_admissible(
         wanted: Shape (m,).
         offset: Shape (n,).
         effect: Shape (n, m).
-        radius: Of the ball, >= 0.
+        radius: Of the ball; none is admissible if it is negative.
         limit: Shape (m,), > 0.
     """
+    if radius < 0.0:
+        return None
     best: tuple[float, np.ndarray | None] = (np.inf, None)
     pending: list[dict[int, float]] = [{}]
     seen: set[frozenset[tuple[int, float]]] = set()

@@ -24,22 +24,23 @@ _synthesized: dict[str, Certificate] = {}
 
 
 class SafetyShield(gym.Wrapper, RecordConstructorArgs):
-    """Overrides an action whenever the safe set could be left (theory.md section 4).
+    """Overrides an action whenever the safe set could be left (docs/shield.md).
 
     The action passes unchanged if every state the estimate allows stays in S; otherwise "project" applies the closest
     input that keeps it there, "switch" (and "project" where there is none) the certified u = K x_hat. From a start in S
     the true state then stays in S for ever, for any policy, disturbance and channel within the assumptions;
-    `info["shield_guaranteed"]` says whether they still hold as far as can be seen.
+    `info["shield_guaranteed"]` says whether they still hold as far as can be seen. "boundary" trusts the agent only
+    where no input at all could leave S. "monitor" never changes the action and counts what "switch" would have done.
 
     Wrap it directly around what `gym.make` returns; wrappers that change or repeat actions go outside it.
 
     ## Info (added to the environment's, at reset too)
     | key | meaning |
     |---|---|
-    | `shield_intervened` | whether the action was overridden |
+    | `shield_intervened` | whether the action was overridden; in mode "monitor" whether "switch" would have |
     | `input_proposed` | the agent's input, shape (m,) [physical units]; zeros at reset |
     | `shield_correction` | Euclidean norm of input - input_proposed |
-    | `shield_margin` | 1 - h - norm(A x_hat + B u)_M for the input applied; at reset for u = 0 |
+    | `shield_margin` | 1 - h - norm(A x_hat + B u)_M for the input applied (`Decision.margin`); at reset for u = 0 |
     | `shield_guaranteed` | whether x in S is proved now |
     | `shield_reason` | why not; empty while guaranteed |
     | `episode_interventions` | running number in this episode |
@@ -47,8 +48,8 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
     Args:
         env: An `NCSEnv`, possibly wrapped.
         certificate: None synthesizes one for the environment's plant, once per process and plant.
-        mode: "project" or "switch".
-        penalty: Subtracted from the reward per intervention, >= 0.
+        mode: "project", "switch", "boundary" or "monitor"; see `SafetyFilter`.
+        penalty: Subtracted from the reward per intervention counted, >= 0.
 
     Raises:
         CertificateError: If the certificate does not verify for the environment's plant.
@@ -93,7 +94,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         """
         proposed = applied_input(self.filter.plant, action)
         decision = self.filter.decide(self._estimate, self._error_shape, proposed)
-        if decision.intervened:
+        if decision.intervened and self.filter.mode != "monitor":
             action = (decision.input / self.filter.plant.u_max).astype(np.float32)
         observation, reward, terminated, truncated, info = self.env.step(action)
         episode, step = self._clock

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -6,8 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ncs_gym import Ellipsoid
+from ncs_gym.ellipsoid import outer_sum
 from shields import CertificateError, SafetyFilter, synthesize
-from shields.filter import MARGIN
+from shields.filter import MARGIN, MODES
 from tests.plants import random_plant
 
 
@@ -33,7 +35,7 @@ def case(request):
     return plant, synthesize(plant)
 
 
-@pytest.mark.parametrize("mode", ["project", "switch"])
+@pytest.mark.parametrize("mode", ["project", "switch", "boundary", "monitor"])
 def test_a_passed_test_keeps_every_possible_next_state_inside(case, mode):
     plant, certificate = case
     shield, rng = SafetyFilter(certificate, plant, mode), np.random.default_rng(0)
@@ -41,7 +43,7 @@ def test_a_passed_test_keeps_every_possible_next_state_inside(case, mode):
     for _ in range(150):
         estimate = 1.4 * certificate.safe_set.sample(rng)
         shape = certificate.Sigma * rng.uniform(0.05, 1.0)
-        decision = shield.decide(estimate, shape, rng.uniform(-1, 1, plant.m) * plant.u_max)
+        decision = shield.decide(estimate, shape, rng.uniform(-1, 1, plant.m) * plant.u_max * rng.random())
         projected += decision.reason == "projected"
         assert (np.abs(decision.input) <= plant.u_max).all()
         if decision.passed:
@@ -64,7 +66,6 @@ def test_an_input_that_passes_is_returned_untouched(case):
 def test_projected_input_is_expressible_in_float32_and_the_closest(case):
     plant, certificate = case
     shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(1)
-    root = np.linalg.cholesky(certificate.M).T
     checked = 0
     for _ in range(200):
         estimate = 1.2 * certificate.safe_set.sample(rng)
@@ -77,13 +78,12 @@ def test_projected_input_is_expressible_in_float32_and_the_closest(case):
         action = (decision.input / plant.u_max).astype(np.float32)
         np.testing.assert_array_equal(plant.u_max * action.astype(np.float64), decision.input)
         # No random admissible input is closer by more than the rounding.
-        radius = 1.0 - shield.spread(shape)
-        others = rng.uniform(-1, 1, (4000, plant.m)) * plant.u_max
-        near = decision.input + (wanted - decision.input) * rng.uniform(0, 1, (500, 1))
-        others = np.vstack([others, near])
-        norms = np.linalg.norm((root @ (plant.A @ estimate))[:, None] + root @ plant.B @ others.T, axis=0)
+        outlook = shield.test.at(estimate, shape)
+        near = decision.input + (wanted - decision.input) * rng.uniform(0, 1, (100, 1))
+        others = np.vstack([rng.uniform(-1, 1, (400, plant.m)) * plant.u_max, near])
+        admissible = np.array([outlook.judge(u.tolist())[0] >= 0.0 for u in others])
         distances = np.linalg.norm(others - wanted, axis=1)
-        best = distances[norms <= radius].min(initial=np.inf)
+        best = distances[admissible].min(initial=np.inf)
         assert np.linalg.norm(decision.input - wanted) <= best + 1e-5
     assert checked > 10
 
@@ -131,10 +131,87 @@ def test_unusable_estimate_gives_zero_and_no_promise(certificate, loaded, estima
     assert (decision.input == 0.0).all()
 
 
-def test_unusable_error_shape_gives_zero_and_no_promise(certificate, loaded):
-    decision = SafetyFilter(certificate, loaded).decide(np.zeros(2), np.full((2, 2), np.nan), np.ones(1))
+@pytest.mark.parametrize("shape", [np.full((2, 2), np.nan), np.eye(3), -np.eye(2), "none"])
+@pytest.mark.parametrize("mode", MODES)
+def test_unusable_error_shape_gives_the_gain_and_no_promise(certificate, loaded, shape, mode):
+    estimate = np.array([1.5, 0.5])
+    decision = SafetyFilter(certificate, loaded, mode).decide(estimate, shape, np.ones(1))
+    assert decision.reason == "invalid"
+    assert decision.intervened
     assert not decision.passed
-    assert not decision.fallback
+    np.testing.assert_allclose(decision.input, certificate.K @ estimate, atol=1e-6)
+
+
+@pytest.mark.parametrize("proposed", ["left", None, [[1.0]], [1.0, 2.0], object()])
+@pytest.mark.parametrize("mode", MODES)
+def test_what_is_no_input_becomes_the_fallback_in_every_mode(certificate, loaded, proposed, mode):
+    decision = SafetyFilter(certificate, loaded, mode).decide(np.array([0.5, 0.1]), certificate.Sigma, proposed)
+    assert decision.reason == "invalid"
+    assert decision.intervened
+
+
+def test_proposed_fallback_is_no_intervention(case):
+    plant, certificate = case
+    rng = np.random.default_rng(5)
+    for mode in ("switch", "monitor"):
+        shield, seen = SafetyFilter(certificate, plant, mode), 0
+        for _ in range(200):
+            estimate = 3.0 * certificate.safe_set.sample(rng)
+            decision = shield.decide(estimate, certificate.Sigma, shield.fallback_input(estimate))
+            assert not decision.intervened
+            seen += decision.reason == "fallback"
+        assert seen > 5
+
+
+def test_monitor_never_changes_the_input_and_counts_what_switch_would_do(case):
+    plant, certificate = case
+    monitor, switch = SafetyFilter(certificate, plant, "monitor"), SafetyFilter(certificate, plant, "switch")
+    rng, counted = np.random.default_rng(6), 0
+    for _ in range(200):
+        estimate, shape = 1.3 * certificate.safe_set.sample(rng), certificate.Sigma * rng.uniform(0.05, 1.0)
+        u = rng.uniform(-1, 1, plant.m) * plant.u_max * rng.random()
+        watched, switched = monitor.decide(estimate, shape, u), switch.decide(estimate, shape, u)
+        np.testing.assert_array_equal(watched.input, u)
+        assert watched.intervened == switched.intervened
+        counted += watched.intervened
+        if watched.intervened:
+            assert watched.reason == "unsafe"
+            assert not watched.passed
+            assert not watched.fallback
+    assert 5 < counted < 195
+
+
+def test_boundary_lets_an_input_pass_only_where_every_input_would(case):
+    plant, certificate = case
+    boundary, switch = SafetyFilter(certificate, plant, "boundary"), SafetyFilter(certificate, plant, "switch")
+    rng = np.random.default_rng(7)
+    seen = set()
+    for _ in range(300):
+        estimate, shape = certificate.safe_set.sample(rng) * rng.uniform(0, 1.2), 0.1 * certificate.Sigma
+        u = rng.uniform(-1, 1, plant.m) * plant.u_max
+        decision = boundary.decide(estimate, shape, u)
+        corners = np.array(list(product(*((-limit, limit) for limit in plant.u_max))))
+        all_pass = all(switch.decide(estimate, shape, corner).reason == "safe" for corner in corners)
+        assert (decision.reason == "safe") is all_pass
+        seen.add(decision.reason)
+        if not all_pass:
+            np.testing.assert_array_equal(decision.input, boundary.fallback_input(estimate))
+    assert "fallback" in seen
+
+
+def test_boundary_trusts_the_agent_where_no_input_can_harm(certificate, loaded):
+    boundary = SafetyFilter(certificate, loaded, "boundary")
+    shape, u = 0.1 * certificate.Sigma, np.array([4.0])
+    assert boundary.decide(np.zeros(2), shape, u).reason == "safe"
+    assert boundary.decide(np.array([1.8, 0.5]), shape, 0.0 * u).reason == "fallback"
+
+
+def test_boundary_refuses_too_many_inputs():
+    plant = random_plant(0, 2, 13)
+    certificate = synthesize(plant)
+    SafetyFilter(certificate, plant, "switch")
+    with pytest.raises(ValueError, match="at most 12 inputs"):
+        SafetyFilter(certificate, plant, "boundary")
 
 
 @given(st.integers(0, 100_000))
@@ -154,20 +231,18 @@ def test_known_inside_is_never_claimed_wrongly(seed):
 CERTIFICATES: dict = {}
 
 
-def test_margin_is_the_slack_of_the_test(certificate, loaded):
+def test_margin_is_that_of_the_contract(certificate, loaded):
     shield = SafetyFilter(certificate, loaded)
     estimate, u = np.array([0.4, -0.3]), np.array([1.0])
+    root = np.linalg.cholesky(certificate.M).T
+    spread = outer_sum(
+        root @ loaded.A @ certificate.Sigma @ loaded.A.T @ root.T, root @ loaded.disturbance.shape @ root.T, np.eye(2)
+    )
     center = loaded.A @ estimate + loaded.B @ u
-    expected = 1.0 - shield.spread(certificate.Sigma) - np.sqrt(center @ certificate.M @ center)
+    expected = 1.0 - np.sqrt(np.linalg.eigvalsh(spread)[-1]) - np.sqrt(center @ certificate.M @ center)
     decision = shield.decide(estimate, certificate.Sigma, u)
     assert decision.margin == pytest.approx(expected, abs=1e-12)
     assert shield.margin(estimate, certificate.Sigma, u) == decision.margin
-
-
-def test_spread_is_an_upper_bound_on_what_error_and_disturbance_can_do(certificate, loaded):
-    shield, rng = SafetyFilter(certificate, loaded), np.random.default_rng(0)
-    level = worst_next_level(certificate, loaded, np.zeros(2), certificate.Sigma, np.zeros(1), rng)
-    assert np.sqrt(level) <= shield.spread(certificate.Sigma) <= 1.2 * np.sqrt(level)
 
 
 def test_filter_refuses_what_does_not_verify(certificate, loaded, plant):
@@ -187,8 +262,8 @@ def test_the_test_is_passed_with_a_margin_or_not_at_all(certificate, loaded):
         middle = 0.5 * (low + high)
         passed = shield.decide(np.array([1.6, 0.0]), shape, np.array([middle])).reason == "safe"
         low, high = (middle, high) if passed else (low, middle)
-    margin = shield.margin(np.array([1.6, 0.0]), shape, np.array([low]))
-    assert MARGIN <= margin <= 2 * MARGIN
+    room, _ = shield.test.at(np.array([1.6, 0.0]), shape).judge([low])
+    assert MARGIN <= room <= 2 * MARGIN
     assert MARGIN >= 1e-10
 
 
