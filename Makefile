@@ -5,13 +5,16 @@ BIN := $(VENV)/bin
 OUT ?= runs/compare
 INSTALLED := $(VENV)/.installed
 
-.PHONY: compare test lint types benchmark clean
+.PHONY: compare test test-slow lint types benchmark clean
 
 compare: $(INSTALLED)
 	$(BIN)/ncs compare --out $(OUT)
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest
+
+test-slow: $(INSTALLED)
+	$(BIN)/python -m pytest -m slow
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -26,7 +26,7 @@ class CompareSettings:
         runs: Paired runs (training seeds) per arm.
         steps: Training steps per run.
         episodes: Evaluation episodes per run.
-        mode: What the shield does with an unsafe action: the closest safe input ("project"), or the certified u = K x_hat
+        mode: What the shield does with an unsafe action: the closest safe input ("project"), or the certified K x_hat
             ("switch"; "boundary" applies it unless every action would be safe).
         penalty: Subtracted from the training reward per intervention.
         certificate: File to use instead of synthesizing one.

@@ -14,8 +14,10 @@ RELATIVE_TOLERANCE = 1e-12
 def closest_on_line(wanted: float, a: float, b: float, c: float, radius: float, limit: float) -> float | None:
     """Returns argmin |u - wanted| over c + 2 b u + a u^2 <= radius^2, |u| <= limit, or None; |wanted| <= limit."""
     square = b * b - a * (c - radius * radius)
-    if radius < 0.0 or square < 0.0 or a <= 0.0:
+    if radius < 0.0 or square < 0.0:
         return None
+    if a <= 0.0:
+        return wanted if c <= radius * radius else None
     half = square**0.5
     low, high = (-b - half) / a, (-b + half) / a
     if low > limit or high < -limit:

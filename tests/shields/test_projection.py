@@ -2,23 +2,39 @@ import cvxpy as cp
 import numpy as np
 import pytest
 
-from shields.projection import closest_admissible
+from shields.projection import closest_admissible, closest_on_line
 
 
-def reference(wanted, offset, effect, radius, limit):
-    """The same projection as a conic program."""
-    u = cp.Variable(len(wanted))
-    constraints = [cp.norm(offset + effect @ u) <= radius, cp.abs(u) <= limit]
-    problem = cp.Problem(cp.Minimize(cp.sum_squares(u - wanted)), constraints)
-    problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10)
-    return u.value if problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) else None
+class Reference:
+    """The same projection as a conic program, canonicalized once: |offset + effect u| <= radius, |u| <= limit."""
+
+    def __init__(self, m: int):
+        self.u = cp.Variable(m)
+        self.wanted, self.limit = cp.Parameter(m), cp.Parameter(m, nonneg=True)
+        self.offset, self.effect, self.radius = cp.Parameter(ROWS), cp.Parameter((ROWS, m)), cp.Parameter(nonneg=True)
+        constraints = [cp.norm(self.offset + self.effect @ self.u) <= self.radius, cp.abs(self.u) <= self.limit]
+        self.problem = cp.Problem(cp.Minimize(cp.sum_squares(self.u - self.wanted)), constraints)
+
+    def __call__(self, wanted, offset, effect, radius, limit):
+        """The closest admissible input; None if there is none."""
+        missing = ROWS - len(offset)
+        self.wanted.value, self.limit.value, self.radius.value = wanted, limit, radius
+        self.offset.value = np.pad(offset, (0, missing))
+        self.effect.value = np.pad(effect, ((0, missing), (0, 0)))
+        self.problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10)
+        return self.u.value if self.problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) else None
+
+
+ROWS = 6
 
 
 def random_case(rng, m):
-    n = int(rng.integers(1, 5))
+    n = int(rng.integers(1, ROWS + 1))
     effect = rng.standard_normal((n, m)) * 10.0 ** rng.uniform(-2, 1, m)
     if rng.random() < 0.2:
         effect[:, rng.integers(m)] = 0.0
+    if rng.random() < 0.2:  # nearly the same effect twice
+        effect[:, -1] = effect[:, 0] * (1.0 + 1e-4 * rng.standard_normal())
     limit = rng.uniform(0.3, 3.0, m)
     wanted = rng.uniform(-1, 1, m) * limit
     offset = rng.standard_normal(n)
@@ -27,11 +43,11 @@ def random_case(rng, m):
 
 
 @pytest.mark.filterwarnings("ignore:Solution may be inaccurate")
-@pytest.mark.parametrize("m", [1, 2, 3])
-def test_projection_agrees_with_a_conic_solver(m):
-    rng = np.random.default_rng(m)
-    compared = 0
-    for _ in range(250):
+@pytest.mark.parametrize("m", [1, 2, 3, 5])
+def test_projection_agrees_with_a_conic_solver_in_a_thousand_cases(m):
+    rng, reference = np.random.default_rng(m), Reference(m)
+    compared = bound = 0
+    for _ in range(1000):
         wanted, offset, effect, radius, limit = random_case(rng, m)
         found = closest_admissible(wanted, offset, effect, radius, limit)
         expected = reference(wanted, offset, effect, radius, limit)
@@ -46,7 +62,13 @@ def test_projection_agrees_with_a_conic_solver(m):
         assert (np.abs(found) <= limit).all()
         distance, best = np.linalg.norm(found - wanted), np.linalg.norm(expected - wanted)
         assert distance <= best * (1 + 1e-4) + 1e-6
-    assert compared > 100
+        bound += bool((np.abs(found) == limit).any()) and distance > 1e-3
+        if m == 1:
+            a, b, c = (effect.T @ effect).item(), (effect.T @ offset).item(), float(offset @ offset)
+            line = closest_on_line(wanted.item(), a, b, c, radius, limit.item())
+            assert line == pytest.approx(found.item(), abs=1e-7)
+    assert compared > 400
+    assert bound > (0 if m == 1 else 20)  # cases in which an input limit binds too
 
 
 def test_wanted_input_inside_is_returned_as_it_is():
@@ -67,3 +89,8 @@ def test_limits_and_test_can_both_bind():
 def test_out_of_reach_is_none():
     assert closest_admissible(np.zeros(2), np.array([5.0, 0.0]), np.eye(2), 1.0, np.ones(2)) is None
     assert closest_admissible(np.zeros(1), np.array([2.0, 0.0]), np.zeros((2, 1)), 1.0, np.ones(1)) is None
+    assert closest_admissible(np.zeros(1), np.zeros(2), np.ones((2, 1)), -1e-9, np.ones(1)) is None
+    assert closest_on_line(0.0, 1.0, 0.0, 0.0, -1e-9, 1.0) is None
+    assert closest_on_line(0.0, 1.0, -5.0, 25.0, 1.0, 1.0) is None  # beyond the limit
+    assert closest_on_line(0.0, 0.0, 0.0, 25.0, 1.0, 1.0) is None  # the input moves nothing
+    assert closest_on_line(0.3, 0.0, 0.0, 0.5, 1.0, 1.0) == 0.3

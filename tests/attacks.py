@@ -1,0 +1,109 @@
+"""What tests use to drive a shielded plant out of its safe set, with everything the assumptions allow."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ncs_gym import AdversarialDisturbance, Channel, Ellipsoid, GilbertElliott, LinearPlant, NCSEnv, truck_trailer
+from shields import Certificate, SafetyShield, synthesize
+from tests.plants import random_plant
+
+CHANNELS = {
+    "perfect": Channel(),
+    "blackout": Channel(loss=1.0),
+    "bursts": Channel(loss=GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.1), quantization_step=0.05),
+    "overtaking": Channel(loss=0.2, quantization_step=0.05, send_period=2, delay=1, jitter=3),
+}
+TRUCKS = {
+    "1000 kg": truck_trailer(),
+    "4000 kg": truck_trailer(mass=4000.0),
+    "4000 kg, position only": truck_trailer(mass=4000.0, H=np.array([[1.0, 0.0]])),
+}
+# n = 2..8, m = 1..3, p < n.
+RANDOM = {
+    f"n={n} m={m} p={p}": random_plant(seed, n, m, p)
+    for seed, (n, m, p) in enumerate(((2, 1, 1), (3, 2, 1), (4, 3, 2), (5, 1, 3), (6, 2, 3), (7, 3, 5), (8, 3, 4)))
+}
+POLICIES = ("random", "constant", "outwards", "gain_turned_round", "searching")
+_certificates: dict[str, Certificate] = {}
+
+
+def certificate_of(plant: LinearPlant) -> Certificate:
+    """The certificate of a plant, made once."""
+    if plant.fingerprint not in _certificates:
+        _certificates[plant.fingerprint] = synthesize(plant)
+    return _certificates[plant.fingerprint]
+
+
+class ExtremalNoise(NCSEnv):
+    """Every bound is attained: first estimate and sensor noise lie on the boundary of theirs.
+
+    Every other sample the noise points where the error points already, so that the filter goes on believing it.
+    """
+
+    def _measure(self):
+        bound = self.plant.sensor_noise.bound
+        stubborn = self.plant.H @ (self.estimator.belief.mean - self._state)
+        v = bound.extreme_point(stubborn) if self.np_random.random() < 0.5 else bound.sample_boundary(self.np_random)
+        return self.plant.H @ self._state + v
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        start = (1 - 1e-12) * self.initial_set.sample_boundary(self.np_random)
+        _, info = super().reset(options={"state": start})
+        self.estimator.reset(start + self.plant.initial_noise.bound.sample_boundary(self.np_random))
+        info["estimate"] = self.estimator.belief.mean.copy()
+        info["estimation_error"] = info["estimate"] - start
+        return self._observation(), info
+
+
+def policy(name: str, env: SafetyShield, rng: np.random.Generator):
+    """Actions from the info: random, constant, steepest ascent, or a search for what the shield lets through."""
+    plant, certificate = env.filter.plant, env.certificate
+    push = plant.B.T @ certificate.M @ plant.A
+
+    def outwards(info):
+        return np.sign(push @ info["estimate"] + 1e-12 * rng.standard_normal(plant.m)).astype(np.float32)
+
+    def searching(info):
+        """The proposal after which the next state is expected farthest out: no gradient, the shield as a black box."""
+        estimate, shape = info["estimate"], info["error_shape"]
+        corners = rng.integers(-1, 2, (4, plant.m)).astype(np.float64)
+        inputs = [env.filter.decide(estimate, shape, plant.u_max * corner).input for corner in corners]
+        nominal = [plant.A @ estimate + plant.B @ u for u in inputs]
+        return corners[int(np.argmax([x @ certificate.M @ x for x in nominal]))].astype(np.float32)
+
+    return {
+        "random": lambda info: rng.uniform(-1, 1, plant.m).astype(np.float32),
+        "constant": lambda info: np.ones(plant.m, np.float32),
+        "outwards": outwards,
+        "gain_turned_round": lambda info: (
+            (-certificate.K @ info["estimate"] * 1e3).clip(-plant.u_max, plant.u_max) / plant.u_max
+        ),
+        "searching": searching,
+    }[name]
+
+
+def attack(plant, channel, disturbance, mode, policy_name, seed, steps):
+    """Largest level of the true state, largest gauge of the error in its ellipsoid, and interventions.
+
+    Fails if the shield ever doubts its proof: every assumption holds.
+    """
+    certificate = certificate_of(plant)
+    inner = ExtremalNoise(plant, channel, disturbance=disturbance, initial_set=certificate.safe_set)
+    env = SafetyShield(inner, certificate, mode=mode)
+    act = policy(policy_name, env, np.random.default_rng(seed))
+    level = error = 0.0
+    _, info = env.reset(seed=seed)
+    for _ in range(steps):
+        *_, info = env.step(act(info))
+        assert info["shield_guaranteed"], info["shield_reason"]
+        assert not info["assumption_violated"]
+        level = max(level, certificate.safe_set.gauge(info["state"]))
+        error = max(error, Ellipsoid(info["error_shape"]).gauge(info["estimation_error"]))
+    return level, error, info["episode_interventions"]
+
+
+def harmful(plant: LinearPlant) -> AdversarialDisturbance:
+    """The disturbance that pushes the next state farthest out of S."""
+    return AdversarialDisturbance(certificate_of(plant).M)
