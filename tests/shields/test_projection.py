@@ -21,7 +21,10 @@ class Reference:
         self.wanted.value, self.limit.value, self.radius.value = wanted, limit, radius
         self.offset.value = np.pad(offset, (0, missing))
         self.effect.value = np.pad(effect, ((0, missing), (0, 0)))
-        self.problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10)
+        try:
+            self.problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10)
+        except cp.SolverError:
+            self.problem.solve(solver=cp.CLARABEL)
         return self.u.value if self.problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) else None
 
 
