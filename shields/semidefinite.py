@@ -11,6 +11,7 @@ from scipy.optimize import minimize
 
 from ncs_gym import LinearPlant
 from shields.certificate import Multipliers
+from shields.infeasible import Infeasible
 from shields.verification import ACTION_ROUNDING
 
 USABLE = (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
@@ -89,7 +90,11 @@ def scaled_problem(plant: LinearPlant, Sigma: np.ndarray, box: np.ndarray) -> Sc
 
 
 def largest_box_ellipsoid(C: np.ndarray) -> np.ndarray:
-    """Returns the shape of the largest ellipsoid in {|c_j x| <= 1}, (n, n), for C (k, n) of full column rank."""
+    """Returns the shape of the largest ellipsoid in {|c_j x| <= 1}, (n, n), for C (k, n) of full column rank.
+
+    Raises:
+        Infeasible: If the solver fails.
+    """
     k, n = C.shape
     if k == n:
         inverse = np.linalg.inv(C)
@@ -97,7 +102,8 @@ def largest_box_ellipsoid(C: np.ndarray) -> np.ndarray:
     scale = np.linalg.cholesky(np.linalg.inv(C.T @ C))
     L = cp.Variable((n, n), symmetric=True)
     problem = cp.Problem(cp.Maximize(cp.log_det(L)), [cp.diag((C @ scale) @ L @ (C @ scale).T) <= 1])
-    problem.solve(solver=cp.CLARABEL)
+    if not _solve(problem):
+        raise Infeasible("the solver did not find the largest ellipsoid in the safe box", "S", float("nan"))
     return scale @ L.value @ scale.T
 
 
@@ -165,7 +171,7 @@ class InvariantSetProgram:
         offset = inner.T @ inner
         for share, P, R in zip((le, *(1.0 - inputs)), self._slopes, self._offsets, strict=True):
             P.value, R.value = share * slope, share * 0.5 * (offset + offset.T)
-        if not _solve(self._program) or self._L.value is None:
+        if not _solve(self._program):
             return None
         L = 0.5 * (self._L.value + self._L.value.T)
         sign, log_det = np.linalg.slogdet(L)
@@ -189,7 +195,7 @@ def best_gain(problem: ScaledProblem, design: Design) -> np.ndarray:
         row, err = K[i : i + 1, :] @ L, K[i : i + 1, :] @ root
         blocks = [[corner, row, err], [row.T, mu * L, zero], [err.T, zero, (1.0 - mu) * identity]]
         constraints.append(cp.bmat(blocks) >> 0)
-    if not _solve(cp.Problem(cp.Minimize(room), constraints)) or K.value is None:
+    if not _solve(cp.Problem(cp.Minimize(room), constraints)):
         return design.K
     return K.value
 
@@ -233,11 +239,13 @@ def as_multipliers(problem: ScaledProblem, design: Design, rate: float) -> Multi
 
 
 def _solve(program: cp.Problem) -> bool:
-    """Returns whether the solver found something to work with; exact verification judges it later."""
+    """Returns whether the solver found finite numbers to work with; exact verification judges them later."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # "solution may be inaccurate": verified exactly afterwards
             program.solve(solver=cp.CLARABEL)
     except cp.SolverError:
         return False
-    return program.status in USABLE
+    if program.status not in USABLE:
+        return False
+    return all(variable.value is not None and np.isfinite(variable.value).all() for variable in program.variables())

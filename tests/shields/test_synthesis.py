@@ -1,10 +1,12 @@
 import pickle
 
+import cvxpy as cp
+import gymnasium as gym
 import numpy as np
 import pytest
 
 from ncs_gym import LinearPlant, truck_trailer
-from shields import Infeasible, synthesize, verify
+from shields import Infeasible, SafetyShield, synthesize, verify
 from shields.semidefinite import largest_box_ellipsoid
 from tests.plants import random_plant
 
@@ -155,3 +157,47 @@ def test_progress_is_told(loaded):
     lines = []
     synthesize(loaded, progress=lines.append)
     assert any("volume" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [cp.SolverError("it failed"), "infeasible_inaccurate", "user_limit", None, np.nan],
+    ids=["raises", "infeasible", "stopped", "no values", "NaN"],
+)
+def test_solver_that_fails_gives_no_certificate_and_no_shield(monkeypatch, answer):
+    plant = random_plant(11, 2, 1)
+
+    def solve(program, *args, **kwargs):
+        if isinstance(answer, Exception):
+            raise answer
+        program._status = answer if isinstance(answer, str) else "optimal"
+        for variable in program.variables():
+            variable._value = None if answer is None else np.full(variable.shape, np.nan)
+        return program
+
+    monkeypatch.setattr(cp.Problem, "solve", solve)
+    with pytest.raises(Infeasible):
+        synthesize(plant)
+    with pytest.raises(Infeasible):
+        SafetyShield(gym.make("ncs_gym/LinearNCS-v0", plant=plant))
+    with pytest.raises(Infeasible, match="largest ellipsoid"):
+        synthesize(truck_trailer(C=np.array([[0.5, 0.0], [0.0, 0.5], [0.4, 0.4]])))
+
+
+def test_solver_whose_answers_are_a_little_wrong_gives_no_false_certificate(monkeypatch):
+    plant = random_plant(12, 3, 1)
+    honest, rng = cp.Problem.solve, np.random.default_rng(0)
+
+    def solve(program, *args, **kwargs):
+        honest(program, *args, **kwargs)
+        for variable in program.variables():
+            if variable.value is not None:
+                noise = 1.0 + 1e-2 * rng.standard_normal(variable.shape)
+                variable._value = variable.value * (0.5 * (noise + noise.T) if variable.is_symmetric() else noise)
+
+    monkeypatch.setattr(cp.Problem, "solve", solve)
+    try:
+        certificate = synthesize(plant)
+    except Infeasible:
+        return
+    assert verify(certificate, plant).valid

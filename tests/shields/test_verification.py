@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ncs_gym import truck_trailer
+from ncs_gym import Ellipsoid, truck_trailer
 from shields import CertificateError, synthesize, verify
 from shields.verification import require_valid
 from tests.plants import random_plant
@@ -108,3 +108,61 @@ def test_report_prints_one_line_per_condition(certificate, loaded):
     lines = str(verify(replace(certificate, K=certificate.K + 4.0), loaded)).splitlines()
     assert any(line.startswith("BROKEN") and "(U)" in line for line in lines)
     assert any(line.startswith("holds") and "(E1)" in line for line in lines)
+
+
+def replaced(plant, **values):
+    """The plant with numbers or derived bounds replaced and nothing derived anew, as a faulty derivation leaves it."""
+    assert plant.fingerprint
+    assert plant.disturbance.dim == plant.initial_error.dim
+    faulty = object.__new__(type(plant))
+    faulty.__dict__.update(plant.__dict__ | values)
+    return faulty
+
+
+# Each breaks one condition and no other: a verifier without it would accept. (certificate, plant) -> the same, broken.
+ALONE = {
+    "plant": lambda c, p: (replace(c, fingerprint="0" * 64), p),
+    "shapes": lambda c, p: (shares(c, inputs=(0.5, 0.5)), p),
+    "finite": lambda c, p: (shares(c, rounding=float("inf")), p),
+    "0 < lam_e < 1": lambda c, p: (shares(c, error=1.5), p),
+    "lx, le, ld, s > 0": lambda c, p: (shares(c, estimate=-1e-9), p),
+    "lx + le + ld": lambda c, p: (shares(c, estimate=c.multipliers.estimate + 1e-9), p),
+    "D: the plant's": lambda c, p: (c, replaced(p, disturbance=Ellipsoid((1 - 1e-6) * p.nominal_disturbance.shape))),
+    "D: the certificate's": lambda c, p: (c, replaced(p, disturbance=Ellipsoid((1 + 2e-9) * c.D))),
+    "N:": lambda c, p: (c, replaced(p, sensor_error=Ellipsoid(0.99 * p.sensor_noise.bound.shape))),
+    "r0:": lambda c, p: (c, replaced(p, initial_error=Ellipsoid(0.99 * p.initial_noise.bound.shape))),
+    "(E0)": lambda c, p: (c, replaced(p, initial_error=Ellipsoid(1.01 * np.diag(c.Sigma).max() * np.eye(p.n)))),
+    "(E1)": lambda c, p: (shares(c, error=min(1.0 - 1e-3, c.multipliers.error * 1.2)), p),
+    "(I)": lambda c, p: (shares(c, disturbance=1e-6), p),
+    "(S) c_1": lambda c, p: (c, replaced(p, C=p.C * [[1.0 + 1e-5], [1.0]])),
+    "(S) c_2": lambda c, p: (c, replaced(p, C=p.C * [[1.0], [1.0 + 1e-5]])),
+    "(U) input 1": lambda c, p: (shares(c, inputs=(1e-9,)), p),
+}
+
+
+@pytest.mark.parametrize("name", ALONE)
+def test_each_condition_alone_turns_a_certificate_down(name, certificate, loaded):
+    if name == "(U) input 1":  # a certificate that uses its inputs
+        loaded = random_plant(3, 2, 1)
+        certificate = synthesize(loaded)
+    assert broken(certificate, loaded) == []
+    found = broken(*ALONE[name](certificate, loaded))
+    assert len(found) == 1, found
+    assert name in found[0]
+
+
+def test_only_positive_definiteness_turns_a_flat_set_down():
+    # Without L > 0 the point set {0} would be "invariant": only a plant without any disturbance could have it.
+    plant = truck_trailer(
+        gamma=0.0, process_noise_cov=np.zeros((2, 2)), initial_cov=np.zeros((2, 2)), measurement_noise_cov=np.eye(2)
+    )
+    certificate = synthesize(plant)
+    flat = replace(certificate, L=np.zeros((2, 2)), K=np.zeros((1, 2)))
+    found = broken(flat, plant)
+    assert any("L > 0" in name for name in found)
+
+
+def test_every_condition_has_been_broken_alone(certificate, loaded):
+    names = [condition.name for condition in verify(certificate, loaded).conditions]
+    untested = [name for name in names if not any(mark in name for mark in (*ALONE, "L > 0"))]
+    assert untested == []

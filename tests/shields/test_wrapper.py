@@ -76,7 +76,7 @@ def test_info_gains_the_same_keys_and_types_always(certificate):
         assert info["shield_guaranteed"] is (info["shield_reason"] == "")
 
 
-@pytest.mark.parametrize("mode", ["project", "switch"])
+@pytest.mark.parametrize("mode", ["project", "switch", "boundary"])
 def test_full_throttle_is_overridden_and_stays_inside(certificate, mode):
     infos = play(shielded(certificate, mode), full, seed=0)
     assert infos[-1]["episode_interventions"] == sum(info["shield_intervened"] for info in infos) > 50
@@ -140,6 +140,69 @@ def test_penalty_is_paid_per_intervention_only(certificate):
         _, reward, *_, info = free.step(full(None))
         _, other, *_ = paid.step(full(None))
         assert other == pytest.approx(reward - 0.5 * info["shield_intervened"])
+
+
+def test_monitor_is_the_unshielded_environment_bit_for_bit(certificate):
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1.2, 1.2, (200, 1))  # float64 and beyond the limits: passed on as they are
+    bare, watched = gym.make(CRUISE), shielded(certificate, mode="monitor")
+    np.testing.assert_array_equal(bare.reset(seed=3)[0], watched.reset(seed=3)[0])
+    counted, doubted = 0, False
+    for action in actions:
+        expected, (*result, info) = bare.step(action), watched.step(action)
+        np.testing.assert_array_equal(expected[0], result[0])
+        assert expected[1:4] == tuple(result[1:])
+        np.testing.assert_array_equal(info["input"], info["input_proposed"])
+        assert info["shield_correction"] == 0.0
+        counted += info["shield_intervened"]
+        assert info["episode_interventions"] == counted
+        doubted |= info["shield_reason"] == NOT_KNOWN_INSIDE
+    assert 10 < counted < 150
+    assert doubted
+
+
+def test_monitor_counts_what_switch_does_at_the_same_estimates(certificate):
+    env = shielded(certificate, mode="monitor")
+    switch = SafetyFilter(certificate, env.filter.plant, "switch")
+    _, info = env.reset(seed=0)
+    rng = np.random.default_rng(1)
+    for _ in range(150):
+        estimate, shape = info["estimate"], info["error_shape"]
+        action = rng.uniform(-1, 1, 1).astype(np.float32)
+        *_, info = env.step(action)
+        decision = switch.decide(estimate, shape, 4.0 * action.astype(np.float64))
+        assert info["shield_intervened"] == decision.intervened
+
+
+def test_monitor_keeps_the_proof_while_nothing_unsafe_is_proposed(certificate):
+    env = shielded(certificate, mode="monitor", disturbance=AdversarialDisturbance(certificate.M))
+    gain = certificate.K / env.filter.plant.u_max[:, None]
+    infos = play(env, lambda info: gain @ info["estimate"], seed=0)
+    assert all(info["shield_guaranteed"] for info in infos)
+    assert infos[-1]["episode_interventions"] == 0
+
+
+def test_monitor_charges_the_penalty_for_what_it_counts(certificate):
+    free, charged = (shielded(certificate, mode="monitor", penalty=penalty) for penalty in (0.0, 2.0))
+    for env in (free, charged):
+        env.reset(seed=0)
+    for _ in range(30):
+        (_, reward, *_, info), (_, less, *_, _) = free.step(full(None)), charged.step(full(None))
+        assert less == pytest.approx(reward - 2.0 * info["shield_intervened"])
+
+
+def test_boundary_overrides_more_often_than_switch(certificate):
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (200, 1)).astype(np.float32)
+    counts = []
+    for mode in ("project", "switch", "boundary"):
+        env = shielded(certificate, mode=mode)
+        env.reset(seed=0)
+        for action in actions:
+            *_, info = env.step(action)
+            assert info["shield_guaranteed"]
+        counts.append(info["episode_interventions"])
+    assert counts[2] > counts[1]
 
 
 def test_certificate_is_synthesized_once_per_plant(monkeypatch):
@@ -290,7 +353,7 @@ def test_initial_set_that_leaves_the_safe_set_is_not_trusted(certificate):
 
 def test_too_large_disturbance_is_noticed_and_latched(certificate):
     def gust(rng, plant, nominal_next):
-        return 2.5 * plant.disturbance.extreme_point(rng.standard_normal(2))
+        return 2.0 * plant.disturbance.extreme_point(rng.standard_normal(2))
 
     env = shielded(certificate, disturbance=gust, allow_assumption_violation=True, channel=Channel())
     infos = play(env, full, seed=0)
