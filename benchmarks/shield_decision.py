@@ -1,0 +1,134 @@
+"""What one decision of the shield costs, against the same filter as a parameterized cvxpy problem, in one run.
+
+    python benchmarks/shield_decision.py [--steps 400]
+
+Estimates, error ellipsoids and proposals come from episodes of the registered environment (one input) and of random
+plants under a random policy, so that the mix of passed, projected and fallback decisions is the one met in use.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+import warnings
+from collections import defaultdict
+
+import cvxpy as cp
+import gymnasium as gym
+import numpy as np
+
+from ncs_gym import Channel, LinearPlant, NCSEnv
+from ncs_gym.ellipsoid import outer_sum
+from shields import SafetyFilter, SafetyShield, synthesize
+from shields.filter import MARGIN
+
+CHANNEL = Channel(loss=0.3, quantization_step=0.01, send_period=2, delay=2)
+REPEATS = 20
+
+
+class ConicFilter:
+    """The same projection solved per step: minimize |u - proposed|^2 in the test and the limits (DPP, Clarabel)."""
+
+    def __init__(self, shield: SafetyFilter) -> None:
+        n, m = shield.plant.n, shield.plant.m
+        self.shield, self.u = shield, cp.Variable(m)
+        self.proposed, self.offset = cp.Parameter(m), cp.Parameter(n)
+        self.effect, self.radius = cp.Parameter((n, m)), cp.Parameter()
+        reached = cp.norm(self.offset + self.effect @ self.u)
+        constraints = [reached <= self.radius - MARGIN, cp.abs(self.u) <= shield.plant.u_max]
+        self.problem = cp.Problem(cp.Minimize(cp.sum_squares(self.u - self.proposed)), constraints)
+
+    def decide(self, estimate: np.ndarray, error_shape: np.ndarray, proposed: np.ndarray) -> np.ndarray:
+        test, plant = self.shield.test, self.shield.plant
+        predicted = outer_sum(test.moved @ error_shape @ test.moved.T, test.D, np.eye(plant.n))
+        values, axes = np.linalg.eigh(predicted)
+        h = np.sqrt(values[-1])
+        turn = np.sqrt(h * (1.0 - h) / (h - values))[:, None] * axes.T
+        self.proposed.value, self.radius.value = proposed, 1.0 - h
+        self.offset.value, self.effect.value = turn @ test.moved @ estimate, turn @ test.effect
+        self.problem.solve(solver=cp.CLARABEL)
+        usable = self.problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
+        return self.u.value if usable else np.clip(self.shield.certificate.K @ estimate, -plant.u_max, plant.u_max)
+
+
+def random_plant(seed: int, n: int, m: int) -> LinearPlant:
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((n, n))
+    return LinearPlant(
+        A=A * (0.85 / np.abs(np.linalg.eigvals(A)).max()),
+        B=0.3 * rng.standard_normal((n, m)),
+        C=np.eye(n),
+        u_max=1.0,
+        dt=0.1,
+        gamma=1e-4,
+        measurement_noise_cov=1e-4 * np.eye(n),
+    )
+
+
+def recorded(env: NCSEnv, shield: SafetyFilter, steps: int) -> list[tuple[np.ndarray, ...]]:
+    """Estimate, error shape and proposal of every step of shielded episodes under a random policy."""
+    env = SafetyShield(env, shield.certificate)
+    rng, cases = np.random.default_rng(0), []
+    while len(cases) < steps:
+        _, info = env.reset(seed=len(cases))
+        for _ in range(min(200, steps)):
+            action = rng.uniform(-1, 1, shield.plant.m).astype(np.float32)
+            cases.append((info["estimate"], info["error_shape"], shield.plant.u_max * action.astype(np.float64)))
+            *_, info = env.step(action)
+    return cases[:steps]
+
+
+def microseconds(decide, cases: list, repeats: int) -> float:
+    start = time.perf_counter()
+    for _ in range(repeats):
+        for case in cases:
+            decide(*case)
+    return 1e6 * (time.perf_counter() - start) / (repeats * len(cases))
+
+
+def compare(name: str, env: NCSEnv, steps: int) -> None:
+    """Prints a line for a plant: our time by outcome, the conic filter's, and whether the inputs agree."""
+    shield = SafetyFilter(synthesize(env.plant), env.plant)
+    conic = ConicFilter(shield)
+    cases = recorded(env, shield, steps)
+    by_reason = defaultdict(list)
+    for case in cases:
+        by_reason[shield.decide(*case).reason].append(case)
+    ours = microseconds(shield.decide, cases, REPEATS)
+    parts = {reason: microseconds(shield.decide, some, REPEATS) for reason, some in by_reason.items()}
+    conic.decide(*cases[0])  # canonicalizes
+    theirs = microseconds(conic.decide, cases, 1)
+    apart = max(
+        float(np.abs((shield.decide(*case).input - conic.decide(*case)) / env.plant.u_max).max())
+        for case in by_reason["safe"] + by_reason["projected"]
+    )
+    print(
+        f"{name:28s}{ours:9.1f}"
+        + "".join(f"{parts[reason]:11.1f}" if reason in parts else f"{'-':>11s}" for reason in REASONS)
+        + f"{theirs:10.0f}{theirs / ours:8.0f}x{1 - len(by_reason['safe']) / len(cases):12.1%}{apart:11.1e}",
+        flush=True,
+    )
+
+
+REASONS = ("safe", "projected", "fallback")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--steps", type=int, default=400)
+    options = parser.parse_args()
+    warnings.filterwarnings("ignore", "Solution may be inaccurate")
+    print(f"{'':28s}{'our decision [us]':>42s}{'cvxpy':>10s}")
+    print(
+        f"{'plant':28s}{'mean':>9s}"
+        + "".join(f"{reason:>11s}" for reason in REASONS)
+        + f"{'[us]':>10s}{'ratio':>9s}{'overridden':>12s}{'apart':>11s}"
+    )
+    cruise = gym.make("ncs_gym/TruckTrailerCruise-v0").unwrapped
+    compare("TruckTrailerCruise-v0", cruise, options.steps)
+    for n, m in ((4, 1), (4, 2), (4, 3), (8, 3)):
+        compare(f"random, n = {n}, m = {m}", NCSEnv(random_plant(n, n, m), CHANNEL), options.steps)
+
+
+if __name__ == "__main__":
+    main()
