@@ -6,6 +6,7 @@ import json
 from dataclasses import asdict
 
 import gymnasium as gym
+from tqdm import tqdm
 
 from experiments.settings import SynthesizeSettings, VerifySettings
 from ncs_gym import LinearPlant, scenarios
@@ -22,7 +23,8 @@ def synthesize_file(settings: SynthesizeSettings) -> None:
         OSError: If the file cannot be written.
     """
     plant = plant_of(settings.env)
-    certificate = synthesize(plant, settings.method, progress=lambda line: print(line, flush=True))
+    with tqdm(bar_format="{desc} [{elapsed}]", desc="synthesis", leave=False, disable=None) as line:
+        certificate = synthesize(plant, settings.method, progress=line.set_description_str)
     certificate.save(settings.out)
     print(verify(certificate, plant))
     if certificate.method == "paper":
