@@ -24,6 +24,10 @@ types: $(INSTALLED)
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 benchmark: $(INSTALLED)
+	$(BIN)/python benchmarks/shield_decision.py
+	$(BIN)/python benchmarks/containment.py
+	$(BIN)/python benchmarks/synthesis.py
+	$(BIN)/python benchmarks/codesign_grid.py
 	$(BIN)/python benchmarks/ppo_settings.py
 
 $(INSTALLED): pyproject.toml constraints.txt
