@@ -51,7 +51,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--episodes", type=int, default=15)
     options = parser.parse_args()
-    print(f"{'environment':34s}{'policy':30s}{'norm':>8s}{'shield':>8s}{'exact':>8s}{'exact [us]':>12s}", flush=True)
+    print("share of actions overridden by each test")
+    print(f"{'environment':26s}{'policy':30s}{'norm':>8s}{'shield':>8s}{'exact':>8s}{'exact [us]':>12s}", flush=True)
     for env_id in ("ncs_gym/TruckTrailer-v0", "ncs_gym/TruckTrailerCruise-v0"):
         plant = gym.make(env_id).unwrapped.plant
         env = SafetyShield(gym.make(env_id), synthesize(plant))
@@ -70,7 +71,7 @@ def main() -> None:
                     *_, info = env.step(action)
             count = options.episodes * STEPS
             shares = "".join(f"{share:8.1%}" for share in turned_down / count)
-            print(f"{env_id:34s}{name:30s}{shares}{1e6 * seconds / count:12.0f}", flush=True)
+            print(f"{env_id.removeprefix('ncs_gym/'):26s}{name:30s}{shares}{1e6 * seconds / count:12.0f}", flush=True)
 
 
 if __name__ == "__main__":

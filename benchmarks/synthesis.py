@@ -10,11 +10,11 @@ excluded; every certificate is verified exactly.
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from dataclasses import replace
 
 import numpy as np
+from tqdm import tqdm
 
 from ncs_gym import LinearPlant, certified_error_set, truck_trailer
 from shields import Infeasible, synthesize, verify
@@ -35,17 +35,18 @@ def random_plant(seed: int, n: int, m: int) -> LinearPlant:
 
 def measure(name: str, plants: list[LinearPlant]) -> None:
     seconds, volumes, missing = [], [], 0
+    line = tqdm(bar_format="  {desc} [{elapsed}]", leave=False, disable=None)
     for plant in plants:
         start = time.perf_counter()
         try:
-            certificate = synthesize(plant, progress=lambda line: print(f"\r\x1b[K  {line}", end="", file=sys.stderr))
+            certificate = synthesize(plant, progress=line.set_description_str)
         except Infeasible:
             missing += 1
         else:
             volumes.append(certificate.provenance["volume_of_box_ellipsoid"])
             assert verify(certificate, plant).valid
         seconds.append(time.perf_counter() - start)
-    print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+    line.close()
     span = f"{min(volumes):.4f} .. {max(volumes):.4f}" if volumes else "-"
     print(f"{name:42s}{np.median(seconds):9.2f}{max(seconds):9.2f}{span:>20s}{missing:>12d}", flush=True)
 

@@ -18,9 +18,10 @@ from ncs_gym.noise import SMALLEST_KEPT, TruncatedGaussian, chi2_quantile
 INFLATION = 1.0 + 1e-9
 # The same for directions in which a bound is flat: growth of its diagonal alone.
 FLAT_INFLATION = 1e-12
-# No disturbance set is thinner than this, in squared half-widths of the safe box. With (1+s) D + (1+1/s) F, s = 1e-9,
-# it makes room for F = (1e-14)^2: the rounding of a simulation in float64.
-SIMULATION_ROUNDING = 1e-19
+# No disturbance set is thinner than this, in squared half-widths of the safe box.
+THINNEST = 1e-19
+# Simulating a step in float64 rounds; the disturbance bound has room for that up to this many half-widths out.
+SIMULATED_REACH = 100.0
 # Smaller truncation levels have no finite quantile in float64.
 SMALLEST_DELTA = 1e-12
 
@@ -123,6 +124,11 @@ class LinearPlant(FrozenArrays):
         return read_only(gram + 1e-6 * np.diag(np.diag(gram) + np.trace(gram) / self.n * (np.diag(gram) == 0.0)))
 
     @cached_property
+    def half_widths(self) -> np.ndarray:
+        """Half-widths of the ellipsoid {x : x'Wx <= 1} around the safe box' center, shape (n,)."""
+        return read_only(np.sqrt(np.diag(np.linalg.inv(self.weight))))
+
+    @cached_property
     def process_noise(self) -> TruncatedGaussian:
         """w ~ N(0, Q) truncated at chi2_{n,1-delta}."""
         return TruncatedGaussian(self.process_noise_cov, chi2_quantile(1.0 - self.delta, self.n))
@@ -139,9 +145,17 @@ class LinearPlant(FrozenArrays):
 
     @cached_property
     def disturbance(self) -> Ellipsoid:
-        """D, shape (n, n): holds d (with d'd <= gamma) plus the truncated process noise (theory.md section 1)."""
+        """D, shape (n, n): holds d (with d'd <= gamma), the truncated process noise and the rounding of a simulation.
+
+        Inflated by 1+s, D leaves room for a term F where (1+1/s) F is added: F = n diag(r^2) with r the rounding of
+        A x + B u + d, x up to SIMULATED_REACH half-widths out (theory.md section 1).
+        """
+        reach = SIMULATED_REACH * self.half_widths
+        rounding = np.abs(self.A) @ reach + np.abs(self.B) @ self.u_max + reach
+        rounding *= (self.n + self.m + 2) * np.finfo(float).eps
         box = np.linalg.inv(self.weight)
-        return Ellipsoid(_inflated(self.nominal_disturbance.shape) + SIMULATION_ROUNDING * 0.5 * (box + box.T))
+        room = THINNEST * 0.5 * (box + box.T) + 2.0 * self.n / (INFLATION - 1.0) * np.diag(rounding**2)
+        return Ellipsoid(_inflated(self.nominal_disturbance.shape) + room)
 
     @cached_property
     def nominal_disturbance(self) -> Ellipsoid:

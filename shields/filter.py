@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from ctypes import c_float
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from math import isfinite
 from operator import mul
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from ncs_gym import LinearPlant
 from ncs_gym.frozen import FrozenArrays
-from shields.certificate import Certificate
+from shields.certificate import Certificate, CertificateError
 from shields.one_step import MOST_INPUTS_WITH_VERTICES, OneStepTest, Outlook
 from shields.plane import PlaneOutlook
 from shields.verification import ACTION_ROUNDING, require_valid
@@ -27,14 +28,14 @@ class Decision(NamedTuple):
 
     Attributes:
         input: Input to apply, shape (m,), within the limits; u_max times a float32 action if not the proposed one.
-        intervened: Whether it differs from the proposed one; in mode "monitor": whether "switch" would differ.
+        intervened: Whether it differs from the proposed one; in mode "monitor": whether that of "switch" would.
         passed: Whether it meets the one-step test, so that x+ is in S even if x is not.
         fallback: Whether it is K x_hat, so that x+ is in S if x is and Sigma_k lies inside the certificate's Sigma.
         margin: 1 - h - |A x_hat + B u|_M at the input to apply. Positive only if the test is met; the test is sharper
             and admits some inputs for which this is slightly negative. NaN without a usable estimate.
         reason: "safe" (passed as proposed), "projected", "fallback" (u = K x_hat), "unsafe" (applied as proposed by
-            "monitor"), or "invalid" (a proposed input, estimate or error shape that is not finite or wrongly shaped:
-            u = K x_hat, or zero without a usable estimate).
+            "monitor"), or "invalid" (what was proposed is no input within the limits, or estimate or error shape is
+            unusable: u = K x_hat, zero without a usable estimate, in "monitor" what was proposed if it is an input).
     """
 
     input: np.ndarray
@@ -55,33 +56,38 @@ class SafetyFilter(FrozenArrays):
     Args:
         certificate: Verified exactly here; what does not verify is refused.
         plant: The plant it was made for.
-        mode: What becomes of an input that does not pass: "project" applies the closest one that does, "switch" (and
-            "project" if there is none) K x_hat. "boundary" applies K x_hat unless *every* input within the limits
-            passes. "monitor" applies what is proposed and says whether "switch" would have; it protects nothing.
+        mode: What becomes of an input that does not pass: "project" applies the closest one that does (Euclidean
+            distance in physical units, to within float32), "switch" (and "project" if there is none) K x_hat.
+            "boundary" applies K x_hat unless *every* input within the limits passes. "monitor" applies what is
+            proposed and says whether "switch" would have; it protects nothing.
+
+    Attributes:
+        test: The one-step test.
 
     Raises:
-        CertificateError: If the certificate does not verify for the plant.
+        CertificateError: If the certificate does not verify for the plant, or float64 is too coarse for it.
         ValueError: If the mode is unknown, or "boundary" for more than twelve inputs.
     """
 
     certificate: Certificate
     plant: LinearPlant
     mode: str = "project"
+    test: OneStepTest = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.mode not in MODES:
             raise ValueError(f"mode must be one of {list(MODES)}, got {self.mode!r}")
+        if not isinstance(self.certificate, Certificate) or not isinstance(self.plant, LinearPlant):
+            kinds = f"{type(self.certificate).__name__} and {type(self.plant).__name__}"
+            raise ValueError(f"SafetyFilter takes a Certificate and a LinearPlant, got {kinds}")
         if self.mode == "boundary" and self.plant.m > MOST_INPUTS_WITH_VERTICES:
             raise ValueError(
                 f'mode "boundary" looks at 2^m vertices and takes at most {MOST_INPUTS_WITH_VERTICES} inputs, '
                 f"got {self.plant.m}"
             )
         require_valid(self.certificate, self.plant)
-
-    @cached_property
-    def test(self) -> OneStepTest:
-        """The one-step test."""
-        return OneStepTest(self.certificate.M, self.plant)
+        require_computable(self.certificate, self.plant)
+        object.__setattr__(self, "test", OneStepTest(self.certificate.L, self.plant))
 
     @cached_property
     def _limits(self) -> list[float]:
@@ -98,7 +104,7 @@ class SafetyFilter(FrozenArrays):
         return 2.0 * MARGIN + float(ACTION_ROUNDING) * effect
 
     def decide(self, estimate: np.ndarray, error_shape: np.ndarray, input_proposed: np.ndarray) -> Decision:
-        """Returns the input to apply.
+        """Returns the input to apply; never raises.
 
         Args:
             estimate: x_hat, shape (n,), float64.
@@ -106,16 +112,16 @@ class SafetyFilter(FrozenArrays):
             input_proposed: Shape (m,) [physical units]; the very float64 value that would be applied.
         """
         estimate, error_shape = _as_array(estimate), _as_array(error_shape)
-        outlook = self.test.at(estimate, error_shape)
-        if outlook is None:
-            return self._blind(estimate)
         proposed = _as_array(input_proposed)
         u = proposed.tolist()
         if proposed.shape != (self.plant.m,) or not self._is_within_limits(u):
-            return self._fallback(estimate, outlook, None)
+            u = None
+        outlook = self.test.at(estimate, error_shape)
+        if outlook is None or u is None:
+            return self._fallback(estimate, outlook, u)
         room, margin = outlook.judge(u)
         if (outlook.smallest_room() if self.mode == "boundary" else room) >= MARGIN:
-            return Decision(proposed, False, True, False, margin, "safe")
+            return Decision(proposed.copy(), False, True, False, margin, "safe")
         if self.mode == "project":
             closest = outlook.closest(u, self._reserve)
             if closest is not None:
@@ -126,45 +132,46 @@ class SafetyFilter(FrozenArrays):
         return self._fallback(estimate, outlook, u)
 
     def margin(self, estimate: np.ndarray, error_shape: np.ndarray, u: np.ndarray) -> float:
-        """Returns 1 - h - |A x_hat + B u|_M for an input u, shape (m,); NaN without a usable estimate."""
-        outlook = self.test.at(estimate, error_shape)
-        return float("nan") if outlook is None else outlook.judge(u.tolist())[1]
+        """Returns 1 - h - |A x_hat + B u|_M for an input u, shape (m,); NaN if any of them is unusable."""
+        outlook, u = self.test.at(_as_array(estimate), _as_array(error_shape)), _as_array(u)
+        return float("nan") if outlook is None or u.shape != (self.plant.m,) else outlook.judge(u.tolist())[1]
 
     def knows_inside(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
         """Returns whether |x_hat|_M + sqrt(lambda_max(M Sigma_k)) <= 1, which proves that x is in S."""
-        if self.test.at(estimate, error_shape) is None:
-            return False
-        root = self.test.root
-        radius = max(float(np.linalg.eigvalsh(root @ error_shape @ root.T)[-1]), 0.0) ** 0.5
-        return float(np.linalg.norm(root @ estimate)) + radius <= 1.0 - MARGIN
+        return self.test.knows_inside(_as_array(estimate), _as_array(error_shape), MARGIN)
 
     def fallback_input(self, estimate: np.ndarray) -> np.ndarray:
-        """Returns K x_hat, shape (m,), clipped to the limits and rounded to what a float32 action can express."""
-        return np.array(self._gained(estimate))
+        """Returns K x_hat, shape (m,), clipped to the limits and rounded to what a float32 action can express.
+
+        Raises:
+            ValueError: If the estimate is not finite or does not have shape (n,), or K x_hat overflows.
+        """
+        u = self._gained(_as_array(estimate))
+        if u is None:
+            raise ValueError(f"the estimate must be finite with shape ({self.plant.n},), got {estimate!r}")
+        return np.array(u)
 
     def _fallback(
-        self, estimate: np.ndarray, outlook: Outlook | PlaneOutlook, proposed: list[float] | None
+        self, estimate: np.ndarray, outlook: Outlook | PlaneOutlook | None, proposed: list[float] | None
     ) -> Decision:
-        """Returns K x_hat; in mode "monitor" what was proposed, unless that is no input (None)."""
-        u = self._gained(estimate)
+        """Returns K x_hat, zero if there is none; in "monitor" what was proposed, unless that is no input (None)."""
+        gained = self._gained(estimate)
+        u = [0.0] * self.plant.m if gained is None else gained
         differs = u != proposed
-        if self.mode == "monitor" and differs and proposed is not None:
-            return Decision(np.array(proposed), True, False, False, outlook.judge(proposed)[1], "unsafe")
-        room, margin = outlook.judge(u)
-        return Decision(
-            np.array(u), differs, room >= MARGIN, True, margin, "invalid" if proposed is None else "fallback"
-        )
+        monitors = self.mode == "monitor" and proposed is not None
+        reason = "invalid" if outlook is None or proposed is None else "unsafe" if monitors and differs else "fallback"
+        applied = proposed if monitors else u
+        room, margin = (float("nan"),) * 2 if outlook is None else outlook.judge(applied)
+        fallback = gained is not None and applied == gained
+        return Decision(np.array(applied), differs, room >= MARGIN, fallback, margin, reason)
 
-    def _blind(self, estimate: np.ndarray) -> Decision:
-        """Returns what to do without a usable error shape: K x_hat; without a usable estimate: zero."""
-        usable = estimate.shape == (self.plant.n,) and bool(np.isfinite(estimate).all())
-        u = self.fallback_input(estimate) if usable else np.zeros(self.plant.m)
-        return Decision(u, True, False, usable, float("nan"), "invalid")
-
-    def _gained(self, estimate: np.ndarray) -> list[float]:
-        """Returns K x_hat as an action can express it, m numbers."""
+    def _gained(self, estimate: np.ndarray) -> list[float] | None:
+        """Returns K x_hat as an action can express it, m numbers; None if it cannot be computed."""
         x_hat = estimate.tolist()
-        return self._expressible([sum(map(mul, row, x_hat)) for row in self._gain])
+        if estimate.shape != (self.plant.n,):
+            return None
+        u = [sum(map(mul, row, x_hat)) for row in self._gain]
+        return self._expressible(u) if isfinite(sum(u)) else None
 
     def _expressible(self, u: list[float]) -> list[float]:
         """Returns the nearest u_max * float32 action, m numbers."""
@@ -183,9 +190,30 @@ class SafetyFilter(FrozenArrays):
         return True
 
 
+def require_computable(certificate: Certificate, plant: LinearPlant) -> None:
+    """Raises unless float64 computes K x_hat on S more accurately than (I) and (U) make room for.
+
+    D_u allows a shift by 2^-24 u_max, twice what rounding an action to float32 does; the other half is for this.
+
+    Raises:
+        CertificateError: If it does not.
+    """
+    extent = np.sqrt(np.diag(certificate.L))
+    if certificate.Sigma is not None:
+        extent = extent + np.sqrt(np.diag(certificate.Sigma))
+    error = (plant.n + 2) * np.finfo(float).eps * (np.abs(certificate.K) @ extent)
+    if (error > 0.25 * float(ACTION_ROUNDING) * plant.u_max).any():
+        raise CertificateError("the gain is too large against the input limits to compute K x_hat in float64")
+
+
 def _as_array(value: Any) -> np.ndarray:
     """Returns float64 numbers; an empty array, which has no usable shape, for what are none."""
+    if type(value) is np.ndarray and value.dtype == np.float64:
+        return value
     try:
-        return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+        array = np.asarray(value)
+        if isinstance(value, np.ma.MaskedArray) or array.dtype.kind not in "fiu":
+            return np.empty(0)
+        return array.astype(np.float64)
+    except (TypeError, ValueError, OverflowError):
         return np.empty(0)

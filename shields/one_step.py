@@ -4,50 +4,69 @@ from __future__ import annotations
 
 from functools import cached_property
 from itertools import product
-from math import isfinite
+from math import isfinite, sqrt
 
 import numpy as np
-from scipy.linalg.lapack import dsyev
+from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dpotrf, dsyev
 
 from ncs_gym import LinearPlant
 from ncs_gym.ellipsoid import SMALLEST_SHARE
 from ncs_gym.frozen import read_only
-from shields.plane import PlaneOutlook, outlook_in_plane
+from shields.certificate import CertificateError
+from shields.exact import congruence, is_positive_semidefinite, rational, subtract
+from shields.plane import FARTHEST, INDEFINITE, SMALLEST_RADIUS, PlaneOutlook, outlook_in_plane
 from shields.projection import closest_admissible, closest_on_line
 
 # The test of all inputs looks at the 2^m vertices of the input box.
 MOST_INPUTS_WITH_VERTICES = 12
+# Growths of the root that are tried until it provably does not understate the norm of S.
+ROOT_GROWTHS = (1e-13, 1e-12, 1e-11, 1e-10, 1e-9)
 
 
 class OneStepTest:
-    """Whether everything one step can reach lies in S = {x : x'Mx <= 1} (docs/shield.md, "One step").
+    """Whether everything one step can reach lies in S = {x : x'Mx <= 1} = E(L) (docs/shield.md, "One step").
 
     x+ lies in {c} + E(Sigma_pred) with c = A x_hat + B u. In coordinates where M = I, with p_i the eigenvalues of
-    Sigma_pred, c_i the coordinates of c along their axes and h = sqrt(max p), that set is inside S if
+    Sigma_pred, c_i the coordinates of c along their axes and h = sqrt(max p) < 1, that set is inside S if
 
         sum_i (1-h) h / (h - p_i) c_i^2 <= (1-h)^2,
 
     the exact containment test at the multiplier that is best if all p_i are equal. It admits more than |c|_M <= 1 - h,
-    since every weight is at most 1, and is as cheap: the inputs that pass form an ellipsoid in both.
+    since every weight is at most 1, and is as cheap: the inputs that pass form an ellipsoid in both. The radius 1 - h
+    is reduced, and Sigma_pred enlarged, by a bound on the rounding of all products and of simulating the step.
 
     Args:
-        M: Shape (n, n), positive definite.
+        L: Shape of S, (n, n), positive definite.
         plant: Gives A, B, D and the limits.
+
+    Raises:
+        CertificateError: If S is so thin that no norm computed in float64 provably describes it.
     """
 
-    def __init__(self, M: np.ndarray, plant: LinearPlant) -> None:
+    def __init__(self, L: np.ndarray, plant: LinearPlant) -> None:
         self.plant = plant
-        self.root = read_only(np.linalg.cholesky(M).T)
+        self.root = read_only(certified_root(L))
         self.moved = read_only(self.root @ plant.A)
         self.effect = read_only(self.root @ plant.B)
-        self.D = read_only(self.root @ plant.disturbance.shape @ self.root.T)
+        # Products with |G| bound what rounding does to products with G, in units of `rounding`.
+        self.rounding = 8.0 * (plant.n + plant.m) * float(np.finfo(float).eps)
+        size = np.abs(self.root)
+        self._columns = np.linalg.norm(size @ np.abs(plant.A), axis=0)
+        self._own_columns = np.linalg.norm(size, axis=0)
+        self._pushed = float(np.linalg.norm(size @ np.abs(plant.B), axis=0) @ plant.u_max)
+        bound = plant.disturbance.shape
+        extent = float(self._own_columns @ np.sqrt(np.diag(bound)))
+        D = self.root @ bound @ self.root.T + self.rounding * extent**2 * np.eye(plant.n)
+        self.D = read_only(0.5 * (D + D.T))
         # The trace-optimal share of the ellipsoid around E(Sigma_k moved) + E(D) needs the traces of both.
         self._gram = self.moved.T @ self.moved
         self._second = float(np.trace(self.D)) ** 0.5
         # Two states and one input, the commonest small plant, go ten times faster in plain floats.
         self._plane = None
         if (plant.n, plant.m) == (2, 1):
-            self._plane = (self.moved.tolist(), self.effect[:, 0].tolist(), self.D.tolist(), plant.u_max.item())
+            numbers = (self.moved, self.effect[:, 0], self.D, self._columns)
+            self._plane = (*(array.tolist() for array in numbers), self._pushed, self.rounding, plant.u_max.item())
 
     @cached_property
     def vertices(self) -> np.ndarray:
@@ -66,19 +85,58 @@ class OneStepTest:
             return None
         if self._plane is not None:
             return outlook_in_plane(*self._plane, estimate.tolist(), error_shape.tolist())
-        first = float(
-            np.vdot(self._gram, error_shape)
-        )  # the trace of G A Sigma_k A' G', NaN or infinite if an entry is
-        if not (isfinite(first) and error_shape.diagonal().min() >= 0.0):
+        # The trace of G A Sigma_k A' G'; not finite if any entry of Sigma_k is not.
+        first = float(np.vdot(self._gram, error_shape))
+        if not (isfinite(first) and _is_shape(error_shape)):
             return None
+        spread = float(self._columns.dot(np.sqrt(np.abs(error_shape.diagonal()))))
+        reach = float(self._columns.dot(np.abs(estimate)))
         first = max(abs(first) ** 0.5, SMALLEST_SHARE * self._second)
-        predicted = self.moved.dot(error_shape).dot(self.moved.T)
+        predicted = self.moved.dot(0.5 * (error_shape + error_shape.T)).dot(self.moved.T)
+        predicted.flat[:: n + 1] += self.rounding * spread * spread
         predicted = predicted * (1.0 + self._second / first) + self.D * (1.0 + first / self._second)
         values, axes, failed = dsyev(predicted)  # numpy's eigh, without its three times longer preparation
-        offset = self.moved.dot(estimate)
-        if failed or not isfinite(float(values[0]) + float(values[-1]) + float(offset.dot(offset))):
+        loss = self.rounding * (reach + spread + self._pushed)
+        if failed or not (reach < FARTHEST and isfinite(float(values[0]) + loss) and 0.0 < values[-1] < np.inf):
             return None
-        return Outlook(self, offset, values, axes)
+        return Outlook(self, self.moved.dot(estimate), values, axes, loss)
+
+    def knows_inside(self, estimate: np.ndarray, error_shape: np.ndarray, margin: float) -> bool:
+        """Returns whether |x_hat|_M + sqrt(lambda_max(M Sigma_k)) <= 1 - margin, which proves that x is in S."""
+        if self.at(estimate, error_shape) is None:
+            return False
+        spread = float(self._own_columns @ np.sqrt(np.abs(np.diag(error_shape))))
+        reach = float(self._own_columns @ np.abs(estimate))
+        shape = self.root @ (0.5 * (error_shape + error_shape.T)) @ self.root.T
+        largest = float(np.linalg.eigvalsh(shape)[-1]) + self.rounding * spread**2
+        level = float(np.linalg.norm(self.root @ estimate)) + max(largest, 0.0) ** 0.5
+        return level <= 1.0 - margin - self.rounding * reach
+
+
+def certified_root(L: np.ndarray) -> np.ndarray:
+    """Returns G, shape (n, n), such that |z|_M <= |G z| for all z: G L G' >= I, decided in exact arithmetic.
+
+    Raises:
+        CertificateError: If no such G within 1e-9 of the best was found.
+    """
+    identity = rational(np.eye(len(L)))
+    try:
+        root = solve_triangular(np.linalg.cholesky(L), np.eye(len(L)), lower=True)
+    except np.linalg.LinAlgError:
+        root = np.zeros_like(L)
+    for growth in ROOT_GROWTHS:
+        grown = (1.0 + growth) * root
+        if is_positive_semidefinite(subtract(congruence(rational(grown), rational(L)), identity)):
+            return grown
+    raise CertificateError("the safe set is too thin to decide in float64 what lies in it")
+
+
+def _is_shape(matrix: np.ndarray) -> bool:
+    """Returns whether a matrix (n, n) is positive semidefinite up to rounding, in whatever units."""
+    padded = matrix.copy()
+    padded.flat[:: len(matrix) + 1] *= 1.0 + INDEFINITE
+    padded.flat[:: len(matrix) + 1] += 1e-300  # a state known perfectly
+    return dpotrf(0.5 * (padded + padded.T))[1] == 0
 
 
 class Outlook:
@@ -89,23 +147,30 @@ class Outlook:
         offset: G A x_hat, shape (n,), where |z|_M = |G z|.
         values: Eigenvalues of G Sigma_pred G', shape (n,), ascending.
         axes: Its eigenvectors, shape (n, n).
+        loss: What rounding may do.
 
     Attributes:
-        radius: 1 - h; no input passes unless it is positive.
+        radius: 1 - h less rounding; no input passes if it is negative.
     """
 
-    def __init__(self, test: OneStepTest, offset: np.ndarray, values: np.ndarray, axes: np.ndarray) -> None:
-        h = float(values[-1]) ** 0.5
-        self.radius = 1.0 - h
+    def __init__(
+        self, test: OneStepTest, offset: np.ndarray, values: np.ndarray, axes: np.ndarray, loss: float
+    ) -> None:
+        h = sqrt(values[-1])
+        self.radius = 1.0 - h - loss
         self._test, self._reached = test, offset
-        turn = axes * np.sqrt(h * (1.0 - h) / (h - values)) if h < 1.0 else axes
+        turn = axes
+        if self.radius >= SMALLEST_RADIUS:
+            turn = axes * np.sqrt(h * (1.0 - h) / (h - values))
+        else:
+            self.radius = min(self.radius, 0.0)
         self._offset, self._effect = offset.dot(turn), test.effect.T.dot(turn)
 
     def judge(self, u: list[float]) -> tuple[float, float]:
         """Returns room and margin of an input u, m numbers.
 
         The room is radius - |offset + effect u|: x+ is in S unless it is negative. The margin is
-        1 - h - |A x_hat + B u|_M, which is at most the room.
+        1 - h - |A x_hat + B u|_M, less rounding, which is at most the room.
         """
         moved = self._offset + np.dot(u, self._effect)
         reached = self._reached + np.dot(u, self._test.effect.T)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-# A curvature below this share of the largest counts as a direction that does not move the state.
-FLAT = 1e-14
+# A gain below this share of the largest counts as a direction that does not move the state.
+FLAT = 1e-13
 # Newton steps on the multiplier; from the left on a concave function they rise monotonically and converge fast.
 NEWTON_STEPS = 60
 RELATIVE_TOLERANCE = 1e-12
@@ -88,16 +88,18 @@ def _with_fixed(
 def _onto_ball(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, radius: float) -> np.ndarray | None:
     """Returns argmin |u - wanted| on |offset + effect u| = radius, for a `wanted` outside; None if out of reach.
 
-    In the axes of effect' effect = V diag(s) V' the minimizer for multiplier t is c_i + (w_i - c_i) / (1 + t s_i), with
-    c the center of the test; 1 / sqrt(excess) is concave and increasing in t (as in trust-region methods).
+    With effect = U diag(r) V' and s = r^2 the minimizer for multiplier t is c_i + (w_i - c_i) / (1 + t s_i) in the axes
+    V, c the center of the test; 1 / sqrt(excess) is concave and increasing in t (as in trust-region methods).
     """
-    curvature, axes = np.linalg.eigh(effect.T @ effect)
-    moves = curvature > FLAT * max(float(curvature[-1]), 0.0)
-    s = curvature[moves]
-    center = -(axes.T @ (effect.T @ offset))[moves] / s
-    away = (axes.T @ wanted)[moves] - center
-    residual = offset + effect @ (axes[:, moves] @ center)
+    images, gains, axes = np.linalg.svd(effect, full_matrices=False)
+    moves = gains > FLAT * max(float(gains[0]), 0.0)
+    images, gains, axes = images[:, moves], gains[moves], axes[moves].T
+    seen = images.T @ offset
+    center = -seen / gains
+    away = axes.T @ wanted - center
+    residual = offset - images @ seen
     reach = radius**2 - float(residual @ residual)
+    s = gains**2
     if reach < 0.0 or not moves.any():
         return None
     multiplier = 0.0
@@ -108,5 +110,5 @@ def _onto_ball(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, radiu
             break
         slope = float((s**2 * away**2 * share**3).sum())
         multiplier += excess / slope * (np.sqrt(excess / reach) - 1.0) if reach > 0.0 else 1e300
-    moved = axes[:, moves] @ (away / (1.0 + multiplier * s) - away)
+    moved = axes @ (away / (1.0 + multiplier * s) - away)
     return wanted + moved

@@ -8,6 +8,7 @@ import numpy as np
 
 from ncs_gym import Ellipsoid
 from ncs_gym.ellipsoid import is_inside
+from ncs_gym.plant import SIMULATED_REACH
 from shields.certificate import Certificate
 from shields.exact import is_positive_semidefinite, rational, subtract
 from shields.filter import Decision, SafetyFilter
@@ -16,20 +17,25 @@ ALARM = "a measurement contradicts the assumed bounds"
 OTHER_INPUT = "the input applied is not the one decided"
 OTHER_STEPS = "the environment did not move exactly one step"
 LARGE_ERROR = "the error ellipsoid is not inside the certified one"
+FAR_OUT = "the estimate is so far out of the safe box that rounding counts"
 NO_ERROR_SET = "a certificate of the published method carries no error set"
 NOT_KNOWN_INSIDE = "the state is not known to be in the safe set"
+# In half-widths of the box; half of what the disturbance bound makes room for (`LinearPlant.disturbance`).
+FARTHEST_ESTIMATE = 0.5 * SIMULATED_REACH
 
 
 class ProofTracker:
-    """Whether x in S is proved now, and why not (theory.md section 4, "When the proof holds").
+    """Whether x in S is proved now, and why not (docs/shield.md, "How you see that an assumption broke").
 
-    An alarm of the innovation monitor and an input other than the decided one break the error bound for the rest of
-    the episode. The other two reasons are recoverable: a passed test proves the next state in S without x in S, and
-    a running ellipsoid outside E(Sigma) is still a bound, only K x_hat is not proved safe with it.
+    An alarm of the innovation monitor, an input other than the decided one, a step that is not one step and an estimate
+    so far out that rounding counts break the error bound for the rest of the episode. The others are recoverable: a
+    passed test proves the next state in S without x in S, and a running ellipsoid outside E(Sigma) is still a bound,
+    only K x_hat is not proved safe with it.
     """
 
     def __init__(self, safety_filter: SafetyFilter) -> None:
         self._filter = safety_filter
+        self._reach = FARTHEST_ESTIMATE * safety_filter.plant.half_widths
         self._broken = ""
         self._error_certified = False
         self._inside = False
@@ -78,8 +84,10 @@ class ProofTracker:
         estimate, error_shape = info["estimate"], info["error_shape"]
         if info["assumption_violated"]:
             self._broken = self._broken or ALARM
+        if not (np.abs(estimate) <= self._reach).all():
+            self._broken = self._broken or FAR_OUT
         Sigma = self._filter.certificate.Sigma
-        usable = Sigma is not None and bool(np.isfinite(error_shape).all())
+        usable = Sigma is not None and self._filter.test.at(estimate, error_shape) is not None
         self._error_certified = usable and is_inside(error_shape, Sigma)
         if not self._inside:
             self._inside = self._filter.knows_inside(estimate, error_shape)

@@ -244,7 +244,7 @@ def _solve(program: cp.Problem) -> bool:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # "solution may be inaccurate": verified exactly afterwards
             program.solve(solver=cp.CLARABEL)
-    except cp.SolverError:
+    except (cp.SolverError, ArithmeticError, ValueError):
         return False
     if program.status not in USABLE:
         return False

@@ -20,6 +20,9 @@ from shields.synthesis import synthesize
 # What changes, repeats or swallows actions between the shield and the plant.
 REFUSED = (gym.ActionWrapper, RepeatAction, StickyAction, MaxAndSkipObservation, Autoreset)
 
+# What the clock reads while a step is under way: if it raises, the next one does not follow from what is known.
+INTERRUPTED = (-1, -1)
+
 _synthesized: dict[str, Certificate] = {}
 
 
@@ -74,16 +77,19 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         self.certificate = certificate_for(plant) if certificate is None else certificate
         self.filter = SafetyFilter(self.certificate, plant, mode)
         self._proof = ProofTracker(self.filter)
+        self._clock: tuple[int, int] | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode; see `NCSEnv.reset`."""
+        self._clock = INTERRUPTED
         observation, info = self.env.reset(seed=seed, options=options)
-        self._clock = self._read_clock()
-        self._proof.start(starts_inside(self.certificate, self.env.unwrapped.start), self._clock[1] == 0, info)
+        clock = self._read_clock()
+        self._proof.start(starts_inside(self.certificate, self.env.unwrapped.start), clock[1] == 0, info)
         self._estimate, self._error_shape = info["estimate"].copy(), info["error_shape"].copy()
         self._interventions = 0
         u = np.zeros(self.filter.plant.m)
         margin = self.filter.margin(self._estimate, self._error_shape, u)
+        self._clock = clock
         return observation, info | self._info(u, u, margin, intervened=False)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -91,17 +97,21 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
 
         Raises:
             ValueError: If the action is not finite or wrongly shaped; nothing has moved then.
+            gymnasium.error.ResetNeeded: If there was no reset.
         """
+        if self._clock is None:
+            raise gym.error.ResetNeeded("call reset before the first step")
         proposed = applied_input(self.filter.plant, action)
         decision = self.filter.decide(self._estimate, self._error_shape, proposed)
         if decision.intervened and self.filter.mode != "monitor":
             action = (decision.input / self.filter.plant.u_max).astype(np.float32)
+        (episode, step), self._clock = self._clock, INTERRUPTED
         observation, reward, terminated, truncated, info = self.env.step(action)
-        episode, step = self._clock
-        self._clock = self._read_clock()
-        self._proof.step(decision, self._clock == (episode, step + 1), info)
+        clock = self._read_clock()
+        self._proof.step(decision, clock == (episode, step + 1), info)
         self._estimate, self._error_shape = info["estimate"].copy(), info["error_shape"].copy()
         self._interventions += decision.intervened
+        self._clock = clock
         info = info | self._info(proposed, decision.input, decision.margin, intervened=decision.intervened)
         return observation, float(reward) - self.penalty * decision.intervened, terminated, truncated, info
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ncs_gym import AdversarialDisturbance, Channel, Ellipsoid, GilbertElliott, LinearPlant, NCSEnv, truck_trailer
@@ -19,10 +21,20 @@ TRUCKS = {
     "4000 kg": truck_trailer(mass=4000.0),
     "4000 kg, position only": truck_trailer(mass=4000.0, H=np.array([[1.0, 0.0]])),
 }
-# n = 2..8, m = 1..3, p < n.
+# n = 2..8, m = 1..3, p < n; inputs so weak that the shield lets some through and overrides others.
 RANDOM = {
-    f"n={n} m={m} p={p}": random_plant(seed, n, m, p)
-    for seed, (n, m, p) in enumerate(((2, 1, 1), (3, 2, 1), (4, 3, 2), (5, 1, 3), (6, 2, 3), (7, 3, 5), (8, 3, 4)))
+    f"n={n} m={m} p={p}": replace(random_plant(seed, n, m, p), u_max=u_max)
+    for seed, (n, m, p, u_max) in enumerate(
+        (
+            (2, 1, 1, 0.2),
+            (3, 2, 1, 0.5),
+            (4, 3, 2, 0.1),
+            (5, 1, 3, 0.2),
+            (6, 2, 3, 0.2),
+            (7, 3, 5, 0.08),
+            (8, 3, 4, 0.16),
+        )
+    )
 }
 POLICIES = ("random", "constant", "outwards", "gain_turned_round", "searching")
 _certificates: dict[str, Certificate] = {}

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -11,6 +12,8 @@ from ncs_gym.ellipsoid import outer_sum
 from shields import CertificateError, SafetyFilter, synthesize
 from shields.filter import MARGIN, MODES
 from tests.plants import random_plant
+
+TWO_STATES = random_plant(3, 2, 1)
 
 
 def worst_next_level(certificate, plant, estimate, shape, u, rng, tries=20):
@@ -59,8 +62,10 @@ def test_an_input_that_passes_is_returned_untouched(case):
     u = 1e-3 * plant.u_max
     decision = shield.decide(np.zeros(plant.n), 0.01 * certificate.Sigma, u)
     assert not decision.intervened
-    assert decision.input is u
+    np.testing.assert_array_equal(decision.input, u)
     assert decision.reason == "safe"
+    u[0] = 99.0  # a copy: a reused buffer changes no decision
+    assert decision.input[0] < 1.0
 
 
 def test_projected_input_is_expressible_in_float32_and_the_closest(case):
@@ -111,7 +116,14 @@ def test_fallback_within_the_assumptions_needs_no_clipping(case):
 
 
 @pytest.mark.parametrize(
-    "proposed", [np.array([np.nan]), np.array([np.inf]), np.zeros(2), np.array([4.0000001]), np.zeros((1, 1))]
+    "proposed",
+    [
+        *(np.array([value]) for value in (np.nan, np.inf, 4.0000001, -4.0000001, 1j, 10**400, np.datetime64(1, "s"))),
+        np.zeros(2),
+        np.zeros((1, 1)),
+        np.ma.array([1.0], mask=[True]),
+        [10**400],
+    ],
 )
 def test_invalid_input_becomes_the_fallback(certificate, loaded, proposed):
     estimate = np.array([0.5, 0.1])
@@ -131,7 +143,17 @@ def test_unusable_estimate_gives_zero_and_no_promise(certificate, loaded, estima
     assert (decision.input == 0.0).all()
 
 
-@pytest.mark.parametrize("shape", [np.full((2, 2), np.nan), np.eye(3), -np.eye(2), "none"])
+UNUSABLE_SHAPES = [
+    np.full((2, 2), np.nan),
+    np.eye(3),
+    -np.eye(2),
+    np.array([[0.01, 5.0], [5.0, 0.01]]),
+    np.array([[0.1, 0.5], [0.0, 0.1]]),
+    "none",
+]
+
+
+@pytest.mark.parametrize("shape", UNUSABLE_SHAPES)
 @pytest.mark.parametrize("mode", MODES)
 def test_unusable_error_shape_gives_the_gain_and_no_promise(certificate, loaded, shape, mode):
     estimate = np.array([1.5, 0.5])
@@ -139,7 +161,58 @@ def test_unusable_error_shape_gives_the_gain_and_no_promise(certificate, loaded,
     assert decision.reason == "invalid"
     assert decision.intervened
     assert not decision.passed
-    np.testing.assert_allclose(decision.input, certificate.K @ estimate, atol=1e-6)
+    assert decision.fallback is (mode != "monitor")
+    np.testing.assert_allclose(decision.input, np.ones(1) if mode == "monitor" else certificate.K @ estimate, atol=1e-6)
+
+
+def test_indefinite_error_shapes_of_three_states_are_unusable():
+    plant = random_plant(3, 3, 2)
+    shield = SafetyFilter(certificate_of(plant), plant)
+    swap = np.zeros((3, 3))
+    swap[0, 1] = swap[1, 0] = 0.1
+    for shape in (swap, 0.01 * np.eye(3) + swap, 4.0 * np.triu(swap) + 0.01 * np.eye(3)):
+        assert shield.decide(np.zeros(3), shape, np.zeros(2)).reason == "invalid"
+        assert not shield.knows_inside(np.zeros(3), shape)
+    skew = 1e-4 * np.eye(3) + np.array([[0.0, 1e-5, 0.0], [-1e-5, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    u = np.zeros(2)
+    assert shield.margin(u[[0, 0, 0]], skew, u) == pytest.approx(shield.margin(u[[0, 0, 0]], skew.T, u), abs=1e-15)
+
+
+@pytest.mark.parametrize("size", [1e150, 1e308])
+def test_huge_estimates_never_give_a_nan_input(size):
+    plant = replace(random_plant(3, 3, 2), u_max=1e4)
+    shield = SafetyFilter(certificate_of(plant), plant)
+    for signs in product((-1.0, 1.0), repeat=3):
+        decision = shield.decide(size * np.array(signs), 1e-4 * np.eye(3), np.zeros(2))
+        assert np.isfinite(decision.input).all()
+        assert not decision.passed
+
+
+def test_wrongly_projected_input_is_not_applied(certificate, loaded, monkeypatch):
+    shield = SafetyFilter(certificate, loaded)
+    monkeypatch.setattr("shields.plane.closest_on_line", lambda wanted, *rest: wanted)
+    decision = shield.decide(np.array([1.6, 0.5]), 0.1 * certificate.Sigma, np.array([4.0]))
+    assert decision.reason == "fallback"
+
+
+def test_public_helpers_refuse_what_decide_would_call_invalid(certificate, loaded):
+    shield = SafetyFilter(certificate, loaded)
+    assert np.isnan(shield.margin(np.zeros(2), certificate.Sigma, np.zeros(3)))
+    assert np.isnan(shield.margin(np.array([np.nan, 0.0]), certificate.Sigma, np.zeros(1)))
+    assert shield.margin([0.0, 0.0], certificate.Sigma.tolist(), [0.0]) > 0.0
+    assert not shield.knows_inside(np.array([np.nan, 0.0]), certificate.Sigma)
+    assert not shield.knows_inside(np.zeros(2), -certificate.Sigma)
+    for estimate in (np.zeros(3), np.array([np.nan, 0.0]), "here"):
+        with pytest.raises(ValueError, match=r"shape \(2,\)"):
+            shield.fallback_input(estimate)
+
+
+def test_known_inside_ends_at_the_edge(certificate, loaded):
+    shield, shape = SafetyFilter(certificate, loaded), 0.04 * certificate.Sigma
+    direction = certificate.safe_set.extreme_point(np.array([1.0, 0.3]))
+    radius = np.sqrt(np.linalg.eigvals(certificate.M @ shape).real.max())
+    assert shield.knows_inside((1.0 - radius - 1e-6) * direction, shape)
+    assert not shield.knows_inside((1.0 - radius + 1e-9) * direction, shape)
 
 
 @pytest.mark.parametrize("proposed", ["left", None, [[1.0]], [1.0, 2.0], object()])
@@ -199,6 +272,17 @@ def test_boundary_lets_an_input_pass_only_where_every_input_would(case):
     assert "fallback" in seen
 
 
+def test_boundary_trusts_weak_inputs_of_larger_plants_too():
+    plant = replace(random_plant(3, 3, 2), u_max=0.3)
+    certificate = certificate_of(plant)
+    boundary, rng = SafetyFilter(certificate, plant, "boundary"), np.random.default_rng(0)
+    reasons = set()
+    for _ in range(200):
+        estimate = certificate.safe_set.sample(rng)
+        reasons.add(boundary.decide(estimate, 0.1 * certificate.Sigma, rng.uniform(-0.3, 0.3, 2)).reason)
+    assert reasons == {"safe", "fallback"}
+
+
 def test_boundary_trusts_the_agent_where_no_input_can_harm(certificate, loaded):
     boundary = SafetyFilter(certificate, loaded, "boundary")
     shape, u = 0.1 * certificate.Sigma, np.array([4.0])
@@ -217,10 +301,8 @@ def test_boundary_refuses_too_many_inputs():
 @given(st.integers(0, 100_000))
 @settings(max_examples=100, deadline=None)
 def test_known_inside_is_never_claimed_wrongly(seed):
-    plant = random_plant(3, 2, 1)
-    certificate = (
-        CERTIFICATES.setdefault("two", synthesize(plant)) if "two" not in CERTIFICATES else CERTIFICATES["two"]
-    )
+    plant = TWO_STATES
+    certificate = certificate_of(plant)
     shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(seed)
     estimate, shape = 1.1 * certificate.safe_set.sample(rng), certificate.Sigma * rng.uniform(0, 1)
     if shield.knows_inside(estimate, shape):
@@ -228,7 +310,9 @@ def test_known_inside_is_never_claimed_wrongly(seed):
         assert all(certificate.safe_set.gauge(estimate - errors.sample_boundary(rng)) <= 1.0 for _ in range(50))
 
 
-CERTIFICATES: dict = {}
+@cache
+def certificate_of(plant):
+    return synthesize(plant)
 
 
 def test_margin_is_that_of_the_contract(certificate, loaded):
@@ -250,6 +334,8 @@ def test_filter_refuses_what_does_not_verify(certificate, loaded, plant):
         SafetyFilter(replace(certificate, L=1.1 * certificate.L), loaded)
     with pytest.raises(CertificateError, match="another plant"):
         SafetyFilter(certificate, plant)
+    with pytest.raises(ValueError, match="SafetyFilter takes a Certificate"):
+        SafetyFilter(loaded, certificate)
     with pytest.raises(ValueError, match="mode must be one of"):
         SafetyFilter(certificate, loaded, "hope")
 

@@ -41,7 +41,7 @@ def cases(certificate, plant, rng, count):
 
 def test_room_is_that_of_the_formula(case):
     plant, certificate = case
-    test, rng = OneStepTest(certificate.M, plant), np.random.default_rng(0)
+    test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(0)
     for estimate, shape, u in cases(certificate, plant, rng, 100):
         root, P, h = predicted(certificate, plant, shape)
         c = root @ (plant.A @ estimate + plant.B @ u)
@@ -55,7 +55,7 @@ def test_room_is_that_of_the_formula(case):
 
 def test_the_test_lies_between_the_sufficient_and_the_exact_one(case):
     plant, certificate = case
-    test, rng = OneStepTest(certificate.M, plant), np.random.default_rng(1)
+    test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(1)
     sharper = agree = exactly = 0
     for estimate, shape, u in cases(certificate, plant, rng, 400):
         root, P, h = predicted(certificate, plant, shape)
@@ -87,7 +87,7 @@ def test_the_test_lies_between_the_sufficient_and_the_exact_one(case):
 def test_passing_inputs_are_the_ones_the_worst_case_allows(case):
     # By another route: ascent over the errors and disturbances themselves, not over an ellipsoid around them.
     plant, certificate = case
-    test, rng = OneStepTest(certificate.M, plant), np.random.default_rng(2)
+    test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(2)
     tight = 0.0
     for estimate, shape, u in cases(certificate, plant, rng, 60):
         outlook = test.at(estimate, shape)
@@ -108,7 +108,7 @@ def test_passing_inputs_are_the_ones_the_worst_case_allows(case):
 
 def test_smallest_room_is_that_of_the_worst_input(case):
     plant, certificate = case
-    test, rng = OneStepTest(certificate.M, plant), np.random.default_rng(3)
+    test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(3)
     for estimate, shape, _ in cases(certificate, plant, rng, 30):
         outlook = test.at(estimate, shape)
         inputs = rng.uniform(-1, 1, (500, plant.m)) * plant.u_max
@@ -121,7 +121,7 @@ def test_smallest_room_is_that_of_the_worst_input(case):
 def test_plain_floats_agree_with_arrays():
     plant = PLANTS["truck"]
     certificate = synthesize(plant)
-    fast = OneStepTest(certificate.M, plant)
+    fast = OneStepTest(certificate.L, plant)
     slow = copy(fast)
     slow._plane = None
     rng = np.random.default_rng(4)

@@ -22,7 +22,7 @@ from gymnasium.wrappers import (
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from stable_baselines3.common.monitor import Monitor
 
-from ncs_gym import AdversarialDisturbance, Channel, Ellipsoid
+from ncs_gym import AdversarialDisturbance, Channel, Ellipsoid, NCSEnv
 from shields import Certificate, CertificateError, SafetyShield, synthesize
 from shields.filter import Decision, SafetyFilter
 from shields.proof import ALARM, LARGE_ERROR, NOT_KNOWN_INSIDE, OTHER_INPUT, OTHER_STEPS, ProofTracker
@@ -473,6 +473,51 @@ def test_fallback_proves_nothing_while_the_error_is_not_certified(certificate):
     assert tracker.reason == NOT_KNOWN_INSIDE
     tracker.step(fallback._replace(passed=True), True, info)
     assert tracker.reason == ""
+
+
+@pytest.mark.parametrize("forge", [lambda S: -S, lambda S: np.float64(0.0), lambda S: S[0], lambda S: np.nan * S])
+def test_error_shape_that_is_none_proves_nothing(certificate, forge):
+    class Forger(gym.Wrapper):
+        def step(self, action):
+            *result, info = self.env.step(action)
+            return *result, info | {"error_shape": forge(info["error_shape"])}
+
+    infos = play(SafetyShield(Forger(gym.make(CRUISE)), certificate), full, 5, seed=0)
+    assert not any(info["shield_guaranteed"] for info in infos[2:])
+
+
+def test_interrupted_step_is_noticed(certificate):
+    class Breaks(gym.Wrapper):
+        def step(self, action):
+            *result, info = self.env.step(action)
+            if info["episode_violations"] == 0.0 and self.env.unwrapped.steps == 3:
+                raise KeyboardInterrupt
+            return *result, info
+
+    env = SafetyShield(Breaks(gym.make(CRUISE)), certificate)
+    env.reset(seed=0)
+    for _ in range(2):
+        assert env.step(full(None))[4]["shield_guaranteed"]
+    with pytest.raises(KeyboardInterrupt):
+        env.step(full(None))
+    assert env.step(full(None))[4]["shield_reason"] == OTHER_STEPS
+    assert env.reset(seed=0)[1]["shield_guaranteed"]
+
+
+def test_step_before_reset_is_refused(certificate):
+    env = SafetyShield(NCSEnv(gym.make(CRUISE).unwrapped.plant), certificate)
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(full(None))
+
+
+def test_wrapper_that_changes_the_action_space_is_refused_inside(certificate):
+    class Wider(gym.Wrapper):
+        def __init__(self, env):
+            super().__init__(env)
+            self.action_space = gym.spaces.Box(-2.0, 2.0, (1,), np.float32)
+
+    with pytest.raises(ValueError, match="changes the action space"):
+        SafetyShield(Wider(gym.make(CRUISE)), certificate)
 
 
 def test_alarm_is_cleared_by_a_new_episode(certificate):

@@ -1,0 +1,136 @@
+"""Rounding must never turn "passed" into a lie: judged in rational arithmetic, far out and for thin safe sets."""
+
+from dataclasses import replace
+from fractions import Fraction
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from ncs_gym import LinearPlant
+from shields import CertificateError, Infeasible, SafetyFilter, SafetyShield, synthesize
+from shields.exact import congruence, is_positive_semidefinite, multiply, rational, subtract
+from shields.one_step import certified_root
+from shields.proof import FAR_OUT, NOT_KNOWN_INSIDE
+
+SINGULAR = np.array([[0.5, -0.3], [0.25, -0.15]])
+
+
+def exact_level(certificate, plant, x, u, d):
+    """x+' L^-1 x+ - 1 of two states, exactly."""
+    column = lambda vector: [[Fraction(float(entry))] for entry in vector]  # noqa: E731
+    moved = zip(multiply(rational(plant.A), column(x)), multiply(rational(plant.B), column(u)), column(d), strict=True)
+    p, q = (sum(row[0] for row in rows) for rows in moved)
+    (a, b), (_, c) = rational(certificate.L)
+    return float((c * p * p - 2 * b * p * q + a * q * q) / (a * c - b * b) - 1)
+
+
+def worst_disturbance(certificate, plant, x, u):
+    """Roughly the worst d on the boundary of E(D), shrunk so that it is inside."""
+    d = np.zeros(2)
+    for _ in range(5):
+        slope = np.linalg.solve(certificate.L, plant.A @ x + plant.B @ u + d)
+        d = plant.nominal_disturbance.extreme_point(slope)
+    return (1 - 1e-12) * d
+
+
+@pytest.mark.parametrize("size", [1.0, 1e4, 1e7, 1e10, 1e13])
+def test_passed_means_inside_however_far_out_the_estimate_is(size):
+    # Estimates along a direction that A annihilates: products of huge numbers cancel.
+    plant = LinearPlant(A=SINGULAR, B=np.ones((2, 1)), C=np.eye(2), u_max=1.0, dt=0.1, gamma=1e-6)
+    certificate = synthesize(plant)
+    shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(0)
+    *_, axes = np.linalg.svd(SINGULAR)
+    passed, worst = 0, -1.0
+    for _ in range(300):
+        inwards, u = rng.choice([-1.0, 1.0]) * axes[0], rng.uniform(-1, 1, 1)
+        low, high = 0.0, 8.0
+        base = axes[1] * size * rng.uniform(0.5, 1.0)
+        for _ in range(50):  # to the edge of what passes
+            middle = 0.5 * (low + high)
+            passes = shield.decide(base + middle * inwards, np.zeros((2, 2)), u).reason == "safe"
+            low, high = (middle, high) if passes else (low, middle)
+        x = base + low * inwards
+        if shield.decide(x, np.zeros((2, 2)), u).reason == "safe":
+            passed += 1
+            worst = max(worst, exact_level(certificate, plant, x, u, worst_disturbance(certificate, plant, x, u)))
+    assert worst <= 0.0
+    assert passed > 50
+    assert worst > -1e-4 or size > 1e7  # at the edge, as far as float64 can tell
+
+
+def slanted(ratio):
+    """A plant whose box is `ratio` times longer than wide, and not along the axes."""
+    c, s = np.cos(0.6), np.sin(0.6)
+    C = np.diag([1.0, ratio]) @ np.array([[c, s], [-s, c]])
+    T, size = np.linalg.inv(C), (0.1 / ratio) ** 2
+    return LinearPlant(
+        A=T @ np.array([[0.6, 0.2], [-0.1, 0.5]]) @ C,
+        B=T @ np.array([[1.5], [1.2]]),
+        C=C,
+        u_max=1.0,
+        dt=0.1,
+        gamma=size,
+        initial_cov=size * np.eye(2),
+        measurement_noise_cov=size * np.eye(2),
+    )
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1e2, 1e4])
+def test_passed_means_inside_for_thin_safe_sets(ratio):
+    plant = slanted(ratio)
+    certificate = synthesize(plant)
+    shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(0)
+    passed = 0
+    for _ in range(300):
+        x, shape = 1.2 * certificate.safe_set.sample(rng), 1e-12 * certificate.Sigma
+        decision = shield.decide(x, shape, rng.uniform(-1, 1, 1))
+        if decision.passed:
+            passed += 1
+            d = worst_disturbance(certificate, plant, x, decision.input)
+            assert exact_level(certificate, plant, x, decision.input, d) <= 0.0
+    assert passed > 100
+
+
+def test_box_so_thin_that_simulating_it_rounds_too_much_gets_no_certificate():
+    with pytest.raises(Infeasible):
+        synthesize(slanted(1e7))
+
+
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
+def test_root_never_understates_the_norm(size):
+    rng = np.random.default_rng(0)
+    for n in (1, 2, 3, 6):
+        G = rng.standard_normal((n, n)) * 10.0 ** rng.uniform(-3, 3, n)[:, None]
+        L = size * (G @ G.T)
+        L = 0.5 * (L + L.T)
+        root = certified_root(L)
+        identity = rational(np.eye(n))
+        assert is_positive_semidefinite(subtract(congruence(rational(root), rational(L)), identity))
+        assert not is_positive_semidefinite(subtract(congruence(rational((1 - 1e-8) * root), rational(L)), identity))
+
+
+def test_safe_set_too_thin_for_float64_is_refused():
+    with pytest.raises(CertificateError, match="too thin"):
+        certified_root(np.array([[1.0, 1.0], [1.0, 1.0]]))
+    G = np.random.default_rng(0).standard_normal((6, 6)) * 10.0 ** np.linspace(-9, 0, 6)
+    L = G @ G.T
+    with pytest.raises(CertificateError, match="too thin"):
+        certified_root(0.5 * (L + L.T))
+
+
+def test_gain_too_large_for_float64_is_refused(monkeypatch, certificate, loaded):
+    # Such a gain cannot verify with these limits; a fault in the verifier must not be enough.
+    monkeypatch.setattr("shields.filter.require_valid", lambda *_: None)
+    with pytest.raises(CertificateError, match="gain is too large"):
+        SafetyFilter(replace(certificate, K=1e9 * np.array([[1.0, -1.0]])), loaded)
+
+
+@pytest.mark.parametrize("size", [3.0, 1e3, 1e8])
+def test_start_far_out_is_recovered_from_only_while_rounding_does_not_count(certificate, size):
+    env = SafetyShield(gym.make("ncs_gym/TruckTrailerCruise-v0"), certificate)
+    _, info = env.reset(seed=0, options={"state": np.array([size, 0.0])})
+    assert info["shield_reason"] == (FAR_OUT if size > 100.0 else NOT_KNOWN_INSIDE)
+    for _ in range(199):
+        *_, info = env.step(np.zeros(1, np.float32))
+    assert info["shield_guaranteed"] is (size < 100.0)
