@@ -2,8 +2,8 @@
 
     python benchmarks/shield_decision.py [--steps 400]
 
-"ratio" is cvxpy's time over ours; "too far" is how much farther our input lies from the proposed one than the solver's, at
-most, relative to that distance (both are rounded, so about 1e-4 either way is agreement).
+"ratio" is cvxpy's time over ours; "too far" is how much farther our input lies from the proposed one than the solver's,
+at most, relative to that distance.
 
 Estimates, error ellipsoids and proposals come from episodes of the registered environment (one input) and of random
 plants under a random policy, so that the mix of passed, projected and fallback decisions is the one met in use.
