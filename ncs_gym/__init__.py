@@ -1,6 +1,7 @@
 """Linear plants behind imperfect networks as Gymnasium environments; importing registers the ids."""
 
 from ncs_gym.channel import Channel, GilbertElliott, Packet
+from ncs_gym.contract import ChannelContract, contract_of
 from ncs_gym.disturbance import (
     AdversarialDisturbance,
     BallDisturbance,
@@ -15,8 +16,9 @@ from ncs_gym.error_set import ErrorSet, ErrorSetError, UnstablePlantError, certi
 from ncs_gym.estimator import Estimator
 from ncs_gym.plant import LinearPlant
 from ncs_gym.scenarios import register_all
-from ncs_gym.task import Regulation, SpeedTracking, Task
+from ncs_gym.task import Regulation, SetpointTracking, SpeedTracking, Task
 from ncs_gym.truck import truck_trailer
+from ncs_gym.unstable import batch_reactor, cart_pole
 
 register_all()
 
@@ -25,6 +27,7 @@ __all__ = [
     "BallDisturbance",
     "BoxDisturbance",
     "Channel",
+    "ChannelContract",
     "Disturbance",
     "Ellipsoid",
     "ErrorSet",
@@ -35,11 +38,15 @@ __all__ = [
     "NCSEnv",
     "Packet",
     "Regulation",
+    "SetpointTracking",
     "SinusoidDisturbance",
     "SpeedTracking",
     "SphereDisturbance",
     "Task",
     "UnstablePlantError",
+    "batch_reactor",
+    "cart_pole",
     "certified_error_set",
+    "contract_of",
     "truck_trailer",
 ]

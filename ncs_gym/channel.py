@@ -61,6 +61,7 @@ class Channel:
         send_period: Steps between samples.
         delay: Fixed delay [steps].
         jitter: Largest extra random delay [steps].
+        max_consecutive_losses: Never lose more packets in a row than this; None promises nothing.
 
     Raises:
         ValueError: If a value is out of range.
@@ -71,6 +72,7 @@ class Channel:
     send_period: int = 1
     delay: int = 0
     jitter: int = 0
+    max_consecutive_losses: int | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.loss, GilbertElliott):
@@ -79,6 +81,17 @@ class Channel:
         object.__setattr__(self, "quantization_step", step)
         for name, low in (("send_period", 1), ("delay", 0), ("jitter", 0)):
             object.__setattr__(self, name, as_count(getattr(self, name), name, low=low))
+        if self.max_consecutive_losses is not None:
+            most = as_count(self.max_consecutive_losses, "max_consecutive_losses", low=0)
+            object.__setattr__(self, "max_consecutive_losses", most)
+
+    @property
+    def most_consecutive_losses(self) -> int | None:
+        """How many packets can be lost in a row; None if there is no limit."""
+        never = self.loss == 0.0 or (
+            isinstance(self.loss, GilbertElliott) and self.loss.loss_good == self.loss.loss_bad == 0.0
+        )
+        return 0 if never else self.max_consecutive_losses
 
     @property
     def longest_delay(self) -> int:
@@ -102,6 +115,7 @@ class Link:
     def __init__(self, channel: Channel, rng: np.random.Generator) -> None:
         self.channel = channel
         self._in_flight: dict[int, list[Packet]] = {}
+        self._lost_in_a_row = 0
         self._bad = isinstance(channel.loss, GilbertElliott) and rng.random() < channel.loss.stationary_bad
 
     def sends_at(self, step: int) -> bool:
@@ -125,7 +139,9 @@ class Link:
             self._bad = self._bad != flip
             loss = loss.loss_bad if self._bad else loss.loss_good
         if measurement is not None:
-            lost = rng.random() < loss
+            most = self.channel.max_consecutive_losses
+            lost = rng.random() < loss and (most is None or self._lost_in_a_row < most)
+            self._lost_in_a_row = self._lost_in_a_row + 1 if lost else 0
             extra = int(rng.integers(self.channel.jitter + 1)) if self.channel.jitter else 0
             if not lost:
                 packet = Packet(step, self.channel.quantize(measurement))

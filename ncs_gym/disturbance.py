@@ -193,7 +193,7 @@ class CallableDisturbance(Disturbance):
 
 
 def checked(plant: LinearPlant, d: Any, *, allow_assumption_violation: bool) -> np.ndarray:
-    """Returns a disturbance as an array of shape (n,) inside E(D), scaled back if rounding put it outside.
+    """Returns a disturbance as an array of shape (n,) inside E(D), scaled back to leave room for rounding.
 
     Raises:
         ValueError: If it is not finite, wrongly shaped, or further outside than TOLERANCE and that is not allowed.
@@ -201,12 +201,12 @@ def checked(plant: LinearPlant, d: Any, *, allow_assumption_violation: bool) -> 
     d = as_vector(d, plant.n, "the disturbance")
     if allow_assumption_violation:
         return d
-    size = plant.disturbance.gauge(d)
-    if size > 1.0 + TOLERANCE:
+    if (size := plant.disturbance.gauge(d)) > 1.0 + TOLERANCE:
         raise ValueError(
             f"the disturbance {d.tolist()} lies outside its bound E(D): sqrt(d' D^-1 d) = {size:.6g} > 1 "
             "(allow_assumption_violation=True lets it pass)"
         )
+    size = plant.allowed_disturbance.gauge(d)
     return d if size <= 1.0 - ROUNDING else d * ((1.0 - ROUNDING) / size)
 
 

@@ -9,11 +9,12 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from ncs_gym.channel import Channel, Link
+from ncs_gym.contract import ChannelContract, contract_of
 from ncs_gym.disturbance import as_disturbance, checked, stays_inside
 from ncs_gym.ellipsoid import Ellipsoid
-from ncs_gym.error_set import certified_error_set
+from ncs_gym.error_set import UnstablePlantError, certified_error_set
 from ncs_gym.estimator import Estimator
-from ncs_gym.frozen import as_count, as_flag, as_vector, read_only
+from ncs_gym.frozen import as_count, as_flag, as_numbers, as_vector, read_only
 from ncs_gym.plant import LinearPlant
 from ncs_gym.task import Regulation, Task
 
@@ -21,6 +22,8 @@ T = TypeVar("T")
 
 # The default start covers this share of the half-width of the safe box in every direction.
 START_SHARE = 0.1
+# Keeps the rounding of a sampled start inside the initial set.
+SAMPLE_ROUNDING = 1e-9
 # Widens the observation box: float32 rounding, and estimates a little off the reachable set.
 OBSERVATION_MARGIN = 1.01
 
@@ -71,6 +74,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     | `assumption_violated` | latched alarm of the estimator's innovation monitor |
     | `episode_violations` | running sum of `cost` in this episode |
     | `is_success` | 1.0 while there was none |
+    | `contract_broken` | whether the newest sample used is older now than the channel's contract allows |
 
     Args:
         plant: The plant with its bounds.
@@ -81,6 +85,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         initial_set: Ellipsoid of starting states; by default a tenth of the safe box.
         terminate_on_violation: End the episode when the true state leaves the safe box.
         allow_assumption_violation: Let disturbances outside the certified bound pass instead of raising.
+        contract: What the channel promises, for unstable plants (docs/contracts.md); by default that of the channel
+            if the plant is unstable, none if it is stable. A channel that may break it is allowed.
         render_mode: None; there is no rendering yet.
         horizon: Steps the observation space is sized for.
 
@@ -90,7 +96,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         start: What the start of this episode is known to lie in: `initial_set`, or the state given as an option.
 
     Raises:
-        UnstablePlantError: If the plant is not Schur stable.
+        UnstablePlantError: If the plant is not Schur stable and there is no contract.
         ErrorSetError: If it is too ill-conditioned.
         ValueError: If a setting is of the wrong kind or does not fit the plant.
     """
@@ -106,6 +112,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         initial_set: Ellipsoid | None = None,
         terminate_on_violation: bool = False,
         allow_assumption_violation: bool = False,
+        contract: ChannelContract | None = None,
         render_mode: str | None = None,
         horizon: int = 200,
     ) -> None:
@@ -124,7 +131,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self.render_mode = render_mode
         self.terminate_on_violation = as_flag(terminate_on_violation, "terminate_on_violation")
         self.allow_assumption_violation = as_flag(allow_assumption_violation, "allow_assumption_violation")
-        self.error_set = certified_error_set(plant)
+        self.contract = _contract(plant, self.channel, contract)
+        self.error_set = certified_error_set(plant, self.contract)
         self.estimator = Estimator(plant, self.channel, self.error_set)
         self.horizon = as_count(horizon, "horizon", low=1)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)
@@ -151,7 +159,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         rng = self.np_random
         self.start = self.initial_set if start is None else read_only(start)
-        self._state = self.initial_set.sample(rng) if start is None else start
+        self._state = (1.0 - SAMPLE_ROUNDING) * self.initial_set.sample(rng) if start is None else start
         self._task_memory = self.task.begin(rng, self.plant)
         self._disturbance_memory = self.disturbance.begin(rng, self.plant)
         self._link = Link(self.channel, rng)
@@ -223,6 +231,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             "assumption_violated": self.estimator.alarm,
             "episode_violations": self._violations,
             "is_success": float(self._violations == 0.0),
+            "contract_broken": self.contract is not None and self.estimator.age > self.contract.max_age,
         }
 
 
@@ -232,11 +241,8 @@ def applied_input(plant: LinearPlant, action: Any) -> np.ndarray:
     Raises:
         ValueError: If the action is not finite or does not have shape (m,).
     """
-    try:
-        normalized = np.asarray(action, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"the action must be finite numbers of shape ({plant.m},), got {action!r}") from error
-    if normalized.shape != (plant.m,) or not np.isfinite(normalized).all():
+    normalized = as_numbers(action)
+    if normalized is None or normalized.shape != (plant.m,) or not np.isfinite(normalized).all():
         raise ValueError(f"the action must be finite with shape ({plant.m},), got {action!r}")
     return plant.u_max * np.clip(normalized, -1.0, 1.0)
 
@@ -263,6 +269,27 @@ def observation_bound(env: NCSEnv) -> np.ndarray:
     estimate = largest + np.sqrt(np.diag(env.error_set.Sigma))
     bound = np.concatenate([estimate, env.task.observation_bound(plant, env.horizon)])
     return OBSERVATION_MARGIN * bound
+
+
+def _contract(plant: LinearPlant, channel: Channel, contract: ChannelContract | None) -> ChannelContract | None:
+    """Returns the contract that the estimator's error sets rest on.
+
+    Raises:
+        UnstablePlantError: If an unstable plant has neither a contract nor a channel that keeps one.
+        ValueError: If the channel rounds more coarsely than the contract allows.
+    """
+    if contract is None and plant.spectral_radius >= 1.0:
+        contract = contract_of(channel)
+        if contract is None:
+            raise UnstablePlantError(
+                f"the plant is unstable (spectral radius {plant.spectral_radius:.6g}), the channel promises nothing: "
+                "give it max_consecutive_losses, or the environment contract=ChannelContract(max_age=...)"
+            )
+    if contract is not None and not _expect(contract, ChannelContract, "contract").is_fine_enough_for(channel):
+        raise ValueError(
+            f"the channel rounds to {channel.quantization_step}, the contract allows {contract.quantization_step}"
+        )
+    return contract
 
 
 def _start_option(options: dict[str, Any] | None, n: int) -> np.ndarray | None:

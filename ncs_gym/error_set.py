@@ -9,6 +9,8 @@ import numpy as np
 from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov
 from scipy.optimize import minimize_scalar
 
+from ncs_gym.age_sets import AgeSets, age_sets
+from ncs_gym.contract import ChannelContract
 from ncs_gym.frozen import FrozenArrays
 from ncs_gym.plant import LinearPlant
 
@@ -32,21 +34,81 @@ class ErrorSetError(ValueError):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ErrorSet(FrozenArrays):
-    """E(Sigma) with its rate: (E0) Sigma >= r0^2 I and (E1) Sigma >= A Sigma A'/rate + D/(1 - rate).
+    """What the estimation error never leaves: one set for every age, or one per age under a contract.
+
+    Without a contract, E(Sigma) with (E0) Sigma >= r0^2 I and (E1) Sigma >= A Sigma A'/rate + D/(1 - rate).
 
     Attributes:
-        Sigma: Shape (n, n) [squares of the units of the state].
-        rate: lam_e in (0, 1).
+        Sigma: Shape (n, n) [squares of the units of the state]; under a contract that of the largest age promised.
+        rate: lam_e in (0, 1); under a contract that of the largest age.
+        ages: The sets by age; None without a contract.
     """
 
     Sigma: np.ndarray
     rate: float
+    ages: AgeSets | None = None
 
     def __post_init__(self) -> None:
         self._freeze_arrays()
 
+    def shape_at(self, age: int) -> np.ndarray | None:
+        """Returns the certified shape, (n, n), for a newest sample `age` steps old; None beyond the contract."""
+        if self.ages is None:
+            return self.Sigma
+        return self.ages.shapes[age] if age < len(self.ages.shapes) else None
 
-def certified_error_set(plant: LinearPlant) -> ErrorSet:
+    def rate_at(self, age: int) -> float:
+        """Returns the rate that carries the set of one age into that of the next."""
+        return self.rate if self.ages is None else float(self.ages.rates[age])
+
+
+def certified_error_set(plant: LinearPlant, contract: ChannelContract | None = None) -> ErrorSet:
+    """Returns the error set of a plant: of a stable one without a promise, of any under a contract.
+
+    Raises:
+        UnstablePlantError: If the plant is not Schur stable and there is no contract.
+        ErrorSetError: If none is found, or the plant is too ill-conditioned to compute it.
+    """
+    if contract is None:
+        return _unconditional_set(plant)
+    key = plant.fingerprint, contract
+    if key not in _by_contract:
+        _by_contract[key] = _conditional_set(plant, contract)
+    return _by_contract[key]
+
+
+_by_contract: dict[tuple[str, ChannelContract], ErrorSet] = {}
+
+
+def _conditional_set(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
+    """Returns the error sets by age under a contract; see `age_sets`."""
+    sets = age_sets(plant, contract)
+    if sets is None:
+        raise ErrorSetError(
+            f"no error set was found under a contract of max_age = {contract.max_age}: promise less age"
+        )
+    _check_ages(sets, plant)
+    return ErrorSet(Sigma=sets.shapes[contract.max_age], rate=float(sets.rates[-1]), ages=sets)
+
+
+def _check_ages(sets: AgeSets, plant: LinearPlant) -> None:
+    """Raises unless (C0), (C1) and (C2) hold by more than rounding.
+
+    Raises:
+        ErrorSetError: Naming the condition.
+    """
+    inverse = np.linalg.inv(np.linalg.cholesky(np.linalg.inv(plant.weight)))
+    for name, pairs in sets.needs(plant).items():
+        for outer, inner in pairs:
+            gap = inverse @ (outer - inner) @ inverse.T
+            rounding = ROUNDINGS * plant.n * np.finfo(float).eps * np.abs(inverse @ outer @ inverse.T).max()
+            if not (np.isfinite(gap).all() and np.linalg.eigvalsh(gap)[0] > rounding):
+                raise ErrorSetError(
+                    f"no error set found: the plant is too ill-conditioned for {name} to hold in float64"
+                )
+
+
+def _unconditional_set(plant: LinearPlant) -> ErrorSet:
     """Returns the error set of a stable plant in closed form (theory.md section 3, (E0) and (E1)).
 
     For a fixed rate the smallest solution of (E1) is a Lyapunov series; where it does not cover the first

@@ -11,7 +11,7 @@ from filterpy.kalman import KalmanFilter
 from ncs_gym.channel import Channel, Packet
 from ncs_gym.ellipsoid import is_inside, outer_sum, sum_gauge
 from ncs_gym.error_set import ErrorSet, certified_error_set
-from ncs_gym.plant import FLAT_INFLATION, LinearPlant
+from ncs_gym.plant import FLAT_INFLATION, INFLATION, LinearPlant
 
 # Per dimension, the growth of computed shapes that covers the rounding of F S F' (see `_grown`).
 ROUNDING = 1e-13
@@ -57,8 +57,7 @@ class Estimator:
         self.plant = plant
         self.error_set = certified_error_set(plant) if error_set is None else error_set
         self.buffer = channel.longest_delay
-        D, Sigma = plant.disturbance.shape, self.error_set.Sigma
-        self._fallback = D / (1.0 - self.error_set.rate)
+        Sigma = self.error_set.Sigma
         noise = plant.sensor_error_with(channel.quantization_step).shape
         # Perfect sensors get a little noise, relative to what they measure: a larger bound is a bound.
         self._noise = noise + FLAT_INFLATION * np.diag(np.diag(plant.H @ Sigma @ plant.H.T))
@@ -94,7 +93,7 @@ class Estimator:
         """
         self._inputs[self.step] = np.array(u, dtype=np.float64)
         self.step += 1
-        self.belief = self._priors[self.step] = self._predict(self.belief, u)
+        self.belief = self._priors[self.step] = self._predict(self.belief, u, self.step - 1 - self.belief.newest)
         for packet in packets:
             self._receive(packet)
         expired = self.step - self.buffer - 1
@@ -116,35 +115,45 @@ class Estimator:
             if step in self._samples:
                 belief = self._update(belief, self._samples[step], step)
             if step < self.step:
-                priors[step + 1] = self._predict(belief, self._inputs[step])
+                priors[step + 1] = self._predict(belief, self._inputs[step], step - belief.newest)
         weight = self.plant.weight
-        if np.vdot(weight, belief.shape) <= np.vdot(weight, self.belief.shape):
+        # Under a contract the sets depend on the age, and a newer sample must count.
+        newer = self.error_set.ages is not None and belief.newest > self.belief.newest
+        if newer or np.vdot(weight, belief.shape) <= np.vdot(weight, self.belief.shape):
             self.belief = belief
             self._priors.update(priors)
 
-    def _predict(self, belief: Belief, u: np.ndarray) -> Belief:
-        """Returns the belief one step later: mean A x_hat + B u, shape A Sigma_k A'/lam + D/(1-lam)."""
+    def _predict(self, belief: Belief, u: np.ndarray, age: int) -> Belief:
+        """Returns the belief, of some age, one step later: mean A x_hat + B u, shape A Sigma_k A'/lam + D/(1-lam)."""
         kalman = self._filter
         kalman.x, kalman.P = belief.mean, belief.covariance
         kalman.predict(u)
-        return Belief(kalman.x, kalman.P, self._predicted_shape(belief.shape), belief.newest)
+        return Belief(kalman.x, kalman.P, self._predicted_shape(belief.shape, age), belief.newest)
 
-    def _predicted_shape(self, shape: np.ndarray) -> np.ndarray:
-        """Returns the first of: trace-optimal lam, certified rate, Sigma itself, that lies inside E(Sigma).
+    def _predicted_shape(self, shape: np.ndarray, age: int) -> np.ndarray:
+        """Returns the first of: trace-optimal lam, certified rate, certified set, that lies inside the next age's set.
 
-        Sigma itself is sound: E(shape) lies inside E(Sigma), which (E1) maps into itself.
+        That set itself is sound if E(shape) lies inside the set of its age, which (E1) or (C1) maps into it. Beyond
+        the contract no set is certified; the trace-optimal shape still holds the error.
         """
-        A, D, Sigma = self.plant.A, self.plant.disturbance.shape, self.error_set.Sigma
+        A, D, certified = self.plant.A, self.plant.disturbance.shape, self.error_set.shape_at(age + 1)
         extent = self._abs_A @ np.sqrt(np.diag(shape))
         moved = _grown(A @ shape @ A.T, extent)
         predicted = outer_sum(moved, D, self.plant.weight)
-        if is_inside(predicted, Sigma):
+        if certified is None or is_inside(predicted, certified):
             return predicted
-        predicted = moved / self.error_set.rate + self._fallback
-        return predicted if is_inside(predicted, Sigma) else Sigma
+        rate = self.error_set.rate_at(age)
+        carried = moved / rate + D / (1.0 - rate)
+        if is_inside(carried, certified):
+            return carried
+        return certified if is_inside(shape, self.error_set.shape_at(age)) else predicted
 
     def _update(self, belief: Belief, measurement: np.ndarray, step: int) -> Belief:
-        """Returns the belief after a measurement, unchanged if no gain keeps its ellipsoid inside E(Sigma)."""
+        """Returns the belief after a measurement, with the first gain whose ellipsoid lies inside the set of age 0.
+
+        After the Kalman and the set-membership gain comes the certified one of the belief's age, which (C2) maps into
+        that set. Without a contract there is none, and the belief stays as it was.
+        """
         H = self.plant.H
         residual = measurement - H @ belief.mean
         self._monitor(residual, H @ belief.shape @ H.T)
@@ -152,12 +161,19 @@ class Estimator:
         kalman.x, kalman.P = belief.mean, belief.covariance
         kalman.update(measurement)
         shape = self._updated_shape(belief.shape, kalman.K)
-        if is_inside(shape, self.error_set.Sigma):
+        newest = self.error_set.shape_at(0)
+        if is_inside(shape, newest):
             return Belief(kalman.x, kalman.P, shape, step)
         gain = self._membership_gain(belief.shape)
         shape = self._updated_shape(belief.shape, gain)
-        if not is_inside(shape, self.error_set.Sigma):
-            return belief
+        ages = self.error_set.ages
+        if not is_inside(shape, newest):
+            if ages is None:
+                return belief
+            age = step - belief.newest
+            certified = self.error_set.shape_at(age)
+            if certified is not None and is_inside(belief.shape, certified):
+                gain, shape = ages.gains[age - 1], newest  # by (C2)
         kept = self._identity - gain @ H
         covariance = kept @ belief.covariance @ kept.T + gain @ kalman.R @ gain.T
         return Belief(belief.mean + gain @ residual, covariance, shape, step)
@@ -169,7 +185,7 @@ class Estimator:
         extent = np.sqrt(np.diag(shape))
         carried = _grown(kept @ shape @ kept.T, extent + size @ (self._abs_H @ extent))
         noise = _grown(gain @ self._noise @ gain.T, size @ self._noise_extent)
-        return outer_sum(carried, noise, self.plant.weight)
+        return INFLATION * outer_sum(carried, noise, self.plant.weight) + self.plant.estimate_rounding
 
     def _membership_gain(self, shape: np.ndarray) -> np.ndarray:
         """Returns T_mu = S H'/mu (H S H'/mu + N/(1-mu))^-1, shape (n, p), with the trace-optimal mu.
@@ -223,6 +239,6 @@ def _kalman_filter(plant: LinearPlant, quantization_step: float) -> KalmanFilter
     kalman.F, kalman.B, kalman.H = plant.A, plant.B, plant.H
     kalman.Q = plant.process_noise_cov + plant.gamma * np.eye(plant.n)
     kalman.R = plant.measurement_noise_cov + quantization_step**2 / 12.0 * np.eye(plant.p)
-    if np.linalg.eigvalsh(kalman.R)[0] <= 0.0:
-        kalman.inv = np.linalg.pinv  # perfect sensors: the innovation covariance may be singular
+    if np.linalg.eigvalsh(kalman.R)[0] <= 0.0:  # perfect sensors: keep the innovation covariance invertible
+        kalman.R = kalman.R + FLAT_INFLATION * np.diag((np.abs(plant.H) @ plant.half_widths) ** 2)
     return kalman

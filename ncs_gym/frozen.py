@@ -42,6 +42,20 @@ def read_only(array: np.ndarray) -> np.ndarray:
     return frozen
 
 
+def as_numbers(value: Any) -> np.ndarray | None:
+    """Returns `value` as a float64 array; None for what is not real numbers, whatever it raises when asked."""
+    if type(value) is np.ndarray and value.dtype == np.float64:
+        return value
+    try:
+        array = np.asarray(value)
+        if isinstance(value, np.ma.MaskedArray) or array.dtype.kind not in "fiub":
+            return None
+        with np.errstate(all="ignore"):
+            return array.astype(np.float64)
+    except Exception:
+        return None
+
+
 def as_matrix(value: Any, shape: tuple[int | None, int | None], name: str) -> np.ndarray:
     """Returns `value` as a finite float64 matrix of the expected shape.
 

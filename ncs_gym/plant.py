@@ -147,15 +147,25 @@ class LinearPlant(FrozenArrays):
     def disturbance(self) -> Ellipsoid:
         """D, shape (n, n): holds d (with d'd <= gamma), the truncated process noise and the rounding of a simulation.
 
-        Inflated by 1+s, D leaves room for a term F where (1+1/s) F is added: F = n diag(r^2) with r the rounding of
-        A x + B u + d, x up to SIMULATED_REACH half-widths out (theory.md section 1).
+        It is larger than `allowed_disturbance` by what holds that plus E(F), F = n diag(r^2), with r the rounding of
+        A x + B u + d for x up to SIMULATED_REACH half-widths out: (1+s/4) allowed + (1+4/s) F, s the inflation.
         """
+        return Ellipsoid(_inflated(self.nominal_disturbance.shape) + self._rounding_room)
+
+    @cached_property
+    def allowed_disturbance(self) -> Ellipsoid:
+        """What a disturbance may use of D: the rest is for the rounding of a simulation, shape (n, n)."""
+        inflated = 0.5 * (self.nominal_disturbance.shape + _inflated(self.nominal_disturbance.shape))
+        return Ellipsoid(inflated + 0.5 * self._rounding_room)
+
+    @cached_property
+    def _rounding_room(self) -> np.ndarray:
+        """What D gains for rounding, shape (n, n)."""
         reach = SIMULATED_REACH * self.half_widths
         rounding = np.abs(self.A) @ reach + np.abs(self.B) @ self.u_max + reach
         rounding *= (self.n + self.m + 2) * np.finfo(float).eps
         box = np.linalg.inv(self.weight)
-        room = THINNEST * 0.5 * (box + box.T) + 2.0 * self.n / (INFLATION - 1.0) * np.diag(rounding**2)
-        return Ellipsoid(_inflated(self.nominal_disturbance.shape) + room)
+        return THINNEST * 0.5 * (box + box.T) + 10.0 * self.n / (INFLATION - 1.0) * np.diag(rounding**2)
 
     @cached_property
     def nominal_disturbance(self) -> Ellipsoid:
@@ -175,9 +185,18 @@ class LinearPlant(FrozenArrays):
 
     @cached_property
     def initial_error(self) -> Ellipsoid:
-        """r0^2 I, shape (n, n): holds the error of the first estimate, r0^2 = lambda_max(P0) chi2_{n,1-delta}."""
+        """r0^2 I and room for rounding, shape (n, n): holds the error of the first estimate.
+
+        r0^2 = lambda_max(P0) chi2_{n,1-delta}.
+        """
         r0_squared = float(np.linalg.eigvalsh(self.initial_noise.bound.shape)[-1])
-        return Ellipsoid(INFLATION * max(r0_squared, 0.0) * np.eye(self.n))
+        return Ellipsoid(INFLATION * max(r0_squared, 0.0) * np.eye(self.n) + self.estimate_rounding)
+
+    @cached_property
+    def estimate_rounding(self) -> np.ndarray:
+        """Room for the rounding of x_hat up to SIMULATED_REACH half-widths out, shape (n, n), next to an inflation."""
+        rounding = 4.0 * np.finfo(float).eps * SIMULATED_REACH * self.half_widths
+        return read_only(2.0 * self.n / (INFLATION - 1.0) * np.diag(rounding**2))
 
     @cached_property
     def fingerprint(self) -> str:

@@ -10,12 +10,14 @@ import gymnasium as gym
 import numpy as np
 
 from ncs_gym.channel import Channel
+from ncs_gym.contract import ChannelContract, contract_of
 from ncs_gym.disturbance import BoxDisturbance
 from ncs_gym.ellipsoid import Ellipsoid
 from ncs_gym.env import NCSEnv
 from ncs_gym.plant import LinearPlant
-from ncs_gym.task import Regulation, SpeedTracking, Task
+from ncs_gym.task import Regulation, SetpointTracking, SpeedTracking, Task
 from ncs_gym.truck import truck_trailer
+from ncs_gym.unstable import batch_reactor, cart_pole
 
 # Steps per episode of every registered environment (Liu et al. Section 5).
 EPISODE_STEPS = 200
@@ -34,6 +36,8 @@ class Scenario:
         channel: Default channel.
         task: Default task.
         box: Default disturbance where it suits the plant; "ball" elsewhere.
+        contract: What the default channel promises; for the scenario's own plant only.
+        terminates: Whether a violation ends the episode by default: an unstable plant does not come back.
         start: Radius of the disc of starts, for plants of two states; None and elsewhere: `NCSEnv`'s default.
     """
 
@@ -41,6 +45,8 @@ class Scenario:
     channel: Channel
     task: Task
     box: BoxDisturbance | None = None
+    contract: ChannelContract | None = None
+    terminates: bool = False
     start: float | None = None
     metadata: ClassVar[dict[str, Any]] = NCSEnv.metadata
 
@@ -51,8 +57,9 @@ class Scenario:
         task: Task | None = None,
         disturbance: Any = None,
         initial_set: Ellipsoid | None = None,
-        terminate_on_violation: bool = False,
+        terminate_on_violation: bool | None = None,
         allow_assumption_violation: bool = False,
+        contract: ChannelContract | None = None,
         render_mode: str | None = None,
     ) -> NCSEnv:
         """Returns the environment; None stands for the scenario's own value, see `NCSEnv` for the arguments.
@@ -63,7 +70,7 @@ class Scenario:
         if plant is None:
             if self.plant is None:
                 raise ValueError("this environment has no plant of its own: give plant=LinearPlant(...)")
-            plant = self.plant()
+            plant, contract = self.plant(), self.contract if contract is None else contract
         if initial_set is None and self.start is not None and getattr(plant, "n", 0) == 2:
             initial_set = Ellipsoid(self.start**2 * np.eye(2))
         return NCSEnv(
@@ -72,8 +79,9 @@ class Scenario:
             task=self.task if task is None else task,
             disturbance=self._disturbance(plant) if disturbance is None else disturbance,
             initial_set=initial_set,
-            terminate_on_violation=terminate_on_violation,
+            terminate_on_violation=self.terminates if terminate_on_violation is None else terminate_on_violation,
             allow_assumption_violation=allow_assumption_violation,
+            contract=contract,
             render_mode=render_mode,
             horizon=EPISODE_STEPS,
         )
@@ -105,10 +113,33 @@ TRUCK_TRAILER_CRUISE = Scenario(
 # Any plant of the user's, behind a perfect channel unless given.
 LINEAR_NCS = Scenario(plant=None, channel=Channel(), task=Regulation())
 
+# One sample per step that is 1 to 2 steps late; 20 % are lost, never more than two in a row: no sample in use is older
+# than 4 steps. Positions are rounded to a millimeter and a milliradian.
+CART_POLE_CHANNEL = Channel(loss=0.2, delay=1, jitter=1, max_consecutive_losses=2, quantization_step=1e-4)
+CART_POLE = Scenario(
+    plant=cart_pole,
+    channel=CART_POLE_CHANNEL,
+    task=SetpointTracking(output=(1.0, 0.0, 0.0, 0.0), reach=2.0, width=2.0, change_probability=0.02),
+    contract=contract_of(CART_POLE_CHANNEL),
+    terminates=True,
+)
+
+# A sample per step, one step late; 20 % are lost, never more than two in a row: none in use is older than 3 steps.
+BATCH_REACTOR_CHANNEL = Channel(loss=0.2, delay=1, max_consecutive_losses=2, quantization_step=1e-3)
+BATCH_REACTOR = Scenario(
+    plant=batch_reactor,
+    channel=BATCH_REACTOR_CHANNEL,
+    task=SetpointTracking(output=(0.0, 1.0, 0.0, 0.0), reach=1.0, width=1.0, change_probability=0.05),
+    contract=contract_of(BATCH_REACTOR_CHANNEL),
+    terminates=True,
+)
+
 ENTRY_POINTS = {
     "ncs_gym/TruckTrailer-v0": "TRUCK_TRAILER",
     "ncs_gym/TruckTrailerCruise-v0": "TRUCK_TRAILER_CRUISE",
     "ncs_gym/LinearNCS-v0": "LINEAR_NCS",
+    "ncs_gym/CartPole-v0": "CART_POLE",
+    "ncs_gym/BatchReactor-v0": "BATCH_REACTOR",
 }
 
 

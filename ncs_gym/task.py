@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ncs_gym.frozen import FrozenArrays, as_count, as_covariance, as_number
+from ncs_gym.frozen import FrozenArrays, as_count, as_covariance, as_number, as_vector
 from ncs_gym.plant import LinearPlant
 
 
@@ -150,4 +150,57 @@ class SpeedTracking(Task):
     def check(self, plant):  # noqa: D102
         if self.input_index >= plant.m:
             return f"input_index must be < {plant.m}, got {self.input_index}"
+        return ""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SetpointTracking(Task):
+    """Bring one output c x to a random piecewise-constant target.
+
+    The observation gains the target. The reward is 1 - min(|c x - target| / width, 1) at the end of the step, so that
+    every step survived pays.
+
+    Attributes:
+        output: c, shape (n,).
+        reach: Targets are uniform in [-reach, reach], in the unit of c x.
+        width: The error that pays nothing, in the unit of c x.
+        change_probability: Per step, to draw a new target.
+
+    Raises:
+        ValueError: If a value is out of range.
+    """
+
+    output: np.ndarray
+    reach: float
+    width: float
+    change_probability: float = 0.02
+
+    def __post_init__(self) -> None:
+        output = np.atleast_1d(np.array(self.output, dtype=np.float64))
+        object.__setattr__(self, "output", as_vector(output, output.size, "output"))
+        for name in ("reach", "width"):
+            object.__setattr__(self, name, as_number(getattr(self, name), name, low=0.0, low_open=True))
+        probability = as_number(self.change_probability, "change_probability", low=0.0, high=1.0)
+        object.__setattr__(self, "change_probability", probability)
+        self._freeze_arrays()
+
+    def begin(self, rng, plant):  # noqa: D102
+        return rng.uniform(-self.reach, self.reach)
+
+    def advance(self, rng, plant, memory, u):  # noqa: D102
+        changes, target = rng.random() < self.change_probability, rng.uniform(-self.reach, self.reach)
+        return target if changes else memory
+
+    def observe(self, memory):  # noqa: D102
+        return np.array([memory])
+
+    def observation_bound(self, plant, horizon):  # noqa: D102
+        return np.array([self.reach])
+
+    def reward(self, plant, memory, state, u):  # noqa: D102
+        return 1.0 - min(abs(float(self.output @ state) - memory) / self.width, 1.0)
+
+    def check(self, plant):  # noqa: D102
+        if self.output.shape != (plant.n,):
+            return f"output must have shape ({plant.n},), got {self.output.shape}"
         return ""

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import Ellipsoid
+from ncs_gym.age_sets import AgeSets
+from ncs_gym.contract import ChannelContract
 from ncs_gym.frozen import FrozenArrays, as_matrix, as_number, read_only
 from shields.storage import write_atomically
 
@@ -20,6 +22,7 @@ FORMAT = "ncs-gym certificate 1"
 # What a certificate of each method carries besides L and K.
 PROOF = ("Sigma", "D", "multipliers")
 CONSTANTS = ("kappa", "rho", "epsilon", "epsilon_up")
+SET_ARRAYS = ("shapes", "rates", "gains", "shares", "noise")
 
 
 class CertificateError(ValueError):
@@ -57,6 +60,39 @@ class Multipliers:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class AgeProof(FrozenArrays):
+    """What a certificate under a channel contract proves, age by age (docs/theory.md section 6).
+
+    Attributes:
+        sets: Error sets by age, with the gains that keep them and the contract they rest on.
+        shares: lx, le, ld of (I) for each age 0..h, shape (h+1, 3).
+        inputs: mu_i of (U) for each age 0..h, shape (h+1, m).
+    """
+
+    sets: AgeSets
+    shares: np.ndarray
+    inputs: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Raises CertificateError if the numbers do not fit together."""
+        try:
+            sets, steps = self.sets, self.sets.contract.max_age + 1
+            n, p = len(sets.shapes[0]), len(sets.noise)
+            expected = {"shapes": (steps + 1, n, n), "rates": (steps,), "gains": (steps, n, p), "shares": (steps,)}
+            arrays = {name: np.array(getattr(sets, name), dtype=np.float64) for name in (*expected, "noise")}
+            expected |= {"noise": (p, p)}
+            for name, shape in expected.items():
+                if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
+                    raise ValueError(f"{name} must be finite with shape {shape}")
+            object.__setattr__(self, "sets", AgeSets(contract=sets.contract, **arrays))
+            object.__setattr__(self, "shares", as_matrix(self.shares, (steps, 3), "shares"))
+            object.__setattr__(self, "inputs", as_matrix(self.inputs, (steps, None), "inputs"))
+        except (AttributeError, IndexError, TypeError, ValueError) as error:
+            raise CertificateError(f"not a certificate: in its proof by age, {error}") from error
+        self._freeze_arrays()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Certificate(FrozenArrays):
     """A robust safety invariant set S = {x : x'Mx <= 1} with gain K, and the proof's numbers.
 
@@ -65,9 +101,10 @@ class Certificate(FrozenArrays):
     Attributes:
         L: Shape of the safe set, (n, n); S = E(L).
         K: Gain of the fallback input u = K x_hat, (m, n) [input per state].
-        Sigma: Shape of the certified error set, (n, n); None for "paper".
+        Sigma: Shape of the certified error set, (n, n), under a contract of its largest age; None for "paper".
         D: Shape of the disturbance set it was made for, (n, n); None for "paper".
-        multipliers: See `Multipliers`; None for "paper".
+        multipliers: See `Multipliers`, under a contract those of its largest age; None for "paper".
+        ages: The proof by age under a channel contract; None without one.
         method: "certified" or "paper".
         fingerprint: Of the plant it belongs to.
         kappa, rho, epsilon, epsilon_up: Constants of OP ("paper" only).
@@ -79,6 +116,7 @@ class Certificate(FrozenArrays):
     Sigma: np.ndarray | None = None
     D: np.ndarray | None = None
     multipliers: Multipliers | None = None
+    ages: AgeProof | None = None
     method: str
     fingerprint: str
     kappa: float | None = None
@@ -97,6 +135,8 @@ class Certificate(FrozenArrays):
             wrong += [name for name in foreign if getattr(self, name) is not None]
             if wrong:
                 raise ValueError(f"one of method {self.method!r} has other entries: {', '.join(wrong)}")
+            if self.ages is not None and own is CONSTANTS:
+                raise ValueError("one of method 'paper' has no proof by age")
             matrices = [("L", n), ("K", None)] + [(name, n) for name in ("Sigma", "D") if name in own]
             for name, rows in matrices:
                 object.__setattr__(self, name, as_matrix(getattr(self, name), (rows, n), name))
@@ -121,6 +161,13 @@ class Certificate(FrozenArrays):
     def error_set(self) -> Ellipsoid | None:
         """E(Sigma); None for "paper"."""
         return None if self.Sigma is None else Ellipsoid(self.Sigma)
+
+    @property
+    def error_shapes(self) -> np.ndarray:
+        """Every certified Sigma_j that K x_hat is safe with, shape (k, n, n); none for "paper"."""
+        if self.ages is not None:
+            return self.ages.sets.shapes[:-1]
+        return np.empty((0, *self.L.shape)) if self.Sigma is None else self.Sigma[None]
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes JSON in which every float is exact; a reader never sees half a file.
@@ -164,6 +211,11 @@ class Certificate(FrozenArrays):
             if isinstance(value, np.ndarray):
                 values[name] = value.tolist()
         values["multipliers"] = None if self.multipliers is None else asdict(self.multipliers)
+        if self.ages is not None:
+            sets = self.ages.sets
+            arrays = {name: getattr(sets, name).tolist() for name in SET_ARRAYS}
+            shares = {"shares": self.ages.shares.tolist(), "inputs": self.ages.inputs.tolist()}
+            values["ages"] = {"contract": asdict(sets.contract), "sets": arrays, **shares}
         return values
 
 
@@ -171,6 +223,11 @@ def _from_content(content: dict[str, Any]) -> dict[str, Any]:
     values = {entry.name: content[entry.name] for entry in fields(Certificate)}
     if values["multipliers"] is not None:
         values["multipliers"] = Multipliers(**values["multipliers"])
+    if values["ages"] is not None:
+        ages = values["ages"]
+        arrays = {name: np.array(ages["sets"][name], dtype=np.float64) for name in SET_ARRAYS}
+        sets = AgeSets(contract=ChannelContract(**ages["contract"]), **arrays)
+        values["ages"] = AgeProof(sets=sets, shares=ages["shares"], inputs=ages["inputs"])
     return values
 
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym import LinearPlant
-from ncs_gym.frozen import FrozenArrays
+from ncs_gym.frozen import FrozenArrays, as_numbers
 from shields.certificate import Certificate, CertificateError
 from shields.one_step import MOST_INPUTS_WITH_VERTICES, OneStepTest, Outlook
 from shields.plane import PlaneOutlook
@@ -208,12 +208,5 @@ def require_computable(certificate: Certificate, plant: LinearPlant) -> None:
 
 def _as_array(value: Any) -> np.ndarray:
     """Returns float64 numbers; an empty array, which has no usable shape, for what are none."""
-    if type(value) is np.ndarray and value.dtype == np.float64:
-        return value
-    try:
-        array = np.asarray(value)
-        if isinstance(value, np.ma.MaskedArray) or array.dtype.kind not in "fiu":
-            return np.empty(0)
-        return array.astype(np.float64)
-    except (TypeError, ValueError, OverflowError):
-        return np.empty(0)
+    array = as_numbers(value)
+    return np.empty(0) if array is None else array

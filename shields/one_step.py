@@ -85,6 +85,11 @@ class OneStepTest:
             return None
         if self._plane is not None:
             return outlook_in_plane(*self._plane, estimate.tolist(), error_shape.tolist())
+        return self._in_space(estimate, error_shape)
+
+    @np.errstate(all="ignore")  # what overflows is seen below, what underflows does not count
+    def _in_space(self, estimate: np.ndarray, error_shape: np.ndarray) -> Outlook | None:
+        """Returns the test for any number of states and inputs."""
         # The trace of G A Sigma_k A' G'; not finite if any entry of Sigma_k is not.
         first = float(np.vdot(self._gram, error_shape))
         if not (isfinite(first) and _is_shape(error_shape)):
@@ -93,7 +98,7 @@ class OneStepTest:
         reach = float(self._columns.dot(np.abs(estimate)))
         first = max(abs(first) ** 0.5, SMALLEST_SHARE * self._second)
         predicted = self.moved.dot(0.5 * (error_shape + error_shape.T)).dot(self.moved.T)
-        predicted.flat[:: n + 1] += self.rounding * spread * spread
+        predicted.flat[:: len(predicted) + 1] += self.rounding * spread * spread
         predicted = predicted * (1.0 + self._second / first) + self.D * (1.0 + first / self._second)
         values, axes, failed = dsyev(predicted)  # numpy's eigh, without its three times longer preparation
         loss = self.rounding * (reach + spread + self._pushed)
@@ -166,6 +171,7 @@ class Outlook:
             self.radius = min(self.radius, 0.0)
         self._offset, self._effect = offset.dot(turn), test.effect.T.dot(turn)
 
+    @np.errstate(all="ignore")
     def judge(self, u: list[float]) -> tuple[float, float]:
         """Returns room and margin of an input u, m numbers.
 
@@ -176,11 +182,13 @@ class Outlook:
         reached = self._reached + np.dot(u, self._test.effect.T)
         return self.radius - float(moved.dot(moved)) ** 0.5, self.radius - float(reached.dot(reached)) ** 0.5
 
+    @np.errstate(all="ignore")
     def smallest_room(self) -> float:
         """Returns the room of the worst input within the limits: a vertex, since the norm is convex."""
         moved = self._offset + self._test.vertices @ self._effect
         return self.radius - float((moved * moved).sum(axis=1).max()) ** 0.5
 
+    @np.errstate(all="ignore")
     def closest(self, u: list[float], reserve: float) -> list[float] | None:
         """Returns the input within the limits, m numbers, closest to u with a room of `reserve`; None if none has."""
         target = self.radius - reserve

@@ -8,6 +8,7 @@ import numpy as np
 
 from ncs_gym import Ellipsoid
 from ncs_gym.ellipsoid import is_inside
+from ncs_gym.frozen import as_numbers
 from ncs_gym.plant import SIMULATED_REACH
 from shields.certificate import Certificate
 from shields.exact import is_positive_semidefinite, rational, subtract
@@ -18,10 +19,9 @@ OTHER_INPUT = "the input applied is not the one decided"
 OTHER_STEPS = "the environment did not move exactly one step"
 LARGE_ERROR = "the error ellipsoid is not inside the certified one"
 FAR_OUT = "the estimate is so far out of the safe box that rounding counts"
+UNUSABLE = "the environment reports no usable estimate or error shape"
 NO_ERROR_SET = "a certificate of the published method carries no error set"
 NOT_KNOWN_INSIDE = "the state is not known to be in the safe set"
-# In half-widths of the box; half of what the disturbance bound makes room for (`LinearPlant.disturbance`).
-FARTHEST_ESTIMATE = 0.5 * SIMULATED_REACH
 
 
 class ProofTracker:
@@ -35,7 +35,7 @@ class ProofTracker:
 
     def __init__(self, safety_filter: SafetyFilter) -> None:
         self._filter = safety_filter
-        self._reach = FARTHEST_ESTIMATE * safety_filter.plant.half_widths
+        self._reach = SIMULATED_REACH * safety_filter.plant.half_widths
         self._broken = ""
         self._error_certified = False
         self._inside = False
@@ -81,14 +81,19 @@ class ProofTracker:
 
     def _observe(self, info: dict[str, Any]) -> None:
         """Takes in the alarm, the running ellipsoid, and what the estimate alone proves."""
-        estimate, error_shape = info["estimate"], info["error_shape"]
-        if info["assumption_violated"]:
+        if info["assumption_violated"] not in (False,):
             self._broken = self._broken or ALARM
-        if not (np.abs(estimate) <= self._reach).all():
+        estimate, error_shape = as_numbers(info["estimate"]), as_numbers(info["error_shape"])
+        unusable = estimate is None or error_shape is None
+        if unusable or self._filter.test.at(estimate, error_shape) is None:
+            self._error_certified = False
+            self._broken = self._broken or UNUSABLE
+            return
+        if not (np.abs(estimate) + np.sqrt(np.abs(np.diag(error_shape))) <= self._reach).all():
             self._broken = self._broken or FAR_OUT
-        Sigma = self._filter.certificate.Sigma
-        usable = Sigma is not None and self._filter.test.at(estimate, error_shape) is not None
-        self._error_certified = usable and is_inside(error_shape, Sigma)
+        # K x_hat is proved safe with any of the certified sets; that of another age serves as well.
+        shapes = self._filter.certificate.error_shapes
+        self._error_certified = any(is_inside(error_shape, Sigma) for Sigma in shapes)
         if not self._inside:
             self._inside = self._filter.knows_inside(estimate, error_shape)
 

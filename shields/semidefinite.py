@@ -10,6 +10,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from ncs_gym import LinearPlant
+from ncs_gym.ellipsoid import is_inside
 from shields.certificate import Multipliers
 from shields.infeasible import Infeasible
 from shields.verification import ACTION_ROUNDING
@@ -24,7 +25,7 @@ class ScaledProblem:
     Attributes:
         A, B, C: Scaled plant, shapes (n, n), (n, m), (k, n).
         D: D_u, shape (n, n): disturbance plus the rounding of actions.
-        Sigma: Error set, shape (n, n).
+        Sigmas: Error sets that K x_hat must be safe with, shape (k, n, n).
         transform: T, shape (n, n).
         u_max: Shape (m,).
         growth: s of D_u.
@@ -34,10 +35,20 @@ class ScaledProblem:
     B: np.ndarray
     C: np.ndarray
     D: np.ndarray
-    Sigma: np.ndarray
+    Sigmas: np.ndarray
     transform: np.ndarray
     u_max: np.ndarray
     growth: float
+
+    @property
+    def critical(self) -> np.ndarray:
+        """The error sets that lie in no other, shape (l, n, n)."""
+        kept = list(self.Sigmas)
+        for Sigma in self.Sigmas:
+            others = [other for other in kept if other is not Sigma]
+            if any(is_inside(Sigma, other) for other in others):
+                kept = others
+        return np.stack(kept)
 
     @property
     def n(self) -> int:
@@ -66,8 +77,8 @@ class Design:
     log_det: float
 
 
-def scaled_problem(plant: LinearPlant, Sigma: np.ndarray, box: np.ndarray) -> ScaledProblem:
-    """Returns the design problem for an error set Sigma (n, n) and the largest ellipsoid in the box (n, n)."""
+def scaled_problem(plant: LinearPlant, Sigmas: np.ndarray, box: np.ndarray) -> ScaledProblem:
+    """Returns the design problem for error sets (k, n, n) and the largest ellipsoid in the box (n, n)."""
     T = np.linalg.cholesky(box)
     D = plant.disturbance.shape
     step = plant.B * (float(ACTION_ROUNDING) * plant.u_max)
@@ -82,7 +93,7 @@ def scaled_problem(plant: LinearPlant, Sigma: np.ndarray, box: np.ndarray) -> Sc
         B=inverse @ plant.B @ np.diag(plant.u_max),
         C=plant.C @ T,
         D=inverse @ D_u @ inverse.T,
-        Sigma=inverse @ Sigma @ inverse.T,
+        Sigmas=inverse @ Sigmas @ inverse.T,
         transform=T,
         u_max=plant.u_max,
         growth=growth,
@@ -123,28 +134,34 @@ class InvariantSetProgram:
     def __init__(self, problem: ScaledProblem, slack: float, *, limited: bool = True) -> None:
         n, m = problem.n, problem.m
         self.problem, self.slack = problem, slack
-        self._root = np.linalg.cholesky((1.0 + slack) * problem.Sigma)
+        self._roots = list(np.linalg.cholesky((1.0 + slack) * problem.critical))
         self._L, self._F = cp.Variable((n, n), symmetric=True), cp.Variable((m, n))
         self._state, self._mu = cp.Parameter(nonneg=True), cp.Parameter(m, nonneg=True)
         self._D = cp.Parameter((n, n), symmetric=True)
         # The blocks le X and (1 - mu_i) X, in coordinates where Sigma is the identity (else its smallness spoils the
         # solver's accuracy); each has parameters of its own, because products of parameters are not allowed.
-        self._slopes = [cp.Parameter((n, n)) for _ in range(m + 1)]
-        self._offsets = [cp.Parameter((n, n), symmetric=True) for _ in range(m + 1)]
+        self._slopes = [[cp.Parameter((n, n)) for _ in range(m + 1)] for _ in self._roots]
+        self._offsets = [[cp.Parameter((n, n), symmetric=True) for _ in range(m + 1)] for _ in self._roots]
         self._program = cp.Problem(cp.Maximize(cp.log_det(self._L)), self._constraints(limited))
 
     def _constraints(self, limited: bool) -> list[cp.Constraint]:
-        """Returns (I), (S) and (U) as linear matrix inequalities."""
-        problem, L, F, root = self.problem, self._L, self._F, self._root
-        X = [
-            root.T @ L @ slope + slope.T @ L @ root - offset
-            for slope, offset in zip(self._slopes, self._offsets, strict=True)
-        ]
+        """Returns (S), and (I) and (U) for every critical error set, as linear matrix inequalities."""
+        problem, L = self.problem, self._L
+        constraints = [cp.diag(problem.C @ L @ problem.C.T) <= 1.0 - self.slack]
+        for root, slopes, offsets in zip(self._roots, self._slopes, self._offsets, strict=True):
+            X = [
+                root.T @ L @ slope + slope.T @ L @ root - offset for slope, offset in zip(slopes, offsets, strict=True)
+            ]
+            constraints += self._for_one_set(root, X, limited)
+        return constraints
+
+    def _for_one_set(self, root: np.ndarray, X: list[cp.Expression], limited: bool) -> list[cp.Constraint]:
+        """Returns (I) and (U) for the error set E(root root'), with le X and (1 - mu_i) X in its coordinates."""
+        problem, L, F = self.problem, self._L, self._F
         zero = np.zeros((problem.n, problem.n))
         moved, gain = problem.A @ L + problem.B @ F, problem.B @ F @ root
         constraints = [
-            cp.bmat([[L - self._D, moved, gain], [moved.T, self._state * L, zero], [gain.T, zero, X[0]]]) >> 0,
-            cp.diag(problem.C @ L @ problem.C.T) <= 1.0 - self.slack,
+            cp.bmat([[L - self._D, moved, gain], [moved.T, self._state * L, zero], [gain.T, zero, X[0]]]) >> 0
         ]
         corner = np.array([[1.0 - self.slack - 2.0 * float(ACTION_ROUNDING)]])
         for i in range(problem.m if limited else 0):
@@ -166,11 +183,11 @@ class InvariantSetProgram:
         self._D.value = self.problem.D * ((1.0 + self.slack) / ld)
         self._mu.value = inputs
         # With Sigma = G G' the linearized G'XG is G'L (Sigma^-1 L0 G) + its transpose - (G^-1 L0 G)'(G^-1 L0 G).
-        inner = np.linalg.solve(self._root, linearize_at @ self._root)
-        slope = np.linalg.solve(self._root.T, inner)
-        offset = inner.T @ inner
-        for share, P, R in zip((le, *(1.0 - inputs)), self._slopes, self._offsets, strict=True):
-            P.value, R.value = share * slope, share * 0.5 * (offset + offset.T)
+        for root, slopes, offsets in zip(self._roots, self._slopes, self._offsets, strict=True):
+            inner = np.linalg.solve(root, linearize_at @ root)
+            slope, offset = np.linalg.solve(root.T, inner), inner.T @ inner
+            for share, P, R in zip((le, *(1.0 - inputs)), slopes, offsets, strict=True):
+                P.value, R.value = share * slope, share * 0.5 * (offset + offset.T)
         if not _solve(self._program):
             return None
         L = 0.5 * (self._L.value + self._L.value.T)
@@ -180,43 +197,70 @@ class InvariantSetProgram:
         return Design(L, np.linalg.solve(L, self._F.value.T).T, shares, inputs, float(log_det))
 
 
+def nominal_set(problem: ScaledProblem, state: float) -> np.ndarray | None:
+    """Returns the largest invariant set without estimation error, (n, n), to linearize at; None if there is none.
+
+    Three times the disturbance and four fifths of the limits leave room for the error.
+
+    Args:
+        problem: The scaled design problem.
+        state: lx.
+    """
+    n, m = problem.n, problem.m
+    L, F = cp.Variable((n, n), symmetric=True), cp.Variable((m, n))
+    moved = problem.A @ L + problem.B @ F
+    spread = 3.0 / (1.0 - state) * problem.D
+    constraints = [
+        cp.diag(problem.C @ L @ problem.C.T) <= 1.0,
+        cp.bmat([[L - 0.5 * (spread + spread.T), moved], [moved.T, state * L]]) >> 0,
+    ]
+    for i in range(m):
+        constraints.append(cp.bmat([[np.array([[0.8]]), F[i : i + 1, :]], [F[i : i + 1, :].T, L]]) >> 0)
+    return L.value if _solve(cp.Problem(cp.Maximize(cp.log_det(L)), constraints)) else None
+
+
 def best_gain(problem: ScaledProblem, design: Design) -> np.ndarray:
     """Returns the gain, shape (m, n), that leaves (I) the most room for the design's L; its own if none is better."""
     n, m = problem.n, problem.m
-    L, Sigma, (lx, le, ld) = design.L, problem.Sigma, design.shares
-    root, identity = np.linalg.cholesky(Sigma), np.eye(n)
+    L, (lx, le, ld), identity = design.L, design.shares, np.eye(problem.n)
     K, room = cp.Variable((m, n)), cp.Variable()
     zero = np.zeros((n, n))
-    moved, gain = (problem.A + problem.B @ K) @ L, problem.B @ K @ root
-    blocks = [[room * L - problem.D / ld, moved, gain], [moved.T, lx * L, zero], [gain.T, zero, le * identity]]
-    constraints = [cp.bmat(blocks) >> 0]
+    moved = (problem.A + problem.B @ K) @ L
     corner = np.array([[1.0 - 4.0 * float(ACTION_ROUNDING)]])
-    for i, mu in enumerate(design.inputs):
-        row, err = K[i : i + 1, :] @ L, K[i : i + 1, :] @ root
-        blocks = [[corner, row, err], [row.T, mu * L, zero], [err.T, zero, (1.0 - mu) * identity]]
+    constraints = []
+    for root in np.linalg.cholesky(problem.critical):
+        gain = problem.B @ K @ root
+        blocks = [[room * L - problem.D / ld, moved, gain], [moved.T, lx * L, zero], [gain.T, zero, le * identity]]
         constraints.append(cp.bmat(blocks) >> 0)
+        for i, mu in enumerate(design.inputs):
+            row, err = K[i : i + 1, :] @ L, K[i : i + 1, :] @ root
+            blocks = [[corner, row, err], [row.T, mu * L, zero], [err.T, zero, (1.0 - mu) * identity]]
+            constraints.append(cp.bmat(blocks) >> 0)
     if not _solve(cp.Problem(cp.Minimize(room), constraints)):
         return design.K
     return K.value
 
 
 def best_shares(
-    problem: ScaledProblem, L: np.ndarray, K: np.ndarray, start: tuple[float, float, float]
+    problem: ScaledProblem, Sigmas: np.ndarray, L: np.ndarray, K: np.ndarray, start: tuple[float, float, float]
 ) -> tuple[tuple[float, float, float], float]:
     """Returns shares (lx, le, ld), and the largest generalized eigenvalue of (I)'s right side against L.
 
-    The right side is matrix-convex in the shares, so its largest eigenvalue is a convex function of two numbers.
+    The right side is matrix-convex in the shares, so its largest eigenvalue is a convex function of two numbers, and
+    so is the largest over several error sets, shape (k, n, n).
     """
     root = np.linalg.inv(np.linalg.cholesky(L))
     closed, gain = root @ (problem.A + problem.B @ K), root @ problem.B @ K
-    parts = np.stack([closed @ L @ closed.T, gain @ problem.Sigma @ gain.T, root @ problem.D @ root.T])
+    moved, spread = closed @ L @ closed.T, root @ problem.D @ root.T
+    errors = gain @ Sigmas @ gain.T
 
     def shares_of(logits: np.ndarray) -> np.ndarray:
         weights = np.exp(np.clip(np.append(logits, 0.0), -30.0, 30.0))
         return weights / weights.sum()
 
     def worst(logits: np.ndarray) -> float:
-        return float(np.linalg.eigvalsh(np.tensordot(1.0 / shares_of(logits), parts, 1))[-1])
+        lx, le, ld = shares_of(logits)
+        return float(np.linalg.eigvalsh(moved / lx + errors / le + spread / ld)[:, -1].max())
 
     logits = np.log(np.array(start[:2]) / start[2])
     found = minimize(worst, logits, method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-12, "maxiter": 400})
@@ -224,18 +268,23 @@ def best_shares(
     return (float(lx), float(le), float(ld)), float(found.fun)
 
 
-def best_input_shares(problem: ScaledProblem, L: np.ndarray, K: np.ndarray) -> np.ndarray:
-    """Returns mu_i = a / (a + b), a = sqrt(K_i L K_i'), b = sqrt(K_i Sigma K_i'), shape (m,), kept inside (0, 1)."""
+def best_input_shares(Sigmas: np.ndarray, L: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Returns mu_i = a / (a + b), a = sqrt(K_i L K_i'), b = max sqrt(K_i Sigma K_i'), shape (m,), inside (0, 1)."""
     a = np.sqrt(np.maximum(((K @ L) * K).sum(axis=1), 0.0))
-    b = np.sqrt(np.maximum(((K @ problem.Sigma) * K).sum(axis=1), 0.0))
+    b = np.sqrt(np.maximum(((K @ Sigmas) * K).sum(axis=-1), 0.0)).max(axis=0)
     return np.clip(a / np.maximum(a + b, 1e-300), 1e-6, 1.0 - 1e-6)
 
 
 def as_multipliers(problem: ScaledProblem, design: Design, rate: float) -> Multipliers:
     """Returns the design's multipliers, scaled so that rounding cannot lift lx + le + ld above 1."""
-    lx, le, ld = (share * (1.0 - 1e-15) for share in design.shares)
+    lx, le, ld = rounded_down(design.shares)
     inputs = tuple(float(mu) for mu in design.inputs)
     return Multipliers(error=rate, state=lx, estimate=le, disturbance=ld, inputs=inputs, rounding=problem.growth)
+
+
+def rounded_down(shares: tuple[float, float, float]) -> tuple[float, ...]:
+    """Returns shares so much smaller that rounding cannot lift their sum above 1."""
+    return tuple(share * (1.0 - 1e-15) for share in shares)
 
 
 def _solve(program: cp.Problem) -> bool:

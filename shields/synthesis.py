@@ -9,8 +9,9 @@ from itertools import product
 
 import numpy as np
 
-from ncs_gym import ErrorSetError, LinearPlant, UnstablePlantError, certified_error_set
-from shields.certificate import Certificate
+from ncs_gym import ErrorSet, ErrorSetError, LinearPlant, UnstablePlantError, certified_error_set
+from ncs_gym.contract import ChannelContract
+from shields.certificate import AgeProof, Certificate
 from shields.infeasible import Infeasible
 from shields.paper import paper_certificate
 from shields.semidefinite import (
@@ -22,6 +23,8 @@ from shields.semidefinite import (
     best_input_shares,
     best_shares,
     largest_box_ellipsoid,
+    nominal_set,
+    rounded_down,
     scaled_problem,
 )
 from shields.verification import verify
@@ -29,6 +32,10 @@ from shields.verification import verify
 # (lx, le / (1 - lx)) to start from; without good starts the alternation stalls (theory.md section 3).
 STARTS = ((0.85, 0.3), (0.85, 0.1), (0.92, 0.3), (0.92, 0.1), (0.75, 0.3), (0.6, 0.2), (0.97, 0.2))
 START_INPUT_SHARE = 0.8
+# lx and le / (1 - lx) to start from near the invariant set without estimation error, where the others find nothing:
+# plants that move slowly through their box need lx near 1.
+NOMINAL_STATES = (0.75, 0.85, 0.92, 0.96, 0.98, 0.99, 0.995, 0.998, 0.999)
+NOMINAL_PARTS = (0.1, 0.3, 0.6)
 # Slow cases still gain 1 % a turn after ten.
 ALTERNATIONS = 40
 # Within this of the box ellipsoid's log det nothing is left to gain.
@@ -48,6 +55,7 @@ def synthesize(
     plant: LinearPlant,
     method: str = "certified",
     *,
+    contract: ChannelContract | None = None,
     progress: Progress | None = None,
     dkappa: float = 0.02,
     drho: float = 0.05,
@@ -59,8 +67,9 @@ def synthesize(
     al. as printed with their Algorithm 1, whose certificate carries no error set (docs/paper.md).
 
     Args:
-        plant: The plant with its bounds, Schur stable for "certified".
+        plant: The plant with its bounds, Schur stable for "certified" without a contract.
         method: "certified" or "paper".
+        contract: The channel's promise, under which the error sets depend on the newest sample's age ("certified").
         progress: Called with a line of text per start and per alternation ("certified").
         dkappa: Step of kappa ("paper").
         drho: Step of rho ("paper").
@@ -78,18 +87,20 @@ def synthesize(
         return replace(certificate, provenance=certificate.provenance | exact)
     if method != "certified":
         raise ValueError(f"method must be 'certified' or 'paper', got {method!r}")
-    return _certified(plant, progress or (lambda line: None))
+    if contract is not None and not isinstance(contract, ChannelContract):
+        raise ValueError(f"contract must be a ChannelContract or None, got {contract!r}")
+    return _certified(plant, contract, progress or (lambda line: None))
 
 
-def _certified(plant: LinearPlant, progress: Progress) -> Certificate:
+def _certified(plant: LinearPlant, contract: ChannelContract | None, progress: Progress) -> Certificate:
     """Returns the certificate of the certified method."""
-    problem, Sigma, rate = _design_problem(plant)
+    problem, errors = _design_problem(plant, contract)
     failure = None
     for slack in SLACKS:
         design = _largest_set(problem, slack, progress)
         if design is None:
             break
-        certificate = _certificate(plant, problem, design, Sigma, rate, slack)
+        certificate = _certificate(plant, problem, design, errors, slack)
         report = verify(certificate, plant)
         if report.valid:
             return certificate
@@ -113,13 +124,13 @@ def certify(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> Certificate | N
     Raises:
         Infeasible: If the plant has no error set or its box is unbounded.
     """
-    problem, Sigma, rate = _design_problem(plant)
+    problem, errors = _design_problem(plant)
     inverse = np.linalg.inv(problem.transform)
     scaled_L, scaled_K = inverse @ L @ inverse.T, (K @ problem.transform) / problem.u_max[:, None]
-    shares, _ = best_shares(problem, scaled_L, scaled_K, (0.9, 0.03, 0.07))
-    inputs = best_input_shares(problem, scaled_L, scaled_K)
+    shares, _ = best_shares(problem, problem.Sigmas, scaled_L, scaled_K, (0.9, 0.03, 0.07))
+    inputs = best_input_shares(problem.Sigmas, scaled_L, scaled_K)
     design = Design(scaled_L, scaled_K, shares, inputs, float(np.linalg.slogdet(scaled_L)[1]))
-    certificate = _certificate(plant, problem, design, Sigma, rate, 0.0, shape=L, gain=K)
+    certificate = _certificate(plant, problem, design, errors, 0.0, shape=L, gain=K)
     return certificate if verify(certificate, plant).valid else None
 
 
@@ -131,8 +142,8 @@ def _is_certifiable(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> bool:
         return False
 
 
-def _design_problem(plant: LinearPlant) -> tuple[ScaledProblem, np.ndarray, float]:
-    """Returns the scaled problem, Sigma and lam_e.
+def _design_problem(plant: LinearPlant, contract: ChannelContract | None = None) -> tuple[ScaledProblem, ErrorSet]:
+    """Returns the scaled problem and the error set, with its shapes a little larger than the environment's.
 
     Raises:
         Infeasible: If the plant has no error set or its box is unbounded.
@@ -145,13 +156,19 @@ def _design_problem(plant: LinearPlant) -> tuple[ScaledProblem, np.ndarray, floa
             free,
         )
     try:
-        errors = certified_error_set(plant)
+        errors = grown(certified_error_set(plant, contract))
     except UnstablePlantError as error:
         raise Infeasible(f"(E1) cannot hold: {error}", "E1", plant.spectral_radius - 1.0) from error
     except ErrorSetError as error:
         raise Infeasible(str(error), "E1", 0.0) from error
-    Sigma = GROWTH * errors.Sigma
-    return scaled_problem(plant, Sigma, largest_box_ellipsoid(plant.C)), Sigma, errors.rate
+    shapes = errors.Sigma[None] if errors.ages is None else errors.ages.shapes[:-1]
+    return scaled_problem(plant, shapes, largest_box_ellipsoid(plant.C)), errors
+
+
+def grown(errors: ErrorSet) -> ErrorSet:
+    """Returns an error set with every shape larger by GROWTH; (E0) to (C2) keep holding."""
+    ages = errors.ages and replace(errors.ages, shapes=GROWTH * errors.ages.shapes)
+    return replace(errors, Sigma=GROWTH * errors.Sigma, ages=ages)
 
 
 def _largest_set(problem: ScaledProblem, slack: float, progress: Progress) -> Design | None:
@@ -176,7 +193,8 @@ def _largest_set(problem: ScaledProblem, slack: float, progress: Progress) -> De
 
 def _best_start(problem: ScaledProblem, program: InvariantSetProgram, progress: Progress) -> Design | None:
     """Returns the best design over a handful of shares and two linearizations."""
-    near = problem.Sigma / float(np.linalg.eigvalsh(problem.Sigma)[-1])
+    last = problem.Sigmas[-1]
+    near = last / float(np.linalg.eigvalsh(last)[-1])
     inputs = np.full(problem.m, START_INPUT_SHARE)
     best = None
     starts = list(product(STARTS, (np.eye(problem.n), near)))
@@ -187,14 +205,27 @@ def _best_start(problem: ScaledProblem, program: InvariantSetProgram, progress: 
         progress(f"start {turn + 1} of {len(starts)}: {_volume(best)}")
         if best is not None and -best.log_det < CLOSE_ENOUGH:
             break
+    return best or _nominal_start(problem, program, progress)
+
+
+def _nominal_start(problem: ScaledProblem, program: InvariantSetProgram, progress: Progress) -> Design | None:
+    """Returns the best design linearized at an invariant set without estimation error; None if there is none."""
+    inputs, best = np.full(problem.m, START_INPUT_SHARE), None
+    for state in NOMINAL_STATES:
+        linearize_at = nominal_set(problem, state)
+        for part in NOMINAL_PARTS if linearize_at is not None else ():
+            design = program.solve(_shares(state, part), inputs, linearize_at)
+            if design is not None and (best is None or design.log_det > best.log_det):
+                best = design
+            progress(f"start near the set without errors, lx = {state}: {_volume(best)}")
     return best
 
 
 def _alternate(problem: ScaledProblem, program: InvariantSetProgram, best: Design, step: float) -> Design:
     """Linearizes at the best L, then tries its own, re-optimized and shifted shares; never returns a worse design."""
     K = best.K
-    inputs = best_input_shares(problem, best.L, K)
-    tuned, _ = best_shares(problem, best.L, K, best.shares)
+    inputs = best_input_shares(problem.Sigmas, best.L, K)
+    tuned, _ = best_shares(problem, problem.Sigmas, best.L, K, best.shares)
     anchor = best.L
     for shares, mu in ((best.shares, best.inputs), (tuned, inputs)):
         best = _better(best, program.solve(shares, mu, anchor))
@@ -212,11 +243,10 @@ def _finish(problem: ScaledProblem, best: Design) -> Design:
     gains = (best_gain(problem, best), best.K)
     finished = []
     for K in gains:
-        shares, worst = best_shares(problem, best.L, K, best.shares)
-        inputs = best_input_shares(problem, best.L, K)
-        effort = (
-            np.sqrt(np.einsum("ij,jk,ik->i", K, best.L, K)) + np.sqrt(np.einsum("ij,jk,ik->i", K, problem.Sigma, K))
-        ).max()
+        shares, worst = best_shares(problem, problem.Sigmas, best.L, K, best.shares)
+        inputs = best_input_shares(problem.Sigmas, best.L, K)
+        error_effort = np.sqrt(((K @ problem.Sigmas) * K).sum(axis=-1)).max(axis=0)
+        effort = (np.sqrt(((K @ best.L) * K).sum(axis=1)) + error_effort).max()
         finished.append((max(worst, effort), replace(best, K=K, shares=shares, inputs=inputs)))
     return min(finished, key=lambda pair: pair[0])[1]
 
@@ -225,8 +255,7 @@ def _certificate(
     plant: LinearPlant,
     problem: ScaledProblem,
     design: Design,
-    Sigma: np.ndarray,
-    rate: float,
+    errors: ErrorSet,
     slack: float,
     *,
     shape: np.ndarray | None = None,
@@ -234,12 +263,19 @@ def _certificate(
 ) -> Certificate:
     """Returns the certificate of a design; `shape` and `gain` replace its own L and K where they were given."""
     L, K = problem.physical(design.L, design.K)
+    ages = None
+    if errors.ages is not None:
+        proofs = [_tuned(problem, design, Sigma[None]) for Sigma in problem.Sigmas]
+        shares = np.array([rounded_down(proof.shares) for proof in proofs])
+        ages = AgeProof(sets=errors.ages, shares=shares, inputs=np.array([proof.inputs for proof in proofs]))
+        design = proofs[-1]
     return Certificate(
         L=L if shape is None else shape,
         K=K if gain is None else gain,
-        Sigma=Sigma,
+        Sigma=errors.Sigma,
         D=GROWTH * plant.disturbance.shape,
-        multipliers=as_multipliers(problem, design, rate),
+        multipliers=as_multipliers(problem, design, errors.rate),
+        ages=ages,
         method="certified",
         fingerprint=plant.fingerprint,
         provenance={
@@ -251,11 +287,17 @@ def _certificate(
     )
 
 
+def _tuned(problem: ScaledProblem, design: Design, Sigmas: np.ndarray) -> Design:
+    """Returns a design with the shares that suit some of its error sets best."""
+    shares, _ = best_shares(problem, Sigmas, design.L, design.K, design.shares)
+    return replace(design, shares=shares, inputs=best_input_shares(Sigmas, design.L, design.K))
+
+
 def _diagnosis(problem: ScaledProblem) -> Infeasible:
     """Returns the exception that says what binds, from feasibility at reduced uncertainty and without input limits."""
 
     def feasible(scale: float, *, limited: bool = True) -> bool:
-        trial = replace(problem, D=scale**2 * problem.D, Sigma=scale**2 * problem.Sigma)
+        trial = replace(problem, D=scale**2 * problem.D, Sigmas=scale**2 * problem.Sigmas)
         program = InvariantSetProgram(trial, SLACKS[0], limited=limited)
         return _best_start(trial, program, lambda line: None) is not None
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 
@@ -69,13 +70,15 @@ def verify(certificate: Certificate, plant: LinearPlant) -> Report:
     if certificate.method == "paper":
         conditions.append(flag("shapes: L (n, n), K (m, n)", fits))
         return Report(tuple(conditions + (list(paper_conditions(certificate, plant)) if fits else [])))
-    conditions.append(flag("shapes: L (n, n), K (m, n), one input share per input", fits and _shares_fit(certificate)))
+    conditions.append(
+        flag("shapes: L (n, n), K (m, n), one input share per input", fits and _shares_fit(certificate, plant))
+    )
     if not conditions[-1].holds:
         return Report(tuple(conditions))
     conditions += _shares(certificate)
     if all(condition.holds for condition in conditions[2:]):
         conditions += _bounds(certificate, plant)
-        conditions += _error_set(certificate, plant)
+        conditions += (_error_set if certificate.ages is None else _age_sets)(certificate, plant)
         conditions += _safe_set(certificate, plant)
     return Report(tuple(conditions))
 
@@ -95,24 +98,32 @@ def require_valid(certificate: Certificate, plant: LinearPlant) -> None:
             )
 
 
-def _shares_fit(certificate: Certificate) -> bool:
-    return len(certificate.multipliers.inputs) == certificate.K.shape[0]
+def _shares_fit(certificate: Certificate, plant: LinearPlant) -> bool:
+    if len(certificate.multipliers.inputs) != plant.m:
+        return False
+    if certificate.ages is None:
+        return True
+    sets = certificate.ages.sets
+    return sets.gains.shape[1:] == (plant.n, plant.p) and certificate.ages.inputs.shape[1] == plant.m
 
 
 def _shares(certificate: Certificate) -> Iterator[Condition]:
     """Checks the ranges of all multipliers."""
-    shares = certificate.multipliers
-    finite = all(np.isfinite([shares.error, shares.state, shares.estimate, shares.disturbance, shares.rounding]))
-    finite = finite and all(np.isfinite(shares.inputs))
+    shares, ages = certificate.multipliers, certificate.ages
+    rates = [shares.error] if ages is None else [*ages.sets.rates, *ages.sets.shares]
+    proofs = _invariance_proofs(certificate)
+    inputs = [share for proof in proofs for share in proof.inputs]
+    parts = [[float(share) for share in proof.shares] for proof in proofs]
+    finite = bool(np.isfinite([*rates, *inputs, shares.rounding]).all() and np.isfinite(parts).all())
     yield flag("multipliers: finite", finite)
     if not finite:
         return
-    inside = all(0.0 < share < 1.0 for share in (shares.error, *shares.inputs))
+    inside = all(0.0 < share < 1.0 for share in (*rates, *inputs))
     yield flag("multipliers: 0 < lam_e < 1 and 0 < mu_i < 1", inside)
-    parts = [Fraction(share) for share in (shares.state, shares.estimate, shares.disturbance)]
-    positive = min(*parts, Fraction(shares.rounding)) > 0
+    exact = [[Fraction(share) for share in part] for part in parts]
+    positive = min(*(min(part) for part in exact), Fraction(shares.rounding)) > 0
     yield flag("multipliers: lx, le, ld, s > 0", positive)
-    yield scalar("multipliers: lx + le + ld <= 1", 1 - sum(parts))
+    yield scalar("multipliers: lx + le + ld <= 1", min(1 - sum(part) for part in exact))
 
 
 def _bounds(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
@@ -122,13 +133,19 @@ def _bounds(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]
     energy = Fraction(plant.process_noise.energy)
     ball = scale(Fraction(plant.gamma), identity)
     ellipsoid = scale(energy, noise)
-    share = _trace_share(ball, ellipsoid)
-    need = add(ball, ellipsoid) if share is None else add(scale(1 / share, ball), scale(1 / (1 - share), ellipsoid))
+    need = _sum_bound(ball, ellipsoid)
     bound = rational(plant.disturbance.shape)
     yield matrix_condition("D: the plant's holds the disturbance and the process noise", subtract(bound, need))
     yield matrix_condition("D: the certificate's holds the plant's", subtract(rational(certificate.D), bound))
     sensor = scale(Fraction(plant.sensor_noise.energy), rational(plant.measurement_noise_cov))
-    yield matrix_condition("N: holds the sensor noise", subtract(rational(plant.sensor_error.shape), sensor))
+    if certificate.ages is None:
+        yield matrix_condition("N: holds the sensor noise", subtract(rational(plant.sensor_error.shape), sensor))
+    else:
+        sets = certificate.ages.sets
+        step = Fraction(sets.contract.quantization_step)
+        ball = scale(plant.p * step * step / 4, rational(np.eye(plant.p)))
+        need = _sum_bound(ball, sensor)
+        yield matrix_condition("N: holds the sensor noise and the rounding", subtract(rational(sets.noise), need))
     first = scale(Fraction(plant.initial_noise.energy), rational(plant.initial_cov))
     yield matrix_condition(
         "r0: holds the error of the first estimate", subtract(rational(plant.initial_error.shape), first)
@@ -144,27 +161,65 @@ def _error_set(certificate: Certificate, plant: LinearPlant) -> Iterator[Conditi
     yield matrix_condition("(E1) Sigma - A Sigma A'/lam_e - D/(1-lam_e) >= 0", subtract(Sigma, grown))
 
 
+def _age_sets(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
+    """(C0), (C1) and (C2): under the contract the error of every age stays in the set of that age."""
+    sets, identity = certificate.ages.sets, rational(np.eye(plant.n))
+    A, H, D, N = (rational(matrix) for matrix in (plant.A, plant.H, certificate.D, sets.noise))
+    shapes = [rational(shape) for shape in sets.shapes]
+    oldest = certificate.ages.sets.contract.max_age
+    yield flag("Sigma is the set of the largest age", np.array_equal(certificate.Sigma, sets.shapes[oldest]))
+    yield matrix_condition("(C0) Sigma_0 - r0^2 I >= 0", subtract(shapes[0], rational(plant.initial_error.shape)))
+    for j, rate in enumerate(map(Fraction, sets.rates)):
+        grown = add(scale(1 / rate, congruence(A, shapes[j])), scale(1 / (1 - rate), D))
+        name = f"(C1) Sigma_{j + 1} - A Sigma_{j} A'/lam - D/(1-lam) >= 0"
+        yield matrix_condition(name, subtract(shapes[j + 1], grown))
+    for j, (gain, share) in enumerate(zip(sets.gains, map(Fraction, sets.shares), strict=True), start=1):
+        T = rational(gain)
+        kept = congruence(subtract(identity, multiply(T, H)), shapes[j])
+        updated = add(scale(1 / share, kept), scale(1 / (1 - share), congruence(T, N)))
+        name = f"(C2) Sigma_0 - (I-TH) Sigma_{j} (I-TH)'/mu - T N T'/(1-mu) >= 0"
+        yield matrix_condition(name, subtract(shapes[0], updated))
+
+
+class _InvarianceProof(NamedTuple):
+    """Shares that prove (I) and (U) for one error set: a label, Sigma, (lx, le, ld) and mu."""
+
+    label: str
+    Sigma: np.ndarray
+    shares: Sequence[float]
+    inputs: Sequence[float]
+
+
+def _invariance_proofs(certificate: Certificate) -> list[_InvarianceProof]:
+    """Returns one proof per error set: one in all, or under a contract one per age."""
+    shares, ages = certificate.multipliers, certificate.ages
+    if ages is None:
+        parts = (shares.state, shares.estimate, shares.disturbance)
+        return [_InvarianceProof("", certificate.Sigma, parts, shares.inputs)]
+    rows = zip(ages.sets.shapes[:-1], ages.shares, ages.inputs, strict=True)
+    return [_InvarianceProof(f" at age {j}", *row) for j, row in enumerate(rows)]
+
+
 def _safe_set(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
     """(I), (S), (U): the safe set is invariant, lies in the box, and its input respects the limits."""
-    shares = certificate.multipliers
-    L, K, Sigma = rational(certificate.L), rational(certificate.K), rational(certificate.Sigma)
-    B = rational(plant.B)
+    L, K, B = rational(certificate.L), rational(certificate.K), rational(plant.B)
     yield matrix_condition("L > 0", L, strict=True)
-    gain = multiply(B, K)
-    D_u = _with_action_rounding(rational(certificate.D), B, plant.u_max, Fraction(shares.rounding))
-    grown = add(
-        scale(1 / Fraction(shares.state), congruence(add(rational(plant.A), gain), L)),
-        scale(1 / Fraction(shares.estimate), congruence(gain, Sigma)),
-        scale(1 / Fraction(shares.disturbance), D_u),
-    )
-    yield matrix_condition("(I) L - (A+BK) L (A+BK)'/lx - BK Sigma K'B'/le - D_u/ld >= 0", subtract(L, grown))
+    gain, growth = multiply(B, K), Fraction(certificate.multipliers.rounding)
+    D_u = _with_action_rounding(rational(certificate.D), B, plant.u_max, growth)
+    moved = congruence(add(rational(plant.A), gain), L)
     for j, row in enumerate(plant.C):
         yield scalar(f"(S) c_{j + 1} L c_{j + 1}' <= 1", 1 - quadratic(rational(row), L))
-    for i, (limit, share) in enumerate(zip(plant.u_max, shares.inputs, strict=True)):
-        mu = Fraction(share)
-        used = quadratic([K[i]], L) / mu + quadratic([K[i]], Sigma) / (1 - mu)
-        allowed = (Fraction(float(limit)) * (1 - ACTION_ROUNDING)) ** 2
-        yield scalar(f"(U) input {i + 1} stays within u_max (1 - 2^-24)", allowed - used)
+    for proof in _invariance_proofs(certificate):
+        Sigma = rational(proof.Sigma)
+        state, estimate, disturbance = (Fraction(float(share)) for share in proof.shares)
+        grown = add(scale(1 / state, moved), scale(1 / estimate, congruence(gain, Sigma)), scale(1 / disturbance, D_u))
+        name = f"(I) L - (A+BK) L (A+BK)'/lx - BK Sigma K'B'/le - D_u/ld >= 0{proof.label}"
+        yield matrix_condition(name, subtract(L, grown))
+        for i, (limit, share) in enumerate(zip(plant.u_max, proof.inputs, strict=True)):
+            mu = Fraction(float(share))
+            used = quadratic([K[i]], L) / mu + quadratic([K[i]], Sigma) / (1 - mu)
+            allowed = (Fraction(float(limit)) * (1 - ACTION_ROUNDING)) ** 2
+            yield scalar(f"(U) input {i + 1} stays within u_max (1 - 2^-24){proof.label}", allowed - used)
 
 
 def _with_action_rounding(D: Matrix, B: Matrix, u_max: np.ndarray, growth: Fraction) -> Matrix:
@@ -174,6 +229,12 @@ def _with_action_rounding(D: Matrix, B: Matrix, u_max: np.ndarray, growth: Fract
     for i, limit in enumerate(u_max):
         spread[i][i] = m * (ACTION_ROUNDING * Fraction(float(limit))) ** 2
     return add(scale(1 + growth, D), scale(1 + 1 / growth, congruence(B, spread)))
+
+
+def _sum_bound(first: Matrix, second: Matrix) -> Matrix:
+    """Returns a shape around E(first) + E(second): P1/nu + P2/(1-nu), or the sum if one of them is zero."""
+    share = _trace_share(first, second)
+    return add(first, second) if share is None else add(scale(1 / share, first), scale(1 / (1 - share), second))
 
 
 def _trace_share(first: Matrix, second: Matrix) -> Fraction | None:

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, StickyAction
 
-from ncs_gym import LinearPlant, NCSEnv
+from ncs_gym import ChannelContract, LinearPlant, NCSEnv
 from ncs_gym.env import applied_input
 from ncs_gym.frozen import as_number
 from shields.certificate import Certificate
@@ -23,7 +23,7 @@ REFUSED = (gym.ActionWrapper, RepeatAction, StickyAction, MaxAndSkipObservation,
 # What the clock reads while a step is under way: if it raises, the next one does not follow from what is known.
 INTERRUPTED = (-1, -1)
 
-_synthesized: dict[str, Certificate] = {}
+_synthesized: dict[tuple[str, ChannelContract | None], Certificate] = {}
 
 
 class SafetyShield(gym.Wrapper, RecordConstructorArgs):
@@ -50,7 +50,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
 
     Args:
         env: An `NCSEnv`, possibly wrapped.
-        certificate: None synthesizes one for the environment's plant, once per process and plant.
+        certificate: None synthesizes one for the environment's plant and contract, once per process.
         mode: "project", "switch", "boundary" or "monitor"; see `SafetyFilter`.
         penalty: Subtracted from the reward per intervention counted, >= 0.
 
@@ -74,18 +74,19 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         self.penalty = as_number(penalty, "penalty", low=0.0)
         if certificate is not None and not isinstance(certificate, Certificate):
             raise ValueError(f"certificate must be a Certificate or None, got {certificate!r}")
-        self.certificate = certificate_for(plant) if certificate is None else certificate
+        contract = env.unwrapped.contract
+        self.certificate = certificate_for(plant, contract) if certificate is None else certificate
         self.filter = SafetyFilter(self.certificate, plant, mode)
         self._proof = ProofTracker(self.filter)
         self._clock: tuple[int, int] | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode; see `NCSEnv.reset`."""
-        self._clock = INTERRUPTED
+        self._clock = self._clock and INTERRUPTED
         observation, info = self.env.reset(seed=seed, options=options)
         clock = self._read_clock()
         self._proof.start(starts_inside(self.certificate, self.env.unwrapped.start), clock[1] == 0, info)
-        self._estimate, self._error_shape = info["estimate"].copy(), info["error_shape"].copy()
+        self._estimate, self._error_shape = np.array(info["estimate"]), np.array(info["error_shape"])
         self._interventions = 0
         u = np.zeros(self.filter.plant.m)
         margin = self.filter.margin(self._estimate, self._error_shape, u)
@@ -109,7 +110,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         observation, reward, terminated, truncated, info = self.env.step(action)
         clock = self._read_clock()
         self._proof.step(decision, clock == (episode, step + 1), info)
-        self._estimate, self._error_shape = info["estimate"].copy(), info["error_shape"].copy()
+        self._estimate, self._error_shape = np.array(info["estimate"]), np.array(info["error_shape"])
         self._interventions += decision.intervened
         self._clock = clock
         info = info | self._info(proposed, decision.input, decision.margin, intervened=decision.intervened)
@@ -132,15 +133,16 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         }
 
 
-def certificate_for(plant: LinearPlant) -> Certificate:
-    """Returns a synthesized certificate, made once per process and plant.
+def certificate_for(plant: LinearPlant, contract: ChannelContract | None = None) -> Certificate:
+    """Returns a synthesized certificate, made once per process, plant and channel contract.
 
     Raises:
         Infeasible: If none is found.
     """
-    if plant.fingerprint not in _synthesized:
-        _synthesized[plant.fingerprint] = synthesize(plant)
-    return _synthesized[plant.fingerprint]
+    key = plant.fingerprint, contract
+    if key not in _synthesized:
+        _synthesized[key] = synthesize(plant, contract=contract)
+    return _synthesized[key]
 
 
 def _plant_behind(env: gym.Env) -> LinearPlant:

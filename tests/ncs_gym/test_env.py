@@ -29,6 +29,7 @@ KEYS = {
     "assumption_violated": bool,
     "episode_violations": float,
     "is_success": float,
+    "contract_broken": bool,
 }
 
 

@@ -188,6 +188,25 @@ def test_huge_estimates_never_give_a_nan_input(size):
         assert not decision.passed
 
 
+class Contrary:
+    """Raises whatever it likes when asked for numbers."""
+
+    def __array__(self, *args, **kwargs):
+        raise RuntimeError("not today")
+
+
+@pytest.mark.parametrize("states", [2, 3])
+def test_decide_never_raises(states):
+    plant = random_plant(3, states, states - 1)
+    shield = SafetyFilter(certificate_of(plant), plant)
+    good = np.zeros(states), 1e-4 * np.eye(states), np.zeros(plant.m)
+    for k in range(3):
+        for bad in (Contrary(), [Contrary()], object(), {}, "x", None, 1e-320 * good[k], 1e200 * np.ones_like(good[k])):
+            with np.errstate(all="raise"):
+                decision = shield.decide(*good[:k], bad, *good[k + 1 :])
+            assert np.isfinite(decision.input).all()
+
+
 def test_wrongly_projected_input_is_not_applied(certificate, loaded, monkeypatch):
     shield = SafetyFilter(certificate, loaded)
     monkeypatch.setattr("shields.plane.closest_on_line", lambda wanted, *rest: wanted)

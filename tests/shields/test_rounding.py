@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import LinearPlant
+from ncs_gym import Channel, LinearPlant, NCSEnv
 from shields import CertificateError, Infeasible, SafetyFilter, SafetyShield, synthesize
 from shields.exact import congruence, is_positive_semidefinite, multiply, rational, subtract
 from shields.one_step import certified_root
@@ -124,6 +124,35 @@ def test_gain_too_large_for_float64_is_refused(monkeypatch, certificate, loaded)
     monkeypatch.setattr("shields.filter.require_valid", lambda *_: None)
     with pytest.raises(CertificateError, match="gain is too large"):
         SafetyFilter(replace(certificate, K=1e9 * np.array([[1.0, -1.0]])), loaded)
+
+
+@pytest.mark.parametrize("first_error", [0.0, 1e-6])
+@pytest.mark.parametrize("name", ["singular", "slanted"])
+def test_error_lies_in_its_ellipsoid_exactly_when_rounding_is_all_there_is(name, first_error):
+    # No noise but a disturbance of the user's that asks for all of E(D), from up to 60 half-widths out.
+    base = LinearPlant(A=SINGULAR, B=np.ones((2, 1)), C=np.eye(2), u_max=1.0, dt=0.1, gamma=0.0)
+    plant = replace(base if name == "singular" else slanted(30.0), gamma=0.0, measurement_noise_cov=None)
+    plant = replace(plant, initial_cov=first_error**2 * np.eye(2))
+    sign = [1.0]
+
+    def everything(rng, plant, nominal_next):
+        sign[0] = -sign[0] if rng.random() < 0.2 else sign[0]
+        return sign[0] * plant.disturbance.extreme_point(plant.half_widths * [1.0, -1.0])
+
+    for channel in (Channel(), Channel(loss=1.0), Channel(loss=0.5, delay=1)):
+        env = NCSEnv(plant, channel, disturbance=everything)
+        for seed in range(8):
+            far = plant.half_widths * np.random.default_rng(seed).uniform(-1, 1, 2) * (60.0 if seed % 2 else 0.9)
+            _, info = env.reset(seed=seed, options={"state": far})
+            for action in np.random.default_rng(seed).uniform(-1, 1, (40, 1)):
+                error = [
+                    Fraction(float(a)) - Fraction(float(b))
+                    for a, b in zip(info["estimate"], info["state"], strict=True)
+                ]
+                rows = [[Fraction(1), *error]]
+                rows += [[z, *row] for z, row in zip(error, rational(info["error_shape"]), strict=True)]
+                assert is_positive_semidefinite(rows)
+                info = env.step(action)[4]
 
 
 @pytest.mark.parametrize("size", [3.0, 1e3, 1e8])

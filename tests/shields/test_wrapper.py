@@ -25,7 +25,7 @@ from stable_baselines3.common.monitor import Monitor
 from ncs_gym import AdversarialDisturbance, Channel, Ellipsoid, NCSEnv
 from shields import Certificate, CertificateError, SafetyShield, synthesize
 from shields.filter import Decision, SafetyFilter
-from shields.proof import ALARM, LARGE_ERROR, NOT_KNOWN_INSIDE, OTHER_INPUT, OTHER_STEPS, ProofTracker
+from shields.proof import ALARM, FAR_OUT, LARGE_ERROR, NOT_KNOWN_INSIDE, OTHER_INPUT, OTHER_STEPS, ProofTracker
 from tests.plants import random_plant
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -210,7 +210,7 @@ def test_certificate_is_synthesized_once_per_plant(monkeypatch):
 
     calls = []
     monkeypatch.setattr(wrapper, "_synthesized", {})
-    monkeypatch.setattr(wrapper, "synthesize", lambda plant: calls.append(plant) or synthesize(plant))
+    monkeypatch.setattr(wrapper, "synthesize", lambda plant, contract: calls.append(plant) or synthesize(plant))
     one, other = SafetyShield(gym.make(CRUISE)), SafetyShield(gym.make(CRUISE))
     assert one.certificate is other.certificate
     assert len(calls) == 1
@@ -235,7 +235,7 @@ def test_bad_settings_are_refused(certificate, kwargs, word):
         shielded(certificate, **kwargs)
 
 
-@pytest.mark.parametrize("action", [np.array([np.nan]), np.zeros(2), None, "left"])
+@pytest.mark.parametrize("action", [np.array([np.nan]), np.zeros(2), None, "left", ["0.1"], [10**400], np.array([1j])])
 def test_bad_action_raises_before_anything_moves(certificate, action):
     env = shielded(certificate)
     env.reset(seed=0)
@@ -502,6 +502,36 @@ def test_interrupted_step_is_noticed(certificate):
         env.step(full(None))
     assert env.step(full(None))[4]["shield_reason"] == OTHER_STEPS
     assert env.reset(seed=0)[1]["shield_guaranteed"]
+
+
+def test_alarm_that_is_no_boolean_counts_as_one(certificate):
+    class Silent(gym.Wrapper):
+        def step(self, action):
+            *result, info = self.env.step(action)
+            return *result, info | {"assumption_violated": None}
+
+    env = SafetyShield(Silent(gym.make(CRUISE)), certificate)
+    env.reset(seed=0)
+    assert env.step(full(None))[4]["shield_reason"] == ALARM
+
+
+def test_error_that_may_reach_far_out_proves_nothing(certificate):
+    class Vague(gym.Wrapper):
+        def step(self, action):
+            *result, info = self.env.step(action)
+            return *result, info | {"error_shape": 1e5 * np.eye(2)}
+
+    env = SafetyShield(Vague(gym.make(CRUISE)), certificate)
+    env.reset(seed=0)
+    assert env.step(full(None))[4]["shield_reason"] == FAR_OUT
+
+
+def test_step_after_a_failed_first_reset_is_refused(certificate):
+    env = SafetyShield(gym.make(CRUISE), certificate)
+    with pytest.raises(ValueError, match="option"):
+        env.reset(options={"bad": 1})
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(full(None))
 
 
 def test_step_before_reset_is_refused(certificate):

@@ -1,0 +1,161 @@
+"""Error sets by age: how far an estimate may be off when its newest sample is j steps old."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ncs_gym.contract import ChannelContract
+from ncs_gym.ellipsoid import outer_sum
+from ncs_gym.frozen import FrozenArrays
+from ncs_gym.plant import LinearPlant
+
+# The sets are made for noise this much larger than allowed, so that at run time good gains nearly always fit in.
+NOISE_GROWTH = 1.2
+# Growth per iteration: strict inequalities at the end.
+GROWTH = 1.0 + 1e-6
+# Shares mu that gains are chosen from.
+SHARES = np.linspace(0.01, 0.99, 99)
+ITERATIONS = 5000
+# Relative change per iteration below which nothing happens any more.
+CONVERGED = 1e-9
+# Sets this much larger than the safe box are of no use.
+LARGEST = 1e6
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AgeSets(FrozenArrays):
+    """E(Sigma_0) .. E(Sigma_{h+1}), h the contract's largest age (docs/theory.md section 6).
+
+        (C0) Sigma_0 >= r0^2 I
+        (C1) Sigma_{j+1} >= A Sigma_j A'/lam_j + D/(1-lam_j)                             j = 0..h
+        (C2) Sigma_0 >= (I-T_j H) Sigma_j (I-T_j H)'/mu_j + T_j N T_j'/(1-mu_j)          j = 1..h+1
+
+    Attributes:
+        contract: The promise they rest on.
+        shapes: Sigma_j, shape (h+2, n, n).
+        rates: lam_j, shape (h+1,).
+        gains: T_1 .. T_{h+1}, shape (h+1, n, p).
+        shares: mu_1 .. mu_{h+1}, shape (h+1,).
+        noise: N of the contract's quantizer, shape (p, p).
+    """
+
+    contract: ChannelContract
+    shapes: np.ndarray
+    rates: np.ndarray
+    gains: np.ndarray
+    shares: np.ndarray
+    noise: np.ndarray
+
+    def __post_init__(self) -> None:
+        self._freeze_arrays()
+
+    def needs(self, plant: LinearPlant) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
+        """Returns, per condition, pairs (outer, inner) of shapes of which each outer must hold the inner one."""
+        D, first = plant.disturbance.shape, plant.initial_error.shape
+        identity = np.eye(plant.n)
+        grown = [
+            plant.A @ shape @ plant.A.T / rate + D / (1.0 - rate)
+            for shape, rate in zip(self.shapes, self.rates, strict=False)
+        ]
+        updated = [
+            (kept := identity - gain @ plant.H) @ shape @ kept.T / share + gain @ self.noise @ gain.T / (1.0 - share)
+            for shape, gain, share in zip(self.shapes[1:], self.gains, self.shares, strict=True)
+        ]
+        return {
+            "(C0)": [(self.shapes[0], first)],
+            "(C1)": list(zip(self.shapes[1:], grown, strict=True)),
+            "(C2)": [(self.shapes[0], update) for update in updated],
+        }
+
+
+def age_sets(plant: LinearPlant, contract: ChannelContract) -> AgeSets | None:
+    """Returns error sets by age, without a solver; None if the iteration finds none.
+
+    From Sigma_0 = r0^2 I: carry it through the longest gap, update after every possible gap with the set-membership
+    gain, and let Sigma_0 be the smallest ellipsoid around the results that pairwise joins give; until nothing grows
+    any more. Its limit meets (C0), (C1) and (C2), which is checked; shares minimize traces in units of the box.
+
+    Args:
+        plant: The plant with its bounds.
+        contract: The channel's promise.
+    """
+    # Coordinates z = T^-1 x with W = (T T')^-1, so that units do not matter.
+    T = np.linalg.cholesky(np.linalg.inv(plant.weight))
+    inverse = np.linalg.inv(T)
+    A, H = inverse @ plant.A @ T, plant.H @ T
+    D = inverse @ plant.disturbance.shape @ inverse.T
+    D = D + 1e-9 * float(np.trace(D)) / plant.n * np.eye(plant.n)
+    first = inverse @ plant.initial_error.shape @ inverse.T + 1e-12 * np.eye(plant.n)
+    exact = plant.sensor_error_with(contract.quantization_step).shape
+    noise = NOISE_GROWTH * exact + 1e-12 * np.diag(np.diag(H @ H.T)) * float(np.trace(D)) / plant.n
+    start, last, steps = first, np.zeros_like(first), contract.max_age + 1
+    for _ in range(ITERATIONS):
+        shapes = _carried(start, A, D, steps)
+        updates = [_update(shape, H, noise) for shape in shapes[1:]]
+        grown = first
+        for _, _, shape in reversed(updates):
+            grown = _joined(grown, shape)
+        size = float(np.trace(grown))
+        if not size < LARGEST:
+            return None
+        converged = float(np.abs(grown - last).max()) <= CONVERGED * size
+        start, last = GROWTH * grown, grown
+        if converged:
+            break
+    else:
+        return None
+    shapes = _carried(start, A, D, steps)
+    gains, shares, _ = zip(*(_update(shape, H, noise) for shape in shapes[1:]), strict=True)
+    return AgeSets(
+        contract=contract,
+        shapes=np.stack([_symmetric(T @ shape @ T.T) for shape in shapes]),
+        rates=np.array([_rate(shape, A, D) for shape in shapes[:-1]]),
+        gains=np.stack([T @ gain for gain in gains]),
+        shares=np.array(shares),
+        noise=exact,
+    )
+
+
+def _carried(start: np.ndarray, A: np.ndarray, D: np.ndarray, steps: int) -> list[np.ndarray]:
+    """Returns Sigma_0 .. Sigma_steps, each a little more than the trace-smallest ellipsoid the last one moves into."""
+    shapes = [start]
+    for _ in range(steps):
+        shapes.append(GROWTH * _symmetric(outer_sum(A @ shapes[-1] @ A.T, D, np.eye(len(A)))))
+    return shapes
+
+
+def _rate(shape: np.ndarray, A: np.ndarray, D: np.ndarray) -> float:
+    """Returns the lam of `_carried`."""
+    a, b = np.sqrt(np.trace(A @ shape @ A.T)), np.sqrt(np.trace(D))
+    return float(a / (a + b))
+
+
+def _update(shape: np.ndarray, H: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+    """Returns the set-membership gain T, its share mu and the updated shape, for the trace-smallest of SHARES."""
+    values, vectors = np.linalg.eigh(shape)
+    factor = vectors * np.sqrt(np.maximum(values, 0.0))
+    seen = H @ factor
+    gains, basis = np.linalg.eigh(seen.T @ np.linalg.solve(noise, seen))
+    axes, gains = factor @ basis, np.maximum(gains, 0.0)
+    sizes = (axes * axes).sum(axis=0)
+    traces = (sizes / (SHARES[:, None] + (1.0 - SHARES[:, None]) * gains)).sum(axis=1)
+    mu = float(SHARES[int(np.argmin(traces))])
+    updated = (axes / (mu + (1.0 - mu) * gains)) @ axes.T
+    spread = shape @ H.T / mu
+    gain = np.linalg.solve(H @ spread + noise / (1.0 - mu), spread.T).T
+    return gain, mu, _symmetric(updated)
+
+
+def _joined(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Returns the smallest ellipsoid around two: in axes in which both are diagonal, the larger of each entry."""
+    root = np.linalg.cholesky(first)
+    inverse = np.linalg.inv(root)
+    values, axes = np.linalg.eigh(inverse @ second @ inverse.T)
+    turned = root @ axes
+    return _symmetric((turned * np.maximum(values, 1.0)) @ turned.T)
+
+
+def _symmetric(matrix: np.ndarray) -> np.ndarray:
+    return 0.5 * (matrix + matrix.T)
