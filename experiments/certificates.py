@@ -9,7 +9,7 @@ import gymnasium as gym
 from tqdm import tqdm
 
 from experiments.settings import SynthesizeSettings, VerifySettings
-from ncs_gym import LinearPlant, scenarios
+from ncs_gym import ChannelContract, LinearPlant, scenarios
 from ncs_gym.scenarios import ENTRY_POINTS
 from shields import Certificate, CertificateError, Report, synthesize, verify
 from shields.storage import write_atomically
@@ -23,8 +23,11 @@ def synthesize_file(settings: SynthesizeSettings) -> None:
         OSError: If the file cannot be written.
     """
     plant = plant_of(settings.env)
+    contract = contract_of_env(settings.env)
+    if settings.max_age is not None:
+        contract = ChannelContract(settings.max_age, contract.quantization_step if contract else 0.0)
     with tqdm(bar_format="{desc} [{elapsed}]", desc="synthesis", leave=False, disable=None) as line:
-        certificate = synthesize(plant, settings.method, progress=line.set_description_str)
+        certificate = synthesize(plant, settings.method, contract=contract, progress=line.set_description_str)
     certificate.save(settings.out)
     print(verify(certificate, plant))
     if certificate.method == "paper":
@@ -63,6 +66,11 @@ def plant_of(env_id: str) -> LinearPlant:
     if env_id not in _with_plant():
         raise ValueError(f"unknown environment {env_id!r}; known are {', '.join(_with_plant())}")
     return gym.make(env_id).unwrapped.plant
+
+
+def contract_of_env(env_id: str) -> ChannelContract | None:
+    """Returns the channel contract a registered environment rests on; None for a stable plant."""
+    return gym.make(env_id).unwrapped.contract
 
 
 def _with_plant() -> list[str]:

@@ -16,7 +16,7 @@ import gymnasium as gym
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from experiments.certificates import plant_of
+from experiments.certificates import contract_of_env, plant_of
 from experiments.figures import episode_figure, phase_figure, training_figure
 from experiments.plotting import as_png
 from experiments.pool import run_all
@@ -78,7 +78,7 @@ def _check(settings: CompareSettings) -> None:
 
 def _certificate(settings: CompareSettings, plant: LinearPlant) -> Certificate:
     if settings.certificate is None:
-        return synthesize(plant)
+        return synthesize(plant, contract=contract_of_env(settings.env))
     certificate = Certificate.load(settings.certificate)
     require_valid(certificate, plant)
     return certificate

@@ -57,12 +57,14 @@ class SynthesizeSettings:
         env: Id of a registered environment.
         method: The certified method, or the published one as printed.
         out: File for the certificate (JSON).
+        max_age: Channel contract to rest on, in steps; by default the environment's own, if it needs one.
         seed: Accepted by every command; the synthesis is deterministic and does not use it.
     """
 
     env: str = "ncs_gym/TruckTrailerCruise-v0"
     method: Literal["certified", "paper"] = "certified"
     out: Path = Path("certificate.json")
+    max_age: int | None = None
     seed: int = 0
 
 

@@ -7,19 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from ncs_gym.contract import ChannelContract
-from ncs_gym.ellipsoid import outer_sum
+from ncs_gym.ellipsoid import is_inside, outer_sum
 from ncs_gym.frozen import FrozenArrays
 from ncs_gym.plant import LinearPlant
 
 # The sets are made for noise this much larger than allowed, so that at run time good gains nearly always fit in.
 NOISE_GROWTH = 1.2
-# Growth per iteration: strict inequalities at the end.
-GROWTH = 1.0 + 1e-6
-# Shares mu that gains are chosen from.
-SHARES = np.linspace(0.01, 0.99, 99)
-ITERATIONS = 5000
-# Relative change per iteration below which nothing happens any more.
-CONVERGED = 1e-9
+# Strict inequalities at the end.
+SLACK = 1.0 + 1e-7
+# Growth per iteration; it doubles now and then, which ends cycles between shares that are equally good.
+SMALLEST_GROWTH, DOUBLING = 1e-6, 50.0
+# Shares mu that gains are chosen from: fine sensors want it close to 1.
+SHARES = np.concatenate([np.linspace(0.01, 0.99, 99), 1.0 - np.logspace(-2.1, -4.0, 20)])
+ITERATIONS = 1000
 # Sets this much larger than the safe box are of no use.
 LARGEST = 1e6
 
@@ -74,8 +74,8 @@ def age_sets(plant: LinearPlant, contract: ChannelContract) -> AgeSets | None:
     """Returns error sets by age, without a solver; None if the iteration finds none.
 
     From Sigma_0 = r0^2 I: carry it through the longest gap, update after every possible gap with the set-membership
-    gain, and let Sigma_0 be the smallest ellipsoid around the results that pairwise joins give; until nothing grows
-    any more. Its limit meets (C0), (C1) and (C2), which is checked; shares minimize traces in units of the box.
+    gain, and let Sigma_0 be the smallest ellipsoid around the results that pairwise joins give; until it holds what
+    comes of it, which is (C0), (C1) and (C2). Shares minimize traces in units of the box.
 
     Args:
         plant: The plant with its bounds.
@@ -90,20 +90,18 @@ def age_sets(plant: LinearPlant, contract: ChannelContract) -> AgeSets | None:
     first = inverse @ plant.initial_error.shape @ inverse.T + 1e-12 * np.eye(plant.n)
     exact = plant.sensor_error_with(contract.quantization_step).shape
     noise = NOISE_GROWTH * exact + 1e-12 * np.diag(np.diag(H @ H.T)) * float(np.trace(D)) / plant.n
-    start, last, steps = first, np.zeros_like(first), contract.max_age + 1
-    for _ in range(ITERATIONS):
+    start, steps = first, contract.max_age + 1
+    for turn in range(ITERATIONS):
         shapes = _carried(start, A, D, steps)
         updates = [_update(shape, H, noise) for shape in shapes[1:]]
         grown = first
         for _, _, shape in reversed(updates):
             grown = _joined(grown, shape)
-        size = float(np.trace(grown))
-        if not size < LARGEST:
+        if not float(np.trace(grown)) < LARGEST:
             return None
-        converged = float(np.abs(grown - last).max()) <= CONVERGED * size
-        start, last = GROWTH * grown, grown
-        if converged:
+        if is_inside(SLACK * grown, start):
             break
+        start = (1.0 + SMALLEST_GROWTH * 2.0 ** (turn / DOUBLING)) * grown
     else:
         return None
     shapes = _carried(start, A, D, steps)
@@ -122,7 +120,7 @@ def _carried(start: np.ndarray, A: np.ndarray, D: np.ndarray, steps: int) -> lis
     """Returns Sigma_0 .. Sigma_steps, each a little more than the trace-smallest ellipsoid the last one moves into."""
     shapes = [start]
     for _ in range(steps):
-        shapes.append(GROWTH * _symmetric(outer_sum(A @ shapes[-1] @ A.T, D, np.eye(len(A)))))
+        shapes.append(SLACK * _symmetric(outer_sum(A @ shapes[-1] @ A.T, D, np.eye(len(A)))))
     return shapes
 
 

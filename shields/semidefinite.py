@@ -15,6 +15,8 @@ from shields.certificate import Multipliers
 from shields.infeasible import Infeasible
 from shields.verification import ACTION_ROUNDING
 
+# No error set in the programs is thinner than this share of its length; exact verification uses the sets themselves.
+THINNEST = 0.01
 USABLE = (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
 
 
@@ -42,13 +44,17 @@ class ScaledProblem:
 
     @property
     def critical(self) -> np.ndarray:
-        """The error sets that lie in no other, shape (l, n, n)."""
+        """The error sets that lie in no other, slightly thickened where they are very flat, shape (l, n, n).
+
+        Linearizing L Sigma^-1 L leaves L no room to move if Sigma is almost flat; a larger set is a sound one.
+        """
         kept = list(self.Sigmas)
         for Sigma in self.Sigmas:
             others = [other for other in kept if other is not Sigma]
             if any(is_inside(Sigma, other) for other in others):
                 kept = others
-        return np.stack(kept)
+        longest = np.linalg.eigvalsh(np.stack(kept))[:, -1]
+        return np.stack(kept) + THINNEST**2 * longest[:, None, None] * np.eye(self.n)
 
     @property
     def n(self) -> int:
@@ -142,7 +148,10 @@ class InvariantSetProgram:
         # solver's accuracy); each has parameters of its own, because products of parameters are not allowed.
         self._slopes = [[cp.Parameter((n, n)) for _ in range(m + 1)] for _ in self._roots]
         self._offsets = [[cp.Parameter((n, n), symmetric=True) for _ in range(m + 1)] for _ in self._roots]
-        self._program = cp.Problem(cp.Maximize(cp.log_det(self._L)), self._constraints(limited))
+        self._stretch = cp.Variable()
+        constraints = self._constraints(limited)
+        self._largest = cp.Problem(cp.Maximize(cp.log_det(self._L)), [*constraints, self._stretch == 1.0])
+        self._roomiest = cp.Problem(cp.Maximize(self._stretch), constraints)
 
     def _constraints(self, limited: bool) -> list[cp.Constraint]:
         """Returns (S), and (I) and (U) for every critical error set, as linear matrix inequalities."""
@@ -161,7 +170,10 @@ class InvariantSetProgram:
         zero = np.zeros((problem.n, problem.n))
         moved, gain = problem.A @ L + problem.B @ F, problem.B @ F @ root
         constraints = [
-            cp.bmat([[L - self._D, moved, gain], [moved.T, self._state * L, zero], [gain.T, zero, X[0]]]) >> 0
+            cp.bmat(
+                [[L - self._stretch * self._D, moved, gain], [moved.T, self._state * L, zero], [gain.T, zero, X[0]]]
+            )
+            >> 0
         ]
         corner = np.array([[1.0 - self.slack - 2.0 * float(ACTION_ROUNDING)]])
         for i in range(problem.m if limited else 0):
@@ -170,25 +182,36 @@ class InvariantSetProgram:
             constraints.append(cp.bmat(blocks) >> 0)
         return constraints
 
-    def solve(self, shares: tuple[float, float, float], inputs: np.ndarray, linearize_at: np.ndarray) -> Design | None:
+    def solve(
+        self,
+        shares: tuple[float, float, float],
+        inputs: np.ndarray,
+        linearize_at: np.ndarray,
+        *,
+        scale: float = 1.0,
+        roomiest: bool = False,
+    ) -> Design | None:
         """Returns the best design for shares (lx, le, ld) and mu, shape (m,); None if there is none.
 
         Args:
             shares: lx, le, ld > 0 that sum to 1.
             inputs: mu_i in (0, 1).
             linearize_at: L0, shape (n, n).
+            scale: Of the radii of disturbance and error sets.
+            roomiest: Look for the design that bears the largest disturbance instead of the largest set.
         """
         lx, le, ld = shares
         self._state.value = lx * (1.0 - self.slack)
-        self._D.value = self.problem.D * ((1.0 + self.slack) / ld)
+        self._D.value = self.problem.D * ((1.0 + self.slack) * scale**2 / ld)
         self._mu.value = inputs
         # With Sigma = G G' the linearized G'XG is G'L (Sigma^-1 L0 G) + its transpose - (G^-1 L0 G)'(G^-1 L0 G).
         for root, slopes, offsets in zip(self._roots, self._slopes, self._offsets, strict=True):
             inner = np.linalg.solve(root, linearize_at @ root)
             slope, offset = np.linalg.solve(root.T, inner), inner.T @ inner
             for share, P, R in zip((le, *(1.0 - inputs)), slopes, offsets, strict=True):
-                P.value, R.value = share * slope, share * 0.5 * (offset + offset.T)
-        if not _solve(self._program):
+                P.value, R.value = share / scale**2 * slope, 0.5 * share / scale**2 * (offset + offset.T)
+        program = self._roomiest if roomiest else self._largest
+        if not _solve(program) or self._stretch.value < 1.0 - 1e-6:
             return None
         L = 0.5 * (self._L.value + self._L.value.T)
         sign, log_det = np.linalg.slogdet(L)
@@ -197,19 +220,20 @@ class InvariantSetProgram:
         return Design(L, np.linalg.solve(L, self._F.value.T).T, shares, inputs, float(log_det))
 
 
-def nominal_set(problem: ScaledProblem, state: float) -> np.ndarray | None:
+def nominal_set(problem: ScaledProblem, state: float, growth: float) -> np.ndarray | None:
     """Returns the largest invariant set without estimation error, (n, n), to linearize at; None if there is none.
 
-    Three times the disturbance and four fifths of the limits leave room for the error.
+    A larger disturbance and four fifths of the limits leave room for the error.
 
     Args:
         problem: The scaled design problem.
         state: lx.
+        growth: Of the disturbance.
     """
     n, m = problem.n, problem.m
     L, F = cp.Variable((n, n), symmetric=True), cp.Variable((m, n))
     moved = problem.A @ L + problem.B @ F
-    spread = 3.0 / (1.0 - state) * problem.D
+    spread = growth / (1.0 - state) * problem.D
     constraints = [
         cp.diag(problem.C @ L @ problem.C.T) <= 1.0,
         cp.bmat([[L - 0.5 * (spread + spread.T), moved], [moved.T, state * L]]) >> 0,

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from importlib.metadata import version
-from itertools import product
 
 import numpy as np
 
@@ -23,23 +21,23 @@ from shields.semidefinite import (
     best_input_shares,
     best_shares,
     largest_box_ellipsoid,
-    nominal_set,
     rounded_down,
     scaled_problem,
 )
+from shields.starts import (
+    CLOSE_ENOUGH,
+    Progress,
+    as_shares,
+    best_start,
+    grown_start,
+    nominal_start,
+    plain_start,
+    volume_of,
+)
 from shields.verification import verify
 
-# (lx, le / (1 - lx)) to start from; without good starts the alternation stalls (theory.md section 3).
-STARTS = ((0.85, 0.3), (0.85, 0.1), (0.92, 0.3), (0.92, 0.1), (0.75, 0.3), (0.6, 0.2), (0.97, 0.2))
-START_INPUT_SHARE = 0.8
-# lx and le / (1 - lx) to start from near the invariant set without estimation error, where the others find nothing:
-# plants that move slowly through their box need lx near 1.
-NOMINAL_STATES = (0.75, 0.85, 0.92, 0.96, 0.98, 0.99, 0.995, 0.998, 0.999)
-NOMINAL_PARTS = (0.1, 0.3, 0.6)
 # Slow cases still gain 1 % a turn after ten.
 ALTERNATIONS = 40
-# Within this of the box ellipsoid's log det nothing is left to gain.
-CLOSE_ENOUGH = 2e-4
 # An alternation that gains less than this in log det has converged.
 SMALLEST_GAIN = 1e-4
 # Room for exact verification, tried in turn.
@@ -47,8 +45,6 @@ SLACKS = (1e-6, 1e-5, 1e-4, 1e-3)
 # The certificate's Sigma and D are larger than the environment's by this, so that another machine's rounding (of a
 # Lyapunov solution, of a chi-square quantile) stays inside.
 GROWTH = 1.0 + 1e-9
-
-Progress = Callable[[str], None]
 
 
 def synthesize(
@@ -94,7 +90,10 @@ def synthesize(
 
 def _certified(plant: LinearPlant, contract: ChannelContract | None, progress: Progress) -> Certificate:
     """Returns the certificate of the certified method."""
-    problem, errors = _design_problem(plant, contract)
+    try:
+        problem, errors = _design_problem(plant, contract)
+    except Infeasible as infeasible:
+        raise _with_largest_age(infeasible, plant, contract) from infeasible
     failure = None
     for slack in SLACKS:
         design = _largest_set(problem, slack, progress)
@@ -110,7 +109,7 @@ def _certified(plant: LinearPlant, contract: ChannelContract | None, progress: P
             failed.name.split()[0].strip("():"),
             -failed.margin,
         )
-    raise failure or _diagnosis(problem)
+    raise failure or _with_largest_age(_diagnosis(problem), plant, contract)
 
 
 def certify(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> Certificate | None:
@@ -174,7 +173,7 @@ def grown(errors: ErrorSet) -> ErrorSet:
 def _largest_set(problem: ScaledProblem, slack: float, progress: Progress) -> Design | None:
     """Returns the best design of several starts, improved by alternation and finished; None if no start works."""
     program = InvariantSetProgram(problem, slack)
-    best = _best_start(problem, program, progress)
+    best = best_start(problem, program, progress)
     if best is None:
         return None
     step = 0.3
@@ -182,43 +181,13 @@ def _largest_set(problem: ScaledProblem, slack: float, progress: Progress) -> De
         if -best.log_det < CLOSE_ENOUGH:
             break
         better = _alternate(problem, program, best, step)
-        progress(f"alternation {turn + 1} of at most {ALTERNATIONS}: {_volume(better)}")
+        progress(f"alternation {turn + 1} of at most {ALTERNATIONS}: {volume_of(better)}")
         if better.log_det - best.log_det < SMALLEST_GAIN:
             step /= 3.0
             if step < 0.03:
                 break
         best = better
     return _finish(problem, best)
-
-
-def _best_start(problem: ScaledProblem, program: InvariantSetProgram, progress: Progress) -> Design | None:
-    """Returns the best design over a handful of shares and two linearizations."""
-    last = problem.Sigmas[-1]
-    near = last / float(np.linalg.eigvalsh(last)[-1])
-    inputs = np.full(problem.m, START_INPUT_SHARE)
-    best = None
-    starts = list(product(STARTS, (np.eye(problem.n), near)))
-    for turn, ((state, part), linearize_at) in enumerate(starts):
-        design = program.solve(_shares(state, part), inputs, linearize_at)
-        if design is not None and (best is None or design.log_det > best.log_det):
-            best = design
-        progress(f"start {turn + 1} of {len(starts)}: {_volume(best)}")
-        if best is not None and -best.log_det < CLOSE_ENOUGH:
-            break
-    return best or _nominal_start(problem, program, progress)
-
-
-def _nominal_start(problem: ScaledProblem, program: InvariantSetProgram, progress: Progress) -> Design | None:
-    """Returns the best design linearized at an invariant set without estimation error; None if there is none."""
-    inputs, best = np.full(problem.m, START_INPUT_SHARE), None
-    for state in NOMINAL_STATES:
-        linearize_at = nominal_set(problem, state)
-        for part in NOMINAL_PARTS if linearize_at is not None else ():
-            design = program.solve(_shares(state, part), inputs, linearize_at)
-            if design is not None and (best is None or design.log_det > best.log_det):
-                best = design
-            progress(f"start near the set without errors, lx = {state}: {_volume(best)}")
-    return best
 
 
 def _alternate(problem: ScaledProblem, program: InvariantSetProgram, best: Design, step: float) -> Design:
@@ -234,7 +203,7 @@ def _alternate(problem: ScaledProblem, program: InvariantSetProgram, best: Desig
     for factor, shift in ((1.0 + step, 0.0), (1.0 / (1.0 + step), 0.0), (1.0, step), (1.0, -step)):
         state = 1.0 - np.clip((1.0 - lx) * factor, 1e-4, 0.99)
         share = np.clip(part * (1.0 + shift), 1e-3, 0.99)
-        best = _better(best, program.solve(_shares(state, share), best.inputs, best.L))
+        best = _better(best, program.solve(as_shares(state, share), best.inputs, best.L))
     return best
 
 
@@ -293,16 +262,44 @@ def _tuned(problem: ScaledProblem, design: Design, Sigmas: np.ndarray) -> Design
     return replace(design, shares=shares, inputs=best_input_shares(Sigmas, design.L, design.K))
 
 
+def _with_largest_age(reason: Infeasible, plant: LinearPlant, contract: ChannelContract | None) -> Infeasible:
+    """Returns the exception with the largest age for which a start is found, under a contract of some age."""
+    if contract is None or contract.max_age == 0 or reason.binding == "S":
+        return reason
+
+    def works(age: int) -> bool:
+        try:
+            problem, _ = _design_problem(plant, replace(contract, max_age=age))
+        except Infeasible:
+            return False
+        program = InvariantSetProgram(problem, SLACKS[0])
+        starts = (start(problem, program, lambda line: None) for start in (nominal_start, plain_start))
+        return any(design is not None for design in starts)
+
+    low, high = -1, contract.max_age
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if works(middle) else (low, middle)
+    hint = f"max_age = {low} is the largest that works" if low >= 0 else "no smaller max_age works either"
+    details = reason.details | ({"max_age": low} if low >= 0 else {})
+    return Infeasible(f"{reason}; {hint} (asked: {contract.max_age})", reason.binding, reason.shortfall, details)
+
+
 def _diagnosis(problem: ScaledProblem) -> Infeasible:
     """Returns the exception that says what binds, from feasibility at reduced uncertainty and without input limits."""
 
     def feasible(scale: float, *, limited: bool = True) -> bool:
         trial = replace(problem, D=scale**2 * problem.D, Sigmas=scale**2 * problem.Sigmas)
         program = InvariantSetProgram(trial, SLACKS[0], limited=limited)
-        return _best_start(trial, program, lambda line: None) is not None
+        found = plain_start(trial, program, silent)
+        return found is not None or (not limited and nominal_start(trial, program, silent) is not None)
 
-    low, high = 0.0, 1.0
-    for _ in range(7):
+    def silent(line: str) -> None:
+        pass
+
+    design, low = grown_start(problem, InvariantSetProgram(problem, SLACKS[0]), silent)
+    low, high = (low, 1.0) if design is not None else (0.0, 1.0)
+    for _ in range(7 if low == 0.0 else 0):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if feasible(middle) else (low, middle)
     binding = "U" if feasible(1.0, limited=False) else "I"
@@ -312,16 +309,6 @@ def _diagnosis(problem: ScaledProblem) -> Infeasible:
         binding,
         1.0 - low,
     )
-
-
-def _shares(state: float, part: float) -> tuple[float, float, float]:
-    """Returns (lx, le, ld) from lx and le / (1 - lx)."""
-    return float(state), float((1.0 - state) * part), float((1.0 - state) * (1.0 - part))
-
-
-def _volume(design: Design | None) -> str:
-    """Returns how large a design's set is, for people."""
-    return "none found yet" if design is None else f"{np.exp(0.5 * design.log_det):.4f} of the box ellipsoid's volume"
 
 
 def _better(best: Design, other: Design | None) -> Design:

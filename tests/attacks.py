@@ -6,7 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from ncs_gym import AdversarialDisturbance, Channel, Ellipsoid, GilbertElliott, LinearPlant, NCSEnv, truck_trailer
+from ncs_gym import (
+    AdversarialDisturbance,
+    Channel,
+    ChannelContract,
+    Ellipsoid,
+    GilbertElliott,
+    LinearPlant,
+    NCSEnv,
+    truck_trailer,
+)
+from ncs_gym.ellipsoid import is_inside
 from shields import Certificate, SafetyShield, synthesize
 from tests.plants import random_plant
 
@@ -37,14 +47,15 @@ RANDOM = {
     )
 }
 POLICIES = ("random", "constant", "outwards", "gain_turned_round", "searching")
-_certificates: dict[str, Certificate] = {}
+_certificates: dict[tuple[str, ChannelContract | None], Certificate] = {}
 
 
-def certificate_of(plant: LinearPlant) -> Certificate:
-    """The certificate of a plant, made once."""
-    if plant.fingerprint not in _certificates:
-        _certificates[plant.fingerprint] = synthesize(plant)
-    return _certificates[plant.fingerprint]
+def certificate_of(plant: LinearPlant, contract: ChannelContract | None = None) -> Certificate:
+    """The certificate of a plant under a contract, made once."""
+    key = plant.fingerprint, contract
+    if key not in _certificates:
+        _certificates[key] = synthesize(plant, contract=contract)
+    return _certificates[key]
 
 
 class ExtremalNoise(NCSEnv):
@@ -96,13 +107,14 @@ def policy(name: str, env: SafetyShield, rng: np.random.Generator):
     }[name]
 
 
-def attack(plant, channel, disturbance, mode, policy_name, seed, steps):
+def attack(plant, channel, disturbance, mode, policy_name, seed, steps, contract=None):
     """Largest level of the true state, largest gauge of the error in its ellipsoid, and interventions.
 
-    Fails if the shield ever doubts its proof: every assumption holds.
+    Fails if the shield ever doubts its proof, or the running ellipsoid leaves the certified one of its age: every
+    assumption holds.
     """
-    certificate = certificate_of(plant)
-    inner = ExtremalNoise(plant, channel, disturbance=disturbance, initial_set=certificate.safe_set)
+    certificate = certificate_of(plant, contract)
+    inner = ExtremalNoise(plant, channel, disturbance=disturbance, initial_set=certificate.safe_set, contract=contract)
     env = SafetyShield(inner, certificate, mode=mode)
     act = policy(policy_name, env, np.random.default_rng(seed))
     level = error = 0.0
@@ -111,11 +123,13 @@ def attack(plant, channel, disturbance, mode, policy_name, seed, steps):
         *_, info = env.step(act(info))
         assert info["shield_guaranteed"], info["shield_reason"]
         assert not info["assumption_violated"]
+        assert not info["contract_broken"]
+        assert is_inside(info["error_shape"], (1 + 1e-12) * inner.error_set.shape_at(info["measurement_age"]))
         level = max(level, certificate.safe_set.gauge(info["state"]))
         error = max(error, Ellipsoid(info["error_shape"]).gauge(info["estimation_error"]))
     return level, error, info["episode_interventions"]
 
 
-def harmful(plant: LinearPlant) -> AdversarialDisturbance:
+def harmful(plant: LinearPlant, contract: ChannelContract | None = None) -> AdversarialDisturbance:
     """The disturbance that pushes the next state farthest out of S."""
-    return AdversarialDisturbance(certificate_of(plant).M)
+    return AdversarialDisturbance(certificate_of(plant, contract).M)

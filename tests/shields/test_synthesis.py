@@ -5,7 +5,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import LinearPlant, truck_trailer
+from ncs_gym import ChannelContract, LinearPlant, truck_trailer
 from shields import Infeasible, SafetyShield, synthesize, verify
 from shields.semidefinite import largest_box_ellipsoid
 from tests.plants import random_plant
@@ -116,16 +116,15 @@ def test_unbounded_box_is_infeasible():
 
 
 def test_weak_input_is_what_binds():
-    # Disturbances that the plant alone cannot stand inside the box, but a strong input can.
+    # An unstable plant that a strong input can hold in the box, and a weak one cannot.
     def with_limit(u_max):
-        return LinearPlant(
-            A=[[0.9, 0.35], [0.0, 0.8]], B=[[0.0], [1.0]], C=np.eye(2), u_max=u_max, dt=0.1, gamma=1.95e-3,
-            measurement_noise_cov=1e-6 * np.eye(2), initial_cov=1e-8 * np.eye(2),
-        )  # fmt: skip
+        return LinearPlant(A=[[1.1]], B=[[1.0]], C=[[1.0]], u_max=u_max, dt=0.1, gamma=4e-4)
 
-    assert verify(synthesize(with_limit(5.0)), with_limit(5.0)).valid
+    contract = ChannelContract(1)
+    certificate = synthesize(with_limit(1.0), contract=contract)
+    assert verify(certificate, with_limit(1.0)).valid
     with pytest.raises(Infeasible) as caught:
-        synthesize(with_limit(1e-4))
+        synthesize(with_limit(1e-3), contract=contract)
     assert caught.value.binding == "U"
 
 

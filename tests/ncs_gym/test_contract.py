@@ -1,0 +1,227 @@
+from dataclasses import replace
+from fractions import Fraction
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from ncs_gym import (
+    Channel,
+    ChannelContract,
+    Ellipsoid,
+    ErrorSetError,
+    GilbertElliott,
+    LinearPlant,
+    NCSEnv,
+    SetpointTracking,
+    UnstablePlantError,
+    batch_reactor,
+    cart_pole,
+    certified_error_set,
+    contract_of,
+    truck_trailer,
+)
+from ncs_gym.channel import Link
+from ncs_gym.ellipsoid import is_inside
+from ncs_gym.estimator import Estimator
+from shields.exact import add, congruence, is_positive_semidefinite, multiply, rational, scale, subtract
+
+PLANTS = {
+    "cart-pole": (cart_pole(), ChannelContract(4, 1e-4)),
+    "cart-pole, position and angle": (cart_pole(full_state=False), ChannelContract(3)),
+    "batch reactor": (batch_reactor(), ChannelContract(3, 1e-3)),
+    "truck-trailer": (truck_trailer(), ChannelContract(5, 0.05)),
+    "scalar": (LinearPlant(A=[[1.2]], B=[[1.0]], C=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-4), ChannelContract(0)),
+}
+CHANNELS = [
+    Channel(loss=0.5, max_consecutive_losses=2),
+    Channel(loss=1.0, max_consecutive_losses=1, send_period=3),
+    Channel(loss=GilbertElliott(p_good_to_bad=0.3, p_bad_to_good=0.1), max_consecutive_losses=3, delay=1, jitter=2),
+    Channel(delay=4),
+    Channel(loss=0.7, max_consecutive_losses=1, send_period=2, jitter=3),
+]
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+def test_channel_keeps_the_contract_derived_from_it_and_no_better_one(channel):
+    # By another route: the newest sample that has arrived, counted packet by packet.
+    contract, rng = contract_of(channel), np.random.default_rng(0)
+    link, newest, oldest = Link(channel, rng), 0, 0
+    for step in range(1, 20_000):
+        sample = np.zeros(1) if link.sends_at(step) else None
+        newest = max([newest, *(packet.stamp for packet in link.exchange(rng, step, sample))])
+        oldest = max(oldest, step - newest)
+    assert oldest == contract.max_age
+
+
+@pytest.mark.parametrize("most", [0, 1, 3])
+def test_channel_never_loses_more_in_a_row_than_it_promises(most):
+    channel, rng = Channel(loss=0.9, max_consecutive_losses=most), np.random.default_rng(1)
+    link = Link(channel, rng)
+    arrived = [bool(link.exchange(rng, step, np.zeros(1))) for step in range(1, 3000)]
+    runs = "".join("1" if here else "0" for here in arrived).split("1")
+    assert max(map(len, runs)) == most
+
+
+def test_channel_that_may_lose_for_ever_promises_nothing():
+    assert contract_of(Channel(loss=0.1)) is None
+    assert contract_of(Channel(loss=1.0)) is None
+    assert contract_of(Channel(loss=GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.5))) is None
+    assert contract_of(Channel(quantization_step=0.1)) == ChannelContract(0, 0.1)
+    assert contract_of(Channel(loss=GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.5, loss_bad=0.0))).max_age == 0
+
+
+def test_contract_knows_who_keeps_it():
+    contract = ChannelContract(3, 0.01)
+    assert contract.is_kept_by(Channel(loss=0.5, max_consecutive_losses=3))
+    assert not contract.is_kept_by(Channel(loss=0.5, max_consecutive_losses=4))
+    assert not contract.is_kept_by(Channel(quantization_step=0.02))
+    assert not contract.is_kept_by(Channel(loss=0.5))
+
+
+@pytest.mark.parametrize("bad", [-1, 1.5, None, "h", True])
+def test_bad_contracts_are_refused(bad):
+    with pytest.raises(ValueError, match="max_age"):
+        ChannelContract(bad)
+    with pytest.raises(ValueError, match="max_consecutive_losses"):
+        Channel(max_consecutive_losses=-1 if bad is None else bad)
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_error_sets_meet_their_conditions_exactly(name):
+    plant, contract = PLANTS[name]
+    sets = certified_error_set(plant, contract).ages
+    A, H, D, N = (rational(matrix) for matrix in (plant.A, plant.H, plant.disturbance.shape, sets.noise))
+    shapes = [rational(shape) for shape in sets.shapes]
+    assert len(shapes) == contract.max_age + 2
+    assert is_positive_semidefinite(subtract(shapes[0], rational(plant.initial_error.shape)))
+    for j, rate in enumerate(map(Fraction, sets.rates)):
+        grown = add(scale(1 / rate, congruence(A, shapes[j])), scale(1 / (1 - rate), D))
+        assert is_positive_semidefinite(subtract(shapes[j + 1], grown))
+    for j, (gain, share) in enumerate(zip(sets.gains, map(Fraction, sets.shares), strict=True), start=1):
+        T = rational(gain)
+        kept = congruence(subtract(rational(np.eye(plant.n)), multiply(T, H)), shapes[j])
+        updated = add(scale(1 / share, kept), scale(1 / (1 - share), congruence(T, N)))
+        assert is_positive_semidefinite(subtract(shapes[0], updated))
+
+
+def test_contract_makes_the_error_set_of_a_stable_plant_smaller():
+    plant = truck_trailer(mass=4000.0)
+    promised = certified_error_set(plant, ChannelContract(2))
+    assert np.trace(promised.Sigma) < np.trace(certified_error_set(plant).Sigma)
+
+
+def test_no_error_set_is_found_for_a_promise_that_is_too_weak():
+    with pytest.raises(ErrorSetError, match="promise"):
+        certified_error_set(batch_reactor(), ChannelContract(200))
+
+
+def test_unstable_plant_needs_a_promise():
+    with pytest.raises(UnstablePlantError, match="max_consecutive_losses"):
+        NCSEnv(cart_pole(), Channel(loss=0.1))
+    assert NCSEnv(cart_pole(), Channel(delay=1)).contract == ChannelContract(1)
+    assert NCSEnv(cart_pole(), Channel(loss=0.1), contract=ChannelContract(4)).contract == ChannelContract(4)
+    assert NCSEnv(truck_trailer(), Channel()).contract is None
+    with pytest.raises(ValueError, match="rounds to"):
+        NCSEnv(cart_pole(), Channel(quantization_step=0.1), contract=ChannelContract(4, 0.01))
+    with pytest.raises(ValueError, match="contract must be"):
+        NCSEnv(cart_pole(), Channel(), contract=4)
+
+
+def test_update_falls_back_to_the_certified_gain_and_never_skips(monkeypatch):
+    plant, contract = PLANTS["batch reactor"]
+    channel = Channel(loss=0.5, max_consecutive_losses=3)
+    estimator = Estimator(plant, channel, certified_error_set(plant, contract))
+    # Bad gains: neither the Kalman nor the set-membership gain will do.
+    monkeypatch.setattr(estimator, "_membership_gain", lambda shape: np.full((4, 2), 50.0))
+    estimator._filter.P = np.eye(4)
+    rng, x = np.random.default_rng(0), 1e-4 * np.ones(4)
+    estimator.reset(x.copy())
+    monkeypatch.setattr(estimator._filter, "update", lambda z: setattr(estimator._filter, "K", np.full((4, 2), 50.0)))
+    link, used = Link(channel, rng), 0
+    for step in range(1, 200):
+        d = (1 - 1e-9) * plant.nominal_disturbance.sample_boundary(rng)
+        u = -rng.uniform(-1, 1, 2) * 0.0
+        x = plant.A @ x + d
+        if np.abs(x).max() > 0.5:  # the plant is unstable; only the error matters here
+            u = np.zeros(2)
+            shift = x.copy()
+            x = x - shift
+            estimator.belief = estimator.belief._replace(mean=estimator.belief.mean - np.linalg.solve(plant.A, shift))
+            estimator._priors.clear()
+        packets = link.exchange(rng, step, plant.H @ x + (1 - 1e-9) * plant.sensor_noise.bound.sample_boundary(rng))
+        estimator.advance(u, packets)
+        used += estimator.age == 0
+        assert is_inside(estimator.belief.shape, (1 + 1e-12) * estimator.error_set.shape_at(estimator.age))
+        assert Ellipsoid(estimator.belief.shape).gauge(estimator.belief.mean - x) <= 1.0
+    assert used > 50
+
+
+@pytest.mark.parametrize("env_id", ["ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0"])
+def test_registered_channels_keep_their_contracts(env_id):
+    env = gym.make(env_id).unwrapped
+    assert env.contract.is_kept_by(env.channel)
+    assert env.plant.spectral_radius > 1.0
+    assert env.terminate_on_violation
+    _, info = env.reset(seed=0)
+    ages = []
+    for _ in range(300):
+        info = env.step(np.zeros(env.plant.m))[4]
+        ages.append(info["measurement_age"])
+        assert not info["contract_broken"]
+    assert max(ages) == env.contract.max_age
+
+
+@pytest.mark.parametrize("env_id", ["ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0"])
+def test_breaking_the_contract_is_reported_when_it_happens(env_id):
+    whole = gym.make(env_id).unwrapped.channel
+    env = gym.make(env_id, channel=replace(whole, max_consecutive_losses=None, loss=1.0)).unwrapped
+    env.reset(seed=0)
+    for step in range(1, 12):
+        info = env.step(np.zeros(env.plant.m))[4]
+        assert info["contract_broken"] is (step > env.contract.max_age)
+
+
+def test_one_step_beyond_the_contract_the_error_can_leave_the_certified_set():
+    for plant, contract in PLANTS.values():
+        if plant.spectral_radius < 1.0:
+            continue
+        sets = certified_error_set(plant, contract)
+        M, errors = np.linalg.inv(sets.Sigma), Ellipsoid(sets.Sigma)
+        worst = 0.0
+        for seed in range(20):
+            slope = np.random.default_rng(seed).standard_normal(plant.n)
+            for _ in range(60):
+                e, d = errors.extreme_point(plant.A.T @ slope), plant.disturbance.extreme_point(slope)
+                slope = M @ (plant.A @ e + d)
+            worst = max(worst, errors.gauge(plant.A @ e + d))
+        assert worst > 1.01
+
+
+def test_exact_discretization_of_the_unstable_plants():
+    # By another route: fine Euler steps of the continuous equations.
+    for plant, rates in ((cart_pole(), [(3, 2, 1.1 * 9.81 / 0.5), (1, 2, -0.1 * 9.81)]),):
+        x, u, steps = np.array([0.1, -0.2, 0.05, 0.3]), 2.0, 20_000
+        expected = plant.A @ x + plant.B @ [u]
+        h = plant.dt / steps
+        for _ in range(steps):
+            slope = np.array([x[1], u, x[3], -u / 0.5])
+            for row, column, rate in rates:
+                slope[row] += rate * x[column]
+            x = x + h * slope
+        np.testing.assert_allclose(x, expected, atol=1e-6)
+    assert batch_reactor().spectral_radius == pytest.approx(1.1047, abs=1e-4)
+
+
+def test_setpoint_tracking_pays_for_being_close():
+    task, plant = SetpointTracking(output=(1.0, 0.0), reach=1.0, width=0.5, change_probability=1.0), truck_trailer()
+    rng = np.random.default_rng(0)
+    target = task.begin(rng, plant)
+    assert task.reward(plant, target, np.array([target, 9.0]), np.zeros(1)) == 1.0
+    assert task.reward(plant, target, np.array([target + 0.25, 0.0]), np.zeros(1)) == pytest.approx(0.5)
+    assert task.reward(plant, target, np.array([target - 3.0, 0.0]), np.zeros(1)) == 0.0
+    targets = {task.advance(rng, plant, target, np.zeros(1)) for _ in range(50)}
+    assert len(targets) == 50
+    assert max(map(abs, targets)) <= 1.0
+    np.testing.assert_array_equal(task.observe(target), [target])
+    assert "shape (4,)" in task.check(cart_pole())

@@ -1,0 +1,183 @@
+"""Attacks on unstable plants whose channel goes to the edge of its contract."""
+
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from ncs_gym import Channel, ChannelContract, batch_reactor, cart_pole
+from shields import Certificate, CertificateError, SafetyShield, synthesize, verify
+from shields.proof import LARGE_ERROR, NOT_KNOWN_INSIDE
+from tests.attacks import attack, certificate_of, harmful
+
+PLANTS = {
+    "cart-pole": (cart_pole(), ChannelContract(4)),
+    "cart-pole, position and angle": (cart_pole(full_state=False), ChannelContract(3)),
+    "batch reactor": (batch_reactor(), ChannelContract(3)),
+}
+
+
+def edges(age):
+    """Channels that keep ChannelContract(age) and use all of it."""
+    return {
+        "constant delay": Channel(delay=age),
+        "longest gap each time": Channel(loss=1.0, max_consecutive_losses=age),
+        "overtaking": Channel(loss=0.4, max_consecutive_losses=1, jitter=age - 1),
+    }
+
+
+@pytest.mark.parametrize("steps", [250, pytest.param(9000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("channel", edges(3))
+@pytest.mark.parametrize("name", PLANTS)
+def test_unstable_plants_never_leave_their_safe_sets_while_the_contract_is_kept(name, channel, steps):
+    plant, contract = PLANTS[name]
+    edge = edges(contract.max_age)[channel]
+    assert contract.is_kept_by(edge)
+    for seed, (mode, policy) in enumerate(
+        [("project", "random"), ("project", "outwards"), ("switch", "searching"), ("boundary", "random")]
+    ):
+        disturbance = "sphere" if policy == "random" else harmful(plant, contract)
+        level, error, overridden = attack(plant, edge, disturbance, mode, policy, seed + steps, steps, contract)
+        assert level <= 1.0
+        assert error <= 1.0
+        assert overridden > 0
+
+
+def test_the_attack_comes_close():
+    plant, contract = PLANTS["cart-pole"]
+    edge = edges(contract.max_age)["constant delay"]
+    level, error, _ = attack(plant, edge, harmful(plant, contract), "project", "outwards", 1, 1500, contract)
+    assert level > 0.98
+    assert error > 0.6
+
+
+@pytest.mark.parametrize("env_id", ["ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0"])
+def test_registered_environments_are_shielded_out_of_the_box(env_id):
+    rng = np.random.default_rng(0)
+    shielded, bare = SafetyShield(gym.make(env_id)), gym.make(env_id)
+    for env, violates in ((shielded, False), (bare, True)):
+        violations = 0.0
+        for seed in range(5):
+            env.reset(seed=seed)
+            ended = False
+            while not ended:
+                action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+                *_, terminated, truncated, info = env.step(action)
+                ended = terminated or truncated
+            violations += info["episode_violations"]
+            assert info.get("shield_guaranteed", True)
+        assert (violations > 0.0) is violates
+
+
+@pytest.mark.parametrize("env_id", ["ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0"])
+def test_broken_contract_ends_the_guarantee_in_time_and_newer_samples_restore_it(env_id):
+    whole = gym.make(env_id)
+    silent = replace(whole.unwrapped.channel, max_consecutive_losses=None, loss=1.0)
+    env = SafetyShield(
+        gym.make(env_id, channel=silent, terminate_on_violation=False, disturbance="adversarial"),
+        certificate_of(whole.unwrapped.plant, whole.unwrapped.contract),
+    )
+    env.reset(seed=0)
+    outside = guaranteed_outside = 0
+    reasons = set()
+    for _ in range(80):
+        *_, info = env.step(env.action_space.sample())
+        level = info["state"] @ env.certificate.M @ info["state"]
+        outside += level > 1.0
+        guaranteed_outside += level > 1.0 and info["shield_guaranteed"]
+        reasons.add(info["shield_reason"])
+    assert reasons & {LARGE_ERROR, NOT_KNOWN_INSIDE}
+    assert outside > 0  # without samples an unstable plant is lost ...
+    assert guaranteed_outside == 0  # ... and never while the shield says otherwise
+
+
+@pytest.fixture(scope="module")
+def promised():
+    plant, contract = batch_reactor(), ChannelContract(2, 1e-3)
+    return plant, synthesize(plant, contract=contract)
+
+
+def test_certificate_under_a_contract_is_valid_and_survives_its_file(promised, tmp_path):
+    plant, certificate = promised
+    assert verify(certificate, plant).valid
+    certificate.save(tmp_path / "c.json")
+    loaded = Certificate.load(tmp_path / "c.json")
+    assert verify(loaded, plant).valid
+    assert loaded.ages.sets.contract == certificate.ages.sets.contract
+    np.testing.assert_array_equal(loaded.ages.sets.shapes, certificate.ages.sets.shapes)
+    np.testing.assert_array_equal(loaded.ages.inputs, certificate.ages.inputs)
+    names = [condition.name for condition in verify(certificate, plant).conditions]
+    assert sum(name.startswith("(C1)") for name in names) == sum(name.startswith("(C2)") for name in names) == 3
+    assert sum(name.startswith("(I)") for name in names) == 3
+    assert sum(name.startswith("(U)") for name in names) == 6
+
+
+def sets(certificate, **change):
+    return replace(certificate, ages=replace(certificate.ages, sets=replace(certificate.ages.sets, **change)))
+
+
+def at(array, index, factor):
+    changed = array.copy()
+    changed[index] = changed[index] * factor
+    return changed
+
+
+MUTATIONS = {
+    "small first set": (lambda c, s: sets(c, shapes=at(s.shapes, 0, 1e-6)), ["(C0)", "(C2)"]),
+    "a set in between": (lambda c, s: sets(c, shapes=at(s.shapes, 1, 0.9)), ["(C1) Sigma_1"]),
+    "the last set": (lambda c, s: sets(c, shapes=at(s.shapes, 3, 0.9)), ["(C1) Sigma_3"]),
+    "a gain": (lambda c, s: sets(c, gains=at(s.gains, 1, 1.5)), ["(C2)"]),
+    "no gain": (lambda c, s: sets(c, gains=at(s.gains, 2, 0.0)), ["(C2)"]),
+    "a rate": (lambda c, s: sets(c, rates=at(s.rates, 0, 0.5)), ["(C1) Sigma_1"]),
+    "a rate above one": (lambda c, s: sets(c, rates=at(s.rates, 0, 5.0)), ["0 < lam_e < 1"]),
+    "a share": (lambda c, s: sets(c, shares=at(s.shares, 0, 0.01)), ["(C2)"]),
+    "less noise": (lambda c, s: sets(c, noise=0.9 * s.noise), ["N:"]),
+    "coarser rounding": (lambda c, s: sets(c, contract=ChannelContract(2, 5e-3)), ["N:"]),
+    "another Sigma": (lambda c, s: replace(c, Sigma=1.1 * c.Sigma), ["Sigma is the set of the largest age"]),
+    "shares of (I)": (
+        lambda c, s: replace(c, ages=replace(c.ages, shares=at(c.ages.shares, (1, 1), 1e-6))),
+        ["(I) L - (A+BK) L (A+BK)'/lx - BK Sigma K'B'/le - D_u/ld >= 0 at age 1"],
+    ),
+    "shares of (U)": (
+        lambda c, s: replace(c, ages=replace(c.ages, inputs=at(c.ages.inputs, (0, 1), 1e-9))),
+        ["(U) input 2 stays within u_max (1 - 2^-24) at age 0"],
+    ),
+    "shares above one": (
+        lambda c, s: replace(c, ages=replace(c.ages, shares=at(c.ages.shares, (2, 0), 1.5))),
+        ["lx + le + ld <= 1"],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MUTATIONS)
+def test_mutation_of_a_proof_by_age_is_rejected_for_the_right_condition(name, promised):
+    plant, certificate = promised
+    mutate, expected = MUTATIONS[name]
+    report = verify(mutate(certificate, certificate.ages.sets), plant)
+    broken = [condition.name for condition in report.conditions if not condition.holds]
+    for mark in expected:
+        assert any(mark in found for found in broken), (mark, broken)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"shapes": np.zeros((2, 4, 4))},
+        {"rates": np.zeros(5)},
+        {"gains": np.full((3, 4, 2), np.nan)},
+        {"contract": ChannelContract(3)},
+    ],
+)
+def test_proof_by_age_that_does_not_fit_together_is_no_certificate(promised, change):
+    _, certificate = promised
+    with pytest.raises(CertificateError):
+        sets(certificate, **change)
+
+
+def test_certificate_for_other_outputs_does_not_fit(promised):
+    _, certificate = promised
+    other = batch_reactor(H=np.eye(4), measurement_noise_cov=1e-6 * np.eye(4))
+    report = verify(replace(certificate, fingerprint=other.fingerprint), other)
+    assert not report.valid
+    assert "shapes" in next(condition.name for condition in report.conditions if not condition.holds)
