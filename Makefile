@@ -27,6 +27,7 @@ benchmark: $(INSTALLED)
 	$(BIN)/python benchmarks/shield_decision.py
 	$(BIN)/python benchmarks/containment.py
 	$(BIN)/python benchmarks/synthesis.py
+	$(BIN)/python benchmarks/contracts.py
 	$(BIN)/python benchmarks/codesign_grid.py
 	$(BIN)/python benchmarks/ppo_settings.py
 

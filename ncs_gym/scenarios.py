@@ -114,7 +114,7 @@ TRUCK_TRAILER_CRUISE = Scenario(
 LINEAR_NCS = Scenario(plant=None, channel=Channel(), task=Regulation())
 
 # One sample per step that is 1 to 2 steps late; 20 % are lost, never more than two in a row: no sample in use is older
-# than 4 steps. Positions are rounded to a millimeter and a milliradian.
+# than 4 steps. Measurements are rounded to 1e-4 of their units.
 CART_POLE_CHANNEL = Channel(loss=0.2, delay=1, jitter=1, max_consecutive_losses=2, quantization_step=1e-4)
 CART_POLE = Scenario(
     plant=cart_pole,

@@ -91,7 +91,7 @@ def synthesize(
 def _certified(plant: LinearPlant, contract: ChannelContract | None, progress: Progress) -> Certificate:
     """Returns the certificate of the certified method."""
     try:
-        problem, errors = _design_problem(plant, contract)
+        problem, errors = design_problem(plant, contract)
     except Infeasible as infeasible:
         raise _with_largest_age(infeasible, plant, contract) from infeasible
     failure = None
@@ -123,7 +123,7 @@ def certify(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> Certificate | N
     Raises:
         Infeasible: If the plant has no error set or its box is unbounded.
     """
-    problem, errors = _design_problem(plant)
+    problem, errors = design_problem(plant)
     inverse = np.linalg.inv(problem.transform)
     scaled_L, scaled_K = inverse @ L @ inverse.T, (K @ problem.transform) / problem.u_max[:, None]
     shares, _ = best_shares(problem, problem.Sigmas, scaled_L, scaled_K, (0.9, 0.03, 0.07))
@@ -141,7 +141,7 @@ def _is_certifiable(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> bool:
         return False
 
 
-def _design_problem(plant: LinearPlant, contract: ChannelContract | None = None) -> tuple[ScaledProblem, ErrorSet]:
+def design_problem(plant: LinearPlant, contract: ChannelContract | None = None) -> tuple[ScaledProblem, ErrorSet]:
     """Returns the scaled problem and the error set, with its shapes a little larger than the environment's.
 
     Raises:
@@ -269,7 +269,7 @@ def _with_largest_age(reason: Infeasible, plant: LinearPlant, contract: ChannelC
 
     def works(age: int) -> bool:
         try:
-            problem, _ = _design_problem(plant, replace(contract, max_age=age))
+            problem, _ = design_problem(plant, replace(contract, max_age=age))
         except Infeasible:
             return False
         program = InvariantSetProgram(problem, SLACKS[0])

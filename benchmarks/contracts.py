@@ -1,0 +1,89 @@
+"""The largest disturbance for which the synthesis finds a start, against the contract's age, per unstable plant.
+
+    python benchmarks/contracts.py [--ages 1 4 8] [--out contracts.png]
+
+Disturbance radii are in percent of the half-widths of the safe box; sensor noise and first error are a hundredth of
+that. By bisection to 8 %; a start is what the synthesis needs, the rest of it enlarges the set. Seconds are those of a
+whole synthesis, with exact verification, at two thirds of that radius.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from ncs_gym import ChannelContract, LinearPlant, batch_reactor, cart_pole
+from ncs_gym.noise import chi2_quantile
+from shields import Infeasible, synthesize
+from shields.semidefinite import InvariantSetProgram
+from shields.starts import best_start
+from shields.synthesis import SLACKS, design_problem
+
+PLANTS = {
+    "cart-pole, full state": cart_pole(),
+    "cart-pole, position and angle": cart_pole(full_state=False),
+    "batch reactor, two outputs": batch_reactor(),
+}
+PRECISION = 1.08
+
+
+def with_radius(plant: LinearPlant, radius: float) -> LinearPlant:
+    """The plant with a disturbance of a share of the box, and a hundredth of that for sensors and first estimate."""
+    half_widths, n = plant.half_widths, plant.n
+    outputs = np.abs(plant.H) @ half_widths
+    return replace(
+        plant,
+        process_noise_cov=np.diag((radius * half_widths) ** 2) / chi2_quantile(0.95, n),
+        measurement_noise_cov=np.diag((0.01 * radius * outputs) ** 2) / chi2_quantile(0.95, plant.p),
+        initial_cov=(0.01 * radius * half_widths.min()) ** 2 / chi2_quantile(0.95, n) * np.eye(n),
+    )
+
+
+def has_start(plant: LinearPlant, contract: ChannelContract) -> bool:
+    try:
+        problem, _ = design_problem(plant, contract)
+    except Infeasible:
+        return False
+    return best_start(problem, InvariantSetProgram(problem, SLACKS[0]), lambda line: None) is not None
+
+
+def largest_radius(plant: LinearPlant, contract: ChannelContract) -> float:
+    low, high = 1e-5, 0.1
+    while high / low > PRECISION:
+        middle = (low * high) ** 0.5
+        low, high = (middle, high) if has_start(with_radius(plant, middle), contract) else (low, middle)
+    return low
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--ages", type=int, nargs="+", default=[1, 4, 8])
+    parser.add_argument("--out", default=None, help="file for a figure")
+    options = parser.parse_args()
+    print(f"{'plant':32s}{'max_age':>8s}{'radius / box':>14s}{'volume / box':>14s}{'synthesis [s]':>15s}", flush=True)
+    figure, axes = plt.subplots(figsize=(5.5, 3.5), layout="constrained")
+    for name, plant in PLANTS.items():
+        radii = []
+        for age in options.ages:
+            contract = ChannelContract(age)
+            radii.append(largest_radius(plant, contract))
+            start = time.perf_counter()
+            certificate = synthesize(with_radius(plant, radii[-1] / 1.5), contract=contract)
+            seconds = time.perf_counter() - start
+            volume = certificate.provenance["volume_of_box_ellipsoid"]
+            print(f"{name:32s}{age:8d}{radii[-1]:14.3%}{volume:14.2f}{seconds:15.1f}", flush=True)
+        axes.semilogy(options.ages, 100.0 * np.array(radii), marker="o", label=name)
+    axes.set_xlabel("max_age of the contract [steps]")
+    axes.set_ylabel("largest disturbance radius [% of the box]")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    if options.out is not None:
+        figure.savefig(options.out, dpi=150)
+
+
+if __name__ == "__main__":
+    main()
