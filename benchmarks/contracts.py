@@ -19,9 +19,10 @@ import numpy as np
 from ncs_gym import ChannelContract, LinearPlant, batch_reactor, cart_pole
 from ncs_gym.noise import chi2_quantile
 from shields import Infeasible, synthesize
+from shields.design_problem import design_problem
 from shields.semidefinite import InvariantSetProgram
 from shields.starts import best_start
-from shields.synthesis import SLACKS, design_problem
+from shields.synthesis import SLACKS
 
 PLANTS = {
     "cart-pole, full state": cart_pole(),

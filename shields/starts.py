@@ -12,10 +12,9 @@ from shields.semidefinite import (
     Design,
     InvariantSetProgram,
     ScaledProblem,
-    best_input_shares,
-    best_shares,
     nominal_set,
 )
+from shields.shares import best_input_shares, best_shares
 
 # (lx, le / (1 - lx)) to start from; without good starts the alternation stalls (theory.md section 3).
 STARTS = ((0.85, 0.3), (0.85, 0.1), (0.92, 0.3), (0.92, 0.1), (0.75, 0.3), (0.6, 0.2), (0.97, 0.2))

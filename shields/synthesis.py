@@ -7,31 +7,25 @@ from importlib.metadata import version
 
 import numpy as np
 
-from ncs_gym import ErrorSet, ErrorSetError, LinearPlant, UnstablePlantError, certified_error_set
+from ncs_gym import ErrorSet, LinearPlant
 from ncs_gym.contract import ChannelContract
 from shields.certificate import AgeProof, Certificate
+from shields.design_problem import GROWTH, design_problem
+from shields.diagnosis import diagnosis, with_largest_age
 from shields.infeasible import Infeasible
 from shields.paper import paper_certificate
 from shields.semidefinite import (
     Design,
     InvariantSetProgram,
     ScaledProblem,
-    as_multipliers,
     best_gain,
-    best_input_shares,
-    best_shares,
-    largest_box_ellipsoid,
-    rounded_down,
-    scaled_problem,
 )
+from shields.shares import as_multipliers, best_input_shares, best_shares, rounded_down
 from shields.starts import (
     CLOSE_ENOUGH,
     Progress,
     as_shares,
     best_start,
-    grown_start,
-    nominal_start,
-    plain_start,
     volume_of,
 )
 from shields.verification import verify
@@ -42,9 +36,6 @@ ALTERNATIONS = 40
 SMALLEST_GAIN = 1e-4
 # Room for exact verification, tried in turn.
 SLACKS = (1e-6, 1e-5, 1e-4, 1e-3)
-# The certificate's Sigma and D are larger than the environment's by this, so that another machine's rounding (of a
-# Lyapunov solution, of a chi-square quantile) stays inside.
-GROWTH = 1.0 + 1e-9
 
 
 def synthesize(
@@ -93,7 +84,7 @@ def _certified(plant: LinearPlant, contract: ChannelContract | None, progress: P
     try:
         problem, errors = design_problem(plant, contract)
     except Infeasible as infeasible:
-        raise _with_largest_age(infeasible, plant, contract) from infeasible
+        raise with_largest_age(infeasible, plant, contract) from infeasible
     failure = None
     for slack in SLACKS:
         design = _largest_set(problem, slack, progress)
@@ -109,7 +100,7 @@ def _certified(plant: LinearPlant, contract: ChannelContract | None, progress: P
             failed.name.split()[0].strip("():"),
             -failed.margin,
         )
-    raise failure or _with_largest_age(_diagnosis(problem), plant, contract)
+    raise failure or with_largest_age(diagnosis(problem), plant, contract)
 
 
 def certify(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> Certificate | None:
@@ -139,35 +130,6 @@ def _is_certifiable(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> bool:
         return certify(plant, L, K) is not None
     except Infeasible:
         return False
-
-
-def design_problem(plant: LinearPlant, contract: ChannelContract | None = None) -> tuple[ScaledProblem, ErrorSet]:
-    """Returns the scaled problem and the error set, with its shapes a little larger than the environment's.
-
-    Raises:
-        Infeasible: If the plant has no error set or its box is unbounded.
-    """
-    free = plant.n - int(np.linalg.matrix_rank(plant.C))
-    if free:
-        raise Infeasible(
-            f"the safe box leaves {free} of {plant.n} directions unbounded: add rows to C with generous limits",
-            "S",
-            free,
-        )
-    try:
-        errors = grown(certified_error_set(plant, contract))
-    except UnstablePlantError as error:
-        raise Infeasible(f"(E1) cannot hold: {error}", "E1", plant.spectral_radius - 1.0) from error
-    except ErrorSetError as error:
-        raise Infeasible(str(error), "E1", 0.0) from error
-    shapes = errors.Sigma[None] if errors.ages is None else errors.ages.shapes[:-1]
-    return scaled_problem(plant, shapes, largest_box_ellipsoid(plant.C)), errors
-
-
-def grown(errors: ErrorSet) -> ErrorSet:
-    """Returns an error set with every shape larger by GROWTH; (E0) to (C2) keep holding."""
-    ages = errors.ages and replace(errors.ages, shapes=GROWTH * errors.ages.shapes)
-    return replace(errors, Sigma=GROWTH * errors.Sigma, ages=ages)
 
 
 def _largest_set(problem: ScaledProblem, slack: float, progress: Progress) -> Design | None:
@@ -260,55 +222,6 @@ def _tuned(problem: ScaledProblem, design: Design, Sigmas: np.ndarray) -> Design
     """Returns a design with the shares that suit some of its error sets best."""
     shares, _ = best_shares(problem, Sigmas, design.L, design.K, design.shares)
     return replace(design, shares=shares, inputs=best_input_shares(Sigmas, design.L, design.K))
-
-
-def _with_largest_age(reason: Infeasible, plant: LinearPlant, contract: ChannelContract | None) -> Infeasible:
-    """Returns the exception with the largest age for which a start is found, under a contract of some age."""
-    if contract is None or contract.max_age == 0 or reason.binding == "S":
-        return reason
-
-    def works(age: int) -> bool:
-        try:
-            problem, _ = design_problem(plant, replace(contract, max_age=age))
-        except Infeasible:
-            return False
-        program = InvariantSetProgram(problem, SLACKS[0])
-        starts = (start(problem, program, lambda line: None) for start in (nominal_start, plain_start))
-        return any(design is not None for design in starts)
-
-    low, high = -1, contract.max_age
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if works(middle) else (low, middle)
-    hint = f"max_age = {low} is the largest that works" if low >= 0 else "no smaller max_age works either"
-    details = reason.details | ({"max_age": low} if low >= 0 else {})
-    return Infeasible(f"{reason}; {hint} (asked: {contract.max_age})", reason.binding, reason.shortfall, details)
-
-
-def _diagnosis(problem: ScaledProblem) -> Infeasible:
-    """Returns the exception that says what binds, from feasibility at reduced uncertainty and without input limits."""
-
-    def feasible(scale: float, *, limited: bool = True) -> bool:
-        trial = replace(problem, D=scale**2 * problem.D, Sigmas=scale**2 * problem.Sigmas)
-        program = InvariantSetProgram(trial, SLACKS[0], limited=limited)
-        found = plain_start(trial, program, silent)
-        return found is not None or (not limited and nominal_start(trial, program, silent) is not None)
-
-    def silent(line: str) -> None:
-        pass
-
-    design, low = grown_start(problem, InvariantSetProgram(problem, SLACKS[0]), silent)
-    low, high = (low, 1.0) if design is not None else (0.0, 1.0)
-    for _ in range(7 if low == 0.0 else 0):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if feasible(middle) else (low, middle)
-    binding = "U" if feasible(1.0, limited=False) else "I"
-    what = "(U) the input limits are too tight" if binding == "U" else "(I) no invariant ellipsoid in the box was found"
-    return Infeasible(
-        f"{what}: one is found once disturbance and error radii shrink to {low:.1%} of those given",
-        binding,
-        1.0 - low,
-    )
 
 
 def _better(best: Design, other: Design | None) -> Design:
