@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ncs_gym.contract import ChannelContract
-from ncs_gym.ellipsoid import is_inside, outer_sum
+from ncs_gym.ellipsoid import SMALLEST_SHARE, is_inside, outer_sum
 from ncs_gym.frozen import FrozenArrays
 from ncs_gym.plant import LinearPlant
 
@@ -71,7 +71,16 @@ class AgeSets(FrozenArrays):
 
 
 def age_sets(plant: LinearPlant, contract: ChannelContract) -> AgeSets | None:
-    """Returns error sets by age, without a solver; None if the iteration finds none.
+    """Returns error sets by age, without a solver; None if the iteration finds none, or none that float64 can hold."""
+    with np.errstate(all="ignore"):
+        try:
+            return _age_sets(plant, contract)
+        except np.linalg.LinAlgError:
+            return None
+
+
+def _age_sets(plant: LinearPlant, contract: ChannelContract) -> AgeSets | None:
+    """Returns error sets by age; None if the iteration finds none.
 
     From Sigma_0 = r0^2 I: carry it through the longest gap, update after every possible gap with the set-membership
     gain, and let Sigma_0 be the smallest ellipsoid around the results that pairwise joins give; until it holds what
@@ -93,6 +102,8 @@ def age_sets(plant: LinearPlant, contract: ChannelContract) -> AgeSets | None:
     start, steps = first, contract.max_age + 1
     for turn in range(ITERATIONS):
         shapes = _carried(start, A, D, steps)
+        if not float(np.trace(shapes[-1])) < LARGEST**2:
+            return None
         updates = [_update(shape, H, noise) for shape in shapes[1:]]
         grown = first
         for _, _, shape in reversed(updates):
@@ -127,7 +138,7 @@ def _carried(start: np.ndarray, A: np.ndarray, D: np.ndarray, steps: int) -> lis
 def _rate(shape: np.ndarray, A: np.ndarray, D: np.ndarray) -> float:
     """Returns the lam of `_carried`."""
     a, b = np.sqrt(np.trace(A @ shape @ A.T)), np.sqrt(np.trace(D))
-    return float(a / (a + b))
+    return float(np.clip(a / (a + b), SMALLEST_SHARE, 1.0 - SMALLEST_SHARE))
 
 
 def _update(shape: np.ndarray, H: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:

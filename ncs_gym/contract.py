@@ -42,7 +42,7 @@ class ChannelContract:
 
 
 def contract_of(channel: Channel) -> ChannelContract | None:
-    """Returns the tightest contract a channel always keeps: h = (l+1) M + delay - 1; None if it promises nothing.
+    """Returns the contract a channel keeps by its settings: h = (l+1) M + delay - 1; None if it may lose for ever.
 
     With a sample every M steps, at most l losses in a row and a longest delay of `delay` steps: among l+1 consecutive
     samples one arrives, so at every step a sample at most (l+1) M - 1 + delay steps old has arrived.

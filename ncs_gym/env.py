@@ -24,6 +24,8 @@ T = TypeVar("T")
 START_SHARE = 0.1
 # Keeps the rounding of a sampled start inside the initial set.
 SAMPLE_ROUNDING = 1e-9
+# Observations of an unstable plant end this many half-widths of the box out: what lies beyond is lost anyway.
+FARTHEST_OBSERVED = 1e6
 # Widens the observation box: float32 rounding, and estimates a little off the reachable set.
 OBSERVATION_MARGIN = 1.01
 
@@ -266,7 +268,12 @@ def observation_bound(env: NCSEnv) -> np.ndarray:
         reach += np.abs(power @ plant.B) @ plant.u_max + plant.disturbance.support(power)
         power = power @ plant.A
         largest = np.maximum(largest, reach + env.initial_set.support(power))
-    estimate = largest + np.sqrt(np.diag(env.error_set.Sigma))
+    ages = env.error_set.ages
+    shapes = env.error_set.Sigma[None] if ages is None else ages.shapes
+    estimate = largest + np.sqrt(np.diagonal(shapes, axis1=1, axis2=2).max(axis=0))
+    estimate = np.minimum(
+        estimate, np.maximum(FARTHEST_OBSERVED * plant.half_widths, env.initial_set.support(np.eye(plant.n)))
+    )
     bound = np.concatenate([estimate, env.task.observation_bound(plant, env.horizon)])
     return OBSERVATION_MARGIN * bound
 

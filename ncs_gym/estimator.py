@@ -17,6 +17,8 @@ from ncs_gym.plant import FLAT_INFLATION, INFLATION, LinearPlant
 ROUNDING = 1e-13
 # An innovation this far beyond its exact bound counts as rounding, not as an alarm.
 ALARM_TOLERANCE = 1e-9
+# Covariances grow no further than this (in squared units of the state).
+LARGEST_COVARIANCE = 1e12
 # Shares mu that the set-membership gain is chosen from; any share is sound.
 SHARES = np.linspace(0.01, 0.99, 99)
 
@@ -51,11 +53,15 @@ class Estimator:
 
     Raises:
         UnstablePlantError: If no error set is given and the plant is not Schur stable.
+        ValueError: If the channel rounds more coarsely than the contract of the error set allows.
     """
 
     def __init__(self, plant: LinearPlant, channel: Channel, error_set: ErrorSet | None = None) -> None:
         self.plant = plant
         self.error_set = certified_error_set(plant) if error_set is None else error_set
+        ages = self.error_set.ages
+        if ages is not None and not ages.contract.is_fine_enough_for(channel):
+            raise ValueError(f"the channel rounds more coarsely than the contract of the error set: {ages.contract}")
         self.buffer = channel.longest_delay
         Sigma = self.error_set.Sigma
         noise = plant.sensor_error_with(channel.quantization_step).shape
@@ -128,7 +134,9 @@ class Estimator:
         kalman = self._filter
         kalman.x, kalman.P = belief.mean, belief.covariance
         kalman.predict(u)
-        return Belief(kalman.x, kalman.P, self._predicted_shape(belief.shape, age), belief.newest)
+        # The covariance of an unstable plant grows without end in an outage; it picks gains and may stop growing.
+        covariance = kalman.P if np.trace(kalman.P) < LARGEST_COVARIANCE else belief.covariance
+        return Belief(kalman.x, covariance, self._predicted_shape(belief.shape, age), belief.newest)
 
     def _predicted_shape(self, shape: np.ndarray, age: int) -> np.ndarray:
         """Returns the first of: trace-optimal lam, certified rate, certified set, that lies inside the next age's set.
@@ -158,11 +166,10 @@ class Estimator:
         residual = measurement - H @ belief.mean
         self._monitor(residual, H @ belief.shape @ H.T)
         kalman = self._filter
-        kalman.x, kalman.P = belief.mean, belief.covariance
-        kalman.update(measurement)
-        shape = self._updated_shape(belief.shape, kalman.K)
         newest = self.error_set.shape_at(0)
-        if is_inside(shape, newest):
+        if self._kalman_update(belief, measurement) and is_inside(
+            shape := self._updated_shape(belief.shape, kalman.K), newest
+        ):
             return Belief(kalman.x, kalman.P, shape, step)
         gain = self._membership_gain(belief.shape)
         shape = self._updated_shape(belief.shape, gain)
@@ -177,6 +184,16 @@ class Estimator:
         kept = self._identity - gain @ H
         covariance = kept @ belief.covariance @ kept.T + gain @ kalman.R @ gain.T
         return Belief(belief.mean + gain @ residual, covariance, shape, step)
+
+    def _kalman_update(self, belief: Belief, measurement: np.ndarray) -> bool:
+        """Updates filterpy's filter; returns False if the covariance is too ill-conditioned (after a long outage)."""
+        kalman = self._filter
+        kalman.x, kalman.P = belief.mean, belief.covariance
+        try:
+            kalman.update(measurement)
+        except np.linalg.LinAlgError:
+            return False
+        return bool(np.isfinite(kalman.x).all() and np.isfinite(kalman.K).all() and np.isfinite(kalman.P).all())
 
     def _updated_shape(self, shape: np.ndarray, gain: np.ndarray) -> np.ndarray:
         """Returns (I-TH) Sigma_k (I-TH)'/mu + T N T'/(1-mu) with the trace-optimal mu: sound for any gain T."""
@@ -202,15 +219,23 @@ class Estimator:
         traces = (weights / (SHARES[:, None] + (1.0 - SHARES[:, None]) * np.maximum(gains, 0.0))).sum(axis=1)
         mu = SHARES[int(np.argmin(traces))]
         spread = shape @ H.T / mu
-        return np.linalg.solve(H @ spread + self._noise / (1.0 - mu), spread.T).T
+        return _solved(H @ spread + self._noise / (1.0 - mu), spread.T).T
 
     def _monitor(self, residual: np.ndarray, spread: np.ndarray) -> None:
         """Latches the alarm if a residual y - H x_hat lies outside E(H Sigma H') + E(N).
 
         The ellipsoid of shape H Sigma H' + N lies inside that sum, so passing it settles the matter.
         """
-        if residual @ np.linalg.solve(spread + self._noise, residual) > 1.0:
+        if residual @ _solved(spread + self._noise, residual) > 1.0:
             self.alarm |= sum_gauge(residual, spread, self._noise) > 1.0 + ALARM_TOLERANCE
+
+
+def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Returns matrix^-1 right, by the pseudo-inverse where the matrix is singular in float64 (after long outages)."""
+    try:
+        return np.linalg.solve(matrix, right)
+    except np.linalg.LinAlgError:
+        return np.linalg.pinv(matrix) @ right
 
 
 def _grown(product: np.ndarray, extent: np.ndarray) -> np.ndarray:

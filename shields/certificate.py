@@ -18,7 +18,7 @@ from ncs_gym.contract import ChannelContract
 from ncs_gym.frozen import FrozenArrays, as_matrix, as_number, read_only
 from shields.storage import write_atomically
 
-FORMAT = "ncs-gym certificate 1"
+FORMAT = "ncs-gym certificate 2"
 # What a certificate of each method carries besides L and K.
 PROOF = ("Sigma", "D", "multipliers")
 CONSTANTS = ("kappa", "rho", "epsilon", "epsilon_up")
@@ -77,6 +77,8 @@ class AgeProof(FrozenArrays):
         """Raises CertificateError if the numbers do not fit together."""
         try:
             sets, steps = self.sets, self.sets.contract.max_age + 1
+            if not isinstance(sets.contract, ChannelContract):
+                raise ValueError("its contract is no ChannelContract")
             n, p = len(sets.shapes[0]), len(sets.noise)
             expected = {"shapes": (steps + 1, n, n), "rates": (steps,), "gains": (steps, n, p), "shares": (steps,)}
             arrays = {name: np.array(getattr(sets, name), dtype=np.float64) for name in (*expected, "noise")}

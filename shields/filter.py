@@ -199,8 +199,8 @@ def require_computable(certificate: Certificate, plant: LinearPlant) -> None:
         CertificateError: If it does not.
     """
     extent = np.sqrt(np.diag(certificate.L))
-    if certificate.Sigma is not None:
-        extent = extent + np.sqrt(np.diag(certificate.Sigma))
+    if len(certificate.error_shapes):
+        extent = extent + np.sqrt(np.diagonal(certificate.error_shapes, axis1=1, axis2=2)).max(axis=0)
     error = (plant.n + 2) * np.finfo(float).eps * (np.abs(certificate.K) @ extent)
     if (error > 0.25 * float(ACTION_ROUNDING) * plant.u_max).any():
         raise CertificateError("the gain is too large against the input limits to compute K x_hat in float64")

@@ -167,7 +167,11 @@ def _age_sets(certificate: Certificate, plant: LinearPlant) -> Iterator[Conditio
     A, H, D, N = (rational(matrix) for matrix in (plant.A, plant.H, certificate.D, sets.noise))
     shapes = [rational(shape) for shape in sets.shapes]
     oldest = certificate.ages.sets.contract.max_age
-    yield flag("Sigma is the set of the largest age", np.array_equal(certificate.Sigma, sets.shapes[oldest]))
+    last = certificate.multipliers
+    same = np.array_equal(certificate.Sigma, sets.shapes[oldest]) and last.error == sets.rates[-1]
+    same &= (last.state, last.estimate, last.disturbance) == tuple(certificate.ages.shares[-1])
+    same &= tuple(last.inputs) == tuple(certificate.ages.inputs[-1])
+    yield flag("Sigma is the set of the largest age, with its multipliers", same)
     yield matrix_condition("(C0) Sigma_0 - r0^2 I >= 0", subtract(shapes[0], rational(plant.initial_error.shape)))
     for j, rate in enumerate(map(Fraction, sets.rates)):
         grown = add(scale(1 / rate, congruence(A, shapes[j])), scale(1 / (1 - rate), D))

@@ -13,6 +13,7 @@ from ncs_gym import (
     GilbertElliott,
     LinearPlant,
     NCSEnv,
+    Packet,
     SetpointTracking,
     UnstablePlantError,
     batch_reactor,
@@ -225,3 +226,68 @@ def test_setpoint_tracking_pays_for_being_close():
     assert max(map(abs, targets)) <= 1.0
     np.testing.assert_array_equal(task.observe(target), [target])
     assert "shape (4,)" in task.check(cart_pole())
+
+
+def test_error_set_for_finer_rounding_is_refused():
+    plant = batch_reactor()
+    with pytest.raises(ValueError, match="coarsely"):
+        Estimator(plant, Channel(quantization_step=0.05), certified_error_set(plant, ChannelContract(2)))
+
+
+@pytest.mark.parametrize("outage", [150, 1500])
+def test_long_outages_end_no_episode_with_an_exception(outage):
+    twice = LinearPlant(
+        A=[[1.2]],
+        B=[[1.0]],
+        C=[[1.0]],
+        H=[[1.0], [1.0]],
+        u_max=1.0,
+        dt=0.1,
+        gamma=1e-4,
+        measurement_noise_cov=1e-6 * np.eye(2),
+    )
+    for plant in (twice, batch_reactor(), cart_pole()):
+        contract = ChannelContract(2)
+        estimator = Estimator(plant, Channel(), certified_error_set(plant, contract))
+        estimator.reset(np.zeros(plant.n))
+        for step in range(1, outage + 50):
+            packets = [] if step < outage else [Packet(step, np.zeros(plant.p))]
+            estimator.advance(np.zeros(plant.m), packets)
+        assert np.isfinite(estimator.belief.mean).all()
+
+
+@pytest.mark.parametrize("age", [400, 8000])
+def test_hopeless_contracts_end_in_an_error_set_error(age):
+    for plant in (batch_reactor(), cart_pole(full_state=False)):
+        with pytest.raises(ErrorSetError):
+            certified_error_set(plant, ChannelContract(age))
+
+
+def test_observation_box_holds_estimates_of_every_age_and_is_finite():
+    plant = LinearPlant(
+        A=np.diag([1.05, 0.01]),
+        B=np.ones((2, 1)),
+        C=np.eye(2),
+        u_max=1.0,
+        dt=0.1,
+        gamma=1e-6,
+        initial_cov=0.01 * np.eye(2),
+    )
+    env = NCSEnv(plant, Channel(delay=4))
+    for seed in range(100):
+        observation, info = env.reset(seed=seed)
+        np.testing.assert_array_equal(observation, info["estimate"].astype(np.float32))
+    fast = NCSEnv(LinearPlant(A=[[2.0]], B=[[1.0]], C=[[1.0]], u_max=3.0, dt=0.1, gamma=1e-6), Channel())
+    assert np.isfinite(fast.observation_space.high).all()
+
+
+def test_prediction_falls_back_to_the_certified_set(monkeypatch):
+    plant, contract = PLANTS["cart-pole"]
+    sets = certified_error_set(plant, contract)
+    estimator = Estimator(plant, Channel(), sets)
+    monkeypatch.setattr("ncs_gym.estimator.outer_sum", lambda first, second, weight: 1e3 * (first + second))
+    monkeypatch.setattr(type(sets), "rate_at", lambda self, age: 1e-6)
+    shape = estimator._predicted_shape(sets.ages.shapes[1], 1)
+    np.testing.assert_array_equal(shape, sets.ages.shapes[2])
+    outside = 2.0 * sets.ages.shapes[1]  # a broken contract: no certified set applies
+    assert not is_inside(estimator._predicted_shape(outside, 1), sets.ages.shapes[2])

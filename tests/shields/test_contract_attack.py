@@ -134,6 +134,10 @@ MUTATIONS = {
     "a share": (lambda c, s: sets(c, shares=at(s.shares, 0, 0.01)), ["(C2)"]),
     "less noise": (lambda c, s: sets(c, noise=0.9 * s.noise), ["N:"]),
     "coarser rounding": (lambda c, s: sets(c, contract=ChannelContract(2, 5e-3)), ["N:"]),
+    "idle multipliers": (
+        lambda c, s: replace(c, multipliers=replace(c.multipliers, state=0.5)),
+        ["Sigma is the set of the largest age"],
+    ),
     "another Sigma": (lambda c, s: replace(c, Sigma=1.1 * c.Sigma), ["Sigma is the set of the largest age"]),
     "shares of (I)": (
         lambda c, s: replace(c, ages=replace(c.ages, shares=at(c.ages.shares, (1, 1), 1e-6))),

@@ -76,7 +76,7 @@ def slanted(ratio):
     )
 
 
-@pytest.mark.parametrize("ratio", [1.0, 1e2, 1e4])
+@pytest.mark.parametrize("ratio", [1.0, 1e2, 1e3])
 def test_passed_means_inside_for_thin_safe_sets(ratio):
     plant = slanted(ratio)
     certificate = synthesize(plant)
