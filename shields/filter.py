@@ -21,6 +21,7 @@ from shields.verification import ACTION_ROUNDING, require_valid
 MODES = ("project", "switch", "boundary", "monitor")
 # The test must be passed by this much, in units of the safe set: far more than the rounding of its computation.
 MARGIN = 1e-9
+FLOAT64 = np.dtype(np.float64)
 
 
 class Decision(NamedTuple):
@@ -208,5 +209,7 @@ def require_computable(certificate: Certificate, plant: LinearPlant) -> None:
 
 def _as_array(value: Any) -> np.ndarray:
     """Returns float64 numbers; an empty array, which has no usable shape, for what are none."""
+    if type(value) is np.ndarray and value.dtype is FLOAT64:  # the common case, without another call
+        return value
     array = as_numbers(value)
     return np.empty(0) if array is None else array
