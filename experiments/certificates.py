@@ -47,6 +47,8 @@ def verify_file(settings: VerifySettings) -> None:
     env_id = settings.env or _matching_env(certificate)
     report = verify(certificate, plant_of(env_id))
     print(f"against the plant of {env_id}:\n{report}")
+    if certificate.ages is not None:
+        print(f"it rests on {certificate.ages.sets.contract}")
     if settings.out is not None:
         write_atomically(settings.out, json.dumps(_as_json(report, env_id), indent=1) + "\n")
     if not report.valid:

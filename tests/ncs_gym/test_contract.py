@@ -140,22 +140,14 @@ def test_update_falls_back_to_the_certified_gain_and_never_skips(monkeypatch):
     estimator.reset(x.copy())
     monkeypatch.setattr(estimator._filter, "update", lambda z: setattr(estimator._filter, "K", np.full((4, 2), 50.0)))
     link, used = Link(channel, rng), 0
-    for step in range(1, 200):
-        d = (1 - 1e-9) * plant.nominal_disturbance.sample_boundary(rng)
-        u = -rng.uniform(-1, 1, 2) * 0.0
-        x = plant.A @ x + d
-        if np.abs(x).max() > 0.5:  # the plant is unstable; only the error matters here
-            u = np.zeros(2)
-            shift = x.copy()
-            x = x - shift
-            estimator.belief = estimator.belief._replace(mean=estimator.belief.mean - np.linalg.solve(plant.A, shift))
-            estimator._priors.clear()
+    for step in range(1, 100):  # the plant is unstable and not controlled; only the error matters here
+        x = plant.A @ x + (1 - 1e-9) * plant.nominal_disturbance.sample_boundary(rng)
         packets = link.exchange(rng, step, plant.H @ x + (1 - 1e-9) * plant.sensor_noise.bound.sample_boundary(rng))
-        estimator.advance(u, packets)
+        estimator.advance(np.zeros(2), packets)
         used += estimator.age == 0
         assert is_inside(estimator.belief.shape, (1 + 1e-12) * estimator.error_set.shape_at(estimator.age))
         assert Ellipsoid(estimator.belief.shape).gauge(estimator.belief.mean - x) <= 1.0
-    assert used > 50
+    assert used > 25
 
 
 @pytest.mark.parametrize("env_id", ["ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0"])
