@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ncs_gym.contract import ChannelContract
-from ncs_gym.ellipsoid import SMALLEST_SHARE, is_inside, outer_sum
+from ncs_gym.ellipsoid import SMALLEST_SHARE, is_inside, joined, outer_sum
 from ncs_gym.frozen import FrozenArrays
 from ncs_gym.plant import LinearPlant
+from ncs_gym.regulator import regulator_gain
 
 # The sets are made for noise this much larger than allowed, so that at run time good gains nearly always fit in.
 NOISE_GROWTH = 1.2
@@ -20,6 +21,9 @@ SMALLEST_GROWTH, DOUBLING = 1e-6, 50.0
 # Shares mu that gains are chosen from: fine sensors want it close to 1.
 SHARES = np.concatenate([np.linspace(0.01, 0.99, 99), 1.0 - np.logspace(-2.1, -4.0, 20)])
 ITERATIONS = 1000
+# The regulator whose answer to an error counts, in units of the box and of the input limits, and how much it counts:
+# of a few tried, the one that leaves the unstable plants of benchmarks/contracts.py the largest disturbances.
+EFFORT, DECAY, ANSWER = 10.0, 0.75, 10.0
 # Sets this much larger than the safe box are of no use.
 LARGEST = 1e6
 
@@ -84,14 +88,14 @@ def _age_sets(plant: LinearPlant, contract: ChannelContract) -> AgeSets | None:
 
     From Sigma_0 = r0^2 I: carry it through the longest gap, update after every possible gap with the set-membership
     gain, and let Sigma_0 be the smallest ellipsoid around the results that pairwise joins give; until it holds what
-    comes of it, which is (C0), (C1) and (C2). Shares minimize traces in units of the box.
+    comes of it, which is (C0), (C1) and (C2). Shares minimize traces weighted with what errors cost.
 
     Args:
         plant: The plant with its bounds.
         contract: The channel's promise.
     """
     # Coordinates z = T^-1 x with W = (T T')^-1, so that units do not matter.
-    T = np.linalg.cholesky(np.linalg.inv(plant.weight))
+    T = np.linalg.cholesky(np.linalg.inv(_cost(plant)))
     inverse = np.linalg.inv(T)
     A, H = inverse @ plant.A @ T, plant.H @ T
     D = inverse @ plant.disturbance.shape @ inverse.T
@@ -107,7 +111,7 @@ def _age_sets(plant: LinearPlant, contract: ChannelContract) -> AgeSets | None:
         updates = [_update(shape, H, noise) for shape in shapes[1:]]
         grown = first
         for _, _, shape in reversed(updates):
-            grown = _joined(grown, shape)
+            grown = joined(grown, shape)
         if not float(np.trace(grown)) < LARGEST:
             return None
         if is_inside(SLACK * grown, start):
@@ -125,6 +129,17 @@ def _age_sets(plant: LinearPlant, contract: ChannelContract) -> AgeSets | None:
         shares=np.array(shares),
         noise=exact,
     )
+
+
+def _cost(plant: LinearPlant) -> np.ndarray:
+    """Returns W, shape (n, n): the size of an error in the box, and that of a regulator's answer to it."""
+    T = np.linalg.cholesky(np.linalg.inv(plant.weight))
+    inverse = np.linalg.inv(T)
+    K = regulator_gain(inverse @ plant.A @ T, inverse @ plant.B * plant.u_max, EFFORT, DECAY)
+    if K is None:
+        return plant.weight
+    K = K @ inverse
+    return plant.weight + ANSWER * K.T @ K
 
 
 def _carried(start: np.ndarray, A: np.ndarray, D: np.ndarray, steps: int) -> list[np.ndarray]:
@@ -155,15 +170,6 @@ def _update(shape: np.ndarray, H: np.ndarray, noise: np.ndarray) -> tuple[np.nda
     spread = shape @ H.T / mu
     gain = np.linalg.solve(H @ spread + noise / (1.0 - mu), spread.T).T
     return gain, mu, _symmetric(updated)
-
-
-def _joined(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Returns the smallest ellipsoid around two: in axes in which both are diagonal, the larger of each entry."""
-    root = np.linalg.cholesky(first)
-    inverse = np.linalg.inv(root)
-    values, axes = np.linalg.eigh(inverse @ second @ inverse.T)
-    turned = root @ axes
-    return _symmetric((turned * np.maximum(values, 1.0)) @ turned.T)
 
 
 def _symmetric(matrix: np.ndarray) -> np.ndarray:

@@ -167,6 +167,21 @@ def outer_sum(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.n
     return first / share + second / (1.0 - share)
 
 
+def joined(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Returns the smallest ellipsoid around two: in axes in which both are diagonal, the larger of each entry.
+
+    Args:
+        first: P1, shape (n, n), positive definite.
+        second: P2, shape (n, n), positive semidefinite.
+    """
+    root = np.linalg.cholesky(first)
+    inverse = np.linalg.inv(root)
+    values, axes = np.linalg.eigh(inverse @ second @ inverse.T)
+    turned = root @ axes
+    shape = (turned * np.maximum(values, 1.0)) @ turned.T
+    return 0.5 * (shape + shape.T)
+
+
 def sum_gauge(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> float:
     """Returns sqrt(max over nu of r'(P1/nu + P2/(1-nu))^-1 r): at most 1 exactly if r is in E(P1) + E(P2).
 

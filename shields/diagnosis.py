@@ -6,9 +6,10 @@ from dataclasses import replace
 
 from ncs_gym import ChannelContract, LinearPlant
 from shields.design_problem import design_problem
+from shields.gain_search import roomiest_gain
 from shields.infeasible import Infeasible
 from shields.semidefinite import InvariantSetProgram, ScaledProblem
-from shields.starts import grown_start, nominal_start, plain_start
+from shields.starts import best_start
 
 # Room of the trial programs.
 SLACK = 1e-6
@@ -24,9 +25,7 @@ def with_largest_age(reason: Infeasible, plant: LinearPlant, contract: ChannelCo
             problem, _ = design_problem(plant, replace(contract, max_age=age))
         except Infeasible:
             return False
-        program = InvariantSetProgram(problem, SLACK)
-        starts = (start(problem, program, lambda line: None) for start in (nominal_start, plain_start))
-        return any(design is not None for design in starts)
+        return _has_start(problem)
 
     low, high = -1, contract.max_age
     while high - low > 1:
@@ -38,26 +37,27 @@ def with_largest_age(reason: Infeasible, plant: LinearPlant, contract: ChannelCo
 
 
 def diagnosis(problem: ScaledProblem) -> Infeasible:
-    """Returns the exception that says what binds, from feasibility at reduced uncertainty and without input limits."""
-
-    def feasible(scale: float, *, limited: bool = True) -> bool:
-        trial = replace(problem, D=scale**2 * problem.D, Sigmas=scale**2 * problem.Sigmas)
-        program = InvariantSetProgram(trial, SLACK, limited=limited)
-        found = plain_start(trial, program, silent)
-        return found is not None or (not limited and nominal_start(trial, program, silent) is not None)
-
-    def silent(line: str) -> None:
-        pass
-
-    design, low = grown_start(problem, InvariantSetProgram(problem, SLACK), silent)
-    low, high = (low, 1.0) if design is not None else (0.0, 1.0)
-    for _ in range(7 if low == 0.0 else 0):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if feasible(middle) else (low, middle)
-    binding = "U" if feasible(1.0, limited=False) else "I"
+    """Returns the exception that says what binds, and the share of the radii that a design was found for."""
+    share = next((scale for scale in _promising(problem) if _has_start(problem, scale)), 0.0)
+    unlimited = roomiest_gain(problem, problem.Sigmas[-1], limited=False)
+    binding = "U" if unlimited is not None and unlimited.reach >= 1.0 else "I"
     what = "(U) the input limits are too tight" if binding == "U" else "(I) no invariant ellipsoid in the box was found"
     return Infeasible(
-        f"{what}: one is found once disturbance and error radii shrink to {low:.1%} of those given",
+        f"{what}: one is found once disturbance and error radii shrink to {share:.1%} of those given",
         binding,
-        1.0 - low,
+        1.0 - share,
+        {"share_of_radii": share},
     )
+
+
+def _promising(problem: ScaledProblem) -> list[float]:
+    """Returns shares of the radii, below 1 and falling, at which a design may be found."""
+    gain = roomiest_gain(problem, problem.Sigmas[-1])
+    reach = 1.0 if gain is None else min(gain.reach, 1.0)
+    return [reach * factor for factor in (0.999, 0.99, 0.97, 0.93, 0.85, 0.7, 0.5, 0.3, 0.1, 0.01)]
+
+
+def _has_start(problem: ScaledProblem, scale: float = 1.0) -> bool:
+    """Returns whether a design is found for radii of disturbance and error sets scaled by `scale`."""
+    scaled = replace(problem, D=scale**2 * problem.D, Sigmas=scale**2 * problem.Sigmas)
+    return best_start(scaled, InvariantSetProgram(scaled, SLACK), lambda line: None) is not None

@@ -132,10 +132,9 @@ class InvariantSetProgram:
         problem: The scaled design problem.
         slack: Relative growth of every disturbance and shrinkage of every limit, the room that exact
             verification needs.
-        limited: False drops (U), to find out what binds.
     """
 
-    def __init__(self, problem: ScaledProblem, slack: float, *, limited: bool = True) -> None:
+    def __init__(self, problem: ScaledProblem, slack: float) -> None:
         n, m = problem.n, problem.m
         self.problem, self.slack = problem, slack
         self._roots = list(np.linalg.cholesky((1.0 + slack) * problem.critical))
@@ -146,12 +145,9 @@ class InvariantSetProgram:
         # solver's accuracy); each has parameters of its own, because products of parameters are not allowed.
         self._slopes = [[cp.Parameter((n, n)) for _ in range(m + 1)] for _ in self._roots]
         self._offsets = [[cp.Parameter((n, n), symmetric=True) for _ in range(m + 1)] for _ in self._roots]
-        self._stretch = cp.Variable()
-        constraints = self._constraints(limited)
-        self._largest = cp.Problem(cp.Maximize(cp.log_det(self._L)), [*constraints, self._stretch == 1.0])
-        self._roomiest = cp.Problem(cp.Maximize(self._stretch), constraints)
+        self._program = cp.Problem(cp.Maximize(cp.log_det(self._L)), self._constraints())
 
-    def _constraints(self, limited: bool) -> list[cp.Constraint]:
+    def _constraints(self) -> list[cp.Constraint]:
         """Returns (S), and (I) and (U) for every critical error set, as linear matrix inequalities."""
         problem, L = self.problem, self._L
         constraints = [cp.diag(problem.C @ L @ problem.C.T) <= 1.0 - self.slack]
@@ -159,22 +155,19 @@ class InvariantSetProgram:
             X = [
                 root.T @ L @ slope + slope.T @ L @ root - offset for slope, offset in zip(slopes, offsets, strict=True)
             ]
-            constraints += self._for_one_set(root, X, limited)
+            constraints += self._for_one_set(root, X)
         return constraints
 
-    def _for_one_set(self, root: np.ndarray, X: list[cp.Expression], limited: bool) -> list[cp.Constraint]:
+    def _for_one_set(self, root: np.ndarray, X: list[cp.Expression]) -> list[cp.Constraint]:
         """Returns (I) and (U) for the error set E(root root'), with le X and (1 - mu_i) X in its coordinates."""
         problem, L, F = self.problem, self._L, self._F
         zero = np.zeros((problem.n, problem.n))
         moved, gain = problem.A @ L + problem.B @ F, problem.B @ F @ root
         constraints = [
-            cp.bmat(
-                [[L - self._stretch * self._D, moved, gain], [moved.T, self._state * L, zero], [gain.T, zero, X[0]]]
-            )
-            >> 0
+            cp.bmat([[L - self._D, moved, gain], [moved.T, self._state * L, zero], [gain.T, zero, X[0]]]) >> 0
         ]
         corner = np.array([[1.0 - self.slack - 2.0 * float(ACTION_ROUNDING)]])
-        for i in range(problem.m if limited else 0):
+        for i in range(problem.m):
             row = F[i : i + 1, :]
             blocks = [[corner, row, row @ root], [row.T, self._mu[i] * L, zero], [(row @ root).T, zero, X[i + 1]]]
             constraints.append(cp.bmat(blocks) >> 0)
@@ -185,9 +178,6 @@ class InvariantSetProgram:
         shares: tuple[float, float, float],
         inputs: np.ndarray,
         linearize_at: np.ndarray,
-        *,
-        scale: float = 1.0,
-        roomiest: bool = False,
     ) -> Design | None:
         """Returns the best design for shares (lx, le, ld) and mu, shape (m,); None if there is none.
 
@@ -195,50 +185,24 @@ class InvariantSetProgram:
             shares: lx, le, ld > 0 that sum to 1.
             inputs: mu_i in (0, 1).
             linearize_at: L0, shape (n, n).
-            scale: Of the radii of disturbance and error sets.
-            roomiest: Look for the design that bears the largest disturbance instead of the largest set.
         """
         lx, le, ld = shares
         self._state.value = lx * (1.0 - self.slack)
-        self._D.value = self.problem.D * ((1.0 + self.slack) * scale**2 / ld)
+        self._D.value = self.problem.D * ((1.0 + self.slack) / ld)
         self._mu.value = inputs
         # With Sigma = G G' the linearized G'XG is G'L (Sigma^-1 L0 G) + its transpose - (G^-1 L0 G)'(G^-1 L0 G).
         for root, slopes, offsets in zip(self._roots, self._slopes, self._offsets, strict=True):
             inner = np.linalg.solve(root, linearize_at @ root)
             slope, offset = np.linalg.solve(root.T, inner), inner.T @ inner
             for share, P, R in zip((le, *(1.0 - inputs)), slopes, offsets, strict=True):
-                P.value, R.value = share / scale**2 * slope, 0.5 * share / scale**2 * (offset + offset.T)
-        program = self._roomiest if roomiest else self._largest
-        if not _solve(program) or self._stretch.value < 1.0 - 1e-6:
+                P.value, R.value = share * slope, 0.5 * share * (offset + offset.T)
+        if not _solve(self._program):
             return None
         L = 0.5 * (self._L.value + self._L.value.T)
         sign, log_det = np.linalg.slogdet(L)
         if sign <= 0 or np.linalg.eigvalsh(L)[0] <= 0.0:
             return None
         return Design(L, np.linalg.solve(L, self._F.value.T).T, shares, inputs, float(log_det))
-
-
-def nominal_set(problem: ScaledProblem, state: float, growth: float) -> np.ndarray | None:
-    """Returns the largest invariant set without estimation error, (n, n), to linearize at; None if there is none.
-
-    A larger disturbance and four fifths of the limits leave room for the error.
-
-    Args:
-        problem: The scaled design problem.
-        state: lx.
-        growth: Of the disturbance.
-    """
-    n, m = problem.n, problem.m
-    L, F = cp.Variable((n, n), symmetric=True), cp.Variable((m, n))
-    moved = problem.A @ L + problem.B @ F
-    spread = growth / (1.0 - state) * problem.D
-    constraints = [
-        cp.diag(problem.C @ L @ problem.C.T) <= 1.0,
-        cp.bmat([[L - 0.5 * (spread + spread.T), moved], [moved.T, state * L]]) >> 0,
-    ]
-    for i in range(m):
-        constraints.append(cp.bmat([[np.array([[0.8]]), F[i : i + 1, :]], [F[i : i + 1, :].T, L]]) >> 0)
-    return L.value if _solve(cp.Problem(cp.Maximize(cp.log_det(L)), constraints)) else None
 
 
 def best_gain(problem: ScaledProblem, design: Design) -> np.ndarray:

@@ -3,30 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from functools import reduce
 from itertools import product
 
 import numpy as np
 
-from shields.semidefinite import (
-    Design,
-    InvariantSetProgram,
-    ScaledProblem,
-    nominal_set,
-)
-from shields.shares import best_input_shares, best_shares
+from ncs_gym.ellipsoid import joined
+from shields.gain_search import roomiest_gain
+from shields.semidefinite import Design, InvariantSetProgram, ScaledProblem
+from shields.shares import best_input_shares
 
 # (lx, le / (1 - lx)) to start from; without good starts the alternation stalls (theory.md section 3).
 STARTS = ((0.85, 0.3), (0.85, 0.1), (0.92, 0.3), (0.92, 0.1), (0.75, 0.3), (0.6, 0.2), (0.97, 0.2))
 START_INPUT_SHARE = 0.8
-# lx and le / (1 - lx) to start from near the invariant set without estimation error, where the others find nothing:
-# plants that move slowly through their box need lx near 1.
-NOMINAL_STATES = (0.75, 0.85, 0.92, 0.96, 0.98, 0.99, 0.995, 0.998, 0.999)
-NOMINAL_PARTS = (0.1, 0.3, 0.6)
-# Where they find nothing either, radii are grown from at least this share of those given, by steps of this size.
-SMALLEST_SCALE, SMALLEST_STEP, LARGEST_STEP = 0.3, 0.01, 0.15
-# Of the disturbance; the second is tried where the first finds nothing.
-NOMINAL_GROWTHS = (3.0, 1.2)
+# The invariant set of the gain that bears most is enlarged by at most this to start from.
+LARGEST_GROWTH = 100.0
 # Within this of the box ellipsoid's log det nothing is left to gain.
 CLOSE_ENOUGH = 2e-4
 
@@ -34,12 +25,8 @@ Progress = Callable[[str], None]
 
 
 def best_start(problem: ScaledProblem, program: InvariantSetProgram, progress: Progress) -> Design | None:
-    """Returns the best design of the cheapest kind of start that finds one."""
-    design = plain_start(problem, program, progress) or nominal_start(problem, program, progress)
-    if design is None:
-        grown_design, reached = grown_start(problem, program, progress)
-        design = grown_design if reached >= 1.0 else None
-    return design
+    """Returns the design of the cheapest kind of start that finds one; None if there is none."""
+    return plain_start(problem, program, progress) or roomy_start(problem, program, progress)
 
 
 def plain_start(problem: ScaledProblem, program: InvariantSetProgram, progress: Progress) -> Design | None:
@@ -59,54 +46,19 @@ def plain_start(problem: ScaledProblem, program: InvariantSetProgram, progress: 
     return best
 
 
-def grown_start(
-    problem: ScaledProblem, program: InvariantSetProgram, progress: Progress
-) -> tuple[Design | None, float]:
-    """Returns a design for smaller radii grown as far as it goes, and the share of the radii it reaches.
-
-    Each turn looks for the design that bears the most disturbance, linearizes there and enlarges the radii.
-    """
-    scale, design = 1.0, None
-    while design is None and scale > SMALLEST_SCALE:
-        scale *= 0.7
-        design = nominal_start(problem, program, progress, scale)
-    step = LARGEST_STEP
-    while design is not None and scale < 1.0 and step > SMALLEST_STEP:
-        trial = min(1.0, scale * (1.0 + step))
-        better = _roomiest(problem, program, design, trial)
-        progress(f"growing from smaller radii: {scale:.3f} of those given")
-        if better is None:
-            step *= 0.5
-        else:
-            scale, design = trial, better
-    return design, scale
-
-
-def _roomiest(problem: ScaledProblem, program: InvariantSetProgram, design: Design, scale: float) -> Design | None:
-    """Returns the design near another that bears the most disturbance with radii scaled by `scale`, if there is one."""
-    Sigmas = scale**2 * problem.Sigmas
-    shares, _ = best_shares(replace(problem, D=scale**2 * problem.D), Sigmas, design.L, design.K, design.shares)
-    choices = ((shares, best_input_shares(Sigmas, design.L, design.K)), (design.shares, design.inputs))
-    found = (program.solve(*choice, design.L, scale=scale, roomiest=True) for choice in choices)
-    return next((one for one in found if one is not None), None)
-
-
-def nominal_start(
-    problem: ScaledProblem, program: InvariantSetProgram, progress: Progress, scale: float = 1.0
-) -> Design | None:
-    """Returns the best design linearized at an invariant set without estimation error; None if there is none."""
-    problem = replace(problem, D=scale**2 * problem.D)
-    inputs, best = np.full(problem.m, START_INPUT_SHARE), None
-    for growth, state in product(NOMINAL_GROWTHS, NOMINAL_STATES):
-        if best is not None and growth != NOMINAL_GROWTHS[0]:
-            break
-        linearize_at = nominal_set(problem, state, growth)
-        for part in NOMINAL_PARTS if linearize_at is not None else ():
-            design = program.solve(as_shares(state, part), inputs, linearize_at, scale=scale)
-            if design is not None and (best is None or design.log_det > best.log_det):
-                best = design
-            progress(f"start near the set without errors, lx = {state}: {volume_of(best)}")
-    return best
+def roomy_start(problem: ScaledProblem, program: InvariantSetProgram, progress: Progress) -> Design | None:
+    """Returns a design near the gain that bears the largest radii; None if they are smaller than those given."""
+    last, covering = problem.Sigmas[-1], reduce(joined, problem.Sigmas)
+    for Sigma in (last,) if len(problem.Sigmas) == 1 else (last, covering):
+        gain = roomiest_gain(problem, Sigma)
+        reach = 0.0 if gain is None else gain.reach
+        progress(f"start at the gain that bears most: {reach:.3f} of the radii given")
+        for size in (reach**2, reach, 1.0) if reach >= 1.0 else ():
+            L = min(size, LARGEST_GROWTH) * gain.L
+            design = program.solve(gain.shares, best_input_shares(Sigma[None], L, gain.K), L)
+            if design is not None:
+                return design
+    return None
 
 
 def as_shares(state: float, part: float) -> tuple[float, float, float]:

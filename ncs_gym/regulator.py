@@ -1,0 +1,29 @@
+"""The linear-quadratic regulator, which tells what estimation errors cost and where searches for gains begin."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import solve_discrete_are
+
+
+def regulator_gain(A: np.ndarray, B: np.ndarray, effort: float, decay: float) -> np.ndarray | None:
+    """Returns K, shape (m, n), of u = K x that minimizes the sum of (|x|^2 + effort |u|^2) / decay^k.
+
+    The closed loop's eigenvalues are smaller than sqrt(decay).
+
+    Args:
+        A: Shape (n, n), in coordinates where |x| is the size of the state.
+        B: Shape (n, m), in coordinates where |u| is the size of the input.
+        effort: Weight of the inputs.
+        decay: In (0, 1].
+
+    Returns:
+        The gain; None where the Riccati equation has no solution that scipy finds.
+    """
+    A, B, m = A / np.sqrt(decay), B / np.sqrt(decay), B.shape[1]
+    try:
+        P = solve_discrete_are(A, B, np.eye(len(A)), effort * np.eye(m))
+        gain = -np.linalg.solve(effort * np.eye(m) + B.T @ P @ B, B.T @ P @ A)
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    return gain if np.isfinite(gain).all() else None
