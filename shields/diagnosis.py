@@ -8,39 +8,71 @@ from ncs_gym import ChannelContract, LinearPlant
 from shields.design_problem import design_problem
 from shields.gain_search import roomiest_gain
 from shields.infeasible import Infeasible
-from shields.semidefinite import InvariantSetProgram, ScaledProblem
-from shields.starts import best_start
+from shields.semidefinite import ScaledProblem
+from shields.starts import ENOUGH
 
-# Room of the trial programs.
-SLACK = 1e-6
+# Of the gamma asked for, and the ratio it is found to.
+SMALLEST_GAMMA, GAMMA_PRECISION = 1e-6, 1.02
 
 
-def with_largest_age(reason: Infeasible, plant: LinearPlant, contract: ChannelContract | None) -> Infeasible:
-    """Returns the exception with the largest age for which a start is found, under a contract of some age."""
-    if contract is None or contract.max_age == 0 or reason.binding == "S":
+def with_what_works(reason: Infeasible, plant: LinearPlant, contract: ChannelContract | None) -> Infeasible:
+    """Returns the exception with the largest age, and at the age asked for the largest gamma, that are borne.
+
+    Args:
+        reason: What stands in the way.
+        plant: The plant it stands in the way of.
+        contract: The channel's promise; without one the exception is returned as it is.
+    """
+    if contract is None or reason.binding == "S":
         return reason
+    hints, details = [str(reason)], dict(reason.details)
+    if contract.max_age > 0:
+        age = _largest_age(plant, contract)
+        hints.append("no smaller max_age works either" if age is None else f"max_age = {age} is the largest that works")
+        details |= {} if age is None else {"max_age": age}
+    if plant.gamma > 0.0:
+        gamma = _largest_gamma(plant, contract)
+        hints.append(
+            "no smaller gamma works either" if gamma is None else f"gamma = {gamma:.3g} is the largest that works"
+        )
+        details |= {} if gamma is None else {"largest_gamma": gamma}
+    message = f"{'; '.join(hints)} (asked: max_age = {contract.max_age}, gamma = {plant.gamma:g})"
+    return Infeasible(message, reason.binding, reason.shortfall, details)
 
-    def works(age: int) -> bool:
-        try:
-            problem, _ = design_problem(plant, replace(contract, max_age=age))
-        except Infeasible:
-            return False
-        return _has_start(problem)
 
+def _works(plant: LinearPlant, contract: ChannelContract) -> bool:
+    """Returns whether a gain bears the radii."""
+    try:
+        problem, _ = design_problem(plant, contract)
+    except Infeasible:
+        return False
+    return _share(problem) >= ENOUGH
+
+
+def _largest_age(plant: LinearPlant, contract: ChannelContract) -> int | None:
+    """Returns the largest max_age below the contract's that works, None if none does."""
     low, high = -1, contract.max_age
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (middle, high) if works(middle) else (low, middle)
-    hint = f"max_age = {low} is the largest that works" if low >= 0 else "no smaller max_age works either"
-    details = reason.details | ({"max_age": low} if low >= 0 else {})
-    return Infeasible(f"{reason}; {hint} (asked: {contract.max_age})", reason.binding, reason.shortfall, details)
+        low, high = (middle, high) if _works(plant, replace(contract, max_age=middle)) else (low, middle)
+    return low if low >= 0 else None
+
+
+def _largest_gamma(plant: LinearPlant, contract: ChannelContract) -> float | None:
+    """Returns the largest gamma below the plant's that works, nearly; None if none above a millionth of it does."""
+    low, high = SMALLEST_GAMMA * plant.gamma, plant.gamma
+    if not _works(replace(plant, gamma=low), contract):
+        return None
+    while high > GAMMA_PRECISION * low:
+        middle = (low * high) ** 0.5
+        low, high = (middle, high) if _works(replace(plant, gamma=middle), contract) else (low, middle)
+    return low
 
 
 def diagnosis(problem: ScaledProblem) -> Infeasible:
-    """Returns the exception that says what binds, and the share of the radii that a design was found for."""
-    share = next((scale for scale in _promising(problem) if _has_start(problem, scale)), 0.0)
-    unlimited = roomiest_gain(problem, problem.Sigmas[-1], limited=False)
-    binding = "U" if unlimited is not None and unlimited.reach >= 1.0 else "I"
+    """Returns the exception that says what binds, and the share of the radii that a gain bears."""
+    share = min(_share(problem), 1.0)
+    binding = "U" if _share(problem, limited=False) >= 1.0 else "I"
     what = "(U) the input limits are too tight" if binding == "U" else "(I) no invariant ellipsoid in the box was found"
     return Infeasible(
         f"{what}: one is found once disturbance and error radii shrink to {share:.1%} of those given",
@@ -50,14 +82,7 @@ def diagnosis(problem: ScaledProblem) -> Infeasible:
     )
 
 
-def _promising(problem: ScaledProblem) -> list[float]:
-    """Returns shares of the radii, below 1 and falling, at which a design may be found."""
-    gain = roomiest_gain(problem, problem.Sigmas[-1])
-    reach = 1.0 if gain is None else min(gain.reach, 1.0)
-    return [reach * factor for factor in (0.999, 0.99, 0.97, 0.93, 0.85, 0.7, 0.5, 0.3, 0.1, 0.01)]
-
-
-def _has_start(problem: ScaledProblem, scale: float = 1.0) -> bool:
-    """Returns whether a design is found for radii of disturbance and error sets scaled by `scale`."""
-    scaled = replace(problem, D=scale**2 * problem.D, Sigmas=scale**2 * problem.Sigmas)
-    return best_start(scaled, InvariantSetProgram(scaled, SLACK), lambda line: None) is not None
+def _share(problem: ScaledProblem, *, limited: bool = True) -> float:
+    """Returns the share of the radii that the best gain found bears; 0 if none stabilizes."""
+    gain = roomiest_gain(problem, problem.covering, limited=limited)
+    return 0.0 if gain is None else gain.reach

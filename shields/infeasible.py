@@ -14,8 +14,10 @@ class Infeasible(ValueError):
             which the uncertainty (disturbance and error radii) is too large, in (0, 1]; for "S" the number of
             directions without a limit; where only exact verification failed, its margin; for "C2"
             1 - lambda_min(L)/alpha.
-        details: Further figures by name (method "paper": the best ratio lambda_min(L)/alpha, its kappa and rho, the
-            largest gamma and the largest scales of the uncertainty for which OP is feasible).
+        details: Further figures by name. "certified": `share_of_radii` for which a design is found; under a contract
+            also the largest `max_age`, and the `largest_gamma` at the age asked for. "paper": the best ratio
+            lambda_min(L)/alpha, its kappa and rho, the largest gamma and the largest scales of the uncertainty for
+            which OP is feasible.
     """
 
     def __init__(self, message: str, binding: str, shortfall: float, details: dict[str, float] | None = None) -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from functools import reduce
 
 import cvxpy as cp
 import numpy as np
 
 from ncs_gym import LinearPlant
-from ncs_gym.ellipsoid import is_inside
+from ncs_gym.ellipsoid import is_inside, joined
 from shields.infeasible import Infeasible
 from shields.verification import ACTION_ROUNDING
 
@@ -53,6 +54,11 @@ class ScaledProblem:
                 kept = others
         longest = np.linalg.eigvalsh(np.stack(kept))[:, -1]
         return np.stack(kept) + THINNEST**2 * longest[:, None, None] * np.eye(self.n)
+
+    @property
+    def covering(self) -> np.ndarray:
+        """An error set around all of them, shape (n, n)."""
+        return reduce(joined, self.Sigmas)
 
     @property
     def n(self) -> int:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import reduce
 from itertools import product
 
 import numpy as np
 
-from ncs_gym.ellipsoid import joined
-from shields.gain_search import roomiest_gain
+from shields.gain_search import RoomyGain, roomiest_gain
 from shields.semidefinite import Design, InvariantSetProgram, ScaledProblem
 from shields.shares import best_input_shares
 
@@ -18,6 +16,8 @@ STARTS = ((0.85, 0.3), (0.85, 0.1), (0.92, 0.3), (0.92, 0.1), (0.75, 0.3), (0.6,
 START_INPUT_SHARE = 0.8
 # The invariant set of the gain that bears most is enlarged by at most this to start from.
 LARGEST_GROWTH = 100.0
+# It counts if exact verification has this much room.
+ENOUGH = 1.0 + 1e-5
 # Within this of the box ellipsoid's log det nothing is left to gain.
 CLOSE_ENOUGH = 2e-4
 
@@ -26,7 +26,8 @@ Progress = Callable[[str], None]
 
 def best_start(problem: ScaledProblem, program: InvariantSetProgram, progress: Progress) -> Design | None:
     """Returns the design of the cheapest kind of start that finds one; None if there is none."""
-    return plain_start(problem, program, progress) or roomy_start(problem, program, progress)
+    design = plain_start(problem, program, progress) if len(problem.Sigmas) == 1 else None
+    return design or roomy_start(problem, program, progress)
 
 
 def plain_start(problem: ScaledProblem, program: InvariantSetProgram, progress: Progress) -> Design | None:
@@ -48,17 +49,24 @@ def plain_start(problem: ScaledProblem, program: InvariantSetProgram, progress: 
 
 def roomy_start(problem: ScaledProblem, program: InvariantSetProgram, progress: Progress) -> Design | None:
     """Returns a design near the gain that bears the largest radii; None if they are smaller than those given."""
-    last, covering = problem.Sigmas[-1], reduce(joined, problem.Sigmas)
-    for Sigma in (last,) if len(problem.Sigmas) == 1 else (last, covering):
+    for Sigma in (problem.Sigmas[-1], problem.covering) if len(problem.Sigmas) > 1 else problem.Sigmas:
         gain = roomiest_gain(problem, Sigma)
         reach = 0.0 if gain is None else gain.reach
         progress(f"start at the gain that bears most: {reach:.3f} of the radii given")
-        for size in (reach**2, reach, 1.0) if reach >= 1.0 else ():
-            L = min(size, LARGEST_GROWTH) * gain.L
-            design = program.solve(gain.shares, best_input_shares(Sigma[None], L, gain.K), L)
-            if design is not None:
-                return design
-    return None
+        if gain is None or reach < ENOUGH:
+            continue
+        L = min(reach**2, LARGEST_GROWTH) * gain.L
+        design = program.solve(gain.shares, best_input_shares(Sigma[None], L, gain.K), L)
+        if design is not None:
+            return design
+    return None if gain is None or reach < ENOUGH else _as_design(gain, problem.covering)
+
+
+def _as_design(gain: RoomyGain, Sigma: np.ndarray) -> Design:
+    """Returns the gain's own set, with half the room it has left on either side, as a design."""
+    L = gain.reach * gain.L
+    inputs = best_input_shares(Sigma[None], L, gain.K)
+    return Design(L, gain.K, gain.shares, inputs, float(np.linalg.slogdet(L)[1]))
 
 
 def as_shares(state: float, part: float) -> tuple[float, float, float]:

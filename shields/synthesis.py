@@ -11,7 +11,7 @@ from ncs_gym import ErrorSet, LinearPlant
 from ncs_gym.contract import ChannelContract
 from shields.certificate import AgeProof, Certificate
 from shields.design_problem import GROWTH, design_problem
-from shields.diagnosis import diagnosis, with_largest_age
+from shields.diagnosis import diagnosis, with_what_works
 from shields.infeasible import Infeasible
 from shields.paper import paper_certificate
 from shields.semidefinite import (
@@ -84,7 +84,7 @@ def _certified(plant: LinearPlant, contract: ChannelContract | None, progress: P
     try:
         problem, errors = design_problem(plant, contract)
     except Infeasible as infeasible:
-        raise with_largest_age(infeasible, plant, contract) from infeasible
+        raise with_what_works(infeasible, plant, contract) from infeasible
     failure = None
     for slack in SLACKS:
         design = _largest_set(problem, slack, progress)
@@ -100,7 +100,7 @@ def _certified(plant: LinearPlant, contract: ChannelContract | None, progress: P
             failed.name.split()[0].strip("():"),
             -failed.margin,
         )
-    raise failure or with_largest_age(diagnosis(problem), plant, contract)
+    raise failure or with_what_works(diagnosis(problem), plant, contract)
 
 
 def certify(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> Certificate | None:

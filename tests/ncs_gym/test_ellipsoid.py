@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from ncs_gym import Ellipsoid
-from ncs_gym.ellipsoid import is_inside, outer_sum, sum_gauge
+from ncs_gym.ellipsoid import is_inside, joined, outer_sum, sum_gauge
 
 seeds = st.integers(0, 10_000)
 
@@ -168,3 +168,16 @@ def test_outer_sum_with_a_point_is_the_other():
 def test_bad_shapes_are_refused(shape):
     with pytest.raises(ValueError, match="shape"):
         Ellipsoid(shape)
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_joined_ellipsoid_holds_both_and_touches_each(n):
+    rng = np.random.default_rng(n)
+    first, second = (factor @ factor.T for factor in rng.standard_normal((2, n, n)))
+    around = joined(first, second)
+    for shape in (first, second):
+        values = np.linalg.eigvals(np.linalg.solve(around, shape)).real
+        assert values.max() <= 1.0 + 1e-9
+        assert n == 1 or values.max() == pytest.approx(1.0)
+    flat = np.zeros((n, n))
+    np.testing.assert_allclose(joined(first, flat), first)

@@ -1,0 +1,118 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ncs_gym import ChannelContract, batch_reactor, cart_pole
+from ncs_gym.noise import chi2_quantile
+from ncs_gym.regulator import regulator_gain
+from shields import Infeasible, synthesize, verify
+from shields.design_problem import design_problem
+from shields.gain_search import _Search, _starts, roomiest_gain
+from tests.plants import random_plant
+
+CONTRACT = ChannelContract(2, 1e-4)
+PLANTS = {"cart-pole": cart_pole(), "reactor": batch_reactor()}
+
+
+@pytest.mark.parametrize("limited", [True, False])
+@pytest.mark.parametrize("name", PLANTS)
+def test_derivatives_are_those_of_finite_differences(name, limited):
+    problem, _ = design_problem(PLANTS[name], CONTRACT)
+    search = _Search(problem, problem.covering, limited)
+    for point in _starts(problem)[:4]:
+        slopes = search._needs(point)[1]
+        steps = 1e-4 * np.eye(len(point))
+        differences = [(search._needs(point + step)[0] - search._needs(point - step)[0]) / 2e-4 for step in steps]
+        np.testing.assert_allclose(slopes, np.transpose(differences), rtol=1e-3, atol=1e-4 * np.abs(slopes).max())
+
+
+def radii_scaled(plant, share):
+    """The plant with all its uncertainty scaled; its box, limits and contract's quantizer aside."""
+    covariances = ("process_noise_cov", "measurement_noise_cov", "initial_cov")
+    return replace(plant, **{name: share**2 * getattr(plant, name) for name in covariances})
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_the_share_it_finds_is_what_exact_verification_accepts(name):
+    plant, contract = PLANTS[name], ChannelContract(2)
+    problem, _ = design_problem(plant, contract)
+    reach = roomiest_gain(problem, problem.covering).reach
+    bearable = radii_scaled(plant, 0.99 * reach)
+    assert verify(synthesize(bearable, contract=contract), bearable).valid
+    with pytest.raises(Infeasible, match="radii shrink to") as caught:
+        synthesize(radii_scaled(plant, 2.0 * reach), contract=contract)
+    assert caught.value.details["share_of_radii"] == pytest.approx(0.5, rel=1e-2)
+
+
+def test_its_set_is_the_smallest_that_is_invariant_with_its_gain():
+    problem, _ = design_problem(cart_pole(), CONTRACT)
+    gain = roomiest_gain(problem, problem.covering)
+    (lx, le, ld), moved = gain.shares, problem.B @ gain.K
+    closed = problem.A + moved
+    need = closed @ gain.L @ closed.T / lx + moved @ problem.covering @ moved.T / le + problem.D / ld
+    np.testing.assert_allclose(gain.L, need, rtol=1e-9, atol=1e-12)
+    effort = np.sqrt([[row @ shape @ row for shape in (gain.L, problem.covering)] for row in gain.K]).sum(axis=1)
+    box = np.sqrt(np.diag(problem.C @ gain.L @ problem.C.T))
+    assert 1.0 / gain.reach == pytest.approx(max(effort.max(), box.max()), rel=1e-9)
+
+
+def test_it_bears_more_than_any_regulator_it_starts_from():
+    problem, _ = design_problem(batch_reactor(), CONTRACT)
+    search = _Search(problem, problem.covering, True)
+    best_regulator = np.exp(-0.5 * min(search.most_needed(start) for start in _starts(problem)))
+    assert roomiest_gain(problem, problem.covering).reach > 1.2 * best_regulator
+
+
+def test_without_input_limits_more_is_borne():
+    problem, _ = design_problem(batch_reactor(), CONTRACT)
+    reach, unlimited = (roomiest_gain(problem, problem.covering, limited=limited).reach for limited in (True, False))
+    assert unlimited > 1.1 * reach
+
+
+def test_a_plant_that_no_input_can_stabilize_has_no_gain():
+    problem, _ = design_problem(cart_pole(), CONTRACT)
+    assert roomiest_gain(replace(problem, B=np.zeros_like(problem.B)), problem.covering) is None
+
+
+def test_a_stable_plant_needs_no_regulator():
+    problem, _ = design_problem(random_plant(0, 3, 1))
+    gain = roomiest_gain(replace(problem, B=np.zeros_like(problem.B)), problem.covering)
+    assert gain is not None
+    assert gain.reach > 0.0
+
+
+def test_largest_gamma_and_age_are_what_synthesis_accepts():
+    plant = cart_pole(full_state=False, gamma=1e-5)
+    with pytest.raises(Infeasible, match=r"gamma = .* is the largest that works") as caught:
+        synthesize(plant, contract=ChannelContract(4, 1e-4))
+    gamma = caught.value.details["largest_gamma"]
+    assert 0.0 < gamma < 1e-5
+    assert synthesize(replace(plant, gamma=0.98 * gamma), contract=ChannelContract(4, 1e-4)) is not None
+    with pytest.raises(Infeasible):
+        synthesize(replace(plant, gamma=1.05 * gamma), contract=ChannelContract(4, 1e-4))
+    with pytest.raises(Infeasible, match=r"max_age = .* is the largest that works") as caught:
+        synthesize(cart_pole(), contract=ChannelContract(60, 1e-4))
+    age = caught.value.details["max_age"]
+    assert synthesize(cart_pole(), contract=ChannelContract(age, 1e-4)) is not None
+
+
+def test_regulator_decays_as_fast_as_asked_for():
+    plant = cart_pole()
+    for decay in (0.75, 0.9, 1.0):
+        gain = regulator_gain(plant.A, plant.B, 1.0, decay)
+        assert np.abs(np.linalg.eigvals(plant.A + plant.B @ gain)).max() < np.sqrt(decay)
+    assert regulator_gain(plant.A, np.zeros_like(plant.B), 1.0, 1.0) is None
+
+
+@pytest.mark.parametrize(("full_state", "age", "radius"), [(True, 1, 6.3e-3), (True, 8, 3.7e-3), (False, 4, 1.7e-3)])
+def test_cart_pole_bears_at_least_the_radii_that_were_measured_before(full_state, age, radius):
+    plant = cart_pole(full_state=full_state)
+    half_widths, n = plant.half_widths, plant.n
+    plant = replace(
+        plant,
+        process_noise_cov=np.diag((radius * half_widths) ** 2) / chi2_quantile(0.95, n),
+        measurement_noise_cov=np.diag((0.01 * radius * plant.H @ half_widths) ** 2) / chi2_quantile(0.95, plant.p),
+        initial_cov=(0.01 * radius * half_widths.min()) ** 2 / chi2_quantile(0.95, n) * np.eye(n),
+    )
+    assert verify(synthesize(plant, contract=ChannelContract(age)), plant).valid
