@@ -19,6 +19,9 @@ ROUNDING = 1e-13
 ALARM_TOLERANCE = 1e-9
 # Covariances grow no further than this (in squared units of the state).
 LARGEST_COVARIANCE = 1e12
+# Factors of covariances keep this many bits, and shapes are rounded up to multiples of this in coordinates where the
+# certified set of age 0 is the unit ball. Then both recur when a pattern of arrivals does, and can be tabulated.
+COVARIANCE_BITS, SHAPE_STEP = 8, 2.0**-20
 # Shares mu that the set-membership gain is chosen from; any share is sound.
 SHARES = np.linspace(0.01, 0.99, 99)
 
@@ -28,7 +31,8 @@ class Belief(NamedTuple):
 
     Attributes:
         mean: x_hat, shape (n,).
-        covariance: P, shape (n, n); picks gains and is never used for safety.
+        covariance: P, shape (n, n), of a Kalman filter that takes the same samples; picks gains and is never used for
+            safety.
         shape: Sigma_k, shape (n, n): x_hat - x lies in E(Sigma_k).
         newest: Step of the newest sample used (0: the first estimate).
     """
@@ -50,20 +54,31 @@ class Estimator:
         plant: The plant, whose inputs the estimator knows exactly.
         channel: Gives the quantizer's error and the longest delay, hence the replay buffer.
         error_set: E(Sigma) with its rate; computed from the plant by default.
+        covariance_bits: Bits kept of the factors of covariances (a gain's optimality is of second order in them).
+        shape_step: What shapes are rounded up to, as a share of the certified set's square extent.
 
     Raises:
         UnstablePlantError: If no error set is given and the plant is not Schur stable.
         ValueError: If the channel rounds more coarsely than the contract of the error set allows.
     """
 
-    def __init__(self, plant: LinearPlant, channel: Channel, error_set: ErrorSet | None = None) -> None:
-        self.plant = plant
+    def __init__(
+        self,
+        plant: LinearPlant,
+        channel: Channel,
+        error_set: ErrorSet | None = None,
+        covariance_bits: int = COVARIANCE_BITS,
+        shape_step: float = SHAPE_STEP,
+    ) -> None:
+        self.plant, self._bits, self._step = plant, covariance_bits, shape_step
         self.error_set = certified_error_set(plant) if error_set is None else error_set
         ages = self.error_set.ages
         if ages is not None and not ages.contract.is_fine_enough_for(channel):
             raise ValueError(f"the channel rounds more coarsely than the contract of the error set: {ages.contract}")
         self.buffer = channel.longest_delay
         Sigma = self.error_set.Sigma
+        self._ball = np.linalg.cholesky(self.error_set.shape_at(0))
+        self._to_ball = np.linalg.inv(self._ball)
         noise = plant.sensor_error_with(channel.quantization_step).shape
         # Perfect sensors get a little noise, relative to what they measure: a larger bound is a bound.
         self._noise = noise + FLAT_INFLATION * np.diag(np.diag(plant.H @ Sigma @ plant.H.T))
@@ -136,6 +151,7 @@ class Estimator:
         kalman.predict(u)
         # The covariance of an unstable plant grows without end in an outage; it picks gains and may stop growing.
         covariance = kalman.P if np.trace(kalman.P) < LARGEST_COVARIANCE else belief.covariance
+        covariance = _settled(covariance, self._bits)
         return Belief(kalman.x, covariance, self._predicted_shape(belief.shape, age), belief.newest)
 
     def _predicted_shape(self, shape: np.ndarray, age: int) -> np.ndarray:
@@ -147,11 +163,11 @@ class Estimator:
         A, D, certified = self.plant.A, self.plant.disturbance.shape, self.error_set.shape_at(age + 1)
         extent = self._abs_A @ np.sqrt(np.diag(shape))
         moved = _grown(A @ shape @ A.T, extent)
-        predicted = outer_sum(moved, D, self.plant.weight)
+        predicted = self._settled_shape(outer_sum(moved, D, self.plant.weight))
         if certified is None or is_inside(predicted, certified):
             return predicted
         rate = self.error_set.rate_at(age)
-        carried = moved / rate + D / (1.0 - rate)
+        carried = self._settled_shape(moved / rate + D / (1.0 - rate))
         if is_inside(carried, certified):
             return carried
         return certified if is_inside(shape, self.error_set.shape_at(age)) else predicted
@@ -167,10 +183,10 @@ class Estimator:
         self._monitor(residual, H @ belief.shape @ H.T)
         kalman = self._filter
         newest = self.error_set.shape_at(0)
-        if self._kalman_update(belief, measurement) and is_inside(
-            shape := self._updated_shape(belief.shape, kalman.K), newest
-        ):
-            return Belief(kalman.x, kalman.P, shape, step)
+        updated = self._kalman_update(belief, measurement)
+        covariance = _settled(kalman.P, self._bits) if updated else belief.covariance
+        if updated and is_inside(shape := self._updated_shape(belief.shape, kalman.K), newest):
+            return Belief(kalman.x, covariance, shape, step)
         gain = self._membership_gain(belief.shape)
         shape = self._updated_shape(belief.shape, gain)
         ages = self.error_set.ages
@@ -181,8 +197,6 @@ class Estimator:
             certified = self.error_set.shape_at(age)
             if certified is not None and is_inside(belief.shape, certified):
                 gain, shape = ages.gains[age - 1], newest  # by (C2)
-        kept = self._identity - gain @ H
-        covariance = kept @ belief.covariance @ kept.T + gain @ kalman.R @ gain.T
         return Belief(belief.mean + gain @ residual, covariance, shape, step)
 
     def _kalman_update(self, belief: Belief, measurement: np.ndarray) -> bool:
@@ -202,7 +216,20 @@ class Estimator:
         extent = np.sqrt(np.diag(shape))
         carried = _grown(kept @ shape @ kept.T, extent + size @ (self._abs_H @ extent))
         noise = _grown(gain @ self._noise @ gain.T, size @ self._noise_extent)
-        return INFLATION * outer_sum(carried, noise, self.plant.weight) + self.plant.estimate_rounding
+        return self._settled_shape(
+            INFLATION * outer_sum(carried, noise, self.plant.weight) + self.plant.estimate_rounding
+        )
+
+    def _settled_shape(self, shape: np.ndarray) -> np.ndarray:
+        """Returns a shape rounded up to multiples of a step where the certified set of age 0 is the unit ball.
+
+        Rounding moves an entry by half a step, hence no direction by more than n halves of one, which is added before.
+        """
+        inward, outward = self._to_ball, self._ball
+        inner = _grown(inward @ shape @ inward.T, np.abs(inward) @ np.sqrt(np.abs(np.diag(shape))))
+        inner.flat[:: len(inner) + 1] += len(inner) * self._step
+        inner = self._step * np.round(inner / self._step)
+        return _grown(outward @ inner @ outward.T, np.abs(outward) @ np.sqrt(np.diag(inner)))
 
     def _membership_gain(self, shape: np.ndarray) -> np.ndarray:
         """Returns T_mu = S H'/mu (H S H'/mu + N/(1-mu))^-1, shape (n, p), with the trace-optimal mu.
@@ -236,6 +263,17 @@ def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
         return np.linalg.solve(matrix, right)
     except np.linalg.LinAlgError:
         return np.linalg.pinv(matrix) @ right
+
+
+def _settled(covariance: np.ndarray, bits: int) -> np.ndarray:
+    """Returns a covariance whose Cholesky factor has some bits only, relative to powers of two near the deviations."""
+    try:
+        factor = np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        return covariance
+    steps = np.exp2(np.ceil(0.5 * np.log2(np.diag(covariance))) - bits)[:, None]
+    factor = steps * np.round(factor / steps)
+    return factor @ factor.T
 
 
 def _grown(product: np.ndarray, extent: np.ndarray) -> np.ndarray:

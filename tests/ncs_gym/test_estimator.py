@@ -13,6 +13,9 @@ from ncs_gym.estimator import _grown
 from shields.exact import congruence, is_positive_semidefinite, rational, subtract
 from tests.plants import random_plant
 
+# So fine that rounding of covariances and shapes does not show.
+FINE = {"covariance_bits": 45, "shape_step": 2.0**-45}
+
 
 def roomy(plant, factor=1e4):
     """An error set so large that the guard accepts every Kalman update."""
@@ -51,7 +54,7 @@ def test_estimate_equals_batch_least_squares_with_late_and_reordered_packets(see
     plant = replace(plant, measurement_noise_cov=1e-7 * np.eye(plant.p))
     channel = Channel(loss=0.3, quantization_step=0.001, delay=1, jitter=3)
     rng = np.random.default_rng(seed)
-    estimator = Estimator(plant, channel, roomy(plant))
+    estimator = Estimator(plant, channel, roomy(plant), **FINE)
     first = rng.standard_normal(3)
     estimator.reset(first)
     link, inputs, used = Link(channel, rng), [], []
@@ -75,7 +78,7 @@ def test_order_of_arrival_does_not_matter():
     samples = {stamp: 0.05 * rng.standard_normal(2) for stamp in (1, 2, 3, 4)}
     ends = []
     for order in itertools.permutations(samples):
-        estimator = Estimator(plant, Channel(delay=8), roomy(plant))
+        estimator = Estimator(plant, Channel(delay=8), roomy(plant), **FINE)
         for _ in range(4):
             estimator.advance(np.zeros(1), [])
         estimator.advance(np.array([0.5]), [Packet(stamp, samples[stamp]) for stamp in order])
