@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ncs_gym.ellipsoid import Ellipsoid
 from ncs_gym.frozen import FrozenArrays, as_covariance, as_number, as_vector
 from ncs_gym.plant import LinearPlant
 
@@ -30,6 +31,8 @@ class Disturbance(FrozenArrays, ABC):
     """
 
     replaces_process_noise: ClassVar[bool] = False
+    # Whether a draw depends on nothing but randomness, so that draws can be made in blocks ahead of time.
+    is_memoryless: ClassVar[bool] = False
 
     def begin(self, rng: np.random.Generator, plant: LinearPlant) -> Any:
         """Returns what stays fixed for one episode (None unless overridden)."""
@@ -49,6 +52,27 @@ class Disturbance(FrozenArrays, ABC):
             memory: What `begin` returned.
         """
 
+    def begin_many(self, rng: np.random.Generator, plant: LinearPlant, count: int) -> np.ndarray:
+        """Returns the memories of `count` episodes along the first axis."""
+        memories = np.empty(count, dtype=object)
+        memories[:] = [self.begin(rng, plant) for _ in range(count)]
+        return memories
+
+    def draw_many(
+        self, rng: np.random.Generator, plant: LinearPlant, nominal_next: np.ndarray, steps: np.ndarray, memory: Any
+    ) -> np.ndarray:
+        """Returns d for many environments, shape (N, n); one by one unless overridden.
+
+        Args:
+            rng: Source of randomness.
+            plant: The plant.
+            nominal_next: A x + B u, shape (N, n).
+            steps: Number of steps taken before this one, shape (N,).
+            memory: What `begin_many` returned, first axis N.
+        """
+        several = zip(nominal_next, steps.tolist(), memory, strict=True)
+        return np.array([self.draw(rng, plant, each, step, remembered) for each, step, remembered in several])
+
     def check(self, plant: LinearPlant) -> str:
         """Returns why this disturbance does not fit the plant, or an empty string."""
         return ""
@@ -62,10 +86,17 @@ class Disturbance(FrozenArrays, ABC):
 class BallDisturbance(Disturbance):
     """Uniform in the ball of squared radius gamma."""
 
+    is_memoryless: ClassVar[bool] = True
+
     def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
         direction = rng.standard_normal(plant.n)
         radius = np.sqrt(plant.gamma) * rng.random() ** (1.0 / plant.n)
         return direction * (radius / np.linalg.norm(direction))
+
+    def draw_many(self, rng, plant, nominal_next, steps, memory):  # noqa: D102
+        if plant.gamma == 0.0:
+            return np.zeros_like(nominal_next)
+        return Ellipsoid(plant.gamma * np.eye(plant.n)).sample_many(rng, len(nominal_next))
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +111,7 @@ class BoxDisturbance(Disturbance):
     """
 
     half_widths: Sequence[float] | np.ndarray | None = None
+    is_memoryless: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.half_widths is None:
@@ -93,6 +125,14 @@ class BoxDisturbance(Disturbance):
     def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
         widths = np.sqrt(plant.gamma / plant.n) if self.half_widths is None else self.half_widths
         return rng.uniform(-1.0, 1.0, plant.n) * widths
+
+    def draw_many(self, rng, plant, nominal_next, steps, memory):  # noqa: D102
+        from ncs_gym.kernels import add_box
+
+        d = np.zeros(nominal_next.shape)
+        widths = np.sqrt(plant.gamma / plant.n) if self.half_widths is None else np.asarray(self.half_widths)
+        add_box(rng, np.broadcast_to(widths, plant.n).astype(np.float64), d)
+        return d
 
     def check(self, plant):  # noqa: D102
         if self.half_widths is None:
@@ -133,15 +173,27 @@ class SinusoidDisturbance(Disturbance):
         axis, phase = memory
         return np.sqrt(plant.gamma) * axis * np.sin(2.0 * np.pi * step / self.period + phase)
 
+    def begin_many(self, rng, plant, count):  # noqa: D102
+        axes = Ellipsoid(np.eye(plant.n)).sample_boundary_many(rng, count)
+        return np.column_stack([axes, rng.uniform(0.0, 2.0 * np.pi, count)])
+
+    def draw_many(self, rng, plant, nominal_next, steps, memory):  # noqa: D102
+        swing = np.sin(2.0 * np.pi * steps / self.period + memory[:, -1])
+        return np.sqrt(plant.gamma) * memory[:, :-1] * swing[:, None]
+
 
 @dataclass(frozen=True, eq=False)
 class SphereDisturbance(Disturbance):
     """A random boundary point of E(D): always as large as allowed."""
 
     replaces_process_noise: ClassVar[bool] = True
+    is_memoryless: ClassVar[bool] = True
 
     def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
         return (1.0 - ROUNDING) * plant.nominal_disturbance.sample_boundary(rng)
+
+    def draw_many(self, rng, plant, nominal_next, steps, memory):  # noqa: D102
+        return (1.0 - ROUNDING) * plant.nominal_disturbance.sample_boundary_many(rng, len(nominal_next))
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,6 +222,15 @@ class AdversarialDisturbance(Disturbance):
         worst = int(np.argmax(np.abs(values) + plant.nominal_disturbance.support(plant.C)))
         direction = plant.C[worst] * (1.0 if values[worst] >= 0.0 else -1.0)
         return (1.0 - ROUNDING) * plant.nominal_disturbance.extreme_point(direction)
+
+    def draw_many(self, rng, plant, nominal_next, steps, memory):  # noqa: D102
+        bound = plant.nominal_disturbance
+        if self.M is not None:
+            return (1.0 - ROUNDING) * bound.farthest_points(nominal_next, self.M)
+        values = nominal_next @ plant.C.T
+        worst = np.argmax(np.abs(values) + bound.support(plant.C), axis=1)
+        signs = np.where(np.take_along_axis(values, worst[:, None], axis=1) >= 0.0, 1.0, -1.0)
+        return (1.0 - ROUNDING) * signs * np.stack([bound.extreme_point(row) for row in plant.C])[worst]
 
     def check(self, plant):  # noqa: D102
         if self.M is not None and self.M.shape != (plant.n, plant.n):
@@ -208,6 +269,23 @@ def checked(plant: LinearPlant, d: Any, *, allow_assumption_violation: bool) -> 
         )
     size = plant.allowed_disturbance.gauge(d)
     return d if size <= 1.0 - ROUNDING else d * ((1.0 - ROUNDING) / size)
+
+
+def checked_many(plant: LinearPlant, d: Any, count: int, *, allow_assumption_violation: bool) -> np.ndarray:
+    """Returns disturbances of many environments as `checked` does, shape (count, n).
+
+    Raises:
+        ValueError: If one is not finite, wrongly shaped, or further outside than TOLERANCE and that is not allowed.
+    """
+    d = np.array(d, dtype=np.float64)
+    if d.shape != (count, plant.n) or not np.isfinite(d).all():
+        raise ValueError(f"the disturbances must be finite with shape ({count}, {plant.n}), got {d!r}")
+    if allow_assumption_violation:
+        return d
+    outside = np.flatnonzero(plant.allowed_disturbance.gauges(d) > 1.0 - ROUNDING)
+    for row in outside:
+        d[row] = checked(plant, d[row], allow_assumption_violation=False)
+    return d
 
 
 BY_NAME: dict[str, type[Disturbance]] = {

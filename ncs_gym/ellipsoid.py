@@ -82,6 +82,14 @@ class Ellipsoid(FrozenArrays):
             return float("inf")
         return float(np.sqrt((coordinates[~flat] ** 2 / values[~flat]).sum()))
 
+    def gauges(self, points: np.ndarray) -> np.ndarray:
+        """Returns the gauge of each row of points (count, n), shape (count,)."""
+        scale, values, vectors = self._principal_axes
+        coordinates = (points / np.where(scale > 0.0, scale, 1.0)) @ vectors
+        flat = values == 0.0
+        off = (np.abs(coordinates[:, flat]) > OFF_FLAT).any(axis=1) | (points[:, scale == 0.0] != 0.0).any(axis=1)
+        return np.where(off, np.inf, np.sqrt((coordinates[:, ~flat] ** 2 / values[~flat]).sum(axis=1)))
+
     def contains(self, point: np.ndarray) -> bool:
         """Returns whether a point, shape (n,), lies inside or on the boundary (in float64, no tolerance)."""
         return self.gauge(point) <= 1.0
@@ -89,6 +97,15 @@ class Ellipsoid(FrozenArrays):
     def sample(self, rng: np.random.Generator) -> np.ndarray:
         """Returns a uniformly distributed point, shape (n,)."""
         return self.sample_boundary(rng) * rng.random() ** (1.0 / self.dim)
+
+    def sample_many(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Returns uniformly distributed points, shape (count, n)."""
+        return self.sample_boundary_many(rng, count) * rng.random((count, 1)) ** (1.0 / self.dim)
+
+    def sample_boundary_many(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Returns boundary points as `sample_boundary` does, shape (count, n)."""
+        directions = rng.standard_normal((count, self.dim))
+        return (directions / np.linalg.norm(directions, axis=1, keepdims=True)) @ self.factor.T
 
     def sample_boundary(self, rng: np.random.Generator) -> np.ndarray:
         """Returns a boundary point, shape (n,): the image of a uniform direction of the unit sphere."""
@@ -102,6 +119,19 @@ class Ellipsoid(FrozenArrays):
     def sum_contains(self, other: Ellipsoid, point: np.ndarray) -> bool:
         """Returns whether a point lies in the Minkowski sum of both ellipsoids (see `sum_gauge`)."""
         return sum_gauge(point, self.shape, other.shape) <= 1.0
+
+    def farthest_points(self, centers: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """Returns what `farthest_point` does for each row of centers (count, n), shape (count, n)."""
+        factor = self.factor
+        values, vectors = np.linalg.eigh(factor.T @ weight @ factor)
+        slopes = centers @ (weight @ factor @ vectors)
+        coordinates = slopes / (_largest_roots(slopes, values)[:, None] - values)
+        coordinates[~np.isfinite(coordinates).all(axis=1)] = 0.0
+        missing = np.maximum(1.0 - (coordinates**2).sum(axis=1), 0.0)
+        longest = coordinates[:, -1]
+        coordinates[:, -1] += np.where(missing > 1e-9, np.copysign(np.sqrt(missing), longest), 0.0)
+        lengths = np.maximum(1.0, np.linalg.norm(coordinates, axis=1))
+        return (coordinates / lengths[:, None]) @ (factor @ vectors).T
 
     def farthest_point(self, center: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """Returns z of the ellipsoid that maximizes (center + z)' W (center + z).
@@ -134,6 +164,25 @@ class Ellipsoid(FrozenArrays):
         missing = max(1.0 - float(coordinates @ coordinates), 0.0)
         coordinates[-1] += np.copysign(np.sqrt(missing), coordinates[-1]) if missing > 1e-9 else 0.0
         return factor @ (vectors @ (coordinates / max(1.0, float(np.linalg.norm(coordinates)))))
+
+
+def _largest_roots(slopes: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Returns nu >= max(values) with sum (slope_i / (nu - value_i))^2 = 1 for each row of slopes (count, n).
+
+    The norm as a function of nu is convex and falling, and so is its inverse concave: Newton on 1/norm from the left of
+    the root rises monotonically and converges fast.
+    """
+    lengths = np.linalg.norm(slopes, axis=1)
+    nu = values[-1] + np.maximum(np.abs(slopes[:, -1]), 1e-12 * np.maximum(values[-1], lengths))
+    for _ in range(40):
+        gap = nu[:, None] - values
+        square = ((slopes / gap) ** 2).sum(axis=1)
+        slope = (slopes**2 / gap**3).sum(axis=1)
+        step = np.where(square > 1.0, square * (np.sqrt(square) - 1.0) / np.maximum(slope, 1e-300), 0.0)
+        nu = nu + step
+        if not (step > 1e-15 * nu).any():
+            break
+    return nu
 
 
 def is_inside(inner: np.ndarray, outer: np.ndarray) -> bool:

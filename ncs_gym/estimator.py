@@ -43,6 +43,20 @@ class Belief(NamedTuple):
     newest: int
 
 
+class Update(NamedTuple):
+    """What a measurement does to a belief, whatever it says.
+
+    Attributes:
+        gain: T, shape (n, p).
+        covariance: P afterwards, shape (n, n).
+        shape: Sigma_k afterwards, shape (n, n).
+    """
+
+    gain: np.ndarray
+    covariance: np.ndarray
+    shape: np.ndarray
+
+
 class Estimator:
     """Estimates the state from time-stamped packets that may be lost, late, reordered or duplicated.
 
@@ -75,7 +89,7 @@ class Estimator:
         ages = self.error_set.ages
         if ages is not None and not ages.contract.is_fine_enough_for(channel):
             raise ValueError(f"the channel rounds more coarsely than the contract of the error set: {ages.contract}")
-        self.buffer = channel.longest_delay
+        self.channel, self.buffer = channel, channel.longest_delay
         Sigma = self.error_set.Sigma
         self._ball = np.linalg.cholesky(self.error_set.shape_at(0))
         self._to_ball = np.linalg.inv(self._ball)
@@ -137,10 +151,7 @@ class Estimator:
                 belief = self._update(belief, self._samples[step], step)
             if step < self.step:
                 priors[step + 1] = self._predict(belief, self._inputs[step], step - belief.newest)
-        weight = self.plant.weight
-        # Under a contract the sets depend on the age, and a newer sample must count.
-        newer = self.error_set.ages is not None and belief.newest > self.belief.newest
-        if newer or np.vdot(weight, belief.shape) <= np.vdot(weight, self.belief.shape):
+        if self.prefers(belief.shape, self.step - belief.newest, self.belief.shape, self.age):
             self.belief = belief
             self._priors.update(priors)
 
@@ -173,41 +184,62 @@ class Estimator:
         return certified if is_inside(shape, self.error_set.shape_at(age)) else predicted
 
     def _update(self, belief: Belief, measurement: np.ndarray, step: int) -> Belief:
-        """Returns the belief after a measurement, with the first gain whose ellipsoid lies inside the set of age 0.
-
-        After the Kalman and the set-membership gain comes the certified one of the belief's age, which (C2) maps into
-        that set. Without a contract there is none, and the belief stays as it was.
-        """
+        """Returns the belief after a measurement; the same if the guard turns it down."""
         H = self.plant.H
         residual = measurement - H @ belief.mean
         self._monitor(residual, H @ belief.shape @ H.T)
-        kalman = self._filter
-        newest = self.error_set.shape_at(0)
-        updated = self._kalman_update(belief, measurement)
-        covariance = _settled(kalman.P, self._bits) if updated else belief.covariance
-        if updated and is_inside(shape := self._updated_shape(belief.shape, kalman.K), newest):
-            return Belief(kalman.x, covariance, shape, step)
-        gain = self._membership_gain(belief.shape)
-        shape = self._updated_shape(belief.shape, gain)
-        ages = self.error_set.ages
-        if not is_inside(shape, newest):
-            if ages is None:
-                return belief
-            age = step - belief.newest
-            certified = self.error_set.shape_at(age)
-            if certified is not None and is_inside(belief.shape, certified):
-                gain, shape = ages.gains[age - 1], newest  # by (C2)
-        return Belief(belief.mean + gain @ residual, covariance, shape, step)
+        update = self.update_of(belief.covariance, belief.shape, step - belief.newest)
+        if update is None:
+            return belief
+        return Belief(belief.mean + update.gain @ residual, update.covariance, update.shape, step)
 
-    def _kalman_update(self, belief: Belief, measurement: np.ndarray) -> bool:
-        """Updates filterpy's filter; returns False if the covariance is too ill-conditioned (after a long outage)."""
+    def update_of(self, covariance: np.ndarray, shape: np.ndarray, age: int) -> Update | None:
+        """Returns what an update does to a belief, with the first gain whose ellipsoid lies inside the set of age 0.
+
+        After the Kalman and the set-membership gain comes the certified one of the belief's age, which (C2) maps into
+        that set. Without a contract there is none, and None says that the sample must not be used.
+
+        Args:
+            covariance: P, shape (n, n).
+            shape: Sigma_k, shape (n, n).
+            age: Of the newest sample used.
+        """
+        newest = self.error_set.shape_at(0)
+        kalman = self._kalman_update(covariance)
+        updated_covariance = covariance if kalman is None else kalman[1]
+        if kalman is not None and is_inside(updated := self._updated_shape(shape, kalman[0]), newest):
+            return Update(kalman[0], updated_covariance, updated)
+        gain = self._membership_gain(shape)
+        updated = self._updated_shape(shape, gain)
+        ages = self.error_set.ages
+        if not is_inside(updated, newest):
+            if ages is None:
+                return None
+            certified = self.error_set.shape_at(age)
+            if certified is not None and is_inside(shape, certified):
+                gain, updated = ages.gains[age - 1], newest  # by (C2)
+        return Update(gain, updated_covariance, updated)
+
+    def prefers(self, shape: np.ndarray, age: int, present: np.ndarray, present_age: int) -> bool:
+        """Returns whether a replayed belief is better than the present one, by their shapes (n, n) and ages.
+
+        Under a contract the sets depend on the age, and a newer sample must count.
+        """
+        if self.error_set.ages is not None and age < present_age:
+            return True
+        return bool(np.vdot(self.plant.weight, shape) <= np.vdot(self.plant.weight, present))
+
+    def _kalman_update(self, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Returns gain and covariance by filterpy; None if it is too ill-conditioned (after a long outage)."""
         kalman = self._filter
-        kalman.x, kalman.P = belief.mean, belief.covariance
+        kalman.x, kalman.P = np.zeros(self.plant.n), covariance
         try:
-            kalman.update(measurement)
+            kalman.update(np.zeros(self.plant.p))
         except np.linalg.LinAlgError:
-            return False
-        return bool(np.isfinite(kalman.x).all() and np.isfinite(kalman.K).all() and np.isfinite(kalman.P).all())
+            return None
+        if not (np.isfinite(kalman.K).all() and np.isfinite(kalman.P).all()):
+            return None
+        return kalman.K, _settled(kalman.P, self._bits)
 
     def _updated_shape(self, shape: np.ndarray, gain: np.ndarray) -> np.ndarray:
         """Returns (I-TH) Sigma_k (I-TH)'/mu + T N T'/(1-mu) with the trace-optimal mu: sound for any gain T."""
@@ -254,7 +286,15 @@ class Estimator:
         The ellipsoid of shape H Sigma H' + N lies inside that sum, so passing it settles the matter.
         """
         if residual @ _solved(spread + self._noise, residual) > 1.0:
-            self.alarm |= sum_gauge(residual, spread, self._noise) > 1.0 + ALARM_TOLERANCE
+            self.alarm |= self.is_impossible(residual, spread)
+
+    def is_impossible(self, residual: np.ndarray, spread: np.ndarray) -> bool:
+        """Returns whether a residual, shape (p,), lies outside E(spread) + E(N), spread = H Sigma_k H'."""
+        return sum_gauge(residual, spread, self._noise) > 1.0 + ALARM_TOLERANCE
+
+    def inverse_of_bound(self, spread: np.ndarray) -> np.ndarray:
+        """Returns (spread + N)^-1, shape (p, p), of the quick test: r'(spread + N)^-1 r <= 1 is possible."""
+        return _solved(spread + self._noise, np.eye(self.plant.p))
 
 
 def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:

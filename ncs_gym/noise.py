@@ -50,6 +50,19 @@ class TruncatedGaussian(FrozenArrays):
             if direction @ direction <= self.energy:
                 return factor @ direction
 
+    def sample_many(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Returns draws, shape (count, n)."""
+        out = np.zeros((count, self.covariance.shape[0]))
+        self.add_to(rng, out)
+        return out
+
+    def add_to(self, rng: np.random.Generator, out: np.ndarray) -> None:
+        """Adds a draw to each row of `out`, shape (count, n), by compiled rejection."""
+        from ncs_gym.kernels import add_truncated
+
+        if self._factor is not None:
+            add_truncated(rng, self.energy, self._factor, out)
+
 
 @cache
 def chi2_quantile(probability: float, degrees: int) -> float:

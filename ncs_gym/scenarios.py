@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -18,6 +18,9 @@ from ncs_gym.plant import LinearPlant
 from ncs_gym.task import Regulation, SetpointTracking, SpeedTracking, Task
 from ncs_gym.truck import truck_trailer
 from ncs_gym.unstable import batch_reactor, cart_pole
+
+if TYPE_CHECKING:
+    from ncs_gym.vector_env import NCSVectorEnv
 
 # Steps per episode of every registered environment (Liu et al. Section 5).
 EPISODE_STEPS = 200
@@ -50,8 +53,17 @@ class Scenario:
     start: float | None = None
     metadata: ClassVar[dict[str, Any]] = NCSEnv.metadata
 
-    def __call__(
+    def __call__(self, **settings: Any) -> NCSEnv:
+        """Returns the environment; see `settings` for the keywords.
+
+        Raises:
+            ValueError: If the scenario has no plant of its own and none is given, or a setting is wrong.
+        """
+        return NCSEnv(**self.settings(**settings))
+
+    def settings(
         self,
+        *,
         plant: LinearPlant | None = None,
         channel: Channel | None = None,
         task: Task | None = None,
@@ -61,11 +73,11 @@ class Scenario:
         allow_assumption_violation: bool = False,
         contract: ChannelContract | None = None,
         render_mode: str | None = None,
-    ) -> NCSEnv:
-        """Returns the environment; None stands for the scenario's own value, see `NCSEnv` for the arguments.
+    ) -> dict[str, Any]:
+        """Returns the arguments of `NCSEnv`; None stands for the scenario's own value.
 
         Raises:
-            ValueError: If the scenario has no plant of its own and none is given, or a setting is wrong.
+            ValueError: If the scenario has no plant of its own and none is given.
         """
         if plant is None:
             if self.plant is None:
@@ -73,18 +85,18 @@ class Scenario:
             plant, contract = self.plant(), self.contract if contract is None else contract
         if initial_set is None and self.start is not None and getattr(plant, "n", 0) == 2:
             initial_set = Ellipsoid(self.start**2 * np.eye(2))
-        return NCSEnv(
-            plant=plant,
-            channel=self.channel if channel is None else channel,
-            task=self.task if task is None else task,
-            disturbance=self._disturbance(plant) if disturbance is None else disturbance,
-            initial_set=initial_set,
-            terminate_on_violation=self.terminates if terminate_on_violation is None else terminate_on_violation,
-            allow_assumption_violation=allow_assumption_violation,
-            contract=contract,
-            render_mode=render_mode,
-            horizon=EPISODE_STEPS,
-        )
+        return {
+            "plant": plant,
+            "channel": self.channel if channel is None else channel,
+            "task": self.task if task is None else task,
+            "disturbance": self._disturbance(plant) if disturbance is None else disturbance,
+            "initial_set": initial_set,
+            "terminate_on_violation": self.terminates if terminate_on_violation is None else terminate_on_violation,
+            "allow_assumption_violation": allow_assumption_violation,
+            "contract": contract,
+            "render_mode": render_mode,
+            "horizon": EPISODE_STEPS,
+        }
 
     def _disturbance(self, plant: LinearPlant) -> Any:
         if self.box is None or not isinstance(plant, LinearPlant) or self.box.check(plant) or self.box.excess(plant):
@@ -143,8 +155,50 @@ ENTRY_POINTS = {
 }
 
 
+class VectorScenario:
+    """Makes vector environments of a scenario.
+
+    Args:
+        scenario: Gives the settings.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = NCSEnv.metadata
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+
+    def __call__(
+        self,
+        num_envs: int = 1,
+        max_episode_steps: int | None = None,
+        autoreset_mode: Any = "NextStep",
+        **settings: Any,
+    ) -> NCSVectorEnv:
+        """Returns the vector environment; see `NCSVectorEnv`, and `Scenario.settings` for the rest."""
+        from ncs_gym.vector_env import NCSVectorEnv  # the compiler takes half a second to import
+
+        return NCSVectorEnv(
+            num_envs,
+            max_episode_steps=max_episode_steps,
+            autoreset_mode=autoreset_mode,
+            **self.scenario.settings(**settings),
+        )
+
+
+TRUCK_TRAILER_VECTOR = VectorScenario(TRUCK_TRAILER)
+TRUCK_TRAILER_CRUISE_VECTOR = VectorScenario(TRUCK_TRAILER_CRUISE)
+LINEAR_NCS_VECTOR = VectorScenario(LINEAR_NCS)
+CART_POLE_VECTOR = VectorScenario(CART_POLE)
+BATCH_REACTOR_VECTOR = VectorScenario(BATCH_REACTOR)
+
+
 def register_all() -> None:
     """Registers the ids with gymnasium; `import ncs_gym` calls it."""
     for env_id, name in ENTRY_POINTS.items():
         if env_id not in gym.registry:
-            gym.register(id=env_id, entry_point=f"{__name__}:{name}", max_episode_steps=EPISODE_STEPS)
+            gym.register(
+                id=env_id,
+                entry_point=f"{__name__}:{name}",
+                vector_entry_point=f"{__name__}:{name}_VECTOR",
+                max_episode_steps=EPISODE_STEPS,
+            )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,6 +40,29 @@ class Task(FrozenArrays, ABC):
     def reward(self, plant: LinearPlant, memory: Any, state: np.ndarray, u: np.ndarray) -> float:
         """Returns the reward of a step that applied u (m,) and ended in `state` (n,) and `memory`."""
 
+    def begin_many(self, rng: np.random.Generator, plant: LinearPlant, count: int) -> np.ndarray:
+        """Returns the memories of `count` episodes along the first axis."""
+        memories = np.empty(count, dtype=object)
+        memories[:] = [self.begin(rng, plant) for _ in range(count)]
+        return memories
+
+    def advance_many(
+        self, rng: np.random.Generator, plant: LinearPlant, memory: np.ndarray, inputs: np.ndarray
+    ) -> np.ndarray:
+        """Returns what `advance` does for inputs (N, m) of many environments; one by one unless overridden."""
+        moved = np.empty_like(memory)
+        moved[:] = [self.advance(rng, plant, each, u) for each, u in zip(memory, inputs, strict=True)]
+        return moved
+
+    def observe_many(self, memory: np.ndarray) -> np.ndarray:
+        """Returns the extra observation entries of many environments, shape (N, extra)."""
+        return np.array([self.observe(each) for each in memory])
+
+    def reward_many(self, plant: LinearPlant, memory: np.ndarray, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        """Returns the rewards of many environments, shape (N,), for states (N, n) and inputs (N, m)."""
+        several = zip(memory, states, inputs, strict=True)
+        return np.array([self.reward(plant, each, state, u) for each, state, u in several], dtype=np.float64)
+
     def check(self, plant: LinearPlant) -> str:
         """Returns why this task does not suit the plant, or an empty string."""
         return ""
@@ -67,15 +91,25 @@ class Regulation(Task):
         self._freeze_arrays()
 
     def reward(self, plant, memory, state, u):  # noqa: D102
-        if self.state_cost is None:
-            output = plant.C @ state
-            cost = float(output @ output)
-        else:
-            cost = float(state @ self.state_cost @ state)
-        if self.input_cost is None:
-            effort = u / plant.u_max
-            return -cost - 0.01 * float(effort @ effort)
-        return -cost - float(u @ self.input_cost @ u)
+        Q, R = _costs(self, plant)
+        return -float(state @ Q @ state) - float(u @ R @ u)
+
+    def begin_many(self, rng, plant, count):  # noqa: D102
+        return np.zeros((count, 0))
+
+    def advance_many(self, rng, plant, memory, inputs):  # noqa: D102
+        return memory
+
+    def observe_many(self, memory):  # noqa: D102
+        return memory
+
+    def reward_many(self, plant, memory, states, inputs):  # noqa: D102
+        from ncs_gym.kernels import quadratic
+
+        Q, R = _costs(self, plant)
+        rewards = np.empty(len(states))
+        quadratic(Q, states.T, R, inputs.T, rewards)
+        return -rewards
 
     def check(self, plant):  # noqa: D102
         for name, size in (("state_cost", plant.n), ("input_cost", plant.m)):
@@ -83,6 +117,14 @@ class Regulation(Task):
             if value is not None and value.shape != (size, size):
                 return f"{name} must have shape ({size}, {size}), got {value.shape}"
         return ""
+
+
+@lru_cache(maxsize=64)
+def _costs(task: Regulation, plant: LinearPlant) -> tuple[np.ndarray, np.ndarray]:
+    """Returns Q and R."""
+    Q = plant.C.T @ plant.C if task.state_cost is None else task.state_cost
+    R = np.diag(0.01 / plant.u_max**2) if task.input_cost is None else task.input_cost
+    return Q, R
 
 
 class SpeedProfile(NamedTuple):
@@ -147,6 +189,24 @@ class SpeedTracking(Task):
         effort = float(u[self.input_index])
         return -self.error_weight * min(abs(error) / 5.0, 5.0) - self.input_weight * effort**2
 
+    def begin_many(self, rng, plant, count):  # noqa: D102
+        return self.fastest * rng.random((2, count)).T
+
+    def advance_many(self, rng, plant, memory, inputs):  # noqa: D102
+        changes, targets = rng.random((2, len(memory)))
+        moved = np.empty_like(memory)
+        moved[:, 0] = memory[:, 0] + plant.dt * inputs[:, self.input_index]
+        moved[:, 1] = np.where(changes < self.change_probability, self.fastest * targets, memory[:, 1])
+        return moved
+
+    def observe_many(self, memory):  # noqa: D102
+        return memory[:, 1:] - memory[:, :1]
+
+    def reward_many(self, plant, memory, states, inputs):  # noqa: D102
+        error = np.abs(memory[:, 1] - memory[:, 0])
+        effort = inputs[:, self.input_index]
+        return -self.error_weight * np.minimum(error / 5.0, 5.0) - self.input_weight * effort * effort
+
     def check(self, plant):  # noqa: D102
         if self.input_index >= plant.m:
             return f"input_index must be < {plant.m}, got {self.input_index}"
@@ -199,6 +259,20 @@ class SetpointTracking(Task):
 
     def reward(self, plant, memory, state, u):  # noqa: D102
         return 1.0 - min(abs(float(self.output @ state) - memory) / self.width, 1.0)
+
+    def begin_many(self, rng, plant, count):  # noqa: D102
+        return self.reach * (2.0 * rng.random((count, 1)) - 1.0)
+
+    def advance_many(self, rng, plant, memory, inputs):  # noqa: D102
+        changes, targets = rng.random((2, len(memory)))
+        targets = self.reach * (2.0 * targets - 1.0)
+        return np.where(changes < self.change_probability, targets, memory[:, 0])[:, None]
+
+    def observe_many(self, memory):  # noqa: D102
+        return memory
+
+    def reward_many(self, plant, memory, states, inputs):  # noqa: D102
+        return 1.0 - np.minimum(np.abs(states @ self.output - memory[:, 0]) / self.width, 1.0)
 
     def check(self, plant):  # noqa: D102
         if self.output.shape != (plant.n,):
