@@ -1,5 +1,8 @@
 """Linear plants behind imperfect networks as Gymnasium environments; importing registers the ids."""
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from ncs_gym.channel import Channel, GilbertElliott, Packet
 from ncs_gym.contract import ChannelContract, contract_of
 from ncs_gym.disturbance import (
@@ -20,6 +23,9 @@ from ncs_gym.task import Regulation, SetpointTracking, SpeedTracking, Task
 from ncs_gym.truck import truck_trailer
 from ncs_gym.unstable import batch_reactor, cart_pole
 
+if TYPE_CHECKING:
+    from ncs_gym.vector_env import NCSVectorEnv
+
 register_all()
 
 __all__ = [
@@ -36,6 +42,7 @@ __all__ = [
     "GilbertElliott",
     "LinearPlant",
     "NCSEnv",
+    "NCSVectorEnv",
     "Packet",
     "Regulation",
     "SetpointTracking",
@@ -50,3 +57,10 @@ __all__ = [
     "contract_of",
     "truck_trailer",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Imports what needs the compiler only when it is asked for."""
+    if name == "NCSVectorEnv":
+        return import_module("ncs_gym.vector_env").NCSVectorEnv
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

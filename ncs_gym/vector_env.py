@@ -38,8 +38,8 @@ class NCSVectorEnv(VectorEnv):
 
     Attributes:
         single: The scalar environment with these settings; never stepped.
-        steps: Steps taken in each episode, shape (N,).
         episodes: Episodes begun in each environment, shape (N,).
+        starts: States that episodes were started at by an option, NaN where not, shape (N, n).
 
     Raises:
         ValueError: If a setting is wrong; see `NCSEnv`.
@@ -85,6 +85,11 @@ class NCSVectorEnv(VectorEnv):
     def steps(self) -> np.ndarray:
         """Steps taken in each episode, shape (N,)."""
         return self._fleet.steps
+
+    @property
+    def patterns(self) -> tuple[GainTable, np.ndarray]:
+        """The gain table in use, and the node in it, shape (N,), whose error shape is the present one."""
+        return self._table, self._fleet.node
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None

@@ -99,7 +99,7 @@ class SafetyFilter(FrozenArrays):
         return self.certificate.K.tolist()
 
     @cached_property
-    def _reserve(self) -> float:
+    def reserve(self) -> float:
         """The room a projected input needs: the margin, and what rounding the action to float32 can move x+."""
         effect = float(np.linalg.norm(self.test.effect, axis=0) @ self.plant.u_max)
         return 2.0 * MARGIN + float(ACTION_ROUNDING) * effect
@@ -124,7 +124,7 @@ class SafetyFilter(FrozenArrays):
         if (outlook.smallest_room() if self.mode == "boundary" else room) >= MARGIN:
             return Decision(proposed.copy(), False, True, False, margin, "safe")
         if self.mode == "project":
-            closest = outlook.closest(u, self._reserve)
+            closest = outlook.closest(u, self.reserve)
             if closest is not None:
                 closest = self._expressible(closest)
                 room, margin = outlook.judge(closest)

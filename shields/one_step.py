@@ -52,11 +52,11 @@ class OneStepTest:
         # Products with |G| bound what rounding does to products with G, in units of `rounding`.
         self.rounding = 8.0 * (plant.n + plant.m) * float(np.finfo(float).eps)
         size = np.abs(self.root)
-        self._columns = np.linalg.norm(size @ np.abs(plant.A), axis=0)
-        self._own_columns = np.linalg.norm(size, axis=0)
-        self._pushed = float(np.linalg.norm(size @ np.abs(plant.B), axis=0) @ plant.u_max)
+        self.columns = np.linalg.norm(size @ np.abs(plant.A), axis=0)
+        self.own_columns = np.linalg.norm(size, axis=0)
+        self.pushed = float(np.linalg.norm(size @ np.abs(plant.B), axis=0) @ plant.u_max)
         bound = plant.disturbance.shape
-        extent = float(self._own_columns @ np.sqrt(np.diag(bound)))
+        extent = float(self.own_columns @ np.sqrt(np.diag(bound)))
         D = self.root @ bound @ self.root.T + self.rounding * extent**2 * np.eye(plant.n)
         self.D = read_only(0.5 * (D + D.T))
         # The trace-optimal share of the ellipsoid around E(Sigma_k moved) + E(D) needs the traces of both.
@@ -65,8 +65,8 @@ class OneStepTest:
         # Two states and one input, the commonest small plant, go ten times faster in plain floats.
         self._plane = None
         if (plant.n, plant.m) == (2, 1):
-            numbers = (self.moved, self.effect[:, 0], self.D, self._columns)
-            self._plane = (*(array.tolist() for array in numbers), self._pushed, self.rounding, plant.u_max.item())
+            numbers = (self.moved, self.effect[:, 0], self.D, self.columns)
+            self._plane = (*(array.tolist() for array in numbers), self.pushed, self.rounding, plant.u_max.item())
 
     @cached_property
     def vertices(self) -> np.ndarray:
@@ -94,27 +94,42 @@ class OneStepTest:
         first = float(np.vdot(self._gram, error_shape))
         if not (isfinite(first) and _is_shape(error_shape)):
             return None
-        spread = float(self._columns.dot(np.sqrt(np.abs(error_shape.diagonal()))))
-        reach = float(self._columns.dot(np.abs(estimate)))
+        spread = float(self.columns.dot(np.sqrt(np.abs(error_shape.diagonal()))))
+        reach = float(self.columns.dot(np.abs(estimate)))
         first = max(abs(first) ** 0.5, SMALLEST_SHARE * self._second)
         predicted = self.moved.dot(0.5 * (error_shape + error_shape.T)).dot(self.moved.T)
         predicted.flat[:: len(predicted) + 1] += self.rounding * spread * spread
         predicted = predicted * (1.0 + self._second / first) + self.D * (1.0 + first / self._second)
         values, axes, failed = dsyev(predicted)  # numpy's eigh, without its three times longer preparation
-        loss = self.rounding * (reach + spread + self._pushed)
+        loss = self.rounding * (reach + spread + self.pushed)
         if failed or not (reach < FARTHEST and isfinite(float(values[0]) + loss) and 0.0 < values[-1] < np.inf):
             return None
         return Outlook(self, self.moved.dot(estimate), values, axes, loss)
+
+    @np.errstate(all="ignore")
+    def shape_view(self, error_shape: np.ndarray) -> tuple[np.ndarray, float, float] | None:
+        """Returns what the test knows without an estimate: W of |z|^2 = z'Wz, 1 - h, and what rounding grows with.
+
+        W holds for radii of at least SMALLEST_RADIUS. None if the shape, (n, n), is unusable.
+        """
+        seen = self._in_space(np.zeros(self.plant.n), error_shape)
+        if seen is None:
+            return None
+        spread = float(self.columns.dot(np.sqrt(np.abs(error_shape.diagonal()))))
+        return seen.weight, 1.0 - seen.h, spread
+
+    def largest_error(self, error_shape: np.ndarray) -> float:
+        """Returns a bound of sqrt(lambda_max(M Sigma_k)), with its rounding."""
+        spread = float(self.own_columns @ np.sqrt(np.abs(np.diag(error_shape))))
+        shape = self.root @ (0.5 * (error_shape + error_shape.T)) @ self.root.T
+        return max(float(np.linalg.eigvalsh(shape)[-1]) + self.rounding * spread**2, 0.0) ** 0.5
 
     def knows_inside(self, estimate: np.ndarray, error_shape: np.ndarray, margin: float) -> bool:
         """Returns whether |x_hat|_M + sqrt(lambda_max(M Sigma_k)) <= 1 - margin, which proves that x is in S."""
         if self.at(estimate, error_shape) is None:
             return False
-        spread = float(self._own_columns @ np.sqrt(np.abs(np.diag(error_shape))))
-        reach = float(self._own_columns @ np.abs(estimate))
-        shape = self.root @ (0.5 * (error_shape + error_shape.T)) @ self.root.T
-        largest = float(np.linalg.eigvalsh(shape)[-1]) + self.rounding * spread**2
-        level = float(np.linalg.norm(self.root @ estimate)) + max(largest, 0.0) ** 0.5
+        reach = float(self.own_columns @ np.abs(estimate))
+        level = float(np.linalg.norm(self.root @ estimate)) + self.largest_error(error_shape)
         return level <= 1.0 - margin - self.rounding * reach
 
 
@@ -155,13 +170,14 @@ class Outlook:
         loss: What rounding may do.
 
     Attributes:
+        h: Of the test.
         radius: 1 - h less rounding; no input passes if it is negative.
     """
 
     def __init__(
         self, test: OneStepTest, offset: np.ndarray, values: np.ndarray, axes: np.ndarray, loss: float
     ) -> None:
-        h = sqrt(values[-1])
+        self.h = h = sqrt(values[-1])
         self.radius = 1.0 - h - loss
         self._test, self._reached = test, offset
         turn = axes
@@ -169,7 +185,13 @@ class Outlook:
             turn = axes * np.sqrt(h * (1.0 - h) / (h - values))
         else:
             self.radius = min(self.radius, 0.0)
+        self._turn = turn
         self._offset, self._effect = offset.dot(turn), test.effect.T.dot(turn)
+
+    @property
+    def weight(self) -> np.ndarray:
+        """W with |z|^2 = z'Wz in the norm of the test, shape (n, n)."""
+        return self._turn.dot(self._turn.T)
 
     @np.errstate(all="ignore")
     def judge(self, u: list[float]) -> tuple[float, float]:

@@ -1,0 +1,295 @@
+"""The shield as a wrapper of a vector environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
+
+from ncs_gym.frozen import as_number
+from ncs_gym.plant import SIMULATED_REACH
+from ncs_gym.vector_env import NCSVectorEnv
+from shields import kernels, proof
+from shields.certificate import Certificate
+from shields.filter import MARGIN, SafetyFilter
+from shields.proof import starts_inside
+from shields.vector_filter import Decisions, VectorFilter
+from shields.wrapper import certificate_for
+
+# Reasons by code, see `kernels`.
+WHY = np.array(
+    [
+        "",
+        proof.ALARM,
+        proof.OTHER_INPUT,
+        proof.OTHER_STEPS,
+        proof.LARGE_ERROR,
+        proof.FAR_OUT,
+        proof.UNUSABLE,
+        proof.NO_ERROR_SET,
+        proof.NOT_KNOWN_INSIDE,
+    ],
+    dtype=object,
+)
+
+
+class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
+    """`SafetyShield` for an `NCSVectorEnv`: the same decisions, proof and info keys, in batches.
+
+    Every info value has N as its first axis; `shield_reason` is an array of str objects. A step that only resets an
+    environment counts no intervention. With SAME_STEP autoreset `final_info` holds the last step's values.
+
+    Args:
+        env: An `NCSVectorEnv`, possibly wrapped; not by wrappers that change actions.
+        certificate: None synthesizes one for the environment's plant and contract, once per process.
+        mode: "project", "switch", "boundary" or "monitor"; see `SafetyFilter`.
+        penalty: Subtracted from the reward per intervention counted, >= 0.
+
+    Raises:
+        CertificateError: If the certificate does not verify for the environment's plant.
+        Infeasible: If none is given and none is found.
+        ValueError: If the environment is not an `NCSVectorEnv`, an inner wrapper changes actions, or a setting is
+            wrong.
+    """
+
+    def __init__(
+        self,
+        env: VectorEnv,
+        certificate: Certificate | None = None,
+        mode: str = "project",
+        penalty: float = 0.0,
+    ) -> None:
+        RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty)
+        inner = _environment_behind(env)
+        VectorWrapper.__init__(self, env)
+        self.penalty = as_number(penalty, "penalty", low=0.0)
+        if certificate is not None and not isinstance(certificate, Certificate):
+            raise ValueError(f"certificate must be a Certificate or None, got {certificate!r}")
+        self.certificate = certificate_for(inner.plant, inner.contract) if certificate is None else certificate
+        self.filter = SafetyFilter(self.certificate, inner.plant, mode)
+        self._batch = VectorFilter(self.filter)
+        self._starts_inside = starts_inside(self.certificate, inner.single.initial_set)
+        count = self.num_envs
+        self._knowledge = kernels.Knowledge(
+            np.full(count, kernels.OTHER_STEPS), np.zeros(count, np.bool_), np.zeros(count, np.bool_)
+        )
+        self._table, self._numbers = None, np.zeros(0, np.int64)
+        self._interventions = np.zeros(count, np.int64)
+        self._clock: tuple[np.ndarray, np.ndarray] | None = None
+
+    def reset(
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Starts episodes; see `NCSVectorEnv.reset`."""
+        clock, self._clock = self._clock, self._clock and _interrupted(self._clock)
+        observation, info = self.env.reset(seed=seed, options=options)
+        now = self._read_clock()
+        restarted = np.ones(self.num_envs, np.bool_) if clock is None else now[0] != clock[0]
+        self._observe(info, restarted, now[1] == np.where(restarted, 0, 0 if clock is None else clock[1]), None)
+        self._clock = now
+        return observation, info | self._idle_info(restarted, None)
+
+    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Applies the actions, or what the shield puts in the place of some.
+
+        Raises:
+            ValueError: If an action is not finite or the shape is wrong; nothing has moved then.
+            gymnasium.error.ResetNeeded: If there was no reset.
+        """
+        if self._clock is None:
+            raise gym.error.ResetNeeded("call reset before the first step")
+        inner: NCSVectorEnv = self.env.unwrapped
+        proposed = inner.inputs_of(actions)
+        decisions = self._batch.decide(self._estimate, self._shape_number, proposed)
+        if self.filter.mode != "monitor" and decisions.intervened.any():
+            overriding = (decisions.inputs.T / self.filter.plant.u_max).astype(np.float32)
+            actions = np.where(decisions.intervened[:, None], overriding, np.asarray(actions))
+        (episodes, steps), self._clock = self._clock, _interrupted(self._clock)
+        observation, rewards, terminated, truncated, info = self.env.step(actions)
+        clock = self._read_clock()
+        restarted = clock[0] != episodes
+        moved_once = np.where(restarted, (clock[0] == episodes + 1) & (clock[1] == 0), clock[1] == steps + 1)
+        counted = decisions.intervened
+        added = {}
+        if restarted.any() and "final_info" in info:
+            added["final_info"] = self._final_info(info, decisions, proposed, moved_once, episodes, steps)
+            rewards = rewards - self.penalty * counted if self.penalty else rewards
+            counted = counted & ~restarted
+        else:
+            counted = counted & ~restarted
+            rewards = rewards - self.penalty * counted if self.penalty else rewards
+        self._interventions += counted
+        self._observe(info, restarted, moved_once, decisions)
+        self._clock = clock
+        if restarted.any():
+            added |= self._idle_info(restarted, (decisions, proposed))
+        else:
+            added |= self._info(decisions, proposed)
+        return observation, rewards, terminated, truncated, info | added
+
+    def _observe(
+        self, info: dict[str, Any], restarted: np.ndarray, moved_once: np.ndarray, decisions: Decisions | None
+    ) -> None:
+        """Takes in what the environment reports, and moves the proofs on."""
+        self._interventions[restarted] = 0
+        self._estimate = np.ascontiguousarray(info["estimate"].T)
+        self._shape_number = self._numbers_of_shapes()
+        self._reason = self._proved(info, restarted, moved_once, decisions)
+
+    def _proved(
+        self,
+        info: dict[str, Any],
+        restarted: np.ndarray,
+        moved_once: np.ndarray,
+        decisions: Decisions | None,
+        knowledge: kernels.Knowledge | None = None,
+    ) -> np.ndarray:
+        """Returns why each proof does not hold, as codes, shape (N,), and changes `knowledge`."""
+        knowledge = self._knowledge if knowledge is None else knowledge
+        count, m = self.num_envs, self.filter.plant.m
+        nothing = np.zeros(count, np.bool_)
+        none = Decisions(np.zeros((m, count)), nothing, knowledge.inside, knowledge.inside, nothing, nothing)
+        decided = none if decisions is None else decisions
+        book, test = self._batch.book, self.filter.test
+        facts = (
+            self._shape_number,
+            book.outlooks.usable,
+            book.certified,
+            book.extent,
+            book.largest,
+            test.root,
+            test.own_columns,
+            test.rounding,
+            MARGIN,
+            SIMULATED_REACH * self.filter.plant.half_widths,
+            self.certificate.Sigma is not None,
+        )
+        reason = np.empty(count, np.int64)
+        inputs = decided.inputs if decisions is None else np.ascontiguousarray(info["input"].T)
+        kernels.track(
+            knowledge,
+            restarted,
+            moved_once,
+            decided.inputs,
+            decided.passed,
+            decided.fallback,
+            self._known_starts(restarted),
+            inputs,
+            self._estimate,
+            info["assumption_violated"],
+            facts,
+            reason,
+        )
+        return reason
+
+    def _known_starts(self, restarted: np.ndarray) -> np.ndarray:
+        """Returns whether all possible starts of the present episodes lie in S, shape (N,)."""
+        known = np.full(self.num_envs, self._starts_inside)
+        starts = self.env.unwrapped.starts
+        for e in np.flatnonzero(restarted & ~np.isnan(starts[:, 0])).tolist():
+            known[e] = starts_inside(self.certificate, starts[e])
+        return known
+
+    def _numbers_of_shapes(self) -> np.ndarray:
+        """Returns the index in the book of each environment's error shape, shape (N,)."""
+        table, nodes = self.env.unwrapped.patterns
+        if table is not self._table:
+            self._table, self._numbers = table, np.full(len(table), -1)
+        if len(table) > len(self._numbers):
+            self._numbers = np.append(self._numbers, np.full(len(table), -1))
+        numbers = self._numbers[nodes]
+        if numbers.min() < 0:
+            n = self.filter.plant.n
+            for node in np.unique(nodes[numbers < 0]).tolist():
+                self._numbers[node] = self._batch.book.number(table.shapes[node].reshape(n, n).copy())
+            numbers = self._numbers[nodes]
+        return numbers
+
+    def _read_clock(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the numbers of episodes begun and of steps taken in them, shape (N,) each."""
+        inner = self.env.unwrapped
+        return inner.episodes.copy(), inner.steps.copy()
+
+    def _info(self, decisions: Decisions, proposed: np.ndarray) -> dict[str, Any]:
+        """Returns the shield's keys for the step that applied these decisions."""
+        correction = decisions.inputs - proposed
+        return {
+            "shield_intervened": decisions.intervened,
+            "input_proposed": proposed.T,
+            "shield_correction": np.sqrt(np.einsum("ie,ie->e", correction, correction)),
+            "shield_margin": decisions.margin,
+            "shield_guaranteed": self._reason == 0,
+            "shield_reason": WHY[self._reason],
+            "episode_interventions": self._interventions.copy(),
+        }
+
+    def _idle_info(self, restarted: np.ndarray, done: tuple[Decisions, np.ndarray] | None) -> dict[str, Any]:
+        """Returns the shield's keys where episodes just began; elsewhere those of what was done, nothing if None."""
+        count, m = self.num_envs, self.filter.plant.m
+        nothing = np.zeros(count, np.bool_)
+        margins = self._batch.margins(self._estimate, self._shape_number)
+        info = self._info(
+            Decisions(np.zeros((m, count)), nothing, nothing, nothing, margins, nothing), np.zeros((m, count))
+        )
+        if done is None:
+            return info
+        stepped = self._info(*done)
+        return {
+            key: np.where(restarted.reshape(-1, *[1] * (value.ndim - 1)), info[key], value)
+            for key, value in stepped.items()
+        }
+
+    def _final_info(
+        self,
+        info: dict[str, Any],
+        decisions: Decisions,
+        proposed: np.ndarray,
+        moved_once: np.ndarray,
+        episodes: np.ndarray,
+        steps: np.ndarray,
+    ) -> dict[str, Any]:
+        """Returns final_info with the shield's keys of the last steps of episodes that ended (SAME_STEP)."""
+        final, n = dict(info["final_info"]), self.filter.plant.n
+        done = info["_final_info"]
+        kept = self._estimate, self._shape_number, self._interventions, getattr(self, "_reason", None)
+        book = self._batch.book
+        self._estimate = np.ascontiguousarray(final["estimate"].T)
+        shapes = [book.number(final["error_shape"][e].reshape(n, n).copy()) for e in np.flatnonzero(done).tolist()]
+        self._shape_number = self._shape_number.copy()
+        self._shape_number[done] = shapes
+        knowledge = kernels.Knowledge(*(array.copy() for array in self._knowledge))
+        never = np.zeros(self.num_envs, np.bool_)
+        self._reason = self._proved(final, never, done | moved_once, decisions, knowledge)
+        self._interventions = self._interventions + decisions.intervened
+        for key, value in self._info(decisions, proposed).items():
+            final[key], final[f"_{key}"] = value, done.copy()
+        self._estimate, self._shape_number, self._interventions, self._reason = kept
+        return final
+
+
+def _interrupted(clock: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns what the clock reads while a step is under way, which no later step follows from."""
+    return np.full_like(clock[0], -1), np.full_like(clock[1], -1)
+
+
+def _environment_behind(env: VectorEnv) -> NCSVectorEnv:
+    """Returns the innermost environment after looking at every wrapper around it."""
+    layer = env
+    while isinstance(layer, VectorWrapper):
+        if isinstance(layer, (VectorActionWrapper, VectorSafetyShield)):
+            raise ValueError(
+                f"the shield must be inside {type(layer).__name__}, which changes actions: wrap the shield around the "
+                "environment first"
+            )
+        layer = layer.env
+    if not isinstance(layer, NCSVectorEnv):
+        raise ValueError(
+            f"the shield needs an NCSVectorEnv inside, got {type(layer).__name__}: for gymnasium's sync and async "
+            "vector environments give make_vec(..., wrappers=[SafetyShield])"
+        )
+    if env.single_action_space != layer.single_action_space:
+        raise ValueError(f"a wrapper inside the shield changes the action space to {env.single_action_space}")
+    return layer

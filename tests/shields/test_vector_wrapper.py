@@ -1,0 +1,279 @@
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import VectorActionWrapper, VectorObservationWrapper
+from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
+
+from ncs_gym import Channel, ChannelContract, NCSVectorEnv, SphereDisturbance, batch_reactor, truck_trailer
+from shields import CertificateError, SafetyFilter, SafetyShield, VectorSafetyShield
+from shields.filter import MODES
+from shields.proof import ProofTracker, starts_inside
+from shields.vector_filter import REASONS, VectorFilter
+from tests.attacks import CHANNELS, RANDOM, TRUCKS, certificate_of, harmful
+
+KEYS = {
+    "shield_intervened",
+    "input_proposed",
+    "shield_correction",
+    "shield_margin",
+    "shield_guaranteed",
+    "shield_reason",
+    "episode_interventions",
+}
+
+
+def random_shapes(rng, plant, count):
+    """Error shapes of all sizes, some flat, some unusable."""
+    certified = certificate_of(plant).Sigma
+    factor = np.linalg.cholesky(certified)
+    shapes = []
+    for _ in range(count):
+        inner = rng.standard_normal((plant.n, plant.n)) * np.exp(rng.uniform(-4.0, 1.0))
+        inner[:, 0] *= rng.choice([1.0, 1e-8])
+        shape = factor @ inner @ inner.T @ factor.T
+        shapes.append(0.5 * (shape + shape.T))
+    shapes[0] = np.zeros_like(certified)
+    shapes[1] = np.full_like(certified, np.nan)
+    shapes[2] = -certified
+    return np.array(shapes)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("plant", [*TRUCKS.values(), *RANDOM.values()], ids=[*TRUCKS, *RANDOM])
+def test_decisions_equal_those_of_the_scalar_filter(plant, mode):
+    safety_filter = SafetyFilter(certificate_of(plant), plant, mode)
+    batch, rng, count = VectorFilter(safety_filter), np.random.default_rng(0), 400
+    estimates = certificate_of(plant).safe_set.sample_boundary_many(rng, count) * rng.uniform(0, 1.3, (count, 1))
+    estimates[3], estimates[4], estimates[5] = 1e200, np.nan, 0.0
+    shapes = random_shapes(rng, plant, 60)[rng.integers(60, size=count)]
+    proposed = rng.uniform(-1, 1, (count, plant.m)) * plant.u_max
+    proposed[::7] = plant.u_max
+    # Some propose just what the fallback would do.
+    proposed[::11] = [
+        np.zeros(plant.m) if not np.isfinite(x).all() else safety_filter.fallback_input(x) for x in estimates[::11]
+    ]
+    numbers = np.array([batch.book.number(shape) for shape in shapes])
+    found = batch.decide(np.ascontiguousarray(estimates.T), numbers, np.ascontiguousarray(proposed.T))
+    seen = set()
+    for e in range(count):
+        one = safety_filter.decide(estimates[e], shapes[e], proposed[e])
+        seen.add(one.reason)
+        assert REASONS[found.reason[e]] == one.reason
+        np.testing.assert_allclose(found.inputs[:, e], one.input, rtol=3e-7, atol=1e-12)
+        assert (found.intervened[e], found.passed[e], found.fallback[e]) == (one.intervened, one.passed, one.fallback)
+        np.testing.assert_allclose(found.margin[e], one.margin, atol=1e-6 if one.reason == "projected" else 1e-12)
+    assert {"safe", "invalid"} <= seen
+    assert seen & {"projected", "fallback", "unsafe"}
+
+
+def drive(env, steps, policy):
+    """Steps a shielded vector environment; checks every key against scalar filters and trackers."""
+    shield, inner = env, env.unwrapped
+    safety_filter = SafetyFilter(shield.certificate, inner.plant, shield.filter.mode)
+    trackers = [ProofTracker(safety_filter) for _ in range(env.num_envs)]
+    _, info = env.reset(seed=0)
+    inside = starts_inside(shield.certificate, inner.single.initial_set)
+    counts = np.zeros(env.num_envs, int)
+    rows = [{key: value[e] for key, value in info.items()} for e in range(env.num_envs)]
+    for tracker, row in zip(trackers, rows, strict=True):
+        tracker.start(inside, True, row)
+    totals = {"interventions": 0, "guaranteed": 0, "reasons": set()}
+    for _ in range(steps):
+        actions = policy(info)
+        episodes = inner.episodes.copy()
+        decisions = [
+            safety_filter.decide(row["estimate"], row["error_shape"], u)
+            for row, u in zip(rows, inner.inputs_of(actions).T, strict=True)
+        ]
+        *_, info = env.step(actions)
+        rows = [{key: value[e] for key, value in info.items()} for e in range(env.num_envs)]
+        for e, (tracker, row, decision) in enumerate(zip(trackers, rows, decisions, strict=True)):
+            if inner.episodes[e] != episodes[e]:
+                tracker.start(inside, True, row)
+                counts[e] = 0
+                assert not row["shield_intervened"]
+                assert not row["input_proposed"].any()
+                margin = safety_filter.margin(row["estimate"], row["error_shape"], np.zeros(inner.plant.m))
+                assert row["shield_margin"] == pytest.approx(margin, abs=1e-12)
+            else:
+                tracker.step(decision, True, row)
+                counts[e] += decision.intervened
+                assert row["shield_intervened"] == decision.intervened
+                np.testing.assert_allclose(row["input"], decision.input, rtol=3e-7, atol=1e-9)
+                assert row["shield_margin"] == pytest.approx(decision.margin, abs=1e-6)
+            assert row["shield_reason"] == tracker.reason
+            assert row["shield_guaranteed"] == (not tracker.reason)
+            assert row["episode_interventions"] == counts[e]
+        totals["interventions"] += int(info["shield_intervened"].sum())
+        totals["guaranteed"] += int(info["shield_guaranteed"].sum())
+        totals["reasons"] |= set(info["shield_reason"].tolist())
+    return totals
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("name", ["TruckTrailerCruise", "BatchReactor"])
+def test_infos_equal_those_of_scalar_shields(name, mode):
+    env = VectorSafetyShield(gym.make_vec(f"ncs_gym/{name}-v0", num_envs=6, max_episode_steps=60), mode=mode)
+    rng = np.random.default_rng(1)
+
+    def policy(info):
+        return np.sign(rng.uniform(-1, 1, (6, env.unwrapped.plant.m)) + 0.8).astype(np.float32)
+
+    totals = drive(env, 150, policy)
+    assert totals["interventions"] > 0
+    assert totals["guaranteed"] > 0
+
+
+def test_reasons_of_broken_proofs_equal_those_of_scalar_shields():
+    env = NCSVectorEnv(
+        8,
+        plant=batch_reactor(),
+        channel=Channel(loss=0.6, quantization_step=1e-3),
+        contract=ChannelContract(2, 1e-3),
+        max_episode_steps=40,
+        disturbance=lambda rng, plant, nominal: 4.0 * plant.disturbance.sample_boundary(rng),
+        allow_assumption_violation=True,
+    )
+    shielded = VectorSafetyShield(env, mode="monitor")
+    rng = np.random.default_rng(0)
+    totals = drive(shielded, 100, lambda info: rng.uniform(-1, 1, (8, 2)))
+    assert len(totals["reasons"]) >= 4
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+@pytest.mark.parametrize("mode", ["project", "switch", "boundary"])
+def test_no_policy_leaves_the_safe_set(mode, channel):
+    plant = TRUCKS["4000 kg"]
+    env = NCSVectorEnv(500, plant=plant, channel=CHANNELS[channel], disturbance=harmful(plant), max_episode_steps=100)
+    shield = VectorSafetyShield(env, certificate_of(plant), mode)
+    _, info = shield.reset(seed=0)
+    rng, levels, overridden = np.random.default_rng(0), [], 0
+    for step in range(200):
+        outwards = np.sign(info["estimate"] @ (shield.certificate.M @ plant.B))
+        actions = outwards if step % 2 else rng.uniform(-1, 1, (500, 1))
+        _, _, _, _, info = shield.step(actions)
+        levels.append(np.einsum("ei,ij,ej->e", info["state"], shield.certificate.M, info["state"]).max())
+        assert info["shield_guaranteed"].all()
+        overridden += int(info["shield_intervened"].sum())
+    assert 0.5 < max(levels) <= 1.0
+    assert 0 < overridden < 200 * 500
+
+
+def test_same_step_autoreset_reports_the_last_step_in_final_info():
+    settings = {"num_envs": 5, "max_episode_steps": 7}
+    shields = [
+        VectorSafetyShield(gym.make_vec("ncs_gym/TruckTrailerCruise-v0", autoreset_mode=mode, **settings), penalty=1.0)
+        for mode in ("SameStep", "Disabled")
+    ]
+    for shield in shields:
+        shield.reset(seed=0)
+    for _ in range(7):
+        same, plain = (shield.step(np.ones((5, 1), np.float32)) for shield in shields)
+    np.testing.assert_array_equal(same[1], plain[1])
+    final = same[4]["final_info"]
+    for key, value in plain[4].items():
+        np.testing.assert_array_equal(final[key], value)
+    assert not same[4]["shield_intervened"].any()
+    assert not same[4]["episode_interventions"].any()
+    assert same[4]["shield_guaranteed"].all()
+
+
+def test_penalty_is_subtracted_per_intervention_but_not_for_a_reset():
+    rewards = []
+    for penalty in (0.0, 3.0):
+        env = VectorSafetyShield(
+            gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=4, max_episode_steps=10), penalty=penalty
+        )
+        env.reset(seed=0)
+        run = [env.step(np.ones((4, 1), np.float32)) for _ in range(25)]
+        rewards.append(np.array([step[1] for step in run]))
+        counts = np.array([step[4]["shield_intervened"] for step in run])
+    np.testing.assert_allclose(rewards[0] - rewards[1], 3.0 * counts)
+    assert counts.any()
+    assert not counts[10].any()
+
+
+def test_partial_resets_keep_what_is_known_of_the_others():
+    env = VectorSafetyShield(gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=3, autoreset_mode="Disabled"))
+    _, info = env.reset(seed=0)
+    assert set(info) >= KEYS
+    for _ in range(20):
+        *_, info = env.step(np.ones((3, 1), np.float32))
+    counts = info["episode_interventions"]
+    assert counts.any()
+    _, info = env.reset(options={"reset_mask": np.array([False, True, False]), "state": np.array([9.0, 9.0])})
+    np.testing.assert_array_equal(info["episode_interventions"][[0, 2]], counts[[0, 2]])
+    assert info["episode_interventions"][1] == 0
+    np.testing.assert_array_equal(info["shield_guaranteed"], [True, False, True])
+    assert "not known to be in the safe set" in info["shield_reason"][1]
+    *_, info = env.step(np.ones((3, 1), np.float32))
+    np.testing.assert_array_equal(info["shield_guaranteed"][[0, 2]], True)
+
+
+def test_steps_behind_the_shields_back_end_the_proof():
+    env = VectorSafetyShield(gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=2))
+    env.reset(seed=0)
+    env.env.step(np.ones((2, 1), np.float32))
+    *_, info = env.step(np.ones((2, 1), np.float32))
+    assert not info["shield_guaranteed"].any()
+    env.reset()
+    assert env.step(np.ones((2, 1), np.float32))[4]["shield_guaranteed"].all()
+    with pytest.raises(ValueError, match="actions"):
+        env.step(np.full((2, 1), np.nan))
+    assert env.step(np.ones((2, 1), np.float32))[4]["shield_guaranteed"].all()
+
+
+def test_works_under_gymnasiums_vector_wrappers():
+    env = gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=3, max_episode_steps=20)
+    env = NormalizeObservation(RecordEpisodeStatistics(VectorSafetyShield(env)))
+    env.reset(seed=0)
+    episodes = 0
+    for _ in range(50):
+        *_, info = env.step(env.action_space.sample())
+        episodes += int(info.get("_episode", np.zeros(3)).sum())
+        assert info["shield_guaranteed"].all()
+    assert episodes == 6
+
+
+def test_wrong_uses_are_refused():
+    class Scaled(VectorActionWrapper):
+        def actions(self, actions):
+            return 0.5 * actions
+
+    class Plain(VectorObservationWrapper):
+        def observations(self, observations):
+            return observations
+
+    env = gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=2)
+    with pytest.raises(ValueError, match="inside Scaled"):
+        VectorSafetyShield(Scaled(env))
+    with pytest.raises(ValueError, match="inside VectorSafetyShield"):
+        VectorSafetyShield(VectorSafetyShield(env))
+    with pytest.raises(ValueError, match="wrappers="):
+        VectorSafetyShield(gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=2, vectorization_mode="sync"))
+    with pytest.raises(ValueError, match="mode must be"):
+        VectorSafetyShield(env, mode="off")
+    with pytest.raises(ValueError, match="penalty"):
+        VectorSafetyShield(env, penalty=-1.0)
+    with pytest.raises(ValueError, match="certificate must be"):
+        VectorSafetyShield(env, certificate="file")
+    with pytest.raises(CertificateError):
+        VectorSafetyShield(env, certificate_of(truck_trailer()))
+    with pytest.raises(gym.error.ResetNeeded):
+        VectorSafetyShield(Plain(env)).step(np.zeros((2, 1)))
+
+
+def test_scalar_shields_in_gymnasiums_sync_environment_still_work():
+    env = gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=2, vectorization_mode="sync", wrappers=[SafetyShield])
+    env.reset(seed=0)
+    assert env.step(np.ones((2, 1), np.float32))[4]["shield_guaranteed"].all()
+
+
+def test_sphere_disturbance_and_shared_certificate():
+    certificate = certificate_of(TRUCKS["4000 kg"])
+    envs = [NCSVectorEnv(2, plant=TRUCKS["4000 kg"], disturbance=SphereDisturbance()) for _ in range(2)]
+    shields = [VectorSafetyShield(env, certificate) for env in envs]
+    for shield in shields:
+        shield.reset(seed=1)
+    one, other = (shield.step(np.ones((2, 1)))[4] for shield in shields)
+    np.testing.assert_array_equal(one["input"], other["input"])
