@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+
+from agents.sb3_vec_env import SB3VecEnv
 
 
 @dataclass(frozen=True)
@@ -30,8 +33,8 @@ class SafetyCallback(BaseCallback):
     """Counts violations of the true state and interventions in every training step, and logs their rates.
 
     The counts come from each step's info; `Monitor` alone would see the last step of each episode only. Works with any
-    stable-baselines3 algorithm. TensorBoard gets `safety/violation_rate`, `safety/intervention_rate` (per step since
-    the last log) and `safety/violation_steps` (total).
+    stable-baselines3 algorithm, on `SB3VecEnv` and on single environments. TensorBoard gets `safety/violation_rate`,
+    `safety/intervention_rate` (per step since the last log) and `safety/violation_steps` (total).
 
     Args:
         on_progress: Called with the number of steps taken since its last call.
@@ -56,9 +59,12 @@ class SafetyCallback(BaseCallback):
         return self._interventions
 
     def _on_step(self) -> bool:
-        for info in self.locals["infos"]:
-            self._violations += int(info["cost"] > 0.0)
-            self._interventions += bool(info.get("shield_intervened", False))
+        batch = _batch_info(self.training_env)
+        if batch is None:
+            infos = self.locals["infos"]
+            batch = {key: [info[key] for info in infos] for key in ("cost", "shield_intervened") if key in infos[0]}
+        self._violations += int((np.asarray(batch["cost"]) > 0.0).sum())
+        self._interventions += int(np.sum(batch.get("shield_intervened", 0)))
         return True
 
     def _on_rollout_end(self) -> None:
@@ -74,3 +80,10 @@ class SafetyCallback(BaseCallback):
         if self._on_progress is not None:
             self._on_progress(self.num_timesteps - self._reported)
             self._reported = self.num_timesteps
+
+
+def _batch_info(env: VecEnv) -> dict[str, np.ndarray] | None:
+    """Returns the infos of the last step as arrays, None where there are only dicts."""
+    while isinstance(env, VecEnvWrapper):
+        env = env.venv
+    return env.batch_info if isinstance(env, SB3VecEnv) else None

@@ -13,15 +13,13 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 import ncs_gym  # noqa: F401  (registers the environments)
 from agents.callbacks import SafetyCallback, TrainingPoint
+from agents.sb3_vec_env import EPISODE_KEYS, SB3VecEnv
 from agents.settings import PPOSettings
-from shields import Certificate, SafetyShield
-
-# What Monitor keeps of an episode's last step: running totals, so these are the episode's.
-EPISODE_KEYS = ("episode_violations", "is_success")
+from shields import Certificate, SafetyShield, VectorSafetyShield
 
 
 @dataclass(frozen=True)
@@ -88,6 +86,16 @@ def make_env(env_id: str, shielding: Shielding | None = None) -> gym.Env:
     return SafetyShield(env, shielding.certificate, mode=shielding.mode, penalty=shielding.penalty)
 
 
+def make_training_env(env_id: str, count: int, shielding: Shielding | None = None) -> VecEnv:
+    """Returns `count` environments for stable-baselines3: a vector environment if the id has one, else single ones."""
+    if gym.spec(env_id).vector_entry_point is None:
+        return DummyVecEnv([lambda: Monitor(make_env(env_id, shielding), info_keywords=EPISODE_KEYS)] * count)
+    env = gym.make_vec(env_id, num_envs=count)
+    if shielding is not None:
+        env = VectorSafetyShield(env, shielding.certificate, mode=shielding.mode, penalty=shielding.penalty)
+    return SB3VecEnv(env)
+
+
 def train(
     env_id: str,
     steps: int,
@@ -103,16 +111,15 @@ def train(
     Args:
         env_id: A registered `ncs_gym` id.
         steps: Environment steps to train for, rounded up to whole rollouts.
-        seed: Seeds environments, network and sampling; arms with the same seed meet the same draws of nature.
+        seed: Seeds environments, network and sampling; arms with the same seed meet the same draws
+            of nature as long as their episodes last equally long.
         shielding: None trains unshielded.
         settings: Of PPO; the defaults if None.
         log_folder: Where TensorBoard's events go.
         on_progress: Called with the number of steps taken since its last call.
     """
     settings = settings or PPOSettings()
-    env = VecNormalize(
-        DummyVecEnv([lambda: _monitored(env_id, shielding) for _ in range(settings.envs)]), gamma=settings.discount
-    )
+    env = VecNormalize(make_training_env(env_id, settings.envs, shielding), gamma=settings.discount)
     model = _ppo(env, settings, seed)
     model.set_logger(configure(str(log_folder), ["tensorboard"]) if log_folder else Logger(None, []))
     callback = SafetyCallback(on_progress)
@@ -125,12 +132,8 @@ def train(
 
 def untrained(env_id: str, seed: int, settings: PPOSettings | None = None) -> Agent:
     """Returns a policy with the random weights that training starts from."""
-    env = VecNormalize(DummyVecEnv([lambda: _monitored(env_id, None)]), training=False)
+    env = VecNormalize(make_training_env(env_id, 1), training=False)
     return Agent(_ppo(env, settings or PPOSettings(), seed), env)
-
-
-def _monitored(env_id: str, shielding: Shielding | None) -> Monitor:
-    return Monitor(make_env(env_id, shielding), info_keywords=EPISODE_KEYS)
 
 
 def _ppo(env: VecNormalize, settings: PPOSettings, seed: int) -> PPO:

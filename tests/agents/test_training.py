@@ -1,6 +1,9 @@
+import copy
+
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.vector import VectorWrapper
 
 from agents.evaluation import evaluate
 from agents.settings import PPOSettings
@@ -26,21 +29,34 @@ def test_same_seed_trains_the_same_agent():
 
 
 def test_training_counts_every_violating_step(monkeypatch):
-    # Counted again by a wrapper around each environment, step by step.
+    # Counted again from the true states, at every step of the vector environment.
     counted = []
 
-    class Counter(gym.Wrapper):
-        def step(self, action):
-            result = self.env.step(action)
-            counted.append(result[4]["cost"])
+    class Counter(VectorWrapper):
+        def step(self, actions):
+            result = self.env.step(actions)
+            states = result[4]["state"] @ self.env.unwrapped.plant.C.T
+            counted.extend((np.abs(states).max(axis=1) > 1.0).tolist())
             return result
 
-    monkeypatch.setattr("agents.training.make_env", lambda *arguments: Counter(make_env(*arguments)))
+    make_vec = gym.make_vec
+    monkeypatch.setattr(gym, "make_vec", lambda *arguments, **keywords: Counter(make_vec(*arguments, **keywords)))
     result = train(CRUISE, 2048, 0, settings=TINY)
     assert result.steps == len(counted) == 2048
     assert result.violation_steps == sum(counted) > 0
     assert result.history[-1].violation_steps == result.violation_steps
     assert result.interventions == 0
+
+
+def test_single_environments_are_counted_alike(shielding, monkeypatch):
+    # What has no vector environment is stepped one by one.
+    spec = copy.deepcopy(gym.spec(CRUISE))
+    spec.id, spec.vector_entry_point = "Scalar-v0", None
+    monkeypatch.setitem(gym.registry, "Scalar-v0", spec)
+    result = train("Scalar-v0", 1024, 0, shielding, TINY)
+    assert result.violation_steps == 0
+    assert result.interventions > 20
+    assert train("Scalar-v0", 1024, 0, None, TINY).violation_steps > 0
 
 
 def test_shielded_training_has_no_violation_and_counts_interventions(shielding):

@@ -1,0 +1,214 @@
+"""Gymnasium's vector environments for stable-baselines3."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecEnv
+
+from ncs_gym import NCSVectorEnv
+
+# Vector environments whose reset takes options={"reset_mask": ...} and starts the episodes of these alone.
+WITH_RESET_MASK = (NCSVectorEnv, SyncVectorEnv, AsyncVectorEnv)
+# What `Monitor(info_keywords=...)` would keep of an episode's last step, where the environment reports it.
+EPISODE_KEYS = ("episode_violations", "is_success")
+
+
+class SB3VecEnv(VecEnv):
+    """A gymnasium `VectorEnv` as a stable-baselines3 `VecEnv`.
+
+    stable-baselines3 wants the first observation of the next episode in the step that ends one, and the last one in
+    `info["terminal_observation"]`. That is exact for SAME_STEP autoreset, and for NEXT_STEP and DISABLED where resets
+    of single environments are possible (`NCSVectorEnv`, gymnasium's sync and async). Other NEXT_STEP environments take
+    a step to reset: with `allow_reset_transitions=True` the learner sees that step as a transition of reward 0 from the
+    last observation of an episode to the first of the next, once per episode.
+
+    Like `Monitor` it adds `info["episode"]` (`r`, `l`, `t`) to the last step of an episode, with `episode_violations`
+    and `is_success` where there are such infos. A dict per environment and step is slow: by default they hold what the
+    library needs; `batch_info` has all values of the last step as arrays, and `info_keys` says what to copy.
+
+    Args:
+        vector_env: The environment.
+        allow_reset_transitions: See above.
+        info_keys: Infos that every step's dicts hold; the last step of an episode has all of them.
+
+    Attributes:
+        vector_env: The environment.
+        batch_info: Infos of the last step, arrays with the environment as first axis; where an episode ended its own.
+
+    Raises:
+        ValueError: If episodes cannot be restarted in time and that is not allowed.
+    """
+
+    def __init__(
+        self, vector_env: VectorEnv, *, allow_reset_transitions: bool = False, info_keys: Sequence[str] = ()
+    ) -> None:
+        if not isinstance(vector_env, (VectorEnv, gym.vector.VectorWrapper)):
+            raise ValueError(f"vector_env must be a gymnasium VectorEnv, got {type(vector_env).__name__}")
+        self.vector_env, self._info_keys = vector_env, tuple(info_keys)
+        self._mode = vector_env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
+        self._masks = isinstance(vector_env.unwrapped, WITH_RESET_MASK)
+        if self._mode is not AutoresetMode.SAME_STEP and not self._masks and not allow_reset_transitions:
+            raise ValueError(
+                f"{type(vector_env.unwrapped).__name__} takes a step of its own to reset: make it with SAME_STEP "
+                "autoreset, or accept a transition of reward 0 per episode with allow_reset_transitions=True"
+            )
+        if self._mode is AutoresetMode.DISABLED and not self._masks:
+            raise ValueError(f"{type(vector_env.unwrapped).__name__} does not reset at all")
+        self.batch_info: dict[str, Any] = {}
+        self._started = time.time()
+        super().__init__(vector_env.num_envs, vector_env.single_observation_space, vector_env.single_action_space)
+
+    def reset(self) -> np.ndarray:
+        """Starts episodes, with the seeds and options given before."""
+        options = {str(option): option for option in self._options if option}
+        if len(options) > 1:
+            raise ValueError("a vector environment takes the same options for all environments")
+        seeds: Any = None if self._seeds[0] is None else self._seeds
+        if seeds is not None and not isinstance(self.vector_env.unwrapped, WITH_RESET_MASK[1:]):
+            seeds = seeds[0]
+        observation, info = self.vector_env.reset(seed=seeds, options=next(iter(options.values()), None))
+        self._reset_seeds()
+        self._reset_options()
+        self.reset_infos = [{key: value[e] for key, value in _dense(info).items()} for e in range(self.num_envs)]
+        self._returns, self._lengths = np.zeros(self.num_envs), np.zeros(self.num_envs, np.int64)
+        self._resetting = np.zeros(self.num_envs, np.bool_)
+        return observation
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Stores the actions for `step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Steps; returns observations, rewards (float32), dones and a dict per environment."""
+        observation, rewards, terminated, truncated, info = self.vector_env.step(self._actions)
+        done = terminated | truncated
+        self._returns += rewards
+        self._lengths += ~self._resetting
+        last = observation
+        self.batch_info = info
+        if self._mode is AutoresetMode.SAME_STEP and done.any():
+            last = info["final_obs"]
+            self.batch_info = _with_final(info, done)
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        dense = _dense(self.batch_info)
+        for key in self._info_keys:
+            for one, value in zip(infos, dense[key], strict=True):
+                one[key] = value
+        for e in np.flatnonzero(done).tolist():
+            infos[e] = self._last_info(e, dense, last[e], bool(truncated[e] and not terminated[e]))
+        if done.any():
+            self._returns[done], self._lengths[done] = 0.0, 0
+            if self._masks and self._mode is not AutoresetMode.SAME_STEP:
+                fresh, reset_info = self.vector_env.reset(options={"reset_mask": done.copy()})
+                observation = np.where(done.reshape(-1, *[1] * (observation.ndim - 1)), fresh, observation)
+                for e in np.flatnonzero(done).tolist():
+                    self.reset_infos[e] = {key: value[e] for key, value in _dense(reset_info).items()}
+            elif self._mode is AutoresetMode.NEXT_STEP:
+                self._resetting = done
+                return observation, rewards.astype(np.float32), done, infos
+        self._resetting = np.zeros(self.num_envs, np.bool_)
+        return observation, rewards.astype(np.float32), done, infos
+
+    def _last_info(self, e: int, dense: dict[str, np.ndarray], observation: np.ndarray, cut: bool) -> dict[str, Any]:
+        """Returns the dict of environment e whose episode ends now."""
+        info = {key: value[e] for key, value in dense.items()}
+        elapsed = round(time.time() - self._started, 6)
+        info["episode"] = {"r": float(self._returns[e]), "l": int(self._lengths[e]), "t": elapsed}
+        info["episode"] |= {key: float(info[key]) for key in EPISODE_KEYS if key in info}
+        info["terminal_observation"] = np.array(observation)
+        info["TimeLimit.truncated"] = cut
+        return info
+
+    def close(self) -> None:
+        """Closes the environment."""
+        self.vector_env.close()
+
+    def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
+        """Returns an attribute of each environment; of a vector environment that is one object, the same for all.
+
+        Raises:
+            AttributeError: If there is no such attribute, or an array of the vector environment that may be anything.
+        """
+        chosen = self._get_indices(indices)
+        inner = self.vector_env.unwrapped
+        if attr_name == "render_mode":
+            return [self.vector_env.render_mode for _ in chosen]
+        if isinstance(inner, WITH_RESET_MASK[1:]):
+            values = inner.get_attr(attr_name)
+            return [values[e] for e in chosen]
+        source = inner.single if isinstance(inner, NCSVectorEnv) and attr_name not in STATEFUL else inner
+        value = getattr(source, attr_name)
+        if isinstance(value, np.ndarray):
+            raise AttributeError(f"{attr_name} is an array of {type(inner).__name__}: read it from vector_env")
+        return [value for _ in chosen]
+
+    def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
+        """Sets an attribute of environments of gymnasium's sync and async vector environments, all at once.
+
+        Raises:
+            AttributeError: Of any other vector environment, whose environments are not objects.
+        """
+        inner, chosen = self.vector_env.unwrapped, list(self._get_indices(indices))
+        if not isinstance(inner, WITH_RESET_MASK[1:]):
+            raise AttributeError(f"the environments of {type(inner).__name__} have no attributes of their own to set")
+        values = list(inner.get_attr(attr_name)) if len(chosen) < self.num_envs else [None] * self.num_envs
+        for e in chosen:
+            values[e] = value
+        inner.set_attr(attr_name, values)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: int | Iterable[int] | None = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Calls a method of each environment of gymnasium's sync and async vector environments.
+
+        Raises:
+            AttributeError: Of any other vector environment.
+        """
+        inner = self.vector_env.unwrapped
+        if not isinstance(inner, WITH_RESET_MASK[1:]):
+            raise AttributeError(f"the environments of {type(inner).__name__} have no methods of their own to call")
+        results = inner.call(method_name, *method_args, **method_kwargs)
+        return [results[e] for e in self._get_indices(indices)]
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gym.Wrapper], indices: int | Iterable[int] | None = None
+    ) -> list[bool]:
+        """Returns True for `Monitor`, whose infos this class gives; else whether a wrapper of that class is around."""
+        wrapped, layer = wrapper_class is Monitor, self.vector_env
+        while isinstance(layer, gym.vector.VectorWrapper):
+            wrapped |= isinstance(layer, wrapper_class)
+            layer = layer.env
+        return [wrapped for _ in self._get_indices(indices)]
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """Returns a frame per environment, None where the vector environment renders none."""
+        frames = self.vector_env.render() if self.vector_env.render_mode is not None else None
+        return [None] * self.num_envs if frames is None else list(frames)
+
+
+# Attributes of `NCSVectorEnv` that its scalar prototype has too, but never changes.
+STATEFUL = ("steps", "episodes", "np_random", "starts", "spec", "num_envs", "metadata")
+
+
+def _dense(info: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Returns the infos that are arrays with an entry per environment."""
+    return {
+        key: value for key, value in info.items() if not key.startswith(("_", "final_")) and not isinstance(value, dict)
+    }
+
+
+def _with_final(info: dict[str, Any], done: np.ndarray) -> dict[str, Any]:
+    """Returns infos with those of the last step where episodes ended."""
+    final = info.get("final_info", {})
+    merged = dict(info)
+    for key, value in _dense(info).items():
+        if key in final:
+            merged[key] = np.where(done.reshape(-1, *[1] * (value.ndim - 1)), final[key], value)
+    return merged

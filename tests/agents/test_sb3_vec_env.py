@@ -1,0 +1,176 @@
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
+
+import ncs_gym  # noqa: F401
+from agents.sb3_vec_env import SB3VecEnv
+from shields import VectorSafetyShield
+
+CRUISE = "ncs_gym/TruckTrailerCruise-v0"
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_gymnasiums_sync_environment_is_stepped_exactly_like_stable_baselines3s_own(mode):
+    def make():
+        return gym.make("CartPole-v1", max_episode_steps=30)
+
+    vector = gym.make_vec(
+        "CartPole-v1",
+        num_envs=3,
+        vectorization_mode="sync",
+        max_episode_steps=30,
+        vector_kwargs={"autoreset_mode": mode},
+    )
+    ours, theirs = SB3VecEnv(vector), DummyVecEnv([lambda: Monitor(make())] * 3)
+    for env in (ours, theirs):
+        env.seed(5)
+    np.testing.assert_array_equal(ours.reset(), theirs.reset())
+    rng, cuts, ends = np.random.default_rng(0), 0, 0
+    for step in range(300):
+        # Balances for a while, so that some episodes are cut and others fail.
+        lean = theirs.envs[0].unwrapped.state[2] + theirs.envs[0].unwrapped.state[3]
+        actions = np.array([int(lean > 0), *rng.integers(2, size=2)])
+        one, other = ours.step(actions), theirs.step(actions)
+        for mine, expected in zip(one[:3], other[:3], strict=True):
+            np.testing.assert_array_equal(mine, expected, err_msg=f"step {step}")
+        for mine, expected in zip(one[3], other[3], strict=True):
+            assert ("episode" in mine) == ("episode" in expected)
+            if "episode" in expected:
+                ends += 1
+                np.testing.assert_array_equal(mine["terminal_observation"], expected["terminal_observation"])
+                assert mine["TimeLimit.truncated"] == expected["TimeLimit.truncated"]
+                cuts += mine["TimeLimit.truncated"]
+                assert mine["episode"]["l"] == expected["episode"]["l"]
+                assert mine["episode"]["r"] == pytest.approx(expected["episode"]["r"])
+    assert 0 < cuts < ends
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_our_vector_environment_loses_no_transition(mode):
+    vector = gym.make_vec("ncs_gym/CartPole-v0", num_envs=30, max_episode_steps=60, autoreset_mode=mode)
+    env = SB3VecEnv(vector)
+    env.seed(0)
+    observation = env.reset()
+    rng, ends, cuts, steps = np.random.default_rng(1), 0, 0, np.zeros(30, int)
+    for _ in range(200):
+        fresh, reward, done, infos = env.step(rng.uniform(-0.3, 0.3, (30, 1)).astype(np.float32))
+        steps += 1
+        inner = vector.unwrapped
+        assert reward.dtype == np.float32
+        assert (inner.steps[done] == 0).all()
+        for e, info in enumerate(infos):
+            assert ("terminal_observation" in info) == done[e]
+            if done[e]:
+                ends += 1
+                cut = info["TimeLimit.truncated"]
+                cuts += cut
+                assert cut == (steps[e] == 60 and info["cost"] == 0.0)
+                assert info["episode"]["l"] == steps[e]
+                assert info["episode"]["is_success"] == float(info["episode_violations"] == 0.0)
+                np.testing.assert_allclose(info["terminal_observation"][:4], info["estimate"], rtol=1e-6)
+                assert not np.array_equal(fresh[e], info["terminal_observation"])
+                np.testing.assert_allclose(fresh[e][:4], inner._fleet.mean[:, e], rtol=1e-6)
+                steps[e] = 0
+        np.testing.assert_array_equal(env.batch_info["cost"] > 0, [info.get("cost", 0) > 0 for info in infos])
+        observation = fresh
+    assert observation in vector.observation_space
+    assert 0 < cuts < ends
+
+
+def test_environments_that_take_a_step_to_reset_show_it_as_one_transition():
+    vector = gym.make_vec("CartPole-v1", num_envs=4, max_episode_steps=10)
+    with pytest.raises(ValueError, match="allow_reset_transitions"):
+        SB3VecEnv(vector)
+    env = SB3VecEnv(vector, allow_reset_transitions=True)
+    env.seed(3)
+    env.reset()
+    for step in range(1, 40):
+        observation, reward, done, infos = env.step(np.array([step % 2] * 4))
+        assert done.all() == (step % 11 == 10)
+        if done.any():
+            np.testing.assert_array_equal(infos[0]["terminal_observation"], observation[0])
+            assert infos[0]["episode"]["l"] == infos[0]["episode"]["r"] == 10
+        assert (reward == float(step % 11 != 0)).all()
+        if step % 11 == 0:
+            assert np.abs(observation).max() <= 0.05
+
+
+def test_seeds_make_runs_equal():
+    runs = []
+    for seed in (0, 0, 1):
+        env = SB3VecEnv(gym.make_vec(CRUISE, num_envs=3))
+        env.seed(seed)
+        runs.append([env.reset(), *(env.step(np.ones((3, 1), np.float32))[0] for _ in range(5))])
+    np.testing.assert_array_equal(runs[0], runs[1])
+    assert not np.array_equal(runs[0], runs[2])
+
+
+def test_options_reach_the_environment_once():
+    env = SB3VecEnv(gym.make_vec(CRUISE, num_envs=2))
+    env.set_options({"state": np.array([0.5, 0.0])})
+    env.reset()
+    assert env.reset_infos[1]["state"][0] == 0.5
+    env.reset()
+    assert env.reset_infos[1]["state"][0] != 0.5
+    env.set_options([{"state": np.zeros(2)}, {"state": np.ones(2)}])
+    with pytest.raises(ValueError, match="same options"):
+        env.reset()
+
+
+def test_infos_hold_what_is_asked_for():
+    shield = VectorSafetyShield(gym.make_vec(CRUISE, num_envs=3))
+    env = SB3VecEnv(shield, info_keys=("cost", "shield_intervened"))
+    env.reset()
+    *_, infos = env.step(np.ones((3, 1), np.float32))
+    assert all(set(info) == {"cost", "shield_intervened"} for info in infos)
+    assert {"estimate", "shield_reason"} <= set(env.batch_info)
+
+
+def test_attributes():
+    shield = VectorSafetyShield(gym.make_vec(CRUISE, num_envs=3))
+    env = SB3VecEnv(RecordEpisodeStatistics(shield))
+    assert env.get_attr("render_mode") == [None] * 3
+    assert env.get_attr("plant", [0, 2]) == [shield.unwrapped.plant] * 2
+    assert env.env_is_wrapped(Monitor) == [True] * 3
+    assert env.env_is_wrapped(VectorSafetyShield, 1) == [True]
+    assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [False] * 3
+    assert env.get_images() == [None] * 3
+    for call in (
+        lambda: env.get_attr("nothing"),
+        lambda: env.get_attr("steps"),
+        lambda: env.set_attr("plant", 1),
+        lambda: env.env_method("reset"),
+    ):
+        with pytest.raises(AttributeError):
+            call()
+    sync = SB3VecEnv(gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync"))
+    sync.set_attr("length", 0.7, indices=1)
+    assert sync.get_attr("length") == [0.5, 0.7]
+    sync.reset()
+    assert len(sync.env_method("get_wrapper_attr", "length", indices=[0])) == 1
+    env.close()
+    with pytest.raises(ValueError, match="must be a gymnasium VectorEnv"):
+        SB3VecEnv(gym.make("CartPole-v1"))
+
+
+@pytest.mark.parametrize("algorithm", [PPO, SAC])
+def test_algorithms_learn_on_it(algorithm):
+    env = VecNormalize(VecMonitor(SB3VecEnv(VectorSafetyShield(gym.make_vec(CRUISE, num_envs=4)))))
+    few = {"n_steps": 64} if algorithm is PPO else {"learning_starts": 100}
+    model = algorithm("MlpPolicy", env, seed=0, device="cpu", **few).learn(1200)
+    assert len(model.ep_info_buffer) > 0
+    assert np.isfinite(model.predict(env.reset())[0]).all()
+
+
+def test_evaluate_policy_counts_episodes_by_its_infos():
+    env = SB3VecEnv(gym.make_vec(CRUISE, num_envs=3, max_episode_steps=20))
+    model = PPO("MlpPolicy", env, seed=0, device="cpu", n_steps=32)
+    returns, lengths = evaluate_policy(model, env, n_eval_episodes=7, return_episode_rewards=True)
+    assert lengths == [20] * 7
+    assert len(returns) == 7
