@@ -1,0 +1,121 @@
+"""Attacks on the vector shield: thousands of environments at once, with every bound attained."""
+
+import numpy as np
+import pytest
+
+from ncs_gym import Channel, NCSVectorEnv, batch_reactor, cart_pole
+from ncs_gym.contract import contract_of
+from shields import VectorSafetyShield
+from tests.attacks import CHANNELS, RANDOM, TRUCKS, certificate_of, harmful
+
+PLANTS = {**TRUCKS, **RANDOM}
+UNSTABLE = {
+    "cart-pole": cart_pole(),
+    "cart-pole, position and angle": cart_pole(full_state=False),
+    "batch reactor": batch_reactor(),
+}
+EDGES = {
+    "constant delay": Channel(delay=3),
+    "longest gap each time": Channel(loss=1.0, max_consecutive_losses=3),
+    "overtaking": Channel(loss=0.4, max_consecutive_losses=1, jitter=2),
+}
+# 10 plants by 4 channels and 3 by 3; 3 policies each. Slow: 40 * 3 * 68,000 + 9 * 3 * 68,000 = 1.0e7 steps.
+SLOW_ENVS, SLOW_STEPS = 680, 100
+
+
+class ExtremalVectorNoise(NCSVectorEnv):
+    """First estimates and sensor noise lie on the boundary of their bounds."""
+
+    def _drawn(self, name, draw, size):
+        if name == "noise":
+            return self.plant.sensor_noise.bound.sample_boundary_many(self.np_random, self.num_envs) * (1.0 - 1e-12)
+        return super()._drawn(name, draw, size)
+
+    def _begin(self, mask, starts):
+        super()._begin(mask, starts)
+        chosen = np.flatnonzero(mask)
+        errors = self.plant.initial_noise.bound.sample_boundary_many(self.np_random, len(chosen)) * (1.0 - 1e-12)
+        self._fleet.mean[:, chosen] = self._fleet.state[:, chosen] + errors.T
+
+
+def attack(plant, channel, contract, mode, policy, count, steps, seed):
+    """Largest level of the true state, largest gauge of errors in their ellipsoids, and the share of overrides."""
+    certificate = certificate_of(plant, contract)
+    env = ExtremalVectorNoise(
+        count,
+        plant=plant,
+        channel=channel,
+        contract=contract,
+        disturbance="sphere" if policy == "random" else harmful(plant, contract),
+        initial_set=certificate.safe_set,
+    )
+    shield = VectorSafetyShield(env, certificate, mode)
+    _, info = shield.reset(seed=seed)
+    rng = np.random.default_rng(seed)
+    worst = np.linalg.inv(np.linalg.cholesky(certificate.L))
+    level = error = overridden = 0.0
+    for _ in range(steps):
+        actions = {
+            "random": lambda: rng.uniform(-1, 1, (count, plant.m)),
+            "outwards": lambda estimates: np.sign(estimates @ plant.A.T @ certificate.M @ plant.B),
+            "gain turned round": lambda estimates: -(estimates @ certificate.K.T) * 1e3 / plant.u_max,
+        }[policy](*(() if policy == "random" else (info["estimate"],)))
+        *_, info = shield.step(actions)
+        assert info["shield_guaranteed"].all(), set(info["shield_reason"])
+        assert not info["assumption_violated"].any()
+        assert not info["contract_broken"].any()
+        level = max(level, float(np.linalg.norm(info["state"] @ worst.T, axis=1).max()))
+        table, nodes = env.patterns
+        for node in np.unique(nodes):
+            shape, rows = table.shapes[node].reshape(plant.n, plant.n), nodes == node
+            squares = np.linalg.solve(shape, info["estimation_error"][rows].T) * info["estimation_error"][rows].T
+            error = max(error, float(squares.sum(axis=0).max()) ** 0.5)
+        overridden += float(info["shield_intervened"].sum())
+    return level, error, overridden / (count * steps)
+
+
+def assert_safe(results):
+    assert all(level <= 1.0 and error <= 1.0 + 1e-9 for level, error, _ in results)
+    shares = [share for _, _, share in results]
+    assert max(shares) > 0.0
+    assert min(shares) < 1.0
+
+
+POLICIES = {"random": "boundary", "outwards": "project", "gain turned round": "switch"}
+
+
+@pytest.mark.parametrize(
+    ("count", "steps"), [(40, 40), pytest.param(SLOW_ENVS, SLOW_STEPS, marks=pytest.mark.slow)], ids=["some", "many"]
+)
+@pytest.mark.parametrize("channel", CHANNELS)
+@pytest.mark.parametrize("name", PLANTS)
+def test_no_environment_leaves_its_safe_set(name, channel, count, steps):
+    results = [
+        attack(PLANTS[name], CHANNELS[channel], None, mode, policy, count, steps, seed)
+        for seed, (policy, mode) in enumerate(POLICIES.items())
+    ]
+    assert_safe(results)
+
+
+@pytest.mark.parametrize(
+    ("count", "steps"), [(40, 40), pytest.param(SLOW_ENVS, SLOW_STEPS, marks=pytest.mark.slow)], ids=["some", "many"]
+)
+@pytest.mark.parametrize("channel", EDGES)
+@pytest.mark.parametrize("name", UNSTABLE)
+def test_no_unstable_plant_leaves_its_safe_set_while_the_contract_is_kept(name, channel, count, steps):
+    contract = contract_of(EDGES[channel])
+    assert contract.max_age <= 3
+    results = [
+        attack(UNSTABLE[name], EDGES[channel], contract, mode, policy, count, steps, seed)
+        for seed, (policy, mode) in enumerate(POLICIES.items())
+    ]
+    assert_safe(results)
+
+
+def test_the_attack_comes_close_and_would_see_an_exit():
+    plant, channel = TRUCKS["4000 kg"], CHANNELS["bursts"]
+    level, error, _ = attack(plant, channel, None, "project", "outwards", 200, 100, 0)
+    assert level > 0.9
+    assert error > 0.5
+    with pytest.raises(AssertionError, match="not known to be in the safe set"):
+        attack(plant, channel, None, "monitor", "outwards", 200, 100, 0)
