@@ -21,7 +21,7 @@ ALARM_TOLERANCE = 1e-9
 LARGEST_COVARIANCE = 1e12
 # Factors of covariances keep this many bits, and shapes are rounded up to multiples of this in coordinates where the
 # certified set of age 0 is the unit ball. Then both recur when a pattern of arrivals does, and can be tabulated.
-COVARIANCE_BITS, SHAPE_STEP = 8, 2.0**-20
+COVARIANCE_BITS, SHAPE_STEP = 8, 2.0**-16
 # Shares mu that the set-membership gain is chosen from; any share is sound.
 SHARES = np.linspace(0.01, 0.99, 99)
 

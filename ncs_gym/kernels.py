@@ -30,6 +30,7 @@ class Fleet(NamedTuple):
         node: Of the gain table, shape (N,).
         age: Steps since the newest sample used, shape (N,).
         steps: In this episode, shape (N,).
+        wait: Steps until the next sample is sent, shape (N,).
         lost: Packets lost in a row, shape (N,).
         bad: State of the Gilbert-Elliott chain, shape (N,).
         alarm, arrived: Shape (N,).
@@ -45,6 +46,7 @@ class Fleet(NamedTuple):
     node: np.ndarray
     age: np.ndarray
     steps: np.ndarray
+    wait: np.ndarray
     lost: np.ndarray
     bad: np.ndarray
     alarm: np.ndarray
@@ -147,6 +149,7 @@ def advance(model, fleet, tick, u, nominal, d):
             fleet.state[i, e] = nominal[i, e] + d[e, i]
     fleet.steps[:] += 1
     fleet.age[:] += 1
+    fleet.wait[:] -= 1
     fleet.arrived[:] = False
     fleet.due[slot] = -1
 
@@ -161,19 +164,25 @@ def send(model, network, fleet, tick, uniforms, noise):
         fleet: Changed in place.
         tick: Steps of the whole fleet.
         uniforms: For loss, jitter and chain, shape (3, N); rows at the end that are not needed may be missing.
-        noise: Sensor noise, shape (N, p).
+        noise: Sensor noise, one row per sample sent, shape (>= N, p).
+
+    Returns:
+        How many samples were sent.
     """
     slot = tick % fleet.due.shape[0]
     p, n = model.H.shape
-    for e in range(fleet.steps.size):
+    sent = 0
+    for e in range(fleet.wait.size):
         state = 0
         if network.bursts:
             state = int(fleet.bad[e])
             if uniforms[2, e] < network.moves[state]:
                 state = 1 - state
             fleet.bad[e] = state == 1
-        if fleet.steps[e] % network.period != 0:
+        if fleet.wait[e] > 0:
             continue
+        fleet.wait[e] = network.period
+        sent += 1
         lost = network.losses[state] > 0.0 and uniforms[0, e] < network.losses[state]
         lost = lost and (network.most_lost < 0 or fleet.lost[e] < network.most_lost)
         fleet.lost[e] = fleet.lost[e] + 1 if lost else 0
@@ -182,12 +191,13 @@ def send(model, network, fleet, tick, uniforms, noise):
         extra = int(uniforms[1, e] * (network.jitter + 1)) if network.jitter > 0 else 0
         fleet.due[slot, e] = network.delay + min(extra, network.jitter)
         for i in range(p):
-            value = noise[e, i]
+            value = noise[sent - 1, i]
             for j in range(n):
                 value += model.H[i, j] * fleet.state[j, e]
             if not np.isfinite(value):  # no sensor within the assumptions sends this
                 fleet.due[slot, e], fleet.alarm[e] = -1, True
             fleet.samples[slot, i, e] = np.rint(value / network.step) * network.step if network.step > 0.0 else value
+    return sent
 
 
 @njit(cache=True, nogil=True)
@@ -386,3 +396,19 @@ def quadratic(Q, x, R, u, out):
         for j in range(R.shape[0]):
             for e in range(out.size):
                 out[e] += R[i, j] * u[i, e] * u[j, e]
+
+
+@njit(cache=True, nogil=True)
+def follow_profile(memory, acceleration, dt, draws, change_probability, fastest, out):
+    """Fills speeds and targets, shape (N, 2), one step after `memory`; see `SpeedTracking.advance`."""
+    for e in range(out.shape[0]):
+        out[e, 0] = memory[e, 0] + dt * acceleration[e]
+        out[e, 1] = fastest * draws[1, e] if draws[0, e] < change_probability else memory[e, 1]
+
+
+@njit(cache=True, nogil=True)
+def profile_reward(memory, acceleration, error_weight, input_weight, out):
+    """Fills rewards, shape (N,); see `SpeedTracking.reward`."""
+    for e in range(out.size):
+        error, effort = memory[e, 1] - memory[e, 0], acceleration[e]
+        out[e] = -error_weight * min(abs(error) / 5.0, 5.0) - input_weight * effort * effort

@@ -193,19 +193,22 @@ class SpeedTracking(Task):
         return self.fastest * rng.random((2, count)).T
 
     def advance_many(self, rng, plant, memory, inputs):  # noqa: D102
-        changes, targets = rng.random((2, len(memory)))
-        moved = np.empty_like(memory)
-        moved[:, 0] = memory[:, 0] + plant.dt * inputs[:, self.input_index]
-        moved[:, 1] = np.where(changes < self.change_probability, self.fastest * targets, memory[:, 1])
+        from ncs_gym.kernels import follow_profile
+
+        moved, draws = np.empty_like(memory), rng.random((2, len(memory)))
+        effort = inputs[:, self.input_index]
+        follow_profile(memory, effort, plant.dt, draws, self.change_probability, self.fastest, moved)
         return moved
 
     def observe_many(self, memory):  # noqa: D102
         return memory[:, 1:] - memory[:, :1]
 
     def reward_many(self, plant, memory, states, inputs):  # noqa: D102
-        error = np.abs(memory[:, 1] - memory[:, 0])
-        effort = inputs[:, self.input_index]
-        return -self.error_weight * np.minimum(error / 5.0, 5.0) - self.input_weight * effort * effort
+        from ncs_gym.kernels import profile_reward
+
+        rewards = np.empty(len(memory))
+        profile_reward(memory, inputs[:, self.input_index], self.error_weight, self.input_weight, rewards)
+        return rewards
 
     def check(self, plant):  # noqa: D102
         if self.input_index >= plant.m:

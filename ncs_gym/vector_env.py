@@ -172,20 +172,19 @@ class NCSVectorEnv(VectorEnv):
         self._tick += 1
         kernels.advance(model, fleet, self._tick, u, nominal, d)
         self._memory = self.task.advance_many(self.np_random, self.plant, self._memory, u.T)
-        network = self._network
-        if network.bursts or network.period == 1 or (fleet.steps % network.period == 0).any():
-            noise = self._drawn("noise", self.plant.sensor_noise.sample_many, self.plant.p)
-            kernels.send(model, network, fleet, self._tick, self._uniforms(), noise)
+        noise, start = self._block("noise", self.plant.sensor_noise.sample_many)
+        sent = kernels.send(model, self._network, fleet, self._tick, self._uniforms(), noise[start:])
+        self._blocks["noise"] = noise, start + sent
         self._estimate()
 
     def _disturbances(self, nominal: np.ndarray) -> np.ndarray:
         """Returns this step's d, shape (N, n)."""
         source, plant, count = self.single.disturbance, self.plant, self.num_envs
         if source.is_memoryless and stays_inside(source):
-            return self._drawn("disturbance", self._memoryless_disturbances, plant.n)
+            return self._drawn("disturbance", self._memoryless_disturbances)
         d = source.draw_many(self.np_random, plant, nominal.T, self._fleet.steps, self._disturbance_memory)
         if not source.replaces_process_noise:
-            d = d + self._drawn("process", plant.process_noise.sample_many, plant.n)
+            d = d + self._drawn("process", plant.process_noise.sample_many)
         if stays_inside(source):
             return d
         return checked_many(plant, d, count, allow_assumption_violation=self.single.allow_assumption_violation)
@@ -197,11 +196,16 @@ class NCSVectorEnv(VectorEnv):
             plant.process_noise.add_to(rng, d)
         return d
 
-    def _drawn(self, name: str, draw: Any, size: int) -> np.ndarray:
-        """Returns the next N rows, shape (N, size), of what `draw` fills in blocks."""
-        block, start = self._blocks.get(name, (np.zeros((0, size)), 0))
-        if start == len(block):
+    def _block(self, name: str, draw: Any) -> tuple[np.ndarray, int]:
+        """Returns a block of rows filled by `draw`, at least N of them unused, and the number of the first of these."""
+        block, start = self._blocks.get(name, (None, 0))
+        if block is None or start + self.num_envs > len(block):
             block, start = draw(self.np_random, self.num_envs * max(1, BLOCK // self.num_envs)), 0
+        return block, start
+
+    def _drawn(self, name: str, draw: Any) -> np.ndarray:
+        """Returns the next N rows of a block."""
+        block, start = self._block(name, draw)
         self._blocks[name] = block, start + self.num_envs
         return block[start : start + self.num_envs]
 
@@ -268,6 +272,7 @@ class NCSVectorEnv(VectorEnv):
         fleet.node[chosen] = self._table.root
         for array in (fleet.age, fleet.steps, fleet.lost):
             array[chosen] = 0
+        fleet.wait[chosen] = self.channel.send_period
         fleet.alarm[chosen] = fleet.arrived[chosen] = False
         fleet.violations[chosen] = 0.0
         loss = self.channel.loss
@@ -393,6 +398,7 @@ def _fleet(count: int, plant: LinearPlant, slots: int) -> kernels.Fleet:
         node=np.zeros(count, np.int32),
         age=np.zeros(count, np.int64),
         steps=np.zeros(count, np.int64),
+        wait=np.zeros(count, np.int64),
         lost=np.zeros(count, np.int64),
         bad=np.zeros(count, np.bool_),
         alarm=np.zeros(count, np.bool_),

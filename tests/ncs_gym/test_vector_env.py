@@ -53,7 +53,7 @@ class Log:
             "bad": env._fleet.bad.copy(),
             "memory": env._memory.copy(),
         }
-        for name in ("_disturbances", "_drawn", "_uniforms"):
+        for name in ("_disturbances", "_drawn", "_uniforms", "_block"):
             self._watch(name)
 
     def _watch(self, name):
@@ -61,7 +61,10 @@ class Log:
 
         def watched(*arguments):
             result = original(*arguments)
-            self.now[arguments[0] if name == "_drawn" else name] = result.copy()
+            if name != "_block":
+                self.now[arguments[0] if name == "_drawn" else name] = result.copy()
+            elif arguments[0] == "noise":
+                self.now["noise"] = result[0][result[1] :].copy()
             return result
 
         setattr(self.env, name, watched)
@@ -78,6 +81,9 @@ class Log:
             result = self.env.step(actions)
         finally:
             task.advance_many = original
+        # Noise is used in the order of the environments that send.
+        sends = self.env.steps % self.env.channel.send_period == 0
+        self.now["noise"] = self.now["noise"][np.maximum(np.cumsum(sends) - 1, 0)]
         self.steps.append(self.now)
         return result
 

@@ -26,10 +26,10 @@ SLOW_ENVS, SLOW_STEPS = 680, 100
 class ExtremalVectorNoise(NCSVectorEnv):
     """First estimates and sensor noise lie on the boundary of their bounds."""
 
-    def _drawn(self, name, draw, size):
+    def _block(self, name, draw):
         if name == "noise":
-            return self.plant.sensor_noise.bound.sample_boundary_many(self.np_random, self.num_envs) * (1.0 - 1e-12)
-        return super()._drawn(name, draw, size)
+            return self.plant.sensor_noise.bound.sample_boundary_many(self.np_random, self.num_envs) * (1.0 - 1e-12), 0
+        return super()._block(name, draw)
 
     def _begin(self, mask, starts):
         super()._begin(mask, starts)
