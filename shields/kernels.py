@@ -166,16 +166,88 @@ def decide(rule, outlooks, shape, estimate, proposed, u, intervened, passed, fal
             room = np.minimum(room, _rooms(rule, outlooks, shape, offset, radius, vertex, margin))
         _rooms(rule, outlooks, shape, offset, radius, proposed, margin)
     u[:] = proposed
-    plain, tried = np.eye(rule.moved.shape[0]), np.empty(u.shape[0])
+    bad, count = np.empty(shape.size, np.int64), 0
     for e in range(shape.size):
-        usable = outlooks.usable[shape[e]] and reach[e] < rule.farthest
-        passed[e], intervened[e], fallback[e], reason[e] = usable and room[e] >= rule.margin, False, False, SAFE
-        if not passed[e]:
-            weight = outlooks.weight[shape[e]] if radius[e] >= rule.smallest else plain
-            _correct(
-                rule, weight, usable, radius[e], offset[:, e], estimate[:, e], e, tried, u, intervened, passed,
-                fallback, margin, reason,
-            )  # fmt: skip
+        passed[e] = outlooks.usable[shape[e]] and reach[e] < rule.farthest and room[e] >= rule.margin
+        intervened[e], fallback[e], reason[e] = False, False, SAFE
+        bad[count] = e
+        count += not passed[e]
+    bad = bad[:count]
+    if rule.projects and count > 0:
+        closest = np.full((u.shape[0], count), np.nan)
+        if u.shape[0] == 1:
+            _closest_on_lines(rule, outlooks, shape, offset, radius, proposed, bad, closest)
+        else:
+            for k in range(count):
+                e = bad[k]
+                norm = outlooks.weight[shape[e]] if radius[e] >= rule.smallest else np.eye(offset.shape[0])
+                closest[:, k] = _closest(rule, norm, radius[e] - rule.reserve, offset[:, e], proposed[:, e].copy())
+        bad = _replace(
+            rule, outlooks, shape, offset, radius, reach, bad, closest, u, intervened, passed, margin, reason
+        )
+    if bad.size > 0:
+        _fall_back(
+            rule, outlooks, shape, estimate, offset, radius, reach, bad, u, intervened, passed, fallback, margin, reason
+        )
+
+
+@njit(cache=True, nogil=True)
+def _replace(rule, outlooks, shape, offset, radius, reach, bad, closest, u, intervened, passed, margin, reason):
+    """Puts the closest inputs, shape (m, count), in the place of the bad ones where they pass; returns the rest."""
+    tried = np.empty_like(closest)
+    for i in range(tried.shape[0]):
+        for k in range(bad.size):
+            tried[i, k] = _expressible(closest[i, k], rule.limits[i])
+    room, distance = _rooms_of(rule, outlooks, shape, offset, radius, bad, tried)
+    left = 0
+    for k in range(bad.size):
+        e = bad[k]
+        if outlooks.usable[shape[e]] and reach[e] < rule.farthest and room[k] >= rule.margin:
+            for i in range(tried.shape[0]):
+                u[i, e] = tried[i, k]
+            margin[e], reason[e], intervened[e], passed[e] = distance[k], PROJECTED, True, True
+        else:
+            bad[left] = e
+            left += 1
+    return bad[:left]
+
+
+@njit(cache=True, nogil=True)
+def _fall_back(
+    rule, outlooks, shape, estimate, offset, radius, reach, bad, u, intervened, passed, fallback, margin, reason
+):
+    """Puts K x_hat in the place of the bad inputs, zero where it overflows; in mode "monitor" it only says so."""
+    (m, n), count = rule.gain.shape, bad.size
+    tried, finite = np.zeros((m, count)), np.ones(count, np.bool_)
+    for i in range(m):
+        for j in range(n):
+            for k in range(count):
+                tried[i, k] += rule.gain[i, j] * estimate[j, bad[k]]
+        for k in range(count):
+            finite[k] &= np.isfinite(tried[i, k])
+    for i in range(m):
+        for k in range(count):
+            e = bad[k]
+            tried[i, k] = _expressible(tried[i, k], rule.limits[i]) if finite[k] else 0.0
+            intervened[e] |= tried[i, k] != u[i, e]
+            tried[i, k] = u[i, e] if rule.monitors else tried[i, k]
+            u[i, e] = tried[i, k]
+    room, distance = _rooms_of(rule, outlooks, shape, offset, radius, bad, tried)
+    for k in range(count):
+        e = bad[k]
+        unsafe = rule.monitors and intervened[e]
+        fallback[e] = finite[k] and not unsafe
+        if outlooks.usable[shape[e]] and reach[e] < rule.farthest:
+            margin[e], passed[e], reason[e] = distance[k], room[k] >= rule.margin, UNSAFE if unsafe else FALLBACK
+        else:
+            margin[e], passed[e], reason[e] = np.nan, False, INVALID
+
+
+@njit(cache=True, nogil=True)
+def _rooms_of(rule, outlooks, shape, offset, radius, some, u):
+    """Returns room and margin of inputs u, shape (m, count), in some of the environments."""
+    margin = np.empty(some.size)
+    return _rooms(rule, outlooks, shape[some], offset[:, some], radius[some], u, margin), margin
 
 
 @njit(cache=True, nogil=True)
@@ -221,89 +293,38 @@ def _rooms(rule, outlooks, shape, offset, radius, u, margin):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _correct(
-    rule, weight, usable, radius, offset, estimate, e, tried, u, intervened, passed, fallback, margin, reason
-):  # fmt: skip
-    """Puts the closest input that passes, or K x_hat, in the place of the proposed one of environment e."""
-    n, m = rule.effect.shape
-    if usable and rule.projects:
-        if m == 1:
-            tried[0] = _closest_on_line(rule.effect, rule.limits[0], weight, radius - rule.reserve, offset, u[0, e])
-        else:
-            tried[:] = _closest(rule, weight, radius - rule.reserve, offset, u[:, e].copy())
-        if not np.isnan(tried[0]):
-            for i in range(m):
-                tried[i] = _expressible(tried[i], rule.limits[i])
-            room, distance = _judge(rule.effect, weight, radius, offset, tried)
-            if room >= rule.margin:
-                u[:, e], margin[e], reason[e] = tried, distance, PROJECTED
-                intervened[e] = passed[e] = True
-                return
-    finite = True
-    for i in range(m):
-        value = 0.0
-        for j in range(n):
-            value += rule.gain[i, j] * estimate[j]
-        finite &= np.isfinite(value)
-        tried[i] = _expressible(value, rule.limits[i])
-    if not finite:
-        tried[:] = 0.0
-    differs = False
-    for i in range(m):
-        differs |= tried[i] != u[i, e]
-        tried[i] = u[i, e] if rule.monitors else tried[i]
-    u[:, e], intervened[e] = tried, differs
-    fallback[e] = finite and not (rule.monitors and differs)
-    margin[e], passed[e], reason[e] = np.nan, False, INVALID
-    if usable:
-        room, margin[e] = _judge(rule.effect, weight, radius, offset, tried)
-        passed[e] = room >= rule.margin
-        reason[e] = UNSAFE if rule.monitors and differs else FALLBACK
-
-
-@njit(cache=True, nogil=True)
 def _expressible(value, limit):
     """Returns the nearest limit times a float32 action."""
     return limit * np.float64(np.float32(min(max(value / limit, -1.0), 1.0)))
 
 
 @njit(cache=True, nogil=True)
-def _judge(effect, weight, radius, offset, u):
-    """Returns room and margin of one input, shape (m,)."""
-    square = plain = 0.0
-    for i in range(offset.size):
-        x = offset[i]
-        for a in range(u.size):
-            x += effect[i, a] * u[a]
-        plain += x * x
-        square += weight[i, i] * x * x
-        for j in range(i):
-            y = offset[j]
-            for a in range(u.size):
-                y += effect[j, a] * u[a]
-            square += 2.0 * weight[i, j] * x * y
-    return radius - np.sqrt(abs(square)), radius - np.sqrt(plain)
-
-
-@njit(cache=True, nogil=True)
-def _closest_on_line(effect, limit, weight, target, offset, wanted):
-    """Returns what `_closest` does for one input, as `projection.closest_on_line`."""
-    a = b = c = 0.0
-    for i in range(offset.size):
-        for j in range(offset.size):
-            a += weight[i, j] * effect[i, 0] * effect[j, 0]
-            b += weight[i, j] * effect[i, 0] * offset[j]
-            c += weight[i, j] * offset[i] * offset[j]
-    square = b * b - a * (c - target * target)
-    if target < 0.0 or square < 0.0:
-        return np.nan
-    if a <= 0.0:
-        return wanted if c <= target * target else np.nan
-    half = np.sqrt(square)
-    low, high = (-b - half) / a, (-b + half) / a
-    if low > limit or high < -limit:
-        return np.nan
-    return low if wanted < low else high if wanted > high else wanted
+def _closest_on_lines(rule, outlooks, shape, offset, radius, proposed, bad, closest):
+    """Fills what `_closest` finds for one input, shape (1, count), as `projection.closest_on_line` does."""
+    a, b, c = np.zeros((3, bad.size))
+    for i in range(offset.shape[0]):
+        for j in range(offset.shape[0]):
+            first, second = rule.effect[i, 0], rule.effect[j, 0]
+            for k in range(bad.size):
+                e = bad[k]
+                plain = 1.0 if i == j else 0.0
+                share = outlooks.weight[shape[e], i, j] if radius[e] >= rule.smallest else plain
+                a[k] += share * first * second
+                b[k] += share * first * offset[j, e]
+                c[k] += share * offset[i, e] * offset[j, e]
+    limit = rule.limits[0]
+    for k in range(bad.size):
+        wanted, target = proposed[0, bad[k]], radius[bad[k]] - rule.reserve
+        square = b[k] * b[k] - a[k] * (c[k] - target * target)
+        if target < 0.0 or square < 0.0:
+            continue
+        if a[k] <= 0.0:
+            closest[0, k] = wanted if c[k] <= target * target else np.nan
+            continue
+        half = np.sqrt(square)
+        low, high = (-b[k] - half) / a[k], (-b[k] + half) / a[k]
+        if low <= limit and high >= -limit:
+            closest[0, k] = low if wanted < low else high if wanted > high else wanted
 
 
 @njit(cache=True, nogil=True)

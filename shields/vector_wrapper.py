@@ -72,7 +72,9 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         self.filter = SafetyFilter(self.certificate, inner.plant, mode)
         self._batch = VectorFilter(self.filter)
         self._starts_inside = starts_inside(self.certificate, inner.single.initial_set)
+        self._reach = SIMULATED_REACH * inner.plant.half_widths
         count = self.num_envs
+        self._known = np.zeros(count, np.bool_)
         self._knowledge = kernels.Knowledge(
             np.full(count, kernels.OTHER_STEPS), np.zeros(count, np.bool_), np.zeros(count, np.bool_)
         )
@@ -164,7 +166,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             test.own_columns,
             test.rounding,
             MARGIN,
-            SIMULATED_REACH * self.filter.plant.half_widths,
+            self._reach,
             self.certificate.Sigma is not None,
         )
         reason = np.empty(count, np.int64)
@@ -187,11 +189,12 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
 
     def _known_starts(self, restarted: np.ndarray) -> np.ndarray:
         """Returns whether all possible starts of the present episodes lie in S, shape (N,)."""
-        known = np.full(self.num_envs, self._starts_inside)
-        starts = self.env.unwrapped.starts
-        for e in np.flatnonzero(restarted & ~np.isnan(starts[:, 0])).tolist():
-            known[e] = starts_inside(self.certificate, starts[e])
-        return known
+        if restarted.any():
+            self._known[restarted] = self._starts_inside
+            starts = self.env.unwrapped.starts
+            for e in np.flatnonzero(restarted & ~np.isnan(starts[:, 0])).tolist():
+                self._known[e] = starts_inside(self.certificate, starts[e])
+        return self._known
 
     def _numbers_of_shapes(self) -> np.ndarray:
         """Returns the index in the book of each environment's error shape, shape (N,)."""

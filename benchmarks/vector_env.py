@@ -1,0 +1,151 @@
+"""Environment steps per second, ours against others', in one run; and what an environment costs in memory.
+
+    python benchmarks/vector_env.py [--seconds 1.0] [--warm 3.0]
+
+Ours run the cruise and the case study after `--warm` seconds of stepping (the gain table fills with patterns of
+arrivals at first; compiling is excluded too), with random actions. In brackets the ratio to gymnasium's CartPole vector
+environment of the same size.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+import warnings
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+import ncs_gym  # noqa: F401
+from agents.sb3_vec_env import SB3VecEnv
+from shields import VectorSafetyShield
+
+SIZES = (1, 64, 1024, 16384)
+CRUISE, CASE_STUDY = "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/TruckTrailer-v0"
+
+
+def rate(step, count: int, seconds: float, warm: float) -> float:
+    """Median over five stretches of environment steps per second."""
+    end = time.perf_counter() + warm
+    while time.perf_counter() < end:
+        step()
+    rates = []
+    for _ in range(5):
+        start, steps = time.perf_counter(), 0
+        while time.perf_counter() - start < seconds / 5:
+            step()
+            steps += 1
+        rates.append(steps * count / (time.perf_counter() - start))
+    return float(np.median(rates))
+
+
+def stepper(env, actions):
+    """A function that steps with the next of a few prepared batches of actions."""
+    state = [0]
+
+    def step() -> None:
+        env.step(actions[state[0] % len(actions)])
+        state[0] += 1
+
+    return step
+
+
+def vector(env_id: str, count: int, *, shielded: bool = False):
+    env = gym.make_vec(env_id, num_envs=count)
+    if shielded:
+        env = VectorSafetyShield(env)
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    if isinstance(env.single_action_space, gym.spaces.Discrete):
+        actions = [rng.integers(env.single_action_space.n, size=count) for _ in range(16)]
+    else:
+        actions = [rng.uniform(-1, 1, env.action_space.shape).astype(np.float32) for _ in range(16)]
+    return env, stepper(env, actions)
+
+
+def dummy(env_id: str, count: int):
+    env = DummyVecEnv([lambda: gym.make(env_id)] * count)
+    env.reset()
+    rng = np.random.default_rng(0)
+    return env, stepper(
+        env, [rng.uniform(-1, 1, (count, *env.action_space.shape)).astype(np.float32) for _ in range(16)]
+    )
+
+
+def adapter(env_id: str, count: int):
+    env = SB3VecEnv(gym.make_vec(env_id, num_envs=count))
+    env.reset()
+    rng = np.random.default_rng(0)
+    return env, stepper(
+        env, [rng.uniform(-1, 1, (count, *env.action_space.shape)).astype(np.float32) for _ in range(16)]
+    )
+
+
+def memory(count: int) -> float:
+    """Bytes per environment of all arrays that a vector environment keeps, shared tables excluded."""
+    inner = gym.make_vec(CRUISE, num_envs=count).unwrapped
+    inner.reset(seed=0)
+    inner.step(np.zeros((count, 1), np.float32))
+    arrays = [*inner._fleet, inner._suspects, inner._residuals, inner._missing, inner._memory, inner._done]
+    arrays += [block for block, _ in inner._blocks.values()]
+    return sum(array.nbytes for array in arrays) / count
+
+
+def shown(value: float) -> str:
+    return f"{value / 1e6:.2f}M" if value >= 1e6 else f"{value / 1e3:.1f}k"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=1.0)
+    parser.add_argument("--warm", type=float, default=3.0)
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    rows = {
+        "gymnasium CartPole, vector": lambda n: vector("CartPole-v1", n)[1],
+        "ours, case study": lambda n: vector(CASE_STUDY, n)[1],
+        "ours, case study, shielded": lambda n: vector(CASE_STUDY, n, shielded=True)[1],
+        "ours, cruise": lambda n: vector(CRUISE, n)[1],
+        "ours, cruise, shielded": lambda n: vector(CRUISE, n, shielded=True)[1],
+        "ours, cruise, SB3VecEnv": lambda n: adapter(CRUISE, n)[1],
+        "ours, cruise, DummyVecEnv": lambda n: dummy(CRUISE, n)[1] if n <= 64 else None,
+        "gymnasium Pendulum, DummyVecEnv": lambda n: dummy("Pendulum-v1", n)[1] if n <= 64 else None,
+    }
+    print(f"{'environment steps per second':34s}" + "".join(f"{f'N = {n}':>17s}" for n in SIZES))
+    base: dict[int, float] = {}
+    for name, make in rows.items():
+        cells = []
+        for count in SIZES:
+            step = make(count)
+            if step is None:
+                cells.append("-")
+                continue
+            found = rate(step, count, options.seconds, options.warm)
+            base.setdefault(count, found)
+            cells.append(f"{shown(found)} ({found / base[count]:.2f})")
+        print(f"{name:34s}" + "".join(f"{cell:>17s}" for cell in cells), flush=True)
+    decide(options)
+    print("bytes per environment: " + ", ".join(f"{memory(count):.0f} at N = {count}" for count in SIZES[1:]))
+
+
+def decide(options: argparse.Namespace) -> None:
+    """Prints what a batched decision costs per environment."""
+    for env_id in (CRUISE, CASE_STUDY):
+        env, step = vector(env_id, 1024, shielded=True)
+        for _ in range(500):
+            step()
+        proposed = env.unwrapped.inputs_of(np.random.default_rng(0).uniform(-1, 1, (1024, 1)))
+        batch, estimate, numbers = env._batch, env._estimate, env._shape_number
+
+        def once(batch=batch, estimate=estimate, numbers=numbers, proposed=proposed) -> None:
+            batch.decide(estimate, numbers, proposed)
+
+        decisions = rate(once, 1024, options.seconds, 0.2)
+        share = batch.decide(estimate, numbers, proposed).intervened.mean()
+        cost = f"{1e6 / decisions:.3f} us per environment at N = 1024, {share:.0%} overridden"
+        print(f"decision of the vector shield, {env_id}: {cost}")
+
+
+if __name__ == "__main__":
+    main()
