@@ -18,7 +18,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import ncs_gym  # noqa: F401
-from agents.sb3_vec_env import SB3VecEnv
+from agents import SB3VecEnv
 from shields import VectorSafetyShield
 
 SIZES = (1, 64, 1024, 16384)

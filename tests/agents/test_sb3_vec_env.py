@@ -9,7 +9,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 import ncs_gym  # noqa: F401
-from agents.sb3_vec_env import SB3VecEnv
+from agents import SB3VecEnv
 from shields import VectorSafetyShield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
