@@ -21,6 +21,10 @@ GREY = "#555555"
 FEW_POINTS = 5
 
 
+# Interventions are averaged over as many steps as 64 environments side by side need for an episode of 200.
+RATE_WINDOW = 64 * 200
+
+
 def training_figure(arms: dict[str, Sequence[UnitResult]]) -> Figure:
     """Returns return, violating steps so far and intervention rate against training steps; a thin line per run."""
     with matplotlib.rc_context(STYLE):
@@ -29,7 +33,9 @@ def training_figure(arms: dict[str, Sequence[UnitResult]]) -> Figure:
         for name, results in arms.items():
             steps = np.array([point.steps for point in results[0].history])
             overridden = _per_run(results, "interventions")
-            rates = 100.0 * np.diff(overridden, axis=1, prepend=0) / np.diff(steps, prepend=0)
+            past = np.maximum(steps - RATE_WINDOW, 0)
+            before = np.array([np.interp(past, [0, *steps], [0, *row]) for row in overridden])
+            rates = 100.0 * (overridden - before) / (steps - past)
             curves = [_per_run(results, "episode_return"), _per_run(results, "violation_steps"), rates]
             for axis, values in zip(axes, curves, strict=True):
                 if axis is axes[2] and not overridden.any():
