@@ -43,7 +43,7 @@ class SB3VecEnv(VecEnv):
         batch_info: Infos of the last step, arrays with the environment as first axis; where an episode ended its own.
 
     Raises:
-        ValueError: If episodes cannot be restarted in time and that is not allowed.
+        ValueError: If episodes cannot be restarted in time and that is not allowed, or observations are no arrays.
     """
 
     def __init__(
@@ -51,6 +51,8 @@ class SB3VecEnv(VecEnv):
     ) -> None:
         if not isinstance(vector_env, (VectorEnv, gym.vector.VectorWrapper)):
             raise ValueError(f"vector_env must be a gymnasium VectorEnv, got {type(vector_env).__name__}")
+        if isinstance(vector_env.single_observation_space, (gym.spaces.Dict, gym.spaces.Tuple)):
+            raise ValueError(f"observations must be arrays, got {vector_env.single_observation_space}")
         self.vector_env, self._info_keys = vector_env, tuple(info_keys)
         self._mode = vector_env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
         self._masks = isinstance(vector_env.unwrapped, WITH_RESET_MASK)
@@ -67,13 +69,13 @@ class SB3VecEnv(VecEnv):
 
     def reset(self) -> np.ndarray:
         """Starts episodes, with the seeds and options given before."""
-        options = {str(option): option for option in self._options if option}
-        if len(options) > 1:
+        options = self._options[0]
+        if not all(_same(option, options) for option in self._options):
             raise ValueError("a vector environment takes the same options for all environments")
         seeds: Any = None if self._seeds[0] is None else self._seeds
         if seeds is not None and not isinstance(self.vector_env.unwrapped, WITH_RESET_MASK[1:]):
             seeds = seeds[0]
-        observation, info = self.vector_env.reset(seed=seeds, options=next(iter(options.values()), None))
+        observation, info = self.vector_env.reset(seed=seeds, options=options or None)
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{key: value[e] for key, value in _dense(info).items()} for e in range(self.num_envs)]
@@ -98,7 +100,7 @@ class SB3VecEnv(VecEnv):
             self.batch_info = _with_final(info, done)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         dense = _dense(self.batch_info)
-        for key in self._info_keys:
+        for key in dense.keys() & self._info_keys:
             for one, value in zip(infos, dense[key], strict=True):
                 one[key] = value
         for e in np.flatnonzero(done).tolist():
@@ -206,9 +208,14 @@ def _dense(info: dict[str, Any]) -> dict[str, np.ndarray]:
 
 def _with_final(info: dict[str, Any], done: np.ndarray) -> dict[str, Any]:
     """Returns infos with those of the last step where episodes ended."""
-    final = info.get("final_info", {})
-    merged = dict(info)
-    for key, value in _dense(info).items():
-        if key in final:
-            merged[key] = np.where(done.reshape(-1, *[1] * (value.ndim - 1)), final[key], value)
+    final = _dense(info.get("final_info", {}))
+    merged = dict(info) | {key: value for key, value in final.items() if key not in info}
+    for key in final.keys() & _dense(info).keys():
+        value = info[key]
+        merged[key] = np.where(done.reshape(-1, *[1] * (value.ndim - 1)), final[key], value)
     return merged
+
+
+def _same(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    """Returns whether two options are equal, arrays entry by entry."""
+    return one.keys() == other.keys() and all(np.array_equal(one[key], other[key]) for key in one)

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ncs_gym.ellipsoid import Ellipsoid
-from ncs_gym.frozen import FrozenArrays, as_covariance, as_number, as_vector
+from ncs_gym.frozen import FrozenArrays, as_covariance, as_number, as_vector, forget_batches
 from ncs_gym.plant import LinearPlant
 
 # Extreme points are pulled in, and points out by rounding pushed in, by this much.
@@ -26,6 +26,9 @@ TOLERANCE = 1e-9
 class Disturbance(FrozenArrays, ABC):
     """A disturbance in {d : d'd <= gamma}; truncated process noise is added to it.
 
+    `begin_many` and `draw_many` serve vector environments. A subclass that overrides `begin` or `draw` without both of
+    them gets the ones below, which go through the environments one by one.
+
     Subclasses with `replaces_process_noise` use the whole of E(D), process noise included. The environment checks what
     does not come from a class of this module at every step.
     """
@@ -33,6 +36,11 @@ class Disturbance(FrozenArrays, ABC):
     replaces_process_noise: ClassVar[bool] = False
     # Whether a draw depends on nothing but randomness, so that draws can be made in blocks ahead of time.
     is_memoryless: ClassVar[bool] = False
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        """Keeps batch methods of a parent from hiding what a subclass changes."""
+        super().__init_subclass__(**keywords)
+        forget_batches(cls, Disturbance, {"begin": "begin_many", "draw": "draw_many"})
 
     def begin(self, rng: np.random.Generator, plant: LinearPlant) -> Any:
         """Returns what stays fixed for one episode (None unless overridden)."""

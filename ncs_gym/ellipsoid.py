@@ -247,6 +247,10 @@ def sum_gauge(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> float
         shape = first / share + second / (1.0 - share)
         return Ellipsoid(0.5 * (shape + shape.T)).gauge(point)
 
+    # In units in which neither overflows: the gauge does not change.
+    size = float(max(np.abs(np.diag(first)).max(), np.abs(np.diag(second)).max()))
+    if 0.0 < size < np.inf:
+        point, first, second = point / size**0.5, first / size, second / size
     if not np.any(second):
         return Ellipsoid(first).gauge(point)
     if not np.any(first):

@@ -213,7 +213,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     def _observation(self) -> np.ndarray:
         entries = np.concatenate([self.estimator.belief.mean, self.task.observe(self._task_memory)])
         space = self.observation_space
-        return np.clip(entries.astype(np.float32), space.low, space.high)
+        return np.clip(entries, space.low, space.high).astype(np.float32)
 
     def _info(self, u: np.ndarray, *, packet_arrived: bool) -> dict[str, Any]:
         belief = self.estimator.belief

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
+from scipy.linalg import solve_triangular
 
 from ncs_gym.channel import Channel, Packet
 from ncs_gym.ellipsoid import is_inside, outer_sum, sum_gauge
@@ -92,14 +93,17 @@ class Estimator:
         self.channel, self.buffer = channel, channel.longest_delay
         Sigma = self.error_set.Sigma
         self._ball = np.linalg.cholesky(self.error_set.shape_at(0))
-        self._to_ball = np.linalg.inv(self._ball)
+        identity = np.eye(plant.n)
+        self._to_ball = solve_triangular(self._ball, identity, lower=True)
+        # Entries of |ball to_ball - I| are at most these.
+        self._ball_error = 4.0 * plant.n * np.finfo(float).eps * (np.abs(self._ball) @ np.abs(self._to_ball))
         noise = plant.sensor_error_with(channel.quantization_step).shape
         # Perfect sensors get a little noise, relative to what they measure: a larger bound is a bound.
         self._noise = noise + FLAT_INFLATION * np.diag(np.diag(plant.H @ Sigma @ plant.H.T))
         self._noise_extent = np.sqrt(np.diag(self._noise))
         self._abs_A, self._abs_H = np.abs(plant.A), np.abs(plant.H)
         self._information = plant.H.T @ np.linalg.solve(self._noise, plant.H)
-        self._identity = np.eye(plant.n)
+        self._identity = identity
         self._filter = _kalman_filter(plant, channel.quantization_step)
         self.reset(np.zeros(plant.n))
 
@@ -261,7 +265,13 @@ class Estimator:
         inner = _grown(inward @ shape @ inward.T, np.abs(inward) @ np.sqrt(np.abs(np.diag(shape))))
         inner.flat[:: len(inner) + 1] += len(inner) * self._step
         inner = self._step * np.round(inner / self._step)
-        return _grown(outward @ inner @ outward.T, np.abs(outward) @ np.sqrt(np.diag(inner)))
+        settled = _grown(outward @ inner @ outward.T, np.abs(outward) @ np.sqrt(np.diag(inner)))
+        # Both products together move the shape S by at most E S + S E', |E| at most `ball_error`; with s the extent and
+        # a = max |E| s / s that is at most 2 n a diag(s^2).
+        extent = np.sqrt(np.abs(np.diag(shape)))
+        turned = float(np.max(self._ball_error @ extent / np.maximum(extent, 1e-300)))
+        settled.flat[:: len(inner) + 1] += 2.0 * len(inner) * turned * extent**2
+        return settled
 
     def _membership_gain(self, shape: np.ndarray) -> np.ndarray:
         """Returns T_mu = S H'/mu (H S H'/mu + N/(1-mu))^-1, shape (n, p), with the trace-optimal mu.

@@ -363,7 +363,7 @@ def report(model, fleet, shapes, most_age, low, high, counted, observation, erro
     n, N = fleet.state.shape
     for i in range(n):
         for e in range(N):
-            observation[i, e] = min(max(np.float32(fleet.mean[i, e]), low[i]), high[i])
+            observation[i, e] = min(max(fleet.mean[i, e], low[i]), high[i])
             error[i, e] = fleet.mean[i, e] - fleet.state[i, e]
     cost[:] = 0.0
     for k in range(values.shape[0]):

@@ -13,12 +13,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ncs_gym.frozen import FrozenArrays, as_count, as_covariance, as_number, as_vector
+from ncs_gym.frozen import FrozenArrays, as_count, as_covariance, as_number, as_vector, forget_batches
 from ncs_gym.plant import LinearPlant
+
+BATCHES = {name: f"{name}_many" for name in ("begin", "advance", "observe", "reward")}
 
 
 class Task(FrozenArrays, ABC):
-    """A reward, and perfectly known extra entries of the observation."""
+    """A reward, and perfectly known extra entries of the observation.
+
+    The methods that end in `_many` serve vector environments. A subclass that overrides others without these gets the
+    ones below, which go through the environments one by one.
+    """
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        """Keeps batch methods of a parent from hiding what a subclass changes."""
+        super().__init_subclass__(**keywords)
+        forget_batches(cls, Task, BATCHES)
 
     def begin(self, rng: np.random.Generator, plant: LinearPlant) -> Any:
         """Returns the task's memory at the start of an episode (None unless overridden)."""

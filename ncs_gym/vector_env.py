@@ -87,6 +87,11 @@ class NCSVectorEnv(VectorEnv):
         return self._fleet.steps
 
     @property
+    def ticks(self) -> int:
+        """Steps of the whole vector since it was made."""
+        return self._tick
+
+    @property
     def patterns(self) -> tuple[GainTable, np.ndarray]:
         """The gain table in use, and the node in it, shape (N,), whose error shape is the present one."""
         return self._table, self._fleet.node
@@ -308,7 +313,7 @@ class NCSVectorEnv(VectorEnv):
             broken,
         )
         if len(observation) > n:
-            extra = self.task.observe_many(self._memory).astype(np.float32)
+            extra = self.task.observe_many(self._memory)
             observation[n:] = np.clip(extra, space.low[n:], space.high[n:]).T
         info = {
             "state": fleet.state.copy().T,

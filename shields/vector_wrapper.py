@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 
-from ncs_gym.frozen import as_number
+from ncs_gym.frozen import as_number, as_numbers
 from ncs_gym.plant import SIMULATED_REACH
 from ncs_gym.vector_env import NCSVectorEnv
 from shields import kernels, proof
@@ -34,6 +34,14 @@ WHY = np.array(
     ],
     dtype=object,
 )
+
+
+class Clock(NamedTuple):
+    """How often the environments moved: episodes begun and steps in them, shape (N,) each, and steps of the vector."""
+
+    episodes: np.ndarray
+    steps: np.ndarray
+    ticks: int
 
 
 class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
@@ -80,17 +88,21 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         )
         self._table, self._numbers = None, np.zeros(0, np.int64)
         self._interventions = np.zeros(count, np.int64)
-        self._clock: tuple[np.ndarray, np.ndarray] | None = None
+        self._reason = np.full(count, kernels.OTHER_STEPS)
+        # What the clock reads while a step is under way: if it raises, the next does not follow from what is known.
+        self._interrupted = Clock(np.full(count, -1), np.full(count, -1), -2)
+        self._clock: Clock | None = None
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Starts episodes; see `NCSVectorEnv.reset`."""
-        clock, self._clock = self._clock, self._clock and _interrupted(self._clock)
+        before, self._clock = self._clock or self._interrupted, self._clock and self._interrupted
         observation, info = self.env.reset(seed=seed, options=options)
         now = self._read_clock()
-        restarted = np.ones(self.num_envs, np.bool_) if clock is None else now[0] != clock[0]
-        self._observe(info, restarted, now[1] == np.where(restarted, 0, 0 if clock is None else clock[1]), None)
+        restarted = now.episodes != before.episodes
+        unmoved = (now.steps == before.steps) & (now.ticks == before.ticks)
+        self._observe(info, restarted, np.where(restarted, now.steps == 0, unmoved), None)
         self._clock = now
         return observation, info | self._idle_info(restarted, None)
 
@@ -109,15 +121,16 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         if self.filter.mode != "monitor" and decisions.intervened.any():
             overriding = (decisions.inputs.T / self.filter.plant.u_max).astype(np.float32)
             actions = np.where(decisions.intervened[:, None], overriding, np.asarray(actions))
-        (episodes, steps), self._clock = self._clock, _interrupted(self._clock)
+        before, self._clock = self._clock, self._interrupted
         observation, rewards, terminated, truncated, info = self.env.step(actions)
-        clock = self._read_clock()
-        restarted = clock[0] != episodes
-        moved_once = np.where(restarted, (clock[0] == episodes + 1) & (clock[1] == 0), clock[1] == steps + 1)
+        now = self._read_clock()
+        restarted = now.episodes != before.episodes
+        fresh, moved = (now.episodes == before.episodes + 1) & (now.steps == 0), now.steps == before.steps + 1
+        moved_once = np.where(restarted, fresh, moved) & (now.ticks == before.ticks + 1)
         counted = decisions.intervened
         added = {}
         if restarted.any() and "final_info" in info:
-            added["final_info"] = self._final_info(info, decisions, proposed, moved_once, episodes, steps)
+            added["final_info"] = self._final_info(info, decisions, proposed, moved_once)
             rewards = rewards - self.penalty * counted if self.penalty else rewards
             counted = counted & ~restarted
         else:
@@ -125,7 +138,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             rewards = rewards - self.penalty * counted if self.penalty else rewards
         self._interventions += counted
         self._observe(info, restarted, moved_once, decisions)
-        self._clock = clock
+        self._clock = now
         if restarted.any():
             added |= self._idle_info(restarted, (decisions, proposed))
         else:
@@ -137,7 +150,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
     ) -> None:
         """Takes in what the environment reports, and moves the proofs on."""
         self._interventions[restarted] = 0
-        self._estimate = np.ascontiguousarray(info["estimate"].T)
+        self._estimate = self._reported(info, "estimate", np.nan)
         self._shape_number = self._numbers_of_shapes()
         self._reason = self._proved(info, restarted, moved_once, decisions)
 
@@ -170,7 +183,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             self.certificate.Sigma is not None,
         )
         reason = np.empty(count, np.int64)
-        inputs = decided.inputs if decisions is None else np.ascontiguousarray(info["input"].T)
+        inputs = decided.inputs if decisions is None else self._reported(info, "input", np.nan)
         kernels.track(
             knowledge,
             restarted,
@@ -181,11 +194,18 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             self._known_starts(restarted),
             inputs,
             self._estimate,
-            info["assumption_violated"],
+            self._reported(info, "assumption_violated", 1.0) != 0.0,
             facts,
             reason,
         )
         return reason
+
+    def _reported(self, info: dict[str, Any], key: str, unusable: float) -> np.ndarray:
+        """Returns a copy of an info with the environment as last axis, all `unusable` if its shape or kind is wrong."""
+        plant, count = self.filter.plant, self.num_envs
+        shape = {"estimate": (count, plant.n), "input": (count, plant.m)}.get(key, (count,))
+        value = as_numbers(info.get(key))
+        return np.full(shape[::-1], unusable) if value is None or value.shape != shape else np.array(value.T, order="C")
 
     def _known_starts(self, restarted: np.ndarray) -> np.ndarray:
         """Returns whether all possible starts of the present episodes lie in S, shape (N,)."""
@@ -211,10 +231,10 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             numbers = self._numbers[nodes]
         return numbers
 
-    def _read_clock(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the numbers of episodes begun and of steps taken in them, shape (N,) each."""
+    def _read_clock(self) -> Clock:
+        """Returns how often the environments moved until now."""
         inner = self.env.unwrapped
-        return inner.episodes.copy(), inner.steps.copy()
+        return Clock(inner.episodes.copy(), inner.steps.copy(), inner.ticks)
 
     def _info(self, decisions: Decisions, proposed: np.ndarray) -> dict[str, Any]:
         """Returns the shield's keys for the step that applied these decisions."""
@@ -251,31 +271,24 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         decisions: Decisions,
         proposed: np.ndarray,
         moved_once: np.ndarray,
-        episodes: np.ndarray,
-        steps: np.ndarray,
     ) -> dict[str, Any]:
         """Returns final_info with the shield's keys of the last steps of episodes that ended (SAME_STEP)."""
         final, n = dict(info["final_info"]), self.filter.plant.n
         done = info["_final_info"]
-        kept = self._estimate, self._shape_number, self._interventions, getattr(self, "_reason", None)
+        kept = self._estimate, self._shape_number, self._interventions, self._reason
         book = self._batch.book
-        self._estimate = np.ascontiguousarray(final["estimate"].T)
+        self._estimate = self._reported(final, "estimate", np.nan)
         shapes = [book.number(final["error_shape"][e].reshape(n, n).copy()) for e in np.flatnonzero(done).tolist()]
         self._shape_number = self._shape_number.copy()
         self._shape_number[done] = shapes
         knowledge = kernels.Knowledge(*(array.copy() for array in self._knowledge))
         never = np.zeros(self.num_envs, np.bool_)
-        self._reason = self._proved(final, never, done | moved_once, decisions, knowledge)
+        self._reason = self._proved(final, never, moved_once, decisions, knowledge)
         self._interventions = self._interventions + decisions.intervened
         for key, value in self._info(decisions, proposed).items():
             final[key], final[f"_{key}"] = value, done.copy()
         self._estimate, self._shape_number, self._interventions, self._reason = kept
         return final
-
-
-def _interrupted(clock: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns what the clock reads while a step is under way, which no later step follows from."""
-    return np.full_like(clock[0], -1), np.full_like(clock[1], -1)
 
 
 def _environment_behind(env: VectorEnv) -> NCSVectorEnv:

@@ -118,9 +118,10 @@ def test_options_reach_the_environment_once():
     assert env.reset_infos[1]["state"][0] == 0.5
     env.reset()
     assert env.reset_infos[1]["state"][0] != 0.5
-    env.set_options([{"state": np.zeros(2)}, {"state": np.ones(2)}])
-    with pytest.raises(ValueError, match="same options"):
-        env.reset()
+    for options in ([{"state": np.zeros(2)}, {"state": np.full(2, 1e-12)}], [{"state": np.zeros(2)}, {}]):
+        env.set_options(options)
+        with pytest.raises(ValueError, match="same options"):
+            env.reset()
 
 
 def test_infos_hold_what_is_asked_for():
@@ -130,6 +131,44 @@ def test_infos_hold_what_is_asked_for():
     *_, infos = env.step(np.ones((3, 1), np.float32))
     assert all(set(info) == {"cost", "shield_intervened"} for info in infos)
     assert {"estimate", "shield_reason"} <= set(env.batch_info)
+
+
+def test_last_infos_of_sync_environments_are_complete_when_all_end_at_once():
+    class Extra(gym.Wrapper):
+        def step(self, action):
+            *rest, info = self.env.step(action)
+            return *rest, info | {"k": 3.0, "is_success": 1.0}
+
+    vector = gym.make_vec(
+        "CartPole-v1",
+        num_envs=2,
+        vectorization_mode="sync",
+        max_episode_steps=4,
+        wrappers=[Extra],
+        vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
+    )
+    env = SB3VecEnv(vector, info_keys=("k",))
+    env.seed(0)
+    env.reset()
+    for step in range(1, 9):
+        _, _, done, infos = env.step(np.array([step % 2] * 2))
+        assert done.all() == (step % 4 == 0)
+        assert all(info["k"] == 3.0 for info in infos)
+    assert infos[0]["episode"]["is_success"] == 1.0
+
+
+def test_dictionary_observations_are_refused():
+    class Named(gym.ObservationWrapper):
+        def __init__(self, env):
+            super().__init__(env)
+            self.observation_space = gym.spaces.Dict({"x": env.observation_space})
+
+        def observation(self, observation):
+            return {"x": observation}
+
+    vector = gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync", wrappers=[Named])
+    with pytest.raises(ValueError, match="must be arrays"):
+        SB3VecEnv(vector)
 
 
 def test_attributes():
@@ -162,7 +201,7 @@ def test_attributes():
 @pytest.mark.parametrize("algorithm", [PPO, SAC])
 def test_algorithms_learn_on_it(algorithm):
     env = VecNormalize(VecMonitor(SB3VecEnv(VectorSafetyShield(gym.make_vec(CRUISE, num_envs=4)))))
-    few = {"n_steps": 64} if algorithm is PPO else {"learning_starts": 100}
+    few = {"n_steps": 64} if algorithm is PPO else {"learning_starts": 100, "train_freq": 16}
     model = algorithm("MlpPolicy", env, seed=0, device="cpu", **few).learn(1200)
     assert len(model.ep_info_buffer) > 0
     assert np.isfinite(model.predict(env.reset())[0]).all()

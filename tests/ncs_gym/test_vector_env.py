@@ -9,7 +9,6 @@ from ncs_gym import (
     BoxDisturbance,
     Channel,
     ChannelContract,
-    Ellipsoid,
     GilbertElliott,
     LinearPlant,
     NCSEnv,
@@ -497,22 +496,50 @@ def test_wrong_settings_are_refused(wrong):
         make("TruckTrailer", **({"count": 2} | {("count" if k == "num_envs" else k): v for k, v in wrong.items()}))
 
 
-def test_a_users_own_task_and_disturbance_work_one_by_one():
-    class Odd(SetpointTracking):
-        begin_many = SetpointTracking.__mro__[1].begin_many
-        advance_many = SetpointTracking.__mro__[1].advance_many
-        observe_many = SetpointTracking.__mro__[1].observe_many
-        reward_many = SetpointTracking.__mro__[1].reward_many
+def test_what_a_users_subclass_changes_counts():
+    class Fixed(SpeedTracking):
+        def reward(self, plant, memory, state, u):
+            return 42.0 + memory.speed
 
-    plant = random_plant(0, 2, 1)
-    task = Odd(output=(1.0, 0.0), reach=1.0, width=2.0)
-    env = NCSVectorEnv(4, plant=plant, task=task, initial_set=Ellipsoid(0.01 * np.eye(2)), max_episode_steps=3)
+    class Odd(SetpointTracking):
+        def begin(self, rng, plant):
+            return 0.25
+
+    class Quiet(BallDisturbance):
+        def draw(self, rng, plant, nominal_next, step, memory):
+            return np.full(plant.n, 1e-3)
+
+    plant = truck_trailer(process_noise_cov=np.zeros((2, 2)))
+    env = NCSVectorEnv(4, plant=plant, task=Fixed(), disturbance=Quiet(), max_episode_steps=3)
     observation, info = env.reset(seed=0)
-    for _ in range(10):
+    for step in range(1, 10):
+        before = info["state"]
         observation, reward, _, _, info = env.step(np.zeros((4, 1), np.float32))
-    expected = [task.reward(plant, m, x, np.zeros(1)) for m, x in zip(env._memory, info["state"], strict=True)]
-    np.testing.assert_allclose(reward, expected)
-    np.testing.assert_allclose(observation[:, -1], env._memory.astype(float), rtol=1e-6)
+        if step % 4:
+            np.testing.assert_allclose(reward, [42.0 + memory.speed for memory in env._memory])
+            np.testing.assert_allclose(info["state"], before @ plant.A.T + 1e-3)
+    env = NCSVectorEnv(3, plant=plant, task=Odd(output=(1.0, 0.0), reach=1.0, width=2.0, change_probability=0.0))
+    observation, _ = env.reset(seed=0)
+    np.testing.assert_array_equal(observation[:, -1], 0.25)
+
+
+def test_long_outages_of_unstable_plants_raise_nothing():
+    burst = GilbertElliott(p_good_to_bad=0.003, p_bad_to_good=0.0008)
+    settings = {
+        "plant": batch_reactor(),
+        "channel": Channel(loss=burst, jitter=1),
+        "contract": ChannelContract(3),
+        "disturbance": "sphere",
+    }
+    env = NCSVectorEnv(4, **settings)
+    env.reset(seed=1)
+    single = NCSEnv(**settings)
+    single.reset(seed=2)
+    with np.errstate(all="raise", under="ignore"):
+        for _ in range(2000):
+            observation, *_ = env.step(np.zeros((4, 2), np.float32))
+            assert single.step(np.zeros(2, np.float32))[0] in single.observation_space
+    assert observation in env.observation_space
 
 
 def test_gymnasiums_sync_vector_env_of_scalar_ones_is_still_available():

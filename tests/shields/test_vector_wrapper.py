@@ -1,7 +1,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import VectorActionWrapper, VectorObservationWrapper
+from gymnasium.vector import VectorActionWrapper, VectorObservationWrapper, VectorWrapper
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 
 from ncs_gym import Channel, ChannelContract, NCSVectorEnv, SphereDisturbance, batch_reactor, truck_trailer
@@ -221,6 +221,77 @@ def test_steps_behind_the_shields_back_end_the_proof():
     with pytest.raises(ValueError, match="actions"):
         env.step(np.full((2, 1), np.nan))
     assert env.step(np.ones((2, 1), np.float32))[4]["shield_guaranteed"].all()
+
+
+def outwards(shield, info):
+    return np.sign(info["estimate"] @ (shield.certificate.M @ shield.unwrapped.plant.B))
+
+
+def assert_honest(shield, info):
+    """No environment is called safe that is not."""
+    levels = np.einsum("ei,ij,ej->e", info["state"], shield.certificate.M, info["state"])
+    assert (levels[info["shield_guaranteed"]] <= 1.0).all()
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_a_user_who_changes_what_was_returned_changes_no_decision(mode):
+    plant = TRUCKS["4000 kg"]
+    env = NCSVectorEnv(20, plant=plant, disturbance=harmful(plant), max_episode_steps=30, autoreset_mode=mode)
+    shield = VectorSafetyShield(env, certificate_of(plant))
+    _, info = shield.reset(seed=0)
+    for _ in range(60):
+        actions = outwards(shield, info)
+        for array in info.values():
+            if isinstance(array, np.ndarray) and array.dtype != object:
+                array[:] = 0
+        _, _, _, _, info = shield.step(actions)
+        assert_honest(shield, info)
+        assert info["shield_guaranteed"].all()
+
+
+def test_last_steps_behind_the_shields_back_promise_nothing():
+    plant = TRUCKS["4000 kg"]
+    env = NCSVectorEnv(50, plant=plant, disturbance=harmful(plant), max_episode_steps=30, autoreset_mode="SameStep")
+    shield = VectorSafetyShield(env, certificate_of(plant))
+    _, info = shield.reset(seed=0)
+    for _ in range(28):
+        _, _, _, _, info = shield.step(outwards(shield, info))
+    env.step(outwards(shield, info))
+    _, _, _, truncated, info = shield.step(outwards(shield, info))
+    assert truncated.all()
+    assert not info["final_info"]["shield_guaranteed"].any()
+    _, _, _, _, info = shield.step(outwards(shield, info))
+    assert not info["shield_guaranteed"].any()
+
+
+@pytest.mark.parametrize(
+    ("key", "change"),
+    [
+        ("estimate", lambda x: x[:, :1]),
+        ("estimate", lambda x: np.column_stack([x, x])),
+        ("estimate", lambda x: x[:10]),
+        ("estimate", lambda x: None),
+        ("estimate", lambda x: x.astype(object)),
+        ("input", lambda x: x[:, :0]),
+        ("input", lambda x: x[:3]),
+        ("input", lambda x: [*x.tolist(), [1j]]),
+        ("assumption_violated", lambda x: x[:3]),
+        ("assumption_violated", lambda x: "no"),
+    ],
+)
+def test_infos_of_the_wrong_shape_or_kind_promise_nothing(key, change):
+    class Broken(VectorWrapper):
+        def step(self, actions):
+            *rest, info = self.env.step(actions)
+            return *rest, info | {key: change(info[key])}
+
+    plant = TRUCKS["4000 kg"]
+    env = Broken(NCSVectorEnv(20, plant=plant, disturbance=harmful(plant)))
+    shield = VectorSafetyShield(env, certificate_of(plant))
+    shield.reset(seed=0)
+    for _ in range(30):
+        *_, info = shield.step(np.ones((20, 1), np.float32))
+        assert not info["shield_guaranteed"].any()
 
 
 def test_works_under_gymnasiums_vector_wrappers():
