@@ -59,7 +59,9 @@ def roomy_start(problem: ScaledProblem, program: InvariantSetProgram, progress: 
         design = program.solve(gain.shares, best_input_shares(Sigma[None], L, gain.K), L)
         if design is not None:
             return design
-    return None if gain is None or reach < ENOUGH else _as_design(gain, problem.covering)
+    # Thickened error sets by age may leave the program nothing where the sets themselves leave something.
+    several = len(problem.Sigmas) > 1
+    return _as_design(gain, problem.covering) if several and gain is not None and reach >= ENOUGH else None
 
 
 def _as_design(gain: RoomyGain, Sigma: np.ndarray) -> Design:
