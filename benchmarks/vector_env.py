@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import ncs_gym  # noqa: F401
 from agents import SB3VecEnv
+from ncs_gym.kernels import add_truncated
 from shields import VectorSafetyShield
 
 SIZES = (1, 64, 1024, 16384)
@@ -126,7 +127,21 @@ def main() -> None:
             cells.append(f"{shown(found)} ({found / base[count]:.2f})")
         print(f"{name:34s}" + "".join(f"{cell:>17s}" for cell in cells), flush=True)
     decide(options)
+    draws(options)
     print("bytes per environment: " + ", ".join(f"{memory(count):.0f} at N = {count}" for count in SIZES[1:]))
+
+
+def draws(options: argparse.Namespace) -> None:
+    """Prints what a normal number costs drawn by numpy and in compiled loops, and how large the gain tables become."""
+    rng, block, factor = np.random.default_rng(0), np.zeros((8192, 2)), np.eye(2)
+    numpys = rate(lambda: rng.standard_normal(out=block), block.size, options.seconds, 0.1)
+    ours = rate(lambda: add_truncated(rng, 1e3, factor, block), block.size, options.seconds, 0.1)
+    print(f"a normal number: numpy {1e9 / numpys:.1f} ns, compiled {1e9 / ours:.1f} ns with its scaling")
+    for name in ("TruckTrailer", "TruckTrailerCruise", "CartPole", "BatchReactor"):
+        env, step = vector(f"ncs_gym/{name}-v0", 1024)
+        for _ in range(400):
+            step()
+        print(f"patterns of arrivals after 400 steps of 1024, {name}: {len(env.unwrapped.patterns[0])}")
 
 
 def decide(options: argparse.Namespace) -> None:

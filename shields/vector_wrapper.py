@@ -127,15 +127,12 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         restarted = now.episodes != before.episodes
         fresh, moved = (now.episodes == before.episodes + 1) & (now.steps == 0), now.steps == before.steps + 1
         moved_once = np.where(restarted, fresh, moved) & (now.ticks == before.ticks + 1)
-        counted = decisions.intervened
-        added = {}
-        if restarted.any() and "final_info" in info:
+        added, counted = {}, decisions.intervened & ~restarted
+        charged = counted
+        if restarted.any() and "final_info" in info:  # SAME_STEP: the step ended an episode before it began the next
             added["final_info"] = self._final_info(info, decisions, proposed, moved_once)
-            rewards = rewards - self.penalty * counted if self.penalty else rewards
-            counted = counted & ~restarted
-        else:
-            counted = counted & ~restarted
-            rewards = rewards - self.penalty * counted if self.penalty else rewards
+            charged = decisions.intervened
+        rewards = rewards - self.penalty * charged if self.penalty else rewards
         self._interventions += counted
         self._observe(info, restarted, moved_once, decisions)
         self._clock = now
