@@ -24,6 +24,8 @@ ITERATIONS = 1000
 # The regulator whose answer to an error counts, in units of the box and of the input limits, and how much it counts:
 # of a few tried, the one that leaves the unstable plants of benchmarks/contracts.py the largest disturbances.
 EFFORT, DECAY, ANSWER = 10.0, 0.75, 10.0
+# How much the answer counts of a gain that the plant names.
+NAMED_ANSWER = 1000.0
 # Sets this much larger than the safe box are of no use.
 LARGEST = 1e6
 
@@ -132,7 +134,10 @@ def _age_sets(plant: LinearPlant, contract: ChannelContract) -> AgeSets | None:
 
 
 def _cost(plant: LinearPlant) -> np.ndarray:
-    """Returns W, shape (n, n): the size of an error in the box, and that of a regulator's answer to it."""
+    """Returns W, shape (n, n): the size of an error in the box, and that of a gain's answer to it."""
+    if plant.error_gain is not None:
+        K = plant.error_gain / plant.u_max[:, None]
+        return plant.weight + NAMED_ANSWER * K.T @ K
     T = np.linalg.cholesky(np.linalg.inv(plant.weight))
     inverse = np.linalg.inv(T)
     K = regulator_gain(inverse @ plant.A @ T, inverse @ plant.B * plant.u_max, EFFORT, DECAY)

@@ -42,6 +42,8 @@ class LinearPlant(FrozenArrays):
         measurement_noise_cov: R, shape (p, p), truncated at chi2_{p,1-delta}; zero by default.
         initial_cov: P0 of the first estimate, shape (n, n), truncated alike; zero by default.
         delta: Probability mass that the truncation of each Gaussian removes, in [1e-12, 0.999].
+        error_gain: The gain, shape (m, n), whose answers to an estimation error make it costly when error sets by age
+            are chosen (docs/contracts.md), a certificate's K in round numbers; a regulator's by default.
         state_names, state_units, input_names, input_units: For tables and figures.
 
     Raises:
@@ -60,6 +62,7 @@ class LinearPlant(FrozenArrays):
     measurement_noise_cov: np.ndarray | None = None
     initial_cov: np.ndarray | None = None
     delta: float = 0.05
+    error_gain: np.ndarray | None = None
     state_names: Sequence[str] = field(default=())
     state_units: Sequence[str] = field(default=())
     input_names: Sequence[str] = field(default=())
@@ -85,6 +88,8 @@ class LinearPlant(FrozenArrays):
         for name, size in (("process_noise_cov", n), ("measurement_noise_cov", H.shape[0]), ("initial_cov", n)):
             value = getattr(self, name)
             self._set(name, np.zeros((size, size)) if value is None else as_covariance(value, size, name))
+        if self.error_gain is not None:
+            self._set("error_gain", as_matrix(self.error_gain, (m, n), "error_gain"))
         for name, size, letter in (("state", n, "x"), ("input", m, "u")):
             names = tuple(getattr(self, f"{name}_names")) or tuple(f"{letter}{i + 1}" for i in range(size))
             units = tuple(getattr(self, f"{name}_units")) or ("",) * size
@@ -206,6 +211,8 @@ class LinearPlant(FrozenArrays):
             array = getattr(self, name)
             digest.update(f"{name}{array.shape}".encode() + array.astype("<f8").tobytes())
         digest.update(np.array([self.dt, self.gamma, self.delta], dtype="<f8").tobytes())
+        if self.error_gain is not None:
+            digest.update(self.error_gain.astype("<f8").tobytes())
         return digest.hexdigest()
 
     def constraint_values(self, state: np.ndarray) -> np.ndarray:

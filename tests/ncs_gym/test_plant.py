@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -74,6 +76,7 @@ def test_fingerprint_changes_with_every_number():
         truck_trailer(u_max=4.0000001),
         truck_trailer(initial_cov=2e-4 * np.eye(2)),
         truck_trailer(H=np.array([[1.0, 0.0]])),
+        replace(base, error_gain=[[1.0, 0.0]]),
     ]
     prints = {plant.fingerprint for plant in (base, *others)}
     assert len(prints) == 1 + len(others)
@@ -108,6 +111,7 @@ def good() -> dict:
         ({"initial_cov": [[1.0, 0.5], [0.0, 1.0]]}, "initial_cov must be symmetric"),
         ({"measurement_noise_cov": np.eye(3)}, "measurement_noise_cov must have shape"),
         ({"state_names": ["one"]}, "state_names"),
+        ({"error_gain": np.ones((2, 2))}, "error_gain must have shape"),
     ],
 )
 def test_bad_numbers_are_refused_in_one_sentence(change, words):

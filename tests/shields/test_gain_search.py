@@ -119,3 +119,11 @@ def test_cart_pole_bears_at_least_the_radii_that_were_measured_before(full_state
         initial_cov=(0.01 * radius * half_widths.min()) ** 2 / chi2_quantile(0.95, n) * np.eye(n),
     )
     assert verify(synthesize(plant, contract=ChannelContract(age)), plant).valid
+
+
+@pytest.mark.parametrize("contract", [ChannelContract(1), ChannelContract(3, 1e-3)])
+def test_error_sets_chosen_for_the_reactors_gain_leave_more_room(contract):
+    plants = batch_reactor(), batch_reactor(error_gain=None)
+    problems = [design_problem(plant, contract)[0] for plant in plants]
+    named, unnamed = (roomiest_gain(problem, problem.covering).reach for problem in problems)
+    assert named > 1.01 * unnamed
