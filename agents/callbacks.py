@@ -11,10 +11,13 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from agents.sb3_vec_env import SB3VecEnv
 
+# Where every step of all environments is a rollout, the history has this many points.
+POINTS = 200
+
 
 @dataclass(frozen=True)
 class TrainingPoint:
-    """Totals after one rollout.
+    """Totals so far.
 
     Attributes:
         steps: Environment steps so far.
@@ -38,48 +41,51 @@ class SafetyCallback(BaseCallback):
 
     Args:
         on_progress: Called with the number of steps taken since its last call.
+
+    Attributes:
+        history: Totals after every rollout; where rollouts are single steps, `POINTS` of them.
+        violation_steps: Steps so far whose true state violated the safe box.
+        interventions: Steps so far in which the shield intervened.
     """
 
     def __init__(self, on_progress: Callable[[int], None] | None = None) -> None:
         super().__init__()
         self.history: list[TrainingPoint] = []
         self._on_progress = on_progress
-        self._violations = self._interventions = 0
-        self._logged = (0, 0, 0)
-        self._reported = 0
+        self.violation_steps = self.interventions = 0
 
-    @property
-    def violation_steps(self) -> int:
-        """Steps so far whose true state violated the safe box."""
-        return self._violations
-
-    @property
-    def interventions(self) -> int:
-        """Steps so far in which the shield intervened."""
-        return self._interventions
+    def _on_training_start(self) -> None:
+        self._every = self.locals["total_timesteps"] // POINTS
 
     def _on_step(self) -> bool:
         batch = _batch_info(self.training_env)
         if batch is None:
             infos = self.locals["infos"]
             batch = {key: [info[key] for info in infos] for key in ("cost", "shield_intervened") if key in infos[0]}
-        self._violations += int((np.asarray(batch["cost"]) > 0.0).sum())
-        self._interventions += int(np.sum(batch.get("shield_intervened", 0)))
+        self.violation_steps += int((np.asarray(batch["cost"]) > 0.0).sum())
+        self.interventions += int(np.sum(batch.get("shield_intervened", 0)))
         return True
 
     def _on_rollout_end(self) -> None:
-        steps, violations, interventions = self._logged
-        taken = max(self.num_timesteps - steps, 1)
-        self.logger.record("safety/violation_rate", (self._violations - violations) / taken)
-        self.logger.record("safety/intervention_rate", (self._interventions - interventions) / taken)
-        self.logger.record("safety/violation_steps", self._violations)
-        self._logged = (self.num_timesteps, self._violations, self._interventions)
+        if self.num_timesteps - (self.history[-1].steps if self.history else 0) >= self._every:
+            self._note()
+
+    def _on_training_end(self) -> None:
+        if not self.history or self.history[-1].steps < self.num_timesteps:
+            self._note()
+
+    def _note(self) -> None:
+        """Adds a point to the history and to TensorBoard's next event."""
+        last = self.history[-1] if self.history else TrainingPoint(0, float("nan"), 0, 0)
+        taken = max(self.num_timesteps - last.steps, 1)
+        self.logger.record("safety/violation_rate", (self.violation_steps - last.violation_steps) / taken)
+        self.logger.record("safety/intervention_rate", (self.interventions - last.interventions) / taken)
+        self.logger.record("safety/violation_steps", self.violation_steps)
         returns = [episode["r"] for episode in self.model.ep_info_buffer or ()]
         mean = float(np.mean(returns)) if returns else float("nan")
-        self.history.append(TrainingPoint(self.num_timesteps, mean, self._violations, self._interventions))
+        self.history.append(TrainingPoint(self.num_timesteps, mean, self.violation_steps, self.interventions))
         if self._on_progress is not None:
-            self._on_progress(self.num_timesteps - self._reported)
-            self._reported = self.num_timesteps
+            self._on_progress(self.num_timesteps - last.steps)
 
 
 def _batch_info(env: VecEnv) -> dict[str, np.ndarray] | None:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
-from agents.training import Shielding, make_env
+from agents.control_loop import ControlLoop
+from agents.trajectory import Trajectory, trajectory_of
+from ncs_gym import NCSVectorEnv
 
-# Episodes played side by side, so that a network's prediction is shared.
-SIDE_BY_SIDE = 25
+# Episodes played side by side at most.
+SIDE_BY_SIDE = 1000
 
-# Maps raw observations, shape (N, entries), and their infos to actions, shape (N, m).
-Policy = Callable[[np.ndarray, list[dict]], np.ndarray]
+# Maps raw observations, shape (N, entries), and infos, arrays with N as first axis, to actions, shape (N, m).
+Policy = Callable[[np.ndarray, dict[str, Any]], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -22,103 +24,134 @@ class Episode:
     """One finished episode.
 
     Attributes:
-        seed: The environment was reset with it.
+        index: Its number within the evaluation; with the same seed and number of episodes, episodes of equal index meet
+            the same start, disturbances and channel, whatever the policy and the shield.
         steps: Length.
-        episode_return: Sum of the environment's rewards, without shield penalties.
+        episode_return: Sum of the environment's rewards, without penalties of shield or violations.
         violation_steps: Steps after which the true state violated the safe box.
-        interventions: Steps in which the shield intervened.
+        estimate_violation_steps: Steps after which the estimate lay outside of it.
+        interventions: Steps in which the shield intervened, or would have (mode "monitor").
         guaranteed: Whether the shield's proof held at every step; False without a shield.
         largest_level: Largest x'Mx of the true state; NaN without a certificate.
     """
 
-    seed: int
+    index: int
     steps: int
     episode_return: float
     violation_steps: int
+    estimate_violation_steps: int
     interventions: int
     guaranteed: bool
     largest_level: float
 
 
+@dataclass(frozen=True)
+class Evaluation:
+    """Finished episodes.
+
+    Attributes:
+        episodes: All of them.
+        trajectory: The first, step by step.
+    """
+
+    episodes: list[Episode]
+    trajectory: Trajectory
+
+
 def evaluate(
-    env_id: str,
+    loop: ControlLoop,
     policy: Policy,
     episodes: int,
-    first_seed: int,
-    shielding: Shielding | None = None,
+    seed: int,
     level_matrix: np.ndarray | None = None,
     on_progress: Callable[[int], None] | None = None,
-) -> list[Episode]:
-    """Returns one record per episode; episode i is reset with seed first_seed + i, so that policies can be paired.
+) -> Evaluation:
+    """Returns what a policy does in a number of episodes, played side by side.
 
     Args:
-        env_id: A registered `ncs_gym` id.
+        loop: What it is evaluated in; penalties are left out.
         policy: Maps observations and infos to actions.
-        episodes: How many.
-        first_seed: Seed of the first.
-        shielding: None plays unshielded.
+        episodes: How many, >= 1.
+        seed: Of all draws, see `Episode.index`.
         level_matrix: M, shape (n, n), for `Episode.largest_level`.
-        on_progress: Called with the number of finished episodes since its last call.
+        on_progress: Called with the number of steps taken since its last call.
     """
-    envs = [make_env(env_id, shielding) for _ in range(min(episodes, SIDE_BY_SIDE))]
     records: list[Episode] = []
-    for start in range(0, episodes, len(envs)):
-        seeds = range(first_seed + start, first_seed + min(start + len(envs), episodes))
-        records += _play(envs[: len(seeds)], policy, seeds, shielding, level_matrix)
-        if on_progress is not None:
-            on_progress(len(seeds))
-    return records
+    trajectory: Trajectory | None = None
+    for first in range(0, episodes, SIDE_BY_SIDE):
+        count = min(SIDE_BY_SIDE, episodes - first)
+        play = _Play(loop.unpriced, count, level_matrix)
+        infos = play.run(policy, [seed, first], keep=trajectory is None, on_progress=on_progress)
+        trajectory = trajectory or trajectory_of(infos, 0)
+        records += play.records(first)
+    return Evaluation(records, trajectory)  # type: ignore[arg-type]
 
 
-def _play(
-    envs: list[gym.Env], policy: Policy, seeds: range, shielding: Shielding | None, level_matrix: np.ndarray | None
-) -> list[Episode]:
-    """Plays one episode in each environment, side by side."""
-    penalty = 0.0 if shielding is None else shielding.penalty
-    starts = [env.reset(seed=seed) for env, seed in zip(envs, seeds, strict=True)]
-    observations, infos = [list(part) for part in zip(*starts, strict=True)]
-    tallies = [_Tally(seed, level_matrix, info) for seed, info in zip(seeds, infos, strict=True)]
-    running = list(range(len(envs)))
-    while running:
-        actions = policy(np.stack([observations[i] for i in running]), [infos[i] for i in running])
-        for i, action in zip(list(running), actions, strict=True):
-            observations[i], reward, terminated, truncated, infos[i] = envs[i].step(action)
-            tallies[i].add(float(reward) + penalty * infos[i].get("shield_intervened", False), infos[i])
-            if terminated or truncated:
-                running.remove(i)
-    return [tally.episode() for tally in tallies]
+class _Play:
+    """Episodes side by side, each from its start to its end, with running totals in arrays."""
 
+    def __init__(self, loop: ControlLoop, count: int, level_matrix: np.ndarray | None) -> None:
+        # Episodes that end early go on unseen, so that the others' draws do not depend on them.
+        prototype = loop.single().unwrapped
+        self._ends = bool(getattr(prototype, "terminate_on_violation", False))
+        self._envs, self._C, self._level_matrix = loop.vector(count), prototype.plant.C, level_matrix
+        if self._ends and isinstance(self._envs.unwrapped, NCSVectorEnv):
+            self._envs = loop.vector(count, terminate_on_violation=False)
+        self._alive = np.ones(count, np.bool_)
+        self._totals = {name: np.zeros(count) for name in ("return", "steps", "violations", "estimate", "acted")}
+        self._guaranteed, self._level = np.ones(count, np.bool_), np.zeros(count)
 
-class _Tally:
-    """Running totals of one episode."""
+    def run(
+        self, policy: Policy, seed: list[int], keep: bool, on_progress: Callable[[int], None] | None
+    ) -> list[dict[str, Any]]:
+        """Plays; returns the infos until the first episode ends if they are to be kept."""
+        word = int(np.random.SeedSequence(seed).generate_state(1)[0] >> 1)
+        observations, info = self._envs.reset(seed=word)
+        self._watch(info)
+        kept = [info]
+        while self._alive.any():
+            observations, rewards, terminated, truncated, info = self._envs.step(policy(observations, info))
+            if keep and self._alive[0]:
+                kept.append(info)
+            self._add(rewards, info)
+            self._alive &= ~(terminated | truncated)
+            if self._ends:
+                self._alive &= ~(info["cost"] > 0.0)
+            if on_progress is not None:
+                on_progress(len(self._alive))
+        self._envs.close()
+        return kept
 
-    def __init__(self, seed: int, level_matrix: np.ndarray | None, info: dict) -> None:
-        self._seed, self._level_matrix = seed, level_matrix
-        self._return, self._steps = 0.0, 0
-        self._guaranteed, self._level = True, 0.0
-        self._violations = 0
-        self._observe(info)
+    def records(self, first: int) -> list[Episode]:
+        """Returns one record per episode; the first has the given number."""
+        totals = self._totals
+        return [
+            Episode(
+                index=first + e,
+                steps=int(totals["steps"][e]),
+                episode_return=float(totals["return"][e]),
+                violation_steps=int(totals["violations"][e]),
+                estimate_violation_steps=int(totals["estimate"][e]),
+                interventions=int(totals["acted"][e]),
+                guaranteed=bool(self._guaranteed[e]),
+                largest_level=float(self._level[e]) if self._level_matrix is not None else float("nan"),
+            )
+            for e in range(len(self._alive))
+        ]
 
-    def add(self, reward: float, info: dict) -> None:
-        self._return += reward
-        self._steps += 1
-        self._violations += info["cost"] > 0.0
-        self._observe(info)
+    def _add(self, rewards: np.ndarray, info: dict[str, Any]) -> None:
+        """Adds a step of the episodes that are not over."""
+        outside = np.abs(info["estimate"] @ self._C.T).max(axis=1) > 1.0
+        acted = info.get("shield_intervened", np.zeros(len(rewards), np.bool_))
+        values = {"return": rewards, "steps": 1, "violations": info["cost"] > 0.0, "estimate": outside, "acted": acted}
+        for name, value in values.items():
+            self._totals[name] += np.where(self._alive, value, 0)
+        self._watch(info)
 
-    def episode(self) -> Episode:
-        info = self._info
-        return Episode(
-            seed=self._seed,
-            steps=self._steps,
-            episode_return=self._return,
-            violation_steps=self._violations,
-            interventions=int(info.get("episode_interventions", 0)),
-            guaranteed=self._guaranteed,
-            largest_level=self._level if self._level_matrix is not None else float("nan"),
-        )
-
-    def _observe(self, info: dict) -> None:
-        self._info = info
-        self._guaranteed &= bool(info.get("shield_guaranteed", False))
+    def _watch(self, info: dict[str, Any]) -> None:
+        """Takes note of guarantees and levels."""
+        proven = info.get("shield_guaranteed", np.zeros(len(self._alive), np.bool_)).astype(np.bool_)
+        self._guaranteed &= proven | ~self._alive
         if self._level_matrix is not None:
-            self._level = max(self._level, float(info["state"] @ self._level_matrix @ info["state"]))
+            levels = np.einsum("ei,ij,ej->e", info["state"], self._level_matrix, info["state"])
+            self._level = np.maximum(self._level, np.where(self._alive, levels, 0.0))

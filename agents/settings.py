@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
+
+
+class _Settings:
+    """Checks ranges by the names that algorithms share."""
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        for entry in fields(self):  # type: ignore[arg-type]
+            _check(entry.name, getattr(self, entry.name))
 
 
 @dataclass(frozen=True, kw_only=True)
-class PPOSettings:
-    """Settings of PPO; the defaults learn the cruise task in 150,000 steps.
+class PPOSettings(_Settings):
+    """Settings of PPO and TRPO; the defaults learn the cruise task in 150,000 steps.
 
     Many environments, batches of 2048 and a higher learning rate than stable-baselines3's defaults train an order of
     magnitude faster at no loss of return on these small tasks (`python benchmarks/ppo_settings.py`).
@@ -37,17 +47,77 @@ class PPOSettings:
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
-        for name in ("envs", "rollout", "batch_size", "epochs", "width"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be a whole number >= 1, got {value!r}")
-        for name in ("discount", "gae_lambda"):
-            value = getattr(self, name)
-            if not 0.0 <= value <= 1.0:
-                raise ValueError(f"{name} must be in [0, 1], got {value!r}")
-        if not 0.0 < self.learning_rate < math.inf:
-            raise ValueError(f"learning_rate must be positive, got {self.learning_rate!r}")
-        if not math.isfinite(self.log_std):
-            raise ValueError(f"log_std must be finite, got {self.log_std!r}")
+        super().__post_init__()
         if self.rollout * self.envs < 2:
             raise ValueError("rollout * envs must be at least 2")
+
+
+@dataclass(frozen=True, kw_only=True)
+class A2CSettings(_Settings):
+    """Settings of A2C.
+
+    Attributes:
+        envs: Environments stepped side by side.
+        rollout: Steps per environment between updates.
+        learning_rate: Of RMSprop, falling linearly to zero.
+        discount: Per step.
+        gae_lambda: Of generalized advantage estimation.
+        log_std: Initial log standard deviation of the actions.
+        width: Units in each of two hidden layers, for policy and value.
+    """
+
+    envs: int = 64
+    rollout: int = 8
+    learning_rate: float = 2e-3
+    discount: float = 0.9
+    gae_lambda: float = 0.9
+    log_std: float = -0.7
+    width: int = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class OffPolicySettings(_Settings):
+    """Settings of SAC, TD3, TQC and CrossQ.
+
+    Attributes:
+        envs: Environments stepped side by side.
+        gradient_steps: Updates per step of all environments.
+        batch_size: Samples per update.
+        buffer_size: Transitions kept.
+        learning_starts: Steps with random actions before the first update.
+        learning_rate: Of Adam, falling linearly to zero.
+        discount: Per step.
+        noise: Standard deviation of TD3's exploration, in units of the input limits.
+        width: Units in each of two hidden layers, for policy and values.
+    """
+
+    envs: int = 64
+    gradient_steps: int = 16
+    batch_size: int = 256
+    buffer_size: int = 200_000
+    learning_starts: int = 2_000
+    learning_rate: float = 3e-3
+    discount: float = 0.9
+    noise: float = 0.2
+    width: int = 64
+
+
+AgentSettings = PPOSettings | A2CSettings | OffPolicySettings
+
+
+def _check(name: str, value: Any) -> None:
+    """Raises ValueError if a setting is out of the range its name stands for."""
+    if name in ("discount", "gae_lambda"):
+        if not 0.0 <= value <= 1.0:
+            raise ValueError(f"{name} must be in [0, 1], got {value!r}")
+    elif name == "learning_rate":
+        if not 0.0 < value < math.inf:
+            raise ValueError(f"learning_rate must be positive, got {value!r}")
+    elif name == "noise":
+        if not 0.0 <= value < math.inf:
+            raise ValueError(f"noise must be >= 0, got {value!r}")
+    elif name == "log_std":
+        if not math.isfinite(value):
+            raise ValueError(f"log_std must be finite, got {value!r}")
+    elif isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ValueError(f"{name} must be a whole number >= 1, got {value!r}")

@@ -1,4 +1,4 @@
-"""Trains PPO on an environment, shielded or not."""
+"""Trains a stable-baselines3 agent in a control loop, and counts what happens on the way."""
 
 from __future__ import annotations
 
@@ -6,57 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import gymnasium as gym
-import numpy as np
-import torch
-from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger, configure
-from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecNormalize
 
-import ncs_gym  # noqa: F401  (registers the environments)
+from agents.agent import Agent, Normalization
+from agents.algorithms import ALGORITHMS, algorithm_class, build
 from agents.callbacks import SafetyCallback, TrainingPoint
-from agents.sb3_vec_env import EPISODE_KEYS, SB3VecEnv
-from agents.settings import PPOSettings
-from shields import Certificate, SafetyShield, VectorSafetyShield
-
-
-@dataclass(frozen=True)
-class Shielding:
-    """How an environment is shielded.
-
-    Attributes:
-        certificate: Verified when the shield is built.
-        mode: Of `SafetyShield`.
-        penalty: Subtracted from the reward per intervention.
-    """
-
-    certificate: Certificate
-    mode: str = "project"
-    penalty: float = 0.0
-
-
-@dataclass(frozen=True)
-class Agent:
-    """A trained policy with the statistics its observations are normalized by.
-
-    Attributes:
-        model: PPO.
-        normalizer: VecNormalize, no longer updated.
-    """
-
-    model: PPO
-    normalizer: VecNormalize
-
-    def act(self, observations: np.ndarray) -> np.ndarray:
-        """Returns deterministic actions, shape (N, m), for raw observations, shape (N, entries)."""
-        return self.model.predict(self.normalizer.normalize_obs(observations), deterministic=True)[0]
-
-    def save(self, folder: Path) -> None:
-        """Writes `model.zip` and `normalizer.pkl` into an existing folder."""
-        self.model.save(folder / "model.zip")
-        self.normalizer.save(str(folder / "normalizer.pkl"))
+from agents.control_loop import ControlLoop
+from agents.sb3_vec_env import SB3VecEnv
+from agents.settings import AgentSettings
 
 
 @dataclass(frozen=True)
@@ -65,7 +23,7 @@ class TrainingResult:
 
     Attributes:
         agent: The trained policy.
-        history: Totals after each rollout.
+        history: Totals along the way.
         steps: Environment steps taken (whole rollouts: at least what was asked for).
         violation_steps: Steps whose true state violated the safe box, all of training.
         interventions: Steps in which the shield intervened, all of training.
@@ -78,30 +36,12 @@ class TrainingResult:
     interventions: int
 
 
-def make_env(env_id: str, shielding: Shielding | None = None) -> gym.Env:
-    """Returns an environment, shielded if asked for."""
-    env = gym.make(env_id)
-    if shielding is None:
-        return env
-    return SafetyShield(env, shielding.certificate, mode=shielding.mode, penalty=shielding.penalty)
-
-
-def make_training_env(env_id: str, count: int, shielding: Shielding | None = None) -> VecEnv:
-    """Returns `count` environments for stable-baselines3: a vector environment if the id has one, else single ones."""
-    if gym.spec(env_id).vector_entry_point is None:
-        return DummyVecEnv([lambda: Monitor(make_env(env_id, shielding), info_keywords=EPISODE_KEYS)] * count)
-    env = gym.make_vec(env_id, num_envs=count)
-    if shielding is not None:
-        env = VectorSafetyShield(env, shielding.certificate, mode=shielding.mode, penalty=shielding.penalty)
-    return SB3VecEnv(env)
-
-
 def train(
-    env_id: str,
+    loop: ControlLoop,
     steps: int,
     seed: int,
-    shielding: Shielding | None = None,
-    settings: PPOSettings | None = None,
+    algorithm: str = "PPO",
+    settings: AgentSettings | None = None,
     *,
     log_folder: Path | None = None,
     on_progress: Callable[[int], None] | None = None,
@@ -109,45 +49,46 @@ def train(
     """Returns a trained agent and what happened on the way; the same seed gives the same result on one machine.
 
     Args:
-        env_id: A registered `ncs_gym` id.
+        loop: What it is trained in.
         steps: Environment steps to train for, rounded up to whole rollouts.
-        seed: Seeds environments, network and sampling; arms with the same seed meet the same draws
+        seed: Seeds environments, network and sampling; loops with the same seed meet the same draws
             of nature as long as their episodes last equally long.
-        shielding: None trains unshielded.
-        settings: Of PPO; the defaults if None.
+        algorithm: A name in `agents.algorithms`.
+        settings: Of the algorithm; its defaults if None.
         log_folder: Where TensorBoard's events go.
         on_progress: Called with the number of steps taken since its last call.
+
+    Raises:
+        ValueError: If the algorithm is unknown, or the settings are another's.
+        ModuleNotFoundError: If the algorithm's package is not installed.
     """
-    settings = settings or PPOSettings()
-    env = VecNormalize(make_training_env(env_id, settings.envs, shielding), gamma=settings.discount)
-    model = _ppo(env, settings, seed)
+    algorithm_class(algorithm)
+    settings = settings or ALGORITHMS[algorithm][1]()
+    env = VecNormalize(SB3VecEnv(loop.vector(settings.envs)), gamma=settings.discount)
+    model = build(algorithm, env, settings, seed)
     model.set_logger(configure(str(log_folder), ["tensorboard"]) if log_folder else Logger(None, []))
     callback = SafetyCallback(on_progress)
     model.learn(steps, callback=callback)
-    env.training = False
+    agent = _agent(loop, algorithm, settings, model, env)
     return TrainingResult(
-        Agent(model, env), callback.history, model.num_timesteps, callback.violation_steps, callback.interventions
+        agent, callback.history, model.num_timesteps, callback.violation_steps, callback.interventions
     )
 
 
-def untrained(env_id: str, seed: int, settings: PPOSettings | None = None) -> Agent:
+def untrained(loop: ControlLoop, seed: int, algorithm: str = "PPO", settings: AgentSettings | None = None) -> Agent:
     """Returns a policy with the random weights that training starts from."""
-    env = VecNormalize(make_training_env(env_id, 1), training=False)
-    return Agent(_ppo(env, settings or PPOSettings(), seed), env)
+    algorithm_class(algorithm)
+    settings = settings or ALGORITHMS[algorithm][1]()
+    env = VecNormalize(SB3VecEnv(loop.vector(1)), training=False)
+    return _agent(loop, algorithm, settings, build(algorithm, env, settings, seed), env)
 
 
-def _ppo(env: VecNormalize, settings: PPOSettings, seed: int) -> PPO:
-    torch.set_num_threads(1)  # more threads only pay off at batches of 16384 and make results depend on their number
-    return PPO(
-        "MlpPolicy",
-        env,
-        learning_rate=LinearSchedule(settings.learning_rate, 0.0, 1.0),
-        n_steps=settings.rollout,
-        batch_size=min(settings.batch_size, settings.rollout * env.num_envs),
-        n_epochs=settings.epochs,
-        gamma=settings.discount,
-        gae_lambda=settings.gae_lambda,
-        policy_kwargs={"net_arch": [settings.width] * 2, "log_std_init": settings.log_std},
-        seed=seed,
-        device="cpu",
+def _agent(loop: ControlLoop, algorithm: str, settings: AgentSettings, model, env: VecNormalize) -> Agent:
+    return Agent(
+        algorithm=algorithm,
+        settings=settings,
+        env=loop.env,
+        channel=loop.channel,
+        model=model,
+        normalization=Normalization.of(env),
     )

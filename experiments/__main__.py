@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import os
 import sys
@@ -15,7 +16,7 @@ def main() -> None:
     """Parses the command line and runs the command; errors become one sentence on stderr and exit code 2."""
     try:
         _require_own_agents()
-        settings = _parse()
+        settings = _parse(sys.argv[1:])
         _run(settings)
     except KeyboardInterrupt:
         sys.exit(_complain("interrupted", INTERRUPTED))
@@ -28,39 +29,39 @@ def main() -> None:
         sys.exit(_complain(_sentence(error), ERROR))
 
 
-def _parse() -> object:
+# What each command runs, and whether it needs the training extra.
+COMMANDS = {
+    "compare": ("CompareSettings", "experiments.compare:compare", True),
+    "train": ("TrainSettings", "experiments.single:train_agent", True),
+    "evaluate": ("EvaluateSettings", "experiments.single:evaluate_agent", True),
+    "sweep": ("SweepSettings", "experiments.sweep:sweep", True),
+    "synthesize": ("SynthesizeSettings", "experiments.certificates:synthesize_file", False),
+    "verify": ("VerifySettings", "experiments.certificates:verify_file", False),
+    "audit": ("AuditSettings", "experiments.audit:audit", False),
+    "reproduce": ("ReproduceSettings", "experiments.reproduce:reproduce", False),
+}
+
+
+def _parse(arguments: list[str]) -> object:
     import tyro
 
     from experiments import settings
+    from experiments.settings_file import with_config
 
     return tyro.extras.subcommand_cli_from_dict(
-        {
-            "compare": settings.CompareSettings,
-            "synthesize": settings.SynthesizeSettings,
-            "verify": settings.VerifySettings,
-            "audit": settings.AuditSettings,
-            "reproduce": settings.ReproduceSettings,
-        },
+        {name: getattr(settings, kind) for name, (kind, _, _) in COMMANDS.items()},
         prog="ncs",
         description="Safe learning control over imperfect networks.",
+        args=with_config(arguments),
     )
 
 
 def _run(chosen: object) -> None:
-    from experiments import settings
-
-    if isinstance(chosen, settings.CompareSettings):
+    _, target, needs_training = next(entry for entry in COMMANDS.values() if entry[0] == type(chosen).__name__)
+    if needs_training:
         _require_training_extra()
-        from experiments.compare import compare as run
-    elif isinstance(chosen, settings.AuditSettings):
-        from experiments.audit import audit as run
-    elif isinstance(chosen, settings.ReproduceSettings):
-        from experiments.reproduce import reproduce as run
-    elif isinstance(chosen, settings.SynthesizeSettings):
-        from experiments.certificates import synthesize_file as run
-    else:
-        from experiments.certificates import verify_file as run
-    run(chosen)
+    module, _, function = target.partition(":")
+    getattr(importlib.import_module(module), function)(chosen)
 
 
 def _require_own_agents() -> None:

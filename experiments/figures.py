@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -10,12 +11,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from experiments.plotting import STYLE
+from experiments.plotting import STYLE, as_png
 from experiments.unit import UnitResult
 from ncs_gym import LinearPlant
 from shields import Certificate
 
-COLORS = {"unshielded": "#c8553d", "shielded": "#1f6f8b"}
+COLORS = {
+    "unshielded": "#c8553d",
+    "monitor": "#8a5a44",
+    "penalized": "#e09f3e",
+    "shielded": "#1f6f8b",
+}
 GREY = "#555555"
 # Curves of fewer points show them.
 FEW_POINTS = 5
@@ -23,6 +29,29 @@ FEW_POINTS = 5
 
 # Interventions are averaged over as many steps as 64 environments side by side need for an episode of 200.
 RATE_WINDOW = 64 * 200
+
+
+def figures_of(
+    plant: LinearPlant, certificate: Certificate, summary: dict[str, Any], results: dict[str, Sequence[UnitResult]]
+) -> dict[str, tuple[str, bytes]]:
+    """Returns caption and PNG of every figure by name."""
+    arms = {name: results[name] for name in summary["arms"]}
+    return {
+        "training": ("Training: thin lines are single runs, thick ones their mean.", as_png(training_figure(arms))),
+        "phase": (
+            "True states of the first evaluation episode of each run.",
+            as_png(phase_figure(plant, certificate, arms)),
+        ),
+        "episode": (
+            "One evaluation episode of the first runs, same draws of nature.",
+            as_png(episode_figure(plant, arms)),
+        ),
+    }
+
+
+def color_of(arm: str) -> str:
+    """Returns the color of an arm; its variants share it."""
+    return COLORS[arm.split(":")[0].split("+")[0]]
 
 
 def training_figure(arms: dict[str, Sequence[UnitResult]]) -> Figure:
@@ -40,9 +69,9 @@ def training_figure(arms: dict[str, Sequence[UnitResult]]) -> Figure:
             for axis, values in zip(axes, curves, strict=True):
                 if axis is axes[2] and not overridden.any():
                     continue
-                axis.plot(steps, values.T, color=COLORS[name], lw=0.8, alpha=0.4)
+                axis.plot(steps, values.T, color=color_of(name), lw=0.8, alpha=0.4)
                 marker = "o" if len(steps) < FEW_POINTS else None
-                axis.plot(steps, values.mean(axis=0), color=COLORS[name], lw=2.0, marker=marker, label=name)
+                axis.plot(steps, values.mean(axis=0), color=color_of(name), lw=2.0, marker=marker, label=name)
         _label(axes[0], "training steps", "mean return of recent episodes", "Return")
         _label(axes[1], "training steps", "violating steps so far", "Violations of the true state")
         _label(axes[2], "training steps", "actions overridden [%]", "Interventions of the shield")
@@ -64,7 +93,7 @@ def phase_figure(plant: LinearPlant, certificate: Certificate, arms: dict[str, S
         for axis, (name, results) in zip(axes, arms.items(), strict=True):
             for result in results:
                 states = result.trajectory.states
-                (handles[name],) = axis.plot(states[:, 0], states[:, 1], color=COLORS[name], lw=0.9, alpha=0.85)
+                (handles[name],) = axis.plot(states[:, 0], states[:, 1], color=color_of(name), lw=0.9, alpha=0.85)
                 outside = plant.constraint_values(states.T).max(axis=0) > 0.0
                 if outside.any():
                     (handles["violation"],) = axis.plot(*states[outside, :2].T, "x", color="black", ms=5)
@@ -82,9 +111,9 @@ def episode_figure(plant: LinearPlant, arms: dict[str, Sequence[UnitResult]]) ->
         for name, results in arms.items():
             path = results[0].trajectory
             time = plant.dt * np.arange(len(path.states))
-            top.plot(time, np.abs(path.states @ plant.C.T).max(axis=1), color=COLORS[name], lw=1.3, label=name)
+            top.plot(time, np.abs(path.states @ plant.C.T).max(axis=1), color=color_of(name), lw=1.3, label=name)
             bottom.step(
-                time[:-1], path.inputs[:, 0], where="post", color=COLORS[name], lw=1.2, label=f"applied, {name}"
+                time[:-1], path.inputs[:, 0], where="post", color=color_of(name), lw=1.2, label=f"applied, {name}"
             )
             changed = np.any(path.inputs != path.proposed, axis=1)
             if changed.any():

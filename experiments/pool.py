@@ -6,8 +6,9 @@ import multiprocessing
 import queue
 import signal
 import sys
-from collections.abc import Sequence
-from concurrent.futures import FIRST_EXCEPTION, Future, ProcessPoolExecutor, wait
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
@@ -18,15 +19,25 @@ from experiments.unit import Unit, UnitResult, run_unit
 REFRESH = 0.5
 # Where nobody watches (output to a file), a line this often is enough [s].
 QUIET_REFRESH = 20.0
+# Workers tell about at least this many steps at a time.
+NEWSWORTHY = 1000
 
 
-def run_all(units: Sequence[Unit], jobs: int, total_steps: int) -> list[UnitResult]:
-    """Returns the results of all units, in their order; the first failure stops the rest and is raised.
+def run_all(
+    units: Sequence[Unit],
+    jobs: int,
+    total_steps: int,
+    on_result: Callable[[Unit, UnitResult], None],
+    log_folder: Path | None = None,
+) -> None:
+    """Runs all units; the first failure stops the rest and is raised.
 
     Args:
         units: What to run.
         jobs: Worker processes.
         total_steps: Training and evaluation steps of all units, for the progress bar.
+        on_result: Called with every unit and its result as soon as it is there.
+        log_folder: TensorBoard's events of a unit go to a folder in it, of the unit's name.
     """
     context = multiprocessing.get_context("spawn")
     interval = REFRESH if sys.stderr.isatty() else QUIET_REFRESH
@@ -36,10 +47,10 @@ def run_all(units: Sequence[Unit], jobs: int, total_steps: int) -> list[UnitResu
         tqdm(total=total_steps, unit="step", unit_scale=True, mininterval=interval, file=sys.stderr) as bar,
     ):
         news, stop = manager.Queue(), manager.Event()
-        futures = [executor.submit(_work, unit, news, stop) for unit in units]
+        logs = [None if log_folder is None else log_folder / unit.name for unit in units]
+        futures = [executor.submit(_work, unit, log, news, stop) for unit, log in zip(units, logs, strict=True)]
         try:
-            _watch(futures, units, news, bar)
-            return [future.result() for future in futures]
+            _watch(dict(zip(futures, units, strict=True)), news, bar, on_result)
         except BaseException:
             stop.set()
             executor.shutdown(cancel_futures=True)
@@ -55,34 +66,38 @@ def _ignore_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _work(unit: Unit, news: Any, stop: Any) -> UnitResult:
+def _work(unit: Unit, log_folder: Path | None, news: Any, stop: Any) -> UnitResult:
     """Runs a unit in a worker; it ends at its next report once `stop` is set."""
+    due = 0
 
     def report(steps: int) -> None:
-        if stop.is_set():
-            raise Stopped(unit.name)
-        news.put(steps)
+        nonlocal due
+        due += steps
+        if due >= NEWSWORTHY:
+            if stop.is_set():
+                raise Stopped(unit.name)
+            news.put(due)
+            due = 0
 
-    return run_unit(unit, report)
+    result = run_unit(unit, report, log_folder)
+    news.put(due)
+    return result
 
 
-def _watch(futures: Sequence[Future], units: Sequence[Unit], news: Any, bar: tqdm) -> None:
-    """Updates the bar until every future is done or one has failed."""
-    told: set[int] = set()
-    pending = set(futures)
+def _watch(units: dict[Future, Unit], news: Any, bar: tqdm, on_result: Callable[[Unit, UnitResult], None]) -> None:
+    """Updates the bar and hands results on until every future is done; raises the first failure."""
+    pending = set(units)
     while pending:
-        done, pending = wait(pending, timeout=REFRESH, return_when=FIRST_EXCEPTION)
+        done, pending = wait(pending, timeout=REFRESH, return_when=FIRST_COMPLETED)
         while True:
             try:
                 bar.update(news.get_nowait())
             except queue.Empty:
                 break
-        if any(future.exception() for future in done):
-            return
-        for i, future in enumerate(futures):
-            if future.done() and i not in told:
-                told.add(i)
-                bar.write(_line(units[i], future.result()), file=sys.stderr)
+        for future in sorted(done, key=lambda one: one.exception() is not None):
+            result = future.result()
+            on_result(units[future], result)
+            bar.write(_line(units[future], result), file=sys.stderr)
 
 
 def _line(unit: Unit, result: UnitResult) -> str:

@@ -39,24 +39,45 @@ def html_report(summary: dict[str, Any], verification: Report, figures: dict[str
     """
     settings = summary["settings"]
     title = f"Shielded and unshielded PPO on {settings['env']}"
-    images = "".join(
-        f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
-        f"<figcaption>{escape(caption)}</figcaption></figure>"
-        for caption, png in figures.items()
-    )
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title><style>{STYLE}</style></head><body>
 <h1>{escape(title)}</h1>
 <p>{EXPLANATION.format(mode=escape(settings["mode"]))}</p>
-{_table(table_rows(summary))}
+{_table(table_rows(summary["arms"] | summary["references"]))}
 <ul>{"".join(f"<li>{escape(line)}</li>" for line in findings)}</ul>
-{images}
-<h2>The certificate, verified in exact rational arithmetic</h2>
-{_conditions(verification)}
-<h2>Settings and versions</h2>
-<pre>{escape(json.dumps({name: summary[name] for name in ("settings", "plant", "versions")}, indent=1))}</pre>
+{_images(figures)}
+{_provenance(summary, verification)}
 </body></html>
 """
+
+
+def sweep_report(summary: dict[str, Any], verification: Report, figures: dict[str, bytes]) -> str:
+    """Returns the page of a sweep; see `html_report`."""
+    title = f"Channels of {summary['settings']['env']}"
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title><style>{STYLE}</style></head><body>
+<h1>{escape(title)}</h1>
+<p>Agents trained and evaluated anew for every channel, with the same seeds. Violations are those of the true state.</p>
+{_images(figures)}
+{_provenance(summary, verification)}
+</body></html>
+"""
+
+
+def _images(figures: dict[str, bytes]) -> str:
+    return "".join(
+        f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
+        f"<figcaption>{escape(caption)}</figcaption></figure>"
+        for caption, png in figures.items()
+    )
+
+
+def _provenance(summary: dict[str, Any], verification: Report) -> str:
+    content = {name: summary[name] for name in ("settings", "plant", "certificate", "versions")}
+    return f"""<h2>The certificate, verified in exact rational arithmetic</h2>
+{_conditions(verification)}
+<h2>Settings and versions</h2>
+<pre>{escape(json.dumps(content, indent=1))}</pre>"""
 
 
 def _table(rows: list[list[str]]) -> str:

@@ -8,45 +8,166 @@ from typing import Literal
 
 import tyro
 
-from agents.settings import PPOSettings
+from agents.settings import A2CSettings, AgentSettings, OffPolicySettings, PPOSettings
+from experiments.channels import ChannelSettings
+
+Algorithm = Literal["PPO", "A2C", "SAC", "TD3", "TRPO", "TQC", "CrossQ"]
+Mode = Literal["project", "switch", "boundary"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareSettings:
-    """Trains PPO with and without the shield and compares violations, return and interventions.
-
-    Synthesizes and exactly verifies a certificate, trains paired runs (equal seeds meet the same draws of nature),
-    evaluates each on the same episodes, prints a table and leaves summary.json, episodes.parquet, report.html, figures,
-    models, TensorBoard events and the certificate in the output folder.
+class LearningSettings:
+    """What the commands that train share.
 
     Attributes:
+        config: A settings.json of an earlier run; its settings hold where none are given here.
         env: Id of a registered environment.
-        out: Output folder; created if it does not exist, results in it are replaced.
         seed: Of the experiment, >= 0; all runs derive theirs from it.
-        runs: Paired runs (training seeds) per arm.
         steps: Training steps per run.
         episodes: Evaluation episodes per run.
+        algo: Learning algorithm; TRPO, TQC and CrossQ need sb3-contrib.
         mode: What the shield does with an unsafe action: the closest safe input ("project"), or the certified K x_hat
             ("switch"; "boundary" applies it unless every action would be safe).
-        penalty: Subtracted from the training reward per intervention.
+        intervention_penalty: Subtracted from the training reward per intervention, in arms with "+penalty".
+        violation_penalty: Subtracted from the training reward per violating step, in the arm "penalized".
         certificate: File to use instead of synthesizing one.
-        jobs: Worker processes.
-        smoke: Shrink the run to a minute, to see that everything works.
-        ppo: Settings of PPO.
+        channel: What to change of the environment's channel.
+        ppo: Settings of PPO and TRPO.
+        a2c: Settings of A2C.
+        off_policy: Settings of SAC, TD3, TQC and CrossQ.
     """
 
+    config: Path | None = None
     env: str = "ncs_gym/TruckTrailerCruise-v0"
-    out: Path = Path("runs/compare")
     seed: int = 0
-    runs: int = 3
     steps: int = 150_000
     episodes: int = 200
-    mode: Literal["project", "switch", "boundary"] = "project"
-    penalty: float = 0.0
+    algo: Algorithm = "PPO"
+    mode: Mode = "project"
+    intervention_penalty: float = 0.1
+    violation_penalty: float = 1.0
     certificate: Path | None = None
+    channel: ChannelSettings = field(default_factory=ChannelSettings)
+    ppo: PPOSettings = field(default_factory=PPOSettings)
+    a2c: A2CSettings = field(default_factory=A2CSettings)
+    off_policy: OffPolicySettings = field(default_factory=OffPolicySettings)
+
+    @property
+    def agent(self) -> AgentSettings:
+        """Settings of the chosen algorithm."""
+        return {"PPO": self.ppo, "TRPO": self.ppo, "A2C": self.a2c}.get(self.algo, self.off_policy)
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        for name in ("seeds", "steps", "episodes", "jobs"):
+            if getattr(self, name, 1) < 1:
+                raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
+        if self.seed < 0:
+            raise ValueError(f"--seed must be >= 0, got {self.seed}")
+        for name in ("intervention_penalty", "violation_penalty"):
+            if not 0.0 <= getattr(self, name) < float("inf"):
+                raise ValueError(f"--{name.replace('_', '-')} must be >= 0, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareSettings(LearningSettings):
+    """Trains agents with and without the shield and compares violations, return and interventions.
+
+    Synthesizes and exactly verifies a certificate, trains paired runs (equal seeds meet the same draws of nature),
+    evaluates each on the same episodes, prints a table and leaves summary.json, settings.json, episodes.parquet,
+    training.parquet, report.html, figures, models, TensorBoard events and the certificate in the output folder. Started
+    again with the same folder, finished runs are kept.
+
+    Attributes:
+        out: Output folder; created if it does not exist.
+        seeds: Paired training runs per arm.
+        arms: unshielded, monitor (unshielded, counts what the shield would have done), penalized (unshielded, pays for
+            violations), shielded, shielded:MODE, and each shielded one with +penalty (pays for interventions).
+        jobs: Worker processes.
+        smoke: Shrink the run to a minute, to see that everything works.
+    """
+
+    out: Path = Path("runs/compare")
+    seeds: int = 3
+    arms: tuple[str, ...] = ("unshielded", "penalized", "shielded")
     jobs: int = 2
     smoke: bool = False
-    ppo: PPOSettings = field(default_factory=PPOSettings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainSettings(LearningSettings):
+    """Trains one agent, evaluates it, and saves it with everything needed to use it.
+
+    Attributes:
+        out: Output folder; created if it does not exist.
+        arm: How it is trained; see the arms of `ncs compare`.
+    """
+
+    out: Path = Path("runs/train")
+    arm: str = "shielded"
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateSettings:
+    """Evaluates a trained agent, behind a shield or not, on any channel.
+
+    Attributes:
+        model: Folder of a trained agent (models/NAME of `ncs compare`, or what `ncs train` left).
+        shield: Mode of the shield; "monitor" changes nothing and counts what it would have done.
+        episodes: How many.
+        seed: Of the episodes.
+        certificate: File to use instead of synthesizing one.
+        channel: What to change of the channel it was trained with.
+        out: File for the summary (JSON).
+    """
+
+    model: tyro.conf.Positional[Path]
+    shield: Literal["none", "monitor", "project", "switch", "boundary"] = "none"
+    episodes: int = 200
+    seed: int = 0
+    certificate: Path | None = None
+    channel: ChannelSettings = field(default_factory=ChannelSettings)
+    out: Path | None = None
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        if self.episodes < 1:
+            raise ValueError(f"--episodes must be at least 1, got {self.episodes}")
+        if self.seed < 0:
+            raise ValueError(f"--seed must be >= 0, got {self.seed}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepSettings(LearningSettings):
+    """Compares arms over a grid of channels: how violations, return and interventions depend on its quality.
+
+    Every point of the grid is a comparison of its own with the same seeds. Leaves sweep.parquet, summary.json,
+    settings.json, report.html with heatmaps, and the models. Started again with the same folder, finished runs are
+    kept.
+
+    Attributes:
+        out: Output folder; created if it does not exist.
+        seeds: Paired training runs per arm and channel.
+        steps: Training steps per run.
+        episodes: Evaluation episodes per run.
+        arms: See `ncs compare`.
+        losses: Probabilities that a packet is lost.
+        delays: Steps that every packet is late.
+        quantization_steps: Measurements are rounded to multiples of these; the environment's own if none is given.
+        burst_lengths: Mean numbers of packets lost in a row; 1 loses independently.
+        jobs: Worker processes.
+    """
+
+    out: Path = Path("runs/sweep")
+    seeds: int = 1
+    steps: int = 50_000
+    episodes: int = 100
+    arms: tuple[str, ...] = ("unshielded", "shielded")
+    losses: tuple[float, ...] = (0.0, 0.3, 0.6)
+    delays: tuple[int, ...] = (0, 2, 4)
+    quantization_steps: tuple[float, ...] = ()
+    burst_lengths: tuple[float, ...] = (1.0,)
+    jobs: int = 2
 
 
 @dataclass(frozen=True, kw_only=True)

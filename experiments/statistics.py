@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.stats import beta, t
+from scipy.stats import beta, t, trim_mean
 
 CONFIDENCE = 0.95
+RESAMPLES = 10_000
 
 
 def clopper_pearson(events: int, trials: int) -> tuple[float, float]:
@@ -31,3 +32,28 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float] | None:
     half = float(t.ppf(0.5 + CONFIDENCE / 2.0, len(values) - 1)) * float(np.std(values, ddof=1)) / len(values) ** 0.5
     mean = float(np.mean(values))
     return mean - half, mean + half
+
+
+def interquartile_mean(values: Sequence[float], axis: int = -1) -> float:
+    """Returns the mean without the lowest and the highest quarter of the values (rounded down)."""
+    return trim_mean(values, 0.25, axis=axis)
+
+
+def bootstrap_interval(
+    values: Sequence[float], statistic: Callable[..., float] = np.mean
+) -> tuple[float, float] | None:
+    """Returns the percentile bootstrap's 95 % interval; None for fewer than two values.
+
+    With a handful of values it is too narrow: with n of them it cannot reach beyond the smallest and the largest.
+
+    Args:
+        values: Independent values.
+        statistic: Takes (resamples, values) and `axis`.
+    """
+    if len(values) < 2:
+        return None
+    rng = np.random.default_rng(0)
+    drawn = np.asarray(values)[rng.integers(len(values), size=(RESAMPLES, len(values)))]
+    tail = 50.0 * (1.0 - CONFIDENCE)
+    low, high = np.percentile(statistic(drawn, axis=1), [tail, 100.0 - tail])
+    return float(low), float(high)

@@ -1,25 +1,30 @@
-"""The unit of work: one policy trained and evaluated; a function of its settings alone."""
+"""The unit of work: one policy trained and evaluated; a pure function of its settings."""
 
 from __future__ import annotations
 
-import os
+import hashlib
+import json
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 
-import gymnasium as gym
 import numpy as np
 
 from agents.callbacks import TrainingPoint
+from agents.control_loop import ControlLoop, Shielding
 from agents.evaluation import Episode, Policy, evaluate
-from agents.settings import PPOSettings
-from agents.training import Shielding, TrainingResult, train, untrained
-from experiments.trajectory import Trajectory, record
+from agents.settings import AgentSettings
+from agents.training import TrainingResult, train, untrained
+from agents.trajectory import Trajectory
+from ncs_gym import Channel
 from shields import Certificate
 
-Learner = Literal["ppo", "untrained", "gain", "zero"]
+Learner = Literal["agent", "untrained", "gain", "zero"]
+# What results depend on besides the settings.
+PACKAGES = ("ncs-gym", "gymnasium", "stable-baselines3", "torch", "cvxpy", "clarabel", "numpy", "filterpy", "numba")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,51 +33,72 @@ class Unit:
 
     Attributes:
         arm: Name of the arm it belongs to.
-        learner: "ppo" is trained; "untrained" has its initial weights, "gain" is u = K x_hat, "zero" does nothing.
+        learner: "agent" is trained; "untrained" has its initial weights, "gain" is u = K x_hat, "zero" does nothing.
         env: A registered id.
+        channel: In place of the environment's own.
         seed: Of the experiment.
         index: Number of the run within its arm; runs with equal index are paired across arms.
         steps: Training steps.
         episodes: Evaluation episodes.
         certificate: For the shield and for x'Mx.
         mode: The shield's; None for no shield.
-        penalty: The shield's.
-        ppo: Settings of PPO.
-        folder: Where the model and TensorBoard's events go.
+        intervention_penalty: Subtracted from the training reward per intervention.
+        violation_penalty: Subtracted from the training reward per violating step.
+        algorithm: A name in `agents.algorithms`.
+        settings: Of the algorithm.
+        place: Where in a sweep it belongs; for its name only.
     """
 
     arm: str
     learner: Learner
     env: str
+    channel: Channel | None = None
     seed: int
     index: int
     steps: int
     episodes: int
     certificate: Certificate
     mode: str | None
-    penalty: float
-    ppo: PPOSettings
-    folder: Path
+    intervention_penalty: float = 0.0
+    violation_penalty: float = 0.0
+    algorithm: str
+    settings: AgentSettings
+    place: str = ""
 
     @property
     def name(self) -> str:
         """For files and progress lines."""
-        return f"{self.arm}-{self.index}".replace(" ", "-")
+        return "-".join(filter(None, (self.place, self.arm, str(self.index)))).replace(" ", "-").replace(":", "-")
 
     @property
-    def shielding(self) -> Shielding | None:
-        """The shield's settings, None without one."""
-        return None if self.mode is None else Shielding(self.certificate, self.mode, self.penalty)
+    def loop(self) -> ControlLoop:
+        """What the policy is trained and evaluated in."""
+        shielding = None
+        if self.mode is not None:
+            shielding = Shielding(self.certificate, self.mode, self.intervention_penalty)
+        return ControlLoop(
+            env=self.env, channel=self.channel, shielding=shielding, violation_penalty=self.violation_penalty
+        )
 
     @property
     def training_seed(self) -> int:
-        """Seed of the first training environment (the others take the next ones) and of the network."""
+        """Seed of training environments and network; alike in all arms."""
         return self._seeds()[0]
 
     @property
     def evaluation_seed(self) -> int:
-        """Seed of the first evaluation episode; alike in all arms, as is the training seed."""
+        """Seed of the evaluation episodes; alike in all arms."""
         return self._seeds()[1]
+
+    @property
+    def key(self) -> str:
+        """SHA-256 of everything the result depends on: all settings and the versions of the packages."""
+        content = {
+            name: getattr(self, name) for name in self.__dataclass_fields__ if name not in ("certificate", "place")
+        }
+        content |= {"certificate": self.certificate.checksum, "channel": self.channel and asdict(self.channel)}
+        content |= {"settings": asdict(self.settings), "versions": versions()}
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def _seeds(self) -> list[int]:
         """Returns two 31-bit numbers that depend on the experiment's seed and the run, not on the arm."""
@@ -88,9 +114,10 @@ class UnitResult:
         train_steps: Steps of training (0 if nothing was trained).
         train_violation_steps: Of these, steps whose true state violated the safe box.
         train_interventions: Of these, steps in which the shield intervened.
-        history: Totals after each rollout.
+        history: Totals along the way.
         episodes: Evaluation.
         trajectory: The first evaluation episode.
+        files: The trained agent's files, contents by name; empty if nothing was trained.
     """
 
     arm: str
@@ -101,28 +128,32 @@ class UnitResult:
     history: list[TrainingPoint]
     episodes: list[Episode]
     trajectory: Trajectory
+    files: dict[str, bytes]
 
 
-def run_unit(unit: Unit, on_progress: Callable[[int], None]) -> UnitResult:
-    """Returns the result of a unit; saves a trained model under its folder.
+def run_unit(unit: Unit, on_progress: Callable[[int], None], log_folder: Path | None = None) -> UnitResult:
+    """Returns the result of a unit; nothing is written but TensorBoard's events.
 
     Args:
         unit: The settings.
-        on_progress: Called with the number of training steps or finished evaluation steps since its last call.
+        on_progress: Called with the number of training and evaluation steps taken since its last call.
+        log_folder: Where TensorBoard's events go; earlier ones there are removed.
     """
-    trained = _train(unit, on_progress) if unit.learner == "ppo" else None
+    trained = None
+    if unit.learner == "agent":
+        if log_folder is not None:
+            shutil.rmtree(log_folder, ignore_errors=True)
+        trained = train(
+            unit.loop,
+            unit.steps,
+            unit.training_seed,
+            unit.algorithm,
+            unit.settings,
+            log_folder=log_folder,
+            on_progress=on_progress,
+        )
     policy = _policy(unit, trained)
-    level_matrix = unit.certificate.M
-    length = gym.spec(unit.env).max_episode_steps or 1
-    episodes = evaluate(
-        unit.env,
-        policy,
-        unit.episodes,
-        unit.evaluation_seed,
-        unit.shielding,
-        level_matrix,
-        lambda finished: on_progress(finished * length),
-    )
+    evaluation = evaluate(unit.loop, policy, unit.episodes, unit.evaluation_seed, unit.certificate.M, on_progress)
     return UnitResult(
         arm=unit.arm,
         index=unit.index,
@@ -130,43 +161,26 @@ def run_unit(unit: Unit, on_progress: Callable[[int], None]) -> UnitResult:
         train_violation_steps=trained.violation_steps if trained else 0,
         train_interventions=trained.interventions if trained else 0,
         history=trained.history if trained else [],
-        episodes=episodes,
-        trajectory=record(unit.env, policy, unit.evaluation_seed, unit.shielding),
+        episodes=evaluation.episodes,
+        trajectory=evaluation.trajectory,
+        files=trained.agent.files() if trained else {},
     )
 
 
-def _train(unit: Unit, on_progress: Callable[[int], None]) -> TrainingResult:
-    """Trains, and moves the finished model into place in one step."""
-    events = unit.folder / "tensorboard" / unit.name
-    shutil.rmtree(events, ignore_errors=True)
-    result = train(
-        unit.env,
-        unit.steps,
-        unit.training_seed,
-        unit.shielding,
-        unit.ppo,
-        log_folder=events,
-        on_progress=on_progress,
-    )
-    partial, place = unit.folder / f".{unit.name}.partial", unit.folder / "models" / unit.name
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    result.agent.save(partial)
-    shutil.rmtree(place, ignore_errors=True)
-    place.parent.mkdir(exist_ok=True)
-    os.replace(partial, place)
-    return result
+def versions() -> dict[str, str]:
+    """Returns the versions of the packages that results depend on."""
+    return {name: version(name) for name in PACKAGES}
 
 
 def _policy(unit: Unit, trained: TrainingResult | None) -> Policy:
     """Returns the policy to evaluate."""
     if trained is not None:
         return lambda observations, infos: trained.agent.act(observations)
-    plant = gym.make(unit.env).unwrapped.plant
+    plant = unit.loop.single().unwrapped.plant
     if unit.learner == "untrained":
-        agent = untrained(unit.env, unit.training_seed, unit.ppo)
+        agent = untrained(unit.loop, unit.training_seed, unit.algorithm, unit.settings)
         return lambda observations, infos: agent.act(observations)
     if unit.learner == "gain":
         gain = unit.certificate.K / plant.u_max[:, None]
-        return lambda observations, infos: np.clip([gain @ info["estimate"] for info in infos], -1.0, 1.0)
-    return lambda observations, infos: np.zeros((len(infos), plant.m), np.float32)
+        return lambda observations, infos: np.clip(infos["estimate"] @ gain.T, -1.0, 1.0)
+    return lambda observations, infos: np.zeros((len(observations), plant.m), np.float32)

@@ -171,15 +171,18 @@ class Certificate(FrozenArrays):
             return self.ages.sets.shapes[:-1]
         return np.empty((0, *self.L.shape)) if self.Sigma is None else self.Sigma[None]
 
+    @cached_property
+    def checksum(self) -> str:
+        """SHA-256 of the content of its file."""
+        return _digest(json.loads(json.dumps(self._content()), parse_float=str, parse_int=str))
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes JSON in which every float is exact; a reader never sees half a file.
 
         Raises:
             OSError: If the file cannot be written.
         """
-        content = self._content()
-        literal = json.loads(json.dumps(content), parse_float=str, parse_int=str)
-        document = {"format": FORMAT, "sha256": _digest(literal), "certificate": content}
+        document = {"format": FORMAT, "sha256": self.checksum, "certificate": self._content()}
         write_atomically(Path(path), json.dumps(document, indent=1) + "\n")
 
     @classmethod

@@ -1,0 +1,189 @@
+"""A trained policy, and its files: weights and numbers, no pickled code."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import zipfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.vec_env import VecNormalize
+
+from agents.algorithms import ALGORITHMS, build
+from agents.control_loop import ControlLoop
+from agents.sb3_vec_env import SB3VecEnv
+from agents.settings import AgentSettings
+from ncs_gym import Channel, GilbertElliott
+from shields.storage import write_atomically
+
+FORMAT = "ncs-gym agent 1"
+
+
+class AgentError(ValueError):
+    """A file is no agent, damaged, or of another environment."""
+
+
+@dataclass(frozen=True, eq=False)
+class Normalization:
+    """What observations are normalized by: clip((o - mean) / sqrt(variance + epsilon), +-clip).
+
+    Attributes:
+        mean, variance: Shape (entries,).
+        epsilon: Keeps the root away from 0.
+        clip: Largest absolute value.
+    """
+
+    mean: np.ndarray
+    variance: np.ndarray
+    epsilon: float
+    clip: float
+
+    @classmethod
+    def of(cls, env: VecNormalize) -> Normalization:
+        """Returns the present statistics of a `VecNormalize`."""
+        return cls(env.obs_rms.mean.copy(), env.obs_rms.var.copy(), float(env.epsilon), float(env.clip_obs))
+
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
+        """Returns normalized observations (N, entries), float32."""
+        scaled = (observations - self.mean) / np.sqrt(self.variance + self.epsilon)
+        return np.clip(scaled, -self.clip, self.clip).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Agent:
+    """A policy with everything that is needed to act and to be built again.
+
+    Attributes:
+        algorithm: Its name in `agents.algorithms`.
+        settings: It was trained with.
+        env: Id of the environment it was trained in.
+        channel: Of that environment, None for the id's own.
+        model: The stable-baselines3 object.
+        normalization: Of its observations.
+    """
+
+    algorithm: str
+    settings: AgentSettings
+    env: str
+    channel: Channel | None
+    model: BaseAlgorithm
+    normalization: Normalization
+
+    def act(self, observations: np.ndarray) -> np.ndarray:
+        """Returns deterministic actions, shape (N, m), for raw observations, shape (N, entries)."""
+        return self.model.predict(self.normalization(observations), deterministic=True)[0]
+
+    def files(self) -> dict[str, bytes]:
+        """Returns the contents of `model.zip` (stable-baselines3's) and `agent.json` (what else `load` needs)."""
+        buffer = io.BytesIO()
+        self.model.save(buffer)
+        content = {
+            "algorithm": self.algorithm,
+            "settings": asdict(self.settings),
+            "env": self.env,
+            "channel": None if self.channel is None else asdict(self.channel),
+            "plant": plant_fingerprint(self.env),
+            "normalization": {
+                "mean": self.normalization.mean.tolist(),
+                "variance": self.normalization.variance.tolist(),
+                "epsilon": self.normalization.epsilon,
+                "clip": self.normalization.clip,
+            },
+            "sha256_of_model": hashlib.sha256(buffer.getvalue()).hexdigest(),
+        }
+        document = {"format": FORMAT, "sha256": _digest(content), "agent": content}
+        return {"model.zip": buffer.getvalue(), "agent.json": (json.dumps(document, indent=1) + "\n").encode()}
+
+    def save(self, folder: Path) -> None:
+        """Writes the two files into an existing folder.
+
+        Raises:
+            OSError: If one cannot be written.
+        """
+        for name, content in self.files().items():
+            write_atomically(folder / name, content)
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Agent:
+        """Returns the agent in a folder; nothing pickled is read, so that a foreign file cannot run code.
+
+        Raises:
+            AgentError: If the files are missing, damaged, of another format or of an environment that has changed.
+            ModuleNotFoundError: If the algorithm's package is not installed.
+        """
+        folder = Path(folder)
+        folder = folder.parent if folder.suffix in (".zip", ".json") else folder
+        try:
+            document, weights = json.loads((folder / "agent.json").read_bytes()), (folder / "model.zip").read_bytes()
+        except OSError as error:
+            raise AgentError(f"cannot read the agent in {folder}: {error.strerror}") from error
+        except ValueError as error:
+            raise AgentError(f"{folder / 'agent.json'} is damaged: it is not valid JSON") from error
+        if not isinstance(document, dict) or document.get("format") != FORMAT:
+            raise AgentError(f"{folder / 'agent.json'} is not of format {FORMAT!r}")
+        content = document.get("agent")
+        if not isinstance(content, dict) or document.get("sha256") != _digest(content):
+            raise AgentError(f"{folder / 'agent.json'} was altered: its checksum does not match")
+        if hashlib.sha256(weights).hexdigest() != content.get("sha256_of_model"):
+            raise AgentError(f"{folder / 'model.zip'} was altered: its checksum does not match")
+        try:
+            return _rebuilt(content, weights)
+        except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, zipfile.BadZipFile) as error:
+            if isinstance(error, AgentError):
+                raise
+            raise AgentError(f"the agent in {folder} is damaged: {error}") from error
+
+
+def plant_fingerprint(env_id: str) -> str | None:
+    """Returns the fingerprint of an environment's plant, None for an environment without one."""
+    plant = getattr(gym.make(env_id).unwrapped, "plant", None)
+    return None if plant is None else plant.fingerprint
+
+
+def channel_from_json(content: dict[str, Any] | None) -> Channel | None:
+    """Returns the channel that `dataclasses.asdict` turned into `content`."""
+    if content is None:
+        return None
+    loss = content["loss"]
+    return Channel(**content | {"loss": GilbertElliott(**loss) if isinstance(loss, dict) else loss})
+
+
+def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
+    """Returns an agent from checked contents."""
+    env_id, algorithm = content["env"], content["algorithm"]
+    if env_id not in gym.registry:
+        raise AgentError(f"the agent was trained in {env_id}, which is not registered here")
+    if content["plant"] != plant_fingerprint(env_id):
+        raise AgentError(f"the agent was trained on another plant than that of {env_id}: their fingerprints differ")
+    if algorithm not in ALGORITHMS:
+        raise AgentError(f"the agent is of an unknown algorithm, {algorithm!r}")
+    settings = ALGORITHMS[algorithm][1](**content["settings"])
+    channel = channel_from_json(content["channel"])
+    model = build(algorithm, SB3VecEnv(ControlLoop(env=env_id, channel=channel).vector(1)), settings, seed=0)
+    _, parameters, _ = load_from_zip_file(io.BytesIO(weights), load_data=False, device="cpu")
+    model.set_parameters(parameters, exact_match=True, device="cpu")
+    numbers = content["normalization"]
+    return Agent(
+        algorithm=algorithm,
+        settings=settings,
+        env=env_id,
+        channel=channel,
+        model=model,
+        normalization=Normalization(
+            np.array(numbers["mean"], dtype=np.float64),
+            np.array(numbers["variance"], dtype=np.float64),
+            float(numbers["epsilon"]),
+            float(numbers["clip"]),
+        ),
+    )
+
+
+def _digest(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

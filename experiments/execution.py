@@ -1,0 +1,51 @@
+"""Runs the units of an experiment, without those that were finished before."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import gymnasium as gym
+
+from agents.settings import OffPolicySettings
+from experiments.pool import run_all
+from experiments.unit import Unit, UnitResult
+from experiments.unit_store import UnitStore
+
+
+def results_of(units: Sequence[Unit], folder: Path, jobs: int) -> list[UnitResult]:
+    """Returns the results of all units, in their order; each is stored as soon as it is there.
+
+    Args:
+        units: The experiment.
+        folder: Where finished units are, and go.
+        jobs: Worker processes.
+
+    Raises:
+        ResultsError: If a stored result is damaged.
+        OSError: If the folder cannot be written.
+    """
+    store = UnitStore(folder)
+    results = {unit.name: result for unit in units if (result := store.load(unit)) is not None}
+    missing = [unit for unit in units if unit.name not in results]
+    if results:
+        print(f"{len(results)} of {len(units)} units were finished before", file=sys.stderr)
+
+    def keep(unit: Unit, result: UnitResult) -> None:
+        store.save(unit, result)
+        results[unit.name] = result
+
+    if missing:
+        run_all(missing, min(jobs, len(missing)), sum(map(_steps, missing)), keep, folder / "tensorboard")
+    return [results[unit.name] for unit in units]
+
+
+def _steps(unit: Unit) -> int:
+    """Returns how many training and evaluation steps a unit takes."""
+    evaluation = unit.episodes * (gym.spec(unit.env).max_episode_steps or 1)
+    if unit.learner != "agent":
+        return evaluation
+    settings = unit.settings
+    rollout = settings.envs * (1 if isinstance(settings, OffPolicySettings) else settings.rollout)
+    return -(-unit.steps // rollout) * rollout + evaluation

@@ -1,0 +1,77 @@
+"""Settings of a run in a file, from which the same run can be started again."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from shields.storage import write_atomically
+
+FORMAT = "ncs-gym settings 1"
+FLAG = "--config"
+
+
+class SettingsError(ValueError):
+    """A file holds no settings of the command."""
+
+
+def settings_json(command: str, settings: Any) -> dict[str, Any]:
+    """Returns a command's settings as JSON values."""
+    values = json.loads(json.dumps(asdict(settings), default=str))
+    return {"format": FORMAT, "command": command, "settings": {k: v for k, v in values.items() if k != "config"}}
+
+
+def save_settings(path: Path, command: str, settings: Any) -> None:
+    """Writes a command's settings.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    write_atomically(path, json.dumps(settings_json(command, settings), indent=1) + "\n")
+
+
+def with_config(arguments: list[str]) -> list[str]:
+    """Returns the command line with `--config FILE` replaced by the flags in the file, before the user's own flags.
+
+    Raises:
+        SettingsError: If the file is missing, damaged or another command's.
+    """
+    given = [i for i, argument in enumerate(arguments) if argument == FLAG or argument.startswith(f"{FLAG}=")]
+    if not given or not arguments[0:1] or arguments[0].startswith("-"):
+        return arguments
+    at = given[0]
+    value = arguments[at].partition("=")[2] or "".join(arguments[at + 1 : at + 2])
+    rest = arguments[1:at] + arguments[at + (1 if "=" in arguments[at] else 2) :]
+    return [arguments[0], *_flags(_read(Path(value), arguments[0])), *rest]
+
+
+def _read(path: Path, command: str) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_bytes())
+    except OSError as error:
+        raise SettingsError(f"cannot read settings {path}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise SettingsError(f"settings {path} are damaged: not valid JSON") from error
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise SettingsError(f"{path} is not of format {FORMAT!r}")
+    if document.get("command") != command or not isinstance(document.get("settings"), dict):
+        raise SettingsError(f"{path} holds settings of ncs {document.get('command')}, not of ncs {command}")
+    return document["settings"]
+
+
+def _flags(values: dict[str, Any], prefix: str = "--") -> list[str]:
+    """Returns settings as command-line flags; the parser checks them like a user's."""
+    flags: list[str] = []
+    for name, value in values.items():
+        flag = prefix + name.replace("_", "-")
+        if isinstance(value, dict):
+            flags += _flags(value, flag + ".")
+        elif isinstance(value, bool):
+            flags.append(flag if value else f"{prefix}no-{name.replace('_', '-')}")
+        elif isinstance(value, list):
+            flags += [flag, *map(str, value)]
+        else:
+            flags += [flag, repr(value) if isinstance(value, float) else str(value)]
+    return flags
