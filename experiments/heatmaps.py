@@ -3,74 +3,183 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from experiments.plotting import STYLE, as_png
+from experiments.arms import arm_of
+from experiments.plotting import STYLE, as_png, label, thousands, with_unit
 
-# Quantity by name of the figure: key in an arm's summary, factor, title, color map, range.
+# Panels side by side at most.
+COLUMNS = 4
+# Fields darker than this have light numbers; relative luminance, which weighs colors as eyes do.
+DARK = 0.45
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What a heatmap shows.
+
+    Attributes:
+        key: In an arm's summary.
+        factor: From the summary's unit to the shown one.
+        title: With what the figure is labeled.
+        unit: The shown one.
+        colors: A color map of matplotlib.
+        low: Start of the color scale; None for the smallest value.
+        high: Its end; None for the largest value.
+        caption: A sentence.
+        of_shields: Whether only arms with a shield have it.
+    """
+
+    key: str
+    factor: float
+    title: str
+    unit: str
+    colors: str
+    low: float | None
+    high: float | None
+    caption: str
+    of_shields: bool = False
+
+
 QUANTITIES = {
-    "violations": ("eval_violation_rate", 100.0, "violating evaluation episodes [%]", "OrRd", (0.0, 100.0)),
-    "interventions": ("intervention_rate", 100.0, "actions overridden [%]", "PuBu", (0.0, None)),
-    "return": ("eval_return_mean", 1.0, "mean return", "viridis", (None, None)),
+    "violations": Quantity(
+        "eval_violation_rate",
+        100.0,
+        "violating evaluation episodes",
+        "%",
+        "OrRd",
+        0.0,
+        100.0,
+        "Violations: share of evaluation episodes in which the true state violates, over all runs of an arm.",
+    ),
+    "return": Quantity(
+        "eval_return_mean",
+        1.0,
+        "mean return",
+        "",
+        "cividis",
+        None,
+        None,
+        "Return: mean of the evaluation episodes, without penalties; one color scale for all arms.",
+    ),
+    "interventions": Quantity(
+        "intervention_rate",
+        100.0,
+        "actions overridden",
+        "%",
+        "PuBu",
+        0.0,
+        None,
+        "Interventions: share of the agent's actions in evaluation that the shield overrides.",
+        of_shields=True,
+    ),
 }
 
 
 def heatmaps_of(summary: dict[str, Any], arms: Sequence[str]) -> dict[str, tuple[str, bytes]]:
-    """Returns caption and PNG of every figure by name."""
-    return {
-        name: (f"{title[0].upper()}{title[1:]}, by channel and arm.", as_png(_figure(summary["cells"], arms, name)))
-        for name, (_, _, title, _, _) in QUANTITIES.items()
-    }
+    """Returns caption and PNG of every figure by name; without an arm that has a shield, none of interventions."""
+    figures = {}
+    for name, quantity in QUANTITIES.items():
+        shown = [arm for arm in arms if not quantity.of_shields or arm_of(arm, "project").mode is not None]
+        if shown:
+            figure = heatmap_figure(summary["cells"], shown, quantity)
+            figures[name] = (heatmap_caption(quantity, summary["cells"], shown), as_png(figure))
+    return figures
 
 
-def _figure(cells: Sequence[dict[str, Any]], arms: Sequence[str], name: str) -> Figure:
-    """Returns one quantity: a column per arm, a row per combination of rounding and burst length."""
-    key, factor, title, colors, (low, high) = QUANTITIES[name]
+def heatmap_caption(quantity: Quantity, cells: Sequence[dict[str, Any]], arms: Sequence[str]) -> str:
+    """Returns what the fields are."""
+    runs = max(cell["arms"][arm]["runs"] for cell in cells for arm in arms)
+    text = f"{quantity.caption} {runs} {'run' if runs == 1 else 'runs'} per field."
+    if quantity.of_shields and "monitor" in arms:
+        text += " The monitor's are what the shield would have overridden."
+    return text
+
+
+def heatmap_figure(cells: Sequence[dict[str, Any]], arms: Sequence[str], quantity: Quantity) -> Figure:
+    """Returns one quantity: a panel per arm, a block of them per combination of rounding and burst length."""
     losses, delays = (sorted({cell[side] for cell in cells}) for side in ("loss", "delay"))
     others = list(dict.fromkeys((cell["quantization_step"], cell["burst_length"]) for cell in cells))
-    values = {(arm, other): np.full((len(delays), len(losses)), np.nan) for arm in arms for other in others}
-    for cell in cells:
-        other = cell["quantization_step"], cell["burst_length"]
-        for arm in arms:
-            at = delays.index(cell["delay"]), losses.index(cell["loss"])
-            values[arm, other][at] = factor * cell["arms"][arm][key]
-    everything = np.concatenate([panel.ravel() for panel in values.values()])
-    low, high = np.nanmin(everything) if low is None else low, np.nanmax(everything) if high is None else high
+    fields = {(arm, other): _field(cells, arm, other, quantity, losses, delays) for other in others for arm in arms}
+    norm = _norm(list(fields.values()), quantity)
+    block = -(-len(arms) // COLUMNS)
+    columns, rows = -(-len(arms) // block), block * len(others)
+    height = 0.5 * len(delays) + (0.65 if len(others) > 1 else 0.45)
     with matplotlib.rc_context(STYLE | {"axes.grid": False}):
-        size = (1.6 + 1.0 * len(losses) * len(arms) + 0.8, 1.2 + (0.7 * len(delays) + 0.5) * len(others))
-        figure = Figure(figsize=size, layout="constrained")
-        axes = figure.subplots(len(others), len(arms), squeeze=False, sharex=True, sharey=True)
-        for row, other in zip(axes, others, strict=True):
-            for axis, arm in zip(row, arms, strict=True):
-                image = axis.imshow(
-                    values[arm, other], cmap=colors, vmin=low, vmax=max(high, low + 1e-9), origin="lower", aspect="auto"
-                )
-                _write_values(axis, values[arm, other], low, high, dark_high=colors != "viridis")
-                axis.set_title(_title(arm, other, len(others) > 1), fontsize=10)
-                axis.set_xticks(range(len(losses)), [f"{loss:g}" for loss in losses])
-                axis.set_yticks(range(len(delays)), [str(delay) for delay in delays])
-                axis.tick_params(length=0)
-            row[0].set_ylabel("delay [steps]")
-        for axis in axes[-1]:
-            axis.set_xlabel("loss probability")
-        figure.colorbar(image, ax=axes, label=title, shrink=0.9)
+        width = 1.8 + max(0.68 * len(losses) + 0.15, 1.7) * columns
+        figure = Figure(figsize=(width, 0.7 + max(height, 1.3) * rows), layout="constrained")
+        panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+        for at, panel in enumerate(panels.flat):
+            row, column = divmod(at, columns)
+            arm_at = row % block * columns + column
+            panel.set_visible(arm_at < len(arms))
+            if not panel.get_visible():
+                continue
+            arm, other = arms[arm_at], others[row // block]
+            _draw(panel, fields[arm, other], quantity.colors, norm)
+            panel.set_title(_title(arm, other, len(others) > 1))
+            below = row + 1 < rows and (row % block + 1 == block or arm_at + columns < len(arms))
+            _name_axes(panel, losses, delays, left=column == 0, lowest=not below)
+        mappable = ScalarMappable(norm, quantity.colors)
+        figure.colorbar(mappable, ax=panels, label=with_unit(quantity.title, quantity.unit), format=thousands)
         return figure
 
 
-def _write_values(axis: Any, values: np.ndarray, low: float, high: float, dark_high: bool) -> None:
-    """Writes the numbers into the fields, light on dark."""
+def _field(
+    cells: Sequence[dict[str, Any]],
+    arm: str,
+    other: tuple[float | None, float],
+    quantity: Quantity,
+    losses: list[float],
+    delays: list[int],
+) -> np.ndarray:
+    """Returns the values of a panel, shape (delays, losses)."""
+    values = np.full((len(delays), len(losses)), np.nan)
+    for cell in cells:
+        if (cell["quantization_step"], cell["burst_length"]) == other:
+            at = delays.index(cell["delay"]), losses.index(cell["loss"])
+            values[at] = quantity.factor * cell["arms"][arm][quantity.key]
+    return values
+
+
+def _norm(fields: Sequence[np.ndarray], quantity: Quantity) -> Normalize:
+    """Returns one color scale for all panels."""
+    low = np.nanmin(fields) if quantity.low is None else quantity.low
+    high = np.nanmax(fields) if quantity.high is None else quantity.high
+    # Where all values are alike the scale still has a length.
+    return Normalize(low, high if high > low else low + 1.0)
+
+
+def _draw(axis: Axes, values: np.ndarray, colors: str, norm: Normalize) -> None:
+    """Draws a panel and writes the numbers into its fields, light on dark."""
+    axis.imshow(values, cmap=colors, norm=norm, origin="lower", aspect="auto")
     for (i, j), value in np.ndenumerate(values):
-        share = (value - low) / (high - low) if high > low else 0.0
-        dark = share > 0.6 if dark_high else share < 0.5
-        axis.text(j, i, f"{value:.1f}", ha="center", va="center", fontsize=9, color="white" if dark else "#222222")
+        if np.isfinite(value):
+            dark = np.array(matplotlib.colormaps[colors](norm(value))[:3]) @ LUMINANCE < DARK
+            text = f"{value:.1f}".replace("-", "\N{MINUS SIGN}") if value else "0"
+            axis.text(j, i, text, ha="center", va="center", fontsize=9, color="white" if dark else "#222222")
+
+
+def _name_axes(axis: Axes, losses: list[float], delays: list[int], left: bool, lowest: bool) -> None:
+    """Labels the outer axes of the panels."""
+    axis.set_xticks(range(len(losses)), [f"{loss:g}" for loss in losses])
+    axis.set_yticks(range(len(delays)), [str(delay) for delay in delays])
+    axis.tick_params(length=0, labelbottom=lowest, labelleft=left)
+    axis.spines[:].set_visible(False)
+    label(axis, "loss probability" if lowest else "", "delay [steps]" if left else "", axis.get_title())
 
 
 def _title(arm: str, other: tuple[float | None, float], several: bool) -> str:
     rounding, burst = other
     if not several:
         return arm
-    return f"{arm}: {'' if rounding is None else f'rounding {rounding:g}, '}bursts of {burst:g}"
+    return f"{arm}\n{'' if rounding is None else f'rounding {rounding:g}, '}bursts of {burst:g}"

@@ -4,21 +4,63 @@ from __future__ import annotations
 
 import io
 
+import matplotlib
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 STYLE = {
     "font.size": 10,
     "axes.spines.top": False,
     "axes.spines.right": False,
+    "axes.edgecolor": "#555555",
+    "axes.axisbelow": True,
     "axes.grid": True,
+    "axes.titlesize": 10.5,
     "grid.color": "#e4e4e4",
     "legend.frameon": False,
     "figure.dpi": 130,
 }
+# Widths in a legend, on average [inches].
+LETTER, HANDLE = 0.085, 0.6
+SQUARED = "\N{SUPERSCRIPT TWO}"
 
 
 def as_png(figure: Figure) -> bytes:
     """Returns a figure as a PNG file's bytes."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": ""})
+    # Some settings are read only when a figure is drawn.
+    with matplotlib.rc_context(STYLE):
+        figure.savefig(buffer, format="png", metadata={"Software": ""})
     return buffer.getvalue()
+
+
+def with_unit(name: str, unit: str) -> str:
+    """Returns an axis label; some plants have no units."""
+    return f"{name} [{unit}]".replace("^2", SQUARED) if unit else name
+
+
+def label(axis: Axes, x: str, y: str, title: str = "") -> None:
+    """Sets labels and title of an axis."""
+    axis.set_xlabel(x)
+    axis.set_ylabel(y)
+    axis.set_title(title)
+
+
+def legend_below(figure: Figure, handles: dict[str, Artist], rows: int = 1) -> None:
+    """Puts one legend under a figure, where it covers no data, in at least so many rows and as many as it needs."""
+    names, columns = list(handles), max(1, -(-len(handles) // rows))
+    while columns > 1 and _width(names, columns) > figure.get_figwidth():
+        columns -= 1
+    figure.legend(list(handles.values()), names, loc="outside lower center", ncols=columns)
+
+
+def thousands(value: float, _: object = None) -> str:
+    """Returns a tick's text with thousands separators and a true minus sign."""
+    return f"{value:,.12g}".replace("-", "\N{MINUS SIGN}")
+
+
+def _width(names: list[str], columns: int) -> float:
+    """Returns about how wide a legend is [inches]; matplotlib fills one column after the other."""
+    return sum(LETTER * max(map(len, part)) + HANDLE for part in np.array_split(np.array(names), columns))

@@ -1,95 +1,210 @@
-"""One self-contained page about a comparison."""
+"""One self-contained page about a comparison or a sweep."""
 
 from __future__ import annotations
 
-import base64
-import json
 from html import escape
 from typing import Any
 
-from experiments.summary import table_rows
+from experiments.arms import arm_of
+from experiments.origin import origin_sections
+from experiments.page import figure, items, note, page, table
+from experiments.result_tables import (
+    PERCENT,
+    arm_name,
+    difference_table,
+    overridden_text,
+    return_table,
+    return_text,
+    safety_table,
+    violating_text,
+)
 from shields import Report
 
-STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; color: #222; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
-h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
-table { border-collapse: collapse; font-size: .85rem; font-variant-numeric: tabular-nums; }
-th, td { padding: .35rem .7rem; border-bottom: 1px solid #ddd; text-align: right; }
-th:first-child, td:first-child { text-align: left; } td { white-space: nowrap; }
-figure { margin: 1.5rem 0; } figcaption { font-size: .9rem; color: #555; }
-img { max-width: 100%; } code, pre { font-size: .8rem; } pre { background: #f6f6f6; padding: 1rem; overflow-x: auto; }
-.holds { color: #14713f; } .broken { color: #b3261e; font-weight: bold; }
-"""
-
-EXPLANATION = """The same task learned by PPO twice: <b>unshielded</b>, where the agent's action is applied, and
-<b>shielded</b>, where an action that could drive the state out of the safe set is replaced (mode {mode}). Runs with
-equal numbers meet the same initial states, disturbances and packet losses. Below the arms stand policies for reference,
-without training and without a shield. Violations are those of the true state, which neither agent nor shield sees.
-Intervals of the return are over runs for learned policies and over episodes for fixed ones."""
+MODES = {
+    "project": "the closest input that is provably safe is applied instead",
+    "switch": "the certified input K x_hat is applied instead",
+    "boundary": "the certified input K x_hat is applied instead, unless every input would be safe",
+}
+# With fewer runs the percentile bootstrap is plainly too narrow.
+FEW_RUNS = 10
 
 
 def html_report(summary: dict[str, Any], verification: Report, figures: dict[str, bytes], findings: list[str]) -> str:
-    """Returns the page: result table, findings, figures, certificate and settings; opens offline.
+    """Returns the page: tables, findings, figures, certificate and settings; opens offline.
 
     Args:
         summary: The content of summary.json.
         verification: Of the certificate.
         figures: PNG bytes by caption.
-        findings: Sentences to print under the table.
+        findings: Sentences to print under the first table.
     """
-    settings = summary["settings"]
-    title = f"Shielded and unshielded PPO on {settings['env']}"
-    return f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title><style>{STYLE}</style></head><body>
-<h1>{escape(title)}</h1>
-<p>{EXPLANATION.format(mode=escape(settings["mode"]))}</p>
-{_table(table_rows(summary["arms"] | summary["references"]))}
-<ul>{"".join(f"<li>{escape(line)}</li>" for line in findings)}</ul>
-{_images(figures)}
-{_provenance(summary, verification)}
-</body></html>
-"""
+    settings, arms, references = (summary[name] for name in ("settings", "arms", "references"))
+    runs = max(arm["runs"] for arm in arms.values())
+    lead = (
+        f"{settings['algo']}, {settings['steps']:,} training steps per run, {runs} {_runs(runs)} per arm, "
+        f"{settings['episodes']:,} evaluation episodes per run, seed {settings['seed']}"
+    )
+    sections = {
+        "": _reading(summary),
+        "Violations and interventions": safety_table(arms, references) + _safety_note(arms, references),
+        "Findings": items(findings),
+        "Return": return_table(arms, references) + note(_return_note(runs)),
+        "Paired differences": _differences(summary["paired_differences"], runs),
+        "Figures": _figures(figures),
+    }
+    return page(
+        f"Safe learning on {settings['env']}", lead, sections | origin_sections(summary, verification, "compare")
+    )
 
 
 def sweep_report(summary: dict[str, Any], verification: Report, figures: dict[str, bytes]) -> str:
     """Returns the page of a sweep; see `html_report`."""
-    title = f"Channels of {summary['settings']['env']}"
-    return f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title><style>{STYLE}</style></head><body>
-<h1>{escape(title)}</h1>
-<p>Agents trained and evaluated anew for every channel, with the same seeds. Violations are those of the true state.</p>
-{_images(figures)}
-{_provenance(summary, verification)}
-</body></html>
-"""
+    settings = summary["settings"]
+    lead = (
+        f"{settings['algo']}, {settings['steps']:,} training steps per run, {settings['seeds']} "
+        f"{_runs(settings['seeds'])} per arm and channel, {settings['episodes']:,} evaluation episodes per run, "
+        f"seed {settings['seed']}"
+    )
+    reading = (
+        "<p>Agents are trained and evaluated anew for every channel, with the same seeds. Violations are those of the "
+        "true state, which neither agent nor shield sees.</p>\n"
+    )
+    sections = {
+        "": reading + _arms_explained(settings),
+        "Figures": _figures(figures),
+        "Every channel and arm": _sweep_table(summary["cells"], settings["mode"]) + note(_sweep_note(settings)),
+    }
+    title = f"Channels of {settings['env']}"
+    return page(title, lead, sections | origin_sections(summary, verification, "sweep"))
 
 
-def _images(figures: dict[str, bytes]) -> str:
-    return "".join(
-        f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
-        f"<figcaption>{escape(caption)}</figcaption></figure>"
-        for caption, png in figures.items()
+def _reading(summary: dict[str, Any]) -> str:
+    """Returns what was compared."""
+    rows = {
+        "zero input": "does nothing",
+        "K x_hat": "the certified linear feedback",
+        "untrained": "the agents' networks with their initial weights",
+    }
+    known = [f"{name} ({rows[name]})" for name in summary["references"] if name in rows]
+    below = f"<p>Below the rule of a table, for reference and without a shield: {escape(', '.join(known))}.</p>\n"
+    return (
+        "<p>The same task, learned with and without a certified shield. Runs with equal numbers meet the same initial "
+        "states, disturbances and packet losses in all arms. Violations are those of the true state, which neither "
+        "agent nor shield sees, unless a table says that they are the estimate's.</p>\n"
+        f"{_arms_explained(summary['settings'])}{below if known else ''}"
     )
 
 
-def _provenance(summary: dict[str, Any], verification: Report) -> str:
-    content = {name: summary[name] for name in ("settings", "plant", "certificate", "versions")}
-    return f"""<h2>The certificate, verified in exact rational arithmetic</h2>
-{_conditions(verification)}
-<h2>Settings and versions</h2>
-<pre>{escape(json.dumps(content, indent=1))}</pre>"""
-
-
-def _table(rows: list[list[str]]) -> str:
-    head = "".join(f"<th>{escape((top + ' ' + low).strip())}</th>" for top, low in zip(rows[0], rows[1], strict=True))
-    body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows[2:])
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-
-
-def _conditions(verification: Report) -> str:
-    rows = "".join(
-        f"<tr><td>{escape(c.name)}</td><td>{c.margin:+.2e}</td>"
-        f'<td class="{"holds" if c.holds else "broken"}">{"holds" if c.holds else "broken"}</td></tr>'
-        for c in verification.conditions
+def _arms_explained(settings: dict[str, Any]) -> str:
+    """Returns a list of the arms and how their agents are trained."""
+    entries = "".join(
+        f"<dt>{arm_name(name)}</dt><dd>{escape(_explained(name, settings))}</dd>" for name in settings["arms"]
     )
-    return f"<table><thead><tr><th>condition</th><th>margin</th><th></th></tr></thead><tbody>{rows}</tbody></table>"
+    return f"<dl>{entries}</dl>\n"
+
+
+def _explained(name: str, settings: dict[str, Any]) -> str:
+    arm = arm_of(name, settings["mode"])
+    if arm.prices_violations:
+        return f"no shield; in training every violating step costs {settings['violation_penalty']:g} of reward."
+    if arm.mode is None:
+        return "the agent's action is applied as it is."
+    if arm.mode == "monitor":
+        return "unshielded too; a shield watches, and counts in brackets what it would have overridden."
+    price = f" In training every intervention costs {settings['intervention_penalty']:g} of reward."
+    return f"where the action is not provably safe, {MODES[arm.mode]}.{price if arm.prices_interventions else ''}"
+
+
+def _safety_note(arms: dict[str, Any], references: dict[str, Any]) -> str:
+    text = (
+        f"Exact {PERCENT} intervals of the probability that an episode violates, given the trained agents: they say "
+        "nothing of agents trained anew. After no violation the interval's upper end is shown. Steps are plain counts, "
+        "because steps of one episode depend on each other. A shield decides by the estimate, so the estimate's "
+        "violations are counted apart."
+    )
+    if "monitor" in arms | references:
+        text += " In brackets: what the shield would have overridden."
+    return note(text)
+
+
+def _return_note(runs: int) -> str:
+    """Returns how to read the intervals of the return."""
+    text = "Returns in evaluation are the environment's own, without penalties. "
+    if runs == 1:
+        return text + "With one run per arm there is no interval over runs: how training varies is unknown."
+    text += (
+        f"Intervals are over {runs} runs where policies differ from run to run, as trained and untrained agents do; "
+        "where every run has the same, over the episodes. The interquartile mean leaves out the lowest and the highest "
+        "quarter of the values, rounded down"
+    )
+    text += ": of fewer than 4 runs none, so that it is the mean. " if runs < 4 else ". "
+    text += "Student's interval takes the runs' returns for normal. "
+    return text + _bootstrap_note(runs)
+
+
+def _bootstrap_note(runs: int) -> str:
+    if runs >= FEW_RUNS:
+        return f"The bootstrap's is the percentile interval of 10,000 resamples of {runs} runs."
+    return (
+        f"A percentile bootstrap over {runs} runs is too narrow: it cannot reach beyond the lowest and the highest "
+        "run. Believe the wider one."
+    )
+
+
+def _differences(paired: dict[str, Any], runs: int) -> str:
+    if not paired["arms"]:
+        return ""
+    text = f"Each arm minus {paired['baseline']}, run by run: equal numbers meet the same draws of nature. "
+    if runs == 1:
+        return difference_table(paired) + note(text + "One run per arm: there is no interval.")
+    return difference_table(paired) + note(f"{text}Intervals over {runs} pairs of runs. {_bootstrap_note(runs)}")
+
+
+def _figures(figures: dict[str, bytes]) -> str:
+    return "".join(figure(caption, png) for caption, png in figures.items())
+
+
+def _sweep_table(cells: list[dict[str, Any]], mode: str) -> str:
+    """Returns a row per channel and arm."""
+    head = [
+        "arm",
+        "loss probability",
+        "delay [steps]",
+        "rounding",
+        "mean burst",
+        "violating steps in training",
+        f"violating evaluation episodes [{PERCENT}]",
+        "overridden in evaluation",
+        f"mean return [Student's {PERCENT}]",
+    ]
+    rows = []
+    for cell in cells:
+        rounding = "own" if cell["quantization_step"] is None else f"{cell['quantization_step']:g}"
+        place = [f"{cell['loss']:g}", str(cell["delay"]), rounding, f"{cell['burst_length']:g}"]
+        for name, numbers in cell["arms"].items():
+            arm = numbers | {"mode": arm_of(name, mode).mode}
+            rows.append(
+                [
+                    arm_name(name),
+                    *place,
+                    f"{arm['train_violation_steps']:,} of {arm['train_steps']:,}",
+                    violating_text(arm),
+                    overridden_text(arm, "intervention_rate"),
+                    return_text(arm),
+                ]
+            )
+    return table("Every channel and arm", head, rows)
+
+
+def _sweep_note(settings: dict[str, Any]) -> str:
+    text = (
+        "Shares of violating episodes with Clopper and Pearson's exact interval given the trained agents; after no "
+        "violation, its upper end. "
+    )
+    if settings["seeds"] == 1:
+        return text + "One run per arm and channel: the return has no interval, and differences may be chance."
+    return text + f"Intervals of the return are Student's over {settings['seeds']} runs."
+
+
+def _runs(count: int) -> str:
+    return "run" if count == 1 else "runs"
