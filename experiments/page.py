@@ -33,7 +33,7 @@ table.words td, table.words th { text-align: left; white-space: normal; overflow
 .whole { white-space: nowrap; } .holds { color: #14713f; } .broken { color: #b3261e; font-weight: 700; }
 figure { margin: 1.5rem 0 2.25rem; }
 figcaption { font-size: .875rem; color: var(--soft); max-width: 52rem; margin-top: .4rem; }
-img { display: block; width: 100%; height: auto; max-width: 1430px; }
+img { display: block; height: auto; max-width: 100%; }
 code, pre { font: .84rem/1.5 ui-monospace, "SF Mono", Menlo, Consolas, monospace; }
 code { background: var(--wash); padding: .1em .3em; border-radius: 3px; overflow-wrap: anywhere; }
 pre { background: var(--wash); padding: .9rem 1rem; border-radius: 4px; overflow-x: auto; }
@@ -42,7 +42,7 @@ pre { background: var(--wash); padding: .9rem 1rem; border-radius: 4px; overflow
   body { padding: 1.25rem 1rem 3rem; font-size: 15px; } h1 { font-size: 1.4rem; }
   dl { display: block; } dd { margin-bottom: .5rem; }
   tbody td:first-child { white-space: normal; min-width: 7rem; max-width: 9rem; }
-  figure .scroll img { width: 44rem; max-width: none; }
+  figure .scroll img { max-width: 44rem; }
 }
 @media print {
   body { max-width: none; padding: 0; font-size: 10pt; } h2 { break-after: avoid; }

@@ -79,15 +79,18 @@ def episode_caption(arms: Arms) -> str:
 def _draw_states(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant) -> dict[str, Artist]:
     """Draws the largest |c_j x| of states and estimates, and marks the violations."""
     handles: dict[str, Artist] = {}
+    crosses: list[Line2D] = []
     for (name, path), width in zip(paths.items(), WIDTHS, strict=False):
         color = style_of(name).color
         time = plant.dt * np.arange(len(path.states))
         true, estimated = (np.abs(x @ plant.C.T).max(axis=1) for x in (path.states, path.estimates))
         (handles[name],) = axis.plot(time, true, color=color, lw=width)
         (handles[f"{name}, estimate"],) = axis.plot(time, estimated, color=_dark(color), lw=1.1, ls=":", zorder=3)
-        (cross,) = axis.plot(time[true > 1.0], true[true > 1.0], "x", color=INK, ms=4.5, mew=1.0, zorder=4)
+        if (true > 1.0).any():
+            crosses = axis.plot(time[true > 1.0], true[true > 1.0], "x", color=INK, ms=4.5, mew=1.0, zorder=4)
     handles["limit"] = axis.axhline(1.0, **LIMIT)
-    handles["violation of the true state"] = cross
+    if crosses:
+        handles["violation of the true state"] = crosses[0]
     label(axis, "", "largest |c$_j$ x|", "First evaluation episode of the first run")
     axis.set_ylim(0.0, max(1.12, axis.get_ylim()[1]))
     return handles

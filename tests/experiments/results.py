@@ -1,0 +1,86 @@
+"""Results of units made by hand, for tests of figures and reports."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from agents.callbacks import TrainingPoint
+from agents.evaluation import Episode
+from agents.trajectory import Trajectory
+from experiments.arms import arm_of
+from experiments.summary import paired_differences, summarize_arm
+from experiments.unit import UnitResult
+
+ALL_ARMS = [
+    "unshielded",
+    "monitor",
+    "penalized",
+    *(f"shielded{mode}{penalty}" for mode in ("", ":project", ":switch", ":boundary") for penalty in ("", "+penalty")),
+]
+
+
+def trajectory(states: np.ndarray, m: int = 1, intervened: tuple[int, ...] = (), arrivals: tuple[int, ...] = ()):
+    """A trajectory through states (T + 1, n) whose proposed inputs differ from the applied where it intervened."""
+    steps = len(states) - 1
+    acted, arrived = np.zeros(steps, bool), np.zeros(steps, bool)
+    acted[list(intervened)], arrived[list(arrivals)] = True, True
+    inputs = np.full((steps, m), 0.5)
+    return Trajectory(states, states + 0.01, inputs, inputs + acted[:, None], acted, arrived)
+
+
+def history(*steps: int, scale: float = 1.0) -> list[TrainingPoint]:
+    """A history with a finished episode from the second point on, or at once if it has one point."""
+    return [
+        TrainingPoint(at, float("nan") if at == steps[0] and len(steps) > 1 else -scale * at, int(scale * at), at // 10)
+        for at in steps
+    ]
+
+
+def run(arm: str, index: int = 0, violations=(0, 0), returns=(-1.0, -3.0), **change: Any) -> UnitResult:
+    """A run of an arm with an episode of 10 steps for each number of violating steps."""
+    episodes = [
+        Episode(i, 10, total - index, count, count, 1, True, 0.9)
+        for i, (count, total) in enumerate(zip(violations, returns, strict=True))
+    ]
+    content = {
+        "train_steps": 100,
+        "train_violation_steps": 7,
+        "train_interventions": 20,
+        "history": history(10, 20, 100, scale=1.0 + index),
+        "episodes": episodes,
+        "trajectory": trajectory(np.zeros((11, 2))),
+        "files": {},
+    }
+    return UnitResult(arm=arm, index=index, **(content | change))
+
+
+def summary_of(results: dict[str, list[UnitResult]], **settings: Any) -> dict[str, Any]:
+    """The summary of a comparison without reference policies."""
+
+    def arm(name: str) -> dict[str, Any]:
+        mode = arm_of(name, "project").mode
+        return {"mode": mode, "shielded": mode not in (None, "monitor")} | summarize_arm(
+            results[name], fixed_policy=False
+        )
+
+    baseline = next(iter(results))
+    return {
+        "arms": {name: arm(name) for name in results},
+        "references": {},
+        "paired_differences": {"baseline": baseline, "arms": paired_differences(results, baseline)},
+    } | provenance(arms=list(results), **settings)
+
+
+def provenance(**settings: Any) -> dict[str, Any]:
+    """Settings, plant, certificate and versions as in a summary."""
+    own = {"env": "ncs_gym/TruckTrailer-v0", "algo": "PPO", "mode": "project", "seed": 5, "seeds": 2, "steps": 100}
+    own |= {"episodes": 2, "intervention_penalty": 0.25, "violation_penalty": 3.0}
+    own |= {"ppo": {"envs": 64}, "a2c": {"envs": 32}, "off_policy": {"buffer_size": 77}, "certificate": None}
+    return {
+        "settings": own | settings,
+        "plant": {"fingerprint": "f" * 64, "spectral_radius": 0.9},
+        "certificate": "c" * 64,
+        "versions": {"python": "3.11.9", "numpy": "2.1.0"},
+    }

@@ -1,0 +1,213 @@
+import base64
+import re
+from html.parser import HTMLParser
+
+import pytest
+
+from experiments.arms import arm_of
+from experiments.report import html_report, sweep_report
+from shields import Report
+from shields.condition import flag
+from tests.experiments.results import ALL_ARMS, provenance, run, summary_of
+
+VERIFIED = Report((flag("(E1) Sigma - A Sigma A' >= 0", True), flag("(S) the safe set", True)))
+PNG = b"\x89PNG pixels"
+ATTACK = "<script>alert('&')</script>"
+
+
+class Reader(HTMLParser):
+    """Reads a page: tables by name, text, and tags that were not closed."""
+
+    VOID = ("meta", "img", "br")
+
+    def __init__(self, page):
+        super().__init__()
+        self.tables, self.open, self.tags, self.text = {}, [], [], []
+        self.feed(page)
+        self.close()
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+        if tag == "div" and "aria-label" in dict(attributes):
+            self.rows = self.tables.setdefault(dict(attributes)["aria-label"], [])
+        if tag == "tr" and hasattr(self, "rows"):
+            self.rows.append([])
+        if tag in ("td", "th") and self.rows is not None:
+            self.rows[-1].append("")
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if "style" not in self.open:
+            self.text.append(data)
+        if {"td", "th"} & set(self.open):
+            self.rows[-1][-1] += data
+
+
+def comparison(*names, runs=3, figures=None, findings=(), change=None, **settings):
+    results = {name: [run(name, i, **(change or {})) for i in range(runs)] for name in names}
+    return html_report(summary_of(results, **settings), VERIFIED, figures or {}, list(findings))
+
+
+def swept(*names, seeds=1, mode="project", change=None, **settings):
+    arms = summary_of({name: [run(name, i, **(change or {})) for i in range(seeds)] for name in names})["arms"]
+    for arm in arms.values():
+        del arm["mode"], arm["shielded"]  # a sweep's summary has none
+    channels = [(0.0, 0, None, 1.0), (0.6, 4, 0.05, 2.0)]
+    cells = [
+        {"loss": loss, "delay": delay, "quantization_step": rounding, "burst_length": burst, "arms": arms}
+        for loss, delay, rounding, burst in channels
+    ]
+    own = provenance(arms=list(names), seeds=seeds, mode=mode, **settings)
+    return sweep_report({"cells": cells} | own, VERIFIED, {"Violations. Of all.": PNG})
+
+
+def safety(page):
+    return {row[0]: row[1:] for row in Reader(page).tables["Violations and interventions of each arm"]}
+
+
+@pytest.mark.parametrize("page", [comparison(*ALL_ARMS, figures={"A. B.": PNG}), swept(*ALL_ARMS)])
+def test_page_is_well_formed_and_needs_nothing_from_elsewhere(page):
+    reader = Reader(page)
+    assert reader.open == []
+    assert not re.search(r"https?:|//[a-z]|@import|url\(", page)
+    assert {tag for tag, _ in reader.tags} & {"script", "link", "iframe", "object", "base"} == set()
+    sources = [attributes["src"] for _, attributes in reader.tags if "src" in attributes]
+    assert sources
+    assert all(source.startswith("data:image/png;base64,") for source in sources)
+    assert ("meta", {"charset": "utf-8"}) in reader.tags
+    assert any(attributes.get("name") == "viewport" for _, attributes in reader.tags)
+
+
+@pytest.mark.parametrize("report", [comparison, swept])
+def test_everything_from_outside_is_escaped(report):
+    page = report("shielded", env=ATTACK, certificate=ATTACK, ppo={ATTACK: ATTACK})
+    assert "<script" not in page
+    assert page.count("&lt;script&gt;") >= 4
+    assert ATTACK in "".join(Reader(page).text)
+
+
+def test_captions_findings_and_conditions_are_escaped():
+    summary = summary_of({"shielded": [run("shielded")]})
+    summary["references"] = {ATTACK: summary["arms"]["shielded"]}
+    summary["versions"] = {ATTACK: ATTACK}
+    page = html_report(summary, Report((flag(ATTACK, False),)), {f'"{ATTACK}. B': PNG}, [ATTACK])
+    assert "<script" not in page
+    assert Reader(page).open == []
+
+
+def test_figures_are_embedded_with_their_captions():
+    reader = Reader(comparison("shielded", figures={"First. Of all.": PNG, "Second. Too.": b"other"}))
+    images = [attributes for tag, attributes in reader.tags if tag == "img"]
+    assert [image["alt"] for image in images] == ["First", "Second"]
+    assert base64.b64decode(images[0]["src"].partition(",")[2]) == PNG
+    assert "Second. Too." in reader.text
+
+
+def test_every_arm_is_in_every_table_and_explained():
+    reader = Reader(comparison(*ALL_ARMS))
+    for name in ("Violations and interventions of each arm", "Return of each arm"):
+        assert [row[0] for row in reader.tables[name][1:]] == ALL_ARMS
+    assert [row[0] for row in reader.tables["Paired differences"][1:]] == ALL_ARMS[1:]
+    assert sum(tag == "dt" for tag, _ in reader.tags) == len(ALL_ARMS)
+    assert "in training every violating step costs 3 of reward" in "".join(reader.text)
+    assert "every intervention costs 0.25 of reward" in "".join(reader.text)
+
+
+def test_without_a_violation_the_table_says_what_the_probability_is_at_most():
+    cells = safety(comparison("shielded", runs=3))["shielded"]
+    assert "0 of 60 %, at most 45.93 %" in cells[2]  # 1 - 0.025^(1/6)
+
+
+def test_violating_episodes_have_their_exact_interval():
+    change = {"violations": (3, 0)}
+    assert "3 of 650.0 % [11.8, 88.2]" in safety(comparison("unshielded", change=change))["unshielded"][2]
+
+
+def test_violations_of_state_and_estimate_stand_apart():
+    summary = summary_of({"shielded": [run("shielded")]})
+    summary["arms"]["shielded"] |= {"eval_violation_steps": 1234, "eval_estimate_violation_steps": 5678}
+    assert safety(html_report(summary, VERIFIED, {}, []))["shielded"][3:5] == ["1,234", "5,678"]
+
+
+def test_interventions_of_a_monitor_are_in_brackets_and_without_a_shield_there_are_none():
+    rows = safety(comparison("unshielded", "monitor", "shielded"))
+    assert [rows[name][1] for name in rows if name] == ["\N{EN DASH}", "(20.0 %)", "20.0 %"]
+    assert [rows[name][-1] for name in rows if name] == ["\N{EN DASH}", "\N{EN DASH}", "6 of 6"]
+    assert "what the shield would have overridden" in comparison("monitor")
+
+
+def test_returns_and_differences_have_students_and_the_bootstraps_interval():
+    reader = Reader(comparison("unshielded", "shielded", runs=3))
+    returns = {row[0]: row[1:] for row in reader.tables["Return of each arm"]}
+    minus = "\N{MINUS SIGN}"
+    wanted = [f"{minus}3.0", f"[{minus}5.5, {minus}0.5]", f"[{minus}4.0, {minus}2.0]"]
+    assert returns["shielded"][:3] == wanted
+    assert returns["shielded"][5] == "3 runs"
+    assert reader.tables["Paired differences"][1][1:4] == ["+0.0", "[+0.0, +0.0]", "[+0.0, +0.0]"]
+
+
+def test_over_a_handful_of_runs_the_bootstrap_is_called_too_narrow_and_over_many_not():
+    assert comparison("unshielded", "shielded", runs=3).count("A percentile bootstrap over 3 runs is too narrow") == 2
+    assert "too narrow" not in comparison("unshielded", "shielded", runs=10)
+
+
+def test_one_run_has_no_interval_and_the_page_says_so():
+    page = comparison("unshielded", "shielded", runs=1)
+    assert "none: one run" in page
+    assert "how training varies is unknown" in page
+    assert "bootstrap over" not in page
+
+
+def test_a_single_arm_has_no_differences():
+    assert "Paired differences" not in comparison("shielded")
+
+
+def test_policies_without_training_stand_below_a_rule():
+    summary = summary_of({"shielded": [run("shielded")]})
+    summary["references"] = {"zero input": summary["arms"]["shielded"] | {"mode": None, "train_steps": 0}}
+    page = html_report(summary, VERIFIED, {}, [])
+    assert page.count("<tr class=rule><td>zero input</td><td>\N{EN DASH}</td>") == 1
+    assert "zero input (does nothing)" in page
+
+
+def test_conditions_are_shown_and_a_broken_one_stands_out():
+    page = html_report(summary_of({"shielded": [run("shielded")]}), Report((flag("(S)", False),)), {}, ["Finding 1."])
+    assert '<td>(S)</td><td>-1.00e+00</td><td><span class="broken">broken</span></td>' in page.replace("\n", "")
+    assert "<li>Finding 1.</li>" in page
+
+
+def test_settings_of_the_algorithm_used_are_shown_and_of_others_not():
+    text = "".join(Reader(comparison("shielded", algo="SAC")).text)
+    assert "off_policy.buffer_size" in text
+    assert "ppo.envs" not in text
+    assert "ppo.envs" in "".join(Reader(comparison("shielded", algo="PPO")).text)
+    assert "3.11.9" in text
+    assert "c" * 64 in text
+
+
+@pytest.mark.parametrize(("report", "command"), [(comparison, "compare"), (swept, "sweep")])
+def test_page_says_how_to_run_it_again(report, command):
+    assert f"ncs {command} --config settings.json" in report("shielded")
+
+
+def test_sweep_has_a_row_per_channel_and_arm():
+    rows = Reader(swept("unshielded", "monitor", "shielded")).tables["Every channel and arm"]
+    assert [row[:5] for row in rows[1:4]] == [
+        [arm, "0", "0", "own", "1"] for arm in ("unshielded", "monitor", "shielded")
+    ]
+    assert rows[4][:5] == ["unshielded", "0.6", "4", "0.05", "2"]
+    assert [row[7] for row in rows[1:4]] == ["\N{EN DASH}", "(10.0 %)", "10.0 %"]
+    assert "0 of 20 %, at most 84.19 %" in rows[1][6]
+    assert "none: one run" in rows[1][8]
+    assert "over 3 runs" in swept("shielded", seeds=3)
+
+
+@pytest.mark.parametrize("mode", ["project", "switch", "boundary"])
+def test_the_shield_is_explained_as_its_mode_acts(mode):
+    assert arm_of("shielded", mode).mode == mode
+    assert ("closest input" in comparison("shielded", mode=mode)) == (mode == "project")
+    assert ("unless every input" in swept("shielded", mode=mode)) == (mode == "boundary")
