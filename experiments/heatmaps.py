@@ -34,7 +34,7 @@ class Quantity:
         unit: The shown one.
         colors: A color map of matplotlib.
         low: Start of the color scale; None for the smallest value.
-        high: Its end; None for the largest value.
+        high: Its end, unless a value is larger; None for the largest value.
         caption: A sentence.
         of_shields: Whether only arms with a shield have it.
     """
@@ -58,7 +58,7 @@ QUANTITIES = {
         "%",
         "OrRd",
         0.0,
-        100.0,
+        10.0,
         "Violations: share of evaluation episodes in which the true state violates, over all runs of an arm.",
     ),
     "return": Quantity(
@@ -114,7 +114,7 @@ def heatmap_figure(cells: Sequence[dict[str, Any]], arms: Sequence[str], quantit
     block = -(-len(arms) // COLUMNS)
     columns, rows = -(-len(arms) // block), block * len(others)
     height = 0.5 * len(delays) + (0.65 if len(others) > 1 else 0.45)
-    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
+    with matplotlib.rc_context(STYLE), matplotlib.rc_context({"axes.grid": False}):
         width = 1.8 + max(0.68 * len(losses) + 0.15, 1.7) * columns
         figure = Figure(figsize=(width, 0.7 + max(height, 1.3) * rows), layout="constrained")
         panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
@@ -154,7 +154,7 @@ def _field(
 def _norm(fields: Sequence[np.ndarray], quantity: Quantity) -> Normalize:
     """Returns one color scale for all panels."""
     low = np.nanmin(fields) if quantity.low is None else quantity.low
-    high = np.nanmax(fields) if quantity.high is None else quantity.high
+    high = np.nanmax(fields) if quantity.high is None else max(quantity.high, np.nanmax(fields))
     # Where all values are alike the scale still has a length.
     return Normalize(low, high if high > low else low + 1.0)
 
@@ -162,10 +162,11 @@ def _norm(fields: Sequence[np.ndarray], quantity: Quantity) -> Normalize:
 def _draw(axis: Axes, values: np.ndarray, colors: str, norm: Normalize) -> None:
     """Draws a panel and writes the numbers into its fields, light on dark."""
     axis.imshow(values, cmap=colors, norm=norm, origin="lower", aspect="auto")
+    digits = 1 if max(abs(norm.vmin or 0.0), abs(norm.vmax or 0.0)) >= 1.0 else 2
     for (i, j), value in np.ndenumerate(values):
         if np.isfinite(value):
             dark = np.array(matplotlib.colormaps[colors](norm(value))[:3]) @ LUMINANCE < DARK
-            text = f"{value:.1f}".replace("-", "\N{MINUS SIGN}") if value else "0"
+            text = f"{value:.{digits}f}".replace("-", "\N{MINUS SIGN}") if value else "0"
             axis.text(j, i, text, ha="center", va="center", fontsize=9, color="white" if dark else "#222222")
 
 

@@ -41,14 +41,19 @@ def origin_sections(summary: dict[str, Any], verification: Report, command: str)
         "The certificate, verified in exact rational arithmetic": _conditions(verification)
         + note(f"A condition holds when its exact margin has the right sign; margins are printed for people.{which}")
         + pairs(origin),
-        "Settings": pairs(shown) + note("Settings of algorithms that were not used are in settings.json."),
+        "Settings": pairs(shown)
+        + note(
+            "A channel's setting of none leaves the environment's own. Settings of algorithms that were not used are "
+            "in settings.json."
+        ),
         "Versions": pairs(summary["versions"]),
     }
 
 
 def _conditions(verification: Report) -> str:
     rows = [
-        [c.name, f"{c.margin:+.2e}", Markup(f'<span class="{word}">{word}</span>')]
+        # Of a condition that is only true or false, zero says nothing.
+        [c.name, f"{c.margin:+.2e}" if c.margin else "\N{EN DASH}", Markup(f'<span class="{word}">{word}</span>')]
         for c in verification.conditions
         for word in ["holds" if c.holds else "broken"]
     ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from html import escape
 
 STYLE = """
@@ -25,19 +25,22 @@ th, td { padding: .45rem .65rem; border-bottom: 1px solid var(--line); text-alig
 th { min-width: 5rem; font-weight: 600; color: var(--soft); border-bottom: 2px solid var(--ink); }
 td { white-space: nowrap; vertical-align: top; }
 th:first-child, td:first-child { text-align: left; padding-left: 0; position: sticky; left: 0; background: #fff; }
-tr.rule td { border-top: 2px solid var(--line); }
-table.words td, table.words th { text-align: left; white-space: normal; overflow-wrap: anywhere; font-weight: 400; }
-.interval { color: var(--soft); display: block; font-size: .92em; } .list { display: inline-block; min-width: 8rem;
-  white-space: normal; }
+tr.rule td { border-top: 2px solid #b9c0c5; }
+table.words td { text-align: left; position: static !important; white-space: normal;
+  overflow-wrap: anywhere; }
+.interval { color: var(--soft); display: block; font-size: .92em; }
+.list { display: inline-block; min-width: 8rem; white-space: normal; }
 .swatch { display: inline-block; width: .7em; height: .7em; border-radius: 50%; margin-right: .5em; }
-.whole { white-space: nowrap; } .holds { color: #14713f; } .broken { color: #b3261e; font-weight: 700; }
+.whole { white-space: nowrap; }
+.holds { color: #14713f; } .broken { color: #b3261e; font-weight: 700; }
 figure { margin: 1.5rem 0 2.25rem; }
 figcaption { font-size: .875rem; color: var(--soft); max-width: 52rem; margin-top: .4rem; }
 img { display: block; height: auto; max-width: 100%; }
 code, pre { font: .84rem/1.5 ui-monospace, "SF Mono", Menlo, Consolas, monospace; }
 code { background: var(--wash); padding: .1em .3em; border-radius: 3px; overflow-wrap: anywhere; }
 pre { background: var(--wash); padding: .9rem 1rem; border-radius: 4px; overflow-x: auto; }
-.columns { columns: 2 24rem; column-gap: 2.5rem; } .columns table { width: 100%; } .columns tr { break-inside: avoid; }
+.columns { columns: 2 24rem; column-gap: 2.5rem; } .columns table { width: 100%;
+  border-collapse: separate; border-spacing: 0; } .columns tr { break-inside: avoid; }
 @media (max-width: 40rem) {
   body { padding: 1.25rem 1rem 3rem; font-size: 15px; } h1 { font-size: 1.4rem; }
   dl { display: block; } dd { margin-bottom: .5rem; }
@@ -45,11 +48,19 @@ pre { background: var(--wash); padding: .9rem 1rem; border-radius: 4px; overflow
   figure .scroll img { max-width: 44rem; }
 }
 @media print {
-  body { max-width: none; padding: 0; font-size: 10pt; } h2 { break-after: avoid; }
-  figure, tr { break-inside: avoid; } .scroll { overflow: visible; } table { font-size: 7.5pt; }
-  th, td { padding: .25rem .35rem; } td:first-child, th:first-child { position: static; }
+  @page { margin: 14mm; } html { font-size: 11px; } body { max-width: none; padding: 0; font-size: 1rem; }
+  h2 { break-after: avoid; } figure, tr { break-inside: avoid; } .scroll { overflow: visible; }
+  th, td { padding: .3rem .4rem; min-width: 0; } .whole, pre { white-space: pre-wrap; } .list { min-width: 5rem; }
+  td:first-child, th:first-child { position: static; } tbody td:first-child { white-space: normal; }
 }
 """
+
+
+# Pixels of a figure per pixel of the page: the widest figures then fill it, and letters are alike in all.
+DENSITY = 1.36
+WIDTH_IN_PNG = slice(16, 20)
+# More names and values than these stand in columns.
+MANY = 8
 
 
 class Markup(str):
@@ -79,18 +90,18 @@ def page(title: str, lead: str, sections: Mapping[str, str]) -> str:
 """
 
 
-def table(name: str, head: Sequence[str], rows: Sequence[Sequence[str]], rule: int | None = None) -> str:
+def table(name: str, head: Sequence[str], rows: Sequence[Sequence[str]], rules: Collection[int] = ()) -> str:
     """Returns a table that scrolls where it is too wide.
 
     Args:
         name: For readers who hear it.
         head: Cells; `Markup` stays as it is.
         rows: Rows of such cells.
-        rule: Number of the row above which a line is drawn.
+        rules: Numbers of the rows above which a line is drawn.
     """
     heads = "".join(f'<th scope="col">{_html(cell)}</th>' for cell in head)
     body = "\n".join(
-        f"<tr{' class=rule' if i == rule else ''}>{''.join(f'<td>{_html(cell)}</td>' for cell in row)}</tr>"
+        f"<tr{' class=rule' if i in rules else ''}>{''.join(f'<td>{_html(cell)}</td>' for cell in row)}</tr>"
         for i, row in enumerate(rows)
     )
     return (
@@ -100,17 +111,19 @@ def table(name: str, head: Sequence[str], rows: Sequence[Sequence[str]], rule: i
 
 
 def pairs(values: Mapping[str, str]) -> str:
-    """Returns names and values in columns."""
+    """Returns names and values, in columns where there are many."""
     body = "\n".join(f"<tr><td>{_html(name)}</td><td>{_html(value)}</td></tr>" for name, value in values.items())
-    return f'<div class="columns"><table class="words"><tbody>\n{body}\n</tbody></table></div>\n'
+    columns = "columns" if len(values) > MANY else "scroll"
+    return f'<div class="{columns}"><table class="words"><tbody>\n{body}\n</tbody></table></div>\n'
 
 
 def figure(caption: str, png: bytes) -> str:
     """Returns an image with its caption; its first sentence stands for it where it is not seen."""
     data = base64.b64encode(png).decode()
+    width = round(int.from_bytes(png[WIDTH_IN_PNG]) / DENSITY)
     return (
         f'<figure><div class="scroll" role="region" aria-label="figure" tabindex="0">'
-        f'<img alt="{escape(caption.partition(". ")[0])}" src="data:image/png;base64,{data}"></div>'
+        f'<img alt="{escape(caption.partition(". ")[0])}" width="{width}" src="data:image/png;base64,{data}"></div>'
         f"<figcaption>{escape(caption)}</figcaption></figure>\n"
     )
 

@@ -193,7 +193,8 @@ def _sweep_table(cells: list[dict[str, Any]], mode: str) -> str:
                     return_text(arm),
                 ]
             )
-    return table("Every channel and arm", head, rows)
+    per_cell = len(rows) // len(cells)
+    return table("Every channel and arm", head, rows, rules=range(per_cell, len(rows), per_cell))
 
 
 def _sweep_note(settings: dict[str, Any]) -> str:

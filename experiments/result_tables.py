@@ -31,7 +31,7 @@ def safety_table(arms: Summaries, references: Summaries) -> str:
         "episodes in which the proof held",
     ]
     rows = [[arm_name(name), *safety_cells(arm)] for name, arm in (arms | references).items()]
-    return table("Violations and interventions of each arm", head, rows, rule=len(arms))
+    return table("Violations and interventions of each arm", head, rows, rules=[len(arms)])
 
 
 def return_table(arms: Summaries, references: Summaries) -> str:
@@ -54,12 +54,12 @@ def return_table(arms: Summaries, references: Summaries) -> str:
             interval_text(arm["eval_return_bootstrap_ci95"]),
             _number(arm["eval_return_iqm"]),
             interval_text(arm["eval_return_iqm_bootstrap_ci95"]),
-            f"{_count(arm):,} {arm['eval_return_ci95_over']}",
+            _count(arm),
             Markup(f'<span class="list">{", ".join(_number(value) for value in arm["eval_return_by_run"])}</span>'),
         ]
         for name, arm in (arms | references).items()
     ]
-    return table("Return of each arm", head, rows, rule=len(arms))
+    return table("Return of each arm", head, rows, rules=[len(arms)])
 
 
 def difference_table(paired: dict[str, Any]) -> str:
@@ -107,7 +107,9 @@ def arm_name(name: str) -> str:
     if name.removesuffix(PENALTY) not in LOOKS:
         return name
     swatch = f'<span class="swatch" style="background:{style_of(name).color}"></span>'
-    return Markup(f"{swatch}<strong>{escape(name)}</strong>")
+    # Where a phone may break it.
+    broken = escape(name).replace(":", ":<wbr>").replace("+", "<wbr>+")
+    return Markup(f"{swatch}<strong>{broken}</strong>")
 
 
 def violating_text(arm: dict[str, Any]) -> str:
@@ -136,8 +138,10 @@ def return_text(arm: dict[str, Any]) -> str:
     return Markup(f'{_number(arm["eval_return_mean"])}<span class="interval">{escape(interval)}</span>')
 
 
-def _count(arm: dict[str, Any]) -> int:
-    return arm["eval_episodes"] if arm["eval_return_ci95_over"] == "episodes" else arm["runs"]
+def _count(arm: dict[str, Any]) -> str:
+    if arm["eval_return_ci95_over"] == "episodes":
+        return f"{arm['eval_episodes']:,} episodes"
+    return f"{arm['runs']:,} {'run' if arm['runs'] == 1 else 'runs'}"
 
 
 def _counts(values: list[int]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import matplotlib
@@ -11,9 +12,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from experiments.arm_style import style_of
+from experiments.arm_style import ArmStyle, style_of
 from experiments.plotting import STYLE, label, legend_below, thousands
 from experiments.unit import UnitResult
+
+# Markers of the first arm and of the last [points]: where arms coincide, those below show.
+SIZES = (13.0, 6.0)
 
 Arms = dict[str, Sequence[UnitResult]]
 
@@ -28,13 +32,13 @@ def scatter_figure(summary: dict[str, dict[str, Any]], arms: Arms) -> Figure:
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11.0, 4.4), layout="constrained")
         steps, episodes = figure.subplots(1, 2, sharey=True)
-        for name, results in arms.items():
-            arm = summary[name]
+        for (name, results), size in zip(arms.items(), np.linspace(*SIZES, len(arms)), strict=True):
+            arm, style = summary[name], replace(style_of(name), size=float(size))
             per_episode = [_mean(result, "violation_steps") for result in results]
-            rates = [100.0 * np.mean([e.violation_steps > 0 for e in result.episodes]) for result in results]
-            _draw_arm(steps, name, arm, per_episode, float(np.mean(per_episode)), None)
+            rates = [100.0 * float(np.mean([e.violation_steps > 0 for e in result.episodes])) for result in results]
+            _draw_arm(steps, style, arm, per_episode, float(np.mean(per_episode)), None)
             bounds = [100.0 * bound for bound in arm["eval_violation_rate_ci95"]]
-            _draw_arm(episodes, name, arm, rates, 100.0 * arm["eval_violation_rate"], bounds)
+            _draw_arm(episodes, style, arm, rates, 100.0 * arm["eval_violation_rate"], bounds)
         label(steps, "violating steps per evaluation episode", "mean return per episode")
         label(episodes, "violating evaluation episodes [%]", "")
         for axis in (steps, episodes):
@@ -56,7 +60,7 @@ def scatter_caption(arms: Arms) -> str:
         text += " A marker is one run, so the return has no interval;"
     text += (
         " horizontal bars on the right Clopper and Pearson's 95 % interval of violating episodes given the trained"
-        " agents. Violations are those of the true state, returns the environment's own, without penalties."
+        " agents. Markers differ in size only to show where they coincide. Violations are those of the true state, returns the environment's own, without penalties."
     )
     lengths = {episode.steps for results in arms.values() for result in results for episode in result.episodes}
     if len(lengths) > 1:
@@ -65,19 +69,24 @@ def scatter_caption(arms: Arms) -> str:
 
 
 def _draw_arm(
-    axis: Axes, name: str, arm: dict[str, Any], costs: Sequence[float], cost: float, bounds: Sequence[float] | None
+    axis: Axes,
+    style: ArmStyle,
+    arm: dict[str, Any],
+    costs: Sequence[float],
+    cost: float,
+    bounds: Sequence[float] | None,
 ) -> None:
     """Draws an arm's runs and mean, with the intervals that there are.
 
     Args:
         axis: Where.
-        name: The arm's.
+        style: The arm's look.
         arm: Its summary.
         costs: Of each run.
         cost: Of all.
         bounds: The interval of the cost.
     """
-    style, mean = style_of(name), arm["eval_return_mean"]
+    mean = arm["eval_return_mean"]
     if len(costs) > 1:
         axis.plot(costs, arm["eval_return_by_run"], "o", ms=4.5, mfc=style.color, mec="white", mew=0.6, zorder=4)
     if arm["eval_return_ci95"] is not None:

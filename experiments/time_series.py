@@ -108,7 +108,7 @@ def _draw_input(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant, i:
         style = style_of(name)
         edges = plant.dt * np.arange(len(path.inputs) + 1)
         axis.stairs(path.inputs[:, i], edges, baseline=None, color=style.color, lw=width)
-        changed = np.any(path.inputs != path.proposed, axis=1)
+        changed = (path.inputs != path.proposed).any(axis=1)
         if changed.any():
             middle = edges[:-1][changed] + 0.5 * plant.dt
             axis.vlines(
@@ -116,9 +116,10 @@ def _draw_input(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant, i:
             )
             axis.plot(middle, path.proposed[changed, i], ".", color=INK, ms=4.0)
             handles["proposed, but overridden"] = Line2D([], [], ls="none", marker=".", color=INK)
-    for limit in (-plant.u_max[i], plant.u_max[i]):
-        axis.axhline(limit, **LIMIT)
-    axis.set_ylim(-1.15 * plant.u_max[i], 1.15 * plant.u_max[i])
+    limit = float(np.atleast_1d(plant.u_max)[i])
+    for end in (-limit, limit):
+        axis.axhline(end, **LIMIT)
+    axis.set_ylim(-1.15 * limit, 1.15 * limit)
     label(
         axis,
         "",

@@ -51,7 +51,7 @@ def test_smoke_run_leaves_every_file_of_the_contract(smoke):
     assert run.returncode == 0, run.stderr
     left = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file() and "tensorboard" not in path.parts}
     expected = {"summary.json", "episodes.parquet", "report.html", "certificate.json"}
-    expected |= {f"figures/{name}.png" for name in ("training", "phase", "episode")}
+    expected |= {f"figures/{name}.png" for name in ("training", "scatter", "phase", "episode")}
     for arm in ("shielded", "unshielded"):
         expected |= {f"models/{arm}-{i}/{name}" for i in range(2) for name in ("model.zip", "normalizer.pkl")}
     assert left == expected
@@ -91,7 +91,7 @@ def test_smoke_run_prints_the_table_and_the_files(smoke):
 def test_report_is_one_self_contained_page(smoke):
     out, _ = smoke
     page = (out / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 3
+    assert page.count("data:image/png;base64,") == 4
     assert "http://" not in page
     assert "https://" not in page
     assert "(E1) Sigma - A Sigma A&#x27;/lam_e" in page

@@ -321,6 +321,14 @@ def test_after_no_violation_the_scatter_still_shows_what_the_probability_is_at_m
     assert upper > 50.0
 
 
+def test_arms_that_coincide_have_markers_of_different_sizes():
+    shown = arms(*ALL_ARMS)
+    for axis in scatter_figure(summary_of(shown)["arms"], shown).axes:
+        means = [line.get_markersize() for line in axis.get_lines() if len(line.get_xdata()) == 1]
+        assert means == sorted(set(means), reverse=True)
+        assert len(means) == len(ALL_ARMS)
+
+
 def test_one_run_has_no_interval_of_the_return_and_all_zero_costs_have_a_plain_axis():
     shown = arms("shielded", runs=1)
     axis = scatter_figure(summary_of(shown)["arms"], shown).axes[0]

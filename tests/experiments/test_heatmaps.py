@@ -63,10 +63,19 @@ def test_all_panels_share_one_color_scale():
     assert {axis.images[0].get_clim() for axis in shown} == {(-500.0, -1.5)}
 
 
-def test_violations_are_shown_on_the_whole_scale_even_if_there_are_none():
+def test_no_violations_are_pale_and_few_are_not_as_dark_as_many():
     axis = panels(heatmap_figure(cells(["shielded"], rate=0.0), ["shielded"], QUANTITIES["violations"]))[0]
-    assert axis.images[0].get_clim() == (0.0, 100.0)
+    assert axis.images[0].get_clim() == (0.0, 10.0)
     assert set(numbers(axis)) == {"0"}
+    axis = panels(heatmap_figure(cells(["shielded"], rate=0.7), ["shielded"], QUANTITIES["violations"]))[0]
+    assert axis.images[0].get_clim() == (0.0, 70.0)
+
+
+def test_small_rates_have_another_digit():
+    grid = cells(["shielded"], losses=(0.0, 0.3), delays=(0,))
+    grid[1]["arms"]["shielded"]["intervention_rate"] = 0.0004
+    axis = panels(heatmap_figure(grid, ["shielded"], QUANTITIES["interventions"]))[0]
+    assert numbers(axis) == ["0", "0.04"]
 
 
 def test_roundings_and_bursts_have_panels_of_their_own():

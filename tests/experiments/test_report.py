@@ -11,14 +11,14 @@ from shields.condition import flag
 from tests.experiments.results import ALL_ARMS, provenance, run, summary_of
 
 VERIFIED = Report((flag("(E1) Sigma - A Sigma A' >= 0", True), flag("(S) the safe set", True)))
-PNG = b"\x89PNG pixels"
+PNG = b"\x89PNG" + bytes(12) + (1360).to_bytes(4) + b"pixels"
 ATTACK = "<script>alert('&')</script>"
 
 
 class Reader(HTMLParser):
     """Reads a page: tables by name, text, and tags that were not closed."""
 
-    VOID = ("meta", "img", "br")
+    VOID = ("meta", "img", "br", "wbr")
 
     def __init__(self, page):
         super().__init__()
@@ -103,6 +103,7 @@ def test_figures_are_embedded_with_their_captions():
     reader = Reader(comparison("shielded", figures={"First. Of all.": PNG, "Second. Too.": b"other"}))
     images = [attributes for tag, attributes in reader.tags if tag == "img"]
     assert [image["alt"] for image in images] == ["First", "Second"]
+    assert images[0]["width"] == "1000"
     assert base64.b64decode(images[0]["src"].partition(",")[2]) == PNG
     assert "Second. Too." in reader.text
 
@@ -158,6 +159,8 @@ def test_over_a_handful_of_runs_the_bootstrap_is_called_too_narrow_and_over_many
 def test_one_run_has_no_interval_and_the_page_says_so():
     page = comparison("unshielded", "shielded", runs=1)
     assert "none: one run" in page
+    assert "1 run</td>" in page
+    assert "1 runs" not in page
     assert "how training varies is unknown" in page
     assert "bootstrap over" not in page
 
