@@ -17,7 +17,7 @@ from experiments.plotting import STYLE, label, legend_below, thousands
 from experiments.unit import UnitResult
 
 # Markers of the first arm and of the last [points]: where arms coincide, those below show.
-SIZES = (13.0, 6.0)
+SIZES = (12.0, 7.5)
 
 Arms = dict[str, Sequence[UnitResult]]
 
@@ -32,8 +32,10 @@ def scatter_figure(summary: dict[str, dict[str, Any]], arms: Arms) -> Figure:
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11.0, 4.4), layout="constrained")
         steps, episodes = figure.subplots(1, 2, sharey=True)
-        for (name, results), size in zip(arms.items(), np.linspace(*SIZES, len(arms)), strict=True):
-            arm, style = summary[name], replace(style_of(name), size=float(size))
+        sizes = np.linspace(*SIZES, len(arms))
+        styles = {name: replace(style_of(name), size=float(size)) for name, size in zip(arms, sizes, strict=True)}
+        for name, results in arms.items():
+            arm, style = summary[name], styles[name]
             per_episode = [_mean(result, "violation_steps") for result in results]
             rates = [100.0 * float(np.mean([e.violation_steps > 0 for e in result.episodes])) for result in results]
             _draw_arm(steps, style, arm, per_episode, float(np.mean(per_episode)), None)
@@ -43,7 +45,7 @@ def scatter_figure(summary: dict[str, dict[str, Any]], arms: Arms) -> Figure:
         label(episodes, "violating evaluation episodes [%]", "")
         for axis in (steps, episodes):
             _scale(axis)
-        legend_below(figure, {name: style_of(name).handle(line=False, points=True) for name in arms})
+        legend_below(figure, {name: style.handle(line=False, points=True) for name, style in styles.items()})
         return figure
 
 
@@ -60,7 +62,8 @@ def scatter_caption(arms: Arms) -> str:
         text += " A marker is one run, so the return has no interval;"
     text += (
         " horizontal bars on the right Clopper and Pearson's 95 % interval of violating episodes given the trained"
-        " agents. Markers differ in size only to show where they coincide. Violations are those of the true state, returns the environment's own, without penalties."
+        " agents. Markers differ in size only to show where they coincide. Violations are those of the true state,"
+        " returns the environment's own, without penalties."
     )
     lengths = {episode.steps for results in arms.values() for result in results for episode in result.episodes}
     if len(lengths) > 1:
@@ -88,7 +91,7 @@ def _draw_arm(
     """
     mean = arm["eval_return_mean"]
     if len(costs) > 1:
-        axis.plot(costs, arm["eval_return_by_run"], "o", ms=4.5, mfc=style.color, mec="white", mew=0.6, zorder=4)
+        axis.plot(costs, arm["eval_return_by_run"], "o", ms=4.5, mfc=style.color, mec="white", mew=0.6, zorder=2.5)
     if arm["eval_return_ci95"] is not None:
         axis.plot([cost, cost], arm["eval_return_ci95"], "-_", color=style.color, lw=1.3, ms=9.0, mew=1.3)
     if bounds is not None:
