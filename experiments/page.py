@@ -28,6 +28,7 @@ th:first-child, td:first-child { text-align: left; padding-left: 0; position: st
 tr.rule td { border-top: 2px solid #b9c0c5; }
 table.words td { text-align: left; position: static !important; white-space: normal;
   overflow-wrap: anywhere; }
+wbr { display: none; }
 .interval { color: var(--soft); display: block; font-size: .92em; }
 .list { display: inline-block; min-width: 8rem; white-space: normal; }
 .swatch { display: inline-block; width: .7em; height: .7em; border-radius: 50%; margin-right: .5em; }
@@ -42,12 +43,14 @@ pre { background: var(--wash); padding: .9rem 1rem; border-radius: 4px; overflow
 .columns { columns: 2 24rem; column-gap: 2.5rem; } .columns table { width: 100%;
   border-collapse: separate; border-spacing: 0; } .columns tr { break-inside: avoid; }
 @media (max-width: 40rem) {
+  wbr { display: inline; }
   body { padding: 1.25rem 1rem 3rem; font-size: 15px; } h1 { font-size: 1.4rem; }
   dl { display: block; } dd { margin-bottom: .5rem; }
   tbody td:first-child { white-space: normal; min-width: 7rem; max-width: 9rem; }
   figure .scroll img { max-width: 44rem; }
 }
 @media print {
+  wbr { display: inline; }
   @page { margin: 14mm; } html { font-size: 11px; } body { max-width: none; padding: 0; font-size: 1rem; }
   h2 { break-after: avoid; } figure, tr { break-inside: avoid; } .scroll { overflow: visible; }
   th, td { padding: .3rem .4rem; min-width: 0; } .whole, pre { white-space: pre-wrap; } .list { min-width: 5rem; }

@@ -38,8 +38,9 @@ def phase_figure(plant: LinearPlant, certificate: Certificate, arms: Arms) -> Fi
         handles: dict[str, Artist] = {}
         for panel, (name, results) in zip(panels.flat, arms.items(), strict=False):
             handles |= _draw_sets(panel, plant, certificate, plane)
+            color, alpha = style_of(name).color, max(0.8 - 0.05 * len(results), 0.3)  # many paths stay apart
             for result in results:
-                handles |= _draw_path(panel, plant, result.trajectory.states, plane, style_of(name).color)
+                handles |= _draw_path(panel, plant, result.trajectory.states, plane, color, alpha)
             panel.set_title(name)
         for panel in panels.flat[len(arms) :]:
             panel.set_visible(False)
@@ -75,11 +76,11 @@ def plane_of(certificate: Certificate, arms: Arms) -> tuple[int, int]:
 
 
 def _draw_path(
-    axis: Axes, plant: LinearPlant, states: np.ndarray, plane: tuple[int, int], color: str
+    axis: Axes, plant: LinearPlant, states: np.ndarray, plane: tuple[int, int], color: str, alpha: float
 ) -> dict[str, Artist]:
     """Draws one trajectory, its start and its violating states."""
     x, y = states[:, plane].T
-    axis.plot(x, y, color=color, lw=0.9, alpha=0.8)
+    axis.plot(x, y, color=color, lw=0.9, alpha=alpha)
     (start,) = axis.plot(x[:1], y[:1], "o", ls="none", ms=5, mfc="white", mec=INK, mew=1.0)
     handles: dict[str, Artist] = {"start": start}
     outside = plant.constraint_values(states.T).max(axis=0) > 0.0

@@ -18,12 +18,13 @@ from experiments.result_tables import (
     safety_table,
     violating_text,
 )
+from experiments.statistics import RESAMPLES
 from shields import Report
 
 MODES = {
-    "project": "the closest input that is provably safe is applied instead",
-    "switch": "the certified input K x_hat is applied instead",
-    "boundary": "the certified input K x_hat is applied instead, unless every input would be safe",
+    "project": "where the action is not provably safe, the closest input that is takes its place.",
+    "switch": "where the action is not provably safe, the certified input K x_hat takes its place.",
+    "boundary": "where not every input would be provably safe, the certified input K x_hat takes the action's place.",
 }
 # With fewer runs the percentile bootstrap is plainly too narrow.
 FEW_RUNS = 10
@@ -112,7 +113,7 @@ def _explained(name: str, settings: dict[str, Any]) -> str:
     if arm.mode == "monitor":
         return "unshielded too; a shield watches, and counts in brackets what it would have overridden."
     price = f" In training every intervention costs {settings['intervention_penalty']:g} of reward."
-    return f"where the action is not provably safe, {MODES[arm.mode]}.{price if arm.prices_interventions else ''}"
+    return MODES[arm.mode] + (price if arm.prices_interventions else "")
 
 
 def _safety_note(arms: dict[str, Any], references: dict[str, Any]) -> str:
@@ -144,7 +145,7 @@ def _return_note(runs: int) -> str:
 
 def _bootstrap_note(runs: int) -> str:
     if runs >= FEW_RUNS:
-        return f"The bootstrap's is the percentile interval of 10,000 resamples of {runs} runs."
+        return f"The bootstrap's is the percentile interval of {RESAMPLES:,} resamples of {runs} runs."
     return (
         f"A percentile bootstrap over {runs} runs is too narrow: it cannot reach beyond the lowest and the highest "
         "run. Believe the wider one."

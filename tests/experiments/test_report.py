@@ -213,4 +213,4 @@ def test_sweep_has_a_row_per_channel_and_arm():
 def test_the_shield_is_explained_as_its_mode_acts(mode):
     assert arm_of("shielded", mode).mode == mode
     assert ("closest input" in comparison("shielded", mode=mode)) == (mode == "project")
-    assert ("unless every input" in swept("shielded", mode=mode)) == (mode == "boundary")
+    assert ("where not every input" in swept("shielded", mode=mode)) == (mode == "boundary")
