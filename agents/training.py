@@ -21,6 +21,9 @@ from agents.sb3_vec_env import EPISODE_KEYS, SB3VecEnv
 from agents.settings import PPOSettings
 from shields import Certificate, SafetyShield, VectorSafetyShield
 
+# Files of a saved agent.
+MODEL, NORMALIZER = "model.zip", "normalizer.pkl"
+
 
 @dataclass(frozen=True)
 class Shielding:
@@ -55,8 +58,35 @@ class Agent:
 
     def save(self, folder: Path) -> None:
         """Writes `model.zip` and `normalizer.pkl` into an existing folder."""
-        self.model.save(folder / "model.zip")
-        self.normalizer.save(str(folder / "normalizer.pkl"))
+        self.model.save(folder / MODEL)
+        self.normalizer.save(str(folder / NORMALIZER))
+
+    @classmethod
+    def load(cls, file: Path, env_id: str) -> Agent:
+        """Returns what `save` wrote, by the path of the model; without a normalizer beside it, raw input.
+
+        Raises:
+            ValueError: If it is no PPO model, or belongs to an environment with other spaces.
+            OSError: If it cannot be read.
+        """
+        with file.open("rb"):
+            pass  # stable-baselines3 would look for another name
+        try:
+            model = PPO.load(file, device="cpu")
+        except Exception as error:
+            raise ValueError(f"{file} is no PPO model of stable-baselines3") from error
+        env = DummyVecEnv([lambda: make_env(env_id)])
+        if (model.observation_space.shape, model.action_space.shape) != (
+            env.observation_space.shape,
+            env.action_space.shape,
+        ):
+            raise ValueError(f"{file} was trained on an environment with other spaces than {env_id}")
+        beside = file.with_name(NORMALIZER)
+        if not beside.exists():
+            return cls(model, VecNormalize(env, training=False, norm_obs=False))
+        normalizer = VecNormalize.load(str(beside), env)
+        normalizer.training = False
+        return cls(model, normalizer)
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,7 @@ def _parse() -> object:
             "verify": settings.VerifySettings,
             "audit": settings.AuditSettings,
             "reproduce": settings.ReproduceSettings,
+            "render": settings.RenderSettings,
         },
         prog="ncs",
         description="Safe learning control over imperfect networks.",
@@ -50,8 +51,13 @@ def _run(chosen: object) -> None:
     from experiments import settings
 
     if isinstance(chosen, settings.CompareSettings):
-        _require_training_extra()
+        _require_extra("train", "stable_baselines3", "torch", "tensorboard", "pyarrow")
         from experiments.compare import compare as run
+    elif isinstance(chosen, settings.RenderSettings):
+        if chosen.policy not in ("greedy", "zero", "random"):
+            _require_extra("train", "stable_baselines3", "torch")
+        _require_extra("render", "pygame", *(["moviepy"] if chosen.out.suffix == ".mp4" else []))
+        from experiments.render import render as run
     elif isinstance(chosen, settings.AuditSettings):
         from experiments.audit import audit as run
     elif isinstance(chosen, settings.ReproduceSettings):
@@ -74,12 +80,11 @@ def _require_own_agents() -> None:
         )
 
 
-def _require_training_extra() -> None:
-    packages = ("stable_baselines3", "torch", "tensorboard", "pyarrow")
+def _require_extra(extra: str, *packages: str) -> None:
     missing = [name for name in packages if importlib.util.find_spec(name) is None]
     if missing:
         raise ModuleNotFoundError(
-            f"this command needs {', '.join(missing)}: install the training extra, pip install 'ncs-gym[train]'"
+            f"this command needs {', '.join(missing)}: install the extra, pip install 'ncs-gym[{extra}]'"
         )
 
 
