@@ -84,7 +84,7 @@ def _palette() -> Image.Image:
     """Returns an image that carries the colors of our pictures; one made from the pictures forgets small red things."""
     grounds = (theme.PAPER, theme.MIST, theme.SAFE_FILL, theme.DANGER_FILL, theme.ERROR_FILL, theme.SHIELD_FILL)
     marks = (theme.INK, theme.MUTED, theme.STEEL, theme.FAINT, theme.SAFE, theme.DANGER, theme.ESTIMATE, theme.LATE)
-    marks = (*marks, theme.SHIELD, theme.BODYWORK)
+    marks = (*marks, theme.LATE_TEXT, theme.SHIELD, theme.BODYWORK)
     ramp = [theme.strain(share) for share in np.linspace(0.6, 0.95, 9)]
     edges = [theme.blend(mark, ground, share) for mark, ground, share in product(marks, grounds, EDGE_SHARES)]
     colors = list(dict.fromkeys([*grounds, *marks, theme.GRID, theme.LOAD, theme.CRATE, theme.GLASS, *ramp, *edges]))[

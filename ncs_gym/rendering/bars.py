@@ -80,7 +80,7 @@ def _row(plant: LinearPlant, index: int) -> tuple[str, str, float, Callable[[np.
     row = plant.C[index]
     if np.count_nonzero(row) != 1:
         return f"limit {index + 1}", "", 1.0, lambda state: float(row @ state)
-    (i,) = np.flatnonzero(row)
+    i = int(np.flatnonzero(row)[0])
     limit = 1.0 / abs(row[i])
     return plant.state_names[i], unit_text(plant.state_units[i]), limit, lambda state: float(state[i]) / limit
 

@@ -125,7 +125,7 @@ def _draw_packets(canvas: Canvas, scene: Scene, y: float) -> None:
     """Draws the fate of the packets sent in the last steps, the newest at the right."""
     old = scene.age
     text = "newest used: now" if old == 0 else f"newest used: {old} step{'s' if old > 1 else ''} old"
-    _draw_title(canvas, y, "packets sent", text, theme.LATE if old else theme.ESTIMATE)
+    _draw_title(canvas, y, "packets sent", text, theme.LATE_TEXT if old else theme.ESTIMATE)
     track = theme.Rect(theme.PANEL.x, y + 18, theme.PANEL.w, TRACK)
     canvas.rect(track, theme.MIST, radius=4)
     spacing = (track.w - 14) / (RECENT - 1)

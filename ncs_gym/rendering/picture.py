@@ -25,7 +25,10 @@ POLE_STATES = ("position", "speed", "angle", "angular rate")
 class Stage(Protocol):
     """Draws the plant itself, in the upper part of the picture."""
 
-    pair: tuple[int, int]
+    @property
+    def pair(self) -> tuple[int, int]:
+        """The states in the phase plane."""
+        ...
 
     def draw_background(self, canvas: Canvas) -> None:
         """Draws what stays."""

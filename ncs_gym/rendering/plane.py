@@ -78,7 +78,7 @@ class PhasePlane:
         points = [self._visible(state) for state in scene.path[:, list(self._pair)]]
         count = len(points)
         for i in range(1, count):
-            color = theme.blend(theme.GRID, theme.MUTED, i / count)
+            color = theme.blend(theme.FAINT, theme.INK, i / count)
             canvas.line(points[i - 1 : i + 1], color, 1.5)
         for point, acted in zip(points, scene.acted, strict=True):
             if acted:

@@ -110,7 +110,7 @@ def goal_of(task: Task, plant: LinearPlant, memory: Any, state: np.ndarray) -> G
     if isinstance(task, SetpointTracking):
         used, name, unit = np.flatnonzero(task.output), "output", ""
         if len(used) == 1:
-            name, unit = plant.state_names[used[0]], plant.state_units[used[0]]
+            name, unit = plant.state_names[int(used[0])], plant.state_units[int(used[0])]
         value = float(task.output @ state)
         return Goal(name=name, unit=unit, value=value, target=float(memory), low=-task.reach, high=task.reach)
     return None

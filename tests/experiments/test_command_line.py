@@ -27,7 +27,8 @@ ARM_KEYS = {
 def ncs(*arguments, cwd=None, **environment):
     command = [sys.executable, "-m", "experiments", *map(str, arguments)]
     root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-    env = os.environ | {"PYTHONPATH": root} | environment
+    path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
+    env = os.environ | {"PYTHONPATH": path} | environment
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, env=env, timeout=300)
 
 
@@ -123,7 +124,7 @@ def test_synthesize_then_verify(tmp_path):
     assert_one_sentence(other, "does not verify")
 
 
-@pytest.mark.parametrize("command", ["compare", "synthesize", "verify", "audit", "reproduce"])
+@pytest.mark.parametrize("command", ["compare", "synthesize", "verify", "audit", "reproduce", "render"])
 def test_every_command_has_help_seed_and_out(command):
     run = ncs(command, "--help")
     assert run.returncode == 0
