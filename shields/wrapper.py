@@ -84,13 +84,13 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode; see `NCSEnv.reset`."""
         self._clock = self._clock and INTERRUPTED
-        self._interventions = 0
         if self._is_drawn:
-            self._annotate(None, intervened=False)
+            self._annotate(None, 0, intervened=False)
         observation, info = self.env.reset(seed=seed, options=options)
         clock = self._read_clock()
         self._proof.start(starts_inside(self.certificate, self.env.unwrapped.start), clock[1] == 0, info)
         self._estimate, self._error_shape = np.array(info["estimate"]), np.array(info["error_shape"])
+        self._interventions = 0
         u = np.zeros(self.filter.plant.m)
         margin = self.filter.margin(self._estimate, self._error_shape, u)
         self._clock = clock
@@ -110,7 +110,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         if decision.intervened and self.filter.mode != "monitor":
             action = (decision.input / self.filter.plant.u_max).astype(np.float32)
         if self._is_drawn:
-            self._annotate(proposed, intervened=decision.intervened)
+            self._annotate(proposed, self._interventions + decision.intervened, intervened=decision.intervened)
         (episode, step), self._clock = self._clock, INTERRUPTED
         observation, reward, terminated, truncated, info = self.env.step(action)
         clock = self._read_clock()
@@ -125,14 +125,14 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         """Returns the number of episodes begun and of steps taken in this one."""
         return self.env.unwrapped.episodes, self.env.unwrapped.steps
 
-    def _annotate(self, proposed: np.ndarray | None, *, intervened: bool) -> None:
+    def _annotate(self, proposed: np.ndarray | None, interventions: int, *, intervened: bool) -> None:
         """Tells the picture of the step that follows what the shield does in it."""
         note = Annotation(
             safe_set=self.certificate.safe_set,
             label=self.filter.mode,
             proposed=proposed,
             intervened=intervened,
-            interventions=self._interventions + intervened,
+            interventions=interventions,
             protects=self.filter.mode != "monitor",
         )
         self.env.unwrapped.annotate(note)

@@ -19,6 +19,8 @@ TOP = theme.LANE + 27
 SPACING = 28.0
 # The bars reach this far, in units of the limit.
 REACH = 1.3
+# For names and numbers beside the bars, with one column and with two [pixels].
+ROOM, LESS_ROOM = 150.0, 96.0
 OUTSIDE = theme.blend(theme.DANGER_FILL, theme.DANGER, 0.15)
 
 
@@ -34,13 +36,14 @@ class BarStage:
         states = [int(np.flatnonzero(row)[0]) for row in plant.C if np.count_nonzero(row) == 1]
         order = list(dict.fromkeys([*states, *range(plant.n)]))
         self.pair = (min(order[:2]), max(order[:2]))
+        self._room = ROOM if len(self._rows) <= COLUMN else LESS_ROOM
         self._hidden = len(plant.C) - len(self._rows)
 
     def draw_background(self, canvas: Canvas) -> None:
         """Draws names, limits and tracks."""
         for i, (name, _, _, _) in enumerate(self._rows):
             track = self._track(i)
-            canvas.text(name, (track.x - 10, track.y + 7), theme.INK, align=1.0)
+            canvas.text(name, (track.x - 10, track.y + 7), theme.INK, align=1.0, most=self._room)
             canvas.rect(track, OUTSIDE, radius=3)
             inner = track.w / REACH
             canvas.rect(theme.Rect(track.x + (track.w - inner) / 2, track.y, inner, track.h), theme.PAPER)
@@ -62,7 +65,7 @@ class BarStage:
             mark = _x(track, guess)
             canvas.dashed([(mark, track.y - 4), (mark, track.bottom + 4)], theme.ESTIMATE, 2.0, dash=3.0)
             text = f"{reading(value * limit, limit)} {unit}".strip()
-            canvas.text(text, (track.right + 10, track.y + 7), color, bold=abs(value) > 0.8)
+            canvas.text(text, (track.right + 10, track.y + 7), color, bold=abs(value) > 0.8, most=self._room)
         draw_lane(canvas, scene, 130.0, theme.WIDTH - 130.0)
 
     def _track(self, index: int) -> theme.Rect:

@@ -131,6 +131,7 @@ class Canvas:
         align: float = 0.0,
         bold: bool = False,
         upright: bool = False,
+        most: float | None = None,
     ) -> float:
         """Writes text whose vertical middle is at `place`.
 
@@ -142,10 +143,13 @@ class Canvas:
             align: 0 puts the left end at `place`, 0.5 the middle, 1 the right end.
             bold: Whether to use the bold font.
             upright: Turns it by 90 degrees; `place` is its middle then.
+            most: Cuts it to this length [pixels].
 
         Returns:
             Its width [pixels].
         """
+        while most is not None and len(text) > 1 and self.text_width(text, size, bold=bold) > most:
+            text = text[:-2] + "\N{HORIZONTAL ELLIPSIS}"
         image = self._text(text, size, bold, color, upright)
         width, height = image.get_size()
         share = 0.5 if upright else align

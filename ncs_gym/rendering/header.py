@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import ceil, log10
+
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.scene import Scene
@@ -50,4 +52,4 @@ def _draw_chip(
 
 def _decimals(dt: float) -> int:
     """Returns how many decimals of a second a step of dt needs."""
-    return 1 if dt >= 0.1 else 2
+    return min(max(1, ceil(-log10(dt))), 6)

@@ -60,8 +60,8 @@ def _draw_disc(canvas: Canvas, center: tuple[float, float], fill: theme.Color, e
 
 
 def _draw_title(canvas: Canvas, y: float, name: str, value: str, color: theme.Color) -> None:
-    canvas.text(name, (theme.PANEL.x, y + 6), theme.INK)
-    canvas.text(value, (theme.PANEL.right, y + 6), color, align=1.0, bold=True)
+    width = canvas.text(value, (theme.PANEL.right, y + 6), color, align=1.0, bold=True)
+    canvas.text(name, (theme.PANEL.x, y + 6), theme.INK, most=theme.PANEL.w - width - 8)
 
 
 def _draw_input(canvas: Canvas, scene: Scene, index: int, y: float) -> None:

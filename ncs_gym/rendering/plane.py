@@ -102,6 +102,6 @@ class PhasePlane:
             canvas.text(number(value[0]), (x, rect.bottom + 11), theme.MUTED, align=0.5)
             canvas.text(number(value[1]), (rect.x - 6, y), theme.MUTED, align=1.0)
         middle = rect.x + rect.w / 2, rect.bottom + 30
-        canvas.text(titled(plant.state_names[i], plant.state_units[i]), middle, theme.INK, align=0.5)
+        canvas.text(titled(plant.state_names[i], plant.state_units[i]), middle, theme.INK, align=0.5, most=rect.w)
         middle = rect.x - 48, rect.y + rect.h / 2
-        canvas.text(titled(plant.state_names[j], plant.state_units[j]), middle, theme.INK, upright=True)
+        canvas.text(titled(plant.state_names[j], plant.state_units[j]), middle, theme.INK, upright=True, most=rect.h)

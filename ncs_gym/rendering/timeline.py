@@ -49,7 +49,7 @@ class Timeline:
             canvas.text(number(-back), (self._x(back), rect.bottom + 11), theme.MUTED, align=0.5)
         canvas.text("time [steps]", (rect.x + rect.w / 2, rect.bottom + 30), theme.INK, align=0.5)
         title = titled(plant.state_names[0], plant.state_units[0])
-        canvas.text(title, (rect.x - 48, rect.y + rect.h / 2), theme.INK, upright=True)
+        canvas.text(title, (rect.x - 48, rect.y + rect.h / 2), theme.INK, upright=True, most=rect.h)
 
     def draw(self, canvas: Canvas, scene: Scene) -> None:
         """Draws the path, the error bound as a bar, estimate and truth."""
