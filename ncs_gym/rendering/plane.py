@@ -14,6 +14,8 @@ from ncs_gym.rendering.scene import Scene
 REACH = 1.5
 # What is farther out is drawn this many pixels inside the frame.
 EDGE = 7.0
+# No line ends farther out than this, which pygame would take long to draw [pixels].
+BEYOND = 2000.0
 
 
 class PhasePlane:
@@ -62,10 +64,9 @@ class PhasePlane:
         """Draws what moves: error ellipse, path, estimate and truth."""
         canvas.clip(self.rect)
         pair = list(self._pair)
-        ellipse = self.place(scene.estimate[pair] + self._shadow(scene.error_shape))
-        if np.abs(ellipse).max() < 1e5:
-            canvas.polygon(ellipse, theme.ERROR_FILL)
-            canvas.line([*ellipse, ellipse[0]], theme.LATE, 1.0)
+        ellipse = self.place(scene.estimate[pair] + self._shadow(scene.error_shape)).clip(-BEYOND, BEYOND)
+        canvas.polygon(ellipse, theme.ERROR_FILL)
+        canvas.line([*ellipse, ellipse[0]], theme.LATE, 1.0)
         self._draw_path(canvas, scene)
         canvas.circle(self._visible(scene.estimate[pair]), 5.0, theme.ESTIMATE, width=1.5)
         truth = self._visible(scene.state[pair])

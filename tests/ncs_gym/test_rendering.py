@@ -214,8 +214,11 @@ def test_intervention_shows_in_the_header_and_at_the_input(picture):
     acting = replace(quiet, intervened=True, interventions=1)
     frames = [picture.pixels(scene(step=1, input=np.array([1.0]), annotation=note)) for note in (quiet, acting)]
     bar = theme.Rect(theme.PANEL.x, theme.PANEL.y + 16, theme.PANEL.w, 16)
+    beyond = theme.Rect(bar.right - bar.w / 4, bar.y, bar.w / 4, bar.h)  # between the applied input and the proposed
     for rect in (theme.HEADER, bar):
         assert count(frames[1], theme.SHIELD, rect) > count(frames[0], theme.SHIELD, rect) + 100
+    assert count(frames[0], theme.SHIELD, beyond) == 0
+    assert count(frames[1], theme.SHIELD, beyond) > 60
     assert count(frames[1], theme.SHIELD_FILL, theme.STAGE, off=4) > 10_000
     watching = picture.pixels(scene(step=1, input=np.array([4.0]), annotation=replace(acting, protects=False)))
     assert count(watching, theme.SHIELD_FILL, theme.STAGE, off=4) == 0
@@ -250,6 +253,10 @@ def test_annotation_lasts_one_step():
     assert env._film.history.annotation is note
     env.step(np.zeros(1, np.float32))
     assert env._film.history.annotation is None
+    env.annotate(note)
+    for expected in (note, None):
+        env.step(np.zeros(1, np.float32))
+        assert env._film.history.annotation is expected
 
 
 def test_history_forgets():
