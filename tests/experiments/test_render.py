@@ -177,9 +177,14 @@ def test_wrong_settings_raise_before_anything_is_played(changes, words, tmp_path
 
 
 def test_errors_of_the_command_are_one_sentence(tmp_path):
+    assert_one_sentence(ncs("render", "--steps", 0, "--out", "a.gif", cwd=tmp_path), "--steps must be at least 1")
+    assert not (tmp_path / "a.gif").exists()
+
+
+def test_file_that_is_no_model_is_refused(tmp_path):
     (tmp_path / "model.zip").write_text("no model")
-    run = ncs("render", "--policy", "model.zip", "--shield", "none", "--out", "a.gif", cwd=tmp_path)
-    assert_one_sentence(run, "model.zip is no PPO model")
+    with pytest.raises(ValueError, match=r"model\.zip is no PPO model"):
+        render(settings(policy=str(tmp_path / "model.zip"), shield="none", out=tmp_path / "a.gif"))
     assert not (tmp_path / "a.gif").exists()
 
 
