@@ -15,7 +15,7 @@ from ncs_gym.rendering import theme
 from shields.storage import write_atomically
 
 FORMATS = (".gif", ".mp4", ".png")
-# How long a GIF rests on its last picture before it begins again [ms].
+# How long an animation rests on its last picture [ms].
 REST = 2000
 # Mixtures of foreground and background that edges need.
 EDGE_SHARES = (0.35, 0.7)
@@ -64,7 +64,9 @@ def _gif(pictures: Iterable[Image.Image], fps: int) -> bytes:
 def _mp4(pictures: Iterable[Image.Image], fps: int) -> bytes:
     from moviepy.video.io.ImageSequenceClip import ImageSequenceClip
 
-    clip = ImageSequenceClip([np.asarray(each) for each in pictures], fps=fps)
+    frames = [np.asarray(each) for each in pictures]
+    frames += frames[-1:] * max(1, REST * fps // 1000)  # moviepy drops the last one
+    clip = ImageSequenceClip(frames, fps=fps)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "episode.mp4"
         clip.write_videofile(str(file), audio=False, logger=None)
