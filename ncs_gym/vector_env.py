@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 from ncs_gym import kernels
 from ncs_gym.channel import Channel, GilbertElliott
 from ncs_gym.disturbance import checked_many, stays_inside
-from ncs_gym.env import NCSEnv
+from ncs_gym.env import NCSEnv, RenderModeError
 from ncs_gym.frozen import as_count, as_numbers
 from ncs_gym.gain_table import GainTable
 from ncs_gym.plant import LinearPlant
@@ -57,7 +57,9 @@ class NCSVectorEnv(VectorEnv):
         limit = max_episode_steps
         self.max_episode_steps = None if limit is None else as_count(limit, "max_episode_steps", low=1)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.metadata = NCSEnv.metadata | {"autoreset_mode": self.autoreset_mode}
+        self.metadata = NCSEnv.metadata | {"autoreset_mode": self.autoreset_mode, "render_modes": []}
+        if settings.get("render_mode") is not None:
+            raise RenderModeError("a vector environment draws nothing: use gym.make(..., render_mode=...)")
         self.single = NCSEnv(**settings)
         self.plant, self.channel, self.task = self.single.plant, self.single.channel, self.single.task
         self.contract, self.error_set, self.render_mode = self.single.contract, self.single.error_set, None

@@ -32,7 +32,8 @@ ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)
 
 def ncs(*arguments, cwd=None, **environment):
     command = [sys.executable, "-m", "experiments", *map(str, arguments)]
-    env = os.environ | {"PYTHONPATH": ROOT} | environment
+    path = os.pathsep.join(filter(None, [ROOT, os.environ.get("PYTHONPATH")]))
+    env = os.environ | {"PYTHONPATH": path} | environment
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, env=env, timeout=300)
 
 
@@ -217,7 +218,7 @@ def test_synthesize_then_verify(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "command", ["compare", "train", "evaluate", "sweep", "synthesize", "verify", "audit", "reproduce"]
+    "command", ["compare", "train", "evaluate", "sweep", "render", "synthesize", "verify", "audit", "reproduce"]
 )
 def test_every_command_has_help_seed_and_out(command):
     run = ncs(command, "--help")
