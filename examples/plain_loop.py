@@ -14,7 +14,7 @@ x = np.zeros(2)  # the real plant would be here
 estimator.reset(x + plant.initial_noise.sample(rng))
 under_way, overridden, worst = [], 0, 0.0
 for step in range(1000):
-    wanted = np.array([4.0 if step % 50 < 25 else -4.0])  # your controller
+    wanted = np.array([2.2 if step % 50 < 25 else -2.2])  # your controller
     decision = shield.decide(estimator.belief.mean, estimator.belief.shape, wanted)
     overridden += decision.intervened
     x = plant.A @ x + plant.B @ decision.input + plant.process_noise.sample(rng)
