@@ -57,9 +57,9 @@ class GainTable:
         accepted: Whether the replayed history is kept, shape (edges,).
         fresh: Age of the newest sample used after it; UNKNOWN if as before. Shape (edges,).
         held: Whether a sample of each age is used in the replay, shape (edges, buffer + 1).
-        gains: Its gain, zero where it is not used, shape (edges, buffer + 1, n, p).
+        weights: Its gain, zero where it is not used, n * p numbers, and (seen + N)^-1 of the monitor's quick test, p * p
+            numbers; shape (edges, buffer + 1, n * p + p * p).
         seen: H Sigma_k H' before each update, shape (edges, buffer + 1, p, p).
-        checks: (seen + N)^-1 of the monitor's quick test, shape (edges, buffer + 1, p, p).
     """
 
     def __init__(self, estimator: Estimator) -> None:
@@ -83,8 +83,7 @@ class GainTable:
         self.accepted = np.zeros(FIRST_CAPACITY, np.bool_)
         self.fresh = np.zeros(FIRST_CAPACITY, np.int32)
         self.held = np.zeros((FIRST_CAPACITY, ages), np.bool_)
-        self.gains = np.zeros((FIRST_CAPACITY, ages, n, p))
-        self.checks = np.zeros((FIRST_CAPACITY, ages, p, p))
+        self.weights = np.zeros((FIRST_CAPACITY, ages, n * p + p * p))
         self.seen = np.zeros((FIRST_CAPACITY, ages, p, p))
         first = self._spread(plant.initial_cov, plant.initial_error.shape, 0)
         self.root = self._node(Node(first, (UNKNOWN,) * ages, (False,) * ages))
@@ -181,9 +180,8 @@ class GainTable:
             if held[each]:
                 seen = estimator.plant.H @ self._spreads[spread].shape @ estimator.plant.H.T
                 spread, gain = self._updated(spread)
-                self.held[edge, each], self.gains[edge, each] = True, gain
-                self.seen[edge, each] = seen
-                self.checks[edge, each] = estimator.inverse_of_bound(seen)
+                self.held[edge, each], self.seen[edge, each] = True, seen
+                self.weights[edge, each] = np.append(gain, estimator.inverse_of_bound(seen))
             if each > 0:
                 replayed[each - 1] = self._moved(spread)
         now, then = self._spreads[belief], self._spreads[spread]
@@ -200,6 +198,6 @@ class GainTable:
         edge = self._edges
         self._edges += 1
         if edge == len(self.target):
-            for name in ("target", "accepted", "fresh", "held", "gains", "checks", "seen"):
+            for name in ("target", "accepted", "fresh", "held", "weights", "seen"):
                 self._double(name)
         return edge

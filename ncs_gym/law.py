@@ -1,0 +1,76 @@
+"""Distributions of noise and disturbances as compiled loops draw them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from ncs_gym.disturbance import ROUNDING, BallDisturbance, BoxDisturbance, Disturbance, SphereDisturbance
+from ncs_gym.draws import fill_directions, fill_truncated, fill_uniform
+from ncs_gym.noise import TruncatedGaussian
+from ncs_gym.plant import LinearPlant
+
+# What h in F h is: nothing, uniform in a box, truncated normal, uniform in a ball, uniform on a sphere.
+NOTHING, BOX, NORMAL, BALL, SPHERE = range(5)
+
+
+class Law(NamedTuple):
+    """The distribution of F h.
+
+    Attributes:
+        kind: Of h, whose size is 1.
+        factor: F, shape (n, n).
+        energy: The largest h'h of a truncated normal h.
+    """
+
+    kind: int
+    factor: np.ndarray
+    energy: float = 0.0
+
+
+def law_of_noise(noise: TruncatedGaussian) -> Law:
+    """Returns the law of a truncated Gaussian."""
+    factor = noise.factor
+    if factor is None:
+        return Law(NOTHING, np.zeros_like(noise.covariance))
+    return Law(NORMAL, factor, noise.energy)
+
+
+def law_of_disturbance(source: Disturbance, plant: LinearPlant) -> Law | None:
+    """Returns the law of a disturbance that depends on nothing; None of any other, and of what a user wrote."""
+    n, kind = plant.n, type(source)
+    if kind is BoxDisturbance:
+        return Law(BOX, np.diag(source.widths(plant)))
+    if kind is BallDisturbance:
+        return Law(BALL, np.sqrt(plant.gamma) * np.eye(n))
+    if kind is SphereDisturbance:
+        return Law(SPHERE, (1.0 - ROUNDING) * plant.nominal_disturbance.factor)
+    return None
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_drawn(law, keys, number, out):
+    """Adds a draw F h, numbers from `number` on, to each column of `out`, shape (n, N)."""
+    if law.kind == NOTHING:
+        return
+    n, N = out.shape
+    # The first n coordinates of a direction in n + 2 dimensions are uniform in the ball (Archimedes for n = 1).
+    h = np.empty((n + 2 if law.kind == BALL else n, N))
+    if law.kind == BOX:
+        fill_uniform(keys, number, h)
+        for i in range(n):
+            row = h[i]
+            for e in range(N):
+                row[e] = 2.0 * row[e] - 1.0
+    elif law.kind == NORMAL:
+        fill_truncated(keys, number, law.energy, h)
+    else:
+        fill_directions(keys, number, h)
+    for i in range(n):
+        for j in range(n):
+            share, row, drawn = law.factor[i, j], out[i], h[j]
+            if share != 0.0:
+                for e in range(N):
+                    row[e] += share * drawn[e]
