@@ -99,27 +99,24 @@ def fill_keys(key, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_uniform(keys, number, out):
-    """Fills row i of `out`, shape (rows, N), with draw `number` + i of each key, uniform in (0, 1)."""
-    for i in range(out.shape[0]):
-        shift, row = _mixed(GOLDEN * np.uint64(number + i)), out[i]
-        for e in range(row.size):
-            row[e] = _fraction(_mixed(keys[e] + shift))
+def fill_uniform(keys, number, rows, out):
+    """Fills row i < `rows` of `out`, shape (>= rows, N), with draw `number` + i of each key, uniform in (0, 1)."""
+    for i in range(rows):
+        shift = _mixed(GOLDEN * np.uint64(number + i))
+        for e in range(keys.size):
+            out[i, e] = _fraction(_mixed(keys[e] + shift))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_normal(keys, number, share, most, out):
-    """Fills `out`, shape (rank, N), with standard normal numbers, draws `number`.. of each key, two rows at a time.
+    """Fills `out`, shape (even, N), with standard normal numbers, draws `number`.. of each key, two rows at a time.
 
     A pair lies at an angle uniform in one of four quarters, and at a radius r with r^2 / 2 exponential (Box and Muller
     1958). A `share` below 1 keeps the smaller radii of this probability, and none is above sqrt(most).
     """
-    rank, N = out.shape
-    spare = np.empty(N if rank % 2 else 0)
-    for i in range(0, rank, 2):
-        first, second = out[i], out[i + 1] if i + 1 < rank else spare
+    for i in range(0, out.shape[0], 2):
         one, other = _mixed(GOLDEN * np.uint64(number + i)), _mixed(GOLDEN * np.uint64(number + i + 1))
-        for e in range(N):
+        for e in range(keys.size):
             square = 2.0 * _minus_log(1.0 - share * _fraction(_mixed(keys[e] + one)))
             bits = _mixed(keys[e] + other)
             radius = np.float64(np.sqrt(min(square, most))).view(np.uint64)
@@ -127,46 +124,49 @@ def fill_normal(keys, number, share, most, out):
             turn = (_fraction(bits) - 0.5) * (0.5 * np.pi)
             sine, cosine = radius * _sine(turn), radius * _cosine(turn)
             swapped = bits & QUARTER != np.uint64(0)
-            first[e], second[e] = sine if swapped else cosine, cosine if swapped else sine
+            out[i, e], out[i + 1, e] = sine if swapped else cosine, cosine if swapped else sine
+
+
+@njit(cache=True, nogil=True)
+def normals(rank, count):
+    """Returns room for `rank` rows of normal numbers, and one more where they are odd."""
+    return np.empty((rank + rank % 2, count))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_truncated(keys, number, energy, out):
-    """Fills `out`, shape (rank, N), with normal numbers whose sum of squares is at most `energy` for each key."""
-    rank = out.shape[0]
+def fill_truncated(keys, number, energy, rank, out):
+    """Fills `rank` rows of `out` (see `normals`) with normal numbers whose sum of squares is at most `energy`."""
     if rank == 2:  # the radius of a pair is truncated at once
         fill_normal(keys, number, 1.0 - np.exp(-0.5 * energy), energy * EDGE, out)
         return
     fill_normal(keys, number, 1.0, np.inf, out)
-    who = np.arange(out.shape[1])
-    bad, attempt = _beyond(out, energy), np.uint64(0)
-    while bad.size > 0:  # draws anew, with other keys, where it is too much
-        who, attempt = who[bad], attempt + np.uint64(1)
-        others, again = np.empty(who.size, np.uint64), np.empty((rank, who.size))
+    who, attempt = _beyond(out, rank, energy), np.uint64(0)
+    while who.size > 0:  # draws anew, with other keys, where it is too much
+        attempt += np.uint64(1)
+        others, again = np.empty(who.size, np.uint64), normals(rank, who.size)
         for k in range(who.size):
             others[k] = _mixed(keys[who[k]] + GOLDEN * attempt)
         fill_normal(others, number, 1.0, np.inf, again)
         for i in range(rank):
             for k in range(who.size):
                 out[i, who[k]] = again[i, k]
-        bad = _beyond(again, energy)
+        who = who[_beyond(again, rank, energy)]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _squares(g):
-    """Returns the sum of squares of each column, shape (N,)."""
+def _squares(g, rank):
+    """Returns the sum of squares of the first rows of each column, shape (N,)."""
     squares = np.zeros(g.shape[1])
-    for i in range(g.shape[0]):
-        row = g[i]
-        for e in range(row.size):
-            squares[e] += row[e] * row[e]
+    for i in range(rank):
+        for e in range(squares.size):
+            squares[e] += g[i, e] * g[i, e]
     return squares
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _beyond(g, energy):
+def _beyond(g, rank, energy):
     """Returns the columns of g whose sum of squares is above `energy`."""
-    squares = _squares(g)
+    squares = _squares(g, rank)
     bad, count = np.empty(squares.size, np.int64), 0
     for e in range(squares.size):
         bad[count] = e
@@ -175,13 +175,12 @@ def _beyond(g, energy):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_directions(keys, number, out):
-    """Fills `out`, shape (rank, N), with uniform directions, of length 1."""
+def fill_directions(keys, number, rank, out):
+    """Fills `rank` rows of `out` (see `normals`) with uniform directions, of length 1."""
     fill_normal(keys, number, 1.0, np.inf, out)
-    squares = _squares(out)
-    for e in range(squares.size):
-        squares[e] = 1.0 / np.sqrt(max(squares[e], SMALLEST_SQUARE))
-    for i in range(out.shape[0]):
-        row = out[i]
-        for e in range(row.size):
-            row[e] *= squares[e]
+    lengths = _squares(out, rank)
+    for e in range(lengths.size):
+        lengths[e] = 1.0 / np.sqrt(max(lengths[e], SMALLEST_SQUARE))
+    for i in range(rank):
+        for e in range(lengths.size):
+            out[i, e] *= lengths[e]

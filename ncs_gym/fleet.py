@@ -22,6 +22,7 @@ class Fleet(NamedTuple):
         noise: Sensor noise of the last step that any environment sent at, shape (p, N).
         uniforms: What the channel drew, shape (3, N).
         violations: In this episode, shape (N,).
+        keys: Of random numbers, uint64, shape (N,).
         due: Age at which each sample arrives, -1 if never, shape (buffer + 1, N).
         node: Of the gain table, shape (N,).
         age: Steps since the newest sample used, shape (N,).
@@ -30,6 +31,7 @@ class Fleet(NamedTuple):
         lost: Packets lost in a row, shape (N,).
         bad: State of the Gilbert-Elliott chain, 0 or 1, shape (N,).
         alarm, arrived: 0 or 1, shape (N,).
+        counted: Whether violations count now, 0 or 1, shape (N,).
     """
 
     state: np.ndarray
@@ -41,6 +43,7 @@ class Fleet(NamedTuple):
     noise: np.ndarray
     uniforms: np.ndarray
     violations: np.ndarray
+    keys: np.ndarray
     due: np.ndarray
     node: np.ndarray
     age: np.ndarray
@@ -50,15 +53,16 @@ class Fleet(NamedTuple):
     bad: np.ndarray
     alarm: np.ndarray
     arrived: np.ndarray
+    counted: np.ndarray
 
 
 # Rows of int32 before the ring of due ages.
-MARKS = 8
+MARKS = 9
 
 
 def rows_of(n: int, m: int, p: int, slots: int) -> tuple[int, int]:
     """Returns how many rows of float64 and of int32 a fleet has."""
-    return 3 * n + p + 4 + slots * (n + m + p), MARKS + slots
+    return 3 * n + p + 5 + slots * (n + m + p), MARKS + slots
 
 
 @njit(cache=True, nogil=True)
@@ -73,7 +77,7 @@ def fleet_of(n, m, p, slots, numbers, marks):
     end += slots * p
     disturbance, end = numbers[end : end + n], end + n
     noise, end = numbers[end : end + p], end + p
-    uniforms, violations = numbers[end : end + 3], numbers[end + 3]
+    uniforms, violations, keys = numbers[end : end + 3], numbers[end + 3], numbers[end + 4].view(np.uint64)
     return Fleet(
         state,
         mean,
@@ -84,7 +88,8 @@ def fleet_of(n, m, p, slots, numbers, marks):
         noise,
         uniforms,
         violations,
-        marks[8:],
+        keys,
+        marks[MARKS:],
         marks[0],
         marks[1],
         marks[2],
@@ -93,4 +98,5 @@ def fleet_of(n, m, p, slots, numbers, marks):
         marks[5],
         marks[6],
         marks[7],
+        marks[8],
     )

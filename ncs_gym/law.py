@@ -8,9 +8,10 @@ import numpy as np
 from numba import njit
 
 from ncs_gym.disturbance import ROUNDING, BallDisturbance, BoxDisturbance, Disturbance, SphereDisturbance
-from ncs_gym.draws import fill_directions, fill_truncated, fill_uniform
+from ncs_gym.draws import fill_directions, fill_truncated, fill_uniform, normals
 from ncs_gym.noise import TruncatedGaussian
 from ncs_gym.plant import LinearPlant
+from ncs_gym.product import add_product
 
 # What h in F h is: nothing, uniform in a box, truncated normal, uniform in a ball, uniform on a sphere.
 NOTHING, BOX, NORMAL, BALL, SPHERE = range(5)
@@ -51,26 +52,21 @@ def law_of_disturbance(source: Disturbance, plant: LinearPlant) -> Law | None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_drawn(law, keys, number, out):
-    """Adds a draw F h, numbers from `number` on, to each column of `out`, shape (n, N)."""
-    if law.kind == NOTHING:
+def add_drawn(kind, factor, energy, keys, number, out):
+    """Adds a draw F h of a law, numbers from `number` on, to each column of `out`, shape (n, N)."""
+    if kind == NOTHING:
         return
-    n, N = out.shape
+    n = out.shape[0]
     # The first n coordinates of a direction in n + 2 dimensions are uniform in the ball (Archimedes for n = 1).
-    h = np.empty((n + 2 if law.kind == BALL else n, N))
-    if law.kind == BOX:
-        fill_uniform(keys, number, h)
+    rank = n + 2 if kind == BALL else n
+    h = normals(rank, out.shape[1])
+    if kind == BOX:
+        fill_uniform(keys, number, n, h)
         for i in range(n):
-            row = h[i]
-            for e in range(N):
-                row[e] = 2.0 * row[e] - 1.0
-    elif law.kind == NORMAL:
-        fill_truncated(keys, number, law.energy, h)
+            for e in range(out.shape[1]):
+                h[i, e] = 2.0 * h[i, e] - 1.0
+    elif kind == NORMAL:
+        fill_truncated(keys, number, energy, rank, h)
     else:
-        fill_directions(keys, number, h)
-    for i in range(n):
-        for j in range(n):
-            share, row, drawn = law.factor[i, j], out[i], h[j]
-            if share != 0.0:
-                for e in range(N):
-                    row[e] += share * drawn[e]
+        fill_directions(keys, number, rank, h)
+    add_product(factor, h, out)

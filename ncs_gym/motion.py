@@ -8,8 +8,9 @@ from numba import njit
 from ncs_gym.draws import fill_uniform
 from ncs_gym.fleet import fleet_of
 from ncs_gym.law import add_drawn
-from ncs_gym.packets import Doubts, Transitions, follow_predictions, receive, send
-from ncs_gym.report import report
+from ncs_gym.packets import Doubts, Transitions, follow_predictions, receive, send, switch
+from ncs_gym.product import add_product, copy_rows, set_product
+from ncs_gym.report import Report, report
 from ncs_gym.system import unpacked
 
 # Stages of a step, in this order; packets of each age have a stage of their own in between.
@@ -22,9 +23,9 @@ WIDTH = 1024
 
 @njit(cache=True, nogil=True)
 def read_actions(actions, u_max, u):
-    """Fills inputs u, shape (m, N), from actions (N, m); returns whether all are finite."""
+    """Fills the first m rows of u, shape (>= m, N), with inputs from actions (N, m); returns whether all are finite."""
     wrong = 0
-    for i in range(u.shape[0]):
+    for i in range(u_max.size):
         limit, row = u_max[i], u[i]
         for e in range(row.size):
             action = np.float64(actions[e, i])
@@ -34,92 +35,120 @@ def read_actions(actions, u_max, u):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_moved(matrix, x, out):
-    """Adds matrix x to out, shapes (k, n), (n, N) and (k, N)."""
-    for i in range(out.shape[0]):
-        row = out[i]
-        for j in range(x.shape[0]):
-            share, some = matrix[i, j], x[j]
-            for e in range(row.size):
-                row[e] += share * some[e]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def draw(system, fleet, keys, number):
+def draw(system, fleet, number):
     """Draws the disturbances and what the channel needs; numbers of draws begin at `number`."""
-    fleet.disturbance[:] = 0.0
-    add_drawn(system.disturbance, keys, number + DISTURBANCE * WIDTH, fleet.disturbance)
-    add_drawn(system.process, keys, number + PROCESS * WIDTH, fleet.disturbance)
-    fill_uniform(keys, number + NETWORK * WIDTH, fleet.uniforms[: system.uniforms])
+    keys, d = fleet.keys, fleet.disturbance
+    d.fill(0.0)
+    law = system.disturbance
+    add_drawn(law.kind, law.factor, law.energy, keys, number + DISTURBANCE * WIDTH, d)
+    law = system.process
+    add_drawn(law.kind, law.factor, law.energy, keys, number + PROCESS * WIDTH, d)
+    fill_uniform(keys, number + NETWORK * WIDTH, system.uniforms, fleet.uniforms)
+    if system.bursts:
+        switch(system.moves, fleet.uniforms, fleet.bad)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def move(system, fleet, tick, u):
     """Moves states to A x + B u + d, with d in `fleet.disturbance`, and predicts means one step on."""
     slot = tick % system.slots
-    prior, state = fleet.priors[slot], fleet.state
-    prior[:] = 0.0
-    add_moved(system.A, fleet.mean, prior)
-    add_moved(system.B, u, prior)
-    fleet.mean[:] = prior
-    fleet.inputs[slot] = u
-    moved = np.zeros_like(state)
-    add_moved(system.A, state, moved)
-    add_moved(system.B, u, moved)
-    for i in range(state.shape[0]):
-        row, some, d = state[i], moved[i], fleet.disturbance[i]
-        for e in range(row.size):
-            row[e] = some[e] + d[e]
-    for e in range(fleet.age.size):
-        fleet.steps[e] += 1
-        fleet.age[e] += 1
-        fleet.wait[e] -= 1
-    fleet.arrived[:] = 0
+    advance(system.A, system.B, fleet.state, u, fleet.disturbance)
+    predict(system.A, system.B, fleet.mean, u, fleet.priors[slot], fleet.inputs[slot])
+    count(fleet.steps, fleet.age, fleet.wait, fleet.arrived)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def advance(A, B, state, u, d):
+    """Moves states, shape (n, N), to A x + B u + d."""
+    moved = np.empty_like(state)
+    copy_rows(d, moved)
+    add_product(A, state, moved)
+    add_product(B, u, moved)
+    copy_rows(moved, state)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def predict(A, B, mean, u, prior, inputs):
+    """Moves means, shape (n, N), to A x_hat + B u, and remembers them and the inputs."""
+    set_product(A, mean, prior)
+    add_product(B, u, prior)
+    copy_rows(prior, mean)
+    copy_rows(u, inputs)
 
 
 @njit(cache=True, nogil=True)
-def run(first, end, tick, moment, packed, memory, keys, table, shapes, doubts, u, counted, outputs, progress):
+def count(steps, age, wait, arrived):
+    """Moves the counters, shape (N,), one step on."""
+    for e in range(steps.size):
+        steps[e] += 1
+        age[e] += 1
+    for e in range(steps.size):
+        wait[e] -= 1
+        arrived[e] = 0
+
+
+@njit(cache=True, nogil=True)
+def run(
+    first,
+    end,
+    tick,
+    moment,
+    counts,
+    constants,
+    numbers,
+    marks,
+    nodes,
+    edges,
+    weights,
+    shapes,
+    doubts,
+    residuals,
+    reported,
+    flags,
+    observation,
+    progress,
+):
     """Runs the stages `first` up to but not including `end` of a step; stops where the gain table lacks edges.
+
+    Arguments are bare arrays, because numba takes a quarter of a microsecond to open a tuple.
 
     Args:
         first: DRAW, MOVE, PREDICT, RECEIVE + i for packets of age longest - i, and LAST for the report.
         end: See above; above LAST for all.
         tick: Steps of the whole fleet, this one included.
         moment: Steps since the keys were made: with a key it determines what is drawn.
-        packed: The two arrays of a `System`.
-        memory: The two arrays of a `Fleet`.
-        keys: Of random numbers, shape (N,).
-        table: `Transitions` of the gain table.
-        shapes: Of its nodes, shape (nodes, n * n).
-        doubts: Filled; see `Doubts`.
-        u: Inputs, shape (m, N).
-        counted: Whose violations count, shape (N,).
-        outputs: Filled by `report`.
-        progress: Filled with the stage reached, how many edges it lacks, and how many residuals are doubtful.
+        counts, constants: Of a packed `System`.
+        numbers, marks: Of a `Fleet`.
+        nodes, edges, weights, shapes: `Transitions`.
+        doubts, residuals: Filled; `Doubts`, one row of the former for nodes that lack an edge.
+        reported, flags, observation: A `Report` to fill, with its inputs.
+        progress: Filled with the stage reached, how many edges it lacks, how many residuals are doubtful, and how many
+            episodes are over.
 
     Returns:
         Whether `end` was reached.
     """
-    system = unpacked(packed[0], packed[1])
-    (n, m), p = system.B.shape, system.H.shape[0]
-    fleet, number = fleet_of(n, m, p, system.slots, memory[0], memory[1]), moment * PURPOSES * WIDTH
+    system, table = unpacked(counts, constants), Transitions(nodes, edges, weights, shapes)
+    (n, m), p, u = system.B.shape, system.H.shape[0], reported[: system.B.shape[1]]
+    fleet, number = fleet_of(n, m, p, system.slots, numbers, marks), moment * PURPOSES * WIDTH
+    doubtful = Doubts(doubts[:, 0], doubts[:, 1:], residuals)
     if first <= DRAW < end:
-        draw(system, fleet, keys, number)
+        draw(system, fleet, number)
     if first <= MOVE < end:
         move(system, fleet, tick, u)
-        send(system, fleet, tick, keys, number + SENSOR * WIDTH)
+        send(system, fleet, tick, number + SENSOR * WIDTH)
         progress[2] = 0
     if first <= PREDICT < end:
-        progress[0], progress[1] = PREDICT, follow_predictions(table.predicted, fleet.node, doubts.missing)
+        progress[0], progress[1] = PREDICT, follow_predictions(nodes, fleet.node, doubtful.missing)
         if progress[1] > 0:
             return False
     for i in range(max(0, first - RECEIVE), system.jitter + 1):
         if RECEIVE + i < end and first < LAST:
             age = system.delay + system.jitter - i
-            missed, doubtful = receive(system, table, fleet, tick, age, doubts, progress[2])
-            progress[0], progress[1], progress[2] = RECEIVE + i, missed, doubtful
-            if missed > 0:
+            missed, suspected = receive(system, table, fleet, tick, age, doubtful, progress[2])
+            progress[0], progress[1], progress[2] = RECEIVE + i, missed, suspected
+            if progress[1] > 0:
                 return False
     if end > LAST:
-        report(system, fleet, shapes, u, counted, outputs)
+        progress[3] = report(system, fleet, shapes, Report(reported, flags, observation))
     return True

@@ -52,13 +52,14 @@ class TruncatedGaussian(FrozenArrays):
 
     def sample_many(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Returns draws, shape (count, n), by compiled loops."""
-        from ncs_gym.draws import fill_truncated
+        from ncs_gym.draws import fill_truncated, normals
 
         if self.factor is None:
             return np.zeros((count, self.covariance.shape[0]))
-        keys, drawn = rng.integers(2**64, size=count, dtype=np.uint64), np.empty((self.factor.shape[1], count))
-        fill_truncated(keys, 0, self.energy, drawn)
-        return (self.factor @ drawn).T
+        rank = self.factor.shape[1]
+        keys, drawn = rng.integers(2**64, size=count, dtype=np.uint64), normals(rank, count)
+        fill_truncated(keys, 0, self.energy, rank, drawn)
+        return (self.factor @ drawn[:rank]).T
 
 
 @cache

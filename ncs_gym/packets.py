@@ -7,23 +7,31 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from ncs_gym.gain_table import ACCEPTED, FRESH, HELD, LAST_BIT, TARGET
 from ncs_gym.law import add_drawn
+from ncs_gym.product import add_product, set_product
+
+# Counts never get here.
+MOST = 1 << 40
 
 
 class Transitions(NamedTuple):
     """The arrays of a `GainTable` that loops read."""
 
-    predicted: np.ndarray
-    received: np.ndarray
-    target: np.ndarray
-    accepted: np.ndarray
-    fresh: np.ndarray
-    held: np.ndarray
+    nodes: np.ndarray
+    edges: np.ndarray
     weights: np.ndarray
+    shapes: np.ndarray
 
 
 class Doubts(NamedTuple):
-    """Nodes without an edge, shape (N,), and residuals beyond the quick test: (environment, edge, age) and (p,) each."""
+    """What Python has to look at.
+
+    Attributes:
+        missing: Nodes without an edge, shape (>= N,).
+        suspects: Environment, edge and age of residuals beyond the quick test, shape (N (buffer + 1), 3).
+        residuals: These, shape (N (buffer + 1), p).
+    """
 
     missing: np.ndarray
     suspects: np.ndarray
@@ -31,71 +39,110 @@ class Doubts(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def send(system, fleet, tick, keys, number):
+def send(system, fleet, tick, number):
     """Measures, rounds, loses and delays the samples of this step.
 
     Args:
         system: The loop.
         fleet: Changed in place.
         tick: Steps of the whole fleet.
-        keys: Of random numbers, shape (N,).
         number: Of the first draw of the sensors.
     """
-    p, n = system.H.shape
-    N, slot = fleet.wait.size, tick % system.slots
-    due = fleet.due[slot]
-    due[:] = -1
-    if system.bursts:
-        for e in range(N):
-            fleet.bad[e] ^= fleet.uniforms[2, e] < system.moves[fleet.bad[e]]
-    sent = 0
-    for e in range(N):
-        sent += fleet.wait[e] <= 0
-    if sent == 0:
+    slot, law = tick % system.slots, system.sensor
+    if not _some_send(fleet.due, slot, fleet.wait):
         return
-    fleet.noise[:] = 0.0
-    add_drawn(system.sensor, keys, number, fleet.noise)
-    for e in range(N):
-        if fleet.wait[e] <= 0:
-            fleet.wait[e] = system.period
-            loss = system.losses[fleet.bad[e]]
-            lost = loss > 0.0 and fleet.uniforms[0, e] < loss
-            lost = lost and (system.most_lost < 0 or fleet.lost[e] < system.most_lost)
-            extra = int(fleet.uniforms[1, e] * (system.jitter + 1)) if system.jitter > 0 else 0
-            fleet.lost[e] = fleet.lost[e] + 1 if lost else 0
-            due[e] = -1 if lost else system.delay + min(extra, system.jitter)
-    for i in range(p):
-        _measure(system, fleet, i, due, fleet.samples[slot, i])
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _measure(system, fleet, i, due, samples):
-    """Fills what sensor i says, shape (N,), rounded; what is not finite is not sent and raises the alarm."""
-    noise, absurd = fleet.noise[i], 0
-    samples[:] = noise
-    for j in range(fleet.state.shape[0]):
-        share, row = system.H[i, j], fleet.state[j]
-        for e in range(samples.size):
-            samples[e] += share * row[e]
-    for e in range(samples.size):
-        absurd += not np.isfinite(samples[e])
-    if absurd > 0:
-        for e in range(samples.size):
-            if not np.isfinite(samples[e]):
-                samples[e] = 0.0
-                if due[e] >= 0:  # no sensor within the assumptions sends this
-                    due[e], fleet.alarm[e] = -1, 1
-    if system.step > 0.0:
-        for e in range(samples.size):
-            samples[e] = np.rint(samples[e] / system.step) * system.step
+    fleet.noise.fill(0.0)
+    add_drawn(law.kind, law.factor, law.energy, fleet.keys, number, fleet.noise)
+    _lose(system.losses, system.most_lost, fleet.uniforms, fleet.wait, fleet.bad, fleet.lost, fleet.due[slot])
+    _delay(system.period, system.delay, system.jitter, fleet.uniforms, fleet.wait, fleet.due[slot])
+    _measure(system.H, fleet.state, fleet.noise, fleet.samples[slot])
+    _round(system.step, fleet.samples[slot], fleet.due[slot], fleet.alarm)
 
 
 @njit(cache=True, nogil=True)
-def follow_predictions(predicted, node, missing):
+def switch(moves, draws, bad):
+    """Moves the chain of the channel."""
+    for e in range(bad.size):
+        bad[e] ^= draws[2, e] < moves[bad[e]]
+
+
+@njit(cache=True, nogil=True)
+def _some_send(due, slot, wait):
+    """Marks that nothing was sent at this step, and returns whether something is to be."""
+    sent = 0
+    for e in range(wait.size):
+        due[slot, e] = -1
+        sent += wait[e] <= 0
+    return sent > 0
+
+
+@njit(cache=True, nogil=True)
+def _lose(losses, most_lost, draws, wait, bad, in_a_row, due):
+    """Fills -1 where no sample is sent or it is lost, else 0, shape (N,), and counts losses in a row."""
+    good_loss, bad_loss = losses[0], losses[1]
+    most = most_lost if most_lost >= 0 else MOST
+    for e in range(due.size):
+        lost = draws[0, e] < (bad_loss if bad[e] else good_loss)
+        due[e] = -1 if lost & (in_a_row[e] < most) else 0
+    for e in range(due.size):
+        in_a_row[e] = in_a_row[e] if wait[e] > 0 else -due[e] * (in_a_row[e] + 1)
+    for e in range(due.size):
+        due[e] = -1 if wait[e] > 0 else due[e]
+
+
+@njit(cache=True, nogil=True)
+def _delay(period, delay, jitter, draws, wait, due):
+    """Adds the age of arrival where a sample is sent, shape (N,), and sets the time until the next one."""
+    if jitter > 0:
+        for e in range(due.size):
+            extra = np.int32(draws[1, e] * (jitter + 1))
+            due[e] += min(extra, jitter) if due[e] >= 0 else 0
+    for e in range(due.size):
+        due[e] += delay if due[e] >= 0 else 0
+    for e in range(due.size):
+        wait[e] = wait[e] if wait[e] > 0 else period
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _measure(H, state, noise, samples):
+    """Fills H x + noise, shape (p, N)."""
+    for i in range(samples.shape[0]):
+        share = H[i, 0]
+        for e in range(samples.shape[1]):
+            samples[i, e] = noise[i, e] + share * state[0, e]
+        for j in range(1, state.shape[0]):
+            share = H[i, j]
+            if share != 0.0:
+                for e in range(samples.shape[1]):
+                    samples[i, e] += share * state[j, e]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _round(step, samples, due, alarm):
+    """Rounds samples, shape (p, N); what is not finite is not sent and raises the alarm."""
+    absurd = 0
+    for i in range(samples.shape[0]):
+        for e in range(samples.shape[1]):
+            absurd += not np.isfinite(samples[i, e])
+    if absurd > 0:
+        for i in range(samples.shape[0]):
+            for e in range(samples.shape[1]):
+                if not np.isfinite(samples[i, e]):
+                    samples[i, e] = 0.0
+                    if due[e] >= 0:  # no sensor within the assumptions sends this
+                        due[e], alarm[e] = -1, 1
+    if step > 0.0:
+        for i in range(samples.shape[0]):
+            for e in range(samples.shape[1]):
+                samples[i, e] = np.rint(samples[i, e] / step) * step
+
+
+@njit(cache=True, nogil=True)
+def follow_predictions(nodes, node, missing):
     """Moves the node of every environment along the edge of a prediction, if the table has them all.
 
     Args:
-        predicted: Of the gain table.
+        nodes: Of the gain table.
         node: Shape (N,), changed in place.
         missing: Filled with nodes without an edge, shape (N,).
 
@@ -104,12 +151,12 @@ def follow_predictions(predicted, node, missing):
     """
     missed = 0
     for e in range(node.size):
-        if predicted[node[e]] < 0:
+        if nodes[node[e], 0] < 0:
             missing[missed] = node[e]
             missed += 1
     if missed == 0:
         for e in range(node.size):
-            node[e] = predicted[node[e]]
+            node[e] = nodes[node[e], 0]
     return missed
 
 
@@ -133,27 +180,36 @@ def receive(system, table, fleet, tick, age, doubts, doubtful):
     who = _equal(fleet.due[(tick - age) % slots], age)
     if who.size == 0:
         return 0, doubtful
-    edges, missed = _edges(table.received[:, age - system.delay], fleet.node, who, doubts.missing)
+    edges, missed = _edges(table.nodes, 1 + age - system.delay, fleet.node, who, doubts.missing)
     if missed > 0:
         return missed, doubtful
-    chain = _gathered(fleet.priors[(tick - age) % slots], who)
+    held, accepted = _common(table.edges, edges)
+    chain = _gathered(fleet.priors, (tick - age) % slots, who)
     for each in range(age, -1, -1):
         slot = (tick - each) % slots
         if each < age:
-            _keep(table.accepted, edges, who, chain, fleet.priors[slot])
-        if _any_held(table.held, edges, each):
-            samples = _gathered(fleet.samples[slot], who)
-            doubtful = _update(system, table, samples, each, who, edges, chain, doubts, doubtful)
+            _keep(accepted, who, chain, fleet.priors[slot])
+        if held >> min(each, LAST_BIT) & 1:
+            residual, square = _gathered(fleet.samples, slot, who), np.zeros(who.size)
+            _update(system.H, table.weights, each, edges, residual, square, chain)
+            doubtful = _suspect(table.edges, each, edges, who, residual, square, doubts, doubtful)
         if each > 0:
-            chain = _predicted(system, _gathered(fleet.inputs[(tick - each + 1) % slots], who), chain)
-    _keep(table.accepted, edges, who, chain, fleet.mean)
+            inputs = _gathered(fleet.inputs, (tick - each + 1) % slots, who)
+            chain = _predicted(system.A, system.B, inputs, chain)
+    _keep(accepted, who, chain, fleet.mean)
+    _arrive(table.edges, edges, who, fleet.arrived, fleet.node, fleet.age)
+    return 0, doubtful
+
+
+@njit(cache=True, nogil=True)
+def _arrive(table, edges, who, arrived, node, age):
+    """Moves the environments `who` along their edges."""
     for k in range(who.size):
         edge, e = edges[k], who[k]
-        fleet.arrived[e] = 1
-        fleet.node[e] = table.target[edge]
-        if table.fresh[edge] >= 0:
-            fleet.age[e] = table.fresh[edge]
-    return 0, doubtful
+        arrived[e] = 1
+        node[e] = table[edge, TARGET]
+        fresh = table[edge, FRESH]
+        age[e] = fresh if fresh >= 0 else age[e]
 
 
 @njit(cache=True, nogil=True)
@@ -167,112 +223,113 @@ def _equal(marks, value):
 
 
 @njit(cache=True, nogil=True)
-def _edges(received, nodes, who, missing):
+def _edges(nodes, column, node, who, missing):
     """Returns the edges that packets take from the nodes of some environments, and how many of them are missing."""
     edges, missed = np.empty(who.size, np.int64), 0
     for k in range(who.size):
-        edges[k] = received[nodes[who[k]]]
+        edges[k] = nodes[node[who[k]], column]
         missed += edges[k] < 0
     if missed > 0:
         missed = 0
         for k in range(who.size):
             if edges[k] < 0:
-                missing[missed] = nodes[who[k]]
+                missing[missed] = node[who[k]]
                 missed += 1
     return edges, missed
 
 
 @njit(cache=True, nogil=True)
-def _gathered(rows, who):
-    """Returns the columns `who` of an array of rows."""
-    out = np.empty((rows.shape[0], who.size))
-    for i in range(rows.shape[0]):
-        row, some = rows[i], out[i]
+def _gathered(ring, slot, who):
+    """Returns the columns `who` of a slot of a ring, shape (slots, rows, N)."""
+    out = np.empty((ring.shape[1], who.size))
+    for i in range(ring.shape[1]):
         for k in range(who.size):
-            some[k] = row[who[k]]
+            out[i, k] = ring[slot, i, who[k]]
     return out
 
 
 @njit(cache=True, nogil=True)
-def _any_held(held, edges, age):
-    """Returns whether a sample of some age is used along any of the edges."""
-    for k in range(edges.size):  # noqa: SIM110
-        if held[edges[k], age]:
-            return True
-    return False
+def _common(edges, taken):
+    """Returns the ages of samples used along any of the edges taken, as bits, and which edges are accepted.
+
+    The latter is empty if all are.
+    """
+    held, every = 0, 1
+    for k in range(taken.size):
+        held |= edges[taken[k], HELD]
+        every &= edges[taken[k], ACCEPTED]
+    accepted = np.empty(0 if every else taken.size, np.int32)
+    for k in range(accepted.size):
+        accepted[k] = edges[taken[k], ACCEPTED]
+    return held, accepted
 
 
 @njit(cache=True, nogil=True)
-def _keep(accepted, edges, who, chain, out):
+def _keep(accepted, who, chain, out):
     """Writes replayed means, shape (n, count), to the environments, shape (n, N), where they are accepted."""
     for i in range(chain.shape[0]):
-        some, row = chain[i], out[i]
-        for k in range(edges.size):
-            e = who[k]
-            row[e] = some[k] if accepted[edges[k]] else row[e]
+        if accepted.size == 0:
+            for k in range(who.size):
+                out[i, who[k]] = chain[i, k]
+        else:
+            for k in range(who.size):
+                out[i, who[k]] = chain[i, k] if accepted[k] else out[i, who[k]]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _predicted(system, inputs, chain):
+def _predicted(A, B, inputs, chain):
     """Returns A chain + B inputs, shape (n, count)."""
-    out = np.zeros_like(chain)
-    for i in range(out.shape[0]):
-        row = out[i]
-        for j in range(out.shape[0]):
-            share, some = system.A[i, j], chain[j]
-            for k in range(row.size):
-                row[k] += share * some[k]
-        for j in range(inputs.shape[0]):
-            share, some = system.B[i, j], inputs[j]
-            for k in range(row.size):
-                row[k] += share * some[k]
+    out = np.empty_like(chain)
+    set_product(A, chain, out)
+    add_product(B, inputs, out)
     return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _update(system, table, residual, age, who, edges, chain, doubts, doubtful):
-    """Adds gain times residual (zero where no sample is used) to the means of one age; returns how many suspects.
+def _update(H, table, age, edges, residual, square, chain):
+    """Adds gain times residual (zero where no sample is used) to the means of one age.
 
     Args:
-        system: The loop.
-        table: Transitions of the gain table.
-        residual: The samples, shape (p, count); turned into residuals.
+        H: Shape (p, n).
+        table: Weights of the gain table.
         age: Of the samples.
-        who: Environments, shape (count,).
-        edges: Their edges.
+        edges: Of the environments, shape (count,).
+        residual: The samples, shape (p, count); turned into residuals.
+        square: Zeros, shape (count,); filled with the quick test, at most 1 where a residual is possible.
         chain: Means, shape (n, count), changed in place.
-        doubts: Filled with residuals beyond the quick test.
-        doubtful: How many there are already.
     """
     (p, count), n = residual.shape, chain.shape[0]
-    weights, square = np.empty((n * p + p * p, count)), np.zeros(count)
+    weights = np.empty((table.shape[2], count))
     for k in range(count):
-        row = table.weights[edges[k], age]
-        for i in range(row.size):
-            weights[i, k] = row[i]
+        for i in range(table.shape[2]):
+            weights[i, k] = table[edges[k], age, i]
     for i in range(p):
         for j in range(n):
-            share, row, some = system.H[i, j], residual[i], chain[j]
+            share = H[i, j]
             if share != 0.0:
                 for k in range(count):
-                    row[k] -= share * some[k]
+                    residual[i, k] -= share * chain[j, k]
     for i in range(p):
         for j in range(p):
-            share, row, other = weights[n * p + i * p + j], residual[i], residual[j]
             for k in range(count):
-                square[k] += row[k] * share[k] * other[k]
+                square[k] += residual[i, k] * weights[n * p + i * p + j, k] * residual[j, k]
     for i in range(n):
         for j in range(p):
-            share, row, other = weights[i * p + j], chain[i], residual[j]
             for k in range(count):
-                row[k] += share[k] * other[k]
+                chain[i, k] += weights[i * p + j, k] * residual[j, k]
+
+
+@njit(cache=True, nogil=True)
+def _suspect(table, age, edges, who, residual, square, doubts, doubtful):
+    """Notes residuals beyond the quick test; returns how many there are now."""
     far = 0
-    for k in range(count):
+    for k in range(square.size):
         far += not square[k] <= 1.0
     if far > 0:
-        for k in range(count):
-            if not square[k] <= 1.0 and table.held[edges[k], age]:
+        for k in range(square.size):
+            if not square[k] <= 1.0 and table[edges[k], HELD] >> min(age, LAST_BIT) & 1:
                 doubts.suspects[doubtful] = who[k], edges[k], age
-                doubts.residuals[doubtful] = residual[:, k]
+                for i in range(residual.shape[0]):
+                    doubts.residuals[doubtful, i] = residual[i, k]
                 doubtful += 1
     return doubtful

@@ -2,151 +2,203 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
+
+# Counts never get here.
+MOST = 1 << 40
 
 
 class Report(NamedTuple):
     """Arrays that are handed out once and never used again.
 
     Attributes:
-        numbers: Rows by environments: state, estimate, error (n each), shape (n * n), values (k), cost, violations,
-            success, reward.
-        flags: Packet arrived, alarm, contract broken, terminated, truncated, shape (5, N).
-        age: Shape (N,).
+        numbers: Rows by environments: input (m), state, estimate, error (n each), shape (n * n), values (k), cost,
+            violations, success, reward, and the age in bits of int64.
+        flags: Packet arrived, alarm, contract broken, terminated, truncated, done, shape (6, N).
         observation: Shape (n + extra, N).
-        done: Whether an episode is over, shape (N,); this one is kept.
     """
 
     numbers: np.ndarray
     flags: np.ndarray
-    age: np.ndarray
     observation: np.ndarray
-    done: np.ndarray
 
 
-def new_report(n: int, k: int, observed: int, done: np.ndarray) -> Report:
-    """Returns arrays to fill."""
-    N = done.size
-    numbers, flags = np.empty((3 * n + n * n + k + 4, N)), np.empty((5, N), np.bool_)
-    return Report(numbers, flags, np.empty(N, np.int64), np.empty((observed, N), np.float32), done)
+def new_report(count: int, n: int, m: int, k: int, observed: int) -> Report:
+    """Returns arrays to fill for `count` environments."""
+    numbers = np.empty((m + 3 * n + n * n + k + 5, count))
+    return Report(numbers, np.empty((6, count), np.bool_), np.empty((observed, count), np.float32))
 
 
-def infos(filled: Report, u: np.ndarray, n: int) -> dict[str, Any]:
-    """Returns the infos, each with the environment as first axis."""
-    rows, flags, count = filled.numbers, filled.flags, filled.done.size
-    columns, last = rows.T, 3 * n + n * n
-    return {
-        "state": columns[:, :n],
-        "estimate": columns[:, n : 2 * n],
-        "estimation_error": columns[:, 2 * n : 3 * n],
-        "error_shape": rows[3 * n : last].reshape(n, n, count).transpose(2, 0, 1),
-        "input": u.T,
-        "constraint_values": columns[:, last:-4],
-        "cost": rows[-4],
-        "measurement_age": filled.age,
-        "packet_arrived": flags[0],
-        "assumption_violated": flags[1],
-        "episode_violations": rows[-3],
-        "is_success": rows[-2],
-        "contract_broken": flags[2],
-    }
+class Layout:
+    """Where infos are in the rows of a report.
+
+    Args:
+        n: Number of states.
+        m: Number of inputs.
+        k: Number of constraints.
+    """
+
+    def __init__(self, n: int, m: int, k: int) -> None:
+        ends = np.cumsum([0, m, n, n, n, n * n, k]).tolist()
+        parts = [slice(*pair) for pair in pairwise(ends)]
+        self._n, self._shape = n, parts[4]
+        self._input, self._state, self._mean, self._error, _, self._values = ((slice(None), part) for part in parts)
+
+    def infos(self, filled: Report) -> dict[str, Any]:
+        """Returns the infos, each with the environment as first axis."""
+        rows, flags, columns = filled.numbers, filled.flags, filled.numbers.T
+        return {
+            "state": columns[self._state],
+            "estimate": columns[self._mean],
+            "estimation_error": columns[self._error],
+            "error_shape": rows[self._shape].reshape(self._n, self._n, -1).transpose(2, 0, 1),
+            "input": columns[self._input],
+            "constraint_values": columns[self._values],
+            "cost": rows[-5],
+            "measurement_age": rows[-1].view(np.int64),
+            "packet_arrived": flags[0],
+            "assumption_violated": flags[1],
+            "episode_violations": rows[-4],
+            "is_success": rows[-3],
+            "contract_broken": flags[2],
+        }
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def report(system, fleet, shapes, u, counted, filled):
-    """Fills what a step reports, and counts violations.
+def report(system, fleet, shapes, filled):
+    """Fills what a step reports next to the inputs, and counts violations.
 
     Args:
         system: The loop.
         fleet: Whose violations are counted in place.
         shapes: Of the nodes of the gain table, shape (nodes, n * n).
-        u: Inputs, shape (m, N).
-        counted: Whose violations count, shape (N,).
         filled: A `Report`.
+
+    Returns:
+        How many episodes are over.
     """
-    rows, flags, n = filled.numbers, filled.flags, fleet.state.shape[0]
-    for i in range(n):
-        _compare(fleet.state[i], fleet.mean[i], rows[i], rows[n + i], rows[2 * n + i])
-        _clip(fleet.mean[i], system.low[i], system.high[i], filled.observation[i])
-    start = 3 * n + n * n
-    for i in range(n * n):
-        row = rows[3 * n + i]
-        for e in range(row.size):
-            row[e] = shapes[fleet.node[e], i]
-    cost, violations, success = rows[start + len(system.C)], rows[start + len(system.C) + 1], rows[-2]
-    _judge(system.C, fleet.state, rows[start : start + len(system.C)], cost)
-    _count(fleet.violations, counted, cost, violations, success)
-    for e in range(cost.size):
-        filled.age[e] = fleet.age[e]
-        flags[0, e], flags[1, e] = fleet.arrived[e] != 0, fleet.alarm[e] != 0
-    for e in range(cost.size):
-        flags[2, e] = fleet.age[e] > system.most_age and system.most_age >= 0
-        flags[4, e] = fleet.steps[e] >= system.limit and system.limit >= 0
-    for e in range(cost.size):
-        flags[3, e] = system.terminates and cost[e] > 0.0
-        filled.done[e] = flags[3, e] or flags[4, e]
+    (n, m), k, rows = system.B.shape, len(system.C), filled.numbers
+    _estimate(fleet.state, fleet.mean, m, rows)
+    _observe(fleet.mean, system.low, system.high, filled.observation)
+    _shape(shapes, fleet.node, m + 3 * n, rows)
+    start = m + 3 * n + n * n
+    _judge(system.C, fleet.state, start, rows)
+    cost = rows[start + k]
+    _count(cost, fleet.counted, fleet.violations, start + k, rows)
+    _age(fleet.age, rows[start + k + 4].view(np.int64))
     if system.pays:
-        _pay(system.Q, fleet.state, system.R, u, rows[-1])
+        reward = rows[start + k + 3]
+        reward.fill(0.0)
+        _pay(system.Q, fleet.state, reward)
+        _pay(system.R, rows, reward)
+    _flag(system.most_age, fleet.arrived, fleet.alarm, fleet.age, filled.flags)
+    return _end(system.limit, system.terminates, fleet.steps, cost, filled.flags)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _compare(state, mean, state_out, mean_out, error_out):
-    """Fills copies of state and mean, and the error."""
-    for e in range(state.size):
-        state_out[e], mean_out[e] = state[e], mean[e]
-    for e in range(state.size):
-        error_out[e] = mean[e] - state[e]
+def _estimate(state, mean, start, rows):
+    """Fills state, mean and error from row `start` on."""
+    n = state.shape[0]
+    for i in range(n):
+        for e in range(state.shape[1]):
+            rows[start + i, e] = state[i, e]
+        for e in range(state.shape[1]):
+            rows[start + n + i, e] = mean[i, e]
+        for e in range(state.shape[1]):
+            rows[start + 2 * n + i, e] = mean[i, e] - state[i, e]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _clip(mean, low, high, out):
-    """Fills what is observed."""
-    for e in range(mean.size):
-        out[e] = np.float32(min(max(mean[e], low), high))
+def _observe(mean, low, high, out):
+    """Fills the first n rows of what is observed, the mean within its bounds."""
+    for i in range(mean.shape[0]):
+        least, most = low[i], high[i]
+        for e in range(mean.shape[1]):
+            out[i, e] = np.float32(min(max(mean[i, e], least), most))
+
+
+@njit(cache=True, nogil=True)
+def _shape(shapes, node, start, rows):
+    """Fills the error shapes from row `start` on."""
+    for e in range(node.size):
+        for i in range(shapes.shape[1]):
+            rows[start + i, e] = shapes[node[e], i]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _judge(C, state, values, cost):
-    """Fills abs(c_j x) - 1, shape (k, N), and 1.0 where one of them is positive, shape (N,)."""
-    cost[:] = 0.0
-    for k in range(values.shape[0]):
-        row = values[k]
-        row[:] = 0.0
-        for i in range(state.shape[0]):
-            share, some = C[k, i], state[i]
-            for e in range(row.size):
-                row[e] += share * some[e]
-        for e in range(row.size):
-            row[e] = abs(row[e]) - 1.0
-            cost[e] = 1.0 if row[e] > 0.0 else cost[e]
+def _judge(C, state, start, rows):
+    """Fills abs(c_j x) - 1 from row `start` on, and below 1.0 where one of them is positive, else 0.0."""
+    cost = start + C.shape[0]
+    for e in range(rows.shape[1]):
+        rows[cost, e] = 0.0
+    for k in range(start, cost):
+        share = C[k - start, 0]
+        for e in range(rows.shape[1]):
+            rows[k, e] = share * state[0, e]
+        for i in range(1, state.shape[0]):
+            share = C[k - start, i]
+            if share != 0.0:
+                for e in range(rows.shape[1]):
+                    rows[k, e] += share * state[i, e]
+        for e in range(rows.shape[1]):
+            value = abs(rows[k, e]) - 1.0
+            rows[k, e] = value
+            rows[cost, e] = 1.0 if value > 0.0 else rows[cost, e]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _count(total, counted, cost, violations, success):
-    """Adds costs to the totals where they count; fills copies of the totals and 1.0 where there are none."""
-    for e in range(cost.size):
-        total[e] += cost[e] if counted[e] else 0.0
-    for e in range(cost.size):
-        violations[e] = total[e]
-        success[e] = 1.0 if total[e] == 0.0 else 0.0
+def _count(cost, counted, total, start, rows):
+    """Adds costs to the totals where they count; fills two rows after `start`: the totals, and 1.0 where that is 0."""
+    for e in range(total.size):
+        total[e] += cost[e] * counted[e]
+    for e in range(total.size):
+        rows[start + 1, e] = total[e]
+        rows[start + 2, e] = 1.0 if total[e] == 0.0 else 0.0
+
+
+@njit(cache=True, nogil=True)
+def _age(age, out):
+    """Fills the ages, shape (N,)."""
+    for e in range(age.size):
+        out[e] = age[e]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _pay(Q, x, R, u, reward):
-    """Fills -(x'Qx + u'Ru) for x of shape (n, N) and u of shape (m, N)."""
-    reward[:] = 0.0
+def _pay(Q, x, reward):
+    """Subtracts x'Qx, x in the first rows of an array, from rewards, shape (N,)."""
     for i in range(Q.shape[0]):
         for j in range(Q.shape[0]):
-            share, one, other = Q[i, j], x[i], x[j]
+            share = Q[i, j]
             if share != 0.0:
                 for e in range(reward.size):
-                    reward[e] -= share * one[e] * other[e]
-    for i in range(R.shape[0]):
-        for j in range(R.shape[0]):
-            share, one, other = R[i, j], u[i], u[j]
-            if share != 0.0:
-                for e in range(reward.size):
-                    reward[e] -= share * one[e] * other[e]
+                    reward[e] -= share * x[i, e] * x[j, e]
+
+
+@njit(cache=True, nogil=True)
+def _flag(most_age, arrived, alarm, age, flags):
+    """Fills the flags of arrivals, alarms and broken contracts."""
+    most = most_age if most_age >= 0 else MOST
+    for e in range(age.size):
+        flags[0, e] = arrived[e] != 0
+    for e in range(age.size):
+        flags[1, e] = alarm[e] != 0
+    for e in range(age.size):
+        flags[2, e] = age[e] > most
+
+
+@njit(cache=True, nogil=True)
+def _end(limit, terminates, steps, cost, flags):
+    """Fills the flags of what is terminated, truncated and either; returns how many are either."""
+    most, over = limit if limit >= 0 else MOST, 0
+    for e in range(steps.size):
+        flags[3, e] = terminates and cost[e] > 0.0
+    for e in range(steps.size):
+        flags[4, e] = steps[e] >= most
+    for e in range(steps.size):
+        flags[5, e] = flags[3, e] | flags[4, e]
+        over += flags[5, e]
+    return over

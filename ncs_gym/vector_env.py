@@ -18,9 +18,8 @@ from ncs_gym.fleet import fleet_of, rows_of
 from ncs_gym.frozen import as_count, as_numbers
 from ncs_gym.gain_table import GainTable
 from ncs_gym.law import law_of_disturbance
-from ncs_gym.motion import DRAW, LAST, MOVE, PREDICT, read_actions, run
-from ncs_gym.packets import Doubts, Transitions
-from ncs_gym.report import Report, infos, new_report
+from ncs_gym.motion import DRAW, LAST, MOVE, PREDICT, RECEIVE, read_actions, run
+from ncs_gym.report import Layout, Report, new_report
 from ncs_gym.system import packed, system_of
 from ncs_gym.task import Regulation
 
@@ -69,7 +68,7 @@ class NCSVectorEnv(VectorEnv):
         self.single_action_space = self.single.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._counts, self._numbers = packed(system_of(self.single, self.max_episode_steps))
+        self._counts, self._constants = packed(system_of(self.single, self.max_episode_steps))
         self._table = GainTable(self.single.estimator)
         self._allocate()
         self._tick = self._moment = 0
@@ -83,14 +82,13 @@ class NCSVectorEnv(VectorEnv):
         plant, count, slots = self.plant, self.num_envs, self.channel.longest_delay + 1
         sizes = plant.n, plant.m, plant.p, slots
         rows, marks = rows_of(*sizes)
-        self._memory_of_fleet = np.zeros((rows, count)), np.zeros((marks, count), np.int32)
-        self._fleet = fleet_of.py_func(*sizes, *self._memory_of_fleet)
-        self._keys, self._progress = np.zeros(count, np.uint64), np.zeros(3, np.int64)
-        self._done, self._everyone = np.zeros(count, np.bool_), np.ones(count, np.bool_)
-        room = count * slots
-        self._doubts = Doubts(np.empty(count, np.int32), np.empty((room, 3), np.int32), np.empty((room, plant.p)))
-        self._read_table()
-        self._nothing = self._new_report(np.zeros(1, np.bool_))
+        self._kept = np.zeros((rows, count)), np.zeros((marks, count), np.int32)
+        self._fleet = fleet_of.py_func(*sizes, *self._kept)
+        self._fleet.counted[:] = 1
+        self._doubts, self._residuals = np.empty((count * slots, 4), np.int32), np.empty((count * slots, plant.p))
+        self._progress, self._done = np.zeros(4, np.int64), np.zeros(count, np.bool_)
+        self._layout = Layout(plant.n, plant.m, len(plant.C))
+        self._reported = plant.n, plant.m, len(plant.C), self.single_observation_space.shape[0]
         self._pays = type(self.task) is Regulation
         # Disturbances that are not drawn by compiled loops.
         self._disturbs = law_of_disturbance(self.single.disturbance, plant) is None
@@ -127,7 +125,7 @@ class NCSVectorEnv(VectorEnv):
             seed = int(np.random.SeedSequence([int(each) for each in seed]).generate_state(1, np.uint64)[0] >> 1)
         super().reset(seed=seed)
         if seed is not None or not self._consistent:
-            fill_keys(self.np_random.integers(2**64, dtype=np.uint64), self._keys)
+            fill_keys(self.np_random.integers(2**64, dtype=np.uint64), self._fleet.keys)
             self._moment = 0
         if not (self._consistent or mask.all()):
             raise gym.error.ResetNeeded("reset all environments first")
@@ -144,30 +142,27 @@ class NCSVectorEnv(VectorEnv):
             ValueError: If an action is not finite or the shape is wrong; nothing has moved then.
             gymnasium.error.ResetNeeded: If there was no reset, or an earlier step failed half-way.
         """
-        u = self.inputs_of(actions)
+        filled = self._read(actions)
         if not self._consistent:
             raise gym.error.ResetNeeded("call reset: there was none, or an earlier step failed half-way")
         if self._some_done and self.autoreset_mode is AutoresetMode.DISABLED and self._done.any():
             raise gym.error.ResetNeeded("some episodes are over: reset them with options={'reset_mask': ...}")
         self._consistent = False
-        filled, first = self._new_report(self._done), self._start_step(u)
+        first, resetting, u = self._start_step(filled), None, filled.numbers[: self.plant.m]
         if self._some_done and self.autoreset_mode is AutoresetMode.NEXT_STEP:
-            resetting = self._done.copy()
-            self._run(first, LAST, u)
+            first, resetting = self._run(first, LAST, filled), self._done
             self._begin(resetting, None)
             u[:, resetting] = 0.0
-            first = LAST
-        else:
-            resetting = None
-        self._run(first, LAST + 1, u, self._everyone, filled)
-        rewards, terminated, truncated = filled.numbers[-1], filled.flags[3], filled.flags[4]
+        self._run(first, LAST + 1, filled)
+        rewards, terminated, truncated, self._done = filled.numbers[-2], *filled.flags[3:]
         if not self._pays:
             rewards[:] = self.task.reward_many(self.plant, self._memory, self._fleet.state.T, u.T)
         if resetting is not None:
-            rewards[resetting], terminated[resetting], truncated[resetting] = 0.0, False, False
-            self._done[resetting] = False
-        observation, info = self._observed(filled), infos(filled, u, self.plant.n)
-        self._some_done = self._done.any()
+            rewards[resetting] = 0.0
+            filled.flags[3:, resetting] = False
+            self._progress[3] = self._done.sum()
+        observation, info = self._observed(filled), self._layout.infos(filled)
+        self._some_done = self._progress[3] > 0
         if self._some_done and self.autoreset_mode is AutoresetMode.SAME_STEP:
             observation, info = self._restarted(observation, info)
         self._consistent = True
@@ -179,20 +174,25 @@ class NCSVectorEnv(VectorEnv):
         Raises:
             ValueError: If one is not finite or the shape is wrong.
         """
+        return self._read(actions).numbers[: self.plant.m]
+
+    def _read(self, actions: np.ndarray) -> Report:
+        """Returns a report to fill, with the inputs already in it."""
         numbers, wanted = actions, (self.num_envs, self.plant.m)
         if not (type(actions) is np.ndarray and actions.dtype == np.float32 and actions.flags.c_contiguous):
             numbers = as_numbers(actions)
-        u = np.empty(wanted[::-1])
-        if numbers is None or numbers.shape != wanted or not read_actions(numbers, self.plant.u_max, u):
+        filled = new_report(self.num_envs, *self._reported)
+        if numbers is None or numbers.shape != wanted or not read_actions(numbers, self.plant.u_max, filled.numbers):
             raise ValueError(f"the actions must be finite with shape {wanted}, got {actions!r}")
-        return u
+        return filled
 
-    def _start_step(self, u: np.ndarray) -> int:
+    def _start_step(self, filled: Report) -> int:
         """Does what compiled loops cannot, for what a user wrote; returns the stage to go on from."""
         self._tick += 1
         self._moment += 1
+        u = filled.numbers[: self.plant.m]
         if self._disturbs:
-            self._run(DRAW, MOVE, u)
+            self._run(DRAW, MOVE, filled)
             self._disturb(u)
         self._memory = self.task.advance_many(self.np_random, self.plant, self._memory, u.T)
         return MOVE if self._disturbs else DRAW
@@ -209,51 +209,44 @@ class NCSVectorEnv(VectorEnv):
             d = checked_many(plant, d, self.num_envs, allow_assumption_violation=violation)
         fleet.disturbance[:] = d.T
 
-    def _run(
-        self, first: int, end: int, u: np.ndarray, counted: np.ndarray | None = None, filled: Report | None = None
-    ) -> None:
-        """Runs stages of a step; where the gain table lacks edges it works them out and goes on."""
-        progress, doubts, moves = self._progress, self._doubts, first < LAST <= end
+    def _run(self, first: int, end: int, filled: Report) -> int:
+        """Runs stages of a step; where the gain table lacks edges it works them out and goes on. Returns `end`."""
+        table, progress, moves = self._table, self._progress, first < LAST <= end
         while not run(
             first,
             end,
             self._tick,
             self._moment,
-            (self._counts, self._numbers),
-            self._memory_of_fleet,
-            self._keys,
-            self._transitions,
-            self._table.shapes,
-            doubts,
-            u,
-            self._everyone if counted is None else counted,
-            self._nothing if filled is None else filled,
+            self._counts,
+            self._constants,
+            *self._kept,
+            table.nodes,
+            table.edges,
+            table.weights,
+            table.shapes,
+            self._doubts,
+            self._residuals,
+            *filled,
             progress,
         ):
-            first, missed, _ = progress.tolist()
-            for node in np.unique(doubts.missing[:missed]).tolist():
+            first, missed, *_ = progress.tolist()
+            for node in np.unique(self._doubts[:missed, 0]).tolist():
                 if first == PREDICT:
-                    self._table.predict(node)
+                    table.predict(node)
                 else:
-                    self._table.receive(node, self.channel.longest_delay - (first - PREDICT - 1))
-            self._read_table()
+                    table.receive(node, self.channel.longest_delay - (first - RECEIVE))
         if moves and progress[2] > 0:
-            self._settle(progress[2])
-            if filled is not None:
-                filled.flags[1] = self._fleet.alarm
-        if len(self._table) >= gain_table.MOST_NODES:
-            self._table, self._fleet.node[:] = self._table.keeping(self._fleet.node)
-            self._read_table()
+            self._look_closer(int(progress[2]))
+            filled.flags[1] = self._fleet.alarm
+        if len(table) >= gain_table.MOST_NODES:
+            self._table, self._fleet.node[:] = table.keeping(self._fleet.node)
+        return end
 
-    def _settle(self, doubtful: int) -> None:
-        """Looks closer at residuals beyond the quick test."""
-        suspects, residuals, table = self._doubts.suspects, self._doubts.residuals, self._table
-        for row in range(doubtful):
-            e, edge, each = suspects[row].tolist()
-            self._fleet.alarm[e] |= self.single.estimator.is_impossible(residuals[row], table.seen[edge, each])
-
-    def _read_table(self) -> None:
-        self._transitions = Transitions(*(getattr(self._table, name) for name in Transitions._fields))
+    def _look_closer(self, doubtful: int) -> None:
+        """Raises the alarm for residuals beyond the quick test that are beyond the exact one, too."""
+        for (_, e, edge, each), residual in zip(self._doubts[:doubtful].tolist(), self._residuals, strict=False):
+            seen = self._table.seen[edge, each]
+            self._fleet.alarm[e] |= self.single.estimator.is_impossible(residual, seen)
 
     def _begin(self, mask: np.ndarray, starts: np.ndarray | None) -> None:
         """Starts episodes where `mask` says so, at `starts` (N, n) or drawn from the initial set."""
@@ -286,17 +279,17 @@ class NCSVectorEnv(VectorEnv):
 
     def _report(self, counted: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
         """Returns observations (N, n + extra) and infos of now, without inputs; counts violations of some."""
-        u, filled = np.zeros((self.plant.m, self.num_envs)), self._new_report(np.empty_like(self._done))
-        self._run(LAST, LAST + 1, u, counted, filled)
-        return self._observed(filled), infos(filled, u, self.plant.n)
-
-    def _new_report(self, done: np.ndarray) -> Report:
-        return new_report(self.plant.n, len(self.plant.C), self.single_observation_space.shape[0], done)
+        filled = new_report(self.num_envs, *self._reported)
+        filled.numbers[: self.plant.m] = 0.0
+        self._fleet.counted[:] = counted
+        self._run(LAST, LAST + 1, filled)
+        self._fleet.counted[:] = 1
+        return self._observed(filled), self._layout.infos(filled)
 
     def _observed(self, filled: Report) -> np.ndarray:
         """Returns the observations, shape (N, n + extra)."""
         n, space = self.plant.n, self.single_observation_space
-        if space.shape[0] > n:
+        if len(filled.observation) > n:
             extra = self.task.observe_many(self._memory)
             filled.observation[n:] = np.clip(extra, space.low[n:], space.high[n:]).T
         return filled.observation.T

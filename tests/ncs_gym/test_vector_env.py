@@ -66,7 +66,7 @@ class Log:
             result = self.env.step(actions)
         finally:
             task.advance_many = original
-        fleet, network = self.env._fleet, unpacked.py_func(self.env._counts, self.env._numbers)
+        fleet, network = self.env._fleet, unpacked.py_func(self.env._counts, self.env._constants)
         self.now |= {"disturbance": fleet.disturbance.T.copy(), "noise": fleet.noise.T.copy()}
         self.now["uniforms"] = fleet.uniforms[: network.uniforms].copy()
         self.steps.append(self.now)

@@ -32,7 +32,7 @@ class ExtremalVectorNoise(NCSVectorEnv):
         super().__init__(*arguments, **settings)
         system = system_of(self.single, self.max_episode_steps)
         edge = Law(SPHERE, (1.0 - 1e-12) * self.plant.sensor_noise.bound.factor)
-        self._counts, self._numbers = packed(system._replace(sensor=edge))
+        self._counts, self._constants = packed(system._replace(sensor=edge))
 
     def _begin(self, mask, starts):
         super()._begin(mask, starts)
