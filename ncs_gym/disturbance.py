@@ -92,7 +92,6 @@ class Disturbance(FrozenArrays, ABC):
 class BallDisturbance(Disturbance):
     """Uniform in the ball of squared radius gamma."""
 
-
     def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
         direction = rng.standard_normal(plant.n)
         radius = np.sqrt(plant.gamma) * rng.random() ** (1.0 / plant.n)

@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from ncs_gym.compiled import entry
+
 # Constants of SplitMix64: the golden ratio, shifts and multipliers.
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 S1, M1 = np.uint64(30), np.uint64(0xBF58476D1CE4E5B9)
@@ -91,14 +93,14 @@ def _cosine(t):
     return 1.0 - 0.5 * q + q * q * tail
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def fill_keys(key, out):
     """Fills the keys of environments, shape (N,), from one number."""
     for e in range(out.size):
         out[e] = _mixed(_mixed(key) + GOLDEN * np.uint64(e))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def fill_uniform(keys, number, rows, out):
     """Fills row i < `rows` of `out`, shape (>= rows, N), with draw `number` + i of each key, uniform in (0, 1)."""
     for i in range(rows):
@@ -107,7 +109,7 @@ def fill_uniform(keys, number, rows, out):
             out[i, e] = _fraction(_mixed(keys[e] + shift))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def fill_normal(keys, number, share, most, out):
     """Fills `out`, shape (even, N), with standard normal numbers, draws `number`.. of each key, two rows at a time.
 
@@ -127,13 +129,13 @@ def fill_normal(keys, number, share, most, out):
             out[i, e], out[i + 1, e] = sine if swapped else cosine, cosine if swapped else sine
 
 
-@njit(cache=True, nogil=True)
+@entry
 def normals(rank, count):
     """Returns room for `rank` rows of normal numbers, and one more where they are odd."""
     return np.empty((rank + rank % 2, count))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def fill_truncated(keys, number, energy, rank, out):
     """Fills `rank` rows of `out` (see `normals`) with normal numbers whose sum of squares is at most `energy`."""
     if rank == 2:  # the radius of a pair is truncated at once
@@ -153,7 +155,7 @@ def fill_truncated(keys, number, energy, rank, out):
         who = who[_beyond(again, rank, energy)]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def _squares(g, rank):
     """Returns the sum of squares of the first rows of each column, shape (N,)."""
     squares = np.zeros(g.shape[1])
@@ -163,7 +165,7 @@ def _squares(g, rank):
     return squares
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def _beyond(g, rank, energy):
     """Returns the columns of g whose sum of squares is above `energy`."""
     squares = _squares(g, rank)
@@ -174,7 +176,7 @@ def _beyond(g, rank, energy):
     return bad[:count]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@entry
 def fill_directions(keys, number, rank, out):
     """Fills `rank` rows of `out` (see `normals`) with uniform directions, of length 1."""
     fill_normal(keys, number, 1.0, np.inf, out)

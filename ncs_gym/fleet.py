@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from ncs_gym.compiled import inner
 
 
 class Fleet(NamedTuple):
@@ -65,7 +66,7 @@ def rows_of(n: int, m: int, p: int, slots: int) -> tuple[int, int]:
     return 3 * n + p + 5 + slots * (n + m + p), MARKS + slots
 
 
-@njit(cache=True, nogil=True)
+@inner
 def fleet_of(n, m, p, slots, numbers, marks):
     """Returns the `Fleet` in an array of float64 and one of int32, rows by environments."""
     N, state, mean, end = numbers.shape[1], numbers[:n], numbers[n : 2 * n], 2 * n

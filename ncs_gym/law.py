@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from ncs_gym.compiled import inner
 from ncs_gym.disturbance import ROUNDING, BallDisturbance, BoxDisturbance, Disturbance, SphereDisturbance
 from ncs_gym.draws import fill_directions, fill_truncated, fill_uniform, normals
 from ncs_gym.noise import TruncatedGaussian
@@ -51,7 +51,7 @@ def law_of_disturbance(source: Disturbance, plant: LinearPlant) -> Law | None:
     return None
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def add_drawn(kind, factor, energy, keys, number, out):
     """Adds a draw F h of a law, numbers from `number` on, to each column of `out`, shape (n, N)."""
     if kind == NOTHING:

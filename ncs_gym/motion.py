@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from ncs_gym.compiled import entry, inner, version_of
 from ncs_gym.draws import fill_uniform
 from ncs_gym.fleet import fleet_of
 from ncs_gym.law import add_drawn
@@ -16,12 +17,14 @@ from ncs_gym.system import unpacked
 # Stages of a step, in this order; packets of each age have a stage of their own in between.
 DRAW, MOVE, PREDICT, RECEIVE = range(4)
 LAST = 1 << 30
+# What `run` is made of, next to this file.
+SOURCES = ("draws", "fleet", "law", "packets", "product", "report", "system")
 # Numbers of draws: each purpose has this many per step.
 DISTURBANCE, PROCESS, SENSOR, NETWORK, PURPOSES = range(5)
 WIDTH = 1024
 
 
-@njit(cache=True, nogil=True)
+@entry
 def read_actions(actions, u_max, u):
     """Fills the first m rows of u, shape (>= m, N), with inputs from actions (N, m); returns whether all are finite."""
     wrong = 0
@@ -34,7 +37,7 @@ def read_actions(actions, u_max, u):
     return wrong == 0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def draw(system, fleet, number):
     """Draws the disturbances and what the channel needs; numbers of draws begin at `number`."""
     keys, d = fleet.keys, fleet.disturbance
@@ -48,7 +51,7 @@ def draw(system, fleet, number):
         switch(system.moves, fleet.uniforms, fleet.bad)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def move(system, fleet, tick, u):
     """Moves states to A x + B u + d, with d in `fleet.disturbance`, and predicts means one step on."""
     slot = tick % system.slots
@@ -57,7 +60,7 @@ def move(system, fleet, tick, u):
     count(fleet.steps, fleet.age, fleet.wait, fleet.arrived)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def advance(A, B, state, u, d):
     """Moves states, shape (n, N), to A x + B u + d."""
     moved = np.empty_like(state)
@@ -67,7 +70,7 @@ def advance(A, B, state, u, d):
     copy_rows(moved, state)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def predict(A, B, mean, u, prior, inputs):
     """Moves means, shape (n, N), to A x_hat + B u, and remembers them and the inputs."""
     set_product(A, mean, prior)
@@ -76,7 +79,7 @@ def predict(A, B, mean, u, prior, inputs):
     copy_rows(u, inputs)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def count(steps, age, wait, arrived):
     """Moves the counters, shape (N,), one step on."""
     for e in range(steps.size):
@@ -87,8 +90,8 @@ def count(steps, age, wait, arrived):
         arrived[e] = 0
 
 
-@njit(cache=True, nogil=True)
-def run(
+@inner
+def _run(
     first,
     end,
     tick,
@@ -152,3 +155,56 @@ def run(
     if end > LAST:
         progress[3] = report(system, fleet, shapes, Report(reported, flags, observation))
     return True
+
+
+def _compiled_run(version):
+    """Returns `_run`, kept on disk for one version of everything that it calls."""
+
+    @njit(cache=True, nogil=True)
+    def run(
+        first,
+        end,
+        tick,
+        moment,
+        counts,
+        constants,
+        numbers,
+        marks,
+        nodes,
+        edges,
+        weights,
+        shapes,
+        doubts,
+        residuals,
+        reported,
+        flags,
+        observation,
+        progress,
+    ):
+        if version < 0:
+            return False
+        return _run(
+            first,
+            end,
+            tick,
+            moment,
+            counts,
+            constants,
+            numbers,
+            marks,
+            nodes,
+            edges,
+            weights,
+            shapes,
+            doubts,
+            residuals,
+            reported,
+            flags,
+            observation,
+            progress,
+        )
+
+    return run
+
+
+run = _compiled_run(version_of(__file__, *SOURCES))

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from ncs_gym.compiled import inner
 from ncs_gym.gain_table import ACCEPTED, FRESH, HELD, LAST_BIT, TARGET
 from ncs_gym.law import add_drawn
 from ncs_gym.product import add_product, set_product
@@ -38,7 +38,7 @@ class Doubts(NamedTuple):
     residuals: np.ndarray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def send(system, fleet, tick, number):
     """Measures, rounds, loses and delays the samples of this step.
 
@@ -59,14 +59,14 @@ def send(system, fleet, tick, number):
     _round(system.step, fleet.samples[slot], fleet.due[slot], fleet.alarm)
 
 
-@njit(cache=True, nogil=True)
+@inner
 def switch(moves, draws, bad):
     """Moves the chain of the channel."""
     for e in range(bad.size):
         bad[e] ^= draws[2, e] < moves[bad[e]]
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _some_send(due, slot, wait):
     """Marks that nothing was sent at this step, and returns whether something is to be."""
     sent = 0
@@ -76,7 +76,7 @@ def _some_send(due, slot, wait):
     return sent > 0
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _lose(losses, most_lost, draws, wait, bad, in_a_row, due):
     """Fills -1 where no sample is sent or it is lost, else 0, shape (N,), and counts losses in a row."""
     good_loss, bad_loss = losses[0], losses[1]
@@ -90,7 +90,7 @@ def _lose(losses, most_lost, draws, wait, bad, in_a_row, due):
         due[e] = -1 if wait[e] > 0 else due[e]
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _delay(period, delay, jitter, draws, wait, due):
     """Adds the age of arrival where a sample is sent, shape (N,), and sets the time until the next one."""
     if jitter > 0:
@@ -103,21 +103,16 @@ def _delay(period, delay, jitter, draws, wait, due):
         wait[e] = wait[e] if wait[e] > 0 else period
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _measure(H, state, noise, samples):
     """Fills H x + noise, shape (p, N)."""
+    set_product(H, state, samples)
     for i in range(samples.shape[0]):
-        share = H[i, 0]
         for e in range(samples.shape[1]):
-            samples[i, e] = noise[i, e] + share * state[0, e]
-        for j in range(1, state.shape[0]):
-            share = H[i, j]
-            if share != 0.0:
-                for e in range(samples.shape[1]):
-                    samples[i, e] += share * state[j, e]
+            samples[i, e] += noise[i, e]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _round(step, samples, due, alarm):
     """Rounds samples, shape (p, N); what is not finite is not sent and raises the alarm."""
     absurd = 0
@@ -137,7 +132,7 @@ def _round(step, samples, due, alarm):
                 samples[i, e] = np.rint(samples[i, e] / step) * step
 
 
-@njit(cache=True, nogil=True)
+@inner
 def follow_predictions(nodes, node, missing):
     """Moves the node of every environment along the edge of a prediction, if the table has them all.
 
@@ -160,7 +155,7 @@ def follow_predictions(nodes, node, missing):
     return missed
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def receive(system, table, fleet, tick, age, doubts, doubtful):
     """Takes in the packets of one age, if the gain table knows all their edges: replays means from their stamp on.
 
@@ -201,7 +196,7 @@ def receive(system, table, fleet, tick, age, doubts, doubtful):
     return 0, doubtful
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _arrive(table, edges, who, arrived, node, age):
     """Moves the environments `who` along their edges."""
     for k in range(who.size):
@@ -212,7 +207,7 @@ def _arrive(table, edges, who, arrived, node, age):
         age[e] = fresh if fresh >= 0 else age[e]
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _equal(marks, value):
     """Returns the environments with some mark."""
     who, count = np.empty(marks.size, np.int64), 0
@@ -222,7 +217,7 @@ def _equal(marks, value):
     return who[:count]
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _edges(nodes, column, node, who, missing):
     """Returns the edges that packets take from the nodes of some environments, and how many of them are missing."""
     edges, missed = np.empty(who.size, np.int64), 0
@@ -238,7 +233,7 @@ def _edges(nodes, column, node, who, missing):
     return edges, missed
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _gathered(ring, slot, who):
     """Returns the columns `who` of a slot of a ring, shape (slots, rows, N)."""
     out = np.empty((ring.shape[1], who.size))
@@ -248,7 +243,7 @@ def _gathered(ring, slot, who):
     return out
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _common(edges, taken):
     """Returns the ages of samples used along any of the edges taken, as bits, and which edges are accepted.
 
@@ -264,7 +259,7 @@ def _common(edges, taken):
     return held, accepted
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _keep(accepted, who, chain, out):
     """Writes replayed means, shape (n, count), to the environments, shape (n, N), where they are accepted."""
     for i in range(chain.shape[0]):
@@ -276,7 +271,7 @@ def _keep(accepted, who, chain, out):
                 out[i, who[k]] = chain[i, k] if accepted[k] else out[i, who[k]]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _predicted(A, B, inputs, chain):
     """Returns A chain + B inputs, shape (n, count)."""
     out = np.empty_like(chain)
@@ -285,7 +280,7 @@ def _predicted(A, B, inputs, chain):
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _update(H, table, age, edges, residual, square, chain):
     """Adds gain times residual (zero where no sample is used) to the means of one age.
 
@@ -300,8 +295,8 @@ def _update(H, table, age, edges, residual, square, chain):
     """
     (p, count), n = residual.shape, chain.shape[0]
     weights = np.empty((table.shape[2], count))
-    for k in range(count):
-        for i in range(table.shape[2]):
+    for i in range(table.shape[2]):
+        for k in range(count):
             weights[i, k] = table[edges[k], age, i]
     for i in range(p):
         for j in range(n):
@@ -319,7 +314,7 @@ def _update(H, table, age, edges, residual, square, chain):
                 chain[i, k] += weights[i * p + j, k] * residual[j, k]
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _suspect(table, age, edges, who, residual, square, doubts, doubtful):
     """Notes residuals beyond the quick test; returns how many there are now."""
     far = 0

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from numba import njit
+from ncs_gym.compiled import entry
 
 
-@njit(cache=True, nogil=True)
+@entry
 def follow_profile(memory, acceleration, dt, draws, change_probability, fastest, out):
     """Fills speeds and targets, shape (N, 2), one step after `memory`; see `SpeedTracking.advance`."""
     for e in range(out.shape[0]):
@@ -13,7 +13,7 @@ def follow_profile(memory, acceleration, dt, draws, change_probability, fastest,
         out[e, 1] = fastest * draws[1, e] if draws[0, e] < change_probability else memory[e, 1]
 
 
-@njit(cache=True, nogil=True)
+@entry
 def profile_reward(memory, acceleration, error_weight, input_weight, out):
     """Fills rewards, shape (N,); see `SpeedTracking.reward`."""
     for e in range(out.size):

@@ -6,7 +6,9 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
+
+from ncs_gym.compiled import inner
+from ncs_gym.product import set_product
 
 # Counts never get here.
 MOST = 1 << 40
@@ -27,26 +29,28 @@ class Report(NamedTuple):
     observation: np.ndarray
 
 
-def new_report(count: int, n: int, m: int, k: int, observed: int) -> Report:
-    """Returns arrays to fill for `count` environments."""
-    numbers = np.empty((m + 3 * n + n * n + k + 5, count))
-    return Report(numbers, np.empty((6, count), np.bool_), np.empty((observed, count), np.float32))
-
-
 class Layout:
     """Where infos are in the rows of a report.
 
     Args:
+        count: Number of environments.
         n: Number of states.
         m: Number of inputs.
         k: Number of constraints.
+        observed: Number of entries of an observation.
     """
 
-    def __init__(self, n: int, m: int, k: int) -> None:
+    def __init__(self, count: int, n: int, m: int, k: int, observed: int) -> None:
         ends = np.cumsum([0, m, n, n, n, n * n, k]).tolist()
         parts = [slice(*pair) for pair in pairwise(ends)]
         self._n, self._shape = n, parts[4]
         self._input, self._state, self._mean, self._error, _, self._values = ((slice(None), part) for part in parts)
+        self._sizes = (ends[-1] + 5, count), (6, count), (observed, count)
+
+    def new(self) -> Report:
+        """Returns arrays to fill."""
+        numbers, flags, observation = self._sizes
+        return Report(np.empty(numbers), np.empty(flags, np.bool_), np.empty(observation, np.float32))
 
     def infos(self, filled: Report) -> dict[str, Any]:
         """Returns the infos, each with the environment as first axis."""
@@ -68,7 +72,7 @@ class Layout:
         }
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def report(system, fleet, shapes, filled):
     """Fills what a step reports next to the inputs, and counts violations.
 
@@ -86,8 +90,8 @@ def report(system, fleet, shapes, filled):
     _observe(fleet.mean, system.low, system.high, filled.observation)
     _shape(shapes, fleet.node, m + 3 * n, rows)
     start = m + 3 * n + n * n
-    _judge(system.C, fleet.state, start, rows)
     cost = rows[start + k]
+    _judge(system.C, fleet.state, rows[start : start + k], cost)
     _count(cost, fleet.counted, fleet.violations, start + k, rows)
     _age(fleet.age, rows[start + k + 4].view(np.int64))
     if system.pays:
@@ -99,7 +103,7 @@ def report(system, fleet, shapes, filled):
     return _end(system.limit, system.terminates, fleet.steps, cost, filled.flags)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _estimate(state, mean, start, rows):
     """Fills state, mean and error from row `start` on."""
     n = state.shape[0]
@@ -112,7 +116,7 @@ def _estimate(state, mean, start, rows):
             rows[start + 2 * n + i, e] = mean[i, e] - state[i, e]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _observe(mean, low, high, out):
     """Fills the first n rows of what is observed, the mean within its bounds."""
     for i in range(mean.shape[0]):
@@ -121,36 +125,27 @@ def _observe(mean, low, high, out):
             out[i, e] = np.float32(min(max(mean[i, e], least), most))
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _shape(shapes, node, start, rows):
     """Fills the error shapes from row `start` on."""
-    for e in range(node.size):
-        for i in range(shapes.shape[1]):
+    for i in range(shapes.shape[1]):
+        for e in range(node.size):
             rows[start + i, e] = shapes[node[e], i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _judge(C, state, start, rows):
-    """Fills abs(c_j x) - 1 from row `start` on, and below 1.0 where one of them is positive, else 0.0."""
-    cost = start + C.shape[0]
-    for e in range(rows.shape[1]):
-        rows[cost, e] = 0.0
-    for k in range(start, cost):
-        share = C[k - start, 0]
-        for e in range(rows.shape[1]):
-            rows[k, e] = share * state[0, e]
-        for i in range(1, state.shape[0]):
-            share = C[k - start, i]
-            if share != 0.0:
-                for e in range(rows.shape[1]):
-                    rows[k, e] += share * state[i, e]
-        for e in range(rows.shape[1]):
-            value = abs(rows[k, e]) - 1.0
-            rows[k, e] = value
-            rows[cost, e] = 1.0 if value > 0.0 else rows[cost, e]
+@inner
+def _judge(C, state, values, cost):
+    """Fills abs(c_j x) - 1, shape (k, N), and 1.0 where one of them is positive, else 0.0, shape (N,)."""
+    set_product(C, state, values)
+    cost.fill(0.0)
+    for k in range(values.shape[0]):
+        for e in range(cost.size):
+            value = abs(values[k, e]) - 1.0
+            values[k, e] = value
+            cost[e] = 1.0 if value > 0.0 else cost[e]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _count(cost, counted, total, start, rows):
     """Adds costs to the totals where they count; fills two rows after `start`: the totals, and 1.0 where that is 0."""
     for e in range(total.size):
@@ -160,14 +155,14 @@ def _count(cost, counted, total, start, rows):
         rows[start + 2, e] = 1.0 if total[e] == 0.0 else 0.0
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _age(age, out):
     """Fills the ages, shape (N,)."""
     for e in range(age.size):
         out[e] = age[e]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner
 def _pay(Q, x, reward):
     """Subtracts x'Qx, x in the first rows of an array, from rewards, shape (N,)."""
     for i in range(Q.shape[0]):
@@ -178,7 +173,7 @@ def _pay(Q, x, reward):
                     reward[e] -= share * x[i, e] * x[j, e]
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _flag(most_age, arrived, alarm, age, flags):
     """Fills the flags of arrivals, alarms and broken contracts."""
     most = most_age if most_age >= 0 else MOST
@@ -190,7 +185,7 @@ def _flag(most_age, arrived, alarm, age, flags):
         flags[2, e] = age[e] > most
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _end(limit, terminates, steps, cost, flags):
     """Fills the flags of what is terminated, truncated and either; returns how many are either."""
     most, over = limit if limit >= 0 else MOST, 0

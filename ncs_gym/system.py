@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from ncs_gym.channel import GilbertElliott
+from ncs_gym.compiled import inner
 from ncs_gym.env import NCSEnv
 from ncs_gym.law import NOTHING, Law, law_of_disturbance, law_of_noise
 from ncs_gym.task import Regulation
@@ -115,14 +115,14 @@ def packed(system: System) -> tuple[np.ndarray, np.ndarray]:
     return np.array([*counts, system.slots], dtype=np.int64), flat
 
 
-@njit(cache=True, nogil=True)
+@inner
 def _taken(numbers, start, rows, columns):
     """Returns a matrix and where the next begins."""
     end = start + rows * columns
     return numbers[start:end].reshape(rows, columns), end
 
 
-@njit(cache=True, nogil=True)
+@inner
 def unpacked(counts, numbers):
     """Returns the `System` that was packed."""
     n, m, p, k = counts[0], counts[1], counts[2], counts[3]
