@@ -58,8 +58,8 @@ class GainTable:
         edges: Node an edge leads to, whether the replayed history is kept, age of the newest sample used after it
             (UNKNOWN if as before), and the ages of samples used in the replay as bits (the last for all older ones);
             shape (edges, 4).
-        weights: Its gain, zero where it is not used, n * p numbers, and (seen + N)^-1 of the monitor's quick test, p * p
-            numbers; shape (edges, buffer + 1, n * p + p * p).
+        weights: Its gain, zero where it is not used, n * p numbers, and (seen + N)^-1 of the monitor's quick test,
+            p * p numbers; shape (edges, buffer + 1, n * p + p * p).
         seen: H Sigma_k H' before each update, shape (edges, buffer + 1, p, p).
     """
 

@@ -120,11 +120,19 @@ def _run(
         end: See above; above LAST for all.
         tick: Steps of the whole fleet, this one included.
         moment: Steps since the keys were made: with a key it determines what is drawn.
-        counts, constants: Of a packed `System`.
-        numbers, marks: Of a `Fleet`.
-        nodes, edges, weights, shapes: `Transitions`.
-        doubts, residuals: Filled; `Doubts`, one row of the former for nodes that lack an edge.
-        reported, flags, observation: A `Report` to fill, with its inputs.
+        counts: Of a packed `System`.
+        constants: Of a packed `System`.
+        numbers: Of a `Fleet`.
+        marks: Of a `Fleet`.
+        nodes: Of the gain table; see `Transitions`.
+        edges: Of the gain table.
+        weights: Of the gain table.
+        shapes: Of the gain table.
+        doubts: Filled with nodes that lack an edge, and suspects; see `Doubts`.
+        residuals: Filled; see `Doubts`.
+        reported: Inputs, and what a `Report` is filled with.
+        flags: Filled; see `Report`.
+        observation: Filled; see `Report`.
         progress: Filled with the stage reached, how many edges it lacks, how many residuals are doubtful, and how many
             episodes are over.
 

@@ -142,7 +142,8 @@ class NCSVectorEnv(VectorEnv):
             ValueError: If an action is not finite or the shape is wrong; nothing has moved then.
             gymnasium.error.ResetNeeded: If there was no reset, or an earlier step failed half-way.
         """
-        filled = self._read(actions)
+        filled = self._layout.new()
+        self._read(actions, filled.numbers)
         if not self._consistent:
             raise gym.error.ResetNeeded("call reset: there was none, or an earlier step failed half-way")
         if self._some_done and self.autoreset_mode is AutoresetMode.DISABLED and self._done.any():
@@ -175,17 +176,17 @@ class NCSVectorEnv(VectorEnv):
         Raises:
             ValueError: If one is not finite or the shape is wrong.
         """
-        return self._read(actions).numbers[: self.plant.m]
+        u = np.empty(self._actions_shape[::-1])
+        self._read(actions, u)
+        return u
 
-    def _read(self, actions: np.ndarray) -> Report:
-        """Returns a report to fill, with the inputs already in it."""
+    def _read(self, actions: np.ndarray, rows: np.ndarray) -> None:
+        """Fills the first m rows, shape (N,) each, with the inputs that actions stand for."""
         numbers, wanted = actions, self._actions_shape
         if not (type(actions) is np.ndarray and actions.dtype == np.float32 and actions.flags.c_contiguous):
             numbers = as_numbers(actions)
-        filled = self._layout.new()
-        if numbers is None or numbers.shape != wanted or not read_actions(numbers, self.plant.u_max, filled.numbers):
+        if numbers is None or numbers.shape != wanted or not read_actions(numbers, self.plant.u_max, rows):
             raise ValueError(f"the actions must be finite with shape {wanted}, got {actions!r}")
-        return filled
 
     def _start_step(self, filled: Report) -> int:
         """Does what compiled loops cannot, for what a user wrote; returns the stage to go on from."""
