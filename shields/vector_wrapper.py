@@ -128,7 +128,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         inner: NCSVectorEnv = self.env.unwrapped
         proposed = inner.inputs_of(actions)
         decisions = self._batch.decide(self._estimate, self._shape_number, proposed)
-        if self.filter.mode != "monitor" and decisions.intervened.any():
+        if self.filter.mode != "monitor" and np.count_nonzero(decisions.intervened):
             overriding = (decisions.inputs.T / self.filter.plant.u_max).astype(np.float32)
             actions = np.where(decisions.intervened[:, None], overriding, np.asarray(actions))
         before, self._clock = self._clock, self._interrupted
@@ -174,9 +174,10 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         """Returns why each proof does not hold, as codes, shape (N,), and changes `knowledge`."""
         knowledge = self._knowledge if knowledge is None else knowledge
         count, m = self.num_envs, self.filter.plant.m
-        nothing = np.zeros(count, np.bool_)
-        none = Decisions(np.zeros((m, count)), nothing, knowledge.inside, knowledge.inside, nothing, nothing)
-        decided = none if decisions is None else decisions
+        decided = decisions
+        if decided is None:
+            nothing = np.zeros(count, np.bool_)
+            decided = Decisions(np.zeros((m, count)), nothing, knowledge.inside, knowledge.inside, nothing, nothing)
         reason = np.empty(count, np.int64)
         inputs = decided.inputs if decisions is None else self._reported(info, "input", np.nan)
         wrong = track(
@@ -214,7 +215,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
 
     def _known_starts(self, restarted: np.ndarray) -> np.ndarray:
         """Returns whether all possible starts of the present episodes lie in S, shape (N,)."""
-        if restarted.any():
+        if np.count_nonzero(restarted):  # a tenth of the time of `any`
             self._known[restarted] = self._starts_inside
             starts = self.env.unwrapped.starts
             for e in np.flatnonzero(restarted & ~np.isnan(starts[:, 0])).tolist():
