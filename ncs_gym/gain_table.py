@@ -175,6 +175,7 @@ class GainTable:
         belief, priors, held = self._nodes[node]
         held = tuple(there or each == age for each, there in enumerate(held))
         replayed, spread = list(priors), priors[age]
+        self.edges[edge, HELD] = 0
         for each in range(age, -1, -1):
             spread = replayed[each]
             if held[each]:

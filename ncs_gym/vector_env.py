@@ -151,7 +151,7 @@ class NCSVectorEnv(VectorEnv):
         self._consistent = False
         first, resetting, u = self._start_step(filled), None, filled.numbers[: self.plant.m]
         if self._some_done and self.autoreset_mode is AutoresetMode.NEXT_STEP:
-            first, resetting = self._run(first, LAST, filled), self._done
+            first, resetting = self._run(first, LAST, filled), self._done.copy()
             self._begin(resetting, None)
             u[:, resetting] = 0.0
         self._run(first, LAST + 1, filled)

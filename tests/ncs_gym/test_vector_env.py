@@ -338,6 +338,17 @@ def test_results_are_fresh_arrays():
     assert copies[4]["state"].any()
 
 
+def test_no_two_results_share_memory_with_each_other_or_with_the_environment():
+    env = make("TruckTrailerCruise", 4)
+    arrays = [*env.reset(seed=0)[1].values()]
+    for _ in range(2):
+        observation, rewards, terminated, truncated, info = env.step(np.full((4, 1), 0.3, np.float32))
+        arrays += [observation, rewards, terminated, truncated, *info.values()]
+    arrays += [*env._kept, env._memory, env._done]
+    for i, one in enumerate(arrays):
+        assert not any(np.shares_memory(one, other) for other in arrays[:i])
+
+
 def test_seeds_determine_everything_and_block_sizes_do_not_matter_to_one_seed():
     runs = []
     for seed in (7, 7, 8, [1, 2, 3, 4], [1, 2, 3, 5]):
