@@ -15,11 +15,11 @@ import warnings
 
 import gymnasium as gym
 import numpy as np
-from ncs_gym.draws import fill_keys, fill_normal, fill_truncated
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import ncs_gym  # noqa: F401
 from agents import SB3VecEnv
+from ncs_gym.draws import fill_keys, fill_normal, fill_truncated
 from shields import VectorSafetyShield
 
 SIZES = (1, 64, 1024, 16384)

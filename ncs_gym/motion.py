@@ -9,16 +9,17 @@ from ncs_gym.compiled import entry, inner, version_of
 from ncs_gym.draws import fill_uniform
 from ncs_gym.fleet import fleet_of
 from ncs_gym.law import add_drawn
-from ncs_gym.packets import Doubts, Transitions, follow_predictions, receive, send, switch
+from ncs_gym.packets import Doubts, Transitions, follow_predictions, receive
 from ncs_gym.product import add_product, copy_rows, set_product
 from ncs_gym.report import Report, report
+from ncs_gym.samples import send, switch
 from ncs_gym.system import unpacked
 
 # Stages of a step, in this order; packets of each age have a stage of their own in between.
 DRAW, MOVE, PREDICT, RECEIVE = range(4)
 LAST = 1 << 30
 # What `run` is made of, next to this file.
-SOURCES = ("draws", "fleet", "law", "packets", "product", "report", "system")
+SOURCES = ("draws", "fleet", "law", "packets", "product", "report", "samples", "system")
 # Numbers of draws: each purpose has this many per step.
 DISTURBANCE, PROCESS, SENSOR, NETWORK, PURPOSES = range(5)
 WIDTH = 1024

@@ -8,8 +8,9 @@ import numpy as np
 
 from ncs_gym.ellipsoid import is_inside
 from shields.filter import MARGIN, SafetyFilter
-from shields.judgement import FELL_BACK, FLAGS, INTERVENED, PASSED, RADIUS, SPREAD, USABLE, WEIGHT, Rule, decide
+from shields.judgement import FELL_BACK, FLAGS, INTERVENED, PASSED, RADIUS, SPREAD, USABLE, WEIGHT, decide
 from shields.plane import FARTHEST, SMALLEST_RADIUS
+from shields.rule import Rule
 from shields.tracking import CERTIFIED, EXTENT, LARGEST
 from shields.tracking import USABLE as SEEN
 
