@@ -38,6 +38,15 @@ def read_actions(actions, u_max, u):
     return wrong == 0
 
 
+@entry
+def clip(extra, low, high, out):
+    """Fills out, shape (extra, N), with entries of observations, shape (N, extra), within their bounds."""
+    for i in range(out.shape[0]):
+        for e in range(out.shape[1]):
+            value = extra[e, i]
+            out[i, e] = low[i] if value < low[i] else high[i] if value > high[i] else value
+
+
 @inner
 def draw(system, fleet, number):
     """Draws the disturbances and what the channel needs; numbers of draws begin at `number`."""

@@ -18,7 +18,7 @@ from ncs_gym.fleet import fleet_of, rows_of
 from ncs_gym.frozen import as_count, as_numbers
 from ncs_gym.gain_table import GainTable
 from ncs_gym.law import law_of_disturbance
-from ncs_gym.motion import DRAW, LAST, MOVE, PREDICT, RECEIVE, read_actions, run
+from ncs_gym.motion import DRAW, LAST, MOVE, PREDICT, RECEIVE, clip, read_actions, run
 from ncs_gym.report import Layout, Report
 from ncs_gym.system import packed, system_of
 from ncs_gym.task import Regulation
@@ -293,8 +293,8 @@ class NCSVectorEnv(VectorEnv):
         """Returns the observations, shape (N, n + extra)."""
         n, space = self.plant.n, self.single_observation_space
         if len(filled.observation) > n:
-            extra = self.task.observe_many(self._memory)
-            filled.observation[n:] = np.clip(extra, space.low[n:], space.high[n:]).T
+            extra = np.ascontiguousarray(self.task.observe_many(self._memory), dtype=np.float64)
+            clip(extra, space.low[n:], space.high[n:], filled.observation[n:])
         return filled.observation.T
 
     def _restarted(self, observation: np.ndarray, info: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
