@@ -230,7 +230,7 @@ def test_every_command_has_help_seed_and_out(command):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], "Required"),
+        ([], "Missing subcommand"),
         (["fly"], "fly"),
         (["verify"], "Required"),
         (["compare", "--mode", "hope"], "hope"),
