@@ -30,12 +30,13 @@ benchmark: $(INSTALLED)
 	$(BIN)/python benchmarks/contracts.py
 	$(BIN)/python benchmarks/vector_env.py
 	$(BIN)/python benchmarks/codesign_grid.py
+	$(BIN)/python benchmarks/rendering.py
 	$(BIN)/python benchmarks/ppo_settings.py
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt torch
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[train,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[train,render,dev]'
 	touch $@
 
 clean:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import zipfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from pickle import PickleError
 from typing import Any
+from zipfile import BadZipFile
 
 import gymnasium as gym
 import numpy as np
@@ -135,10 +136,11 @@ class Agent:
             raise AgentError(f"{folder / 'model.zip'} was altered: its checksum does not match")
         try:
             return _rebuilt(content, weights)
-        except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, zipfile.BadZipFile) as error:
-            if isinstance(error, AgentError):
-                raise
-            raise AgentError(f"the agent in {folder} is damaged: {error}") from error
+        except AgentError:
+            raise
+        except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, PickleError, BadZipFile) as error:
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            raise AgentError(f"the agent in {folder} is damaged: {reason}") from error
 
 
 def plant_fingerprint(env_id: str) -> str | None:
@@ -170,18 +172,16 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
     _, parameters, _ = load_from_zip_file(io.BytesIO(weights), load_data=False, device="cpu")
     model.set_parameters(parameters, exact_match=True, device="cpu")
     numbers = content["normalization"]
+    mean, variance = (np.array(numbers[name], dtype=np.float64) for name in ("mean", "variance"))
+    if not mean.shape == variance.shape == model.observation_space.shape:
+        raise AgentError(f"the agent is damaged: its normalization has not the shape {model.observation_space.shape}")
     return Agent(
         algorithm=algorithm,
         settings=settings,
         env=env_id,
         channel=channel,
         model=model,
-        normalization=Normalization(
-            np.array(numbers["mean"], dtype=np.float64),
-            np.array(numbers["variance"], dtype=np.float64),
-            float(numbers["epsilon"]),
-            float(numbers["clip"]),
-        ),
+        normalization=Normalization(mean, variance, float(numbers["epsilon"]), float(numbers["clip"])),
     )
 
 

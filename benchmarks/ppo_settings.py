@@ -14,23 +14,49 @@ import time
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3 import PPO
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
+from agents import SB3VecEnv
+from agents.agent import Normalization
+from agents.algorithms import build
+from agents.control_loop import ControlLoop
 from agents.evaluation import evaluate
 from agents.settings import PPOSettings
-from agents.training import train
 
-ENV, SCALAR = "ncs_gym/TruckTrailerCruise-v0", "ScalarCruise-v0"
-gym.register(id=SCALAR, entry_point="ncs_gym.scenarios:TRUCK_TRAILER_CRUISE", max_episode_steps=200)
-# stable-baselines3's defaults, over 8 environments.
-SB3 = PPOSettings(
-    envs=8, rollout=2048, batch_size=64, epochs=10, learning_rate=3e-4, discount=0.99, gae_lambda=0.95, log_std=0.0
-)
+CRUISE = ControlLoop(env="ncs_gym/TruckTrailerCruise-v0")
+# Scalar environments and settings; None stands for stable-baselines3's own defaults.
 ARMS = {
-    "stable-baselines3, scalar": (SCALAR, SB3),
-    "the same, rollout 256": (SCALAR, PPOSettings(**{**vars(SB3), "rollout": 256})),
-    "ours, scalar, 16 environments": (SCALAR, PPOSettings(envs=16, rollout=128, batch_size=1024)),
-    "ours": (ENV, PPOSettings()),
+    "stable-baselines3, scalar": (True, None),
+    "the same, rollout 256": (True, {"n_steps": 256}),
+    "ours, scalar, 16 environments": (True, PPOSettings(envs=16, rollout=128, batch_size=1024)),
+    "ours": (False, PPOSettings()),
 }
+SB3_ENVS = 8
+
+
+def environments(scalar: bool, count: int) -> VecEnv:
+    if scalar:
+        return DummyVecEnv([lambda: Monitor(gym.make(CRUISE.env))] * count)
+    return SB3VecEnv(CRUISE.vector(count))
+
+
+def trained(scalar: bool, settings: PPOSettings | dict | None, steps: int, seed: int) -> tuple[PPO, VecNormalize]:
+    ours = isinstance(settings, PPOSettings)
+    env = VecNormalize(
+        environments(scalar, settings.envs if ours else SB3_ENVS), gamma=settings.discount if ours else 0.99
+    )
+    model = (
+        build("PPO", env, settings, seed) if ours else PPO("MlpPolicy", env, seed=seed, device="cpu", **settings or {})
+    )
+    return model.learn(steps), env
+
+
+def mean_return(model: PPO, env: VecNormalize) -> float:
+    normalize = Normalization.of(env)
+    played = evaluate(CRUISE, lambda o, infos: model.predict(normalize(o), deterministic=True)[0], 100, 10**7)
+    return float(np.mean([episode.episode_return for episode in played.episodes]))
 
 
 def main() -> None:
@@ -39,16 +65,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=2)
     options = parser.parse_args()
     print(f"{'settings':32s}{'frames/s':>10s}{'ratio':>8s}{'return':>10s}   by seed", flush=True)
-    train(ENV, 1, 0)  # compiles
+    trained(False, PPOSettings(), 1, 0)  # compiles
     base = None
-    for name, (env, settings) in ARMS.items():
+    for name, (scalar, settings) in ARMS.items():
         rates, returns = [], []
         for seed in range(options.seeds):
             start = time.perf_counter()
-            result = train(env, options.steps, 1000 * seed, settings=settings)
-            rates.append(result.steps / (time.perf_counter() - start))
-            episodes = evaluate(ENV, lambda o, infos, agent=result.agent: agent.act(o), 100, 10**7)
-            returns.append(float(np.mean([episode.episode_return for episode in episodes])))
+            model, env = trained(scalar, settings, options.steps, 1000 * seed)
+            rates.append(model.num_timesteps / (time.perf_counter() - start))
+            returns.append(mean_return(model, env))
         shown = ", ".join(f"{value:.2f}" for value in returns)
         rate = float(np.median(rates))
         base = base or rate

@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import ncs_gym  # noqa: F401
 from agents import SB3VecEnv
-from ncs_gym.kernels import add_truncated
+from ncs_gym.draws import fill_keys, fill_normal, fill_truncated
 from shields import VectorSafetyShield
 
 SIZES = (1, 64, 1024, 16384)
@@ -88,8 +88,7 @@ def memory(count: int) -> float:
     inner = gym.make_vec(CRUISE, num_envs=count).unwrapped
     inner.reset(seed=0)
     inner.step(np.zeros((count, 1), np.float32))
-    arrays = [*inner._fleet, inner._suspects, inner._residuals, inner._missing, inner._memory, inner._done]
-    arrays += [block for block, _ in inner._blocks.values()]
+    arrays = [*inner._kept, inner._doubts, inner._residuals, inner._memory, inner._done, inner.episodes, inner.starts]
     return sum(array.nbytes for array in arrays) / count
 
 
@@ -133,10 +132,12 @@ def main() -> None:
 
 def draws(options: argparse.Namespace) -> None:
     """Prints what a normal number costs drawn by numpy and in compiled loops, and how large the gain tables become."""
-    rng, block, factor = np.random.default_rng(0), np.zeros((8192, 2)), np.eye(2)
+    rng, block, keys = np.random.default_rng(0), np.zeros((2, 1024)), np.empty(1024, np.uint64)
+    fill_keys(np.uint64(0), keys)
     numpys = rate(lambda: rng.standard_normal(out=block), block.size, options.seconds, 0.1)
-    ours = rate(lambda: add_truncated(rng, 1e3, factor, block), block.size, options.seconds, 0.1)
-    print(f"a normal number: numpy {1e9 / numpys:.1f} ns, compiled {1e9 / ours:.1f} ns with its scaling")
+    ours = rate(lambda: fill_normal(keys, 0, 1.0, np.inf, block), block.size, options.seconds, 0.1)
+    truncated = rate(lambda: fill_truncated(keys, 0, 6.0, 2, block), block.size, options.seconds, 0.1)
+    print(f"a normal number: numpy {1e9 / numpys:.1f} ns, ours {1e9 / ours:.1f} ns, truncated {1e9 / truncated:.1f} ns")
     for name in ("TruckTrailer", "TruckTrailerCruise", "CartPole", "BatchReactor"):
         env, step = vector(f"ncs_gym/{name}-v0", 1024)
         for _ in range(400):

@@ -29,16 +29,18 @@ def main() -> None:
         sys.exit(_complain(_sentence(error), ERROR))
 
 
-# What each command runs, and whether it needs the training extra.
-COMMANDS = {
-    "compare": ("CompareSettings", "experiments.compare:compare", True),
-    "train": ("TrainSettings", "experiments.single:train_agent", True),
-    "evaluate": ("EvaluateSettings", "experiments.single:evaluate_agent", True),
-    "sweep": ("SweepSettings", "experiments.sweep:sweep", True),
-    "synthesize": ("SynthesizeSettings", "experiments.certificates:synthesize_file", False),
-    "verify": ("VerifySettings", "experiments.certificates:verify_file", False),
-    "audit": ("AuditSettings", "experiments.audit:audit", False),
-    "reproduce": ("ReproduceSettings", "experiments.reproduce:reproduce", False),
+TRAINING = {"train": ("stable_baselines3", "torch", "tensorboard", "pyarrow")}
+# What each command runs, and the packages of extras it needs.
+COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
+    "compare": ("CompareSettings", "experiments.compare:compare", TRAINING),
+    "train": ("TrainSettings", "experiments.single:train_agent", TRAINING),
+    "evaluate": ("EvaluateSettings", "experiments.single:evaluate_agent", TRAINING),
+    "sweep": ("SweepSettings", "experiments.sweep:sweep", TRAINING),
+    "render": ("RenderSettings", "experiments.render:render", {"render": ("pygame",)}),
+    "synthesize": ("SynthesizeSettings", "experiments.certificates:synthesize_file", {}),
+    "verify": ("VerifySettings", "experiments.certificates:verify_file", {}),
+    "audit": ("AuditSettings", "experiments.audit:audit", {}),
+    "reproduce": ("ReproduceSettings", "experiments.reproduce:reproduce", {}),
 }
 
 
@@ -57,9 +59,11 @@ def _parse(arguments: list[str]) -> object:
 
 
 def _run(chosen: object) -> None:
-    _, target, needs_training = next(entry for entry in COMMANDS.values() if entry[0] == type(chosen).__name__)
-    if needs_training:
-        _require_training_extra()
+    from experiments.extras import require_extra
+
+    _, target, extras = next(entry for entry in COMMANDS.values() if entry[0] == type(chosen).__name__)
+    for extra, packages in extras.items():
+        require_extra(extra, *packages)
     module, _, function = target.partition(":")
     getattr(importlib.import_module(module), function)(chosen)
 
@@ -72,15 +76,6 @@ def _require_own_agents() -> None:
         raise ImportError(
             f"the package 'agents' found is not this project's ({spec.origin if spec else 'none'}): "
             "install ncs-gym in a virtual environment of its own"
-        )
-
-
-def _require_training_extra() -> None:
-    packages = ("stable_baselines3", "torch", "tensorboard", "pyarrow")
-    missing = [name for name in packages if importlib.util.find_spec(name) is None]
-    if missing:
-        raise ModuleNotFoundError(
-            f"this command needs {', '.join(missing)}: install the training extra, pip install 'ncs-gym[train]'"
         )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
@@ -238,3 +238,33 @@ class ReproduceSettings:
     starts: int = 100
     steps: int = 200
     seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderSettings:
+    """Plays an episode with a policy and draws it, as an animation or its last picture (docs/rendering.md).
+
+    Attributes:
+        env: Id of a registered environment.
+        out: File to write: .gif, .mp4, or .png for the last picture alone.
+        policy: "greedy" (toward the task's goal as hard as it can), "zero", "random", or the folder of a
+            trained agent.
+        shield: What the shield does with an unsafe action; "none" for no shield.
+        side_by_side: Draw the same episode without a shield at the left, with it at the right.
+        certificate: File to use instead of synthesizing one.
+        seed: Of the episode (both, side by side) and of the random policy.
+        steps: Most steps to play.
+        fps: Pictures per second; one per step.
+        width: Of the animation [pixels]; by default as drawn.
+    """
+
+    env: str = "ncs_gym/TruckTrailerCruise-v0"
+    out: Annotated[Path, tyro.conf.arg(aliases=["--gif"])] = Path("episode.gif")
+    policy: str = "greedy"
+    shield: Literal["project", "switch", "boundary", "monitor", "none"] = "project"
+    side_by_side: bool = False
+    certificate: Path | None = None
+    seed: int = 0
+    steps: int = 200
+    fps: int = 10
+    width: int | None = None

@@ -18,6 +18,7 @@ from ncs_gym.env import NCSEnv
 from ncs_gym.error_set import ErrorSet, ErrorSetError, UnstablePlantError, certified_error_set
 from ncs_gym.estimator import Estimator
 from ncs_gym.plant import LinearPlant
+from ncs_gym.rendering import Annotation
 from ncs_gym.scenarios import register_all
 from ncs_gym.task import Regulation, SetpointTracking, SpeedTracking, Task
 from ncs_gym.truck import truck_trailer
@@ -30,6 +31,7 @@ register_all()
 
 __all__ = [
     "AdversarialDisturbance",
+    "Annotation",
     "BallDisturbance",
     "BoxDisturbance",
     "Channel",

@@ -118,6 +118,11 @@ class Link:
         self._lost_in_a_row = 0
         self._bad = isinstance(channel.loss, GilbertElliott) and rng.random() < channel.loss.stationary_bad
 
+    @property
+    def in_flight(self) -> dict[int, list[Packet]]:
+        """The packets on their way, by the step they arrive at."""
+        return self._in_flight
+
     def sends_at(self, step: int) -> bool:
         """Returns whether the sensor sends at this step."""
         return step % self.channel.send_period == 0

@@ -34,8 +34,6 @@ class Disturbance(FrozenArrays, ABC):
     """
 
     replaces_process_noise: ClassVar[bool] = False
-    # Whether a draw depends on nothing but randomness, so that draws can be made in blocks ahead of time.
-    is_memoryless: ClassVar[bool] = False
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         """Keeps batch methods of a parent from hiding what a subclass changes."""
@@ -94,8 +92,6 @@ class Disturbance(FrozenArrays, ABC):
 class BallDisturbance(Disturbance):
     """Uniform in the ball of squared radius gamma."""
 
-    is_memoryless: ClassVar[bool] = True
-
     def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
         direction = rng.standard_normal(plant.n)
         radius = np.sqrt(plant.gamma) * rng.random() ** (1.0 / plant.n)
@@ -119,7 +115,6 @@ class BoxDisturbance(Disturbance):
     """
 
     half_widths: Sequence[float] | np.ndarray | None = None
-    is_memoryless: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.half_widths is None:
@@ -131,16 +126,15 @@ class BoxDisturbance(Disturbance):
         self._freeze_arrays()
 
     def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
-        widths = np.sqrt(plant.gamma / plant.n) if self.half_widths is None else self.half_widths
-        return rng.uniform(-1.0, 1.0, plant.n) * widths
+        return rng.uniform(-1.0, 1.0, plant.n) * self.widths(plant)
 
     def draw_many(self, rng, plant, nominal_next, steps, memory):  # noqa: D102
-        from ncs_gym.kernels import add_box
+        return rng.uniform(-1.0, 1.0, nominal_next.shape) * self.widths(plant)
 
-        d = np.zeros(nominal_next.shape)
-        widths = np.sqrt(plant.gamma / plant.n) if self.half_widths is None else np.asarray(self.half_widths)
-        add_box(rng, np.broadcast_to(widths, plant.n).astype(np.float64), d)
-        return d
+    def widths(self, plant: LinearPlant) -> np.ndarray:
+        """Returns the half-widths for a plant, shape (n,)."""
+        widths = np.sqrt(plant.gamma / plant.n) if self.half_widths is None else self.half_widths
+        return np.broadcast_to(np.asarray(widths, dtype=np.float64), (plant.n,))
 
     def check(self, plant):  # noqa: D102
         if self.half_widths is None:
@@ -195,7 +189,6 @@ class SphereDisturbance(Disturbance):
     """A random boundary point of E(D): always as large as allowed."""
 
     replaces_process_noise: ClassVar[bool] = True
-    is_memoryless: ClassVar[bool] = True
 
     def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
         return (1.0 - ROUNDING) * plant.nominal_disturbance.sample_boundary(rng)

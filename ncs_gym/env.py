@@ -16,7 +16,8 @@ from ncs_gym.error_set import UnstablePlantError, certified_error_set
 from ncs_gym.estimator import Estimator
 from ncs_gym.frozen import as_count, as_flag, as_numbers, as_vector, read_only
 from ncs_gym.plant import LinearPlant
-from ncs_gym.task import Regulation, Task
+from ncs_gym.rendering import Annotation, Film, Scene, scene_of
+from ncs_gym.task import Regulation, SpeedProfile, Task
 
 T = TypeVar("T")
 
@@ -28,6 +29,8 @@ SAMPLE_ROUNDING = 1e-9
 FARTHEST_OBSERVED = 1e6
 # Widens the observation box: float32 rounding, and estimates a little off the reachable set.
 OBSERVATION_MARGIN = 1.01
+RENDER_MODES = ["human", "rgb_array"]
+RENDER_FPS = 30
 
 
 class RenderModeError(ValueError, TypeError):
@@ -89,7 +92,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         allow_assumption_violation: Let disturbances outside the certified bound pass instead of raising.
         contract: What the channel promises, for unstable plants (docs/contracts.md); by default that of the channel
             if the plant is unstable, none if it is stable. A channel that may break it is allowed.
-        render_mode: None; there is no rendering yet.
+        render_mode: "human" shows every step in a window, "rgb_array" makes `render` return an image; both need
+            the extra `[render]` (docs/rendering.md).
         horizon: Steps the observation space is sized for.
 
     Attributes:
@@ -103,7 +107,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         ValueError: If a setting is of the wrong kind or does not fit the plant.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES, "render_fps": RENDER_FPS}
 
     def __init__(
         self,
@@ -128,9 +132,10 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             raise ValueError(f"initial_set must have dimension {plant.n}, got {self.initial_set.dim}")
         if problem := self.task.check(plant):
             raise ValueError(f"{type(self.task).__name__}: {problem}")
-        if render_mode is not None:
-            raise RenderModeError(f"render_mode must be None, got {render_mode!r}")
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise RenderModeError(f"render_mode must be None or one of {RENDER_MODES}, got {render_mode!r}")
         self.render_mode = render_mode
+        self._film = None if render_mode is None else Film(plant, "ncs-gym", RENDER_FPS)
         self.terminate_on_violation = as_flag(terminate_on_violation, "terminate_on_violation")
         self.allow_assumption_violation = as_flag(allow_assumption_violation, "allow_assumption_violation")
         self.contract = _contract(plant, self.channel, contract)
@@ -171,6 +176,9 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._violations = 0.0
         self._consistent = True
         info = self._info(np.zeros(self.plant.m), packet_arrived=False)
+        if self._film is not None:
+            self._film.history.begin(self._state)
+            self._show()
         return self._observation(), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -196,7 +204,45 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         info = self._info(u, packet_arrived=bool(packets))
         terminated = self.terminate_on_violation and info["cost"] > 0.0
         self._consistent = True
+        if self._film is not None:
+            speed = self._task_memory.speed if isinstance(self._task_memory, SpeedProfile) else 0.0
+            self._film.history.add(self._state, u, self._link, packets, self.plant.dt * speed)
+            self._show()
         return self._observation(), float(reward), terminated, False, info
+
+    def render(self) -> np.ndarray | None:
+        """Returns an image, shape (height, width, 3), uint8; None in mode "human", which shows every step by itself.
+
+        Raises:
+            gymnasium.error.DependencyNotInstalled: If pygame is missing.
+            gymnasium.error.ResetNeeded: If there was no reset.
+        """
+        if self._film is None:
+            gym.logger.warn('render() draws nothing without a render mode: gym.make(..., render_mode="rgb_array")')
+            return None
+        if not self._consistent:
+            raise gym.error.ResetNeeded("call reset before render")
+        if self.render_mode == "human":
+            return self._show()
+        return self._film.pixels(self._scene(self._film))
+
+    def annotate(self, annotation: Annotation) -> None:
+        """Shows what a shield knows in the picture of the next step or reset; nothing where nothing is drawn."""
+        if self._film is not None:
+            self._film.history.annotate(annotation)
+
+    def close(self) -> None:
+        """Closes the window."""
+        if self._film is not None:
+            self._film.close()
+
+    def _show(self) -> None:
+        if self._film is not None and self.render_mode == "human":
+            self._film.show(self._scene(self._film))
+
+    def _scene(self, film: Film) -> Scene:
+        memory, violations = self._task_memory, int(self._violations)
+        return scene_of(self.plant, self.task, memory, self.estimator, film.history, violations)
 
     def _draw_disturbance(self, nominal_next: np.ndarray) -> np.ndarray:
         rng, source = self.np_random, self.disturbance

@@ -13,6 +13,9 @@ FIRST_CAPACITY = 256
 # Patterns beyond this are forgotten but for those in use.
 MOST_NODES = 1 << 17
 UNKNOWN = -1
+# Columns of `GainTable.edges`.
+TARGET, ACCEPTED, FRESH, HELD = range(4)
+LAST_BIT = 30
 
 
 class Spread(NamedTuple):
@@ -50,16 +53,14 @@ class GainTable:
         estimator: Whose prediction, update and choice of history the table holds.
 
     Attributes:
-        predicted: Node after a prediction, shape (nodes,).
-        received: Edge of a packet of age delay + i, shape (nodes, jitter + 1).
+        nodes: Node after a prediction, and edge of a packet of age delay + i, shape (nodes, 1 + jitter + 1).
         shapes: Sigma_k of each node, shape (nodes, n * n).
-        target: Node an edge leads to, shape (edges,).
-        accepted: Whether the replayed history is kept, shape (edges,).
-        fresh: Age of the newest sample used after it; UNKNOWN if as before. Shape (edges,).
-        held: Whether a sample of each age is used in the replay, shape (edges, buffer + 1).
-        gains: Its gain, zero where it is not used, shape (edges, buffer + 1, n, p).
+        edges: Node an edge leads to, whether the replayed history is kept, age of the newest sample used after it
+            (UNKNOWN if as before), and the ages of samples used in the replay as bits (the last for all older ones);
+            shape (edges, 4).
+        weights: Its gain, zero where it is not used, n * p numbers, and (seen + N)^-1 of the monitor's quick test,
+            p * p numbers; shape (edges, buffer + 1, n * p + p * p).
         seen: H Sigma_k H' before each update, shape (edges, buffer + 1, p, p).
-        checks: (seen + N)^-1 of the monitor's quick test, shape (edges, buffer + 1, p, p).
     """
 
     def __init__(self, estimator: Estimator) -> None:
@@ -76,15 +77,10 @@ class GainTable:
         self._nodes: list[Node] = []
         self._node_index: dict[Node, int] = {}
         self._edges = 0
-        self.predicted = np.full(FIRST_CAPACITY, UNKNOWN, np.int32)
-        self.received = np.full((FIRST_CAPACITY, channel.jitter + 1), UNKNOWN, np.int32)
+        self.nodes = np.full((FIRST_CAPACITY, 1 + channel.jitter + 1), UNKNOWN, np.int32)
         self.shapes = np.zeros((FIRST_CAPACITY, n * n))
-        self.target = np.zeros(FIRST_CAPACITY, np.int32)
-        self.accepted = np.zeros(FIRST_CAPACITY, np.bool_)
-        self.fresh = np.zeros(FIRST_CAPACITY, np.int32)
-        self.held = np.zeros((FIRST_CAPACITY, ages), np.bool_)
-        self.gains = np.zeros((FIRST_CAPACITY, ages, n, p))
-        self.checks = np.zeros((FIRST_CAPACITY, ages, p, p))
+        self.edges = np.zeros((FIRST_CAPACITY, 4), np.int32)
+        self.weights = np.zeros((FIRST_CAPACITY, ages, n * p + p * p))
         self.seen = np.zeros((FIRST_CAPACITY, ages, p, p))
         first = self._spread(plant.initial_cov, plant.initial_error.shape, 0)
         self.root = self._node(Node(first, (UNKNOWN,) * ages, (False,) * ages))
@@ -94,18 +90,21 @@ class GainTable:
 
     def predict(self, node: int) -> int:
         """Returns the node one step later, without packets."""
-        if self.predicted[node] == UNKNOWN:
+        if self.nodes[node, 0] == UNKNOWN:
             belief, priors, held = self._nodes[node]
             moved = self._moved(belief)
-            self.predicted[node] = self._node(Node(moved, (moved, *priors[:-1]), (False, *held[:-1])))
-        return int(self.predicted[node])
+            # The array may be another one once there is a new node.
+            after = self._node(Node(moved, (moved, *priors[:-1]), (False, *held[:-1])))
+            self.nodes[node, 0] = after
+        return int(self.nodes[node, 0])
 
     def receive(self, node: int, age: int) -> int:
         """Returns the edge of a packet of some age that arrives."""
-        column = age - self._first_age
-        if self.received[node, column] == UNKNOWN:
-            self.received[node, column] = self._replay(node, age)
-        return int(self.received[node, column])
+        column = 1 + age - self._first_age
+        if self.nodes[node, column] == UNKNOWN:
+            edge = self._replay(node, age)
+            self.nodes[node, column] = edge
+        return int(self.nodes[node, column])
 
     def keeping(self, live: np.ndarray) -> tuple[GainTable, np.ndarray]:
         """Returns a table with the nodes `live` (k,) only, and their numbers in it; this one if it is small enough."""
@@ -137,9 +136,9 @@ class GainTable:
         if node not in self._node_index:
             number = self._node_index[node] = len(self._nodes)
             self._nodes.append(node)
-            if number == len(self.predicted):
-                for name in ("predicted", "received", "shapes"):
-                    self._double(name)
+            if number == len(self.nodes):
+                self._double("nodes")
+                self._double("shapes")
             self.shapes[number] = self._spreads[node.belief].shape.ravel()
         return self._node_index[node]
 
@@ -176,30 +175,29 @@ class GainTable:
         belief, priors, held = self._nodes[node]
         held = tuple(there or each == age for each, there in enumerate(held))
         replayed, spread = list(priors), priors[age]
+        self.edges[edge, HELD] = 0
         for each in range(age, -1, -1):
             spread = replayed[each]
             if held[each]:
                 seen = estimator.plant.H @ self._spreads[spread].shape @ estimator.plant.H.T
                 spread, gain = self._updated(spread)
-                self.held[edge, each], self.gains[edge, each] = True, gain
                 self.seen[edge, each] = seen
-                self.checks[edge, each] = estimator.inverse_of_bound(seen)
+                self.edges[edge, HELD] |= 1 << min(each, LAST_BIT)
+                self.weights[edge, each] = np.append(gain, estimator.inverse_of_bound(seen))
             if each > 0:
                 replayed[each - 1] = self._moved(spread)
         now, then = self._spreads[belief], self._spreads[spread]
         if estimator.prefers(then.shape, then.age, now.shape, now.age):
-            self.accepted[edge] = True
-            self.fresh[edge] = then.age if then.age < self._oldest else UNKNOWN
-            self.target[edge] = self._node(Node(spread, tuple(replayed), held))
+            fresh = then.age if then.age < self._oldest else UNKNOWN
+            self.edges[edge, :HELD] = self._node(Node(spread, tuple(replayed), held)), True, fresh
         else:
-            self.accepted[edge], self.fresh[edge] = False, UNKNOWN
-            self.target[edge] = self._node(Node(belief, priors, held))
+            self.edges[edge, :HELD] = self._node(Node(belief, priors, held)), False, UNKNOWN
         return edge
 
     def _new_edge(self) -> int:
         edge = self._edges
         self._edges += 1
-        if edge == len(self.target):
-            for name in ("target", "accepted", "fresh", "held", "gains", "checks", "seen"):
+        if edge == len(self.edges):
+            for name in ("edges", "weights", "seen"):
                 self._double(name)
         return edge

@@ -36,13 +36,13 @@ class TruncatedGaussian(FrozenArrays):
         return Ellipsoid(self.energy * self.covariance)
 
     @cached_property
-    def _factor(self) -> np.ndarray | None:
+    def factor(self) -> np.ndarray | None:
         """G with G G' = covariance; None when there is no noise (then no random number is drawn)."""
         return Ellipsoid(self.covariance).factor if np.any(self.covariance) else None
 
     def sample(self, rng: np.random.Generator) -> np.ndarray:
         """Returns one draw, shape (n,), by rejection."""
-        factor = self._factor
+        factor = self.factor
         if factor is None:
             return np.zeros(self.covariance.shape[0])
         while True:
@@ -51,17 +51,15 @@ class TruncatedGaussian(FrozenArrays):
                 return factor @ direction
 
     def sample_many(self, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Returns draws, shape (count, n)."""
-        out = np.zeros((count, self.covariance.shape[0]))
-        self.add_to(rng, out)
-        return out
+        """Returns draws, shape (count, n), by compiled loops."""
+        from ncs_gym.draws import fill_truncated, normals
 
-    def add_to(self, rng: np.random.Generator, out: np.ndarray) -> None:
-        """Adds a draw to each row of `out`, shape (count, n), by compiled rejection."""
-        from ncs_gym.kernels import add_truncated
-
-        if self._factor is not None:
-            add_truncated(rng, self.energy, self._factor, out)
+        if self.factor is None:
+            return np.zeros((count, self.covariance.shape[0]))
+        rank = self.factor.shape[1]
+        keys, drawn = rng.integers(2**64, size=count, dtype=np.uint64), normals(rank, count)
+        fill_truncated(keys, 0, self.energy, rank, drawn)
+        return (self.factor @ drawn[:rank]).T
 
 
 @cache

@@ -162,7 +162,7 @@ class VectorScenario:
         scenario: Gives the settings.
     """
 
-    metadata: ClassVar[dict[str, Any]] = NCSEnv.metadata
+    metadata: ClassVar[dict[str, Any]] = NCSEnv.metadata | {"render_modes": []}
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario

@@ -101,8 +101,12 @@ class Regulation(Task):
                 object.__setattr__(self, name, as_covariance(value, None, name))
         self._freeze_arrays()
 
+    def costs(self, plant: LinearPlant) -> tuple[np.ndarray, np.ndarray]:
+        """Returns Q and R for a plant."""
+        return _costs(self, plant)
+
     def reward(self, plant, memory, state, u):  # noqa: D102
-        Q, R = _costs(self, plant)
+        Q, R = self.costs(plant)
         return -float(state @ Q @ state) - float(u @ R @ u)
 
     def begin_many(self, rng, plant, count):  # noqa: D102
@@ -115,12 +119,8 @@ class Regulation(Task):
         return memory
 
     def reward_many(self, plant, memory, states, inputs):  # noqa: D102
-        from ncs_gym.kernels import quadratic
-
-        Q, R = _costs(self, plant)
-        rewards = np.empty(len(states))
-        quadratic(Q, states.T, R, inputs.T, rewards)
-        return -rewards
+        Q, R = self.costs(plant)
+        return -np.einsum("ei,ij,ej->e", states, Q, states) - np.einsum("ei,ij,ej->e", inputs, R, inputs)
 
     def check(self, plant):  # noqa: D102
         for name, size in (("state_cost", plant.n), ("input_cost", plant.m)):
@@ -204,7 +204,7 @@ class SpeedTracking(Task):
         return self.fastest * rng.random((2, count)).T
 
     def advance_many(self, rng, plant, memory, inputs):  # noqa: D102
-        from ncs_gym.kernels import follow_profile
+        from ncs_gym.profile import follow_profile
 
         moved, draws = np.empty_like(memory), rng.random((2, len(memory)))
         effort = inputs[:, self.input_index]
@@ -215,7 +215,7 @@ class SpeedTracking(Task):
         return memory[:, 1:] - memory[:, :1]
 
     def reward_many(self, plant, memory, states, inputs):  # noqa: D102
-        from ncs_gym.kernels import profile_reward
+        from ncs_gym.profile import profile_reward
 
         rewards = np.empty(len(memory))
         profile_reward(memory, inputs[:, self.input_index], self.error_weight, self.input_weight, rewards)

@@ -9,16 +9,19 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from ncs_gym import kernels
-from ncs_gym.channel import Channel, GilbertElliott
+from ncs_gym import gain_table
+from ncs_gym.channel import GilbertElliott
 from ncs_gym.disturbance import checked_many, stays_inside
-from ncs_gym.env import NCSEnv
+from ncs_gym.draws import fill_keys
+from ncs_gym.env import NCSEnv, RenderModeError
+from ncs_gym.fleet import fleet_of, rows_of
 from ncs_gym.frozen import as_count, as_numbers
 from ncs_gym.gain_table import GainTable
-from ncs_gym.plant import LinearPlant
-
-# Random numbers that do not depend on the state are drawn in blocks of about this many environment steps.
-BLOCK = 8192
+from ncs_gym.law import law_of_disturbance
+from ncs_gym.motion import DRAW, LAST, MOVE, PREDICT, RECEIVE, clip, read_actions, run
+from ncs_gym.report import Layout, Report
+from ncs_gym.system import packed, system_of
+from ncs_gym.task import Regulation
 
 
 class NCSVectorEnv(VectorEnv):
@@ -57,7 +60,9 @@ class NCSVectorEnv(VectorEnv):
         limit = max_episode_steps
         self.max_episode_steps = None if limit is None else as_count(limit, "max_episode_steps", low=1)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.metadata = NCSEnv.metadata | {"autoreset_mode": self.autoreset_mode}
+        self.metadata = NCSEnv.metadata | {"autoreset_mode": self.autoreset_mode, "render_modes": []}
+        if settings.get("render_mode") is not None:
+            raise RenderModeError("a vector environment draws nothing: use gym.make(..., render_mode=...)")
         self.single = NCSEnv(**settings)
         self.plant, self.channel, self.task = self.single.plant, self.single.channel, self.single.task
         self.contract, self.error_set, self.render_mode = self.single.contract, self.single.error_set, None
@@ -65,21 +70,30 @@ class NCSVectorEnv(VectorEnv):
         self.single_action_space = self.single.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        plant = self.plant
-        self._model = kernels.Model(
-            *(np.ascontiguousarray(a) for a in (plant.A, plant.B, plant.H, plant.C, plant.u_max))
-        )
-        self._network, self._uniform_count = _network_of(self.channel)
+        self._counts, self._constants = packed(system_of(self.single, self.max_episode_steps))
         self._table = GainTable(self.single.estimator)
-        self._fleet = _fleet(self.num_envs, plant, self.channel.longest_delay + 1)
-        self._tick = 0
-        self._done, self._everyone = np.zeros(self.num_envs, np.bool_), np.ones(self.num_envs, np.bool_)
-        self._missing = np.empty(self.num_envs, np.int64)
-        room = self.num_envs * (self.channel.longest_delay + 1)
-        self._suspects, self._residuals = np.empty((room, 3), np.int32), np.empty((room, plant.p))
+        self._allocate()
+        self._tick = self._moment = 0
+        self._some_done = False
         self.episodes = np.zeros(self.num_envs, dtype=np.int64)
         self.starts: np.ndarray | None = None
         self._consistent = False
+
+    def _allocate(self) -> None:
+        """Makes the arrays that are kept."""
+        plant, count, slots = self.plant, self.num_envs, self.channel.longest_delay + 1
+        sizes = plant.n, plant.m, plant.p, slots
+        rows, marks = rows_of(*sizes)
+        self._kept = np.zeros((rows, count)), np.zeros((marks, count), np.int32)
+        self._fleet = fleet_of.py_func(*sizes, *self._kept)
+        self._fleet.counted[:] = 1
+        self._doubts, self._residuals = np.empty((count * slots, 4), np.int32), np.empty((count * slots, plant.p))
+        self._progress, self._done = np.zeros(4, np.int64), np.zeros(count, np.bool_)
+        self._layout = Layout(count, plant.n, plant.m, len(plant.C), self.single_observation_space.shape[0])
+        self._actions_shape = count, plant.m
+        self._pays = type(self.task) is Regulation
+        # Disturbances that are not drawn by compiled loops.
+        self._disturbs = law_of_disturbance(self.single.disturbance, plant) is None
 
     @property
     def steps(self) -> np.ndarray:
@@ -113,13 +127,15 @@ class NCSVectorEnv(VectorEnv):
             seed = int(np.random.SeedSequence([int(each) for each in seed]).generate_state(1, np.uint64)[0] >> 1)
         super().reset(seed=seed)
         if seed is not None or not self._consistent:
-            self._blocks: dict[str, tuple[np.ndarray, int]] = {}
+            fill_keys(self.np_random.integers(2**64, dtype=np.uint64), self._fleet.keys)
+            self._moment = 0
         if not (self._consistent or mask.all()):
             raise gym.error.ResetNeeded("reset all environments first")
         self._consistent = False
         self._begin(mask, starts)
         self._consistent = True
-        return self._report(np.zeros((self.plant.m, self.num_envs)), mask)
+        self._some_done = self._done.any()
+        return self._report(mask)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Applies u = u_max * action, actions of shape (N, m), for one step of every environment.
@@ -128,27 +144,30 @@ class NCSVectorEnv(VectorEnv):
             ValueError: If an action is not finite or the shape is wrong; nothing has moved then.
             gymnasium.error.ResetNeeded: If there was no reset, or an earlier step failed half-way.
         """
-        u = self.inputs_of(actions)
+        filled = self._layout.new()
+        self._read(actions, filled.numbers)
         if not self._consistent:
             raise gym.error.ResetNeeded("call reset: there was none, or an earlier step failed half-way")
-        if self.autoreset_mode is AutoresetMode.DISABLED and self._done.any():
+        if self._some_done and self.autoreset_mode is AutoresetMode.DISABLED and self._done.any():
             raise gym.error.ResetNeeded("some episodes are over: reset them with options={'reset_mask': ...}")
         self._consistent = False
-        resetting = self._done.copy() if self.autoreset_mode is AutoresetMode.NEXT_STEP and self._done.any() else None
-        self._move(u)
-        if resetting is not None:
+        first, resetting, u = self._start_step(filled), None, filled.numbers[: self.plant.m]
+        if self._some_done and self.autoreset_mode is AutoresetMode.NEXT_STEP:
+            first, resetting = self._run(first, LAST, filled), self._done.copy()
             self._begin(resetting, None)
             u[:, resetting] = 0.0
-        rewards = self.task.reward_many(self.plant, self._memory, self._fleet.state.T, u.T)
-        observation, info = self._report(u, self._everyone)
-        terminated = info["cost"] > 0.0 if self.single.terminate_on_violation else np.zeros(self.num_envs, np.bool_)
-        truncated = np.zeros(self.num_envs, np.bool_)
-        if self.max_episode_steps is not None:
-            truncated = self._fleet.steps >= self.max_episode_steps
+        self._run(first, LAST + 1, filled)
+        flags = filled.flags
+        rewards, terminated, truncated, self._done = filled.numbers[-2], flags[3], flags[4], flags[5]
+        if not self._pays:
+            rewards[:] = self.task.reward_many(self.plant, self._memory, self._fleet.state.T, u.T)
         if resetting is not None:
-            rewards[resetting], terminated[resetting], truncated[resetting] = 0.0, False, False
-        self._done = terminated | truncated
-        if self.autoreset_mode is AutoresetMode.SAME_STEP and self._done.any():
+            rewards[resetting] = 0.0
+            filled.flags[3:, resetting] = False
+            self._progress[3] = self._done.sum()
+        observation, info = self._observed(filled), self._layout.infos(filled)
+        self._some_done = self._progress[3] > 0
+        if self._some_done and self.autoreset_mode is AutoresetMode.SAME_STEP:
             observation, info = self._restarted(observation, info)
         self._consistent = True
         return observation, rewards, terminated, truncated, info
@@ -159,111 +178,86 @@ class NCSVectorEnv(VectorEnv):
         Raises:
             ValueError: If one is not finite or the shape is wrong.
         """
-        numbers = actions
-        if not (isinstance(actions, np.ndarray) and actions.dtype == np.float32 and actions.flags.c_contiguous):
-            numbers = as_numbers(actions)
-        u = np.empty((self.plant.m, self.num_envs))
-        wanted = (self.num_envs, self.plant.m)
-        if numbers is None or numbers.shape != wanted or not kernels.read_actions(numbers, self._model.u_max, u):
-            raise ValueError(f"the actions must be finite with shape {wanted}, got {actions!r}")
+        u = np.empty(self._actions_shape[::-1])
+        self._read(actions, u)
         return u
 
-    def _move(self, u: np.ndarray) -> None:
-        """Moves plants, channels and estimators one step on."""
-        fleet, model = self._fleet, self._model
-        nominal = np.empty_like(fleet.state)
-        kernels.moved(model.A, fleet.state, model.B, u, nominal)
-        d = self._disturbances(nominal)
+    def _read(self, actions: np.ndarray, rows: np.ndarray) -> None:
+        """Fills the first m rows, shape (N,) each, with the inputs that actions stand for."""
+        numbers, wanted = actions, self._actions_shape
+        if not (type(actions) is np.ndarray and actions.dtype == np.float32 and actions.flags.c_contiguous):
+            numbers = as_numbers(actions)
+        if numbers is None or numbers.shape != wanted or not read_actions(numbers, self.plant.u_max, rows):
+            raise ValueError(f"the actions must be finite with shape {wanted}, got {actions!r}")
+
+    def _start_step(self, filled: Report) -> int:
+        """Does what compiled loops cannot, for what a user wrote; returns the stage to go on from."""
         self._tick += 1
-        kernels.advance(model, fleet, self._tick, u, nominal, d)
+        self._moment += 1
+        u = filled.numbers[: self.plant.m]
+        if self._disturbs:
+            self._run(DRAW, MOVE, filled)
+            self._disturb(u)
         self._memory = self.task.advance_many(self.np_random, self.plant, self._memory, u.T)
-        noise, start = self._block("noise", self.plant.sensor_noise.sample_many)
-        sent = kernels.send(model, self._network, fleet, self._tick, self._uniforms(), noise[start:])
-        self._blocks["noise"] = noise, start + sent
-        self._estimate()
+        return MOVE if self._disturbs else DRAW
 
-    def _disturbances(self, nominal: np.ndarray) -> np.ndarray:
-        """Returns this step's d, shape (N, n)."""
-        source, plant, count = self.single.disturbance, self.plant, self.num_envs
-        if source.is_memoryless and stays_inside(source):
-            return self._drawn("disturbance", self._memoryless_disturbances)
-        d = source.draw_many(self.np_random, plant, nominal.T, self._fleet.steps, self._disturbance_memory)
+    def _disturb(self, u: np.ndarray) -> None:
+        """Adds disturbances that are not drawn by compiled loops to the process noise."""
+        source, plant, fleet = self.single.disturbance, self.plant, self._fleet
+        nominal = fleet.state.T @ plant.A.T + u.T @ plant.B.T
+        d = source.draw_many(self.np_random, plant, nominal, fleet.steps, self._disturbance_memory)
         if not source.replaces_process_noise:
-            d = d + self._drawn("process", plant.process_noise.sample_many)
-        if stays_inside(source):
-            return d
-        return checked_many(plant, d, count, allow_assumption_violation=self.single.allow_assumption_violation)
+            d = d + fleet.disturbance.T
+        if not stays_inside(source):
+            violation = self.single.allow_assumption_violation
+            d = checked_many(plant, d, self.num_envs, allow_assumption_violation=violation)
+        fleet.disturbance[:] = d.T
 
-    def _memoryless_disturbances(self, rng: np.random.Generator, count: int) -> np.ndarray:
-        source, plant = self.single.disturbance, self.plant
-        d = source.draw_many(rng, plant, np.zeros((count, plant.n)), np.zeros(count), None)
-        if not source.replaces_process_noise:
-            plant.process_noise.add_to(rng, d)
-        return d
+    def _run(self, first: int, end: int, filled: Report) -> int:
+        """Runs stages of a step; where the gain table lacks edges it works them out and goes on. Returns `end`."""
+        table, progress, moves = self._table, self._progress, first < LAST <= end
+        while not run(
+            first,
+            end,
+            self._tick,
+            self._moment,
+            self._counts,
+            self._constants,
+            *self._kept,
+            table.nodes,
+            table.edges,
+            table.weights,
+            table.shapes,
+            self._doubts,
+            self._residuals,
+            *filled,
+            progress,
+        ):
+            first, missed, *_ = progress.tolist()
+            for node in np.unique(self._doubts[:missed, 0]).tolist():
+                if first == PREDICT:
+                    table.predict(node)
+                else:
+                    table.receive(node, self.channel.longest_delay - (first - RECEIVE))
+        if moves and progress[2] > 0:
+            self._look_closer(int(progress[2]))
+            filled.flags[1] = self._fleet.alarm
+        if len(table) >= gain_table.MOST_NODES:
+            self._table, self._fleet.node[:] = table.keeping(self._fleet.node)
+        return end
 
-    def _block(self, name: str, draw: Any) -> tuple[np.ndarray, int]:
-        """Returns a block of rows filled by `draw`, at least N of them unused, and the number of the first of these."""
-        block, start = self._blocks.get(name, (None, 0))
-        if block is None or start + self.num_envs > len(block):
-            block, start = draw(self.np_random, self.num_envs * max(1, BLOCK // self.num_envs)), 0
-        return block, start
-
-    def _drawn(self, name: str, draw: Any) -> np.ndarray:
-        """Returns the next N rows of a block."""
-        block, start = self._block(name, draw)
-        self._blocks[name] = block, start + self.num_envs
-        return block[start : start + self.num_envs]
-
-    def _uniforms(self) -> np.ndarray:
-        """Returns the uniform numbers that the channel needs, shape (0..3, N)."""
-        if self._uniform_count == 0:
-            return np.zeros((0, self.num_envs))
-        block, start = self._blocks.get("uniform", (np.zeros((0, 0, 0)), 0))
-        if start == len(block):
-            block = self.np_random.random((max(1, BLOCK // self.num_envs), self._uniform_count, self.num_envs))
-            start = 0
-        self._blocks["uniform"] = block, start + 1
-        return block[start]
-
-    def _estimate(self) -> None:
-        """Takes the prediction and what arrived into account, along the edges of the gain table."""
-        table, fleet, channel = self._table, self._fleet, self.channel
-        while missed := kernels.follow_predictions(table.predicted, fleet.node, self._missing):
-            for node in np.unique(self._missing[:missed]).tolist():
-                table.predict(node)
-        for age in range(channel.longest_delay, channel.delay - 1, -1):
-            doubtful = self._receive(age)
-            for row in range(doubtful):
-                e, edge, each = self._suspects[row].tolist()
-                fleet.alarm[e] |= self.single.estimator.is_impossible(self._residuals[row], table.seen[edge, each])
-        self._table, fleet.node[:] = table.keeping(fleet.node)
-
-    def _receive(self, age: int) -> int:
-        """Takes in the packets of one age; returns the number of residuals beyond the quick test."""
-        table, column = self._table, age - self.channel.delay
-        while True:
-            arrays = kernels.Transitions(*(getattr(table, name) for name in kernels.Transitions._fields))
-            missed, doubtful = kernels.receive(
-                self._model,
-                arrays,
-                self._fleet,
-                self._tick,
-                age,
-                column,
-                self._missing,
-                self._suspects,
-                self._residuals,
-            )
-            if not missed:
-                return doubtful
-            for node in np.unique(self._missing[:missed]).tolist():
-                table.receive(node, age)
+    def _look_closer(self, doubtful: int) -> None:
+        """Raises the alarm for residuals beyond the quick test that are beyond the exact one, too."""
+        for (_, e, edge, each), residual in zip(self._doubts[:doubtful].tolist(), self._residuals, strict=False):
+            seen = self._table.seen[edge, each]
+            self._fleet.alarm[e] |= self.single.estimator.is_impossible(residual, seen)
 
     def _begin(self, mask: np.ndarray, starts: np.ndarray | None) -> None:
         """Starts episodes where `mask` says so, at `starts` (N, n) or drawn from the initial set."""
         fleet, rng, plant = self._fleet, self.np_random, self.plant
-        chosen = np.flatnonzero(mask)
-        count = len(chosen)
+        # A slice of all is faster than their numbers.
+        chosen = slice(None) if mask.all() else np.flatnonzero(mask)
+        count = int(mask.sum())
         drawn = (1.0 - 1e-9) * self.single.initial_set.sample_many(rng, count) if starts is None else starts[chosen]
         memory = self.task.begin_many(rng, plant, count)
         disturbance_memory = self.single.disturbance.begin_many(rng, plant, count)
@@ -275,10 +269,9 @@ class NCSVectorEnv(VectorEnv):
         fleet.mean[:, chosen] = (drawn + plant.initial_noise.sample_many(rng, count)).T
         fleet.due[:, chosen] = -1
         fleet.node[chosen] = self._table.root
-        for array in (fleet.age, fleet.steps, fleet.lost):
+        for array in (fleet.age, fleet.steps, fleet.lost, fleet.alarm, fleet.arrived):
             array[chosen] = 0
         fleet.wait[chosen] = self.channel.send_period
-        fleet.alarm[chosen] = fleet.arrived[chosen] = False
         fleet.violations[chosen] = 0.0
         loss = self.channel.loss
         if isinstance(loss, GilbertElliott):
@@ -289,48 +282,22 @@ class NCSVectorEnv(VectorEnv):
             self.starts = np.full((self.num_envs, plant.n), np.nan)
         self.starts[chosen] = np.nan if starts is None else drawn
 
-    def _report(self, u: np.ndarray, counted: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
-        """Returns observations (N, n + extra) and infos of now, every array a fresh one; counts violations of some."""
-        fleet, plant, space = self._fleet, self.plant, self.single_observation_space
-        count, n = self.num_envs, plant.n
-        observation = np.empty((space.shape[0], count), np.float32)
-        error, shape = np.empty((n, count)), np.empty((count, n * n))
-        values, cost, broken = np.empty((len(plant.C), count)), np.empty(count), np.empty(count, np.bool_)
-        most = -1 if self.contract is None else self.contract.max_age
-        kernels.report(
-            self._model,
-            fleet,
-            self._table.shapes,
-            most,
-            space.low,
-            space.high,
-            counted,
-            observation,
-            error,
-            shape,
-            values,
-            cost,
-            broken,
-        )
-        if len(observation) > n:
-            extra = self.task.observe_many(self._memory)
-            observation[n:] = np.clip(extra, space.low[n:], space.high[n:]).T
-        info = {
-            "state": fleet.state.copy().T,
-            "estimate": fleet.mean.copy().T,
-            "estimation_error": error.T,
-            "error_shape": shape.reshape(count, n, n),
-            "input": u.T,
-            "constraint_values": values.T,
-            "cost": cost,
-            "measurement_age": fleet.age.copy(),
-            "packet_arrived": fleet.arrived.copy(),
-            "assumption_violated": fleet.alarm.copy(),
-            "episode_violations": fleet.violations.copy(),
-            "is_success": (fleet.violations == 0.0).astype(np.float64),
-            "contract_broken": broken,
-        }
-        return observation.T, info
+    def _report(self, counted: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
+        """Returns observations (N, n + extra) and infos of now, without inputs; counts violations of some."""
+        filled = self._layout.new()
+        filled.numbers[: self.plant.m] = 0.0
+        self._fleet.counted[:] = counted
+        self._run(LAST, LAST + 1, filled)
+        self._fleet.counted[:] = 1
+        return self._observed(filled), self._layout.infos(filled)
+
+    def _observed(self, filled: Report) -> np.ndarray:
+        """Returns the observations, shape (N, n + extra)."""
+        n, space = self.plant.n, self.single_observation_space
+        if len(filled.observation) > n:
+            extra = np.ascontiguousarray(self.task.observe_many(self._memory), dtype=np.float64)
+            clip(extra, space.low[n:], space.high[n:], filled.observation[n:])
+        return filled.observation.T
 
     def _restarted(self, observation: np.ndarray, info: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
         """Returns the first of new episodes where old ones ended, whose last go to final_obs and final_info."""
@@ -340,7 +307,8 @@ class NCSVectorEnv(VectorEnv):
         final |= {f"_{key}": done.copy() for key in info}
         final_observation = np.where(done[:, None], observation, 0).astype(np.float32)
         self._begin(done, None)
-        fresh_observation, fresh = self._report(np.zeros((self.plant.m, self.num_envs)), done)
+        fresh_observation, fresh = self._report(done)
+        self._some_done = False
         observation = np.where(done[:, None], fresh_observation, observation)
         merged = {
             key: np.where(done.reshape(-1, *[1] * (value.ndim - 1)), fresh[key], value) for key, value in info.items()
@@ -370,43 +338,3 @@ class NCSVectorEnv(VectorEnv):
                 f"options['state'] must be finite with shape ({n},) or ({self.num_envs}, {n}), got {options['state']!r}"
             )
         return mask, np.broadcast_to(starts, (self.num_envs, n))
-
-
-def _network_of(channel: Channel) -> tuple[kernels.Network, int]:
-    """Returns a channel as the loops need it, and how many uniform numbers it needs per step."""
-    loss, bursts = channel.loss, isinstance(channel.loss, GilbertElliott)
-    losses = (loss.loss_good, loss.loss_bad) if bursts else (loss, loss)
-    moves = (loss.p_good_to_bad, loss.p_bad_to_good) if bursts else (0.0, 0.0)
-    network = kernels.Network(
-        period=channel.send_period,
-        delay=channel.delay,
-        jitter=channel.jitter,
-        most_lost=-1 if channel.max_consecutive_losses is None else channel.max_consecutive_losses,
-        step=channel.quantization_step,
-        bursts=bursts,
-        losses=np.array(losses),
-        moves=np.array(moves),
-    )
-    needed = 3 if bursts else 2 if channel.jitter else 1 if max(losses) > 0.0 else 0
-    return network, needed
-
-
-def _fleet(count: int, plant: LinearPlant, slots: int) -> kernels.Fleet:
-    """Returns the memory of `count` environments before their first episode."""
-    return kernels.Fleet(
-        state=np.zeros((plant.n, count)),
-        mean=np.zeros((plant.n, count)),
-        priors=np.zeros((slots, plant.n, count)),
-        inputs=np.zeros((slots, plant.m, count)),
-        samples=np.zeros((slots, plant.p, count)),
-        due=np.full((slots, count), -1, np.int32),
-        node=np.zeros(count, np.int32),
-        age=np.zeros(count, np.int64),
-        steps=np.zeros(count, np.int64),
-        wait=np.zeros(count, np.int64),
-        lost=np.zeros(count, np.int64),
-        bad=np.zeros(count, np.bool_),
-        alarm=np.zeros(count, np.bool_),
-        arrived=np.zeros(count, np.bool_),
-        violations=np.zeros(count),
-    )

@@ -7,9 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym.ellipsoid import is_inside
-from shields import kernels
 from shields.filter import MARGIN, SafetyFilter
+from shields.judgement import FELL_BACK, FLAGS, INTERVENED, PASSED, RADIUS, SPREAD, USABLE, WEIGHT, decide
 from shields.plane import FARTHEST, SMALLEST_RADIUS
+from shields.rule import Rule
+from shields.tracking import CERTIFIED, EXTENT, LARGEST
+from shields.tracking import USABLE as SEEN
 
 REASONS = np.array(["safe", "projected", "fallback", "unsafe", "invalid"], dtype=object)
 FIRST_CAPACITY = 256
@@ -37,23 +40,16 @@ class ShapeBook:
     """What a filter needs to know of error shapes, worked out once per shape by the scalar test.
 
     Attributes:
-        outlooks: For the one-step test.
-        certified: Whether a shape lies in one of the certificate's, (k,).
-        extent: Half-widths, shape (k, n).
-        largest: sqrt(lambda_max(M Sigma_k)) with its rounding, shape (k,).
+        outlooks: For the one-step test, shape (k, WEIGHT + n * n); see `judgement`.
+        seen: For proofs, shape (k, EXTENT + n); see `tracking`.
     """
 
     def __init__(self, safety_filter: SafetyFilter) -> None:
         self._filter = safety_filter
         n = safety_filter.plant.n
         self._index: dict[bytes, int] = {}
-        zeros = np.zeros
-        self.outlooks = kernels.Outlooks(
-            zeros((FIRST_CAPACITY, n, n)), zeros(FIRST_CAPACITY), zeros(FIRST_CAPACITY), zeros(FIRST_CAPACITY, np.bool_)
-        )
-        self.certified = zeros(FIRST_CAPACITY, np.bool_)
-        self.extent = zeros((FIRST_CAPACITY, n))
-        self.largest = zeros(FIRST_CAPACITY)
+        self.outlooks = np.zeros((FIRST_CAPACITY, WEIGHT + n * n))
+        self.seen = np.zeros((FIRST_CAPACITY, EXTENT + n))
 
     def number(self, shape: np.ndarray) -> int:
         """Returns the index of a shape, (n, n)."""
@@ -64,19 +60,18 @@ class ShapeBook:
         return self._index[key]
 
     def _add(self, k: int, shape: np.ndarray) -> None:
-        if k == len(self.largest):
-            self.outlooks = kernels.Outlooks(*(np.concatenate([array, array]) for array in self.outlooks))
-            for name in ("certified", "extent", "largest"):
-                setattr(self, name, np.concatenate([getattr(self, name)] * 2))
-        weight, radius, spread, usable = self.outlooks
+        if k == len(self.seen):
+            self.outlooks, self.seen = (np.concatenate([rows, rows]) for rows in (self.outlooks, self.seen))
+        outlook, seen = self.outlooks[k], self.seen[k]
+        outlook[:] = seen[:] = 0.0
         view = self._filter.test.shape_view(shape)
-        usable[k] = view is not None
         if view is None:
             return
-        weight[k], radius[k], spread[k] = view
-        self.certified[k] = any(is_inside(shape, Sigma) for Sigma in self._filter.certificate.error_shapes)
-        self.extent[k] = np.sqrt(np.abs(np.diag(shape)))
-        self.largest[k] = self._filter.test.largest_error(shape)
+        weight, outlook[RADIUS], outlook[SPREAD] = view
+        outlook[USABLE], outlook[WEIGHT:] = 1.0, weight.ravel()
+        seen[SEEN], seen[LARGEST] = 1.0, self._filter.test.largest_error(shape)
+        seen[CERTIFIED] = any(is_inside(shape, Sigma) for Sigma in self._filter.certificate.error_shapes)
+        seen[EXTENT:] = np.sqrt(np.abs(np.diag(shape)))
 
 
 class VectorFilter:
@@ -89,7 +84,7 @@ class VectorFilter:
     def __init__(self, safety_filter: SafetyFilter) -> None:
         self.scalar, self.book = safety_filter, ShapeBook(safety_filter)
         test, plant, mode = safety_filter.test, safety_filter.plant, safety_filter.mode
-        self._rule = kernels.Rule(
+        self._rule = Rule(
             moved=np.ascontiguousarray(test.moved),
             effect=np.ascontiguousarray(test.effect),
             columns=test.columns,
@@ -114,20 +109,16 @@ class VectorFilter:
             numbers: Indices in `book` of the error shapes Sigma_k, shape (N,).
             inputs_proposed: Within the limits, shape (m, N) [physical units].
         """
-        count = numbers.size
-        u = np.empty_like(inputs_proposed)
-        intervened, passed, fallback = np.empty((3, count), np.bool_)
-        margin, reason = np.empty(count), np.empty(count, np.int64)
-        outlooks = self.book.outlooks
-        flags = intervened, passed, fallback
-        kernels.decide(self._rule, outlooks, numbers, estimates, inputs_proposed, u, *flags, margin, reason)
-        return Decisions(u, intervened, passed, fallback, margin, reason)
+        return self._decided(self._rule, estimates, numbers, inputs_proposed)
 
     def margins(self, estimates: np.ndarray, numbers: np.ndarray) -> np.ndarray:
         """Returns the margin of no input, shape (N,)."""
-        zero = np.zeros((self.scalar.plant.m, numbers.size))
-        u, codes = np.empty_like(zero), np.empty(numbers.size, np.int64)
-        flags, margin = np.empty((3, numbers.size), np.bool_), np.empty(numbers.size)
         rule = self._rule._replace(monitors=True, projects=False)
-        kernels.decide(rule, self.book.outlooks, numbers, estimates, zero, u, *flags, margin, codes)
-        return margin
+        return self._decided(rule, estimates, numbers, np.zeros((self.scalar.plant.m, numbers.size))).margin
+
+    def _decided(self, rule: Rule, estimates: np.ndarray, numbers: np.ndarray, proposed: np.ndarray) -> Decisions:
+        count = numbers.size
+        u, flags = np.empty_like(proposed), np.empty((FLAGS, count), np.bool_)
+        margin, reason = np.empty(count), np.empty(count, np.int64)
+        decide(rule, self.book.outlooks, numbers, estimates, proposed, u, flags, margin, reason)
+        return Decisions(u, flags[INTERVENED], flags[PASSED], flags[FELL_BACK], margin, reason)

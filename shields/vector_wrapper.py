@@ -12,14 +12,15 @@ from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 from ncs_gym.frozen import as_number, as_numbers
 from ncs_gym.plant import SIMULATED_REACH
 from ncs_gym.vector_env import NCSVectorEnv
-from shields import kernels, proof
+from shields import proof
 from shields.certificate import Certificate
 from shields.filter import MARGIN, SafetyFilter
 from shields.proof import starts_inside
+from shields.tracking import OTHER_STEPS, Ground, Knowledge, compare_clocks, count_interventions, number, track
 from shields.vector_filter import Decisions, VectorFilter
 from shields.wrapper import certificate_for
 
-# Reasons by code, see `kernels`.
+# Reasons by code, see `tracking`.
 WHY = np.array(
     [
         "",
@@ -80,17 +81,25 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         self.filter = SafetyFilter(self.certificate, inner.plant, mode)
         self._batch = VectorFilter(self.filter)
         self._starts_inside = starts_inside(self.certificate, inner.single.initial_set)
-        self._reach = SIMULATED_REACH * inner.plant.half_widths
+        test = self.filter.test
+        self._ground = Ground(
+            test.root,
+            test.own_columns,
+            SIMULATED_REACH * inner.plant.half_widths,
+            test.rounding,
+            MARGIN,
+            self.certificate.Sigma is not None,
+        )
         count = self.num_envs
         self._known = np.zeros(count, np.bool_)
-        self._knowledge = kernels.Knowledge(
-            np.full(count, kernels.OTHER_STEPS), np.zeros(count, np.bool_), np.zeros(count, np.bool_)
-        )
+        self._knowledge = Knowledge(np.full(count, OTHER_STEPS), np.zeros(count, np.bool_), np.zeros(count, np.bool_))
         self._table, self._numbers = None, np.zeros(0, np.int64)
         self._interventions = np.zeros(count, np.int64)
-        self._reason = np.full(count, kernels.OTHER_STEPS)
+        self._reason = np.full(count, OTHER_STEPS)
+        self._some_wrong = True
+        self._no_reason = np.full(count, "", dtype=object)
         # What the clock reads while a step is under way: if it raises, the next does not follow from what is known.
-        self._interrupted = Clock(np.full(count, -1), np.full(count, -1), -2)
+        self._interrupted = Clock(np.full(count, -1), np.full(count, -1, np.int32), -2)
         self._clock: Clock | None = None
 
     def reset(
@@ -102,6 +111,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         now = self._read_clock()
         restarted = now.episodes != before.episodes
         unmoved = (now.steps == before.steps) & (now.ticks == before.ticks)
+        self._interventions[restarted] = 0
         self._observe(info, restarted, np.where(restarted, now.steps == 0, unmoved), None)
         self._clock = now
         return observation, info | self._idle_info(restarted, None)
@@ -118,35 +128,37 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         inner: NCSVectorEnv = self.env.unwrapped
         proposed = inner.inputs_of(actions)
         decisions = self._batch.decide(self._estimate, self._shape_number, proposed)
-        if self.filter.mode != "monitor" and decisions.intervened.any():
+        if self.filter.mode != "monitor" and np.count_nonzero(decisions.intervened):
             overriding = (decisions.inputs.T / self.filter.plant.u_max).astype(np.float32)
             actions = np.where(decisions.intervened[:, None], overriding, np.asarray(actions))
         before, self._clock = self._clock, self._interrupted
         observation, rewards, terminated, truncated, info = self.env.step(actions)
-        now = self._read_clock()
-        restarted = now.episodes != before.episodes
-        fresh, moved = (now.episodes == before.episodes + 1) & (now.steps == 0), now.steps == before.steps + 1
-        moved_once = np.where(restarted, fresh, moved) & (now.ticks == before.ticks + 1)
-        added, counted = {}, decisions.intervened & ~restarted
-        charged = counted
-        if restarted.any() and "final_info" in info:  # SAME_STEP: the step ended an episode before it began the next
+        now, (restarted, moved_once) = self._read_clock(), np.empty((2, self.num_envs), np.bool_)
+        next_tick = now.ticks == before.ticks + 1
+        clocks = now.episodes, now.steps, before.episodes, before.steps
+        some_restarted = compare_clocks(*clocks, next_tick, restarted, moved_once) > 0
+        added, charged = {}, decisions.intervened
+        if some_restarted and "final_info" in info:  # SAME_STEP: the step ended an episode before it began the next
             added["final_info"] = self._final_info(info, decisions, proposed, moved_once)
-            charged = decisions.intervened
+        elif some_restarted:
+            charged = charged & ~restarted
         rewards = rewards - self.penalty * charged if self.penalty else rewards
-        self._interventions += counted
+        correction = np.empty(self.num_envs)
+        count_interventions(
+            decisions.intervened, restarted, decisions.inputs, proposed, self._interventions, correction
+        )
         self._observe(info, restarted, moved_once, decisions)
         self._clock = now
-        if restarted.any():
-            added |= self._idle_info(restarted, (decisions, proposed))
+        if some_restarted:
+            added |= self._idle_info(restarted, (decisions, proposed, correction))
         else:
-            added |= self._info(decisions, proposed)
+            added |= self._info(decisions, proposed, correction)
         return observation, rewards, terminated, truncated, info | added
 
     def _observe(
         self, info: dict[str, Any], restarted: np.ndarray, moved_once: np.ndarray, decisions: Decisions | None
     ) -> None:
         """Takes in what the environment reports, and moves the proofs on."""
-        self._interventions[restarted] = 0
         self._estimate = self._reported(info, "estimate", np.nan)
         self._shape_number = self._numbers_of_shapes()
         self._reason = self._proved(info, restarted, moved_once, decisions)
@@ -157,31 +169,21 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         restarted: np.ndarray,
         moved_once: np.ndarray,
         decisions: Decisions | None,
-        knowledge: kernels.Knowledge | None = None,
+        knowledge: Knowledge | None = None,
     ) -> np.ndarray:
         """Returns why each proof does not hold, as codes, shape (N,), and changes `knowledge`."""
         knowledge = self._knowledge if knowledge is None else knowledge
         count, m = self.num_envs, self.filter.plant.m
-        nothing = np.zeros(count, np.bool_)
-        none = Decisions(np.zeros((m, count)), nothing, knowledge.inside, knowledge.inside, nothing, nothing)
-        decided = none if decisions is None else decisions
-        book, test = self._batch.book, self.filter.test
-        facts = (
-            self._shape_number,
-            book.outlooks.usable,
-            book.certified,
-            book.extent,
-            book.largest,
-            test.root,
-            test.own_columns,
-            test.rounding,
-            MARGIN,
-            self._reach,
-            self.certificate.Sigma is not None,
-        )
+        decided = decisions
+        if decided is None:
+            nothing = np.zeros(count, np.bool_)
+            decided = Decisions(np.zeros((m, count)), nothing, knowledge.inside, knowledge.inside, nothing, nothing)
         reason = np.empty(count, np.int64)
         inputs = decided.inputs if decisions is None else self._reported(info, "input", np.nan)
-        kernels.track(
+        wrong = track(
+            self._ground,
+            self._batch.book.seen,
+            self._shape_number,
             knowledge,
             restarted,
             moved_once,
@@ -191,11 +193,18 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             self._known_starts(restarted),
             inputs,
             self._estimate,
-            self._reported(info, "assumption_violated", 1.0) != 0.0,
-            facts,
+            self._alarms(info),
             reason,
         )
+        self._some_wrong = wrong > 0
         return reason
+
+    def _alarms(self, info: dict[str, Any]) -> np.ndarray:
+        """Returns which alarms are reported, shape (N,); all if the shape or kind is wrong."""
+        value = info.get("assumption_violated")
+        if type(value) is np.ndarray and value.dtype == np.bool_ and value.shape == (self.num_envs,):
+            return np.ascontiguousarray(value)
+        return self._reported(info, "assumption_violated", 1.0) != 0.0
 
     def _reported(self, info: dict[str, Any], key: str, unusable: float) -> np.ndarray:
         """Returns a copy of an info with the environment as last axis, all `unusable` if its shape or kind is wrong."""
@@ -206,7 +215,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
 
     def _known_starts(self, restarted: np.ndarray) -> np.ndarray:
         """Returns whether all possible starts of the present episodes lie in S, shape (N,)."""
-        if restarted.any():
+        if np.count_nonzero(restarted):  # a tenth of the time of `any`
             self._known[restarted] = self._starts_inside
             starts = self.env.unwrapped.starts
             for e in np.flatnonzero(restarted & ~np.isnan(starts[:, 0])).tolist():
@@ -220,12 +229,12 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             self._table, self._numbers = table, np.full(len(table), -1)
         if len(table) > len(self._numbers):
             self._numbers = np.append(self._numbers, np.full(len(table), -1))
-        numbers = self._numbers[nodes]
-        if numbers.min() < 0:
+        numbers = np.empty(self.num_envs, np.int64)
+        if number(self._numbers, nodes, numbers) < 0:
             n = self.filter.plant.n
             for node in np.unique(nodes[numbers < 0]).tolist():
                 self._numbers[node] = self._batch.book.number(table.shapes[node].reshape(n, n).copy())
-            numbers = self._numbers[nodes]
+            number(self._numbers, nodes, numbers)
         return numbers
 
     def _read_clock(self) -> Clock:
@@ -233,27 +242,27 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         inner = self.env.unwrapped
         return Clock(inner.episodes.copy(), inner.steps.copy(), inner.ticks)
 
-    def _info(self, decisions: Decisions, proposed: np.ndarray) -> dict[str, Any]:
+    def _info(self, decisions: Decisions, proposed: np.ndarray, correction: np.ndarray) -> dict[str, Any]:
         """Returns the shield's keys for the step that applied these decisions."""
-        correction = decisions.inputs - proposed
         return {
             "shield_intervened": decisions.intervened,
             "input_proposed": proposed.T,
-            "shield_correction": np.sqrt(np.einsum("ie,ie->e", correction, correction)),
+            "shield_correction": correction,
             "shield_margin": decisions.margin,
             "shield_guaranteed": self._reason == 0,
-            "shield_reason": WHY[self._reason],
+            "shield_reason": WHY[self._reason] if self._some_wrong else self._no_reason.copy(),
             "episode_interventions": self._interventions.copy(),
         }
 
-    def _idle_info(self, restarted: np.ndarray, done: tuple[Decisions, np.ndarray] | None) -> dict[str, Any]:
+    def _idle_info(
+        self, restarted: np.ndarray, done: tuple[Decisions, np.ndarray, np.ndarray] | None
+    ) -> dict[str, Any]:
         """Returns the shield's keys where episodes just began; elsewhere those of what was done, nothing if None."""
         count, m = self.num_envs, self.filter.plant.m
         nothing = np.zeros(count, np.bool_)
         margins = self._batch.margins(self._estimate, self._shape_number)
-        info = self._info(
-            Decisions(np.zeros((m, count)), nothing, nothing, nothing, margins, nothing), np.zeros((m, count))
-        )
+        idle = Decisions(np.zeros((m, count)), nothing, nothing, nothing, margins, nothing)
+        info = self._info(idle, np.zeros((m, count)), np.zeros(count))
         if done is None:
             return info
         stepped = self._info(*done)
@@ -272,19 +281,20 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         """Returns final_info with the shield's keys of the last steps of episodes that ended (SAME_STEP)."""
         final, n = dict(info["final_info"]), self.filter.plant.n
         done = info["_final_info"]
-        kept = self._estimate, self._shape_number, self._interventions, self._reason
+        kept = self._estimate, self._shape_number, self._interventions, self._reason, self._some_wrong
         book = self._batch.book
         self._estimate = self._reported(final, "estimate", np.nan)
         shapes = [book.number(final["error_shape"][e].reshape(n, n).copy()) for e in np.flatnonzero(done).tolist()]
         self._shape_number = self._shape_number.copy()
         self._shape_number[done] = shapes
-        knowledge = kernels.Knowledge(*(array.copy() for array in self._knowledge))
+        knowledge = Knowledge(*(array.copy() for array in self._knowledge))
         never = np.zeros(self.num_envs, np.bool_)
         self._reason = self._proved(final, never, moved_once, decisions, knowledge)
         self._interventions = self._interventions + decisions.intervened
-        for key, value in self._info(decisions, proposed).items():
+        correction = np.linalg.norm(decisions.inputs - proposed, axis=0)
+        for key, value in self._info(decisions, proposed, correction).items():
             final[key], final[f"_{key}"] = value, done.copy()
-        self._estimate, self._shape_number, self._interventions, self._reason = kept
+        self._estimate, self._shape_number, self._interventions, self._reason, self._some_wrong = kept
         return final
 
 

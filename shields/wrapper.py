@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, StickyAction
 
-from ncs_gym import ChannelContract, LinearPlant, NCSEnv
+from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv
 from ncs_gym.env import applied_input
 from ncs_gym.frozen import as_number
 from shields.certificate import Certificate
@@ -79,10 +79,13 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         self.filter = SafetyFilter(self.certificate, plant, mode)
         self._proof = ProofTracker(self.filter)
         self._clock: tuple[int, int] | None = None
+        self._is_drawn = env.unwrapped.render_mode is not None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode; see `NCSEnv.reset`."""
         self._clock = self._clock and INTERRUPTED
+        if self._is_drawn:
+            self._annotate(None, 0, intervened=False)
         observation, info = self.env.reset(seed=seed, options=options)
         clock = self._read_clock()
         self._proof.start(starts_inside(self.certificate, self.env.unwrapped.start), clock[1] == 0, info)
@@ -106,6 +109,8 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         decision = self.filter.decide(self._estimate, self._error_shape, proposed)
         if decision.intervened and self.filter.mode != "monitor":
             action = (decision.input / self.filter.plant.u_max).astype(np.float32)
+        if self._is_drawn:
+            self._annotate(proposed, self._interventions + decision.intervened, intervened=decision.intervened)
         (episode, step), self._clock = self._clock, INTERRUPTED
         observation, reward, terminated, truncated, info = self.env.step(action)
         clock = self._read_clock()
@@ -119,6 +124,18 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
     def _read_clock(self) -> tuple[int, int]:
         """Returns the number of episodes begun and of steps taken in this one."""
         return self.env.unwrapped.episodes, self.env.unwrapped.steps
+
+    def _annotate(self, proposed: np.ndarray | None, interventions: int, *, intervened: bool) -> None:
+        """Tells the picture of the step that follows what the shield does in it."""
+        note = Annotation(
+            safe_set=self.certificate.safe_set,
+            label=self.filter.mode,
+            proposed=proposed,
+            intervened=intervened,
+            interventions=interventions,
+            protects=self.filter.mode != "monitor",
+        )
+        self.env.unwrapped.annotate(note)
 
     def _info(self, proposed: np.ndarray, applied: np.ndarray, margin: float, *, intervened: bool) -> dict[str, Any]:
         reason = self._proof.reason

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
 from ncs_gym import LinearPlant, truck_trailer
 from shields import Certificate, synthesize
+
+# Gymnasium's checker tries every render mode: no windows while tests run.
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 
 
 @pytest.fixture(scope="session")

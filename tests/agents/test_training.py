@@ -5,18 +5,20 @@ import numpy as np
 import pytest
 from gymnasium.vector import VectorWrapper
 
-from agents.evaluation import evaluate
-from agents.settings import PPOSettings
-from agents.training import EPISODE_KEYS, Shielding, make_env, train, untrained
-from shields import SafetyShield
+from agents.control_loop import ControlLoop, Shielding
+from agents.sb3_vec_env import EPISODE_KEYS
+from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
+from agents.training import train, untrained
 
-CRUISE = "ncs_gym/TruckTrailerCruise-v0"
+CRUISE = ControlLoop(env="ncs_gym/TruckTrailerCruise-v0")
 TINY = PPOSettings(envs=4, rollout=64, batch_size=128, epochs=2)
+TINY_A2C = A2CSettings(envs=4, rollout=8)
+TINY_REPLAY = OffPolicySettings(envs=4, gradient_steps=1, batch_size=32, buffer_size=1000, learning_starts=64)
 
 
 @pytest.fixture(scope="module")
-def shielding(certificate):
-    return Shielding(certificate)
+def shielded(certificate):
+    return ControlLoop(env=CRUISE.env, shielding=Shielding(certificate))
 
 
 def test_same_seed_trains_the_same_agent():
@@ -48,37 +50,87 @@ def test_training_counts_every_violating_step(monkeypatch):
     assert result.interventions == 0
 
 
-def test_single_environments_are_counted_alike(shielding, monkeypatch):
+def test_single_environments_are_counted_alike(certificate, monkeypatch):
     # What has no vector environment is stepped one by one.
-    spec = copy.deepcopy(gym.spec(CRUISE))
+    spec = copy.deepcopy(gym.spec(CRUISE.env))
     spec.id, spec.vector_entry_point = "Scalar-v0", None
     monkeypatch.setitem(gym.registry, "Scalar-v0", spec)
-    result = train("Scalar-v0", 1024, 0, shielding, TINY)
+    result = train(ControlLoop(env="Scalar-v0", shielding=Shielding(certificate)), 1024, 0, settings=TINY)
     assert result.violation_steps == 0
     assert result.interventions > 20
-    assert train("Scalar-v0", 1024, 0, None, TINY).violation_steps > 0
+    assert train(ControlLoop(env="Scalar-v0"), 1024, 0, settings=TINY).violation_steps > 0
 
 
-def test_shielded_training_has_no_violation_and_counts_interventions(shielding):
-    result = train(CRUISE, 2048, 0, shielding, TINY)
+def test_shielded_training_has_no_violation_and_counts_interventions(shielded):
+    result = train(shielded, 2048, 0, settings=TINY)
     assert result.violation_steps == 0
     assert result.interventions > 50
 
 
-def test_rates_reach_tensorboard(shielding, tmp_path):
+def test_monitored_training_is_the_unshielded_one_and_counts_what_the_shield_would_do(certificate):
+    monitored = ControlLoop(env=CRUISE.env, shielding=Shielding(certificate, "monitor"))
+    one, other = train(monitored, 2048, 0, settings=TINY), train(CRUISE, 2048, 0, settings=TINY)
+    observations = np.random.default_rng(0).standard_normal((20, 3))
+    np.testing.assert_array_equal(one.agent.act(observations), other.agent.act(observations))
+    assert one.violation_steps == other.violation_steps > 0
+    assert one.interventions > 0
+
+
+def test_price_of_violations_changes_what_is_learned():
+    priced = ControlLoop(env=CRUISE.env, violation_penalty=5.0)
+    one, other = train(priced, 2048, 0, settings=TINY), train(CRUISE, 2048, 0, settings=TINY)
+    observations = np.random.default_rng(0).standard_normal((20, 3))
+    assert (one.agent.act(observations) != other.agent.act(observations)).any()
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "settings"),
+    [("A2C", TINY_A2C), ("TRPO", TINY), *((name, TINY_REPLAY) for name in ("SAC", "TD3", "TQC", "CrossQ"))],
+)
+def test_every_algorithm_trains_counts_and_repeats_itself(algorithm, settings, shielded):
+    first, second = (train(shielded, 512, 3, algorithm, settings) for _ in range(2))
+    assert first.steps == second.steps >= 512
+    assert first.violation_steps == 0
+    assert first.interventions == second.interventions > 0
+    assert [point.steps for point in first.history] == sorted({point.steps for point in first.history})
+    assert first.history[-1].steps == first.steps
+    assert len(first.history) <= 201
+    observations = np.random.default_rng(0).standard_normal((20, 3))
+    np.testing.assert_array_equal(first.agent.act(observations), second.agent.act(observations))
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "settings", "words"), [("DQN", None, "unknown algorithm 'DQN'"), ("SAC", TINY, "takes OffPolicy")]
+)
+def test_unknown_algorithm_and_foreign_settings_are_refused(algorithm, settings, words):
+    with pytest.raises(ValueError, match=words):
+        train(CRUISE, 64, 0, algorithm, settings)
+
+
+def test_missing_package_is_one_sentence(monkeypatch):
+    import importlib.util
+
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ModuleNotFoundError, match="TQC needs sb3-contrib: pip install sb3-contrib"):
+        train(CRUISE, 64, 0, "TQC", TINY_REPLAY)
+
+
+@pytest.mark.parametrize(("algorithm", "settings"), [("PPO", TINY), ("SAC", TINY_REPLAY)])
+def test_rates_reach_tensorboard(algorithm, settings, shielded, tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    result = train(CRUISE, 1024, 0, shielding, TINY, log_folder=tmp_path)
+    result = train(shielded, 1024, 0, algorithm, settings, log_folder=tmp_path)
     events = EventAccumulator(str(tmp_path))
     events.Reload()
     tags = events.Tags()["scalars"]
     assert {"safety/violation_rate", "safety/intervention_rate", "safety/violation_steps", "time/fps"} <= set(tags)
-    rates = [event.value for event in events.Scalars("safety/intervention_rate")]
-    assert sum(rates) * 256 == pytest.approx(result.interventions, abs=1)
+    if algorithm == "PPO":
+        rates = [event.value for event in events.Scalars("safety/intervention_rate")]
+        assert sum(rates) * 256 == pytest.approx(result.interventions, abs=1)
 
 
-def test_monitor_keeps_the_episodes_totals(shielding):
-    assert set(EPISODE_KEYS) <= set(make_env(CRUISE).reset(seed=0)[1])
+def test_monitor_keeps_the_episodes_totals():
+    assert set(EPISODE_KEYS) <= set(CRUISE.single().reset(seed=0)[1])
     result = train(CRUISE, 4 * 256, 0, settings=TINY)
     episodes = list(result.agent.model.ep_info_buffer)
     assert len(episodes) == 4
@@ -86,27 +138,46 @@ def test_monitor_keeps_the_episodes_totals(shielding):
     assert all(episode["is_success"] == float(episode["episode_violations"] == 0) for episode in episodes)
 
 
-def test_saved_model_acts_alike(tmp_path):
+def test_callback_counts_alike_on_stable_baselines3s_own_vector_environment(certificate):
+    from stable_baselines3 import A2C, SAC
+    from stable_baselines3.common.env_util import make_vec_env
+
+    from agents.callbacks import SafetyCallback
+    from shields import SafetyShield
+
+    env = make_vec_env(lambda: SafetyShield(gym.make(CRUISE.env), certificate), n_envs=2, seed=0)
+    for model in (A2C("MlpPolicy", env, seed=0), SAC("MlpPolicy", env, learning_starts=50, seed=0)):
+        callback = SafetyCallback()
+        model.learn(400, callback=callback)
+        assert callback.violation_steps == 0
+        assert callback.interventions == callback.history[-1].interventions > 0
+        assert callback.history[-1].steps == 400
+
+
+def test_eval_callback_reports_success_on_both_kinds_of_environment(certificate, tmp_path):
     from stable_baselines3 import PPO
+    from stable_baselines3.common.callbacks import EvalCallback
+    from stable_baselines3.common.env_util import make_vec_env
 
-    agent = train(CRUISE, 512, 1, settings=TINY).agent
-    agent.save(tmp_path)
-    observations = np.random.default_rng(0).standard_normal((5, 3))
-    again = PPO.load(tmp_path / "model.zip").predict(agent.normalizer.normalize_obs(observations), deterministic=True)[
-        0
-    ]
-    np.testing.assert_array_equal(again, agent.act(observations))
+    from agents import SB3VecEnv
+
+    def successes(env):
+        log = tmp_path / type(env).__name__
+        model = PPO("MlpPolicy", env, n_steps=64, batch_size=64, seed=0)
+        model.learn(128, callback=EvalCallback(env, n_eval_episodes=4, eval_freq=64, log_path=str(log), verbose=0))
+        return np.load(log / "evaluations.npz")["successes"]
+
+    shielding = Shielding(certificate)
+    vector = SB3VecEnv(ControlLoop(env=CRUISE.env, shielding=shielding).vector(2))
+    scalar = make_vec_env(lambda: ControlLoop(env=CRUISE.env, shielding=shielding).single(), n_envs=2, seed=0)
+    for env in (vector, scalar):
+        assert successes(env).all()
 
 
-def test_progress_adds_up_to_the_steps(shielding):
+def test_progress_adds_up_to_the_steps():
     told = []
     result = train(CRUISE, 1024, 0, settings=TINY, on_progress=told.append)
     assert sum(told) == result.steps
-
-
-def test_make_env_shields_only_if_asked(shielding):
-    assert not isinstance(make_env(CRUISE), SafetyShield)
-    assert make_env(CRUISE, Shielding(shielding.certificate, "switch", 0.5)).penalty == 0.5
 
 
 def test_untrained_agent_is_reproducible():
@@ -115,58 +186,20 @@ def test_untrained_agent_is_reproducible():
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("kind", "change"),
     [
-        {"envs": 0},
-        {"rollout": -1},
-        {"discount": 1.5},
-        {"learning_rate": 0.0},
-        {"epochs": 1.5},
-        {"width": True},
-        {"log_std": np.nan},
+        (PPOSettings, {"envs": 0}),
+        (PPOSettings, {"rollout": -1}),
+        (PPOSettings, {"discount": 1.5}),
+        (PPOSettings, {"learning_rate": 0.0}),
+        (PPOSettings, {"epochs": 1.5}),
+        (PPOSettings, {"width": True}),
+        (PPOSettings, {"log_std": np.nan}),
+        (A2CSettings, {"rollout": 0}),
+        (OffPolicySettings, {"noise": -0.1}),
+        (OffPolicySettings, {"buffer_size": 0}),
     ],
 )
-def test_bad_settings_are_refused(change):
+def test_bad_settings_are_refused(kind, change):
     with pytest.raises(ValueError, match=next(iter(change))):
-        PPOSettings(**change)
-
-
-def zero(observations, infos):
-    return np.zeros((len(observations), 1), np.float32)
-
-
-def throttle(observations, infos):
-    return np.ones((len(observations), 1), np.float32)
-
-
-def test_evaluation_counts_what_a_plain_loop_counts(certificate):
-    records = evaluate(CRUISE, throttle, 30, 100, level_matrix=certificate.M)
-    assert [record.seed for record in records] == list(range(100, 130))
-    for record in records[::7]:
-        env = make_env(CRUISE)
-        _, info = env.reset(seed=record.seed)
-        total, violations, level = 0.0, 0, info["state"] @ certificate.M @ info["state"]
-        for _ in range(200):
-            _, reward, _, _, info = env.step(np.ones(1, np.float32))
-            total += reward
-            violations += info["cost"] > 0
-            level = max(level, info["state"] @ certificate.M @ info["state"])
-        assert record.episode_return == pytest.approx(total)
-        assert (record.violation_steps, record.steps) == (violations, 200)
-        assert record.largest_level == pytest.approx(level)
-        assert not record.guaranteed
-
-
-def test_shielded_evaluation_is_guaranteed_and_leaves_penalties_out(shielding):
-    free = evaluate(CRUISE, throttle, 3, 0, shielding)
-    paid = evaluate(CRUISE, throttle, 3, 0, Shielding(shielding.certificate, penalty=1.0))
-    for one, other in zip(free, paid, strict=True):
-        assert one.guaranteed
-        assert one.violation_steps == 0
-        assert one.interventions == other.interventions > 0
-        assert one.episode_return == pytest.approx(other.episode_return)
-
-
-def test_arms_meet_the_same_draws_of_nature(shielding):
-    bare, shielded = evaluate(CRUISE, zero, 5, 7), evaluate(CRUISE, zero, 5, 7, shielding)
-    assert [record.episode_return for record in bare] == [record.episode_return for record in shielded]
+        kind(**change)

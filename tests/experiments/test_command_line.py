@@ -2,13 +2,16 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from agents.agent import Agent
 from shields import Certificate, verify
 
 ARM_KEYS = {
@@ -24,10 +27,13 @@ ARM_KEYS = {
 }
 
 
+ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+
+
 def ncs(*arguments, cwd=None, **environment):
     command = [sys.executable, "-m", "experiments", *map(str, arguments)]
-    root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-    env = os.environ | {"PYTHONPATH": root} | environment
+    path = os.pathsep.join(filter(None, [ROOT, os.environ.get("PYTHONPATH")]))
+    env = os.environ | {"PYTHONPATH": path} | environment
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, env=env, timeout=300)
 
 
@@ -50,19 +56,22 @@ def test_smoke_run_leaves_every_file_of_the_contract(smoke):
     out, run = smoke
     assert run.returncode == 0, run.stderr
     left = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file() and "tensorboard" not in path.parts}
-    expected = {"summary.json", "episodes.parquet", "report.html", "certificate.json"}
-    expected |= {f"figures/{name}.png" for name in ("training", "scatter", "phase", "episode")}
-    for arm in ("shielded", "unshielded"):
-        expected |= {f"models/{arm}-{i}/{name}" for i in range(2) for name in ("model.zip", "normalizer.pkl")}
-    assert left == expected
-    assert len(list(out.rglob("events.out.tfevents*"))) == 4
+    expected = {"summary.json", "settings.json", "episodes.parquet", "training.parquet", "report.html"}
+    expected |= {"certificate.json"}
+    arms, references = ("shielded", "unshielded", "penalized"), ("zero-input", "K-x_hat", "untrained")
+    for arm in arms:
+        expected |= {f"models/{arm}-{i}/{name}" for i in range(2) for name in ("model.zip", "agent.json")}
+    expected |= {f"units/{name}-{i}.json" for i in range(2) for name in arms + references}
+    assert {path for path in left if not path.startswith("figures/")} == expected
+    assert {f"figures/{name}.png" for name in ("training", "phase", "episode")} <= left
+    assert len(list(out.rglob("events.out.tfevents*"))) == 6
 
 
 def test_summary_holds_the_keys_of_the_contract_and_adds_up(smoke):
     out, _ = smoke
     summary = json.loads((out / "summary.json").read_text())
     rows = pq.read_table(out / "episodes.parquet").to_pylist()
-    assert set(summary["arms"]) == {"unshielded", "shielded"}
+    assert set(summary["arms"]) == {"unshielded", "penalized", "shielded"}
     for name, arm in summary["arms"].items():
         assert set(arm) >= ARM_KEYS
         mine = [row for row in rows if row["arm"] == name]
@@ -76,8 +85,21 @@ def test_summary_holds_the_keys_of_the_contract_and_adds_up(smoke):
     assert shielded["guaranteed_episodes"] == 20
     assert shielded["largest_level"] <= 1.0
     assert unshielded["train_violation_steps"] > 0
-    seeds = {name: [row["seed"] for row in rows if row["arm"] == name] for name in summary["arms"]}
-    assert seeds["shielded"] == seeds["unshielded"]
+    assert summary["paired_differences"]["baseline"] == "unshielded"
+    assert set(summary["paired_differences"]["arms"]) == {"penalized", "shielded"}
+
+
+def test_tables_say_where_they_come_from(smoke):
+    out, _ = smoke
+    summary = json.loads((out / "summary.json").read_text())
+    for name in ("episodes", "training"):
+        metadata = json.loads(pq.read_schema(out / f"{name}.parquet").metadata[b"ncs-gym"])
+        assert metadata == {key: summary[key] for key in ("settings", "plant", "certificate", "versions")}
+    assert Certificate.load(out / "certificate.json").checksum == summary["certificate"]
+    points = pq.read_table(out / "training.parquet").to_pylist()
+    last = {row["arm"]: row["violation_steps"] for row in points if row["run"] == 0}
+    assert last["shielded"] == 0
+    assert last["unshielded"] > 0
 
 
 def test_smoke_run_prints_the_table_and_the_files(smoke):
@@ -91,7 +113,7 @@ def test_smoke_run_prints_the_table_and_the_files(smoke):
 def test_report_is_one_self_contained_page(smoke):
     out, _ = smoke
     page = (out / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 4
+    assert page.count("data:image/png;base64,") >= 3
     assert "http://" not in page
     assert "https://" not in page
     assert "(E1) Sigma - A Sigma A&#x27;/lam_e" in page
@@ -102,13 +124,85 @@ def test_saved_certificate_verifies(smoke, loaded):
     assert verify(Certificate.load(out / "certificate.json"), loaded).valid
 
 
-def test_same_settings_give_the_same_summary(smoke, tmp_path):
+def test_settings_file_gives_the_same_summary_bit_for_bit(smoke, tmp_path):
     out, _ = smoke
-    again = ncs("compare", "--smoke", "--out", tmp_path / "out")
+    again = ncs("compare", "--config", out / "settings.json", "--out", tmp_path / "out", "--jobs", "1")
     assert again.returncode == 0, again.stderr
-    first, second = (json.loads((folder / "summary.json").read_text()) for folder in (out, tmp_path / "out"))
-    assert first["arms"] == second["arms"]
-    assert first["references"] == second["references"]
+    assert (tmp_path / "out" / "summary.json").read_bytes() == (out / "summary.json").read_bytes()
+
+
+def test_killed_run_goes_on_and_ends_like_an_uninterrupted_one(smoke, tmp_path):
+    out, units = tmp_path / "out", tmp_path / "out" / "units"
+    command = [sys.executable, "-m", "experiments", "compare", "--smoke", "--out", str(out)]
+    run = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": ROOT}, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 200.0
+    while len(list(units.glob("*.json"))) < 2:
+        assert run.poll() is None, "it ended before it was killed"
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    run.kill()
+    run.wait()
+    assert not (out / "summary.json").exists()
+    finished = len(list(units.glob("*.json")))
+    again = ncs("compare", "--smoke", "--out", out)
+    assert again.returncode == 0, again.stderr
+    assert f"{finished} of 12 units were finished before" in again.stderr
+    assert (out / "summary.json").read_bytes() == (smoke[0] / "summary.json").read_bytes()
+
+
+def test_finished_run_is_not_run_again_and_damage_is_one_sentence(smoke, tmp_path):
+    shutil.copytree(smoke[0], tmp_path / "out")
+    again = ncs("compare", "--smoke", "--out", tmp_path / "out")
+    assert "12 of 12 units were finished before" in again.stderr
+    assert again.stdout.splitlines()[:-1] == smoke[1].stdout.splitlines()[:-1]
+    unit = tmp_path / "out" / "units" / "shielded-1.json"
+    unit.write_text(unit.read_text()[:100])
+    run = ncs("compare", "--smoke", "--out", tmp_path / "out")
+    assert run.returncode == 2
+    assert "shielded-1.json is damaged; delete it to run the unit again" in run.stderr
+    assert "Traceback" not in run.stderr
+
+
+def test_saved_agent_is_evaluated(smoke, tmp_path):
+    model = smoke[0] / "models" / "unshielded-0"
+    run = ncs("evaluate", model, "--shield", "project", "--episodes", "5", "--out", tmp_path / "e.json")
+    assert run.returncode == 0, run.stderr
+    arm = json.loads((tmp_path / "e.json").read_text())["arms"]["shield: project"]
+    assert (arm["eval_episodes"], arm["eval_violation_steps"], arm["guaranteed_episodes"]) == (5, 0, 5)
+    assert "0 of 5 [0.0, 52.2 %]" in run.stdout
+    other = ncs("evaluate", model, "--episodes", "5", "--channel.loss", "0.9", "--out", tmp_path / "f.json")
+    assert other.returncode == 0, other.stderr
+    worse = json.loads((tmp_path / "f.json").read_text())
+    assert worse["channel"]["loss"] == 0.9
+    assert worse["channel"]["delay"] == 2
+
+
+def test_one_agent_is_trained(tmp_path):
+    run = ncs("train", "--algo", "A2C", "--steps", "1024", "--episodes", "3", "--out", tmp_path / "one")
+    assert run.returncode == 0, run.stderr
+    model = tmp_path / "one" / "models" / "shielded-0"
+    assert f"agent: {model}" in run.stdout
+    summary = json.loads((tmp_path / "one" / "summary.json").read_text())
+    assert summary["arms"]["shielded"]["train_violation_steps"] == 0
+    assert Agent.load(model).algorithm == "A2C"
+
+
+def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path):
+    out = tmp_path / "sweep"
+    grid = ["--losses", "0.5", "--delays", "1", "--burst-lengths", "1", "3", "--episodes", "3", "--steps", "512"]
+    run = ncs("sweep", *grid, "--ppo.envs", "4", "--out", out)
+    assert run.returncode == 0, run.stderr
+    summary = json.loads((out / "summary.json").read_text())
+    assert [(cell["loss"], cell["burst_length"]) for cell in summary["cells"]] == [(0.5, 1), (0.5, 3)]
+    assert all(cell["arms"]["shielded"]["eval_violation_steps"] == 0 for cell in summary["cells"])
+    rows = pq.read_table(out / "sweep.parquet").to_pylist()
+    assert len(rows) == 4
+    assert {"loss", "delay", "burst_length", "arm", "run", "eval_violating_episodes"} <= set(rows[0])
+    assert {path.name for path in (out / "figures").iterdir()} >= {"violations.png", "interventions.png", "return.png"}
+    assert "data:image/png;base64," in (out / "report.html").read_text()
+    more = ncs("sweep", "--config", out / "settings.json", "--losses", "0.5", "0.7")
+    assert more.returncode == 0, more.stderr
+    assert "4 of 8 units were finished before" in more.stderr
 
 
 def test_synthesize_then_verify(tmp_path):
@@ -123,7 +217,9 @@ def test_synthesize_then_verify(tmp_path):
     assert_one_sentence(other, "does not verify")
 
 
-@pytest.mark.parametrize("command", ["compare", "synthesize", "verify", "audit", "reproduce"])
+@pytest.mark.parametrize(
+    "command", ["compare", "train", "evaluate", "sweep", "render", "synthesize", "verify", "audit", "reproduce"]
+)
 def test_every_command_has_help_seed_and_out(command):
     run = ncs(command, "--help")
     assert run.returncode == 0
@@ -132,12 +228,26 @@ def test_every_command_has_help_seed_and_out(command):
 
 
 @pytest.mark.parametrize(
-    "arguments", [[], ["fly"], ["compare", "--mode", "hope"], ["compare", "--steps", "many"], ["verify"]]
+    ("arguments", "words"),
+    [
+        ([], "Missing subcommand"),
+        (["fly"], "fly"),
+        (["verify"], "Required"),
+        (["compare", "--mode", "hope"], "hope"),
+        (["compare", "--steps", "many"], "many"),
+        (["compare", "--steps", "0"], "--steps must be at least 1"),
+        (["compare", "--jobs", "-1"], "--jobs must be at least 1"),
+        (["compare", "--seed", "-1"], "--seed must be >= 0"),
+        (["compare", "--violation-penalty", "nan"], "--violation-penalty must be"),
+        (["compare", "--ppo.discount", "2"], "discount must be in"),
+        (["evaluate", "nowhere", "--episodes", "0"], "--episodes must be at least 1"),
+    ],
 )
-def test_usage_errors_are_the_parsers(arguments):
+def test_usage_errors_are_the_parsers(arguments, words):
     run = ncs(*arguments)
     assert run.returncode == 2
     assert "Traceback" not in run.stderr
+    assert words in " ".join(run.stderr.replace("│", " ").split())
 
 
 @pytest.mark.parametrize(
@@ -145,10 +255,18 @@ def test_usage_errors_are_the_parsers(arguments):
     [
         (["compare", "--env", "CartPole-v1"], ["unknown environment 'CartPole-v1'", "ncs_gym/TruckTrailerCruise-v0"]),
         (["compare", "--env", "ncs_gym/LinearNCS-v0"], ["unknown environment"]),
-        (["compare", "--steps", "0"], ["--steps must be at least 1"]),
-        (["compare", "--jobs", "-1"], ["--jobs must be at least 1"]),
-        (["compare", "--seed", "-1"], ["--seed must be >= 0"]),
-        (["compare", "--penalty", "nan"], ["--penalty must be >= 0"]),
+        (["compare", "--arms", "shielded", "hope"], ["unknown arm 'hope'", "shielded:MODE"]),
+        (["compare", "--arms", "shielded", "shielded"], ["--arms must be different"]),
+        (["compare", "--config", "nowhere.json"], ["cannot read settings nowhere.json"]),
+        (["compare", "--channel.loss", "1.5"], ["loss"]),
+        (["train", "--arm", "hope"], ["unknown arm 'hope'"]),
+        (["evaluate", "nowhere"], ["cannot read the agent in nowhere"]),
+        (["sweep", "--losses", "0.1", "0.1"], ["--losses must be different"]),
+        (["sweep", "--losses", "0.9", "--burst-lengths", "2"], ["bursts of mean length 2"]),
+        (
+            ["sweep", "--env", "ncs_gym/BatchReactor-v0", "--quantization-steps", "0.1"],
+            ["rounds to 0.1, the contract allows 0.001"],
+        ),
         (
             ["synthesize", "--env", "ncs_gym/TruckTrailer-v0", "--method", "paper"],
             ["OP is infeasible", "(C2) binds", "0.034"],

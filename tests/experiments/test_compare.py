@@ -1,60 +1,94 @@
 from dataclasses import replace
-from pathlib import Path
 
+import numpy as np
 import pytest
 
 from agents.evaluation import Episode
-from agents.settings import PPOSettings
-from experiments.compare import _check, _prepare, _units
+from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
+from experiments.arms import arm_of
+from experiments.compare import _units, grouped, prepare
 from experiments.settings import CompareSettings
-from experiments.summary import summarize_arm, way_covered
+from experiments.summary import paired_differences, summarize_arm, table_rows, way_covered
 from experiments.unit import UnitResult
+from experiments.worlds import World
+from shields import verify
+
+ALL_ARMS = ("unshielded", "monitor", "penalized", "shielded", "shielded:switch+penalty", "shielded:boundary")
 
 
-def units(certificate, **change):
-    return _units(replace(CompareSettings(out=Path("out")), **change), certificate)
+@pytest.fixture(scope="module")
+def world(certificate, loaded):
+    return World("ncs_gym/TruckTrailerCruise-v0", None, loaded, certificate, verify(certificate, loaded))
 
 
-def test_runs_with_equal_numbers_are_paired_across_arms_and_differ_from_each_other(certificate):
+def units(world, **change):
+    settings = CompareSettings(**change)
+    return [unit for index in range(settings.seeds) for unit in _units(settings, world, index)]
+
+
+def test_runs_with_equal_numbers_are_paired_across_arms_and_differ_from_each_other(world):
     seeds: dict = {}
-    for unit in units(certificate):
+    for unit in units(world, arms=ALL_ARMS):
         seeds.setdefault(unit.index, set()).add((unit.training_seed, unit.evaluation_seed))
     assert {len(pairs) for pairs in seeds.values()} == {1}
     flat = [number for pairs in seeds.values() for pair in pairs for number in pair]
     assert len(set(flat)) == len(flat) == 6
 
 
-def test_another_seed_draws_everything_anew(certificate):
-    first, second = ({unit.training_seed for unit in units(certificate, seed=seed)} for seed in (0, 1))
+def test_another_seed_draws_everything_anew(world):
+    first, second = ({unit.training_seed for unit in units(world, seed=seed)} for seed in (0, 1))
     assert not first & second
 
 
 @pytest.mark.parametrize("seed", [0, 10**9, 2**63])
-def test_any_seed_is_usable(certificate, seed):
-    for unit in units(certificate, seed=seed):
+def test_any_seed_is_usable(world, seed):
+    for unit in units(world, seed=seed):
         assert 0 <= unit.training_seed < 2**31
         assert 0 <= unit.evaluation_seed < 2**31
 
 
-def test_mode_and_penalty_reach_the_shield_of_the_shielded_arm_only(certificate):
-    for unit in units(certificate, mode="switch", penalty=0.3):
-        if unit.arm == "shielded":
-            assert (unit.shielding.mode, unit.shielding.penalty) == ("switch", 0.3)
-            assert unit.shielding.certificate is certificate
-        else:
-            assert unit.shielding is None
+def test_each_arm_has_its_shield_and_its_prices(world):
+    chosen = units(world, arms=ALL_ARMS, seeds=1, mode="switch", intervention_penalty=0.3, violation_penalty=2.0)
+    loops = {unit.arm: unit.loop for unit in chosen}
+    modes = {name: loop.shielding and loop.shielding.mode for name, loop in loops.items()}
+    assert modes == {
+        "unshielded": None,
+        "monitor": "monitor",
+        "penalized": None,
+        "shielded": "switch",
+        "shielded:switch+penalty": "switch",
+        "shielded:boundary": "boundary",
+        "zero input": None,
+        "K x_hat": None,
+        "untrained": None,
+    }
+    priced = {name for name, loop in loops.items() if loop.shielding and loop.shielding.penalty == 0.3}
+    assert priced == {"shielded:switch+penalty"}
+    assert {name for name, loop in loops.items() if loop.violation_penalty == 2.0} == {"penalized"}
 
 
-def test_settings_reach_every_run(certificate):
-    for unit in units(certificate, steps=7, episodes=9, ppo=PPOSettings(envs=3)):
-        assert (unit.steps, unit.episodes, unit.ppo.envs) == (7, 9, 3)
+@pytest.mark.parametrize("name", ["", "shield", "shielded:", "shielded:hope", "monitor+penalty", "shielded:monitor"])
+def test_unknown_arms_are_refused(name):
+    with pytest.raises(ValueError, match="unknown arm"):
+        arm_of(name, "project")
 
 
-def result(returns, violations, interventions=0):
+@pytest.mark.parametrize(
+    ("algo", "settings"),
+    [("PPO", PPOSettings), ("TRPO", PPOSettings), ("A2C", A2CSettings), ("SAC", OffPolicySettings)],
+)
+def test_settings_reach_every_run(world, algo, settings):
+    given = {"ppo": PPOSettings(envs=3), "a2c": A2CSettings(envs=3), "off_policy": OffPolicySettings(envs=3)}
+    for unit in units(world, steps=7, episodes=9, algo=algo, **given):
+        assert (unit.steps, unit.episodes, unit.algorithm, unit.settings) == (7, 9, algo, settings(envs=3))
+
+
+def result(returns, violations, interventions=0, index=0):
     episodes = [
-        Episode(i, 10, r, v, interventions, True, 0.5) for i, (r, v) in enumerate(zip(returns, violations, strict=True))
+        Episode(i, 10, r, v, 2 * v, interventions, True, 0.5)
+        for i, (r, v) in enumerate(zip(returns, violations, strict=True))
     ]
-    return UnitResult("arm", 0, 100, 4, 20, [], episodes, None)
+    return UnitResult("arm", index, 100, 4, 20, [], episodes, None, {})
 
 
 def test_summary_of_an_arm_adds_up():
@@ -64,6 +98,7 @@ def test_summary_of_an_arm_adds_up():
     assert summary["train_intervention_rate"] == 0.2
     assert summary["eval_violating_episodes"] == 1
     assert summary["eval_violation_steps"] == 2
+    assert summary["eval_estimate_violation_steps"] == 4
     assert summary["eval_return_mean"] == 4.0
     assert summary["intervention_rate"] == 0.5
     assert summary["eval_return_by_run"] == [2.0, 6.0]
@@ -85,19 +120,60 @@ def test_way_covered_is_zero_at_the_zero_input_and_one_at_the_unshielded_agent()
     assert [covered(value) for value in (-65.0, -5.0, -20.0)] == [0.0, 1.0, 0.75]
 
 
-def test_earlier_results_are_removed_and_nothing_else(tmp_path):
-    kept = ["models/mine", "notes", "tensorboard/other"]
-    for name in (*kept, "models/shielded-0", "models/unshielded-2", "tensorboard/shielded-1"):
-        (tmp_path / name).mkdir(parents=True)
+def test_interquartile_mean_leaves_the_extreme_runs_out():
+    runs = [result([value, value], [0, 0]) for value in (-1000.0, 1.0, 3.0, 50.0)]
+    summary = summarize_arm(runs, fixed_policy=False)
+    assert summary["eval_return_iqm"] == 2.0
+    low, high = summary["eval_return_iqm_bootstrap_ci95"]
+    assert -1000.0 <= low <= 2.0 <= high <= 50.0
+
+
+def test_paired_differences_are_those_of_runs_with_equal_index():
+    arms = {
+        "unshielded": [result([0.0, 2.0], [1, 1]), result([10.0, 12.0], [1, 0], index=1)],
+        "shielded": [result([-1.0, 1.0], [0, 0]), result([7.0, 9.0], [0, 0], index=1)],
+    }
+    difference = paired_differences(arms, "unshielded")["shielded"]
+    assert difference["return_mean"] == -2.0  # of -1 and -3
+    assert difference["return_ci95"][1] + 2.0 == pytest.approx(12.706, rel=1e-3)
+    assert difference["return_bootstrap_ci95"] == [-3.0, -1.0]
+    assert difference["violating_episodes"] == -3
+    assert difference["violating_episodes_by_run"] == [-2, -1]
+
+
+def test_no_violation_is_printed_with_its_upper_bound():
+    summary = summarize_arm([result([1.0] * 10, [0] * 10)], fixed_policy=True) | {"mode": "monitor"}
+    row = table_rows({"monitor": summary})[2]
+    assert row[3] == "0 of 10 [0.0, 30.8 %]"
+    assert row[2] == "(20.0 %)"
+
+
+def test_results_are_grouped_by_arm_in_the_order_of_runs():
+    results = [replace(result([0.0], [0], index=i), arm=arm) for arm in ("b", "a") for i in (1, 0)]
+    groups = grouped(results)
+    assert list(groups) == ["b", "a"]
+    assert [one.index for one in groups["a"]] == [0, 1]
+
+
+def test_folder_is_made_and_an_earlier_summary_removed(tmp_path):
+    (tmp_path / "units").mkdir()
     (tmp_path / "summary.json").write_text("{}")
-    _prepare(tmp_path)
-    left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")}
-    assert left == {*kept, "models", "tensorboard", "figures"}
+    prepare(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"units", "figures"}
 
 
 @pytest.mark.parametrize(
-    "change", [{"runs": 0}, {"steps": -1}, {"episodes": 0}, {"jobs": 0}, {"seed": -1}, {"penalty": -0.1}]
+    ("change", "flag"),
+    [
+        ({"seeds": 0}, "--seeds"),
+        ({"steps": -1}, "--steps"),
+        ({"episodes": 0}, "--episodes"),
+        ({"jobs": 0}, "--jobs"),
+        ({"seed": -1}, "--seed"),
+        ({"intervention_penalty": -0.1}, "--intervention-penalty"),
+        ({"violation_penalty": np.inf}, "--violation-penalty"),
+    ],
 )
-def test_settings_out_of_range_are_refused(change):
-    with pytest.raises(ValueError, match=f"--{next(iter(change))} must be"):
-        _check(replace(CompareSettings(), **change))
+def test_settings_out_of_range_are_refused(change, flag):
+    with pytest.raises(ValueError, match=f"{flag} must be"):
+        CompareSettings(**change)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, norm
 
-from experiments.statistics import clopper_pearson, mean_interval
+from experiments.statistics import bootstrap_interval, clopper_pearson, interquartile_mean, mean_interval
 
 
 @pytest.mark.parametrize(("events", "trials"), [(0, 600), (1, 10), (5, 10), (10, 10), (589, 600)])
@@ -35,3 +35,22 @@ def test_mean_interval_covers_at_its_level():
 
 def test_mean_interval_needs_two_values():
     assert mean_interval([1.0]) is None
+
+
+def test_bootstrap_interval_covers_near_its_level_and_never_leaves_the_values():
+    rng = np.random.default_rng(0)
+    draws = [rng.exponential(size=40) for _ in range(400)]
+    intervals = [bootstrap_interval(values) for values in draws]
+    assert np.mean([low <= 1.0 <= high for low, high in intervals]) == pytest.approx(0.93, abs=0.04)
+    assert all(min(v) <= low < high <= max(v) for v, (low, high) in zip(draws, intervals, strict=True))
+
+
+def test_bootstrap_interval_is_repeatable_and_needs_two_values():
+    assert bootstrap_interval([1.0, 5.0, 2.0]) == bootstrap_interval([1.0, 5.0, 2.0])
+    assert bootstrap_interval([1.0]) is None
+
+
+def test_interquartile_mean_is_that_of_the_middle_half():
+    assert interquartile_mean([100.0, 1.0, 2.0, -50.0]) == 1.5
+    assert interquartile_mean([1.0, 2.0, 3.0]) == 2.0
+    np.testing.assert_array_equal(interquartile_mean([[0.0, 1.0, 3.0, 9.0], [1.0] * 4], axis=1), [2.0, 1.0])

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ncs_gym import Channel, Ellipsoid, ErrorSet, Estimator, Packet, certified_error_set, truck_trailer
+from ncs_gym import Channel, Ellipsoid, ErrorSet, Estimator, LinearPlant, Packet, certified_error_set, truck_trailer
 from ncs_gym.channel import GilbertElliott, Link
 from ncs_gym.estimator import _grown
 from shields.exact import congruence, is_positive_semidefinite, rational, subtract
@@ -257,3 +257,26 @@ def test_computed_shapes_hold_the_exact_ones():
         assert is_positive_semidefinite(subtract(rational(grown), exact))
         if aspect <= 1e3:  # ... and no more than that
             assert np.trace(grown) <= np.trace(A @ shape @ A.T) * (1 + 1e-7)
+
+
+def ill_conditioned_estimator(n):
+    """Its certified set has a triangular factor whose inverse has entries of 2^(n - 2)."""
+    factor = np.eye(n) - np.tril(np.ones((n, n)), -1)
+    plant = LinearPlant(A=0.5 * np.eye(n), B=np.ones((n, 1)), C=np.eye(n), u_max=1.0, dt=0.1, gamma=1e-6)
+    return Estimator(plant, Channel(), ErrorSet(Sigma=factor @ factor.T, rate=0.5))
+
+
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e3])
+def test_rounded_shapes_are_no_smaller_where_the_certified_set_is_ill_conditioned(size):
+    estimator, n = ill_conditioned_estimator(44), 44
+    shape = np.random.default_rng(0).standard_normal((n, n))
+    shape = size * estimator._ball @ shape @ shape.T @ estimator._ball.T
+    shape = 0.5 * (shape + shape.T)
+
+    def smallest_growth():
+        return np.linalg.eigvalsh(estimator._settled_shape(shape) - shape)[0] / np.linalg.norm(shape)
+
+    assert smallest_growth() > 0.0
+    # Coordinates of the unit ball and back are not the identity here; a shape is smaller if that is not made up for.
+    estimator._ball_error = np.zeros((n, n))
+    assert smallest_growth() < -1e-8

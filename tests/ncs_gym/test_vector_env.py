@@ -20,6 +20,7 @@ from ncs_gym import (
 from ncs_gym.channel import Link
 from ncs_gym.disturbance import AdversarialDisturbance, BallDisturbance, SinusoidDisturbance, SphereDisturbance
 from ncs_gym.regulator import regulator_gain
+from ncs_gym.system import unpacked
 from ncs_gym.task import SetpointTracking, SpeedProfile, SpeedTracking
 from ncs_gym.vector_env import NCSVectorEnv
 from tests.plants import random_plant
@@ -52,21 +53,6 @@ class Log:
             "bad": env._fleet.bad.copy(),
             "memory": env._memory.copy(),
         }
-        for name in ("_disturbances", "_drawn", "_uniforms", "_block"):
-            self._watch(name)
-
-    def _watch(self, name):
-        original = getattr(self.env, name)
-
-        def watched(*arguments):
-            result = original(*arguments)
-            if name != "_block":
-                self.now[arguments[0] if name == "_drawn" else name] = result.copy()
-            elif arguments[0] == "noise":
-                self.now["noise"] = result[0][result[1] :].copy()
-            return result
-
-        setattr(self.env, name, watched)
 
     def step(self, actions):
         self.now, task = {}, type(self.env.task)
@@ -80,9 +66,9 @@ class Log:
             result = self.env.step(actions)
         finally:
             task.advance_many = original
-        # Noise is used in the order of the environments that send.
-        sends = self.env.steps % self.env.channel.send_period == 0
-        self.now["noise"] = self.now["noise"][np.maximum(np.cumsum(sends) - 1, 0)]
+        fleet, network = self.env._fleet, unpacked.py_func(self.env._counts, self.env._constants)
+        self.now |= {"disturbance": fleet.disturbance.T.copy(), "noise": fleet.noise.T.copy()}
+        self.now["uniforms"] = fleet.uniforms[: network.uniforms].copy()
         self.steps.append(self.now)
         return result
 
@@ -124,9 +110,9 @@ class Replayed(NCSEnv):
 
     def replay(self, action, number):
         drawn = self.log.steps[number]
-        self.now = {key: value[self.index] for key, value in drawn.items() if key not in ("task", "_uniforms")}
+        self.now = {key: value[self.index] for key, value in drawn.items() if key not in ("task", "uniforms")}
         task = drawn["task"][:, self.index].tolist() if "task" in drawn else []
-        uniforms = drawn["_uniforms"][:, self.index].tolist() if "_uniforms" in drawn else []
+        uniforms = drawn["uniforms"][:, self.index].tolist()
         sends = self._link.sends_at(self.steps + 1)
         network = [
             *uniforms[2:],
@@ -139,7 +125,7 @@ class Replayed(NCSEnv):
         return result
 
     def _draw_disturbance(self, nominal_next):
-        return self.now["_disturbances"]
+        return self.now["disturbance"]
 
     def _measure(self):
         return self.plant.H @ self._state + self.now["noise"]
@@ -206,8 +192,7 @@ def test_equals_the_scalar_environment_for_every_channel(channel, mass):
         3, plant=truck_trailer(mass=mass), channel=CHANNELS[channel], task=SpeedTracking(change_probability=0.2)
     )
     log, _ = compare(env, 3, 200)
-    kinds = {key for step in log.steps for key in step}
-    assert "_disturbances" in kinds
+    assert all(step["disturbance"].any() for step in log.steps)
 
 
 @pytest.mark.parametrize("name", IDS)
@@ -351,6 +336,17 @@ def test_results_are_fresh_arrays():
         np.testing.assert_array_equal(one[0], other[0])
         assert all(np.array_equal(one[4][key], other[4][key]) for key in one[4])
     assert copies[4]["state"].any()
+
+
+def test_no_two_results_share_memory_with_each_other_or_with_the_environment():
+    env = make("TruckTrailerCruise", 4)
+    arrays = [*env.reset(seed=0)[1].values()]
+    for _ in range(2):
+        observation, rewards, terminated, truncated, info = env.step(np.full((4, 1), 0.3, np.float32))
+        arrays += [observation, rewards, terminated, truncated, *info.values()]
+    arrays += [*env._kept, env._memory, env._done]
+    for i, one in enumerate(arrays):
+        assert not any(np.shares_memory(one, other) for other in arrays[:i])
 
 
 def test_seeds_determine_everything_and_block_sizes_do_not_matter_to_one_seed():

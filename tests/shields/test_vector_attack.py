@@ -5,6 +5,8 @@ import pytest
 
 from ncs_gym import Channel, NCSVectorEnv, batch_reactor, cart_pole
 from ncs_gym.contract import contract_of
+from ncs_gym.law import SPHERE, Law
+from ncs_gym.system import packed, system_of
 from shields import VectorSafetyShield
 from tests.attacks import CHANNELS, RANDOM, TRUCKS, certificate_of, harmful
 
@@ -26,10 +28,11 @@ SLOW_ENVS, SLOW_STEPS = 680, 100
 class ExtremalVectorNoise(NCSVectorEnv):
     """First estimates and sensor noise lie on the boundary of their bounds."""
 
-    def _block(self, name, draw):
-        if name == "noise":
-            return self.plant.sensor_noise.bound.sample_boundary_many(self.np_random, self.num_envs) * (1.0 - 1e-12), 0
-        return super()._block(name, draw)
+    def __init__(self, *arguments, **settings):
+        super().__init__(*arguments, **settings)
+        system = system_of(self.single, self.max_episode_steps)
+        edge = Law(SPHERE, (1.0 - 1e-12) * self.plant.sensor_noise.bound.factor)
+        self._counts, self._constants = packed(system._replace(sensor=edge))
 
     def _begin(self, mask, starts):
         super()._begin(mask, starts)

@@ -1,0 +1,154 @@
+import json
+import pickle
+import zipfile
+
+import numpy as np
+import pytest
+
+from agents.agent import Agent, AgentError, Normalization
+from agents.control_loop import ControlLoop
+from agents.settings import OffPolicySettings, PPOSettings
+from agents.training import train
+from ncs_gym import Channel, GilbertElliott
+
+CRUISE = "ncs_gym/TruckTrailerCruise-v0"
+OBSERVATIONS = np.random.default_rng(0).standard_normal((50, 3))
+SETTINGS = {
+    "PPO": PPOSettings(envs=4, rollout=64, batch_size=128, epochs=2, width=16),
+    "TD3": OffPolicySettings(envs=4, gradient_steps=1, batch_size=32, buffer_size=1000, learning_starts=64, width=16),
+}
+
+
+def trained(algorithm="PPO", channel=None):
+    return train(ControlLoop(env=CRUISE, channel=channel), 512, 1, algorithm, SETTINGS[algorithm]).agent
+
+
+@pytest.fixture(scope="module")
+def agent():
+    return trained()
+
+
+@pytest.fixture
+def folder(agent, tmp_path):
+    agent.save(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("algorithm", SETTINGS)
+def test_loaded_agent_acts_like_the_saved_one(algorithm, tmp_path):
+    bursts = Channel(loss=GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.5), delay=1)
+    agent = trained(algorithm, bursts)
+    agent.save(tmp_path)
+    for place in (tmp_path, tmp_path / "model.zip"):
+        again = Agent.load(place)
+        np.testing.assert_array_equal(again.act(OBSERVATIONS), agent.act(OBSERVATIONS))
+        assert (again.algorithm, again.settings, again.env) == (algorithm, SETTINGS[algorithm], CRUISE)
+        assert again.channel == bursts
+
+
+def test_model_file_is_stable_baselines3s(folder, agent):
+    from stable_baselines3 import PPO
+
+    scaled = agent.normalization(OBSERVATIONS)
+    again = PPO.load(folder / "model.zip").predict(scaled, deterministic=True)[0]
+    np.testing.assert_array_equal(again, agent.act(OBSERVATIONS))
+
+
+def test_normalization_is_that_of_training():
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    from agents import SB3VecEnv
+
+    env = VecNormalize(SB3VecEnv(ControlLoop(env=CRUISE).vector(4)))
+    env.reset()
+    for _ in range(50):
+        env.step(np.ones((4, 1), np.float32))
+    np.testing.assert_array_equal(
+        Normalization.of(env)(100 * OBSERVATIONS), env.normalize_obs(100 * OBSERVATIONS).astype(np.float32)
+    )
+
+
+def test_loading_runs_no_pickled_code(folder, monkeypatch):
+    import cloudpickle
+
+    def refuse(*arguments, **keywords):
+        raise AssertionError("unpickled")
+
+    for module in (pickle, cloudpickle):
+        for name in ("load", "loads"):
+            monkeypatch.setattr(module, name, refuse)
+    Agent.load(folder)
+
+
+def test_weights_with_code_in_them_are_refused(folder):
+    # A checksum is no signature: who can write one file can write both.
+    import hashlib
+
+    import torch
+
+    from agents.agent import _digest
+
+    class Evil:
+        def __reduce__(self):
+            return (print, ("run!",))
+
+    torch.save({"policy": Evil()}, folder / "policy.pth")
+    with zipfile.ZipFile(folder / "model.zip") as source, zipfile.ZipFile(folder / "new.zip", "w") as target:
+        for name in source.namelist():
+            content = (folder / "policy.pth").read_bytes() if name == "policy.pth" else source.read(name)
+            target.writestr(name, content)
+    (folder / "new.zip").replace(folder / "model.zip")
+    document = json.loads((folder / "agent.json").read_text())
+    document["agent"]["sha256_of_model"] = hashlib.sha256((folder / "model.zip").read_bytes()).hexdigest()
+    document["sha256"] = _digest(document["agent"])
+    (folder / "agent.json").write_text(json.dumps(document))
+    with pytest.raises(AgentError, match="damaged"):
+        Agent.load(folder)
+
+
+def change(folder, **values):
+    from agents.agent import _digest
+
+    document = json.loads((folder / "agent.json").read_text())
+    document["agent"] |= values
+    document["sha256"] = _digest(document["agent"])
+    (folder / "agent.json").write_text(json.dumps(document))
+
+
+SHORT = {"mean": [0.0], "variance": [1.0], "epsilon": 1, "clip": 1}
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda folder: (folder / "agent.json").unlink(), "No such file"),
+        (lambda folder: (folder / "model.zip").unlink(), "No such file"),
+        (lambda folder: (folder / "agent.json").write_text("{"), "not valid JSON"),
+        (lambda folder: (folder / "agent.json").write_text("[]"), "not of format"),
+        (lambda folder: (folder / "agent.json").write_text('{"format": "ncs-gym agent 1"}'), "altered"),
+        (lambda folder: (folder / "model.zip").write_bytes(b"PK"), "altered"),
+        (lambda folder: change(folder, env="Nowhere-v0"), "Nowhere-v0, which is not registered"),
+        (lambda folder: change(folder, env="ncs_gym/TruckTrailer-v0"), "another plant"),
+        (lambda folder: change(folder, algorithm="DQN"), "unknown algorithm"),
+        (lambda folder: change(folder, settings={}), "damaged"),
+        (lambda folder: change(folder, channel={"loss": 7}), "damaged"),
+        (lambda folder: change(folder, normalization={"mean": [0.0] * 3}), "damaged"),
+        (
+            lambda folder: change(folder, normalization=SHORT),
+            "normalization",
+        ),
+    ],
+)
+def test_damaged_and_foreign_agents_are_one_sentence(folder, damage, words):
+    damage(folder)
+    with pytest.raises(AgentError, match=words) as caught:
+        Agent.load(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_truncated_anywhere_the_settings_are_refused(folder):
+    text = (folder / "agent.json").read_bytes()
+    for length in range(0, len(text) - 2, 97):
+        (folder / "agent.json").write_bytes(text[:length])
+        with pytest.raises(AgentError):
+            Agent.load(folder)

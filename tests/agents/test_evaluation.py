@@ -1,0 +1,124 @@
+import copy
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from agents.control_loop import ControlLoop, Shielding
+from agents.evaluation import evaluate
+from shields.wrapper import certificate_for
+
+CRUISE = ControlLoop(env="ncs_gym/TruckTrailerCruise-v0")
+
+
+def zero(observations, infos):
+    return np.zeros((len(observations), 1), np.float32)
+
+
+def throttle(observations, infos):
+    return np.ones((len(observations), 1), np.float32)
+
+
+@pytest.fixture
+def shielding(certificate):
+    return Shielding(certificate)
+
+
+@pytest.fixture
+def scalar(monkeypatch):
+    spec = copy.deepcopy(gym.spec(CRUISE.env))
+    spec.id, spec.vector_entry_point = "Scalar-v0", None
+    monkeypatch.setitem(gym.registry, "Scalar-v0", spec)
+    return ControlLoop(env="Scalar-v0")
+
+
+def test_it_counts_what_a_plain_loop_counts(certificate):
+    word = int(np.random.SeedSequence([100, 0]).generate_state(1)[0] >> 1)
+    played = evaluate(CRUISE, throttle, 8, 100, level_matrix=certificate.M)
+    envs = gym.make_vec(CRUISE.env, num_envs=8)
+    plant = envs.unwrapped.plant
+    _, info = envs.reset(seed=word)
+    states, estimates, total = [info["state"]], [info["estimate"]], np.zeros(8)
+    for _ in range(200):
+        _, rewards, _, _, info = envs.step(np.ones((8, 1), np.float32))
+        total += rewards
+        states.append(info["state"])
+        estimates.append(info["estimate"])
+    states, estimates = np.array(states), np.array(estimates)
+    for e, record in enumerate(played.episodes):
+        assert (record.index, record.steps) == (e, 200)
+        assert record.episode_return == pytest.approx(total[e])
+        assert record.violation_steps == (np.abs(states[1:, e] @ plant.C.T).max(axis=1) > 1.0).sum() > 0
+        assert record.estimate_violation_steps == (np.abs(estimates[1:, e] @ plant.C.T).max(axis=1) > 1.0).sum()
+        assert record.largest_level == pytest.approx(max(x @ certificate.M @ x for x in states[:, e]))
+        assert not record.guaranteed
+    np.testing.assert_array_equal(played.trajectory.states, states[:, 0])
+    np.testing.assert_array_equal(played.trajectory.estimates, estimates[:, 0])
+    assert played.trajectory.arrivals.any()
+    assert not played.trajectory.arrivals.all()
+
+
+def test_environments_without_a_vector_one_are_played_alike(scalar, shielding):
+    for loop in (scalar, ControlLoop(env=scalar.env, shielding=shielding)):
+        played = evaluate(loop, throttle, 4, 0, shielding.certificate.M)
+        shielded = loop.shielding is not None
+        assert [record.steps for record in played.episodes] == [200] * 4
+        assert all((record.violation_steps == 0) == shielded for record in played.episodes)
+        assert all(record.guaranteed == shielded for record in played.episodes)
+        assert len(played.trajectory.states) == 201
+
+
+def test_it_is_guaranteed_behind_a_shield_and_leaves_penalties_out(shielding):
+    free = evaluate(ControlLoop(env=CRUISE.env, shielding=shielding), throttle, 3, 0)
+    priced = ControlLoop(env=CRUISE.env, shielding=Shielding(shielding.certificate, penalty=1.0), violation_penalty=1.0)
+    assert free.episodes == evaluate(priced, throttle, 3, 0).episodes or np.isnan(free.episodes[0].largest_level)
+    for one, other in zip(free.episodes, evaluate(priced, throttle, 3, 0).episodes, strict=True):
+        assert one.guaranteed
+        assert one.violation_steps == 0
+        assert one.interventions == other.interventions > 0
+        assert one.episode_return == other.episode_return
+    assert free.trajectory.intervened.sum() == free.episodes[0].interventions
+    assert (free.trajectory.inputs != free.trajectory.proposed).any()
+
+
+def test_arms_meet_the_same_draws_of_nature(shielding):
+    bare = evaluate(CRUISE, zero, 5, 7).episodes
+    shielded = evaluate(ControlLoop(env=CRUISE.env, shielding=shielding), zero, 5, 7).episodes
+    assert [record.episode_return for record in bare] == [record.episode_return for record in shielded]
+    others = evaluate(CRUISE, zero, 5, 8).episodes
+    assert not {record.episode_return for record in bare} & {record.episode_return for record in others}
+
+
+def test_episode_that_ends_early_changes_nothing_for_the_others():
+    env = "ncs_gym/CartPole-v0"
+    loop = ControlLoop(env=env, shielding=Shielding(certificate_for(*_of(env)), "project"))
+
+    def push_the_first(observations, infos):
+        actions = np.zeros((len(observations), 1), np.float32)
+        actions[0] = 1.0
+        return actions
+
+    bare = ControlLoop(env=env)
+    pushed, quiet = (evaluate(bare, policy, 4, 0).episodes for policy in (push_the_first, zero))
+    assert pushed[0].steps < 200
+    assert pushed[0].violation_steps == 1
+    assert [(r.steps, r.episode_return) for r in pushed[1:]] == [(r.steps, r.episode_return) for r in quiet[1:]]
+    assert all(r.steps == 200 and r.guaranteed for r in evaluate(loop, push_the_first, 4, 0).episodes)
+
+
+def test_many_episodes_are_played_in_parts(monkeypatch):
+    monkeypatch.setattr("agents.evaluation.SIDE_BY_SIDE", 3)
+    played = evaluate(CRUISE, zero, 8, 0)
+    assert [record.index for record in played.episodes] == list(range(8))
+    assert len({record.episode_return for record in played.episodes}) == 8
+
+
+def test_progress_is_told_in_steps():
+    told = []
+    evaluate(CRUISE, zero, 5, 0, on_progress=told.append)
+    assert sum(told) == 5 * 200
+
+
+def _of(env_id):
+    env = gym.make(env_id).unwrapped
+    return env.plant, env.contract

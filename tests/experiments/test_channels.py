@@ -1,0 +1,65 @@
+import numpy as np
+import pytest
+
+from experiments.channels import ChannelSettings, bursts, channel_of
+from experiments.settings import SweepSettings
+from experiments.sweep import cells_of
+from ncs_gym import Channel, GilbertElliott
+
+OWN = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
+
+
+def test_nothing_asked_for_changes_nothing():
+    assert channel_of(ChannelSettings(), OWN) is None
+    assert channel_of(ChannelSettings(loss=0.3), OWN) is None
+
+
+def test_what_is_asked_for_replaces_the_environments_own():
+    changed = channel_of(ChannelSettings(loss=0.1, delay=0, max_consecutive_losses=4), OWN)
+    expected = Channel(loss=0.1, quantization_step=0.05, send_period=2, delay=0, max_consecutive_losses=4)
+    assert changed == expected
+
+
+@pytest.mark.parametrize(("loss", "length"), [(0.3, 4.0), (0.1, 1.0), (0.6, 10.0)])
+def test_bursts_have_the_loss_rate_and_the_length_asked_for(loss, length):
+    chain, rng = bursts(loss, length), np.random.default_rng(0)
+    bad, states = False, []
+    for uniform in rng.random(200_000):
+        bad = uniform >= chain.p_bad_to_good if bad else uniform < chain.p_good_to_bad
+        states.append(bad)
+    states = np.array(states)
+    runs = int((states[1:] & ~states[:-1]).sum())
+    assert states.mean() == pytest.approx(loss, rel=0.05)
+    assert states.sum() / runs == pytest.approx(length, rel=0.05)
+
+
+@pytest.mark.parametrize(("loss", "length"), [(0.9, 1.0), (0.5, 0.5), (1.0, 3.0), (-0.1, 2.0), (0.3, float("nan"))])
+def test_impossible_bursts_are_refused(loss, length):
+    with pytest.raises(ValueError, match="bursts of mean length"):
+        bursts(loss, length)
+
+
+def test_bursts_need_a_loss_probability():
+    own = Channel(loss=GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.5))
+    with pytest.raises(ValueError, match=r"--channel\.loss"):
+        channel_of(ChannelSettings(burst_length=3.0), own)
+    assert channel_of(ChannelSettings(burst_length=3.0, loss=0.2), own).loss == bursts(0.2, 3.0)
+
+
+def test_grid_is_the_product_of_its_sides():
+    settings = SweepSettings(losses=(0.0, 0.5), delays=(1,), quantization_steps=(0.1, 0.2), burst_lengths=(1.0, 3.0))
+    cells = cells_of(settings)
+    assert len(cells) == len({cell.name for cell in cells}) == 8
+    lossless, *_, last = cells
+    assert lossless.channel(ChannelSettings(jitter=1)) == ChannelSettings(
+        loss=0.0, delay=1, quantization_step=0.1, jitter=1
+    )
+    assert last.channel(ChannelSettings()) == ChannelSettings(
+        loss=0.5, delay=1, quantization_step=0.2, burst_length=3.0
+    )
+
+
+@pytest.mark.parametrize("change", [{"losses": ()}, {"delays": (1, 1)}, {"arms": ("shielded", "shielded")}])
+def test_empty_and_repeated_sides_are_refused(change):
+    with pytest.raises(ValueError, match=f"--{next(iter(change))} must be different"):
+        cells_of(SweepSettings(**change))

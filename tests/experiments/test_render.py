@@ -1,0 +1,185 @@
+"""The command that draws an episode, and the policies it plays."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from PIL import Image
+
+from agents.control_loop import ControlLoop
+from agents.training import untrained
+from experiments.policies import greedy_action, policy_by_name
+from experiments.render import render
+from experiments.settings import RenderSettings
+from ncs_gym.rendering import theme
+from shields import SafetyShield
+from tests.experiments.test_command_line import assert_one_sentence, ncs
+
+CRUISE = "ncs_gym/TruckTrailerCruise-v0"
+
+
+@pytest.fixture(scope="module")
+def certificate_file(certificate, tmp_path_factory):
+    file = tmp_path_factory.mktemp("certificate") / "c.json"
+    certificate.save(file)
+    return file
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    """A saved agent that has learned nothing."""
+    folder, agent = tmp_path_factory.mktemp("model"), untrained(ControlLoop(env=CRUISE), seed=0)
+    agent.save(folder)
+    return folder, agent
+
+
+def settings(**changes):
+    return RenderSettings(**({"steps": 3} | changes))
+
+
+def test_command_writes_a_gif_of_both_arms_below_two_megabytes(tmp_path, certificate_file):
+    file = tmp_path / "both.gif"
+    run = ncs("render", "--gif", file, "--side-by-side", "--steps", 30, "--certificate", certificate_file)
+    assert run.returncode == 0, run.stderr
+    assert file.stat().st_size < 2e6
+    with Image.open(file) as image:
+        assert (image.n_frames, image.height) == (31, theme.HEIGHT)
+        assert image.width > 2 * theme.WIDTH
+        assert image.info["duration"] == 100
+        assert image.info["loop"] == 0
+    unshielded, shielded, saved = run.stdout.splitlines()
+    assert unshielded.startswith("no shield: 30 steps, ")
+    assert " 0 with a violation" not in unshielded
+    assert shielded.startswith("project: 30 steps, 0 with a violation, shield acted ")
+    assert str(file) in saved
+
+
+@pytest.mark.parametrize("env_id", ["ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0"])
+def test_episode_that_ends_early_ends_the_animation(env_id, tmp_path, capsys):
+    render(settings(env=env_id, shield="none", steps=100, out=tmp_path / "a.gif"))
+    with Image.open(tmp_path / "a.gif") as image:
+        assert 2 < image.n_frames < 100
+    assert "1 with a violation" in capsys.readouterr().out
+
+
+def test_last_picture_alone_and_scaling(tmp_path):
+    render(settings(shield="none", out=tmp_path / "last.png", width=321))
+    with Image.open(tmp_path / "last.png") as image:
+        assert image.size == (320, 240)
+        assert np.ptp(np.asarray(image.convert("RGB"))) > 100
+
+
+def test_video(tmp_path):
+    render(settings(shield="none", out=tmp_path / "a.mp4"))
+    assert b"ftyp" in (tmp_path / "a.mp4").read_bytes()[:32]
+
+
+def test_small_red_things_stay_red_in_a_gif(tmp_path):
+    render(settings(shield="none", steps=4, out=tmp_path / "a.gif"))
+    with Image.open(tmp_path / "a.gif") as image:
+        image.seek(4)
+        pixels = np.asarray(image.convert("RGB")).astype(int)
+    assert (np.abs(pixels - np.array(theme.DANGER)).max(axis=-1) < 8).sum() > 500
+
+
+def violations_of_greedy(env_id, certificate=None, shielded=False):
+    env = gym.make(env_id)
+    inner = env.unwrapped
+    if shielded:
+        env = SafetyShield(env, certificate)
+    observation, info = env.reset(seed=0)
+    for _ in range(60):
+        action = greedy_action(inner, observation, info["estimate"])
+        np.testing.assert_array_equal(action, greedy_action(inner, observation, info["estimate"]))
+        observation, _, terminated, _, info = env.step(action)
+        if terminated:
+            break
+    return info["episode_violations"]
+
+
+def test_greedy_policy_violates_unless_shielded(certificate):
+    assert violations_of_greedy(CRUISE) > 0
+    assert violations_of_greedy(CRUISE, certificate, shielded=True) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env_id", ["ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0"])
+def test_greedy_policy_violates_unless_shielded_on_unstable_plants(env_id):
+    assert violations_of_greedy(env_id) > 0
+    assert violations_of_greedy(env_id, shielded=True) == 0
+
+
+def test_greedy_policy_uses_no_more_input_than_it_takes():
+    env = gym.make(CRUISE).unwrapped
+    for error, action in ((10.0, 1.0), (-10.0, -1.0), (1.0, 0.5), (-0.5, -0.25), (0.0, 0.0)):
+        assert greedy_action(env, np.array([0.0, 0.0, error]), np.zeros(2)) == pytest.approx([action])
+
+
+def test_greedy_policy_regulates_where_nothing_is_tracked():
+    env = gym.make("ncs_gym/TruckTrailer-v0").unwrapped
+    action = greedy_action(env, np.zeros(2), np.array([1.0, 1.0]))
+    plant = env.plant
+    sizes = [np.linalg.norm(plant.A @ [1.0, 1.0] + plant.B @ [4.0 * a]) for a in (action[0], 0.0, 1.0, -1.0)]
+    assert sizes[0] <= min(sizes[1:])
+
+
+def test_random_policy_follows_the_seed():
+    env = gym.make(CRUISE).unwrapped
+    first, again, other = (policy_by_name("random", CRUISE, env, seed)(np.zeros(3), {}) for seed in (1, 1, 2))
+    assert first == again
+    assert first != other
+    assert policy_by_name("zero", CRUISE, env, 0)(np.zeros(3), {}) == [0.0]
+
+
+def test_saved_model_acts_as_it_did(model):
+    folder, agent = model
+    observations = np.random.default_rng(0).standard_normal((5, 3)).astype(np.float32)
+    policy = policy_by_name(str(folder), CRUISE, gym.make(CRUISE).unwrapped, 0)
+    np.testing.assert_array_equal(policy(observations[0], {}), agent.act(observations[:1])[0])
+
+
+def test_model_of_another_environment_is_refused(model):
+    with pytest.raises(ValueError, match=r"was trained in ncs_gym/TruckTrailerCruise-v0, not in ncs_gym/CartPole-v0"):
+        policy_by_name(str(model[0]), "ncs_gym/CartPole-v0", gym.make("ncs_gym/CartPole-v0").unwrapped, 0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"env": "CartPole-v1"}, "unknown environment 'CartPole-v1'"),
+        ({"out": "a.avi"}, "--out must end in one of .gif, .mp4, .png"),
+        ({"steps": 0}, "--steps must be at least 1"),
+        ({"fps": 0}, "--fps must be at least 1 and at most 50"),
+        ({"seed": -1}, "--seed must be at least 0"),
+        ({"width": 10}, "--width must be at least 160"),
+        ({"side_by_side": True, "shield": "none"}, "--side-by-side compares with a shield"),
+        ({"out": "nowhere/a.gif"}, "No such file or directory"),
+        ({"policy": "nowhere"}, "cannot read the agent in nowhere"),
+    ],
+)
+def test_wrong_settings_raise_before_anything_is_played(changes, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    if "out" in changes:
+        changes = changes | {"out": tmp_path / changes["out"]}
+    with pytest.raises((ValueError, OSError), match=words):
+        render(settings(**changes))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_errors_of_the_command_are_one_sentence(tmp_path):
+    assert_one_sentence(ncs("render", "--steps", 0, "--out", "a.gif", cwd=tmp_path), "--steps must be at least 1")
+    assert not (tmp_path / "a.gif").exists()
+
+
+def test_missing_pygame_is_one_sentence(tmp_path):
+    (tmp_path / "sitecustomize.py").write_text(
+        "import importlib.util as u\nfind = u.find_spec\n"
+        "u.find_spec = lambda name, *rest: None if name == 'pygame' else find(name, *rest)\n"
+    )
+    run = ncs("render", cwd=tmp_path, PYTHONPATH=f"{tmp_path}:{_root()}")
+    assert_one_sentence(run, "this command needs pygame", "pip install 'ncs-gym[render]'")
+
+
+def _root():
+    import experiments
+
+    return experiments.__path__[0].rsplit("/", 1)[0]

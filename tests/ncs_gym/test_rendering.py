@@ -1,0 +1,360 @@
+"""The picture: what it shows is looked for in its pixels."""
+
+import copy
+import pickle
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+from functools import cache
+
+import gymnasium as gym
+import numpy as np
+import pygame
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import RecordVideo
+from stable_baselines3.common.env_util import make_vec_env
+
+from ncs_gym import Annotation, Channel, Ellipsoid, LinearPlant
+from ncs_gym.rendering import Picture, theme
+from ncs_gym.rendering.history import RECENT, Flight
+from ncs_gym.scenarios import ENTRY_POINTS
+from tests.plants import random_plant
+
+CRUISE = "ncs_gym/TruckTrailerCruise-v0"
+OWN = [env_id for env_id in ENTRY_POINTS if "Linear" not in env_id]
+SAFE_SET = Ellipsoid(4.0 * np.eye(2))
+
+
+def make(env_id=CRUISE, render_mode="rgb_array", **settings):
+    if env_id == "ncs_gym/LinearNCS-v0":
+        settings.setdefault("plant", random_plant(0, 3, 2, 2))
+    return gym.make(env_id, render_mode=render_mode, **settings)
+
+
+@cache
+def quiet_scene():
+    """The truck at rest, before its first step."""
+    env = make().unwrapped
+    env.reset(seed=0, options={"state": np.zeros(2)})
+    return replace(env._scene(env._film), estimate=np.zeros(2), error_shape=1e-6 * np.eye(2))
+
+
+def scene(state=(0.0, 0.0), **changes):
+    """A scene that shows nothing but a state, and what changes it."""
+    state = np.array(state, dtype=float)
+    violated = bool((np.abs(state) > 2.0).any())
+    return replace(
+        quiet_scene(), **{"state": state, "estimate": state, "violated": violated, "path": state[None]} | changes
+    )
+
+
+@pytest.fixture(scope="module")
+def picture(loaded):
+    return Picture(loaded)
+
+
+def count(pixels, color, rect, off=24):
+    """How many pixels of a rectangle are close to a color."""
+    x, y, w, h = (round(value) for value in rect)
+    part = pixels[y : y + h, x : x + w].astype(int)
+    return int((np.abs(part - np.array(color)).max(axis=-1) <= off).sum())
+
+
+def changed(first, second, rect):
+    x, y, w, h = (round(value) for value in rect)
+    return int((first != second)[y : y + h, x : x + w].any(axis=-1).sum())
+
+
+@pytest.mark.parametrize("env_id", ENTRY_POINTS)
+def test_every_environment_draws_frames_that_follow_it(env_id):
+    env = make(env_id)
+    env.reset(seed=0)
+    frames = [env.render()]
+    for _ in range(3):
+        env.step(env.action_space.sample())
+        frames.append(env.render())
+    for frame in frames:
+        assert frame.shape == (theme.HEIGHT, theme.WIDTH, 3)
+        assert frame.dtype == np.uint8
+    np.testing.assert_array_equal(env.render(), frames[-1])
+    for rect in (theme.HEADER, theme.STAGE, theme.PLANE, theme.PANEL):
+        assert changed(frames[0], frames[-1], rect) > 0
+    assert frames[-1].flags.writeable
+
+
+@pytest.mark.parametrize("env_id", ["ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0"])
+def test_gymnasiums_checker_renders_without_a_warning(env_id):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(gym.make(env_id).unwrapped)
+
+
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (2, 5), (12, 2)])
+def test_plants_of_any_size_are_drawn(n, m):
+    env = make("ncs_gym/LinearNCS-v0", plant=random_plant(0, n, m), channel=Channel(loss=0.3, jitter=3))
+    env.reset(seed=0)
+    env.unwrapped.annotate(Annotation(safe_set=Ellipsoid(np.eye(n)), label="project"))
+    env.step(env.action_space.sample())
+    assert count(env.render(), theme.SAFE_FILL, theme.PLANE) > 1000
+
+
+def test_oblique_limits_are_drawn_as_they_are():
+    common = {"A": 0.5 * np.eye(2), "B": np.ones((2, 1)), "u_max": 1.0, "dt": 0.1, "gamma": 1e-4}
+    plant = LinearPlant(C=np.array([[1.0, 1.0], [1.0, -1.0]]), **common)
+    env = make("ncs_gym/LinearNCS-v0", plant=plant).unwrapped
+    env.reset(seed=0)
+    frame, plane = env.render(), env._film._picture._plane
+    points = np.array([(0.85, 0.1), (-0.1, -0.85), (0.6, 0.6), (-0.6, 0.55)])  # inside, inside, outside, outside
+    colors = [tuple(frame[round(y), round(x)]) for x, y in plane.place(points)]
+    assert colors == [theme.PAPER, theme.PAPER, theme.DANGER_FILL, theme.DANGER_FILL]
+
+
+def test_coupling_turns_red_near_its_limit(picture):
+    band = theme.Rect(340, 150, 60, 35)
+    red = [count(picture.pixels(scene((stretch, 0.0))), theme.DANGER, band) for stretch in (0.0, 1.0, 1.95, -1.95)]
+    mark = 20  # pixels of the limit's dashed mark at most
+    assert red[0] < mark
+    assert red[1] < mark
+    assert min(red[2:]) > mark + 100
+
+
+def test_coupling_stretches(picture):
+    fronts = []
+    for stretch in (-1.0, 0.0, 1.0):
+        row = picture.pixels(scene((stretch, 0.0)))[130, :400].astype(int)
+        fronts.append(np.flatnonzero(np.abs(row - np.array(theme.LOAD)).max(axis=-1) < 24).max())
+    assert fronts[0] - fronts[1] == pytest.approx(fronts[1] - fronts[2], abs=1)
+    assert fronts[0] - fronts[1] == pytest.approx(31, abs=1)
+
+
+def test_ghost_stands_where_the_estimate_is(picture):
+    right, off = scene(), scene(estimate=np.array([1.0, 0.0]))
+    left = theme.Rect(0, 110, 140, 70)
+    assert count(picture.pixels(right), theme.ESTIMATE, left) == 0
+    assert count(picture.pixels(off), theme.ESTIMATE, left) > 50
+
+
+def test_error_ellipse_has_the_size_of_the_bound(picture):
+    areas = [
+        count(picture.pixels(scene(error_shape=size**2 * np.eye(2))), theme.ERROR_FILL, theme.PLANE, off=6)
+        for size in (0.5, 1.0)
+    ]
+    pixels_per_unit = theme.PLANE.w * theme.PLANE.h / 6.0**2
+    assert areas == pytest.approx([np.pi * 0.25 * pixels_per_unit, np.pi * pixels_per_unit], rel=0.2)
+
+
+def test_packets_show_whether_they_are_on_time_late_or_lost(picture):
+    lane = theme.Rect(250, theme.LANE - 26, 280, 50)
+    at = {"step": 4, "input": np.zeros(1)}
+    empty = picture.pixels(scene(**at))
+    seen = {}
+    for name, flight in (("new", Flight(4, 4)), ("late", Flight(3, 5)), ("lost", Flight(4, None))):
+        frame = picture.pixels(scene(**at, flights=(flight,)))
+        seen[name] = [count(frame, color, lane) for color in (theme.ESTIMATE, theme.LATE, theme.DANGER)]
+        assert changed(empty, frame, lane) > 100
+    assert seen["new"][0] > 80
+    assert seen["new"][1:] == [0, 0]
+    assert seen["late"][1] > 80
+    assert seen["lost"][2] > 80
+    assert seen["late"][2] == seen["lost"][1] == 0
+
+
+def test_packets_travel(picture):
+    lane = theme.Rect(0, theme.LANE - 3, theme.WIDTH, 6)
+    places = []
+    for step in (10, 11, 12):
+        frame = picture.pixels(scene(step=step, flights=(Flight(9, 13),)))
+        x, y, w, h = (round(value) for value in lane)
+        part = frame[y : y + h, x : x + w].astype(int)
+        places.append(np.nonzero(np.abs(part - np.array(theme.LATE)).max(axis=-1) < 24)[1].mean())
+    assert places[0] + 20 < places[1] < places[2] - 20
+
+
+def test_fates_are_those_of_the_channel():
+    def flights(channel, steps=12):
+        env = make(channel=channel).unwrapped
+        env.reset(seed=0)
+        for _ in range(steps):
+            env.step(np.zeros(1, np.float32))
+        return list(env._film.history.flights)
+
+    assert flights(Channel(send_period=3)) == [Flight(k, k) for k in (3, 6, 9, 12)]
+    assert flights(Channel(delay=2)) == [Flight(k, k + 2) for k in range(1, 13)]
+    assert flights(Channel(loss=1.0)) == [Flight(k, None) for k in range(1, 13)]
+    mixed = flights(Channel(loss=0.5, jitter=3))
+    assert any(each.arrival is None for each in mixed)
+    assert len({each.arrival - each.stamp for each in mixed if each.arrival is not None}) > 1
+
+
+def test_arrivals_are_those_of_the_infos():
+    env = make(channel=Channel(loss=0.4, delay=1, jitter=2))
+    env.reset(seed=3)
+    arrived = [k for k in range(1, 31) if env.step(np.zeros(1, np.float32))[4]["packet_arrived"]]
+    flights = env.unwrapped._film.history.flights
+    assert sorted({each.arrival for each in flights if each.arrival is not None and each.arrival <= 30}) == arrived
+
+
+def test_phase_plane_shows_the_safe_set_and_its_absence(picture):
+    note = Annotation(safe_set=SAFE_SET, label="project")
+    with_set, without = picture.pixels(scene(annotation=note)), picture.pixels(scene())
+    area = np.pi * 4.0 * theme.PLANE.w * theme.PLANE.h / 36.0
+    assert count(with_set, theme.SAFE_FILL, theme.PLANE, off=6) == pytest.approx(area, rel=0.15)
+    assert count(without, theme.SAFE_FILL, theme.PLANE, off=6) == 0
+    smaller = picture.pixels(scene(annotation=Annotation(safe_set=Ellipsoid(np.eye(2)), label="project")))
+    assert count(smaller, theme.SAFE_FILL, theme.PLANE, off=6) == pytest.approx(area / 4.0, rel=0.2)
+
+
+def test_intervention_shows_in_the_header_and_at_the_input(picture):
+    quiet = Annotation(safe_set=SAFE_SET, label="project", proposed=np.array([4.0]))
+    acting = replace(quiet, intervened=True, interventions=1)
+    frames = [picture.pixels(scene(step=1, input=np.array([1.0]), annotation=note)) for note in (quiet, acting)]
+    bar = theme.Rect(theme.PANEL.x, theme.PANEL.y + 16, theme.PANEL.w, 16)
+    beyond = theme.Rect(bar.right - bar.w / 4, bar.y, bar.w / 4, bar.h)  # between the applied input and the proposed
+    for rect in (theme.HEADER, bar):
+        assert count(frames[1], theme.SHIELD, rect) > count(frames[0], theme.SHIELD, rect) + 100
+    assert count(frames[0], theme.SHIELD, beyond) == 0
+    assert count(frames[1], theme.SHIELD, beyond) > 60
+    assert count(frames[1], theme.SHIELD_FILL, theme.STAGE, off=4) > 10_000
+    watching = picture.pixels(scene(step=1, input=np.array([4.0]), annotation=replace(acting, protects=False)))
+    assert count(watching, theme.SHIELD_FILL, theme.STAGE, off=4) == 0
+
+
+def test_path_and_the_steps_the_shield_acted_on_are_drawn(picture):
+    path = np.array([(-1.5, -1.0), (1.5, -1.0)])
+    frames = [picture.pixels(scene(path=path, acted=np.array([False, acted]))) for acted in (False, True)]
+    assert changed(picture.pixels(scene()), frames[0], theme.PLANE) > 150
+    assert count(frames[0], theme.SHIELD, theme.PLANE) == 0
+    assert count(frames[1], theme.SHIELD, theme.PLANE) > 15
+
+
+def test_violation_shows(picture):
+    safe, over = picture.pixels(scene()), picture.pixels(scene((2.5, 0.0), violations=1))
+    assert count(safe, theme.DANGER, theme.HEADER) == 0
+    assert count(over, theme.DANGER, theme.HEADER) > 1000
+    assert count(over, theme.DANGER_FILL, theme.STAGE, off=4) > 10_000
+
+
+def test_states_far_outside_are_drawn_at_the_edge(picture):
+    far = np.array([1e9, -1e9])
+    frame = picture.pixels(scene((1e9, -1e9), estimate=far, error_shape=1e30 * np.eye(2), path=far[None]))
+    assert count(frame, theme.DANGER, theme.Rect(theme.PLANE.right - 20, theme.PLANE.bottom - 20, 20, 20)) > 20
+
+
+def test_annotation_lasts_one_step():
+    env = make().unwrapped
+    note = Annotation(safe_set=SAFE_SET, label="project")
+    env.annotate(note)
+    env.reset(seed=0)
+    assert env._film.history.annotation is note
+    env.step(np.zeros(1, np.float32))
+    assert env._film.history.annotation is None
+    env.annotate(note)
+    for expected in (note, None):
+        env.step(np.zeros(1, np.float32))
+        assert env._film.history.annotation is expected
+
+
+def test_history_forgets():
+    env = make()
+    env.reset(seed=0)
+    for _ in range(2 * RECENT):
+        env.step(np.zeros(1, np.float32))
+    assert len(env.unwrapped._film.history.moments) == RECENT
+    env.reset()
+    assert len(env.unwrapped._film.history.moments) == 1
+    assert not env.unwrapped._film.history.flights
+
+
+def test_drawing_does_not_change_the_episode():
+    runs = []
+    for mode in (None, "rgb_array"):
+        env = make(render_mode=mode)
+        env.reset(seed=4)
+        infos = []
+        for _ in range(20):
+            infos.append(env.step(np.ones(1, np.float32))[4])
+            if mode:
+                env.render()
+        runs.append(np.concatenate([np.ravel(value) for info in infos for value in info.values()]))
+    np.testing.assert_array_equal(*runs)
+
+
+def test_record_video_writes_a_file(tmp_path):
+    env = RecordVideo(make(), str(tmp_path / "videos"), video_length=5)
+    env.reset(seed=0)
+    for _ in range(6):
+        env.step(np.zeros(1, np.float32))
+    env.close()
+    (file,) = tmp_path.glob("videos/*.mp4")
+    assert file.stat().st_size > 1000
+
+
+def test_human_mode_shows_every_step_and_closes(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env = make(render_mode="human")
+    env.reset(seed=0)
+    first = pygame.surfarray.array3d(pygame.display.get_surface())
+    assert first.shape == (theme.WIDTH, theme.HEIGHT, 3)
+    env.step(np.ones(1, np.float32))
+    assert (pygame.surfarray.array3d(pygame.display.get_surface()) != first).any()
+    assert env.render() is None
+    env.close()
+    assert not pygame.display.get_init()
+    env.reset()
+    assert pygame.display.get_init()
+    env.close()
+
+
+def test_images_need_no_display_and_leave_the_driver_alone(monkeypatch):
+    monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
+    code = """if True:
+        import os, sys
+        import gymnasium as gym, ncs_gym
+        env = gym.make("ncs_gym/TruckTrailer-v0", render_mode="rgb_array")
+        env.reset(seed=0)
+        assert "pygame" not in sys.modules
+        env.render()
+        assert not sys.modules["pygame"].display.get_init()
+        assert "SDL_VIDEODRIVER" not in os.environ
+    """
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_missing_pygame_is_one_sentence_and_only_for_who_draws(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    env = make()
+    env.reset(seed=0)
+    env.step(np.zeros(1, np.float32))
+    with pytest.raises(gym.error.DependencyNotInstalled, match=r'^rendering needs pygame-ce: pip install "ncs-gym\['):
+        env.render()
+
+
+def test_rendering_without_a_mode_warns_and_before_reset_raises():
+    env = make(render_mode=None).unwrapped
+    with pytest.warns(UserWarning, match="without a render mode"):
+        assert env.render() is None
+    with pytest.raises(gym.error.ResetNeeded):
+        make().unwrapped.render()
+
+
+def test_sb3_makes_environments_that_can_be_drawn_without_a_warning():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        envs = make_vec_env(CRUISE, n_envs=2, seed=0)
+        envs.reset()
+        assert envs.render().shape == (2 * theme.HEIGHT, theme.WIDTH, 3)
+
+
+def test_vector_environments_say_that_they_draw_nothing():
+    with pytest.raises(ValueError, match="a vector environment draws nothing"):
+        gym.make_vec("ncs_gym/TruckTrailer-v0", num_envs=2, render_mode="rgb_array")
+
+
+def test_drawn_environments_can_be_copied_and_pickled():
+    env = make().unwrapped
+    env.reset(seed=0)
+    frame = env.render()
+    for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        np.testing.assert_array_equal(twin.render(), frame)

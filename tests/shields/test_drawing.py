@@ -1,0 +1,106 @@
+"""What the shield tells the picture."""
+
+import gymnasium as gym
+import numpy as np
+import pygame
+import pytest
+from gymnasium.wrappers import RecordVideo
+
+from ncs_gym.rendering import theme
+from shields import SafetyShield
+
+CRUISE = "ncs_gym/TruckTrailerCruise-v0"
+FULL_THROTTLE = np.ones(1, np.float32)
+
+
+def shielded(certificate, mode="project", render_mode="rgb_array"):
+    env = SafetyShield(gym.make(CRUISE, render_mode=render_mode), certificate, mode=mode)
+    env.reset(seed=0)
+    return env
+
+
+def count(pixels, color, rect, off=6):
+    x, y, w, h = (round(value) for value in rect)
+    part = pixels[y : y + h, x : x + w].astype(int)
+    return int((np.abs(part - np.array(color)).max(axis=-1) <= off).sum())
+
+
+def test_safe_set_is_in_the_picture_from_reset_on(certificate):
+    env = shielded(certificate)
+    bare = gym.make(CRUISE, render_mode="rgb_array")
+    bare.reset(seed=0)
+    for _ in range(2):
+        assert count(env.render(), theme.SAFE_FILL, theme.PLANE) > 10_000
+        assert count(bare.render(), theme.SAFE_FILL, theme.PLANE) == 0
+        env.step(FULL_THROTTLE)
+        bare.step(FULL_THROTTLE)
+
+
+def test_an_intervention_shows_in_its_frame_and_in_no_other(certificate):
+    env = shielded(certificate)
+    seen = set()
+    for k in range(30):
+        info = env.step(FULL_THROTTLE if k < 10 else np.zeros(1, np.float32))[4]
+        tinted = count(env.render(), theme.SHIELD_FILL, theme.STAGE) > 10_000
+        assert tinted == info["shield_intervened"]
+        seen.add(tinted)
+    assert seen == {True, False}
+
+
+def test_a_shield_that_watches_does_not_look_as_if_it_acted(certificate):
+    env = shielded(certificate, mode="monitor")
+    for _ in range(6):
+        info = env.step(FULL_THROTTLE)[4]
+        assert count(env.render(), theme.SHIELD_FILL, theme.STAGE) == 0
+    assert info["episode_interventions"] > 0
+
+
+def test_the_picture_shows_the_inputs_and_the_count_of_the_info(certificate):
+    env = shielded(certificate)
+    for _ in range(5):
+        info = env.step(FULL_THROTTLE)[4]
+        note, history = env.unwrapped._film.history.annotation, env.unwrapped._film.history
+        np.testing.assert_array_equal(note.proposed, info["input_proposed"])
+        np.testing.assert_array_equal(history.input, info["input"])
+        assert note.intervened == info["shield_intervened"]
+        assert note.interventions == info["episode_interventions"]
+
+
+def test_stepping_the_environment_below_the_shield_draws_no_shield(certificate):
+    env = shielded(certificate)
+    env.step(FULL_THROTTLE)
+    env.unwrapped.step(FULL_THROTTLE)
+    assert count(env.render(), theme.SAFE_FILL, theme.PLANE) == 0
+
+
+def test_human_mode_shows_the_shield_in_the_very_step(certificate, monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env = shielded(certificate, render_mode="human")
+    for _ in range(4):
+        info = env.step(FULL_THROTTLE)[4]
+    assert info["shield_intervened"]
+    shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+    assert count(shown, theme.SHIELD_FILL, theme.STAGE) > 10_000
+    env.close()
+
+
+@pytest.mark.parametrize("outside", [True, False])
+def test_record_video_works_on_either_side_of_the_shield(certificate, tmp_path, outside):
+    folder = str(tmp_path / "videos")
+    env = gym.make(CRUISE, render_mode="rgb_array")
+    if outside:
+        env = RecordVideo(SafetyShield(env, certificate), folder, video_length=4)
+    else:
+        env = SafetyShield(RecordVideo(env, folder, video_length=4), certificate)
+    env.reset(seed=0)
+    for _ in range(5):
+        env.step(FULL_THROTTLE)
+    env.close()
+    assert [file.stat().st_size > 1000 for file in (tmp_path / "videos").glob("*.mp4")] == [True]
+
+
+def test_a_shield_that_is_not_drawn_tells_nothing(certificate, monkeypatch):
+    env = shielded(certificate, render_mode=None)
+    monkeypatch.setattr(type(env.unwrapped), "annotate", None)
+    env.step(FULL_THROTTLE)
+    assert env.unwrapped._film is None
