@@ -155,10 +155,9 @@ def _findings(summary: dict[str, Any]) -> list[str]:
         interval = difference["return_ci95"]
         text = f" [{interval[0]:+.1f}, {interval[1]:+.1f}]" if interval else ""
         findings.append(f"{name}, paired with {paired['baseline']}: return {difference['return_mean']:+.1f}{text}.")
-    if {"shielded", "unshielded"} <= summary["arms"].keys():
+    if (covered := way_covered(summary)) is not None:
         findings.append(
-            f"The shielded return covers {100 * way_covered(summary):.0f} % of the way from the zero input to the "
-            "unshielded agent."
+            f"The shielded return covers {100 * covered:.0f} % of the way from the zero input to the unshielded agent."
         )
     if "monitor" in summary["arms"]:
         findings.append("In brackets: what the shield would have overridden.")
