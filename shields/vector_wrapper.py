@@ -152,7 +152,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         wrong = self._follow(before, info, decisions, proposed, told, guaranteed)
         if wrong < 0:
             return self._restarted((observation, rewards, terminated, truncated, info), before, decisions, proposed)
-        self._some_wrong, self._clock = wrong > 0, before._replace(ticks=self._inner.ticks)
+        self._some_wrong, self._clock = wrong > 0, Clock(before.episodes, before.steps, self._inner.ticks)
         rewards = rewards - self.penalty * decisions.intervened if self.penalty else rewards
         added = {
             "shield_intervened": decisions.intervened,
