@@ -47,8 +47,15 @@ class Normalization:
 
     @classmethod
     def of(cls, env: VecNormalize) -> Normalization:
-        """Returns the present statistics of a `VecNormalize`."""
-        return cls(env.obs_rms.mean.copy(), env.obs_rms.var.copy(), float(env.epsilon), float(env.clip_obs))
+        """Returns the present statistics of a `VecNormalize`.
+
+        Raises:
+            TypeError: If its observations are dictionaries.
+        """
+        statistics = env.obs_rms
+        if isinstance(statistics, dict):
+            raise TypeError("observations must be one array, got a dictionary of them")
+        return cls(statistics.mean.copy(), statistics.var.copy(), float(env.epsilon), float(env.clip_obs))
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Returns normalized observations (N, entries), float32."""
@@ -161,7 +168,8 @@ def channel_from_json(content: dict[str, Any] | None) -> Channel | None:
     if content is None:
         return None
     loss = content["loss"]
-    return Channel(**content | {"loss": GilbertElliott(**loss) if isinstance(loss, dict) else loss})
+    settings: dict[str, Any] = content | {"loss": GilbertElliott(**loss) if isinstance(loss, dict) else loss}
+    return Channel(**settings)
 
 
 def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.spaces import flatdim
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import LinearSchedule
@@ -73,7 +74,7 @@ def build(name: str, env: VecEnv, settings: AgentSettings, seed: int, steps: int
         "policy_kwargs": {"net_arch": [settings.width] * 2},
     }
     if isinstance(settings, OffPolicySettings):
-        return cls("MlpPolicy", env, **common, **_replay(name, settings, env.action_space.shape[0]))
+        return cls("MlpPolicy", env, **common, **_replay(name, settings, flatdim(env.action_space)))
     common["policy_kwargs"]["log_std_init"] = settings.log_std
     common |= {"n_steps": settings.rollout, "gae_lambda": settings.gae_lambda}
     if isinstance(settings, PPOSettings):

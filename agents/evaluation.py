@@ -11,6 +11,7 @@ import numpy as np
 from agents.control_loop import ControlLoop
 from agents.trajectory import Trajectory, trajectory_of
 from ncs_gym import NCSVectorEnv
+from ncs_gym.env import ncs_env
 
 # Episodes played side by side at most.
 SIDE_BY_SIDE = 1000
@@ -95,8 +96,8 @@ class _Play:
 
     def __init__(self, loop: ControlLoop, count: int, level_matrix: np.ndarray | None) -> None:
         # Episodes that end early go on unseen, so that the others' draws do not depend on them.
-        prototype = loop.single().unwrapped
-        self._ends = bool(getattr(prototype, "terminate_on_violation", False))
+        prototype = ncs_env(loop.single())
+        self._ends = prototype.terminate_on_violation
         self._envs, self._C, self._level_matrix = loop.vector(count), prototype.plant.C, level_matrix
         if self._ends and isinstance(self._envs.unwrapped, NCSVectorEnv):
             self._envs = loop.vector(count, terminate_on_violation=False)

@@ -192,7 +192,9 @@ class SB3VecEnv(VecEnv):
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Returns a frame per environment, None where the vector environment renders none."""
         frames = self.vector_env.render() if self.vector_env.render_mode is not None else None
-        return [None] * self.num_envs if frames is None else list(frames)
+        if frames is None:
+            return [None] * self.num_envs
+        return [frame if isinstance(frame, np.ndarray) else None for frame in frames]
 
 
 # Attributes of `NCSVectorEnv` that its scalar prototype has too, but never changes.

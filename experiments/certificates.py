@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from experiments.settings import SynthesizeSettings, VerifySettings
 from ncs_gym import ChannelContract, LinearPlant, scenarios
+from ncs_gym.env import ncs_env
 from ncs_gym.scenarios import ENTRY_POINTS
 from shields import Certificate, CertificateError, Report, synthesize, verify
 from shields.storage import write_atomically
@@ -67,12 +68,12 @@ def plant_of(env_id: str) -> LinearPlant:
     """
     if env_id not in _with_plant():
         raise ValueError(f"unknown environment {env_id!r}; known are {', '.join(_with_plant())}")
-    return gym.make(env_id).unwrapped.plant
+    return ncs_env(gym.make(env_id)).plant
 
 
 def contract_of_env(env_id: str) -> ChannelContract | None:
     """Returns the channel contract a registered environment rests on; None for a stable plant."""
-    return gym.make(env_id).unwrapped.contract
+    return ncs_env(gym.make(env_id)).contract
 
 
 def _with_plant() -> list[str]:

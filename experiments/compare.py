@@ -132,7 +132,7 @@ def _summary(
     } | provenance("compare", settings, world)
 
 
-def grouped(results: Sequence[UnitResult]) -> dict[str, list[UnitResult]]:
+def grouped(results: Sequence[UnitResult]) -> dict[str, Sequence[UnitResult]]:
     """Returns the results of each arm in the order of their runs."""
     names = dict.fromkeys(result.arm for result in results)
     return {name: sorted((r for r in results if r.arm == name), key=lambda r: r.index) for name in names}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
+from operator import itemgetter
 
 import numpy as np
 
@@ -62,8 +63,9 @@ def worst_step(
     states, disturbances = Ellipsoid(0.5 * (inverse + inverse.T)), Ellipsoid(gamma * np.eye(n))
     spread = np.eye(n) if direction is None else np.outer(direction, direction) / (direction @ direction)
     errors = Ellipsoid(epsilon * spread)
-    rng, best = np.random.default_rng(0), None
-    for _ in range(STARTS):
+    rng = np.random.default_rng(0)
+
+    def ascended() -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
         x, d, e = (source.sample_boundary(rng) for source in (states, disturbances, errors))
         for _ in range(ASCENT_STEPS):
             slope = M @ (closed @ x + d + e)
@@ -73,9 +75,9 @@ def worst_step(
                 errors.extreme_point(slope),
             )
         end = closed @ x + d + e
-        if best is None or end @ M @ end > best[0]:
-            best = (float(end @ M @ end), INSIDE * x, INSIDE * d, INSIDE * e)
-    level, x, d, e = best
+        return float(end @ M @ end), INSIDE * x, INSIDE * d, INSIDE * e
+
+    level, x, d, e = max((ascended() for _ in range(STARTS)), key=itemgetter(0))
     return OneStep(x, d, e, closed @ x + d + e, level, _confirmed(closed, M, gamma, epsilon, x, d, e))
 
 

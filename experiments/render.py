@@ -15,6 +15,7 @@ from experiments.certificates import plant_of
 from experiments.extras import require_extra
 from experiments.policies import UNTRAINED, policy_by_name
 from experiments.settings import RenderSettings
+from ncs_gym.env import ncs_env
 from shields import Certificate, SafetyShield
 
 FASTEST = 50
@@ -57,8 +58,8 @@ class Player:
     def __init__(self, settings: RenderSettings, mode: str) -> None:
         self._mode = mode
         certificate = None if settings.certificate is None else Certificate.load(settings.certificate)
-        self._env = gym.make(settings.env, render_mode="rgb_array")
-        self._policy = policy_by_name(settings.policy, settings.env, self._env.unwrapped, settings.seed)
+        self._env: gym.Env = gym.make(settings.env, render_mode="rgb_array")
+        self._policy = policy_by_name(settings.policy, settings.env, ncs_env(self._env), settings.seed)
         if mode != "none":
             self._env = SafetyShield(self._env, certificate, mode=mode)
         self._observation, self._info = self._env.reset(seed=settings.seed)
@@ -66,7 +67,10 @@ class Player:
 
     def picture(self) -> np.ndarray:
         """Returns the present picture, shape (height, width, 3), uint8."""
-        return self._env.render()
+        picture = self._env.render()
+        if not isinstance(picture, np.ndarray):
+            raise TypeError(f"expected a picture, got {type(picture).__name__}")
+        return picture
 
     def step(self) -> None:
         """Plays a step, unless the episode is over."""

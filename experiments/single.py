@@ -18,6 +18,7 @@ from experiments.settings_file import save_settings
 from experiments.summary import summarize_arm, table_text
 from experiments.unit import UnitResult, versions
 from experiments.worlds import world_of
+from ncs_gym.env import ncs_env
 from shields.storage import write_atomically
 
 
@@ -54,7 +55,7 @@ def evaluate_agent(settings: EvaluateSettings) -> None:
         OSError: If the summary cannot be written.
     """
     agent = Agent.load(settings.model)
-    own = ControlLoop(env=agent.env, channel=agent.channel).single().unwrapped.channel
+    own = ncs_env(ControlLoop(env=agent.env, channel=agent.channel).single()).channel
     channel = channel_of(settings.channel, own) or agent.channel
     world = world_of(agent.env, channel, settings.certificate)
     mode = None if settings.shield == "none" else settings.shield

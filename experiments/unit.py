@@ -23,6 +23,7 @@ from agents.settings import AgentSettings
 from agents.training import TrainingResult, train, untrained
 from agents.trajectory import Trajectory
 from ncs_gym import Channel
+from ncs_gym.env import ncs_env
 from shields import Certificate
 
 Learner = Literal["agent", "untrained", "gain", "zero"]
@@ -196,7 +197,7 @@ def _policy(unit: Unit, trained: TrainingResult | None) -> Policy:
     """Returns the policy to evaluate."""
     if trained is not None:
         return lambda observations, infos: trained.agent.act(observations)
-    plant = unit.loop.single().unwrapped.plant
+    plant = ncs_env(unit.loop.single()).plant
     if unit.learner == "untrained":
         agent = untrained(unit.loop, unit.training_seed, unit.algorithm, unit.settings)
         return lambda observations, infos: agent.act(observations)

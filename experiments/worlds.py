@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 
 from experiments.certificates import plant_of
 from experiments.channels import ChannelSettings, channel_of
 from ncs_gym import Channel, LinearPlant
+from ncs_gym.env import ncs_env
 from shields import Certificate, Report, verify
 from shields.verification import require_valid
 from shields.wrapper import certificate_for
@@ -51,8 +53,9 @@ def world_of(env_id: str, channel: ChannelSettings | Channel | None, certificate
     """
     plant_of(env_id)
     if isinstance(channel, ChannelSettings):
-        channel = channel_of(channel, gym.make(env_id).unwrapped.channel)
-    env = gym.make(env_id, **({} if channel is None else {"channel": channel})).unwrapped
+        channel = channel_of(channel, ncs_env(gym.make(env_id)).channel)
+    changed: dict[str, Any] = {} if channel is None else {"channel": channel}
+    env = ncs_env(gym.make(env_id, **changed))
     if certificate_file is None:
         certificate = certificate_for(env.plant, env.contract)
     else:

@@ -108,6 +108,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES, "render_fps": RENDER_FPS}
+    observation_space: Box
+    action_space: Box
 
     def __init__(
         self,
@@ -353,6 +355,18 @@ def _start_option(options: dict[str, Any] | None, n: int) -> np.ndarray | None:
     if "state" not in options:
         return None
     return as_vector(options["state"], n, "options['state']")
+
+
+def ncs_env(env: gym.Env) -> NCSEnv:
+    """Returns the environment inside all wrappers.
+
+    Raises:
+        ValueError: If it is not an `NCSEnv`.
+    """
+    inner = env.unwrapped
+    if not isinstance(inner, NCSEnv):
+        raise ValueError(f"expected an NCSEnv inside, got {type(inner).__name__}")
+    return inner
 
 
 def _expect(value: Any, kind: type[T], name: str) -> T:

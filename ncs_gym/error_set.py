@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from typing import Literal, overload
 
 import numpy as np
 from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov
@@ -50,6 +51,12 @@ class ErrorSet(FrozenArrays):
 
     def __post_init__(self) -> None:
         self._freeze_arrays()
+
+    @overload
+    def shape_at(self, age: Literal[0]) -> np.ndarray: ...
+
+    @overload
+    def shape_at(self, age: int) -> np.ndarray | None: ...
 
     def shape_at(self, age: int) -> np.ndarray | None:
         """Returns the certified shape, (n, n), for a newest sample `age` steps old; None beyond the contract."""

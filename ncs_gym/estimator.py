@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
@@ -185,7 +185,8 @@ class Estimator:
         carried = self._settled_shape(moved / rate + D / (1.0 - rate))
         if is_inside(carried, certified):
             return carried
-        return certified if is_inside(shape, self.error_set.shape_at(age)) else predicted
+        present = self.error_set.shape_at(age)
+        return certified if present is not None and is_inside(shape, present) else predicted
 
     def _update(self, belief: Belief, measurement: np.ndarray, step: int) -> Belief:
         """Returns the belief after a measurement; the same if the guard turns it down."""
@@ -342,12 +343,12 @@ def _grown(product: np.ndarray, extent: np.ndarray) -> np.ndarray:
     return product
 
 
-def _kalman_filter(plant: LinearPlant, quantization_step: float) -> KalmanFilter:
-    """Returns filterpy's filter with every matrix set.
+def _kalman_filter(plant: LinearPlant, quantization_step: float) -> Any:
+    """Returns filterpy's `KalmanFilter`, which has no types, with every matrix set.
 
     The process covariance is Q + gamma I (Liu et al. Definition 3), the sensor's R plus q^2/12 of a quantizer.
     """
-    kalman = KalmanFilter(dim_x=plant.n, dim_z=plant.p, dim_u=plant.m)
+    kalman: Any = KalmanFilter(dim_x=plant.n, dim_z=plant.p, dim_u=plant.m)
     kalman.x = np.zeros(plant.n)
     kalman.F, kalman.B, kalman.H = plant.A, plant.B, plant.H
     kalman.Q = plant.process_noise_cov + plant.gamma * np.eye(plant.n)

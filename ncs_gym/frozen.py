@@ -8,6 +8,8 @@ import numpy as np
 
 # Entries beyond this would overflow when squared twice.
 LARGEST = 1e75
+# Default of a field that `__post_init__` puts a value in place of: None, but never seen as that from outside.
+FILLED_IN: Any = None
 
 
 class FrozenArrays:

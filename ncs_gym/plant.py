@@ -6,13 +6,16 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ncs_gym.ellipsoid import Ellipsoid
-from ncs_gym.frozen import FrozenArrays, as_covariance, as_matrix, as_number, read_only
+from ncs_gym.frozen import FILLED_IN, FrozenArrays, as_covariance, as_matrix, as_number, read_only
 from ncs_gym.noise import SMALLEST_KEPT, TruncatedGaussian, chi2_quantile
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 # Relative growth of every hard bound, so that rounding in sampling and quantizing stays inside (theory.md section 1).
 INFLATION = 1.0 + 1e-9
@@ -54,19 +57,42 @@ class LinearPlant(FrozenArrays):
     A: np.ndarray
     B: np.ndarray
     C: np.ndarray
-    u_max: np.ndarray | float
+    u_max: np.ndarray
     dt: float
     gamma: float
-    H: np.ndarray | None = None
-    process_noise_cov: np.ndarray | None = None
-    measurement_noise_cov: np.ndarray | None = None
-    initial_cov: np.ndarray | None = None
+    H: np.ndarray = FILLED_IN
+    process_noise_cov: np.ndarray = FILLED_IN
+    measurement_noise_cov: np.ndarray = FILLED_IN
+    initial_cov: np.ndarray = FILLED_IN
     delta: float = 0.05
     error_gain: np.ndarray | None = None
     state_names: Sequence[str] = field(default=())
     state_units: Sequence[str] = field(default=())
     input_names: Sequence[str] = field(default=())
     input_units: Sequence[str] = field(default=())
+
+    if TYPE_CHECKING:
+        # The fields say what is kept; the constructor takes whatever `__post_init__` can turn into that.
+        def __init__(
+            self,
+            *,
+            A: ArrayLike,
+            B: ArrayLike,
+            C: ArrayLike,
+            u_max: ArrayLike,
+            dt: float,
+            gamma: float,
+            H: ArrayLike | None = None,
+            process_noise_cov: ArrayLike | None = None,
+            measurement_noise_cov: ArrayLike | None = None,
+            initial_cov: ArrayLike | None = None,
+            delta: float = 0.05,
+            error_gain: ArrayLike | None = None,
+            state_names: Sequence[str] = (),
+            state_units: Sequence[str] = (),
+            input_names: Sequence[str] = (),
+            input_units: Sequence[str] = (),
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         A = as_matrix(self.A, (None, None), "A")

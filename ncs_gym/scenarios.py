@@ -131,7 +131,7 @@ CART_POLE_CHANNEL = Channel(loss=0.2, delay=1, jitter=1, max_consecutive_losses=
 CART_POLE = Scenario(
     plant=cart_pole,
     channel=CART_POLE_CHANNEL,
-    task=SetpointTracking(output=(1.0, 0.0, 0.0, 0.0), reach=2.0, width=2.0, change_probability=0.02),
+    task=SetpointTracking(output=np.array([1.0, 0.0, 0.0, 0.0]), reach=2.0, width=2.0, change_probability=0.02),
     contract=contract_of(CART_POLE_CHANNEL),
     terminates=True,
 )
@@ -141,7 +141,7 @@ BATCH_REACTOR_CHANNEL = Channel(loss=0.2, delay=1, max_consecutive_losses=2, qua
 BATCH_REACTOR = Scenario(
     plant=batch_reactor,
     channel=BATCH_REACTOR_CHANNEL,
-    task=SetpointTracking(output=(0.0, 1.0, 0.0, 0.0), reach=1.0, width=1.0, change_probability=0.05),
+    task=SetpointTracking(output=np.array([0.0, 1.0, 0.0, 0.0]), reach=1.0, width=1.0, change_probability=0.05),
     contract=contract_of(BATCH_REACTOR_CHANNEL),
     terminates=True,
 )

@@ -8,7 +8,7 @@ import os
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,15 @@ SET_ARRAYS = ("shapes", "rates", "gains", "shares", "noise")
 
 class CertificateError(ValueError):
     """A certificate is damaged, belongs to another plant, or does not verify."""
+
+
+class PaperConstants(NamedTuple):
+    """What a certificate of method "paper" is verified with, besides L and K; see `Certificate`."""
+
+    kappa: float
+    rho: float
+    epsilon: float
+    epsilon_up: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +103,15 @@ class AgeProof(FrozenArrays):
         self._freeze_arrays()
 
 
+class Proof(NamedTuple):
+    """What a certificate of method "certified" is verified with, besides L and K; see `Certificate`."""
+
+    Sigma: np.ndarray
+    D: np.ndarray
+    multipliers: Multipliers
+    ages: AgeProof | None
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Certificate(FrozenArrays):
     """A robust safety invariant set S = {x : x'Mx <= 1} with gain K, and the proof's numbers.
@@ -147,6 +165,26 @@ class Certificate(FrozenArrays):
         except ValueError as error:
             raise CertificateError(f"not a certificate: {error}") from error
         self._freeze_arrays()
+
+    def proof(self) -> Proof:
+        """Returns the numbers that theory.md section 3 is verified with.
+
+        Raises:
+            CertificateError: If the method is "paper", which has none.
+        """
+        if self.Sigma is None or self.D is None or self.multipliers is None:
+            raise CertificateError(f"a certificate of method {self.method!r} has no error set to verify")
+        return Proof(self.Sigma, self.D, self.multipliers, self.ages)
+
+    def constants(self) -> PaperConstants:
+        """Returns the constants that OP is verified with.
+
+        Raises:
+            CertificateError: If the method is "certified", which has none.
+        """
+        if self.kappa is None or self.rho is None or self.epsilon is None or self.epsilon_up is None:
+            raise CertificateError(f"a certificate of method {self.method!r} has no constants of OP to verify")
+        return PaperConstants(self.kappa, self.rho, self.epsilon, self.epsilon_up)
 
     @cached_property
     def M(self) -> np.ndarray:

@@ -17,7 +17,7 @@ from ncs_gym.frozen import as_number
 from shields.cone_program import ConeProgram
 from shields.paper_bounds import PaperBounds, PaperModel
 from shields.paper_conditions import SMALLEST_GAP
-from shields.semidefinite import largest_box_ellipsoid
+from shields.semidefinite import found, largest_box_ellipsoid
 
 # Tightens every constraint, so that what the solver returns meets the printed ones in exact arithmetic.
 SLACK = 1e-7
@@ -108,7 +108,7 @@ def solve_op(plant: LinearPlant, bounds: PaperBounds, *, slack: float = 0.0) -> 
         shape = float(shape[0, 0]) * identity
     if np.linalg.eigvalsh(shape)[0] <= 0.0:
         return None
-    K = units.u_max[:, None] * np.linalg.solve(shape, F.value.T).T / units.size
+    K = units.u_max[:, None] * np.linalg.solve(shape, found(F).T).T / units.size
     shape = units.size**2 * shape
     return PaperDesign(shape, K, bounds, float(np.linalg.slogdet(shape)[1]))
 

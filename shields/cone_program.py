@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import clarabel
 import cvxpy as cp
@@ -10,7 +11,9 @@ import numpy as np
 import scipy.sparse as sp
 from cvxpy.reductions.solvers.conic_solvers.clarabel_conif import dims_to_solver_cones
 
-SOLVED, ALMOST = clarabel.SolverStatus.Solved, clarabel.SolverStatus.AlmostSolved
+# A compiled module without type stubs.
+_clarabel: Any = clarabel
+SOLVED, ALMOST = _clarabel.SolverStatus.Solved, _clarabel.SolverStatus.AlmostSolved
 
 
 class ConeProgram:
@@ -31,11 +34,11 @@ class ConeProgram:
         self._base = base
         self._steps = [(A.data - base[0].data, b - base[1]) for A, b, _, _ in steps]
         A, b, c, cones = base
-        settings = clarabel.DefaultSettings()
+        settings = _clarabel.DefaultSettings()
         settings.verbose = False
         settings.presolve_enable = False
         settings.chordal_decomposition_enable = False
-        self._solver = clarabel.DefaultSolver(sp.csc_array((len(c), len(c))), c, A, b, cones, settings)
+        self._solver = _clarabel.DefaultSolver(sp.csc_array((len(c), len(c))), c, A, b, cones, settings)
 
     @staticmethod
     def _data(problem: cp.Problem, parameters: Sequence[cp.Parameter], values: np.ndarray) -> tuple:

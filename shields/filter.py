@@ -159,9 +159,10 @@ class SafetyFilter(FrozenArrays):
         gained = self._gained(estimate)
         u = [0.0] * self.plant.m if gained is None else gained
         differs = u != proposed
-        monitors = self.mode == "monitor" and proposed is not None
-        reason = "invalid" if outlook is None or proposed is None else "unsafe" if monitors and differs else "fallback"
-        applied = proposed if monitors else u
+        kept = proposed if self.mode == "monitor" else None
+        unsafe = kept is not None and differs
+        reason = "invalid" if outlook is None or proposed is None else "unsafe" if unsafe else "fallback"
+        applied = u if kept is None else kept
         room, margin = (float("nan"),) * 2 if outlook is None else outlook.judge(applied)
         fallback = gained is not None and applied == gained
         return Decision(np.array(applied), differs, room >= MARGIN, fallback, margin, reason)
@@ -171,7 +172,7 @@ class SafetyFilter(FrozenArrays):
         x_hat = estimate.tolist()
         if estimate.shape != (self.plant.n,):
             return None
-        u = [sum(map(mul, row, x_hat)) for row in self._gain]
+        u: list[float] = [sum(map(mul, row, x_hat)) for row in self._gain]
         return self._expressible(u) if isfinite(sum(u)) else None
 
     def _expressible(self, u: list[float]) -> list[float]:

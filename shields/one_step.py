@@ -8,7 +8,7 @@ from math import isfinite, sqrt
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.linalg.lapack import dpotrf, dsyev
+from scipy.linalg.lapack import dpotrf, dsyev  # pyright: ignore[reportAttributeAccessIssue]  # f2py makes them
 
 from ncs_gym import LinearPlant
 from ncs_gym.ellipsoid import SMALLEST_SHARE
@@ -65,8 +65,8 @@ class OneStepTest:
         # Two states and one input, the commonest small plant, go ten times faster in plain floats.
         self._plane = None
         if (plant.n, plant.m) == (2, 1):
-            numbers = (self.moved, self.effect[:, 0], self.D, self.columns)
-            self._plane = (*(array.tolist() for array in numbers), self.pushed, self.rounding, plant.u_max.item())
+            moved, effect, D = self.moved.tolist(), self.effect[:, 0].tolist(), self.D.tolist()
+            self._plane = (moved, effect, D, self.columns.tolist(), self.pushed, self.rounding, plant.u_max.item())
 
     @cached_property
     def vertices(self) -> np.ndarray:

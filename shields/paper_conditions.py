@@ -25,13 +25,14 @@ def paper_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[C
     U and tau are eliminated: (C4)-(C6) can be met for input i exactly if
     u_max^2 / 2 - K_i L K_i' - |K_i L|^2 eps_up / alpha^2 >= 0.
     """
-    kappa, rho = Fraction(certificate.kappa), Fraction(certificate.rho)
+    constants = certificate.constants()
+    kappa, rho = Fraction(constants.kappa), Fraction(constants.rho)
     inside = kappa > 0 and rho >= 1 and 1 - kappa * rho >= SMALLEST_GAP
     yield flag("0 < kappa, 1 <= rho, kappa rho < 1", inside)
     if not inside:
         return
-    bounds = PaperModel(plant).at(certificate.kappa, certificate.rho)
-    stated = np.array([certificate.epsilon_up, certificate.epsilon])
+    bounds = PaperModel(plant).at(constants.kappa, constants.rho)
+    stated = np.array([constants.epsilon_up, constants.epsilon])
     agree = np.allclose(stated, [bounds.epsilon_up, bounds.epsilon], rtol=1e-9, atol=0.0)
     yield flag("eps_up and eps are those of Theorems 5 and 7", bool(agree))
     L, K = rational(certificate.L), rational(certificate.K)

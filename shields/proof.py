@@ -84,8 +84,7 @@ class ProofTracker:
         if info["assumption_violated"] not in (False,):
             self._broken = self._broken or ALARM
         estimate, error_shape = as_numbers(info["estimate"]), as_numbers(info["error_shape"])
-        unusable = estimate is None or error_shape is None
-        if unusable or self._filter.test.at(estimate, error_shape) is None:
+        if estimate is None or error_shape is None or self._filter.test.at(estimate, error_shape) is None:
             self._error_certified = False
             self._broken = self._broken or UNUSABLE
             return

@@ -125,7 +125,7 @@ def largest_box_ellipsoid(C: np.ndarray) -> np.ndarray:
     problem = cp.Problem(cp.Maximize(cp.log_det(L)), [cp.diag((C @ scale) @ L @ (C @ scale).T) <= 1])
     if not _solve(problem):
         raise Infeasible("the solver did not find the largest ellipsoid in the safe box", "S", float("nan"))
-    return scale @ L.value @ scale.T
+    return scale @ found(L) @ scale.T
 
 
 class InvariantSetProgram:
@@ -156,7 +156,7 @@ class InvariantSetProgram:
     def _constraints(self) -> list[cp.Constraint]:
         """Returns (S), and (I) and (U) for every critical error set, as linear matrix inequalities."""
         problem, L = self.problem, self._L
-        constraints = [cp.diag(problem.C @ L @ problem.C.T) <= 1.0 - self.slack]
+        constraints: list[cp.Constraint] = [cp.diag(problem.C @ L @ problem.C.T) <= 1.0 - self.slack]
         for root, slopes, offsets in zip(self._roots, self._slopes, self._offsets, strict=True):
             X = [
                 root.T @ L @ slope + slope.T @ L @ root - offset for slope, offset in zip(slopes, offsets, strict=True)
@@ -169,7 +169,7 @@ class InvariantSetProgram:
         problem, L, F = self.problem, self._L, self._F
         zero = np.zeros((problem.n, problem.n))
         moved, gain = problem.A @ L + problem.B @ F, problem.B @ F @ root
-        constraints = [
+        constraints: list[cp.Constraint] = [
             cp.bmat([[L - self._D, moved, gain], [moved.T, self._state * L, zero], [gain.T, zero, X[0]]]) >> 0
         ]
         corner = np.array([[1.0 - self.slack - 2.0 * float(ACTION_ROUNDING)]])
@@ -204,11 +204,12 @@ class InvariantSetProgram:
                 P.value, R.value = share * slope, 0.5 * share * (offset + offset.T)
         if not _solve(self._program):
             return None
-        L = 0.5 * (self._L.value + self._L.value.T)
+        L, F = found(self._L), found(self._F)
+        L = 0.5 * (L + L.T)
         sign, log_det = np.linalg.slogdet(L)
         if sign <= 0 or np.linalg.eigvalsh(L)[0] <= 0.0:
             return None
-        return Design(L, np.linalg.solve(L, self._F.value.T).T, shares, inputs, float(log_det))
+        return Design(L, np.linalg.solve(L, F.T).T, shares, inputs, float(log_det))
 
 
 def best_gain(problem: ScaledProblem, design: Design) -> np.ndarray:
@@ -230,7 +231,18 @@ def best_gain(problem: ScaledProblem, design: Design) -> np.ndarray:
             constraints.append(cp.bmat(blocks) >> 0)
     if not _solve(cp.Problem(cp.Minimize(room), constraints)):
         return design.K
-    return K.value
+    return found(K)
+
+
+def found(variable: cp.Variable) -> np.ndarray:
+    """Returns the value that a solver found for a variable.
+
+    Raises:
+        ValueError: If it found none.
+    """
+    if variable.value is None:
+        raise ValueError(f"the solver found no value of {variable}")
+    return variable.value
 
 
 def _solve(program: cp.Problem) -> bool:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym import LinearPlant
-from shields.certificate import Certificate, CertificateError
+from shields.certificate import AgeProof, Certificate, CertificateError, Proof
 from shields.condition import Condition, flag, matrix_condition, scalar
 from shields.exact import (
     Matrix,
@@ -70,16 +70,15 @@ def verify(certificate: Certificate, plant: LinearPlant) -> Report:
     if certificate.method == "paper":
         conditions.append(flag("shapes: L (n, n), K (m, n)", fits))
         return Report(tuple(conditions + (list(paper_conditions(certificate, plant)) if fits else [])))
-    conditions.append(
-        flag("shapes: L (n, n), K (m, n), one input share per input", fits and _shares_fit(certificate, plant))
-    )
+    proof = certificate.proof()
+    conditions.append(flag("shapes: L (n, n), K (m, n), one input share per input", fits and _shares_fit(proof, plant)))
     if not conditions[-1].holds:
         return Report(tuple(conditions))
-    conditions += _shares(certificate)
+    conditions += _shares(proof)
     if all(condition.holds for condition in conditions[2:]):
-        conditions += _bounds(certificate, plant)
-        conditions += (_error_set if certificate.ages is None else _age_sets)(certificate, plant)
-        conditions += _safe_set(certificate, plant)
+        conditions += _bounds(proof, plant)
+        conditions += _error_set(proof, plant) if proof.ages is None else _age_sets(proof, proof.ages, plant)
+        conditions += _safe_set(certificate, proof, plant)
     return Report(tuple(conditions))
 
 
@@ -98,22 +97,22 @@ def require_valid(certificate: Certificate, plant: LinearPlant) -> None:
             )
 
 
-def _shares_fit(certificate: Certificate, plant: LinearPlant) -> bool:
-    if len(certificate.multipliers.inputs) != plant.m:
+def _shares_fit(proof: Proof, plant: LinearPlant) -> bool:
+    if len(proof.multipliers.inputs) != plant.m:
         return False
-    if certificate.ages is None:
+    if proof.ages is None:
         return True
-    sets = certificate.ages.sets
-    return sets.gains.shape[1:] == (plant.n, plant.p) and certificate.ages.inputs.shape[1] == plant.m
+    sets = proof.ages.sets
+    return sets.gains.shape[1:] == (plant.n, plant.p) and proof.ages.inputs.shape[1] == plant.m
 
 
-def _shares(certificate: Certificate) -> Iterator[Condition]:
+def _shares(proof: Proof) -> Iterator[Condition]:
     """Checks the ranges of all multipliers."""
-    shares, ages = certificate.multipliers, certificate.ages
+    shares, ages = proof.multipliers, proof.ages
     rates = [shares.error] if ages is None else [*ages.sets.rates, *ages.sets.shares]
-    proofs = _invariance_proofs(certificate)
-    inputs = [share for proof in proofs for share in proof.inputs]
-    parts = [[float(share) for share in proof.shares] for proof in proofs]
+    proofs = _invariance_proofs(proof)
+    inputs = [share for each in proofs for share in each.inputs]
+    parts = [[float(share) for share in each.shares] for each in proofs]
     finite = bool(np.isfinite([*rates, *inputs, shares.rounding]).all() and np.isfinite(parts).all())
     yield flag("multipliers: finite", finite)
     if not finite:
@@ -123,10 +122,10 @@ def _shares(certificate: Certificate) -> Iterator[Condition]:
     exact = [[Fraction(share) for share in part] for part in parts]
     positive = min(*(min(part) for part in exact), Fraction(shares.rounding)) > 0
     yield flag("multipliers: lx, le, ld, s > 0", positive)
-    yield scalar("multipliers: lx + le + ld <= 1", min(1 - sum(part) for part in exact))
+    yield scalar("multipliers: lx + le + ld <= 1", min(1 - sum(part, Fraction(0)) for part in exact))
 
 
-def _bounds(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
+def _bounds(proof: Proof, plant: LinearPlant) -> Iterator[Condition]:
     """Checks that D, N and r0^2 I contain what theory.md section 1 says."""
     identity = rational(np.eye(plant.n))
     noise = rational(plant.process_noise_cov)
@@ -136,12 +135,12 @@ def _bounds(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]
     need = _sum_bound(ball, ellipsoid)
     bound = rational(plant.disturbance.shape)
     yield matrix_condition("D: the plant's holds the disturbance and the process noise", subtract(bound, need))
-    yield matrix_condition("D: the certificate's holds the plant's", subtract(rational(certificate.D), bound))
+    yield matrix_condition("D: the certificate's holds the plant's", subtract(rational(proof.D), bound))
     sensor = scale(Fraction(plant.sensor_noise.energy), rational(plant.measurement_noise_cov))
-    if certificate.ages is None:
+    if proof.ages is None:
         yield matrix_condition("N: holds the sensor noise", subtract(rational(plant.sensor_error.shape), sensor))
     else:
-        sets = certificate.ages.sets
+        sets = proof.ages.sets
         step = Fraction(sets.contract.quantization_step)
         ball = scale(plant.p * step * step / 4, rational(np.eye(plant.p)))
         need = _sum_bound(ball, sensor)
@@ -152,25 +151,25 @@ def _bounds(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]
     )
 
 
-def _error_set(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
+def _error_set(proof: Proof, plant: LinearPlant) -> Iterator[Condition]:
     """(E0) and (E1): the error starts in E(Sigma) and never leaves it."""
-    Sigma, D = rational(certificate.Sigma), rational(certificate.D)
-    rate = Fraction(certificate.multipliers.error)
+    Sigma, D = rational(proof.Sigma), rational(proof.D)
+    rate = Fraction(proof.multipliers.error)
     yield matrix_condition("(E0) Sigma - r0^2 I >= 0", subtract(Sigma, rational(plant.initial_error.shape)))
     grown = add(scale(1 / rate, congruence(rational(plant.A), Sigma)), scale(1 / (1 - rate), D))
     yield matrix_condition("(E1) Sigma - A Sigma A'/lam_e - D/(1-lam_e) >= 0", subtract(Sigma, grown))
 
 
-def _age_sets(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
+def _age_sets(proof: Proof, ages: AgeProof, plant: LinearPlant) -> Iterator[Condition]:
     """(C0), (C1) and (C2): under the contract the error of every age stays in the set of that age."""
-    sets, identity = certificate.ages.sets, rational(np.eye(plant.n))
-    A, H, D, N = (rational(matrix) for matrix in (plant.A, plant.H, certificate.D, sets.noise))
+    sets, identity = ages.sets, rational(np.eye(plant.n))
+    A, H, D, N = (rational(matrix) for matrix in (plant.A, plant.H, proof.D, sets.noise))
     shapes = [rational(shape) for shape in sets.shapes]
-    oldest = certificate.ages.sets.contract.max_age
-    last = certificate.multipliers
-    same = np.array_equal(certificate.Sigma, sets.shapes[oldest]) and last.error == sets.rates[-1]
-    same &= (last.state, last.estimate, last.disturbance) == tuple(certificate.ages.shares[-1])
-    same &= tuple(last.inputs) == tuple(certificate.ages.inputs[-1])
+    oldest = sets.contract.max_age
+    last = proof.multipliers
+    same = np.array_equal(proof.Sigma, sets.shapes[oldest]) and last.error == sets.rates[-1]
+    same &= (last.state, last.estimate, last.disturbance) == tuple(ages.shares[-1])
+    same &= tuple(last.inputs) == tuple(ages.inputs[-1])
     yield flag("Sigma is the set of the largest age, with its multipliers", same)
     yield matrix_condition("(C0) Sigma_0 - r0^2 I >= 0", subtract(shapes[0], rational(plant.initial_error.shape)))
     for j, rate in enumerate(map(Fraction, sets.rates)):
@@ -194,36 +193,36 @@ class _InvarianceProof(NamedTuple):
     inputs: Sequence[float]
 
 
-def _invariance_proofs(certificate: Certificate) -> list[_InvarianceProof]:
+def _invariance_proofs(proof: Proof) -> list[_InvarianceProof]:
     """Returns one proof per error set: one in all, or under a contract one per age."""
-    shares, ages = certificate.multipliers, certificate.ages
+    shares, ages = proof.multipliers, proof.ages
     if ages is None:
         parts = (shares.state, shares.estimate, shares.disturbance)
-        return [_InvarianceProof("", certificate.Sigma, parts, shares.inputs)]
+        return [_InvarianceProof("", proof.Sigma, parts, shares.inputs)]
     rows = zip(ages.sets.shapes[:-1], ages.shares, ages.inputs, strict=True)
     return [_InvarianceProof(f" at age {j}", *row) for j, row in enumerate(rows)]
 
 
-def _safe_set(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
+def _safe_set(certificate: Certificate, proof: Proof, plant: LinearPlant) -> Iterator[Condition]:
     """(I), (S), (U): the safe set is invariant, lies in the box, and its input respects the limits."""
     L, K, B = rational(certificate.L), rational(certificate.K), rational(plant.B)
     yield matrix_condition("L > 0", L, strict=True)
-    gain, growth = multiply(B, K), Fraction(certificate.multipliers.rounding)
-    D_u = _with_action_rounding(rational(certificate.D), B, plant.u_max, growth)
+    gain, growth = multiply(B, K), Fraction(proof.multipliers.rounding)
+    D_u = _with_action_rounding(rational(proof.D), B, plant.u_max, growth)
     moved = congruence(add(rational(plant.A), gain), L)
     for j, row in enumerate(plant.C):
         yield scalar(f"(S) c_{j + 1} L c_{j + 1}' <= 1", 1 - quadratic(rational(row), L))
-    for proof in _invariance_proofs(certificate):
-        Sigma = rational(proof.Sigma)
-        state, estimate, disturbance = (Fraction(float(share)) for share in proof.shares)
+    for each in _invariance_proofs(proof):
+        Sigma = rational(each.Sigma)
+        state, estimate, disturbance = (Fraction(float(share)) for share in each.shares)
         grown = add(scale(1 / state, moved), scale(1 / estimate, congruence(gain, Sigma)), scale(1 / disturbance, D_u))
-        name = f"(I) L - (A+BK) L (A+BK)'/lx - BK Sigma K'B'/le - D_u/ld >= 0{proof.label}"
+        name = f"(I) L - (A+BK) L (A+BK)'/lx - BK Sigma K'B'/le - D_u/ld >= 0{each.label}"
         yield matrix_condition(name, subtract(L, grown))
-        for i, (limit, share) in enumerate(zip(plant.u_max, proof.inputs, strict=True)):
+        for i, (limit, share) in enumerate(zip(plant.u_max, each.inputs, strict=True)):
             mu = Fraction(float(share))
             used = quadratic([K[i]], L) / mu + quadratic([K[i]], Sigma) / (1 - mu)
             allowed = (Fraction(float(limit)) * (1 - ACTION_ROUNDING)) ** 2
-            yield scalar(f"(U) input {i + 1} stays within u_max (1 - 2^-24){proof.label}", allowed - used)
+            yield scalar(f"(U) input {i + 1} stays within u_max (1 - 2^-24){each.label}", allowed - used)
 
 
 def _with_action_rounding(D: Matrix, B: Matrix, u_max: np.ndarray, growth: Fraction) -> Matrix:
@@ -243,7 +242,7 @@ def _sum_bound(first: Matrix, second: Matrix) -> Matrix:
 
 def _trace_share(first: Matrix, second: Matrix) -> Fraction | None:
     """Returns a rational nu near the trace-optimal one (any in (0, 1) proves containment); None if a term is zero."""
-    a, b = (sum(matrix[i][i] for i in range(len(matrix))) for matrix in (first, second))
+    a, b = (sum((matrix[i][i] for i in range(len(matrix))), Fraction(0)) for matrix in (first, second))
     if a == 0 or b == 0:
         return None
     a, b = Fraction(float(a) ** 0.5), Fraction(float(b) ** 0.5)

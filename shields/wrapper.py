@@ -10,7 +10,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, StickyAction
 
 from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv
-from ncs_gym.env import applied_input
+from ncs_gym.env import applied_input, ncs_env
 from ncs_gym.frozen import as_number
 from shields.certificate import Certificate
 from shields.filter import SafetyFilter
@@ -74,7 +74,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         self.penalty = as_number(penalty, "penalty", low=0.0)
         if certificate is not None and not isinstance(certificate, Certificate):
             raise ValueError(f"certificate must be a Certificate or None, got {certificate!r}")
-        contract = env.unwrapped.contract
+        contract = ncs_env(env).contract
         self.certificate = certificate_for(plant, contract) if certificate is None else certificate
         self.filter = SafetyFilter(self.certificate, plant, mode)
         self._proof = ProofTracker(self.filter)
@@ -88,7 +88,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             self._annotate(None, 0, intervened=False)
         observation, info = self.env.reset(seed=seed, options=options)
         clock = self._read_clock()
-        self._proof.start(starts_inside(self.certificate, self.env.unwrapped.start), clock[1] == 0, info)
+        self._proof.start(starts_inside(self.certificate, ncs_env(self.env).start), clock[1] == 0, info)
         self._estimate, self._error_shape = np.array(info["estimate"]), np.array(info["error_shape"])
         self._interventions = 0
         u = np.zeros(self.filter.plant.m)
@@ -123,7 +123,8 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
 
     def _read_clock(self) -> tuple[int, int]:
         """Returns the number of episodes begun and of steps taken in this one."""
-        return self.env.unwrapped.episodes, self.env.unwrapped.steps
+        inner = ncs_env(self.env)
+        return inner.episodes, inner.steps
 
     def _annotate(self, proposed: np.ndarray | None, interventions: int, *, intervened: bool) -> None:
         """Tells the picture of the step that follows what the shield does in it."""
@@ -135,7 +136,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             interventions=interventions,
             protects=self.filter.mode != "monitor",
         )
-        self.env.unwrapped.annotate(note)
+        ncs_env(self.env).annotate(note)
 
     def _info(self, proposed: np.ndarray, applied: np.ndarray, margin: float, *, intervened: bool) -> dict[str, Any]:
         reason = self._proof.reason

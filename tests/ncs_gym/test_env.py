@@ -13,6 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import ncs_gym
 from ncs_gym import BoxDisturbance, Channel, Ellipsoid, GilbertElliott, LinearPlant, NCSEnv, Regulation, SpeedTracking
+from ncs_gym.env import ncs_env
 from tests.plants import random_plant
 
 IDS = ["ncs_gym/TruckTrailer-v0", "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/LinearNCS-v0"]
@@ -400,3 +401,10 @@ def test_linear_ncs_without_a_plant_says_what_it_needs():
 
 def test_registered_specs_hold_no_objects():
     assert all(json.loads(gym.spec(env_id).to_json())["kwargs"] == {} for env_id in IDS)
+
+
+def test_environment_inside_is_found_and_a_foreign_one_refused():
+    env = make(IDS[0])
+    assert ncs_env(env) is env.unwrapped
+    with pytest.raises(ValueError, match="expected an NCSEnv inside, got CartPoleEnv"):
+        ncs_env(gym.make("CartPole-v1"))

@@ -1,4 +1,6 @@
-from dataclasses import replace
+import ast
+import inspect
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -124,3 +126,15 @@ def test_bad_numbers_are_refused_in_one_sentence(change, words):
 def test_bad_truck_is_refused(change):
     with pytest.raises(ValueError, match=next(iter(change))):
         truck_trailer(**change)
+
+
+def test_constructor_for_type_checkers_takes_exactly_the_fields_with_their_defaults():
+    tree = ast.parse(inspect.getsource(LinearPlant))
+    (typed,) = (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and node.name == "__init__")
+    given = [None if default is None else ast.literal_eval(default) for default in typed.args.kw_defaults]
+    real = inspect.signature(LinearPlant).parameters
+    assert [arg.arg for arg in typed.args.kwonlyargs] == [field.name for field in fields(LinearPlant)] == list(real)
+    assert [default is not None for default in typed.args.kw_defaults] == [
+        parameter.default is not parameter.empty for parameter in real.values()
+    ]
+    assert given == [None if p.default is p.empty else p.default for p in real.values()]

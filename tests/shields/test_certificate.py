@@ -112,3 +112,14 @@ def test_a_reader_never_sees_half_a_file(certificate, tmp_path, monkeypatch):
         certificate.save(path)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_each_method_hands_out_only_the_numbers_it_is_verified_with(certificate):
+    assert certificate.proof() == (certificate.Sigma, certificate.D, certificate.multipliers, certificate.ages)
+    with pytest.raises(CertificateError, match="'certified' has no constants"):
+        certificate.constants()
+    constants = {"kappa": 0.5, "rho": 1.2, "epsilon": 0.1, "epsilon_up": 0.2}
+    paper = Certificate(L=certificate.L, K=certificate.K, method="paper", fingerprint="0", **constants)
+    assert paper.constants()._asdict() == constants
+    with pytest.raises(CertificateError, match="'paper' has no error set"):
+        paper.proof()
