@@ -312,7 +312,8 @@ def as_disturbance(value: Any, plant: LinearPlant, allow_assumption_violation: b
     if isinstance(value, str) and value in BY_NAME:
         value = BY_NAME[value]()
     elif not isinstance(value, Disturbance) and callable(value):
-        value = CallableDisturbance(value)
+        function: Any = value
+        value = CallableDisturbance(function)
     if not isinstance(value, Disturbance):
         raise ValueError(f"disturbance must be one of {sorted(BY_NAME)}, a Disturbance or a callable, got {value!r}")
     problem = value.check(plant)

@@ -42,7 +42,7 @@ def law_of_noise(noise: TruncatedGaussian) -> Law:
 def law_of_disturbance(source: Disturbance, plant: LinearPlant) -> Law | None:
     """Returns the law of a disturbance that depends on nothing; None of any other, and of what a user wrote."""
     n, kind = plant.n, type(source)
-    if kind is BoxDisturbance:
+    if isinstance(source, BoxDisturbance) and kind is BoxDisturbance:
         return Law(BOX, np.diag(source.widths(plant)))
     if kind is BallDisturbance:
         return Law(BALL, np.sqrt(plant.gamma) * np.eye(n))

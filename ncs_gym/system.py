@@ -66,8 +66,12 @@ class System(NamedTuple):
 def system_of(env: NCSEnv, max_episode_steps: int | None) -> System:
     """Returns the loop of a scalar environment."""
     plant, channel, task = env.plant, env.channel, env.task
-    loss, bursts = channel.loss, isinstance(channel.loss, GilbertElliott)
-    losses = (loss.loss_good, loss.loss_bad) if bursts else (loss, loss)
+    bursts, moves = isinstance(channel.loss, GilbertElliott), (0.0, 0.0)
+    if isinstance(channel.loss, GilbertElliott):
+        losses = channel.loss.loss_good, channel.loss.loss_bad
+        moves = channel.loss.p_good_to_bad, channel.loss.p_bad_to_good
+    else:
+        losses = channel.loss, channel.loss
     drawn = law_of_disturbance(env.disturbance, plant)
     none = Law(NOTHING, np.zeros((plant.n, plant.n)))
     pays = type(task) is Regulation
@@ -87,7 +91,7 @@ def system_of(env: NCSEnv, max_episode_steps: int | None) -> System:
         most_lost=-1 if channel.max_consecutive_losses is None else channel.max_consecutive_losses,
         bursts=bursts,
         losses=np.array(losses),
-        moves=np.array((loss.p_good_to_bad, loss.p_bad_to_good) if bursts else (0.0, 0.0)),
+        moves=np.array(moves),
         step=channel.quantization_step,
         uniforms=3 if bursts else 2 if channel.jitter else 1 if max(losses) > 0.0 else 0,
         most_age=-1 if env.contract is None else env.contract.max_age,

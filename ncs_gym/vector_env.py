@@ -76,7 +76,7 @@ class NCSVectorEnv(VectorEnv):
         self._tick = self._moment = 0
         self._some_done = False
         self.episodes = np.zeros(self.num_envs, dtype=np.int64)
-        self.starts: np.ndarray | None = None
+        self.starts = np.full((self.num_envs, self.plant.n), np.nan)
         self._consistent = False
 
     def _allocate(self) -> None:
@@ -89,7 +89,7 @@ class NCSVectorEnv(VectorEnv):
         self._fleet.counted[:] = 1
         self._doubts, self._residuals = np.empty((count * slots, 4), np.int32), np.empty((count * slots, plant.p))
         self._progress, self._done = np.zeros(4, np.int64), np.zeros(count, np.bool_)
-        self._layout = Layout(count, plant.n, plant.m, len(plant.C), self.single_observation_space.shape[0])
+        self._layout = Layout(count, plant.n, plant.m, len(plant.C), len(self.single.observation_space.low))
         self._actions_shape = count, plant.m
         self._pays = type(self.task) is Regulation
         # Disturbances that are not drawn by compiled loops.
@@ -278,8 +278,6 @@ class NCSVectorEnv(VectorEnv):
             fleet.bad[chosen] = rng.random(count) < loss.stationary_bad
         self.episodes[chosen] += 1
         self._done[chosen] = False
-        if self.starts is None:
-            self.starts = np.full((self.num_envs, plant.n), np.nan)
         self.starts[chosen] = np.nan if starts is None else drawn
 
     def _report(self, counted: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
@@ -293,7 +291,7 @@ class NCSVectorEnv(VectorEnv):
 
     def _observed(self, filled: Report) -> np.ndarray:
         """Returns the observations, shape (N, n + extra)."""
-        n, space = self.plant.n, self.single_observation_space
+        n, space = self.plant.n, self.single.observation_space
         if len(filled.observation) > n:
             extra = np.ascontiguousarray(self.task.observe_many(self._memory), dtype=np.float64)
             clip(extra, space.low[n:], space.high[n:], filled.observation[n:])

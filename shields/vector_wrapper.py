@@ -86,7 +86,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         penalty: float = 0.0,
     ) -> None:
         RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty)
-        inner = _environment_behind(env)
+        self._inner = inner = _environment_behind(env)
         VectorWrapper.__init__(self, env)
         self.penalty = as_number(penalty, "penalty", low=0.0)
         if certificate is not None and not isinstance(certificate, Certificate):
@@ -123,7 +123,8 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
     ) -> tuple[Any, dict[str, Any]]:
         """Starts episodes; see `NCSVectorEnv.reset`."""
         before, self._clock = self._clock or self._interrupted, self._clock and self._interrupted
-        observation, info = self.env.reset(seed=seed, options=options)
+        # gymnasium's annotation leaves out the lists that its own vector environments take.
+        observation, info = self.env.reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
         now = self._read_clock()
         restarted = now.episodes != before.episodes
         unmoved = (now.steps == before.steps) & (now.ticks == before.ticks)
@@ -308,14 +309,14 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         """Returns whether all possible starts of the present episodes lie in S, shape (N,)."""
         if np.count_nonzero(restarted):  # a tenth of the time of `any`
             self._known[restarted] = self._starts_inside
-            starts = self.env.unwrapped.starts
+            starts = self._inner.starts
             for e in np.flatnonzero(restarted & ~np.isnan(starts[:, 0])).tolist():
                 self._known[e] = starts_inside(self.certificate, starts[e])
         return self._known
 
     def _numbers_of_shapes(self) -> np.ndarray:
         """Returns the index in the book of each environment's error shape, shape (N,)."""
-        table, nodes = self.env.unwrapped.patterns
+        table, nodes = self._inner.patterns
         if table is not self._table:
             self._table, self._numbers = table, np.full(len(table), -1)
         self._make_room(table)
@@ -334,7 +335,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
 
     def _read_clock(self) -> Clock:
         """Returns how often the environments moved until now."""
-        inner = self.env.unwrapped
+        inner = self._inner
         return Clock(inner.episodes.copy(), inner.steps.copy(), inner.ticks)
 
     def _info(self, decisions: Decisions, proposed: np.ndarray, correction: np.ndarray) -> dict[str, Any]:
