@@ -36,7 +36,7 @@ RUNS = {
     ),
     "write_a_task.py": ([], [rf"return of doing nothing: {NUMBER}"]),
 }
-TRAINING = {"own_plant.py", "recurrent_ppo.py", "sb3_ten_lines.py"}
+TRAINING = {"own_plant.py", "recurrent_ppo.py", "sb3_ten_lines.py", "single_file_sac.py"}
 
 
 def run_example(name, *arguments):
