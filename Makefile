@@ -35,7 +35,7 @@ benchmark: $(INSTALLED)
 	$(BIN)/python benchmarks/rendering.py
 	$(BIN)/python benchmarks/ppo_settings.py
 
-# Fails on a broken link, anchor or reference; open site/index.html.
+# Fails on a broken link, anchor or reference. Look at it: python -m http.server -d site (from a file the search is missing).
 docs: $(DOCS_INSTALLED)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 

@@ -86,7 +86,9 @@ def test_reference_of_the_command_line_has_the_settings_of_every_command():
 
 def test_errors_has_every_exception_class_and_no_other():
     table = (ROOT / "docs" / "errors.md").read_text().partition("## Python's")[0]
-    listed = {name: bases for name, bases in re.findall(r"^\| \[`([\w.]+)`\]\S* \| ([^|]*) \|", table, re.MULTILINE)}
+    rows = re.findall(r"^\| \[`(\w+)`\]\([^#]*#([\w.]+)\) \| ([^|]*) \|", table, re.MULTILINE)
+    assert all(name == target.rpartition(".")[2] for name, target, _ in rows)
+    listed = {target: bases for _, target, bases in rows}
     defined = exceptions()
     assert ("shields.infeasible", "Infeasible") in defined
     assert sorted(name.rpartition(".")[2] for name in listed) == sorted(name for _, name in defined)

@@ -24,6 +24,7 @@ STEPS, SOME = 200, 60
 
 SCALAR = {
     "NormalizeObservation": wrappers.NormalizeObservation,
+    "RescaleObservation": lambda env: wrappers.RescaleObservation(env, np.float32(-1.0), np.float32(1.0)),
     "RecordEpisodeStatistics": wrappers.RecordEpisodeStatistics,
     "FrameStackObservation": lambda env: wrappers.FrameStackObservation(env, 3),
     "DelayObservation": lambda env: wrappers.DelayObservation(env, 2),
