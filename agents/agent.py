@@ -6,10 +6,9 @@ import hashlib
 import io
 import json
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
-from pickle import PickleError
 from typing import Any
-from zipfile import BadZipFile
 
 import gymnasium as gym
 import numpy as np
@@ -81,6 +80,14 @@ class Agent:
         """Returns deterministic actions, shape (N, m), for raw observations, shape (N, entries)."""
         return self.model.predict(self.normalization(observations), deterministic=True)[0]
 
+    @cached_property
+    def checksum(self) -> str:
+        """SHA-256 of the weights."""
+        digest = hashlib.sha256()
+        for name, tensor in sorted(self.model.policy.state_dict().items()):
+            digest.update(name.encode() + tensor.detach().cpu().numpy().tobytes())
+        return digest.hexdigest()
+
     def files(self) -> dict[str, bytes]:
         """Returns the contents of `model.zip` (stable-baselines3's) and `agent.json` (what else `load` needs)."""
         buffer = io.BytesIO()
@@ -120,12 +127,12 @@ class Agent:
             ModuleNotFoundError: If the algorithm's package is not installed.
         """
         folder = Path(folder)
-        folder = folder.parent if folder.suffix in (".zip", ".json") else folder
+        folder = folder.parent if folder.name in ("model.zip", "agent.json") else folder
         try:
             document, weights = json.loads((folder / "agent.json").read_bytes()), (folder / "model.zip").read_bytes()
         except OSError as error:
             raise AgentError(f"cannot read the agent in {folder}: {error.strerror}") from error
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise AgentError(f"{folder / 'agent.json'} is damaged: it is not valid JSON") from error
         if not isinstance(document, dict) or document.get("format") != FORMAT:
             raise AgentError(f"{folder / 'agent.json'} is not of format {FORMAT!r}")
@@ -138,7 +145,7 @@ class Agent:
             return _rebuilt(content, weights)
         except AgentError:
             raise
-        except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, PickleError, BadZipFile) as error:
+        except Exception as error:  # a forged file may break any part of the libraries that read it
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise AgentError(f"the agent in {folder} is damaged: {reason}") from error
 
@@ -173,8 +180,9 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
     model.set_parameters(parameters, exact_match=True, device="cpu")
     numbers = content["normalization"]
     mean, variance = (np.array(numbers[name], dtype=np.float64) for name in ("mean", "variance"))
-    if not mean.shape == variance.shape == model.observation_space.shape:
-        raise AgentError(f"the agent is damaged: its normalization has not the shape {model.observation_space.shape}")
+    usable = mean.shape == variance.shape == model.observation_space.shape
+    if not (usable and np.isfinite(mean).all() and np.isfinite(variance).all() and (variance >= 0.0).all()):
+        raise AgentError("the agent is damaged: its normalization has a wrong shape or value")
     return Agent(
         algorithm=algorithm,
         settings=settings,

@@ -43,8 +43,15 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
     return getattr(importlib.import_module(package), name)
 
 
-def build(name: str, env: VecEnv, settings: AgentSettings, seed: int) -> BaseAlgorithm:
+def build(name: str, env: VecEnv, settings: AgentSettings, seed: int, steps: int = 0) -> BaseAlgorithm:
     """Returns an untrained agent.
+
+    Args:
+        name: In `ALGORITHMS`.
+        env: What it will be trained in.
+        settings: Of the algorithm.
+        seed: Of network and sampling.
+        steps: It will be trained for; stretches the fall of the learning rate.
 
     Raises:
         ValueError: If the name is unknown, or the settings are another algorithm's.
@@ -54,8 +61,12 @@ def build(name: str, env: VecEnv, settings: AgentSettings, seed: int) -> BaseAlg
     if not isinstance(settings, ALGORITHMS[name][1]):
         raise ValueError(f"{name} takes {ALGORITHMS[name][1].__name__}, got {type(settings).__name__}")
     torch.set_num_threads(1)  # more threads only pay off at batches of 16384 and make results depend on their number
+    # The rate of an update is that of the start of its rollout: the library looks at the end, where the last is zero.
+    rollout = env.num_envs * (1 if isinstance(settings, OffPolicySettings) else settings.rollout)
+    share = min(rollout / steps, 1.0) if steps else 0.0
+    rate = settings.learning_rate
     common: dict[str, Any] = {
-        "learning_rate": LinearSchedule(settings.learning_rate, 0.0, 1.0),
+        "learning_rate": LinearSchedule(rate * (1.0 + share), rate * share, 1.0),
         "gamma": settings.discount,
         "seed": seed,
         "device": "cpu",

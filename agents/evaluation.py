@@ -15,6 +15,9 @@ from ncs_gym import NCSVectorEnv
 # Episodes played side by side at most.
 SIDE_BY_SIDE = 1000
 
+# Sets the draws of evaluations apart from those of training with the same seed.
+STREAM = 0xE7A1
+
 # Maps raw observations, shape (N, entries), and infos, arrays with N as first axis, to actions, shape (N, m).
 Policy = Callable[[np.ndarray, dict[str, Any]], np.ndarray]
 
@@ -81,7 +84,7 @@ def evaluate(
     for first in range(0, episodes, SIDE_BY_SIDE):
         count = min(SIDE_BY_SIDE, episodes - first)
         play = _Play(loop.unpriced, count, level_matrix)
-        infos = play.run(policy, [seed, first], keep=trajectory is None, on_progress=on_progress)
+        infos = play.run(policy, [seed, first, STREAM], keep=trajectory is None, on_progress=on_progress)
         trajectory = trajectory or trajectory_of(infos, 0)
         records += play.records(first)
     return Evaluation(records, trajectory)  # type: ignore[arg-type]

@@ -14,7 +14,7 @@ from agents.algorithms import ALGORITHMS, algorithm_class, build
 from agents.callbacks import SafetyCallback, TrainingPoint
 from agents.control_loop import ControlLoop
 from agents.sb3_vec_env import SB3VecEnv
-from agents.settings import AgentSettings
+from agents.settings import AgentSettings, OffPolicySettings
 
 
 @dataclass(frozen=True)
@@ -59,13 +59,15 @@ def train(
         on_progress: Called with the number of steps taken since its last call.
 
     Raises:
-        ValueError: If the algorithm is unknown, or the settings are another's.
+        ValueError: If the algorithm is unknown, the settings are another's, or the steps are too few to learn.
         ModuleNotFoundError: If the algorithm's package is not installed.
     """
     algorithm_class(algorithm)
     settings = settings or ALGORITHMS[algorithm][1]()
+    if isinstance(settings, OffPolicySettings) and steps <= settings.learning_starts:
+        raise ValueError(f"{steps} steps train nothing: learning starts after {settings.learning_starts}")
     env = VecNormalize(SB3VecEnv(loop.vector(settings.envs)), gamma=settings.discount)
-    model = build(algorithm, env, settings, seed)
+    model = build(algorithm, env, settings, seed, steps)
     model.set_logger(configure(str(log_folder), ["tensorboard"]) if log_folder else Logger(None, []))
     callback = SafetyCallback(on_progress)
     model.learn(steps, callback=callback)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -14,6 +15,7 @@ INTERRUPTED = 130
 
 def main() -> None:
     """Parses the command line and runs the command; errors become one sentence on stderr and exit code 2."""
+    signal.signal(signal.SIGTERM, _interrupt)
     try:
         _require_own_agents()
         settings = _parse(sys.argv[1:])
@@ -66,6 +68,11 @@ def _run(chosen: object) -> None:
         require_extra(extra, *packages)
     module, _, function = target.partition(":")
     getattr(importlib.import_module(module), function)(chosen)
+
+
+def _interrupt(number: int, frame: object) -> None:
+    """Ends on SIGTERM as on Ctrl-C: workers are stopped, finished runs are kept."""
+    raise KeyboardInterrupt
 
 
 def _require_own_agents() -> None:

@@ -13,7 +13,8 @@ class ChannelSettings:
 
     Attributes:
         loss: Probability that a packet is lost.
-        burst_length: Mean number of packets lost in a row (Gilbert-Elliott); losses are independent without it.
+        burst_length: Mean number of packets lost in a row (Gilbert-Elliott); losses are independent without it
+            (a mean of 1 / (1 - loss)).
         delay: Steps that every packet is late.
         jitter: Largest extra random delay, in steps.
         send_period: A sample is sent every so many steps.
@@ -42,21 +43,35 @@ def channel_of(settings: ChannelSettings, own: Channel) -> Channel | None:
     if settings.burst_length is not None:
         if isinstance(loss, GilbertElliott):
             raise ValueError("--channel.burst-length needs --channel.loss: the environment's own losses come in bursts")
-        loss = bursts(loss, settings.burst_length)
+        period = own.send_period if settings.send_period is None else settings.send_period
+        loss = bursts(loss, settings.burst_length, period)
     if loss != own.loss:
         changes["loss"] = loss
     return replace(own, **changes) if changes else None
 
 
-def bursts(loss: float, length: float) -> GilbertElliott:
+def bursts(loss: float, length: float, send_period: int = 1) -> GilbertElliott:
     """Returns losses of a given probability that come in bursts of a given mean length.
 
-    In the bad state everything is lost; it is left with probability 1/length and entered so often that its share is
-    `loss`.
+    In the bad state everything is lost. From one packet to the next, M = send_period steps later, it is to be left with
+    probability b = 1/length and entered with a = loss b / (1 - loss); the chain moves every step, so its own
+    probabilities have the same ratio and the M-th root of the eigenvalue 1 - a - b.
+
+    Args:
+        loss: Probability that a packet is lost.
+        length: Mean number of packets lost in a row, >= 1; 1 / (1 - loss) if losses were independent.
+        send_period: M [steps].
 
     Raises:
         ValueError: If no such chain exists.
     """
-    if not 0.0 <= loss < 1.0 or not length >= 1.0 or loss > length * (1.0 - loss):
-        raise ValueError(f"no losses of probability {loss} come in bursts of mean length {length}")
-    return GilbertElliott(p_good_to_bad=loss / (length * (1.0 - loss)), p_bad_to_good=1.0 / length)
+    usable = 0.0 <= loss < 1.0 and 1.0 <= length < float("inf")
+    left = 1.0 / length if usable else 0.0
+    entered = loss * left / (1.0 - loss) if usable else 2.0
+    eigenvalue = 1.0 - left - entered
+    if not usable or entered > 1.0 or (eigenvalue < 0.0 and send_period > 1):
+        raise ValueError(f"no losses of probability {loss} come in bursts of mean length {length}: try a longer one")
+    if send_period > 1:
+        share = (1.0 - eigenvalue ** (1.0 / send_period)) / (left + entered)
+        left, entered = share * left, share * entered
+    return GilbertElliott(p_good_to_bad=entered, p_bad_to_good=left)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import platform
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -82,11 +81,12 @@ def unit_of(settings: LearningSettings, world: World, name: str, index: int) -> 
 
 
 def prepare(out: Path) -> None:
-    """Creates the output folder and removes an earlier summary: a summary stands for complete files."""
+    """Creates the output folder and removes an earlier summary, tables, figures and report: they stand together."""
     (out / "figures").mkdir(parents=True, exist_ok=True)
     write_atomically(out / ".writable", "")
     (out / ".writable").unlink()
-    (out / "summary.json").unlink(missing_ok=True)
+    for stale in (out / "summary.json", out / "report.html", *out.glob("*.parquet"), *out.glob("figures/*.png")):
+        stale.unlink(missing_ok=True)
 
 
 def provenance(command: str, settings: LearningSettings, world: World) -> dict[str, Any]:
@@ -96,7 +96,7 @@ def provenance(command: str, settings: LearningSettings, world: World) -> dict[s
         "settings": {name: value for name, value in content.items() if name not in INCIDENTAL},
         "plant": {"fingerprint": world.plant.fingerprint, "spectral_radius": world.plant.spectral_radius},
         "certificate": world.certificate.checksum,
-        "versions": {"python": platform.python_version()} | versions(),
+        "versions": versions(),
     }
 
 
@@ -128,6 +128,7 @@ def _summary(
             "arms": paired_differences({name: by_arm[name] for name in settings.arms}, baseline),
         },
         "units": {unit.name: unit.key for unit in units},
+        "seeds": {unit.index: {"training": unit.training_seed, "evaluation": unit.evaluation_seed} for unit in units},
     } | provenance("compare", settings, world)
 
 
@@ -155,10 +156,9 @@ def _findings(summary: dict[str, Any]) -> list[str]:
         interval = difference["return_ci95"]
         text = f" [{interval[0]:+.1f}, {interval[1]:+.1f}]" if interval else ""
         findings.append(f"{name}, paired with {paired['baseline']}: return {difference['return_mean']:+.1f}{text}.")
-    if {"shielded", "unshielded"} <= summary["arms"].keys():
+    if (covered := way_covered(summary)) is not None:
         findings.append(
-            f"The shielded return covers {100 * way_covered(summary):.0f} % of the way from the zero input to the "
-            "unshielded agent."
+            f"The shielded return covers {100 * covered:.0f} % of the way from the zero input to the unshielded agent."
         )
     if "monitor" in summary["arms"]:
         findings.append("In brackets: what the shield would have overridden.")

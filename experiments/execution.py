@@ -26,6 +26,8 @@ def results_of(units: Sequence[Unit], folder: Path, jobs: int) -> list[UnitResul
         ResultsError: If a stored result is damaged.
         OSError: If the folder cannot be written.
     """
+    if len({unit.name for unit in units}) < len(units):
+        raise ValueError("two units have the same name")
     store = UnitStore(folder)
     results = {unit.name: result for unit in units if (result := store.load(unit)) is not None}
     missing = [unit for unit in units if unit.name not in results]

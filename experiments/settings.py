@@ -84,7 +84,7 @@ class CompareSettings(LearningSettings):
         arms: unshielded, monitor (unshielded, counts what the shield would have done), penalized (unshielded, pays for
             violations), shielded, shielded:MODE, and each shielded one with +penalty (pays for interventions).
         jobs: Worker processes.
-        smoke: Shrink the run to a minute, to see that everything works.
+        smoke: Shrink the run, whatever else is asked for, to see that everything works.
     """
 
     out: Path = Path("runs/compare")
@@ -112,7 +112,7 @@ class EvaluateSettings:
     """Evaluates a trained agent, behind a shield or not, on any channel.
 
     Attributes:
-        model: Folder of a trained agent (models/NAME of `ncs compare`, or what `ncs train` left).
+        model: Folder of a trained agent, such as models/shielded-0 in the output of `ncs compare` or `ncs train`.
         shield: Mode of the shield; "monitor" changes nothing and counts what it would have done.
         episodes: How many.
         seed: Of the episodes.
@@ -154,7 +154,7 @@ class SweepSettings(LearningSettings):
         losses: Probabilities that a packet is lost.
         delays: Steps that every packet is late.
         quantization_steps: Measurements are rounded to multiples of these; the environment's own if none is given.
-        burst_lengths: Mean numbers of packets lost in a row; 1 loses independently.
+        burst_lengths: Mean numbers of packets lost in a row; 0 loses independently.
         jobs: Worker processes.
     """
 
@@ -166,7 +166,7 @@ class SweepSettings(LearningSettings):
     losses: tuple[float, ...] = (0.0, 0.3, 0.6)
     delays: tuple[int, ...] = (0, 2, 4)
     quantization_steps: tuple[float, ...] = ()
-    burst_lengths: tuple[float, ...] = (1.0,)
+    burst_lengths: tuple[float, ...] = (0.0,)
     jobs: int = 2
 
 

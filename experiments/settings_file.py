@@ -41,8 +41,12 @@ def with_config(arguments: list[str]) -> list[str]:
     given = [i for i, argument in enumerate(arguments) if argument == FLAG or argument.startswith(f"{FLAG}=")]
     if not given or not arguments[0:1] or arguments[0].startswith("-"):
         return arguments
+    if len(given) > 1:
+        raise SettingsError(f"{FLAG} is given {len(given)} times")
     at = given[0]
     value = arguments[at].partition("=")[2] or "".join(arguments[at + 1 : at + 2])
+    if not value or value.startswith("--"):
+        raise SettingsError(f"{FLAG} needs a file")
     rest = arguments[1:at] + arguments[at + (1 if "=" in arguments[at] else 2) :]
     return [arguments[0], *_flags(_read(Path(value), arguments[0])), *rest]
 
@@ -65,6 +69,9 @@ def _flags(values: dict[str, Any], prefix: str = "--") -> list[str]:
     """Returns settings as command-line flags; the parser checks them like a user's."""
     flags: list[str] = []
     for name, value in values.items():
+        texts = [each for each in (value if isinstance(value, list) else [value]) if isinstance(each, str)]
+        if any(text.startswith("-") for text in [name, *texts]):
+            raise SettingsError(f"the settings hold a value that is none: {name} = {value!r}")
         flag = prefix + name.replace("_", "-")
         if isinstance(value, dict):
             flags += _flags(value, flag + ".")

@@ -16,7 +16,7 @@ from experiments.execution import results_of
 from experiments.settings import EvaluateSettings, TrainSettings
 from experiments.settings_file import save_settings
 from experiments.summary import summarize_arm, table_text
-from experiments.unit import UnitResult
+from experiments.unit import UnitResult, versions
 from experiments.worlds import world_of
 from shields.storage import write_atomically
 
@@ -68,8 +68,18 @@ def evaluate_agent(settings: EvaluateSettings) -> None:
     summary = {f"shield: {settings.shield}": _described([result], mode)}
     print(f"{agent.algorithm} of {settings.model} in {agent.env}\n\n{table_text(summary, {})}")
     if settings.out is not None:
-        content = {"arms": summary, "channel": asdict(channel) if channel else None, "episodes": settings.episodes}
-        write_atomically(settings.out, json.dumps(content | {"seed": settings.seed}, indent=1) + "\n")
+        content = {
+            "arms": summary,
+            "env": agent.env,
+            "channel": asdict(channel) if channel else None,
+            "episodes": settings.episodes,
+            "seed": settings.seed,
+            "model": {"folder": str(settings.model), "sha256": agent.checksum},
+            "plant": world.plant.fingerprint,
+            "certificate": world.certificate.checksum,
+            "versions": versions(),
+        }
+        write_atomically(settings.out, json.dumps(content, indent=1) + "\n")
 
 
 def _described(results: list[UnitResult], mode: str | None) -> dict[str, Any]:

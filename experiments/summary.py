@@ -72,12 +72,19 @@ def paired_differences(arms: dict[str, Sequence[UnitResult]], baseline: str) -> 
     return {name: differences[name] for name in arms if name in differences}
 
 
-def way_covered(summary: dict[str, Any]) -> float:
-    """Returns how far the shielded return is on the way from the zero input's (0) to the unshielded agent's (1)."""
-    arms, references = summary["arms"], summary["references"]
-    start = references["zero input"]["eval_return_mean"]
-    goal = arms["unshielded"]["eval_return_mean"]
-    return (arms["shielded"]["eval_return_mean"] - start) / (goal - start) if goal != start else float("nan")
+def way_covered(summary: dict[str, Any]) -> float | None:
+    """Returns how far the shielded return is on the way from the zero input's (0) to the unshielded agent's (1).
+
+    None without these arms, and where episodes end early: then returns are sums over different numbers of steps.
+    """
+    named = summary["references"] | summary["arms"]
+    if not {"shielded", "unshielded"} <= named.keys():
+        return None
+    start, goal, here = (named[name] for name in ("zero input", "unshielded", "shielded"))
+    if len({arm["eval_steps"] for arm in (start, goal, here)}) > 1:
+        return None
+    start, goal, here = (arm["eval_return_mean"] for arm in (start, goal, here))
+    return (here - start) / (goal - start) if goal != start else None
 
 
 def table_rows(arms: dict[str, dict[str, Any]]) -> list[list[str]]:

@@ -31,7 +31,7 @@ class Cell:
         loss: Probability that a packet is lost.
         delay: [steps].
         quantization_step: None for the environment's own.
-        burst_length: Mean number of packets lost in a row; 1 for independent losses.
+        burst_length: Mean number of packets lost in a row; 0 for independent losses.
     """
 
     loss: float
@@ -42,12 +42,12 @@ class Cell:
     @property
     def name(self) -> str:
         """For files."""
-        rounding = "" if self.quantization_step is None else f"-q{self.quantization_step:g}"
-        return f"loss{self.loss:g}-delay{self.delay}{rounding}-burst{self.burst_length:g}"
+        rounding = "" if self.quantization_step is None else f"-q{self.quantization_step}"
+        return f"loss{self.loss}-delay{self.delay}{rounding}-burst{self.burst_length}"
 
     def channel(self, base: ChannelSettings) -> ChannelSettings:
         """Returns the changes of the environment's channel that make this cell's."""
-        bursts = None if self.burst_length == 1.0 or self.loss == 0.0 else self.burst_length
+        bursts = None if self.burst_length == 0.0 or self.loss == 0.0 else self.burst_length
         rounding = base.quantization_step if self.quantization_step is None else self.quantization_step
         return replace(base, loss=self.loss, delay=self.delay, quantization_step=rounding, burst_length=bursts)
 
@@ -62,6 +62,9 @@ def sweep(settings: SweepSettings) -> None:
         Infeasible: If no certificate is found.
     """
     cells = cells_of(settings)
+    for name in ("loss", "delay", "burst_length"):
+        if getattr(settings.channel, name) is not None:
+            raise ValueError(f"--channel.{name.replace('_', '-')} is a side of the grid: give its values there")
     for name in settings.arms:
         arm_of(name, settings.mode)
     worlds = [world_of(settings.env, cell.channel(settings.channel), settings.certificate) for cell in cells]

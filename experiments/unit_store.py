@@ -44,6 +44,7 @@ class UnitStore:
         Raises:
             OSError: If a file cannot be written.
         """
+        self._path(unit).unlink(missing_ok=True)  # an older result must not point to the newer agent
         models = self._folder / "models" / unit.name
         if result.files:
             models.mkdir(exist_ok=True)

@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from ncs_gym.compiled import entry
+# Products and sums are not fused: what is drawn does not depend on the processor.
+drawing = njit(cache=True, nogil=True, error_model="numpy")
 
 # Constants of SplitMix64: the golden ratio, shifts and multipliers.
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
@@ -46,61 +47,56 @@ def _fraction(z):
 
 @njit(inline="always", error_model="numpy")
 def _minus_log(x):
-    """Returns -log(x) for a normal x in (0, 1], to a few roundings: the series of atanh after the exponent."""
+    """Returns -log(x) for a normal x in (0, 1], to a few roundings: a polynomial of fdlibm after the exponent."""
     bits = np.float64(x).view(np.int64)
     exponent = (bits - ROOT_HALF) >> FRACTION_BITS
     m = np.int64(bits - (exponent << FRACTION_BITS)).view(np.float64)
     s = (m - 1.0) / (m + 1.0)
     q = s * s
-    tail = 1.0 / 21.0
-    tail = tail * q + 1.0 / 19.0
-    tail = tail * q + 1.0 / 17.0
-    tail = tail * q + 1.0 / 15.0
-    tail = tail * q + 1.0 / 13.0
-    tail = tail * q + 1.0 / 11.0
-    tail = tail * q + 1.0 / 9.0
-    tail = tail * q + 1.0 / 7.0
-    tail = tail * q + 1.0 / 5.0
-    tail = tail * q + 1.0 / 3.0
-    return -(2.0 * s + 2.0 * s * q * tail + exponent * LOG_2)
+    tail = 1.479819860511658591e-01
+    tail = tail * q + 1.531383769920937332e-01
+    tail = tail * q + 1.818357216161805012e-01
+    tail = tail * q + 2.222219843214978396e-01
+    tail = tail * q + 2.857142874366239149e-01
+    tail = tail * q + 3.999999999940941908e-01
+    tail = tail * q + 6.666666666666735130e-01
+    return -(2.0 * s + s * q * tail + exponent * LOG_2)
 
 
 @njit(inline="always", error_model="numpy")
 def _sine(t):
-    """Returns sin(t) for |t| <= pi/4 to a few roundings, by Taylor's series."""
+    """Returns sin(t) for |t| <= pi/4 to a few roundings, by a polynomial of fdlibm."""
     q = t * t
-    tail = -1.0 / 1307674368000.0
-    tail = tail * q + 1.0 / 6227020800.0
-    tail = tail * q - 1.0 / 39916800.0
-    tail = tail * q + 1.0 / 362880.0
-    tail = tail * q - 1.0 / 5040.0
-    tail = tail * q + 1.0 / 120.0
-    tail = tail * q - 1.0 / 6.0
+    tail = 1.58969099521155010221e-10
+    tail = tail * q - 2.50507602534068634195e-08
+    tail = tail * q + 2.75573137070700676789e-06
+    tail = tail * q - 1.98412698298579493134e-04
+    tail = tail * q + 8.33333333332248946124e-03
+    tail = tail * q - 1.66666666666666324348e-01
     return t + t * q * tail
 
 
 @njit(inline="always", error_model="numpy")
 def _cosine(t):
-    """Returns cos(t) for |t| <= pi/4 to a few roundings, by Taylor's series."""
+    """Returns cos(t) for |t| <= pi/4 to a few roundings, by a polynomial of fdlibm."""
     q = t * t
-    tail = 1.0 / 20922789888000.0
-    tail = tail * q - 1.0 / 87178291200.0
-    tail = tail * q + 1.0 / 479001600.0
-    tail = tail * q - 1.0 / 3628800.0
-    tail = tail * q + 1.0 / 40320.0
-    tail = tail * q - 1.0 / 720.0
-    tail = tail * q + 1.0 / 24.0
+    tail = -1.13596475577881948265e-11
+    tail = tail * q + 2.08757232129817482790e-09
+    tail = tail * q - 2.75573143513906633035e-07
+    tail = tail * q + 2.48015872894767294178e-05
+    tail = tail * q - 1.38888888888741095749e-03
+    tail = tail * q + 4.16666666666666019037e-02
     return 1.0 - 0.5 * q + q * q * tail
 
 
-@entry
+@drawing
 def fill_keys(key, out):
     """Fills the keys of environments, shape (N,), from one number."""
     for e in range(out.size):
         out[e] = _mixed(_mixed(key) + GOLDEN * np.uint64(e))
 
 
-@entry
+@drawing
 def fill_uniform(keys, number, rows, out):
     """Fills row i < `rows` of `out`, shape (>= rows, N), with draw `number` + i of each key, uniform in (0, 1)."""
     for i in range(rows):
@@ -109,7 +105,7 @@ def fill_uniform(keys, number, rows, out):
             out[i, e] = _fraction(_mixed(keys[e] + shift))
 
 
-@entry
+@drawing
 def fill_normal(keys, number, share, most, out):
     """Fills `out`, shape (even, N), with standard normal numbers, draws `number`.. of each key, two rows at a time.
 
@@ -129,13 +125,13 @@ def fill_normal(keys, number, share, most, out):
             out[i, e], out[i + 1, e] = sine if swapped else cosine, cosine if swapped else sine
 
 
-@entry
+@drawing
 def normals(rank, count):
     """Returns room for `rank` rows of normal numbers, and one more where they are odd."""
     return np.empty((rank + rank % 2, count))
 
 
-@entry
+@drawing
 def fill_truncated(keys, number, energy, rank, out):
     """Fills `rank` rows of `out` (see `normals`) with normal numbers whose sum of squares is at most `energy`."""
     if rank == 2:  # the radius of a pair is truncated at once
@@ -155,7 +151,7 @@ def fill_truncated(keys, number, energy, rank, out):
         who = who[_beyond(again, rank, energy)]
 
 
-@entry
+@drawing
 def _squares(g, rank):
     """Returns the sum of squares of the first rows of each column, shape (N,)."""
     squares = np.zeros(g.shape[1])
@@ -165,7 +161,7 @@ def _squares(g, rank):
     return squares
 
 
-@entry
+@drawing
 def _beyond(g, rank, energy):
     """Returns the columns of g whose sum of squares is above `energy`."""
     squares = _squares(g, rank)
@@ -176,7 +172,7 @@ def _beyond(g, rank, energy):
     return bad[:count]
 
 
-@entry
+@drawing
 def fill_directions(keys, number, rank, out):
     """Fills `rank` rows of `out` (see `normals`) with uniform directions, of length 1."""
     fill_normal(keys, number, 1.0, np.inf, out)

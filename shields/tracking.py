@@ -124,11 +124,12 @@ def track(
     _mark_fine(knowledge.broken, restarted, moved_once, passed, alarm, fine)
     _mark_same(decided, inputs, fine)
     _mark_near(seen, shape, estimate, ground.reach, fine)
+    doubtful = _mark_proved(fine, ground.has_errors, knowledge.inside, knowledge.certified, reason)
+    if doubtful == 0:
+        return 0
     count = 0
     for e in range(reason.size):
-        if fine[e] and ground.has_errors:
-            knowledge.inside[e], knowledge.certified[e], reason[e] = True, True, 0
-        else:
+        if not fine[e]:
             _track_one(
                 ground,
                 seen[shape[e]],
@@ -146,6 +147,21 @@ def track(
                 reason,
             )
             count += reason[e] != 0
+    return count
+
+
+@entry
+def _mark_proved(fine, has_errors, inside, certified, reason):
+    """Notes that the proofs marked hold, none without an error set; returns how many are not marked."""
+    count = 0
+    for e in range(fine.size):
+        fine[e] &= has_errors
+        count += not fine[e]
+    for e in range(fine.size):
+        inside[e] |= fine[e]
+        certified[e] |= fine[e]
+    for e in range(fine.size):
+        reason[e] = 0
     return count
 
 
@@ -172,8 +188,8 @@ def _mark_same(decided, inputs, fine):
 def _mark_near(seen, shape, estimate, reach, fine):
     """Clears the marks where the estimate is not finite or far out, or the error shape is not a certified one."""
     good = np.empty(fine.size)
-    for e in range(fine.size):
-        good[e] = seen[shape[e], USABLE] * seen[shape[e], CERTIFIED]
+    for e in range(fine.size):  # only usable shapes are certified
+        good[e] = seen[shape[e], CERTIFIED]
     for e in range(fine.size):
         fine[e] &= good[e] > 0.0
     for i in range(estimate.shape[0]):

@@ -10,12 +10,26 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 
 from ncs_gym.frozen import as_number, as_numbers
+from ncs_gym.gain_table import GainTable
 from ncs_gym.plant import SIMULATED_REACH
 from ncs_gym.vector_env import NCSVectorEnv
 from shields import proof
 from shields.certificate import Certificate
 from shields.filter import MARGIN, SafetyFilter
 from shields.proof import starts_inside
+from shields.routine import (
+    BROKEN,
+    CERTIFIED,
+    CORRECTION,
+    COUNTS,
+    INSIDE,
+    INTERVENTIONS,
+    KNOWN,
+    MARKS,
+    TOLD,
+    TOTAL,
+    follow,
+)
 from shields.tracking import OTHER_STEPS, Ground, Knowledge, compare_clocks, count_interventions, number, track
 from shields.vector_filter import Decisions, VectorFilter
 from shields.wrapper import certificate_for
@@ -90,11 +104,13 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             MARGIN,
             self.certificate.Sigma is not None,
         )
-        count = self.num_envs
-        self._known = np.zeros(count, np.bool_)
-        self._knowledge = Knowledge(np.full(count, OTHER_STEPS), np.zeros(count, np.bool_), np.zeros(count, np.bool_))
+        self._bounds = np.array([self._ground.columns, self._ground.reach])
+        count, self._inner = self.num_envs, inner
+        self._counts, self._marks = np.zeros((COUNTS, count), np.int64), np.zeros((MARKS, count), np.bool_)
+        self._counts[BROKEN] = OTHER_STEPS
+        self._knowledge = Knowledge(self._counts[BROKEN], self._marks[INSIDE], self._marks[CERTIFIED])
+        self._known, self._interventions = self._marks[KNOWN], self._counts[INTERVENTIONS]
         self._table, self._numbers = None, np.zeros(0, np.int64)
-        self._interventions = np.zeros(count, np.int64)
         self._reason = np.full(count, OTHER_STEPS)
         self._some_wrong = True
         self._no_reason = np.full(count, "", dtype=object)
@@ -125,14 +141,89 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         """
         if self._clock is None:
             raise gym.error.ResetNeeded("call reset before the first step")
-        inner: NCSVectorEnv = self.env.unwrapped
-        proposed = inner.inputs_of(actions)
+        proposed = self._inner.inputs_of(actions)
         decisions = self._batch.decide(self._estimate, self._shape_number, proposed)
         if self.filter.mode != "monitor" and np.count_nonzero(decisions.intervened):
             overriding = (decisions.inputs.T / self.filter.plant.u_max).astype(np.float32)
             actions = np.where(decisions.intervened[:, None], overriding, np.asarray(actions))
         before, self._clock = self._clock, self._interrupted
         observation, rewards, terminated, truncated, info = self.env.step(actions)
+        told, guaranteed = np.empty((TOLD, self.num_envs)), np.empty(self.num_envs, np.bool_)
+        wrong = self._follow(before, info, decisions, proposed, told, guaranteed)
+        if wrong < 0:
+            return self._restarted((observation, rewards, terminated, truncated, info), before, decisions, proposed)
+        self._some_wrong, self._clock = wrong > 0, Clock(before.episodes, before.steps, self._inner.ticks)
+        rewards = rewards - self.penalty * decisions.intervened if self.penalty else rewards
+        added = {
+            "shield_intervened": decisions.intervened,
+            "input_proposed": proposed.T,
+            "shield_correction": told[CORRECTION],
+            "shield_margin": decisions.margin,
+            "shield_guaranteed": guaranteed,
+            "shield_reason": WHY[self._reason] if self._some_wrong else self._no_reason.copy(),
+            "episode_interventions": told[TOTAL].view(np.int64),
+        }
+        return observation, rewards, terminated, truncated, info | added
+
+    def _follow(
+        self,
+        before: Clock,
+        info: dict[str, Any],
+        decisions: Decisions,
+        proposed: np.ndarray,
+        told: np.ndarray,
+        guaranteed: np.ndarray,
+    ) -> int:
+        """Takes in a step that began no episode; see `routine.follow`."""
+        inner, ground = self._inner, self._ground
+        table, nodes = inner.patterns
+        if table is not self._table:
+            return -1
+        self._make_room(table)
+        return follow(
+            ground.root,
+            self._bounds,
+            ground.rounding,
+            ground.margin,
+            ground.has_errors,
+            self._batch.book.seen,
+            self._numbers,
+            nodes,
+            inner.episodes,
+            inner.steps,
+            before.episodes,
+            before.steps,
+            inner.ticks == before.ticks + 1,
+            self._counts,
+            self._marks,
+            decisions.inputs,
+            proposed,
+            decisions.intervened,
+            decisions.passed,
+            decisions.fallback,
+            self._rows(info, "input"),
+            self._rows(info, "estimate"),
+            self._alarms(info),
+            self._shape_number,
+            self._estimate,
+            self._reason,
+            told,
+            guaranteed,
+        )
+
+    def _rows(self, info: dict[str, Any], key: str) -> np.ndarray:
+        """Returns what `_reported` does, not always a copy."""
+        value = info.get(key)
+        size = self.filter.plant.n if key == "estimate" else self.filter.plant.m
+        if type(value) is np.ndarray and value.dtype == np.float64 and value.shape == (self.num_envs, size):
+            rows = value.T
+            if rows.flags.c_contiguous:
+                return rows
+        return self._reported(info, key, np.nan)
+
+    def _restarted(self, stepped: tuple, before: Clock, decisions: Decisions, proposed: np.ndarray) -> tuple:
+        """Returns what `step` does where some episodes began, given what the environment's step returned."""
+        observation, rewards, terminated, truncated, info = stepped
         now, (restarted, moved_once) = self._read_clock(), np.empty((2, self.num_envs), np.bool_)
         next_tick = now.ticks == before.ticks + 1
         clocks = now.episodes, now.steps, before.episodes, before.steps
@@ -227,8 +318,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         table, nodes = self.env.unwrapped.patterns
         if table is not self._table:
             self._table, self._numbers = table, np.full(len(table), -1)
-        if len(table) > len(self._numbers):
-            self._numbers = np.append(self._numbers, np.full(len(table), -1))
+        self._make_room(table)
         numbers = np.empty(self.num_envs, np.int64)
         if number(self._numbers, nodes, numbers) < 0:
             n = self.filter.plant.n
@@ -236,6 +326,11 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
                 self._numbers[node] = self._batch.book.number(table.shapes[node].reshape(n, n).copy())
             number(self._numbers, nodes, numbers)
         return numbers
+
+    def _make_room(self, table: GainTable) -> None:
+        """Makes the list of numbers at least as long as the table."""
+        if len(table) > len(self._numbers):
+            self._numbers = np.append(self._numbers, np.full(len(table), -1))
 
     def _read_clock(self) -> Clock:
         """Returns how often the environments moved until now."""

@@ -115,6 +115,7 @@ def change(folder, **values):
     (folder / "agent.json").write_text(json.dumps(document))
 
 
+NEGATIVE = {"mean": [0.0] * 3, "variance": [-1.0] * 3, "epsilon": 1e-8, "clip": 10.0}
 SHORT = {"mean": [0.0], "variance": [1.0], "epsilon": 1, "clip": 1}
 
 

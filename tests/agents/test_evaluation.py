@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from agents.control_loop import ControlLoop, Shielding
-from agents.evaluation import evaluate
+from agents.evaluation import STREAM, evaluate
 from shields.wrapper import certificate_for
 
 CRUISE = ControlLoop(env="ncs_gym/TruckTrailerCruise-v0")
@@ -33,7 +33,7 @@ def scalar(monkeypatch):
 
 
 def test_it_counts_what_a_plain_loop_counts(certificate):
-    word = int(np.random.SeedSequence([100, 0]).generate_state(1)[0] >> 1)
+    word = int(np.random.SeedSequence([100, 0, STREAM]).generate_state(1)[0] >> 1)
     played = evaluate(CRUISE, throttle, 8, 100, level_matrix=certificate.M)
     envs = gym.make_vec(CRUISE.env, num_envs=8)
     plant = envs.unwrapped.plant

@@ -99,6 +99,23 @@ def test_every_algorithm_trains_counts_and_repeats_itself(algorithm, settings, s
     np.testing.assert_array_equal(first.agent.act(observations), second.agent.act(observations))
 
 
+def test_a_single_rollout_is_learned_from():
+    agent, start = train(CRUISE, 256, 0, settings=TINY).agent, untrained(CRUISE, 0, settings=TINY)
+    assert agent.checksum != start.checksum
+
+
+def test_rate_falls_from_its_full_value_to_that_of_the_last_rollout():
+    schedule = train(CRUISE, 4 * 256, 0, settings=TINY).agent.model.lr_schedule
+    assert [schedule(remaining) for remaining in (0.75, 0.5, 0.25, 0.0)] == pytest.approx(
+        [TINY.learning_rate * share for share in (1.0, 0.75, 0.5, 0.25)]
+    )
+
+
+def test_too_few_steps_to_learn_are_refused():
+    with pytest.raises(ValueError, match="64 steps train nothing: learning starts after 64"):
+        train(CRUISE, 64, 0, "SAC", TINY_REPLAY)
+
+
 @pytest.mark.parametrize(
     ("algorithm", "settings", "words"), [("DQN", None, "unknown algorithm 'DQN'"), ("SAC", TINY, "takes OffPolicy")]
 )

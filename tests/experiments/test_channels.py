@@ -5,6 +5,7 @@ from experiments.channels import ChannelSettings, bursts, channel_of
 from experiments.settings import SweepSettings
 from experiments.sweep import cells_of
 from ncs_gym import Channel, GilbertElliott
+from ncs_gym.channel import Link
 
 OWN = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
 
@@ -20,20 +21,27 @@ def test_what_is_asked_for_replaces_the_environments_own():
     assert changed == expected
 
 
-@pytest.mark.parametrize(("loss", "length"), [(0.3, 4.0), (0.1, 1.0), (0.6, 10.0)])
-def test_bursts_have_the_loss_rate_and_the_length_asked_for(loss, length):
-    chain, rng = bursts(loss, length), np.random.default_rng(0)
-    bad, states = False, []
-    for uniform in rng.random(200_000):
-        bad = uniform >= chain.p_bad_to_good if bad else uniform < chain.p_good_to_bad
-        states.append(bad)
+@pytest.mark.parametrize(
+    ("loss", "length", "period"), [(0.3, 4.0, 1), (0.1, 1.0, 1), (0.6, 10.0, 1), (0.3, 5.0, 2), (0.6, 2.5, 3)]
+)
+def test_bursts_have_the_loss_rate_and_the_length_asked_for(loss, length, period):
+    # What the channel itself does, packet by packet.
+    channel, rng = Channel(loss=bursts(loss, length, period), send_period=period), np.random.default_rng(0)
+    link, states = Link(channel, rng), []
+    for step in range(1, 200_000):
+        if link.sends_at(step):
+            states.append(not link.exchange(rng, step, np.zeros(1)))
+        else:
+            link.exchange(rng, step, None)
     states = np.array(states)
     runs = int((states[1:] & ~states[:-1]).sum())
     assert states.mean() == pytest.approx(loss, rel=0.05)
     assert states.sum() / runs == pytest.approx(length, rel=0.05)
 
 
-@pytest.mark.parametrize(("loss", "length"), [(0.9, 1.0), (0.5, 0.5), (1.0, 3.0), (-0.1, 2.0), (0.3, float("nan"))])
+@pytest.mark.parametrize(
+    ("loss", "length"), [(0.9, 1.0), (0.5, 0.5), (1.0, 3.0), (-0.1, 2.0), (0.3, float("nan")), (0.3, float("inf"))]
+)
 def test_impossible_bursts_are_refused(loss, length):
     with pytest.raises(ValueError, match="bursts of mean length"):
         bursts(loss, length)
@@ -44,10 +52,11 @@ def test_bursts_need_a_loss_probability():
     with pytest.raises(ValueError, match=r"--channel\.loss"):
         channel_of(ChannelSettings(burst_length=3.0), own)
     assert channel_of(ChannelSettings(burst_length=3.0, loss=0.2), own).loss == bursts(0.2, 3.0)
+    assert channel_of(ChannelSettings(burst_length=3.0), OWN).loss == bursts(0.3, 3.0, 2)
 
 
 def test_grid_is_the_product_of_its_sides():
-    settings = SweepSettings(losses=(0.0, 0.5), delays=(1,), quantization_steps=(0.1, 0.2), burst_lengths=(1.0, 3.0))
+    settings = SweepSettings(losses=(0.0, 0.5), delays=(1,), quantization_steps=(0.1, 0.2), burst_lengths=(0.0, 3.0))
     cells = cells_of(settings)
     assert len(cells) == len({cell.name for cell in cells}) == 8
     lossless, *_, last = cells
@@ -63,3 +72,8 @@ def test_grid_is_the_product_of_its_sides():
 def test_empty_and_repeated_sides_are_refused(change):
     with pytest.raises(ValueError, match=f"--{next(iter(change))} must be different"):
         cells_of(SweepSettings(**change))
+
+
+def test_cells_that_print_alike_have_names_of_their_own():
+    cells = cells_of(SweepSettings(losses=(0.9, 0.90000001), delays=(0,)))
+    assert len({cell.name for cell in cells}) == 2

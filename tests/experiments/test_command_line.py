@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -44,6 +45,20 @@ def assert_one_sentence(run, *words):
     assert len(lines) == 1, run.stderr
     assert lines[0].startswith("ncs: ")
     assert all(word in lines[0] for word in words), lines[0]
+
+
+def children_of(pid):
+    """Process ids of direct children, from /proc."""
+    stats = [path.read_text().rsplit(")", 1) for path in Path("/proc").glob("[0-9]*/stat") if path.exists()]
+    return [int(head.split()[0]) for head, tail in stats if int(tail.split()[1]) == pid]
+
+
+def is_alive(pid):
+    """Whether a process runs (a zombie does not)."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
 
 
 @pytest.fixture(scope="module")
@@ -140,8 +155,13 @@ def test_killed_run_goes_on_and_ends_like_an_uninterrupted_one(smoke, tmp_path):
         assert run.poll() is None, "it ended before it was killed"
         assert time.monotonic() < deadline
         time.sleep(0.05)
+    children = children_of(run.pid)
+    assert len(children) >= 3
     run.kill()
     run.wait()
+    while any(is_alive(child) for child in children):
+        assert time.monotonic() < deadline, "workers outlive their parent"
+        time.sleep(0.1)
     assert not (out / "summary.json").exists()
     finished = len(list(units.glob("*.json")))
     again = ncs("compare", "--smoke", "--out", out)
@@ -189,11 +209,11 @@ def test_one_agent_is_trained(tmp_path):
 
 def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path):
     out = tmp_path / "sweep"
-    grid = ["--losses", "0.5", "--delays", "1", "--burst-lengths", "1", "3", "--episodes", "3", "--steps", "512"]
+    grid = ["--losses", "0.5", "--delays", "1", "--burst-lengths", "0", "3", "--episodes", "3", "--steps", "512"]
     run = ncs("sweep", *grid, "--ppo.envs", "4", "--out", out)
     assert run.returncode == 0, run.stderr
     summary = json.loads((out / "summary.json").read_text())
-    assert [(cell["loss"], cell["burst_length"]) for cell in summary["cells"]] == [(0.5, 1), (0.5, 3)]
+    assert [(cell["loss"], cell["burst_length"]) for cell in summary["cells"]] == [(0.5, 0), (0.5, 3)]
     assert all(cell["arms"]["shielded"]["eval_violation_steps"] == 0 for cell in summary["cells"])
     rows = pq.read_table(out / "sweep.parquet").to_pylist()
     assert len(rows) == 4
@@ -263,6 +283,7 @@ def test_usage_errors_are_the_parsers(arguments, words):
         (["evaluate", "nowhere"], ["cannot read the agent in nowhere"]),
         (["sweep", "--losses", "0.1", "0.1"], ["--losses must be different"]),
         (["sweep", "--losses", "0.9", "--burst-lengths", "2"], ["bursts of mean length 2"]),
+        (["sweep", "--channel.loss", "0.5"], ["--channel.loss is a side of the grid"]),
         (
             ["sweep", "--env", "ncs_gym/BatchReactor-v0", "--quantization-steps", "0.1"],
             ["rounds to 0.1, the contract allows 0.001"],

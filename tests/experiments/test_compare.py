@@ -111,13 +111,19 @@ def test_interval_of_a_fixed_policy_is_over_episodes():
     assert fixed[1] - 4.0 == pytest.approx(3.182 * 2.582 / 2, rel=1e-3)
 
 
-def test_way_covered_is_zero_at_the_zero_input_and_one_at_the_unshielded_agent():
-    def covered(shielded):
-        means = {"unshielded": -5.0, "shielded": shielded, "zero input": -65.0}
-        named = {name: {"eval_return_mean": mean} for name, mean in means.items()}
-        return way_covered({"arms": named, "references": named})
+def covered(shielded, shielded_steps=200):
+    means = {"unshielded": (-5.0, 200), "shielded": (shielded, shielded_steps), "zero input": (-65.0, 200)}
+    named = {name: {"eval_return_mean": mean, "eval_steps": steps} for name, (mean, steps) in means.items()}
+    return way_covered({"arms": named, "references": named})
 
+
+def test_way_covered_is_zero_at_the_zero_input_and_one_at_the_unshielded_agent():
     assert [covered(value) for value in (-65.0, -5.0, -20.0)] == [0.0, 1.0, 0.75]
+
+
+def test_returns_of_episodes_that_end_early_are_no_way_covered():
+    assert covered(-20.0, shielded_steps=150) is None
+    assert way_covered({"arms": {}, "references": {}}) is None
 
 
 def test_interquartile_mean_leaves_the_extreme_runs_out():
@@ -157,8 +163,11 @@ def test_results_are_grouped_by_arm_in_the_order_of_runs():
 
 def test_folder_is_made_and_an_earlier_summary_removed(tmp_path):
     (tmp_path / "units").mkdir()
-    (tmp_path / "summary.json").write_text("{}")
+    (tmp_path / "figures").mkdir()
+    for name in ("summary.json", "report.html", "episodes.parquet", "figures/old.png"):
+        (tmp_path / name).write_text("{}")
     prepare(tmp_path)
+    assert not any((tmp_path / "figures").iterdir())
     assert {path.name for path in tmp_path.iterdir()} == {"units", "figures"}
 
 

@@ -68,3 +68,19 @@ def test_damaged_and_foreign_files_are_one_sentence(content, words, tmp_path):
     with pytest.raises(SettingsError, match=words) as caught:
         with_config(["compare", "--config", str(tmp_path / "s.json")])
     assert "\n" not in str(caught.value)
+
+
+def test_config_is_given_once_and_with_a_file(tmp_path):
+    save_settings(tmp_path / "s.json", "compare", CompareSettings())
+    twice = ["compare", "--config", str(tmp_path / "s.json"), "--config", "other.json"]
+    for arguments, words in ((twice, "2 times"), (["compare", "--config"], "needs a file")):
+        with pytest.raises(SettingsError, match=words):
+            with_config(arguments)
+
+
+@pytest.mark.parametrize("values", [{"arms": ["shielded", "--seed", "9"]}, {"env": "--help"}, {"-x": 1}])
+def test_values_in_a_file_are_no_flags(values, tmp_path):
+    document = {"format": "ncs-gym settings 1", "command": "compare", "settings": values}
+    (tmp_path / "s.json").write_text(json.dumps(document))
+    with pytest.raises(SettingsError, match="a value that is none"):
+        with_config(["compare", "--config", str(tmp_path / "s.json")])

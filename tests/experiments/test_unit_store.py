@@ -84,6 +84,30 @@ def test_result_without_its_agent_is_refused(store, unit, tmp_path):
         store.load(unit)
 
 
+def test_half_stored_result_of_other_settings_leaves_nothing_behind(store, unit, result, monkeypatch):
+    # Killed between the agent's files and the unit's.
+    def killed(path, content):
+        if path.suffix == ".json" and path.parent.name == "units":
+            raise KeyboardInterrupt
+        path.write_bytes(content)
+
+    monkeypatch.setattr("experiments.unit_store.write_atomically", killed)
+    with pytest.raises(KeyboardInterrupt):
+        store.save(replace(unit, steps=257), replace(result, files={"model.zip": b"new", "agent.json": b"new"}))
+    assert store.load(unit) is None
+
+
+def test_changed_source_is_another_key(unit, monkeypatch):
+    before = unit.key
+    monkeypatch.setattr("experiments.unit._source_digest", lambda: "changed")
+    assert unit.key != before
+
+
+def test_units_of_one_name_are_refused(unit, tmp_path):
+    with pytest.raises(ValueError, match="same name"):
+        results_of([unit, unit], tmp_path, jobs=1)
+
+
 def test_nothing_stored_is_nothing_loaded(unit, tmp_path):
     assert UnitStore(tmp_path).load(unit) is None
 

@@ -1,0 +1,72 @@
+"""What works without the training extra, in a virtual environment of its own."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def binaries(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("base") / "venv"
+    subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
+    pip = [str(folder / "bin" / "python"), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    subprocess.run([*pip, "-c", str(ROOT / "constraints.txt"), str(ROOT)], check=True)
+    return folder / "bin"
+
+
+def run(binary, *arguments, cwd):
+    return subprocess.run([str(binary), *map(str, arguments)], cwd=cwd, capture_output=True, text=True, timeout=600)
+
+
+def test_nothing_of_the_extras_is_installed(binaries, tmp_path):
+    code = "import importlib.util as u; print([n for n in ('torch', 'stable_baselines3', 'pygame') if u.find_spec(n)])"
+    assert run(binaries / "python", "-c", code, cwd=tmp_path).stdout.strip() == "[]"
+
+
+def test_environments_and_shields_work(binaries, tmp_path):
+    code = """
+import gymnasium, numpy, ncs_gym, shields, agents
+env = shields.SafetyShield(gymnasium.make("ncs_gym/TruckTrailerCruise-v0"))
+env.reset(seed=0)
+print([env.step(numpy.ones(1, numpy.float32))[4] for _ in range(50)][-1]["episode_violations"])
+envs = shields.VectorSafetyShield(gymnasium.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=3))
+envs.reset(seed=0)
+print(envs.step(numpy.ones((3, 1), numpy.float32))[4]["episode_violations"].sum())
+"""
+    result = run(binaries / "python", "-c", code, cwd=tmp_path)
+    assert result.stdout.split() == ["0.0", "0.0"], result.stderr
+
+
+def test_commands_about_certificates_work(binaries, tmp_path):
+    file = tmp_path / "c.json"
+    for arguments in (["synthesize", "--out", file], ["verify", file], ["audit"]):
+        result = run(binaries / "ncs", *arguments, cwd=tmp_path)
+        assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "extra"),
+    [
+        (["compare"], "train"),
+        (["train"], "train"),
+        (["evaluate", "x"], "train"),
+        (["sweep"], "train"),
+        (["render"], "render"),
+    ],
+)
+def test_commands_that_need_an_extra_say_so_in_one_sentence(binaries, tmp_path, arguments, extra):
+    result = run(binaries / "ncs", *arguments, cwd=tmp_path)
+    assert result.returncode == 2
+    (line,) = result.stderr.strip().splitlines()
+    assert f"pip install 'ncs-gym[{extra}]'" in line
+
+
+def test_training_adapter_says_what_is_missing(binaries, tmp_path):
+    result = run(binaries / "python", "-c", "from agents import SB3VecEnv", cwd=tmp_path)
+    assert result.returncode == 1
+    assert "stable_baselines3" in result.stderr.splitlines()[-1]
