@@ -4,8 +4,10 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= runs/compare
 INSTALLED := $(VENV)/.installed
+DOCS_INSTALLED := $(VENV)/.installed-docs
+ZOO_INSTALLED := $(VENV)/.installed-rl-zoo
 
-.PHONY: compare test test-slow lint types benchmark clean
+.PHONY: compare test test-slow lint types benchmark docs clean
 
 compare: $(INSTALLED)
 	$(BIN)/ncs compare --out $(OUT)
@@ -13,7 +15,7 @@ compare: $(INSTALLED)
 test: $(INSTALLED)
 	$(BIN)/python -m pytest -n auto --dist worksteal
 
-test-slow: $(INSTALLED)
+test-slow: $(INSTALLED) $(ZOO_INSTALLED)
 	$(BIN)/python -m pytest -n auto --dist worksteal -m slow
 
 lint: $(INSTALLED)
@@ -33,11 +35,24 @@ benchmark: $(INSTALLED)
 	$(BIN)/python benchmarks/rendering.py
 	$(BIN)/python benchmarks/ppo_settings.py
 
+# Fails on a broken link, anchor or reference. Look at it: python -m http.server -d site (from a file the search is missing).
+docs: $(DOCS_INSTALLED)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt torch
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[train,render,dev]'
 	touch $@
 
+$(DOCS_INSTALLED): $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	touch $@
+
+# rl-zoo3 declares older versions than it runs with (docs/other_code.md).
+$(ZOO_INSTALLED): examples/rl_zoo/requirements.txt $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r examples/rl_zoo/requirements.txt
+	touch $@
+
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) site

@@ -153,7 +153,7 @@ class SpeedTracking(Task):
     -error_weight min(|error| / 5, 5) - input_weight u^2, at the end of the step.
 
     Attributes:
-        fastest: Targets (and the first speed) are uniform in [0, fastest] [m/s].
+        fastest: Targets (and the first speed) are uniform in `[0, fastest]` [m/s].
         change_probability: Per step, to draw a new target.
         error_weight: Per 5 m/s of error.
         input_weight: Per (m/s^2)^2.

@@ -1,0 +1,104 @@
+"""What the pages say exists: links, names, errors."""
+
+import ast
+import builtins
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("ncs_gym", "shields", "agents", "experiments")
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+CODE = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
+REFERENCE = re.compile(r"^::: (\S+)$", re.MULTILINE)
+
+
+def nav_files(entry):
+    """Pages below an entry of the navigation."""
+    if isinstance(entry, str):
+        return [entry]
+    return [file for each in (entry.values() if isinstance(entry, dict) else entry) for file in nav_files(each)]
+
+
+def exceptions():
+    """Module and name of every exception class that the packages define."""
+    found = []
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.ClassDef):
+                    bases = {base.id for base in node.bases if isinstance(base, ast.Name)}
+                    known = {name for _, name in found}
+                    if any(base in known or is_exception(getattr(builtins, base, None)) for base in bases):
+                        found.append((".".join(path.relative_to(ROOT).with_suffix("").parts), node.name))
+    return found
+
+
+def is_exception(value):
+    return isinstance(value, type) and issubclass(value, BaseException)
+
+
+def resolved(name):
+    """The object of a dotted name."""
+    parts = name.split(".")
+    module, depth = importlib.import_module(parts[0]), 1
+    while depth < len(parts) - 1 and (ROOT / Path(*parts[: depth + 1])).with_suffix(".py").exists():
+        depth += 1
+        module = importlib.import_module(".".join(parts[:depth]))
+    for part in parts[depth:]:
+        module = getattr(module, part)
+    return module
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_relative_links_lead_to_files(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", CODE.sub("", page.read_text())):
+        if not re.match(r"https?://|mailto:|#", target):
+            assert (page.parent / target.partition("#")[0]).exists(), target
+
+
+def test_navigation_has_every_page_once():
+    nav = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]
+    pages = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
+    assert sorted(nav_files(nav)) == sorted(pages)
+
+
+@pytest.mark.parametrize("package", PACKAGES[:3])
+def test_reference_has_every_public_name_of(package):
+    listed = set(REFERENCE.findall((ROOT / "docs" / "api" / f"{package}.md").read_text()))
+    names = importlib.import_module(package).__all__
+    assert names
+    short = {name.rpartition(".")[2] for name in listed}
+    assert set(names) <= short
+    for name in listed:
+        assert resolved(name).__doc__
+
+
+def test_reference_of_the_command_line_has_the_settings_of_every_command():
+    from experiments.__main__ import COMMANDS
+
+    listed = set(REFERENCE.findall((ROOT / "docs" / "api" / "experiments.md").read_text()))
+    assert {f"experiments.settings.{kind}" for kind, _, _ in COMMANDS.values()} <= listed
+
+
+def test_errors_has_every_exception_class_and_no_other():
+    table = (ROOT / "docs" / "errors.md").read_text().partition("## Python's")[0]
+    rows = re.findall(r"^\| \[`(\w+)`\]\([^#]*#([\w.]+)\) \| ([^|]*) \|", table, re.MULTILINE)
+    assert all(name == target.rpartition(".")[2] for name, target, _ in rows)
+    listed = {target: bases for _, target, bases in rows}
+    defined = exceptions()
+    assert ("shields.infeasible", "Infeasible") in defined
+    assert sorted(name.rpartition(".")[2] for name in listed) == sorted(name for _, name in defined)
+    for name, bases in listed.items():
+        error = resolved(name)
+        assert error.__name__ == name.rpartition(".")[2]
+        assert error.__bases__ == tuple(getattr(builtins, base) for base in re.findall(r"`(\w+)`", bases))
+
+
+def test_examples_that_the_pages_name_exist():
+    named = {path for page in PAGES for path in re.findall(r"examples/[\w/]+\.(?:py|yml|txt)", page.read_text())}
+    assert "examples/single_file_ppo.py" in named
+    assert [path for path in named if not (ROOT / path).exists()] == []

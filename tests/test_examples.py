@@ -1,0 +1,76 @@
+"""Every example runs as it is, with a tiny budget, and prints what it is about."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+NUMBER = r"-?[\d.,]+"
+SLOW = pytest.mark.slow
+
+# Arguments of a tiny run, and what has to stand in its output.
+RUNS = {
+    "change_the_channel.py": ([], [rf"{re.escape('30 % lost, 2 steps late')} +root mean square error {NUMBER}"]),
+    "own_plant.py": (
+        ["--steps", "12800"],
+        ["largest angle in the safe set: 0.500 rad", "without a violation: 64 of 64"],
+    ),
+    "plain_loop.py": ([], [r"overridden: \d+ of 1000; closest to the limit: 0\.\d+"]),
+    "quick_start.py": ([], ["violating steps: 0", r"overridden actions: [1-9]", "the proof held: True"]),
+    "recurrent_ppo.py": (["--steps", "1024"], [rf"mean return of the last 4 episodes: {NUMBER}", "violating steps: 0"]),
+    "sb3_ten_lines.py": (
+        ["--steps", "210"],
+        [rf"{name}: last return {NUMBER}; 0 violating steps, [1-9]\d* actions" for name in ("PPO", "SAC", "TD3")],
+    ),
+    "single_file_ppo.py": (
+        ["--total-timesteps", "512", "--num-envs", "2", "--epochs", "2"],
+        [rf"last 2 of 2 episodes: {NUMBER}", r"violating steps: 0; actions overridden: [1-9]"],
+    ),
+    "single_file_sac.py": (
+        ["--total-timesteps", "420", "--learning-starts", "390"],
+        [rf"last 2 of 2 episodes: {NUMBER}", r"violating steps: 0; actions overridden: [1-9]"],
+    ),
+    "write_a_task.py": ([], [rf"return of doing nothing: {NUMBER}"]),
+}
+TRAINING = {"own_plant.py", "recurrent_ppo.py", "sb3_ten_lines.py", "single_file_sac.py"}
+
+
+def run_example(name, *arguments):
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    command = [sys.executable, str(ROOT / "examples" / name), *arguments]
+    # One thread per process: tests run side by side.
+    environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
+    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600)
+
+
+def test_every_example_is_run_here():
+    assert {path.name for path in (ROOT / "examples").glob("*.py")} == set(RUNS)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[SLOW] if name in TRAINING else []) for name in sorted(RUNS)]
+)
+def test_example_runs_and_prints_what_it_is_about(name):
+    arguments, expected = RUNS[name]
+    run = run_example(name, *arguments)
+    assert run.returncode == 0, run.stderr
+    for pattern in expected:
+        assert re.search(pattern, run.stdout), f"{pattern!r} is not in {run.stdout!r}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["single_file_ppo.py", "single_file_sac.py"])
+def test_single_files_learn_and_break_the_coupling_only_without_a_shield(name):
+    budget = {"single_file_ppo.py": "40960", "single_file_sac.py": "6000"}[name]
+    bare, shielded = (
+        run_example(name, "--shield", shield, "--total-timesteps", budget) for shield in ("none", "project")
+    )
+    assert bare.returncode == shielded.returncode == 0, bare.stderr + shielded.stderr
+    assert re.search(r"violating steps: [1-9]", bare.stdout), bare.stdout
+    assert "violating steps: 0;" in shielded.stdout
+    # A random policy returns -100 or so, the zero input -68 (README).
+    assert float(re.search(r"episodes: (-[\d.]+)", shielded.stdout)[1]) > -50.0

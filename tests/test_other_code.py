@@ -1,0 +1,253 @@
+"""Gymnasium's and stable-baselines3's own wrappers and rl-zoo3's trainer, around and inside shields."""
+
+import csv
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import wrappers
+from gymnasium.wrappers import vector
+from stable_baselines3.common.env_util import make_vec_env
+
+from shields import SafetyShield, VectorSafetyShield
+
+ROOT = Path(__file__).resolve().parent.parent
+CRUISE = "ncs_gym/TruckTrailerCruise-v0"
+# Steps of an episode, and of runs that need not end.
+STEPS, SOME = 200, 60
+
+SCALAR = {
+    "NormalizeObservation": wrappers.NormalizeObservation,
+    "RescaleObservation": lambda env: wrappers.RescaleObservation(env, np.float32(-1.0), np.float32(1.0)),
+    "RecordEpisodeStatistics": wrappers.RecordEpisodeStatistics,
+    "FrameStackObservation": lambda env: wrappers.FrameStackObservation(env, 3),
+    "DelayObservation": lambda env: wrappers.DelayObservation(env, 2),
+}
+VECTOR = {
+    "NormalizeObservation": vector.NormalizeObservation,
+    "RecordEpisodeStatistics": vector.RecordEpisodeStatistics,
+}
+
+
+def actions(*shape):
+    """Random, with a preference for full throttle: a shield has to act."""
+    return np.clip(np.random.default_rng(0).normal(0.8, 0.6, shape), -1.0, 1.0).astype(np.float32)
+
+
+def play(env, steps=STEPS, *shape):
+    """One run from a fixed seed: observations, rewards and infos."""
+    observation, info = env.reset(seed=3)
+    seen, rewards, infos = [observation], [], [info]
+    for action in actions(steps, *shape):
+        observation, reward, _, _, info = env.step(action)
+        seen.append(observation)
+        rewards.append(reward)
+        infos.append(info)
+    return np.array(seen), np.array(rewards), infos
+
+
+def assert_same_infos(ones, others):
+    for one, other in zip(ones, others, strict=True):
+        assert one.keys() <= other.keys()
+        for key in one.keys() - {"episode", "_episode"}:
+            np.testing.assert_array_equal(one[key], other[key], err_msg=key)
+
+
+@pytest.fixture(scope="module")
+def bare():
+    return play(gym.make(CRUISE), SOME, 1)
+
+
+@pytest.fixture(scope="module")
+def shielded(certificate):
+    return play(SafetyShield(gym.make(CRUISE), certificate, penalty=0.5), SOME, 1)
+
+
+@pytest.mark.parametrize("name", SCALAR)
+def test_wrappers_leave_the_bare_environment_as_it_is(name, bare):
+    wrapped = play(SCALAR[name](gym.make(CRUISE)), SOME, 1)
+    np.testing.assert_array_equal(bare[1], wrapped[1])
+    assert_same_infos(bare[2], wrapped[2])
+
+
+@pytest.mark.parametrize("order", ["outside", "inside"])
+@pytest.mark.parametrize("name", SCALAR)
+def test_wrappers_change_no_decision_on_either_side_of_the_shield(name, order, shielded, certificate):
+    if order == "outside":
+        env = SCALAR[name](SafetyShield(gym.make(CRUISE), certificate, penalty=0.5))
+    else:
+        env = SafetyShield(SCALAR[name](gym.make(CRUISE)), certificate, penalty=0.5)
+    wrapped = play(env, SOME, 1)
+    assert shielded[2][-1]["episode_interventions"] > 0
+    assert wrapped[2][-1]["shield_guaranteed"]
+    np.testing.assert_array_equal(shielded[1], wrapped[1])
+    assert_same_infos(shielded[2], wrapped[2])
+
+
+def test_normalized_observations_have_the_statistics_of_the_raw_ones(bare):
+    env = wrappers.NormalizeObservation(gym.make(CRUISE))
+    raw, normalized = bare[0], play(env, SOME, 1)[0]
+    deviation = np.sqrt(raw.var(axis=0) + env.epsilon)
+    np.testing.assert_allclose(normalized[-1], (raw[-1] - raw.mean(axis=0)) / deviation, rtol=1e-3, atol=1e-3)
+
+
+def test_stacked_and_delayed_observations_are_the_earlier_ones(bare):
+    raw = bare[0]
+    stacked = play(SCALAR["FrameStackObservation"](gym.make(CRUISE)), SOME, 1)[0]
+    delayed = play(SCALAR["DelayObservation"](gym.make(CRUISE)), SOME, 1)[0]
+    np.testing.assert_array_equal(stacked[2:], np.stack([raw[:-2], raw[1:-1], raw[2:]], axis=1))
+    np.testing.assert_array_equal(delayed[2:], raw[:-2])
+    np.testing.assert_array_equal(delayed[:2], 0.0)
+
+
+def test_recorded_return_pays_the_penalty_only_where_the_recorder_is_outside_the_shield(certificate):
+    record = wrappers.RecordEpisodeStatistics
+    _, rewards, outside = play(record(SafetyShield(gym.make(CRUISE), certificate, penalty=0.5)), STEPS, 1)
+    _, same, inside = play(SafetyShield(record(gym.make(CRUISE)), certificate, penalty=0.5), STEPS, 1)
+    np.testing.assert_array_equal(rewards, same)
+    paid = 0.5 * outside[-1]["episode_interventions"]
+    assert paid > 0.0
+    assert outside[-1]["episode"]["r"] == pytest.approx(rewards.sum())
+    assert inside[-1]["episode"]["r"] == pytest.approx(rewards.sum() + paid)
+
+
+@pytest.mark.parametrize("shielded", [False, True])
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_vector_recorder_adds_up_what_the_vector_environment_pays(mode, shielded, certificate):
+    count, limit = 3, 20
+    env = gym.make_vec(CRUISE, num_envs=count, max_episode_steps=limit, autoreset_mode=mode)
+    if shielded:
+        env = VectorSafetyShield(env, certificate, penalty=0.5)
+    env = vector.RecordEpisodeStatistics(env)
+    _, rewards, infos = play(env, 45, count, 1)
+    first = infos[limit]
+    assert first["_episode"].all()
+    np.testing.assert_array_equal(first["episode"]["l"], limit)
+    np.testing.assert_allclose(first["episode"]["r"], rewards[:limit].sum(axis=0))
+    # NEXT_STEP: the step in between only resets, and belongs to no episode.
+    end = 2 * limit + (mode == "NextStep")
+    np.testing.assert_array_equal(infos[end]["episode"]["l"], limit)
+    np.testing.assert_allclose(infos[end]["episode"]["r"], rewards[end - limit : end].sum(axis=0))
+    assert env.episode_count == 2 * count
+
+
+@pytest.mark.parametrize("order", ["bare", "outside", "inside"])
+@pytest.mark.parametrize("name", VECTOR)
+def test_vector_wrappers_change_neither_seeds_nor_infos_nor_decisions(name, order, certificate):
+    count = 3
+
+    def make(wrap):
+        env = gym.make_vec(CRUISE, num_envs=count, max_episode_steps=20)
+        if order == "bare":
+            return wrap(env)
+        if order == "outside":
+            return wrap(VectorSafetyShield(env, certificate, penalty=0.5))
+        return VectorSafetyShield(wrap(env), certificate, penalty=0.5)
+
+    plain, wrapped = play(make(lambda env: env), 45, count, 1), play(make(VECTOR[name]), 45, count, 1)
+    np.testing.assert_array_equal(plain[1], wrapped[1])
+    assert_same_infos(plain[2], wrapped[2])
+    if order != "bare":
+        assert sum(info["shield_intervened"].sum() for info in wrapped[2]) > 0
+        assert all(info["shield_guaranteed"].all() for info in wrapped[2])
+
+
+def test_vector_normalization_has_the_statistics_of_all_environments(certificate):
+    def make():
+        return VectorSafetyShield(gym.make_vec(CRUISE, num_envs=8), certificate)
+
+    env = vector.NormalizeObservation(make())
+    raw, normalized = play(make(), 100, 8, 1)[0], play(env, 100, 8, 1)[0]
+    every = raw.reshape(-1, raw.shape[-1])
+    expected = (raw[-1] - every.mean(axis=0)) / np.sqrt(every.var(axis=0) + env.epsilon)
+    np.testing.assert_allclose(normalized[-1], expected, rtol=1e-3, atol=1e-3)
+
+
+def test_resets_of_some_environments_pass_through_the_vector_wrappers(certificate):
+    env = gym.make_vec(CRUISE, num_envs=3, autoreset_mode="Disabled")
+    env = vector.RecordEpisodeStatistics(VectorSafetyShield(env, certificate))
+    env.reset(seed=0)
+    for action in actions(5, 3, 1):
+        env.step(action)
+    _, info = env.reset(options={"reset_mask": np.array([True, False, False])})
+    assert info["shield_guaranteed"].all()
+    np.testing.assert_array_equal(env.episode_lengths, [0, 5, 5])
+
+
+def wrapped_outside_monitor(keywords, **settings):
+    """What rl-zoo3 does with its env_wrapper and monitor_kwargs."""
+    return make_vec_env(
+        CRUISE,
+        seed=0,
+        wrapper_class=SafetyShield,
+        wrapper_kwargs=settings,
+        monitor_kwargs={"info_keywords": keywords},
+    )
+
+
+def play_stable_baselines3(env):
+    """Rewards and infos of an episode in a VecEnv of one."""
+    env.reset()
+    steps = [env.step(action[None]) for action in actions(STEPS, 1)]
+    return [float(step[1][0]) for step in steps], [step[3][0] for step in steps]
+
+
+def test_monitor_inside_the_shield_leaves_out_the_penalty_and_does_not_know_the_shields_keys(certificate):
+    env = wrapped_outside_monitor(("episode_violations", "is_success"), certificate=certificate, penalty=0.5)
+    rewards, infos = play_stable_baselines3(env)
+    paid = 0.5 * infos[-1]["episode_interventions"]
+    assert paid > 0.0
+    assert infos[-1]["episode"]["r"] == pytest.approx(sum(rewards) + paid, abs=1e-3)
+    assert infos[-1]["episode"]["episode_violations"] == 0.0
+    env = wrapped_outside_monitor(("episode_interventions",), certificate=certificate)
+    with pytest.raises(KeyError, match="episode_interventions"):
+        play_stable_baselines3(env)
+
+
+def test_shield_that_is_a_part_of_the_id_is_inside_monitor(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "examples" / "rl_zoo")
+    env = make_vec_env(
+        "shielded_cruise:ShieldedCruise-v0", seed=0, monitor_kwargs={"info_keywords": ("episode_interventions",)}
+    )
+    rewards, infos = play_stable_baselines3(env)
+    assert infos[-1]["episode"]["episode_interventions"] == infos[-1]["episode_interventions"] > 0
+    assert infos[-1]["episode"]["r"] == pytest.approx(sum(rewards), abs=1e-3)
+    assert env.get_attr("spec")[0].to_json()
+
+
+def zoo(*arguments):
+    path = [str(ROOT), str(ROOT / "examples" / "rl_zoo"), os.environ.get("PYTHONPATH")]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, path)), "OMP_NUM_THREADS": "1"}
+    run = subprocess.run(
+        [sys.executable, "-m", *map(str, arguments)], capture_output=True, text=True, env=environment, timeout=600
+    )
+    assert run.returncode == 0, run.stderr
+    return run.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    importlib.util.find_spec("rl_zoo3") is None,
+    reason="rl_zoo3 is not installed: pip install --no-deps -r examples/rl_zoo/requirements.txt",
+)
+@pytest.mark.parametrize("name", [CRUISE, "ShieldedCruise-v0"])
+def test_rl_zoo3_trains_with_our_file_and_shield(name, tmp_path):
+    packages = ["--gym-packages", "ncs_gym", "shields", "shielded_cruise"]
+    common = ["--algo", "ppo", "--env", name, *packages, "--seed", 0, "-f", tmp_path]
+    file = ROOT / "examples" / "rl_zoo" / "ncs.yml"
+    printed = zoo("rl_zoo3.train", *common, "--conf-file", file, "-n", 2048, "--eval-freq", 1000, "--eval-episodes", 1)
+    assert float(re.search(r"safety/\s+\|.*?intervention_rate +\| +([\d.e-]+)", printed, re.DOTALL)[1]) > 0.0
+    assert re.search(r"violation_steps +\| +0 ", printed)
+    (first, *_) = (tmp_path / "ppo").glob("*_1/0.monitor.csv")
+    header, *rows = csv.reader(first.read_text().splitlines()[1:])
+    assert rows
+    assert {row[header.index("episode_violations")] for row in rows} == {"0.0"}
+    assert ("episode_interventions" in header) == (name == "ShieldedCruise-v0")
+    played = zoo("rl_zoo3.enjoy", *common, "--no-render", "-n", 250)
+    assert "Episode Reward" in played
