@@ -128,7 +128,8 @@ def table_text(arms: dict[str, dict[str, Any]], references: dict[str, dict[str, 
         )
         for row in rows
     ]
-    rule = "-" * len(lines[0])
+    rule = "-" * max(map(len, lines))
+    lines = [line.rstrip() for line in lines]
     last = 2 + len(arms)
     return "\n".join([*lines[:2], rule, *lines[2:last], *([rule, *lines[last:]] if references else [])])
 
