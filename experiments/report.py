@@ -89,8 +89,8 @@ def _reading(summary: dict[str, Any]) -> str:
     known = [f"{name} ({rows[name]})" for name in summary["references"] if name in rows]
     below = f"<p>Below the rule of a table, for reference and without a shield: {escape(', '.join(known))}.</p>\n"
     return (
-        "<p>The same task, learned with and without a certified shield. Runs with equal numbers meet the same initial "
-        "states, disturbances and packet losses in all arms. Violations are those of the true state, which neither "
+        "<p>The same task, learned with and without a certified shield. In evaluation, runs with equal numbers meet "
+        "the same initial states, disturbances and packet losses in all arms. Violations are those of the true state, which neither "
         "agent nor shield sees, unless a table says that they are the estimate's.</p>\n"
         f"{_arms_explained(summary['settings'])}{below if known else ''}"
     )
@@ -155,7 +155,7 @@ def _bootstrap_note(runs: int) -> str:
 def _differences(paired: dict[str, Any], runs: int) -> str:
     if not paired["arms"]:
         return ""
-    text = f"Each arm minus {paired['baseline']}, run by run: equal numbers meet the same draws of nature. "
+    text = f"Each arm minus {paired['baseline']}, run by run: their episodes meet the same draws of nature. "
     if runs == 1:
         return difference_table(paired) + note(text + "One run per arm: there is no interval.")
     return difference_table(paired) + note(f"{text}Intervals over {runs} pairs of runs. {_bootstrap_note(runs)}")
