@@ -90,8 +90,8 @@ def _reading(summary: dict[str, Any]) -> str:
     below = f"<p>Below the rule of a table, for reference and without a shield: {escape(', '.join(known))}.</p>\n"
     return (
         "<p>The same task, learned with and without a certified shield. In evaluation, runs with equal numbers meet "
-        "the same initial states, disturbances and packet losses in all arms. Violations are those of the true state, which neither "
-        "agent nor shield sees, unless a table says that they are the estimate's.</p>\n"
+        "the same initial states, disturbances and packet losses in all arms. Violations are those of the true state, "
+        "which neither agent nor shield sees, unless a table says that they are the estimate's.</p>\n"
         f"{_arms_explained(summary['settings'])}{below if known else ''}"
     )
 
