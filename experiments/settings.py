@@ -74,9 +74,9 @@ class CompareSettings(LearningSettings):
     """Trains agents with and without the shield and compares violations, return and interventions.
 
     Synthesizes and exactly verifies a certificate, trains paired runs (equal seeds), evaluates each on the same
-    episodes (equal draws of nature), prints a table and leaves summary.json, settings.json, episodes.parquet, training.parquet,
-    report.html, figures, models, TensorBoard events and the certificate in the output folder. Started again with the
-    same folder, finished runs are kept.
+    episodes (equal draws of nature), prints a table and leaves summary.json, settings.json, episodes.parquet,
+    training.parquet, report.html, figures, models, TensorBoard events and the certificate in the output folder. Started
+    again with the same folder, finished runs are kept.
 
     Attributes:
         out: Output folder; created if it does not exist.
