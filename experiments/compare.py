@@ -96,6 +96,7 @@ def provenance(command: str, settings: LearningSettings, world: World) -> dict[s
         "settings": {name: value for name, value in content.items() if name not in INCIDENTAL},
         "plant": {"fingerprint": world.plant.fingerprint, "spectral_radius": world.plant.spectral_radius},
         "certificate": world.certificate.checksum,
+        "certificate_file": world.certificate.document,
         "versions": versions(),
     }
 
@@ -173,7 +174,8 @@ def _write(
     for name, (_, png) in figures.items():
         write_atomically(out / "figures" / f"{name}.png", png)
     world.certificate.save(out / "certificate.json")
-    write_tables(out, results, {name: summary[name] for name in ("settings", "plant", "certificate", "versions")})
+    names = ("settings", "seeds", "plant", "certificate", "certificate_file", "versions")
+    write_tables(out, results, {name: summary[name] for name in names})
     page = html_report(summary, world.verification, {caption: png for caption, png in figures.values()}, findings)
     write_atomically(out / "report.html", page)
     write_atomically(out / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")

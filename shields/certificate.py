@@ -214,14 +214,18 @@ class Certificate(FrozenArrays):
         """SHA-256 of the content of its file."""
         return _digest(json.loads(json.dumps(self._content()), parse_float=str, parse_int=str))
 
+    @property
+    def document(self) -> dict[str, Any]:
+        """The content of its file, JSON values."""
+        return {"format": FORMAT, "sha256": self.checksum, "certificate": self._content()}
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes JSON in which every float is exact; a reader never sees half a file.
 
         Raises:
             OSError: If the file cannot be written.
         """
-        document = {"format": FORMAT, "sha256": self.checksum, "certificate": self._content()}
-        write_atomically(Path(path), json.dumps(document, indent=1) + "\n")
+        write_atomically(Path(path), json.dumps(self.document, indent=1) + "\n")
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Certificate:

@@ -109,8 +109,11 @@ def test_tables_say_where_they_come_from(smoke):
     summary = json.loads((out / "summary.json").read_text())
     for name in ("episodes", "training"):
         metadata = json.loads(pq.read_schema(out / f"{name}.parquet").metadata[b"ncs-gym"])
-        assert metadata == {key: summary[key] for key in ("settings", "plant", "certificate", "versions")}
+        names = ("settings", "seeds", "plant", "certificate", "certificate_file", "versions")
+        assert metadata == {key: summary[key] for key in names}
+    assert json.loads((out / "certificate.json").read_text()) == summary["certificate_file"]
     assert Certificate.load(out / "certificate.json").checksum == summary["certificate"]
+    assert set(summary["seeds"]) == {"0", "1"}
     points = pq.read_table(out / "training.parquet").to_pylist()
     last = {row["arm"]: row["violation_steps"] for row in points if row["run"] == 0}
     assert last["shielded"] == 0
