@@ -183,4 +183,5 @@ def _title(arm: str, other: tuple[float | None, float], several: bool) -> str:
     rounding, burst = other
     if not several:
         return arm
-    return f"{arm}\n{'' if rounding is None else f'rounding {rounding:g}, '}bursts of {burst:g}"
+    losses = f"bursts of {burst:g}" if burst else "independent losses"
+    return f"{arm}\n{'' if rounding is None else f'rounding {rounding:g}, '}{losses}"

@@ -181,7 +181,12 @@ def _sweep_table(cells: list[dict[str, Any]], mode: str) -> str:
     rows = []
     for cell in cells:
         rounding = "own" if cell["quantization_step"] is None else f"{cell['quantization_step']:g}"
-        place = [f"{cell['loss']:g}", str(cell["delay"]), rounding, f"{cell['burst_length']:g}"]
+        place = [
+            f"{cell['loss']:g}",
+            str(cell["delay"]),
+            rounding,
+            f"{cell['burst_length']:g}" if cell["burst_length"] else "none",
+        ]
         for name, numbers in cell["arms"].items():
             arm = numbers | {"mode": arm_of(name, mode).mode}
             rows.append(

@@ -78,6 +78,7 @@ def sweep(settings: SweepSettings) -> None:
     summary = {
         "cells": [asdict(cell) | {"arms": _arms(part)} for cell, part in zip(cells, parts, strict=True)],
         "units": {unit.name: unit.key for unit in units},
+        "seeds": {unit.index: {"training": unit.training_seed, "evaluation": unit.evaluation_seed} for unit in units},
     } | provenance("sweep", settings, worlds[0])
     figures = heatmaps_of(summary, settings.arms)
     for name, (_, png) in figures.items():
@@ -127,7 +128,12 @@ def sweep_text(summary: dict[str, Any]) -> str:
     rows = [header]
     for cell in summary["cells"]:
         rounding = "own" if cell["quantization_step"] is None else f"{cell['quantization_step']:g}"
-        place = [f"{cell['loss']:g}", str(cell["delay"]), rounding, f"{cell['burst_length']:g}"]
+        place = [
+            f"{cell['loss']:g}",
+            str(cell["delay"]),
+            rounding,
+            f"{cell['burst_length']:g}" if cell["burst_length"] else "none",
+        ]
         for name, arm in cell["arms"].items():
             rows.append(
                 [

@@ -1,7 +1,8 @@
 """What works without the training extra, in a virtual environment of its own."""
 
+import shutil
 import subprocess
-import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -10,10 +11,17 @@ ROOT = Path(__file__).resolve().parent.parent
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def binaries(tmp_path_factory):
+# Every Python that pyproject.toml declares; the training extra is tested with the first.
+VERSIONS = ("3.11", "3.12", "3.13")
+
+
+@pytest.fixture(scope="module", params=VERSIONS)
+def binaries(request, tmp_path_factory):
+    python = shutil.which(f"python{request.param}")
+    if python is None or subprocess.run([python, "--version"], capture_output=True).returncode:
+        pytest.skip(f"python{request.param} is not on the PATH")
     folder = tmp_path_factory.mktemp("base") / "venv"
-    subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
+    subprocess.run([python, "-m", "venv", str(folder)], check=True)
     pip = [str(folder / "bin" / "python"), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     subprocess.run([*pip, "-c", str(ROOT / "constraints.txt"), str(ROOT)], check=True)
     return folder / "bin"
@@ -70,3 +78,9 @@ def test_training_adapter_says_what_is_missing(binaries, tmp_path):
     result = run(binaries / "python", "-c", "from agents import SB3VecEnv", cwd=tmp_path)
     assert result.returncode == 1
     assert "stable_baselines3" in result.stderr.splitlines()[-1]
+
+
+def test_declared_versions_are_those_tested():
+    classifiers = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["classifiers"]
+    declared = [line.rsplit(" ", 1)[1] for line in classifiers if line.startswith("Programming Language :: Python :: ")]
+    assert tuple(declared) == VERSIONS

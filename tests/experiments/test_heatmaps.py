@@ -79,11 +79,12 @@ def test_small_rates_have_another_digit():
 
 
 def test_roundings_and_bursts_have_panels_of_their_own():
-    grid = cells(["unshielded", "shielded"], roundings=(0.05, 0.1), bursts=(1.0, 3.0))
+    grid = cells(["unshielded", "shielded"], roundings=(0.05, 0.1), bursts=(0.0, 3.0))
     shown = panels(heatmap_figure(grid, ["unshielded", "shielded"], QUANTITIES["return"]))
     titles = [axis.get_title() for axis in shown]
     assert len(titles) == len(set(titles)) == 8
     assert "shielded\nrounding 0.1, bursts of 3" in titles
+    assert "shielded\nrounding 0.1, independent losses" in titles
 
 
 def test_one_channel_is_a_map_of_one_field():
