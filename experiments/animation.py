@@ -19,8 +19,6 @@ FORMATS = (".gif", ".mp4", ".png")
 REST = 2000
 # Mixtures of foreground and background that edges need.
 EDGE_SHARES = (0.35, 0.7)
-# One of the 256 stays free to mean "as before".
-MOST_COLORS = 255
 
 
 def scaled(picture: np.ndarray, width: int | None) -> Image.Image:
