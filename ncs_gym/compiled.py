@@ -10,7 +10,7 @@ from numba import njit
 # For a function that Python calls and whose file holds everything that it calls: numba looks for changes there alone.
 entry = njit(cache=True, nogil=True, error_model="numpy")
 # For what other compiled functions call: kept with these, never alone.
-inner = njit(nogil=True, error_model="numpy")
+inner = njit(nogil=True, error_model="numpy", forceinline=True)
 
 
 def version_of(file: str, *modules: str) -> int:

@@ -60,8 +60,9 @@ class Disturbance(FrozenArrays, ABC):
 
     def begin_many(self, rng: np.random.Generator, plant: LinearPlant, count: int) -> np.ndarray:
         """Returns the memories of `count` episodes along the first axis."""
-        memories = np.empty(count, dtype=object)
-        memories[:] = [self.begin(rng, plant) for _ in range(count)]
+        memories = np.full(count, None, dtype=object)
+        if type(self).begin is not Disturbance.begin:
+            memories[:] = [self.begin(rng, plant) for _ in range(count)]
         return memories
 
     def draw_many(

@@ -54,12 +54,12 @@ class GainTable:
 
     Attributes:
         nodes: Node after a prediction, and edge of a packet of age delay + i, shape (nodes, 1 + jitter + 1).
-        shapes: Sigma_k of each node, shape (nodes, n * n).
+        shapes: Sigma_k of each node, shape (n * n, nodes).
         edges: Node an edge leads to, whether the replayed history is kept, age of the newest sample used after it
             (UNKNOWN if as before), and the ages of samples used in the replay as bits (the last for all older ones);
             shape (edges, 4).
         weights: Its gain, zero where it is not used, n * p numbers, and (seen + N)^-1 of the monitor's quick test,
-            p * p numbers; shape (edges, buffer + 1, n * p + p * p).
+            p * p numbers; shape (buffer + 1, n * p + p * p, edges).
         seen: H Sigma_k H' before each update, shape (edges, buffer + 1, p, p).
     """
 
@@ -78,9 +78,9 @@ class GainTable:
         self._node_index: dict[Node, int] = {}
         self._edges = 0
         self.nodes = np.full((FIRST_CAPACITY, 1 + channel.jitter + 1), UNKNOWN, np.int32)
-        self.shapes = np.zeros((FIRST_CAPACITY, n * n))
+        self.shapes = np.zeros((n * n, FIRST_CAPACITY))
         self.edges = np.zeros((FIRST_CAPACITY, 4), np.int32)
-        self.weights = np.zeros((FIRST_CAPACITY, ages, n * p + p * p))
+        self.weights = np.zeros((ages, n * p + p * p, FIRST_CAPACITY))
         self.seen = np.zeros((FIRST_CAPACITY, ages, p, p))
         first = self._spread(plant.initial_cov, plant.initial_error.shape, 0)
         self.root = self._node(Node(first, (UNKNOWN,) * ages, (False,) * ages))
@@ -139,13 +139,13 @@ class GainTable:
             if number == len(self.nodes):
                 self._double("nodes")
                 self._double("shapes")
-            self.shapes[number] = self._spreads[node.belief].shape.ravel()
+            self.shapes[:, number] = self._spreads[node.belief].shape.ravel()
         return self._node_index[node]
 
     def _double(self, name: str) -> None:
-        array = getattr(self, name)
+        array, axis = getattr(self, name), -1 if name in ("shapes", "weights") else 0
         more = np.full_like(array, UNKNOWN) if array.dtype == np.int32 else np.zeros_like(array)
-        setattr(self, name, np.concatenate([array, more]))
+        setattr(self, name, np.concatenate([array, more], axis))
 
     def _moved(self, spread: int) -> int:
         """Returns the spread one step later."""
@@ -183,7 +183,7 @@ class GainTable:
                 spread, gain = self._updated(spread)
                 self.seen[edge, each] = seen
                 self.edges[edge, HELD] |= 1 << min(each, LAST_BIT)
-                self.weights[edge, each] = np.append(gain, estimator.inverse_of_bound(seen))
+                self.weights[each, :, edge] = np.append(gain, estimator.inverse_of_bound(seen))
             if each > 0:
                 replayed[each - 1] = self._moved(spread)
         now, then = self._spreads[belief], self._spreads[spread]

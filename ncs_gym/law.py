@@ -22,7 +22,7 @@ class Law(NamedTuple):
 
     Attributes:
         kind: Of h, whose size is 1.
-        factor: F, shape (n, n).
+        factor: F, shape (n, n), diagonal for a box.
         energy: The largest h'h of a truncated normal h.
     """
 
@@ -63,9 +63,11 @@ def add_drawn(kind, factor, energy, keys, number, out):
     if kind == BOX:
         fill_uniform(keys, number, n, h)
         for i in range(n):
+            width = factor[i, i]
             for e in range(out.shape[1]):
-                h[i, e] = 2.0 * h[i, e] - 1.0
-    elif kind == NORMAL:
+                out[i, e] += width * (2.0 * h[i, e] - 1.0)
+        return
+    if kind == NORMAL:
         fill_truncated(keys, number, energy, rank, h)
     else:
         fill_directions(keys, number, rank, h)

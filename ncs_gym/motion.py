@@ -12,7 +12,7 @@ from ncs_gym.law import add_drawn
 from ncs_gym.packets import Doubts, Transitions, follow_predictions, receive
 from ncs_gym.product import add_product, copy_rows, set_product
 from ncs_gym.report import Report, report
-from ncs_gym.samples import send, switch
+from ncs_gym.samples import CHAIN, send, switch
 from ncs_gym.system import unpacked
 
 # Stages of a step, in this order; packets of each age have a stage of their own in between.
@@ -49,15 +49,15 @@ def clip(extra, low, high, out):
 
 @inner
 def draw(system, fleet, number):
-    """Draws the disturbances and what the channel needs; numbers of draws begin at `number`."""
+    """Draws the disturbances and moves the chain of the channel; numbers of draws begin at `number`."""
     keys, d = fleet.keys, fleet.disturbance
     d.fill(0.0)
     law = system.disturbance
     add_drawn(law.kind, law.factor, law.energy, keys, number + DISTURBANCE * WIDTH, d)
     law = system.process
     add_drawn(law.kind, law.factor, law.energy, keys, number + PROCESS * WIDTH, d)
-    fill_uniform(keys, number + NETWORK * WIDTH, system.uniforms, fleet.uniforms)
     if system.bursts:
+        fill_uniform(keys, number + NETWORK * WIDTH + CHAIN, 1, fleet.uniforms[CHAIN:])
         switch(system.moves, fleet.uniforms, fleet.bad)
 
 
@@ -157,7 +157,7 @@ def _run(
         draw(system, fleet, number)
     if first <= MOVE < end:
         move(system, fleet, tick, u)
-        send(system, fleet, tick, number + SENSOR * WIDTH)
+        send(system, fleet, tick, number + SENSOR * WIDTH, number + NETWORK * WIDTH)
         progress[2] = 0
     if first <= PREDICT < end:
         progress[0], progress[1] = PREDICT, follow_predictions(nodes, fleet.node, doubtful.missing)

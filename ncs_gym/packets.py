@@ -196,10 +196,10 @@ def _update(H, table, age, edges, residual, square, chain):
         chain: Means, shape (n, count), changed in place.
     """
     (p, count), n = residual.shape, chain.shape[0]
-    weights = np.empty((table.shape[2], count))
-    for i in range(table.shape[2]):
+    weights = np.empty((table.shape[1], count))
+    for i in range(table.shape[1]):
         for k in range(count):
-            weights[i, k] = table[edges[k], age, i]
+            weights[i, k] = table[age, i, edges[k]]
     for i in range(p):
         for j in range(n):
             share = H[i, j]

@@ -79,7 +79,7 @@ def report(system, fleet, shapes, filled):
     Args:
         system: The loop.
         fleet: Whose violations are counted in place.
-        shapes: Of the nodes of the gain table, shape (nodes, n * n).
+        shapes: Of the nodes of the gain table, shape (n * n, nodes).
         filled: A `Report`.
 
     Returns:
@@ -128,9 +128,9 @@ def _observe(mean, low, high, out):
 @inner
 def _shape(shapes, node, start, rows):
     """Fills the error shapes from row `start` on."""
-    for i in range(shapes.shape[1]):
+    for i in range(shapes.shape[0]):
         for e in range(node.size):
-            rows[start + i, e] = shapes[node[e], i]
+            rows[start + i, e] = shapes[i, node[e]]
 
 
 @inner

@@ -5,15 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from ncs_gym.compiled import inner
+from ncs_gym.draws import fill_uniform
 from ncs_gym.law import add_drawn
 from ncs_gym.product import set_product
 
 # Counts never get here.
 MOST = 1 << 40
+# Rows of uniform draws: whether a packet is lost, its jitter, and the chain.
+LOSS, JITTER, CHAIN = range(3)
 
 
 @inner
-def send(system, fleet, tick, number):
+def send(system, fleet, tick, number, network):
     """Measures, rounds, loses and delays the samples of this step.
 
     Args:
@@ -21,10 +24,12 @@ def send(system, fleet, tick, number):
         fleet: Changed in place.
         tick: Steps of the whole fleet.
         number: Of the first draw of the sensors.
+        network: Of the first draw of the channel.
     """
     slot, law = tick % system.slots, system.sensor
     if not _some_send(fleet.due, slot, fleet.wait):
         return
+    fill_uniform(fleet.keys, network, min(system.uniforms, CHAIN), fleet.uniforms)
     fleet.noise.fill(0.0)
     add_drawn(law.kind, law.factor, law.energy, fleet.keys, number, fleet.noise)
     _lose(system.losses, system.most_lost, fleet.uniforms, fleet.wait, fleet.bad, fleet.lost, fleet.due[slot])
@@ -37,7 +42,7 @@ def send(system, fleet, tick, number):
 def switch(moves, draws, bad):
     """Moves the chain of the channel."""
     for e in range(bad.size):
-        bad[e] ^= draws[2, e] < moves[bad[e]]
+        bad[e] ^= draws[CHAIN, e] < moves[bad[e]]
 
 
 @inner
@@ -56,7 +61,7 @@ def _lose(losses, most_lost, draws, wait, bad, in_a_row, due):
     good_loss, bad_loss = losses[0], losses[1]
     most = most_lost if most_lost >= 0 else MOST
     for e in range(due.size):
-        lost = draws[0, e] < (bad_loss if bad[e] else good_loss)
+        lost = draws[LOSS, e] < (bad_loss if bad[e] else good_loss)
         due[e] = -1 if lost & (in_a_row[e] < most) else 0
     for e in range(due.size):
         in_a_row[e] = in_a_row[e] if wait[e] > 0 else -due[e] * (in_a_row[e] + 1)
@@ -69,7 +74,7 @@ def _delay(period, delay, jitter, draws, wait, due):
     """Adds the age of arrival where a sample is sent, shape (N,), and sets the time until the next one."""
     if jitter > 0:
         for e in range(due.size):
-            extra = np.int32(draws[1, e] * (jitter + 1))
+            extra = np.int32(draws[JITTER, e] * (jitter + 1))
             due[e] += min(extra, jitter) if due[e] >= 0 else 0
     for e in range(due.size):
         due[e] += delay if due[e] >= 0 else 0

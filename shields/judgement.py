@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from ncs_gym import product
-from ncs_gym.compiled import inner, version_of
+from ncs_gym.compiled import entry, inner, version_of
 from ncs_gym.product import add_product, copy_rows, set_product
 from shields.closest import closest_in_space, closest_on_lines
 
@@ -25,7 +25,7 @@ def _decide(rule, outlooks, shape, estimate, proposed, u, flags, margin, reason)
 
     Args:
         rule: The test and the mode.
-        outlooks: What is known of error shapes, shape (k, WEIGHT + n * n).
+        outlooks: What is known of error shapes, shape (WEIGHT + n * n, k).
         shape: Index of each environment's, shape (N,).
         estimate: x_hat, shape (n, N).
         proposed: Inputs within the limits, shape (m, N).
@@ -35,7 +35,7 @@ def _decide(rule, outlooks, shape, estimate, proposed, u, flags, margin, reason)
         reason: Filled with codes, shape (N,).
     """
     count = shape.size
-    look, offset, reach = np.empty((outlooks.shape[1], count)), np.empty(estimate.shape), np.empty(count)
+    look, offset, reach = np.empty((outlooks.shape[0], count)), np.empty(estimate.shape), np.empty(count)
     _look_up(outlooks, shape, look)
     set_product(rule.moved, estimate, offset)
     _reach(rule.columns, estimate, reach)
@@ -68,9 +68,9 @@ def _decide(rule, outlooks, shape, estimate, proposed, u, flags, margin, reason)
 @inner
 def _look_up(outlooks, shape, look):
     """Fills what is known of each environment's error shape, shape (columns, N)."""
-    for i in range(outlooks.shape[1]):
+    for i in range(outlooks.shape[0]):
         for e in range(shape.size):
-            look[i, e] = outlooks[shape[e], i]
+            look[i, e] = outlooks[i, shape[e]]
 
 
 @inner
@@ -219,6 +219,16 @@ def _fall_back(rule, look, offset, reach, bad, estimate, u, flags, margin, reaso
             margin[e], flags[PASSED, e], reason[e] = distance[k], room[k] >= rule.margin, UNSAFE if unsafe else FALLBACK
         else:
             margin[e], flags[PASSED, e], reason[e] = np.nan, False, INVALID
+
+
+@entry
+def override(actions, intervened, inputs, limits, out):
+    """Fills out with actions, shape (N, m), or what stands for inputs, shape (m, N), where the shield intervened."""
+    for i in range(limits.size):
+        limit = limits[i]
+        for e in range(intervened.size):
+            replaced = np.float32(inputs[i, e] / limit)
+            out[e, i] = replaced if intervened[e] else actions[e, i]
 
 
 @inner

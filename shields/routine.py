@@ -21,6 +21,7 @@ CORRECTION, TOTAL, TOLD = range(3)
 def _follow(
     root,
     bounds,
+    widest,
     rounding,
     margin,
     has_errors,
@@ -53,6 +54,7 @@ def _follow(
     Args:
         root: Of a `Ground`.
         bounds: Columns and reach of a `Ground`, shape (2, n).
+        widest: Of a `ShapeBook`.
         rounding: Of a `Ground`.
         margin: Of a `Ground`.
         has_errors: Of a `Ground`.
@@ -81,49 +83,75 @@ def _follow(
         guaranteed: Filled, shape (N,).
 
     Returns:
-        How many proofs do not hold; -1 if an episode began or a shape is not in the book, and nothing was done.
+        How many proofs do not hold; -1 if an episode began or a shape is not in the book: nothing but `shape` has
+        changed then.
     """
-    count = steps.size
-    restarted, moved_once = np.empty(count, np.bool_), np.empty(count, np.bool_)
-    if compare_clocks(episodes, steps, episodes_before, steps_before, next_tick, restarted, moved_once) > 0:
+    if number(numbers, nodes, shape) < 0:
         return -1
-    if _some_unknown(numbers, nodes):
-        return -1
-    number(numbers, nodes, shape)
+    known = has_errors and next_tick and _move_once(episodes, steps, episodes_before, steps_before)
+    if known and _hold(bounds[1], widest, counts[BROKEN], decided, passed, applied, reported, alarm):
+        wrong = 0
+        marks[: CERTIFIED + 1] = True
+        reason.fill(0)
+    else:
+        restarted, moved_once = np.empty(steps.size, np.bool_), np.empty(steps.size, np.bool_)
+        if compare_clocks(episodes, steps, episodes_before, steps_before, next_tick, restarted, moved_once) > 0:
+            return -1
+        wrong = track(
+            Ground(root, bounds[0], bounds[1], rounding, margin, has_errors),
+            seen,
+            shape,
+            Knowledge(counts[BROKEN], marks[INSIDE], marks[CERTIFIED]),
+            restarted,
+            moved_once,
+            decided,
+            passed,
+            fallback,
+            marks[KNOWN],
+            applied,
+            reported,
+            alarm,
+            reason,
+        )
     copy_rows(reported, estimate)
-    total = told[TOTAL].view(np.int64)
-    count_interventions(intervened, restarted, decided, proposed, counts[INTERVENTIONS], told[CORRECTION])
-    wrong = track(
-        Ground(root, bounds[0], bounds[1], rounding, margin, has_errors),
-        seen,
-        shape,
-        Knowledge(counts[BROKEN], marks[INSIDE], marks[CERTIFIED]),
-        restarted,
-        moved_once,
-        decided,
-        passed,
-        fallback,
-        marks[KNOWN],
-        applied,
-        estimate,
-        alarm,
-        reason,
-    )
-    for e in range(count):
-        steps_before[e] = steps[e]
-    for e in range(count):
-        total[e] = counts[INTERVENTIONS, e]
-        guaranteed[e] = reason[e] == 0
+    count_interventions(intervened, decided, proposed, counts[INTERVENTIONS], told[CORRECTION])
+    _tell(steps, reason, counts[INTERVENTIONS], steps_before, told[TOTAL].view(np.int64), guaranteed)
     return wrong
 
 
 @inner
-def _some_unknown(numbers, nodes):
-    """Returns whether the shape of some node is not in the book."""
-    least = 0
-    for e in range(nodes.size):
-        least = min(least, numbers[nodes[e]])
-    return least < 0
+def _move_once(episodes, steps, episodes_before, steps_before):
+    """Returns whether every environment moved just one step, in the same episode."""
+    others = 0
+    for e in range(steps.size):
+        others += (episodes[e] != episodes_before[e]) | (steps[e] != steps_before[e] + 1)
+    return others == 0
+
+
+@inner
+def _hold(reach, widest, broken, decided, passed, applied, estimate, alarm):
+    """Returns whether all proofs hold by the widest of the error shapes; if not, `track` looks at each environment."""
+    doubtful = 0
+    for e in range(broken.size):
+        doubtful += (broken[e] != 0) | (not passed[e]) | alarm[e]
+    for i in range(decided.shape[0]):
+        for e in range(broken.size):
+            doubtful += decided[i, e] != applied[i, e]
+    for i in range(estimate.shape[0]):
+        limit, width = reach[i], widest[i]
+        for e in range(broken.size):
+            doubtful += not abs(estimate[i, e]) + width <= limit
+    return doubtful == 0
+
+
+@inner
+def _tell(steps, reason, interventions, steps_before, total, guaranteed):
+    """Fills what a step tells, and moves the clock on."""
+    for e in range(steps.size):
+        steps_before[e] = steps[e]
+    for e in range(steps.size):
+        total[e] = interventions[e]
+        guaranteed[e] = reason[e] == 0
 
 
 def _compiled_follow(version, other):
@@ -133,6 +161,7 @@ def _compiled_follow(version, other):
     def follow(
         root,
         bounds,
+        widest,
         rounding,
         margin,
         has_errors,
@@ -165,6 +194,7 @@ def _compiled_follow(version, other):
         return _follow(
             root,
             bounds,
+            widest,
             rounding,
             margin,
             has_errors,

@@ -103,7 +103,7 @@ def track(
 
     Args:
         ground: What proofs stand on.
-        seen: What is known of error shapes, shape (k, EXTENT + n).
+        seen: What is known of error shapes, shape (EXTENT + n, k).
         shape: Index of each environment's, shape (N,).
         knowledge: Changed in place.
         restarted: Whether a new episode began, shape (N,).
@@ -132,7 +132,7 @@ def track(
         if not fine[e]:
             _track_one(
                 ground,
-                seen[shape[e]],
+                seen[:, shape[e]],
                 knowledge,
                 e,
                 restarted[e],
@@ -189,13 +189,13 @@ def _mark_near(seen, shape, estimate, reach, fine):
     """Clears the marks where the estimate is not finite or far out, or the error shape is not a certified one."""
     good = np.empty(fine.size)
     for e in range(fine.size):  # only usable shapes are certified
-        good[e] = seen[shape[e], CERTIFIED]
+        good[e] = seen[CERTIFIED, shape[e]]
     for e in range(fine.size):
         fine[e] &= good[e] > 0.0
     for i in range(estimate.shape[0]):
         limit = reach[i]
         for e in range(fine.size):
-            good[e] = seen[shape[e], EXTENT + i]
+            good[e] = seen[EXTENT + i, shape[e]]
         for e in range(fine.size):
             fine[e] &= abs(estimate[i, e]) + good[e] <= limit
 
@@ -251,10 +251,10 @@ def _knows_inside(ground, largest, estimate):
 
 
 @entry
-def count_interventions(intervened, restarted, decided, proposed, interventions, correction):
-    """Adds interventions to the running numbers, 0 for new episodes, and fills norms of corrections, shape (N,)."""
+def count_interventions(intervened, decided, proposed, interventions, correction):
+    """Adds interventions to the running numbers, and fills norms of corrections, shape (N,)."""
     for e in range(interventions.size):
-        interventions[e] = 0 if restarted[e] else interventions[e] + intervened[e]
+        interventions[e] += intervened[e]
     for e in range(correction.size):
         correction[e] = 0.0
     for i in range(decided.shape[0]):

@@ -8,7 +8,7 @@ import numpy as np
 
 from ncs_gym.ellipsoid import is_inside
 from shields.filter import MARGIN, SafetyFilter
-from shields.judgement import FELL_BACK, FLAGS, INTERVENED, PASSED, RADIUS, SPREAD, USABLE, WEIGHT, decide
+from shields.judgement import FELL_BACK, FLAGS, INTERVENED, PASSED, RADIUS, SPREAD, USABLE, WEIGHT, decide, override
 from shields.plane import FARTHEST, SMALLEST_RADIUS
 from shields.rule import Rule
 from shields.tracking import CERTIFIED, EXTENT, LARGEST
@@ -40,16 +40,18 @@ class ShapeBook:
     """What a filter needs to know of error shapes, worked out once per shape by the scalar test.
 
     Attributes:
-        outlooks: For the one-step test, shape (k, WEIGHT + n * n); see `judgement`.
-        seen: For proofs, shape (k, EXTENT + n); see `tracking`.
+        outlooks: For the one-step test, shape (WEIGHT + n * n, k); see `judgement`.
+        seen: For proofs, shape (EXTENT + n, k); see `tracking`.
+        widest: Largest half-widths of all shapes, shape (n,); infinite once one of them is not certified.
     """
 
     def __init__(self, safety_filter: SafetyFilter) -> None:
         self._filter = safety_filter
         n = safety_filter.plant.n
         self._index: dict[bytes, int] = {}
-        self.outlooks = np.zeros((FIRST_CAPACITY, WEIGHT + n * n))
-        self.seen = np.zeros((FIRST_CAPACITY, EXTENT + n))
+        self.outlooks = np.zeros((WEIGHT + n * n, FIRST_CAPACITY))
+        self.seen = np.zeros((EXTENT + n, FIRST_CAPACITY))
+        self.widest = np.zeros(n)
 
     def number(self, shape: np.ndarray) -> int:
         """Returns the index of a shape, (n, n)."""
@@ -60,18 +62,29 @@ class ShapeBook:
         return self._index[key]
 
     def _add(self, k: int, shape: np.ndarray) -> None:
-        if k == len(self.seen):
-            self.outlooks, self.seen = (np.concatenate([rows, rows]) for rows in (self.outlooks, self.seen))
-        outlook, seen = self.outlooks[k], self.seen[k]
+        if k == self.seen.shape[1]:
+            self.outlooks, self.seen = (np.concatenate([rows, rows], axis=1) for rows in (self.outlooks, self.seen))
+        outlook, seen = self.outlooks[:, k], self.seen[:, k]
         outlook[:] = seen[:] = 0.0
         view = self._filter.test.shape_view(shape)
         if view is None:
+            self.widest[:] = np.inf
             return
         weight, outlook[RADIUS], outlook[SPREAD] = view
         outlook[USABLE], outlook[WEIGHT:] = 1.0, weight.ravel()
         seen[SEEN], seen[LARGEST] = 1.0, self._filter.test.largest_error(shape)
         seen[CERTIFIED] = any(is_inside(shape, Sigma) for Sigma in self._filter.certificate.error_shapes)
         seen[EXTENT:] = np.sqrt(np.abs(np.diag(shape)))
+        self.widest = np.maximum(self.widest, seen[EXTENT:] if seen[CERTIFIED] else np.inf)
+
+
+def overridden(actions: np.ndarray, decisions: Decisions, limits: np.ndarray) -> np.ndarray:
+    """Returns the actions, shape (N, m), with those that stand for the inputs decided where the shield intervened."""
+    numbers = np.asarray(actions)
+    numbers = numbers if numbers.dtype == np.float32 else numbers.astype(np.float64)
+    out = np.empty_like(numbers)
+    override(numbers, decisions.intervened, decisions.inputs, limits, out)
+    return out
 
 
 class VectorFilter:

@@ -31,7 +31,7 @@ from shields.routine import (
     follow,
 )
 from shields.tracking import OTHER_STEPS, Ground, Knowledge, compare_clocks, count_interventions, number, track
-from shields.vector_filter import Decisions, VectorFilter
+from shields.vector_filter import Decisions, VectorFilter, overridden
 from shields.wrapper import certificate_for
 
 # Reasons by code, see `tracking`.
@@ -114,6 +114,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         self._reason = np.full(count, OTHER_STEPS)
         self._some_wrong = True
         self._no_reason = np.full(count, "", dtype=object)
+        self._no_reason.flags.writeable = False
         # What the clock reads while a step is under way: if it raises, the next does not follow from what is known.
         self._interrupted = Clock(np.full(count, -1), np.full(count, -1, np.int32), -2)
         self._clock: Clock | None = None
@@ -145,8 +146,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         proposed = self._inner.inputs_of(actions)
         decisions = self._batch.decide(self._estimate, self._shape_number, proposed)
         if self.filter.mode != "monitor" and np.count_nonzero(decisions.intervened):
-            overriding = (decisions.inputs.T / self.filter.plant.u_max).astype(np.float32)
-            actions = np.where(decisions.intervened[:, None], overriding, np.asarray(actions))
+            actions = overridden(actions, decisions, self.filter.plant.u_max)
         before, self._clock = self._clock, self._interrupted
         observation, rewards, terminated, truncated, info = self.env.step(actions)
         told, guaranteed = np.empty((TOLD, self.num_envs)), np.empty(self.num_envs, np.bool_)
@@ -161,7 +161,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             "shield_correction": told[CORRECTION],
             "shield_margin": decisions.margin,
             "shield_guaranteed": guaranteed,
-            "shield_reason": WHY[self._reason] if self._some_wrong else self._no_reason.copy(),
+            "shield_reason": WHY[self._reason] if self._some_wrong else self._no_reason,
             "episode_interventions": told[TOTAL].view(np.int64),
         }
         return observation, rewards, terminated, truncated, info | added
@@ -184,6 +184,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         return follow(
             ground.root,
             self._bounds,
+            self._batch.book.widest,
             ground.rounding,
             ground.margin,
             ground.has_errors,
@@ -236,9 +237,8 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             charged = charged & ~restarted
         rewards = rewards - self.penalty * charged if self.penalty else rewards
         correction = np.empty(self.num_envs)
-        count_interventions(
-            decisions.intervened, restarted, decisions.inputs, proposed, self._interventions, correction
-        )
+        count_interventions(decisions.intervened, decisions.inputs, proposed, self._interventions, correction)
+        self._interventions[restarted] = 0
         self._observe(info, restarted, moved_once, decisions)
         self._clock = now
         if some_restarted:
@@ -324,7 +324,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         if number(self._numbers, nodes, numbers) < 0:
             n = self.filter.plant.n
             for node in np.unique(nodes[numbers < 0]).tolist():
-                self._numbers[node] = self._batch.book.number(table.shapes[node].reshape(n, n).copy())
+                self._numbers[node] = self._batch.book.number(table.shapes[:, node].reshape(n, n).copy())
             number(self._numbers, nodes, numbers)
         return numbers
 
@@ -346,7 +346,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             "shield_correction": correction,
             "shield_margin": decisions.margin,
             "shield_guaranteed": self._reason == 0,
-            "shield_reason": WHY[self._reason] if self._some_wrong else self._no_reason.copy(),
+            "shield_reason": WHY[self._reason] if self._some_wrong else self._no_reason,
             "episode_interventions": self._interventions.copy(),
         }
 
@@ -381,7 +381,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         book = self._batch.book
         self._estimate = self._reported(final, "estimate", np.nan)
         shapes = [book.number(final["error_shape"][e].reshape(n, n).copy()) for e in np.flatnonzero(done).tolist()]
-        self._shape_number = self._shape_number.copy()
+        self._shape_number = np.zeros(self.num_envs, np.int64)
         self._shape_number[done] = shapes
         knowledge = Knowledge(*(array.copy() for array in self._knowledge))
         never = np.zeros(self.num_envs, np.bool_)
