@@ -9,6 +9,7 @@ from ncs_gym import product
 from ncs_gym.compiled import entry, inner, version_of
 from ncs_gym.product import add_product, copy_rows, set_product
 from shields.closest import closest_in_space, closest_on_lines
+from shields.rule import unpacked
 
 # What became of an input; the names are those of `Decision.reason`.
 SAFE, PROJECTED, FALLBACK, UNSAFE, INVALID = range(5)
@@ -241,11 +242,12 @@ def _compiled_decide(version, other):
     """Returns `_decide`, kept on disk for one version of everything that it calls."""
 
     @njit(cache=True, nogil=True)
-    def decide(rule, outlooks, shape, estimate, proposed, u, flags, margin, reason):
+    def decide(counts, numbers, outlooks, shape, estimate, proposed, u, flags, margin, reason):
         if version + other >= 0:
+            rule = unpacked(counts, numbers)
             _decide(rule, outlooks, shape, estimate, proposed, u, flags, margin, reason)
 
     return decide
 
 
-decide = _compiled_decide(version_of(__file__, "closest"), version_of(product.__file__))
+decide = _compiled_decide(version_of(__file__, "closest", "rule"), version_of(product.__file__))

@@ -10,7 +10,7 @@ from ncs_gym.ellipsoid import is_inside
 from shields.filter import MARGIN, SafetyFilter
 from shields.judgement import FELL_BACK, FLAGS, INTERVENED, PASSED, RADIUS, SPREAD, USABLE, WEIGHT, decide, override
 from shields.plane import FARTHEST, SMALLEST_RADIUS
-from shields.rule import Rule
+from shields.rule import Rule, packed
 from shields.tracking import CERTIFIED, EXTENT, LARGEST
 from shields.tracking import USABLE as SEEN
 
@@ -97,7 +97,7 @@ class VectorFilter:
     def __init__(self, safety_filter: SafetyFilter) -> None:
         self.scalar, self.book = safety_filter, ShapeBook(safety_filter)
         test, plant, mode = safety_filter.test, safety_filter.plant, safety_filter.mode
-        self._rule = Rule(
+        rule = Rule(
             moved=np.ascontiguousarray(test.moved),
             effect=np.ascontiguousarray(test.effect),
             columns=test.columns,
@@ -113,6 +113,8 @@ class VectorFilter:
             monitors=mode == "monitor",
             projects=mode == "project",
         )
+        # Of decisions, and of margins without an input.
+        self._rule, self._watching = packed(rule), packed(rule._replace(monitors=True, projects=False))
 
     def decide(self, estimates: np.ndarray, numbers: np.ndarray, inputs_proposed: np.ndarray) -> Decisions:
         """Returns what to apply.
@@ -126,12 +128,13 @@ class VectorFilter:
 
     def margins(self, estimates: np.ndarray, numbers: np.ndarray) -> np.ndarray:
         """Returns the margin of no input, shape (N,)."""
-        rule = self._rule._replace(monitors=True, projects=False)
-        return self._decided(rule, estimates, numbers, np.zeros((self.scalar.plant.m, numbers.size))).margin
+        return self._decided(self._watching, estimates, numbers, np.zeros((self.scalar.plant.m, numbers.size))).margin
 
-    def _decided(self, rule: Rule, estimates: np.ndarray, numbers: np.ndarray, proposed: np.ndarray) -> Decisions:
+    def _decided(
+        self, rule: tuple[np.ndarray, np.ndarray], estimates: np.ndarray, numbers: np.ndarray, proposed: np.ndarray
+    ) -> Decisions:
         count = numbers.size
         u, flags = np.empty_like(proposed), np.empty((FLAGS, count), np.bool_)
         margin, reason = np.empty(count), np.empty(count, np.int64)
-        decide(rule, self.book.outlooks, numbers, estimates, proposed, u, flags, margin, reason)
+        decide(*rule, self.book.outlooks, numbers, estimates, proposed, u, flags, margin, reason)
         return Decisions(u, flags[INTERVENED], flags[PASSED], flags[FELL_BACK], margin, reason)
