@@ -10,8 +10,9 @@ from filterpy.kalman import KalmanFilter
 from scipy.linalg import solve_triangular
 
 from ncs_gym.channel import Channel, Packet
-from ncs_gym.ellipsoid import is_inside, outer_sum, sum_gauge
+from ncs_gym.ellipsoid import is_inside, outer_sum
 from ncs_gym.error_set import ErrorSet, certified_error_set
+from ncs_gym.minkowski import outside_sum
 from ncs_gym.plant import FLAT_INFLATION, INFLATION, LinearPlant
 
 # Per dimension, the growth of computed shapes that covers the rounding of F S F' (see `_grown`).
@@ -22,7 +23,7 @@ ALARM_TOLERANCE = 1e-9
 LARGEST_COVARIANCE = 1e12
 # Factors of covariances keep this many bits, and shapes are rounded up to multiples of this in coordinates where the
 # certified set of age 0 is the unit ball. Then both recur when a pattern of arrivals does, and can be tabulated.
-COVARIANCE_BITS, SHAPE_STEP = 8, 2.0**-16
+COVARIANCE_BITS, SHAPE_STEP = 6, 2.0**-13
 # Shares mu that the set-membership gain is chosen from; any share is sound.
 SHARES = np.linspace(0.01, 0.99, 99)
 
@@ -297,11 +298,11 @@ class Estimator:
         The ellipsoid of shape H Sigma H' + N lies inside that sum, so passing it settles the matter.
         """
         if residual @ _solved(spread + self._noise, residual) > 1.0:
-            self.alarm |= self.is_impossible(residual, spread)
+            self.alarm |= bool(self.are_impossible(residual[None], spread)[0])
 
-    def is_impossible(self, residual: np.ndarray, spread: np.ndarray) -> bool:
-        """Returns whether a residual, shape (p,), lies outside E(spread) + E(N), spread = H Sigma_k H'."""
-        return sum_gauge(residual, spread, self._noise) > 1.0 + ALARM_TOLERANCE
+    def are_impossible(self, residuals: np.ndarray, spread: np.ndarray) -> np.ndarray:
+        """Returns which residuals, shape (k, p), lie outside E(spread) + E(N), spread = H Sigma_k H'."""
+        return outside_sum(residuals, spread, self._noise, ALARM_TOLERANCE)
 
     def inverse_of_bound(self, spread: np.ndarray) -> np.ndarray:
         """Returns (spread + N)^-1, shape (p, p), of the quick test: r'(spread + N)^-1 r <= 1 is possible."""

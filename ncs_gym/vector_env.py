@@ -248,9 +248,13 @@ class NCSVectorEnv(VectorEnv):
 
     def _look_closer(self, doubtful: int) -> None:
         """Raises the alarm for residuals beyond the quick test that are beyond the exact one, too."""
-        for (_, e, edge, each), residual in zip(self._doubts[:doubtful].tolist(), self._residuals, strict=False):
-            seen = self._table.seen[edge, each]
-            self._fleet.alarm[e] |= self.single.estimator.is_impossible(residual, seen)
+        _, who, edges, ages = self._doubts[:doubtful].T
+        seen, residuals = self._table.seen[edges, ages], self._residuals[:doubtful]
+        groups, group = np.unique(np.column_stack([edges, ages]), axis=0, return_inverse=True)
+        for number in range(len(groups)):
+            rows = group.ravel() == number
+            impossible = self.single.estimator.are_impossible(residuals[rows], seen[rows][0])
+            self._fleet.alarm[who[rows][impossible]] = 1
 
     def _begin(self, mask: np.ndarray, starts: np.ndarray | None) -> None:
         """Starts episodes where `mask` says so, at `starts` (N, n) or drawn from the initial set."""

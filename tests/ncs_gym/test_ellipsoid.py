@@ -6,6 +6,7 @@ from scipy.optimize import minimize
 
 from ncs_gym import Ellipsoid
 from ncs_gym.ellipsoid import is_inside, joined, outer_sum, sum_gauge
+from ncs_gym.minkowski import outside_sum
 
 seeds = st.integers(0, 10_000)
 
@@ -181,3 +182,30 @@ def test_joined_ellipsoid_holds_both_and_touches_each(n):
         assert n == 1 or values.max() == pytest.approx(1.0)
     flat = np.zeros((n, n))
     np.testing.assert_allclose(joined(first, flat), first)
+
+
+@pytest.mark.parametrize("size", [1, 2, 4])
+@pytest.mark.parametrize("seed", range(4))
+def test_points_outside_a_sum_are_found_as_by_minimization(seed, size):
+    rng = np.random.default_rng(seed)
+    first, second = random_shape(rng, size), 10.0 ** rng.uniform(-6, 6) * random_shape(rng, size)
+    if seed == 3:
+        first = np.outer(first[0], first[0])
+    directions = rng.standard_normal((40, size))
+    boundary = np.array([Ellipsoid(first).extreme_point(c) + Ellipsoid(second).extreme_point(c) for c in directions])
+    factors = np.concatenate([1.0 + 10.0 ** rng.uniform(-7, 0, 20), 1.0 - 10.0 ** rng.uniform(-7, 0, 20)])
+    points = factors[:, None] * boundary
+    np.testing.assert_array_equal(outside_sum(points, first, second, 0.0), factors > 1.0)
+    for point, factor in zip(points, factors, strict=True):
+        if abs(factor - 1.0) > 1e-5:
+            assert (sum_gauge(point, first, second) > 1.0) == (factor > 1.0)
+    assert not outside_sum(boundary, first, second, 1e-9).any()
+
+
+def test_what_is_not_a_number_lies_outside_a_sum_and_a_flat_second_set_is_allowed():
+    shape = np.diag([4.0, 1.0])
+    points = np.array([[np.nan, 0.0], [np.inf, 0.0], [2.9, 0.0], [3.1, 0.0], [1e200, 0.0]])
+    np.testing.assert_array_equal(outside_sum(points, shape, np.eye(2), 0.0), [True, True, False, True, True])
+    flat = np.diag([1.0, 0.0])
+    np.testing.assert_array_equal(outside_sum(points[2:], shape, flat, 0.0), [False, True, True])
+    assert outside_sum(np.zeros((0, 2)), shape, flat, 0.0).dtype == np.bool_
