@@ -122,10 +122,14 @@ class Ellipsoid(FrozenArrays):
 
     def farthest_points(self, centers: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """Returns what `farthest_point` does for each row of centers (count, n), shape (count, n)."""
+        from ncs_gym.roots import fill_largest_roots  # the compiler takes half a second to import
+
         factor = self.factor
         values, vectors = np.linalg.eigh(factor.T @ weight @ factor)
-        slopes = centers @ (weight @ factor @ vectors)
-        coordinates = slopes / (_largest_roots(slopes, values)[:, None] - values)
+        slopes, roots = np.ascontiguousarray(centers @ (weight @ factor @ vectors)), np.empty(len(centers))
+        fill_largest_roots(slopes, values, roots)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            coordinates = slopes / (roots[:, None] - values)
         coordinates[~np.isfinite(coordinates).all(axis=1)] = 0.0
         missing = np.maximum(1.0 - (coordinates**2).sum(axis=1), 0.0)
         longest = coordinates[:, -1]
@@ -164,25 +168,6 @@ class Ellipsoid(FrozenArrays):
         missing = max(1.0 - float(coordinates @ coordinates), 0.0)
         coordinates[-1] += np.copysign(np.sqrt(missing), coordinates[-1]) if missing > 1e-9 else 0.0
         return factor @ (vectors @ (coordinates / max(1.0, float(np.linalg.norm(coordinates)))))
-
-
-def _largest_roots(slopes: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Returns nu >= max(values) with sum (slope_i / (nu - value_i))^2 = 1 for each row of slopes (count, n).
-
-    The norm as a function of nu is convex and falling, and so is its inverse concave: Newton on 1/norm from the left of
-    the root rises monotonically and converges fast.
-    """
-    lengths = np.linalg.norm(slopes, axis=1)
-    nu = values[-1] + np.maximum(np.abs(slopes[:, -1]), 1e-12 * np.maximum(values[-1], lengths))
-    for _ in range(40):
-        gap = nu[:, None] - values
-        square = ((slopes / gap) ** 2).sum(axis=1)
-        slope = (slopes**2 / gap**3).sum(axis=1)
-        step = np.where(square > 1.0, square * (np.sqrt(square) - 1.0) / np.maximum(slope, 1e-300), 0.0)
-        nu = nu + step
-        if not (step > 1e-15 * nu).any():
-            break
-    return nu
 
 
 def is_inside(inner: np.ndarray, outer: np.ndarray) -> bool:
