@@ -41,6 +41,7 @@ COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
     "render": ("RenderSettings", "experiments.render:render", {"render": ("pygame",)}),
     "synthesize": ("SynthesizeSettings", "experiments.certificates:synthesize_file", {}),
     "verify": ("VerifySettings", "experiments.certificates:verify_file", {}),
+    "certify": ("CertifySettings", "experiments.certify:certify", {}),
     "audit": ("AuditSettings", "experiments.audit:audit", {}),
     "reproduce": ("ReproduceSettings", "experiments.reproduce:reproduce", {}),
 }

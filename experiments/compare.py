@@ -16,7 +16,8 @@ from experiments.settings import CompareSettings, LearningSettings
 from experiments.settings_file import save_settings, settings_json
 from experiments.summary import paired_differences, summarize_arm, table_text, way_covered
 from experiments.tables import write_tables
-from experiments.unit import Learner, Unit, UnitResult, versions
+from experiments.unit import Learner, Unit, UnitResult
+from experiments.versions import versions
 from experiments.worlds import World, world_of
 from shields.storage import write_atomically
 

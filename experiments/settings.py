@@ -207,6 +207,41 @@ class VerifySettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CertifySettings:
+    """Attacks shielded loops with everything the assumptions allow, and counts what leaves the safe set.
+
+    Registered environments and random plants, behind every kind of channel; disturbances that push the next state
+    farthest out, starts, first errors and sensor noise of full size; random and hostile agents.
+
+    Attributes:
+        steps: In all, at least; whole blocks of `envs` episodes are run, one of every case at the least.
+        out: Folder; an interrupted campaign goes on where it was, and one with more steps adds to it.
+        random_plants: How many random plants, each behind four kinds of channels.
+        envs: Episodes of a block, run side by side.
+        jobs: Worker processes.
+        unshielded: Let the shield only watch: what happens without it.
+        seed: Of the campaign, >= 0.
+    """
+
+    steps: float = 1e8
+    out: Path = Path("runs/certify")
+    random_plants: int = 4
+    envs: int = 2048
+    jobs: int = 2
+    unshielded: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        if not 1.0 <= self.steps < 1e15:
+            raise ValueError(f"--steps must be at least 1 and below 1e15, got {self.steps:g}")
+        for name, least in (("random_plants", 0), ("envs", 4), ("jobs", 1), ("seed", 0)):
+            if getattr(self, name) < least:
+                flag = name.replace("_", "-")
+                raise ValueError(f"--{flag} must be at least {least}, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, kw_only=True)
 class AuditSettings:
     """Checks the printed numbers of the paper (Liu et al. Section 5) claim by claim, from its own data.
 

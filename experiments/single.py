@@ -16,7 +16,8 @@ from experiments.execution import results_of
 from experiments.settings import EvaluateSettings, TrainSettings
 from experiments.settings_file import save_settings
 from experiments.summary import summarize_arm, table_text
-from experiments.unit import UnitResult, versions
+from experiments.unit import UnitResult
+from experiments.versions import versions
 from experiments.worlds import world_of
 from ncs_gym.env import ncs_env
 from shields.storage import write_atomically

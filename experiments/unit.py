@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import platform
 import shutil
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import asdict, dataclass
-from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal
 
@@ -22,15 +18,12 @@ from agents.evaluation import Episode, Policy, evaluate
 from agents.settings import AgentSettings
 from agents.training import TrainingResult, train, untrained
 from agents.trajectory import Trajectory
+from experiments.versions import versions
 from ncs_gym import Channel
 from ncs_gym.env import ncs_env
 from shields import Certificate
 
 Learner = Literal["agent", "untrained", "gain", "zero"]
-# What results depend on besides the settings.
-PACKAGES = ("ncs-gym", "gymnasium", "stable-baselines3", "sb3-contrib", "torch", "cvxpy", "clarabel", "numpy", "scipy")
-PACKAGES += ("filterpy", "numba")
-OURS = ("ncs_gym", "shields", "agents", "experiments")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,26 +164,6 @@ def run_unit(unit: Unit, on_progress: Callable[[int], None], log_folder: Path | 
         trajectory=evaluation.trajectory,
         files=trained.agent.files() if trained else {},
     )
-
-
-def versions() -> dict[str, str]:
-    """Returns the versions of what results depend on, as far as installed, and a digest of this project's source."""
-    found = {"python": platform.python_version()}
-    for name in PACKAGES:
-        with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found | {"source": _source_digest()}
-
-
-@cache
-def _source_digest() -> str:
-    """Returns a SHA-256 over the source of the four packages: the registered environments are code, too."""
-    root = Path(__file__).resolve().parent.parent
-    files = sorted(path for package in OURS for path in (root / package).rglob("*.py"))
-    digest = hashlib.sha256()
-    for path in files:
-        digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()
 
 
 def _policy(unit: Unit, trained: TrainingResult | None) -> Policy:

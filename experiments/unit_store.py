@@ -13,14 +13,11 @@ import numpy as np
 from agents.callbacks import TrainingPoint
 from agents.evaluation import Episode
 from agents.trajectory import Trajectory
+from experiments.errors import ResultsError
 from experiments.unit import Unit, UnitResult
 from shields.storage import write_atomically
 
 FORMAT = "ncs-gym unit 1"
-
-
-class ResultsError(ValueError):
-    """A results file is missing, damaged or of another experiment."""
 
 
 class UnitStore:

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from agents.settings import PPOSettings
+from experiments.errors import ResultsError
 from experiments.execution import results_of
 from experiments.unit import Unit, run_unit
-from experiments.unit_store import ResultsError, UnitStore
+from experiments.unit_store import UnitStore
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,70 @@
+"""Nature and agents at their worst within the assumptions."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+
+from ncs_gym import AdversarialDisturbance, NCSVectorEnv
+from ncs_gym.law import SPHERE, Law
+from ncs_gym.system import packed, system_of
+from shields import Certificate
+
+# Points on a boundary are pulled in by rounding.
+INWARD = 1.0 - 1e-12
+
+
+class WorstCaseVectorEnv(NCSVectorEnv):
+    """Disturbances that push the next state farthest out of S; starts, first errors and sensor noise of full size.
+
+    Args:
+        num_envs: N.
+        certificate: Of S.
+        settings: Those of `NCSEnv` without disturbance and initial set.
+    """
+
+    def __init__(self, num_envs: int, certificate: Certificate, **settings: Any) -> None:
+        push = AdversarialDisturbance(certificate.M)
+        super().__init__(num_envs, disturbance=push, initial_set=certificate.safe_set, **settings)
+        system = system_of(self.single, None)
+        sensor = Law(SPHERE, INWARD * self.plant.sensor_noise.bound.factor)
+        self._counts, self._constants = packed(system._replace(sensor=sensor))
+
+    def _begin(self, mask: np.ndarray, starts: np.ndarray | None) -> None:
+        """Starts episodes on the boundary of S, with first estimates on the boundary of their errors' set."""
+        super()._begin(mask, starts)
+        chosen, rng = np.flatnonzero(mask), self.np_random
+        states = self.single.initial_set.sample_boundary_many(rng, len(chosen))
+        errors = self.plant.initial_noise.bound.sample_boundary_many(rng, len(chosen))
+        self._fleet.state[:, chosen] = (1.0 - 1e-9) * states.T
+        self._fleet.mean[:, chosen] = self._fleet.state[:, chosen] + INWARD * errors.T
+
+
+class HostileAgents:
+    """Actions for N environments, a quarter each: random, outwards, the certified gain turned round, and bang-bang.
+
+    Args:
+        env: The environments.
+        certificate: Whose set and gain they turn against.
+        rng: Source of randomness.
+    """
+
+    def __init__(self, env: NCSVectorEnv, certificate: Certificate, rng: np.random.Generator) -> None:
+        plant, self._rng = env.plant, rng
+        self._outwards = (plant.B.T @ certificate.M @ plant.A).T
+        self._turned = -1e3 * (certificate.K / plant.u_max[:, None]).T
+        ends = [env.num_envs * quarter // 4 for quarter in range(5)]
+        self._random, self._out, self._back, self._bang = (slice(*pair) for pair in itertools.pairwise(ends))
+        self._actions = np.zeros((env.num_envs, plant.m), np.float32)
+        self._signs = rng.choice([-1.0, 1.0], self._actions[self._bang].shape)
+
+    def act(self, estimates: np.ndarray) -> np.ndarray:
+        """Returns the actions, shape (N, m), for estimates (N, n); the array is used again."""
+        actions = self._actions
+        actions[self._random] = self._rng.uniform(-1.0, 1.0, actions[self._random].shape)
+        actions[self._out] = np.sign(estimates[self._out] @ self._outwards)
+        actions[self._back] = np.clip(estimates[self._back] @ self._turned, -1.0, 1.0)
+        actions[self._bang] = self._signs
+        return actions
