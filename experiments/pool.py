@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import queue
-import signal
 import sys
-import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from multiprocessing.managers import SyncManager
@@ -16,6 +13,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from experiments.parent import belong_to_parent
 from experiments.unit import Unit, UnitResult, run_unit
 
 # How often the progress bar looks for news [s].
@@ -45,10 +43,10 @@ def run_all(
     context = multiprocessing.get_context("spawn")
     interval = REFRESH if sys.stderr.isatty() else QUIET_REFRESH
     manager = SyncManager(ctx=context)
-    manager.start(_belong_to_parent)
+    manager.start(belong_to_parent)
     with (
         manager,
-        ProcessPoolExecutor(jobs, mp_context=context, initializer=_belong_to_parent) as executor,
+        ProcessPoolExecutor(jobs, mp_context=context, initializer=belong_to_parent) as executor,
         tqdm(total=total_steps, unit="step", unit_scale=True, mininterval=interval, file=sys.stderr) as bar,
     ):
         news, stop = manager.Queue(), manager.Event()
@@ -64,19 +62,6 @@ def run_all(
 
 class Stopped(RuntimeError):
     """Another unit failed, or the user interrupted."""
-
-
-def _belong_to_parent() -> None:
-    """Leaves the reaction to Ctrl-C to the parent, and ends this process when the parent does, however it does."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-
-    def wait_for_parent() -> None:
-        if parent is not None:
-            parent.join()
-        os._exit(1)
-
-    threading.Thread(target=wait_for_parent, daemon=True).start()
 
 
 def _work(unit: Unit, log_folder: Path | None, news: Any, stop: Any) -> UnitResult:

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import os
 
+# One thread per process, as in `ncs`: tests run side by side, and on small matrices waiting threads only burn time.
+# Read when numpy is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import pytest
 
 from ncs_gym import LinearPlant, truck_trailer
