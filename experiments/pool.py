@@ -73,7 +73,7 @@ def _work(unit: Unit, log_folder: Path | None, news: Any, stop: Any) -> UnitResu
         due += steps
         if due >= NEWSWORTHY:
             if stop.is_set():
-                raise Stopped(unit.name)
+                raise Stopped(f"{unit.name} gave up: another unit failed, or the user interrupted")
             news.put(due)
             due = 0
 
