@@ -16,7 +16,7 @@ import pytest
 
 from agents.agent import Agent
 from shields import Certificate, verify
-from tests.command import assert_one_sentence, environment, ncs, ncs_process
+from tests.command import Run, assert_one_sentence, environment, ncs, ncs_process
 
 ARM_KEYS = {
     "train_steps",
@@ -46,9 +46,13 @@ def is_alive(pid):
 
 
 @pytest.fixture(scope="module")
-def smoke(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("smoke")
-    return folder / "out", ncs_process("compare", "--smoke", "--out", folder / "out")
+def smoke(made_once):
+    def make(folder):
+        run = ncs_process("compare", "--smoke", "--out", folder / "out")
+        (folder / "run.json").write_text(json.dumps([run.returncode, run.stdout, run.stderr]))
+
+    folder = made_once("smoke", make)
+    return folder / "out", Run(*json.loads((folder / "run.json").read_text()))
 
 
 def test_smoke_run_leaves_every_file_of_the_contract(smoke):
@@ -151,7 +155,7 @@ def test_killed_run_goes_on_and_ends_like_an_uninterrupted_one(smoke, tmp_path):
         time.sleep(0.1)
     assert not (out / "summary.json").exists()
     finished = len(list(units.glob("*.json")))
-    again = ncs("compare", "--smoke", "--out", out)
+    again = ncs("compare", "--smoke", "--out", out, "--jobs", 1)
     assert again.returncode == 0, again.stderr
     assert f"{finished} of 12 units were finished before" in again.stderr
     assert (out / "summary.json").read_bytes() == (smoke[0] / "summary.json").read_bytes()
@@ -207,7 +211,7 @@ def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path):
     assert {"loss", "delay", "burst_length", "arm", "run", "eval_violating_episodes"} <= set(rows[0])
     assert {path.name for path in (out / "figures").iterdir()} >= {"violations.png", "interventions.png", "return.png"}
     assert "data:image/png;base64," in (out / "report.html").read_text()
-    more = ncs("sweep", "--config", out / "settings.json", "--losses", "0.4", "0.5")
+    more = ncs("sweep", "--config", out / "settings.json", "--losses", "0.4", "0.5", "--jobs", 1)
     assert more.returncode == 0, more.stderr
     assert "4 of 8 units were finished before" in more.stderr
 
