@@ -3,33 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
+from agents.history import TrainingPoint
 from agents.sb3_vec_env import SB3VecEnv
 
 # Where every step of all environments is a rollout, the history has this many points.
 POINTS = 200
-
-
-@dataclass(frozen=True)
-class TrainingPoint:
-    """Totals so far.
-
-    Attributes:
-        steps: Environment steps so far.
-        episode_return: Mean over the last finished episodes, shield penalties included (NaN before the first).
-        violation_steps: Steps so far whose true state violated the safe box.
-        interventions: Steps so far in which the shield intervened.
-    """
-
-    steps: int
-    episode_return: float
-    violation_steps: int
-    interventions: int
 
 
 class SafetyCallback(BaseCallback):

@@ -16,6 +16,8 @@ INTERRUPTED = 130
 def main() -> None:
     """Parses the command line and runs the command; errors become one sentence on stderr and exit code 2."""
     signal.signal(signal.SIGTERM, _interrupt)
+    # Matrices are small: more threads only wait for each other. Read when numpy is imported, here and in workers.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         _require_own_agents()
         settings = _parse(sys.argv[1:])

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from experiments.block import Block, Campaign, run_block
 from experiments.cases import Case, cases
-from experiments.child import belong_to_parent
+from experiments.parent import belong_to_parent
 from experiments.errors import SafetyBroken
 from experiments.settings import CertifySettings
 from experiments.tally import Tally

@@ -13,7 +13,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from experiments.child import belong_to_parent
+from experiments.parent import belong_to_parent
 from experiments.unit import Unit, UnitResult, run_unit
 
 # How often the progress bar looks for news [s].
@@ -73,7 +73,7 @@ def _work(unit: Unit, log_folder: Path | None, news: Any, stop: Any) -> UnitResu
         due += steps
         if due >= NEWSWORTHY:
             if stop.is_set():
-                raise Stopped(unit.name)
+                raise Stopped(f"{unit.name} gave up: another unit failed, or the user interrupted")
             news.put(due)
             due = 0
 

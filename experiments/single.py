@@ -6,7 +6,6 @@ import json
 from dataclasses import asdict
 from typing import Any
 
-from agents.agent import Agent
 from agents.control_loop import ControlLoop, Shielding
 from agents.evaluation import evaluate
 from experiments.arms import arm_of
@@ -55,6 +54,8 @@ def evaluate_agent(settings: EvaluateSettings) -> None:
         Infeasible: If no certificate is found.
         OSError: If the summary cannot be written.
     """
+    from agents.agent import Agent  # takes torch, which `train_agent` leaves to its workers
+
     agent = Agent.load(settings.model)
     own = ncs_env(ControlLoop(env=agent.env, channel=agent.channel).single()).channel
     channel = channel_of(settings.channel, own) or agent.channel

@@ -8,20 +8,22 @@ import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from agents.callbacks import TrainingPoint
 from agents.control_loop import ControlLoop, Shielding
 from agents.evaluation import Episode, Policy, evaluate
+from agents.history import TrainingPoint
 from agents.settings import AgentSettings
-from agents.training import TrainingResult, train, untrained
 from agents.trajectory import Trajectory
 from experiments.versions import versions
 from ncs_gym import Channel
 from ncs_gym.env import ncs_env
 from shields import Certificate
+
+if TYPE_CHECKING:
+    from agents.training import TrainingResult
 
 Learner = Literal["agent", "untrained", "gain", "zero"]
 
@@ -140,6 +142,8 @@ def run_unit(unit: Unit, on_progress: Callable[[int], None], log_folder: Path | 
     """
     trained = None
     if unit.learner == "agent":
+        from agents.training import train  # torch, which the process that only collects results does without
+
         if log_folder is not None:
             shutil.rmtree(log_folder, ignore_errors=True)
         trained = train(
@@ -172,6 +176,8 @@ def _policy(unit: Unit, trained: TrainingResult | None) -> Policy:
         return lambda observations, infos: trained.agent.act(observations)
     plant = ncs_env(unit.loop.single()).plant
     if unit.learner == "untrained":
+        from agents.training import untrained
+
         agent = untrained(unit.loop, unit.training_seed, unit.algorithm, unit.settings)
         return lambda observations, infos: agent.act(observations)
     if unit.learner == "gain":

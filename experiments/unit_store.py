@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from agents.callbacks import TrainingPoint
 from agents.evaluation import Episode
+from agents.history import TrainingPoint
 from agents.trajectory import Trajectory
 from experiments.errors import ResultsError
 from experiments.unit import Unit, UnitResult

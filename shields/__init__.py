@@ -7,11 +7,11 @@ from shields.certificate import Certificate, CertificateError, Multipliers
 from shields.condition import Condition
 from shields.filter import Decision, SafetyFilter
 from shields.infeasible import Infeasible
-from shields.synthesis import certify, synthesize
 from shields.verification import Report, verify
 from shields.wrapper import SafetyShield
 
 if TYPE_CHECKING:
+    from shields.synthesis import certify, synthesize
     from shields.vector_wrapper import VectorSafetyShield
 
 __all__ = [
@@ -31,8 +31,12 @@ __all__ = [
 ]
 
 
+# Imported when they are asked for: what needs the solver, and what needs the compiler.
+LATER = {"certify": "synthesis", "synthesize": "synthesis", "VectorSafetyShield": "vector_wrapper"}
+
+
 def __getattr__(name: str) -> Any:
-    """Imports what needs the compiler only when it is asked for."""
-    if name == "VectorSafetyShield":
-        return import_module("shields.vector_wrapper").VectorSafetyShield
+    """Imports what takes long only when it is asked for."""
+    if name in LATER:
+        return getattr(import_module(f"shields.{LATER[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

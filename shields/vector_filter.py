@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym.ellipsoid import is_inside
+from ncs_gym.frozen import read_only
 from shields.filter import MARGIN, SafetyFilter
 from shields.judgement import FELL_BACK, FLAGS, INTERVENED, PASSED, RADIUS, SPREAD, USABLE, WEIGHT, decide, override
 from shields.plane import FARTHEST, SMALLEST_RADIUS
@@ -103,7 +104,8 @@ class VectorFilter:
             columns=test.columns,
             gain=np.ascontiguousarray(safety_filter.certificate.K),
             limits=np.ascontiguousarray(plant.u_max),
-            vertices=np.ascontiguousarray(test.vertices) if mode == "boundary" else np.zeros((0, plant.m)),
+            # Read-only as the others are: a kind of array more would compile everything once more.
+            vertices=test.vertices if mode == "boundary" else read_only(np.zeros((0, plant.m))),
             pushed=test.pushed,
             rounding=test.rounding,
             margin=MARGIN,

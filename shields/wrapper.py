@@ -15,7 +15,6 @@ from ncs_gym.frozen import as_number
 from shields.certificate import Certificate
 from shields.filter import SafetyFilter
 from shields.proof import ProofTracker, starts_inside
-from shields.synthesis import synthesize
 
 # What changes, repeats or swallows actions between the shield and the plant.
 REFUSED = (gym.ActionWrapper, RepeatAction, StickyAction, MaxAndSkipObservation, Autoreset)
@@ -159,6 +158,8 @@ def certificate_for(plant: LinearPlant, contract: ChannelContract | None = None)
     """
     key = plant.fingerprint, contract
     if key not in _synthesized:
+        from shields.synthesis import synthesize  # takes the solver, which who has a certificate does without
+
         _synthesized[key] = synthesize(plant, contract=contract)
     return _synthesized[key]
 

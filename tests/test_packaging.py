@@ -45,6 +45,21 @@ def test_environment_and_shields_do_not_import_the_learners():
             assert not imports(path) & LEARNERS, path
 
 
+@pytest.mark.parametrize(
+    ("module", "later"),
+    [
+        ("shields", {"cvxpy", "numba", "torch", "matplotlib"}),
+        ("experiments.compare", {"torch", "stable_baselines3"}),
+        ("experiments.parent", {"numpy", "gymnasium"}),
+        ("experiments.__main__", {"numpy", "tyro"}),
+    ],
+)
+def test_what_takes_long_is_imported_when_it_is_needed(module, later):
+    code = f"import sys, {module}; print(sorted({later!r} & set(sys.modules)))"
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"
+
+
 @pytest.mark.parametrize("package", ORDER)
 def test_tested_packages_are_those_of_this_tree(package):
     assert Path(importlib.util.find_spec(package).origin).parent == ROOT / package

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from agents.callbacks import TrainingPoint
 from agents.evaluation import Episode
+from agents.history import TrainingPoint
 from agents.trajectory import Trajectory
 from experiments.arms import arm_of
 from experiments.summary import paired_differences, summarize_arm

@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from fractions import Fraction
 
@@ -13,6 +11,7 @@ import pytest
 from experiments.audit import FAILS, HOLDS, ROUNDED, audit_rows, audit_text
 from experiments.counterexample import worst_step
 from experiments.printed_case import PrintedCase
+from tests.command import ncs
 
 
 @pytest.fixture(scope="module")
@@ -101,8 +100,7 @@ def test_text_is_readable_and_complete(rows):
 
 
 def test_command_prints_json_and_writes_it(rows, tmp_path):
-    command = [sys.executable, "-m", "experiments", "audit", "--json", "--out", str(tmp_path / "audit.json")]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    run = ncs("audit", "--json", "--out", tmp_path / "audit.json")
     assert run.returncode == 0, run.stderr
     assert json.loads(run.stdout) == json.loads((tmp_path / "audit.json").read_text())
     assert [row["verdict"] for row in json.loads(run.stdout)] == [row.verdict for row in rows]

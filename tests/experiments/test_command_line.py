@@ -1,11 +1,13 @@
-"""The command as a user meets it: a subprocess."""
+"""The command as a user meets it: in a process of its own where that matters, else in this one."""
 
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ import pytest
 
 from agents.agent import Agent
 from shields import Certificate, verify
+from tests.command import Run, assert_one_sentence, environment, ncs, ncs_process
 
 ARM_KEYS = {
     "train_steps",
@@ -26,25 +29,6 @@ ARM_KEYS = {
     "eval_return_ci95",
     "intervention_rate",
 }
-
-
-ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-
-
-def ncs(*arguments, cwd=None, **environment):
-    command = [sys.executable, "-m", "experiments", *map(str, arguments)]
-    path = os.pathsep.join(filter(None, [ROOT, os.environ.get("PYTHONPATH")]))
-    env = os.environ | {"PYTHONPATH": path} | environment
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, env=env, timeout=300)
-
-
-def assert_one_sentence(run, *words):
-    assert run.returncode == 2, run.stderr
-    assert "Traceback" not in run.stderr
-    lines = run.stderr.strip().splitlines()
-    assert len(lines) == 1, run.stderr
-    assert lines[0].startswith("ncs: ")
-    assert all(word in lines[0] for word in words), lines[0]
 
 
 def children_of(pid):
@@ -62,9 +46,13 @@ def is_alive(pid):
 
 
 @pytest.fixture(scope="module")
-def smoke(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("smoke")
-    return folder / "out", ncs("compare", "--smoke", "--out", folder / "out")
+def smoke(made_once):
+    def make(folder):
+        run = ncs_process("compare", "--smoke", "--out", folder / "out")
+        (folder / "run.json").write_text(json.dumps([run.returncode, run.stdout, run.stderr]))
+
+    folder = made_once("smoke", make)
+    return folder / "out", Run(*json.loads((folder / "run.json").read_text()))
 
 
 def test_smoke_run_leaves_every_file_of_the_contract(smoke):
@@ -152,7 +140,7 @@ def test_settings_file_gives_the_same_summary_bit_for_bit(smoke, tmp_path):
 def test_killed_run_goes_on_and_ends_like_an_uninterrupted_one(smoke, tmp_path):
     out, units = tmp_path / "out", tmp_path / "out" / "units"
     command = [sys.executable, "-m", "experiments", "compare", "--smoke", "--out", str(out)]
-    run = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": ROOT}, stderr=subprocess.DEVNULL)
+    run = subprocess.Popen(command, env=environment(), stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 200.0
     while len(list(units.glob("*.json"))) < 2:
         assert run.poll() is None, "it ended before it was killed"
@@ -167,7 +155,7 @@ def test_killed_run_goes_on_and_ends_like_an_uninterrupted_one(smoke, tmp_path):
         time.sleep(0.1)
     assert not (out / "summary.json").exists()
     finished = len(list(units.glob("*.json")))
-    again = ncs("compare", "--smoke", "--out", out)
+    again = ncs("compare", "--smoke", "--out", out, "--jobs", 1)
     assert again.returncode == 0, again.stderr
     assert f"{finished} of 12 units were finished before" in again.stderr
     assert (out / "summary.json").read_bytes() == (smoke[0] / "summary.json").read_bytes()
@@ -223,7 +211,7 @@ def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path):
     assert {"loss", "delay", "burst_length", "arm", "run", "eval_violating_episodes"} <= set(rows[0])
     assert {path.name for path in (out / "figures").iterdir()} >= {"violations.png", "interventions.png", "return.png"}
     assert "data:image/png;base64," in (out / "report.html").read_text()
-    more = ncs("sweep", "--config", out / "settings.json", "--losses", "0.4", "0.5")
+    more = ncs("sweep", "--config", out / "settings.json", "--losses", "0.4", "0.5", "--jobs", 1)
     assert more.returncode == 0, more.stderr
     assert "4 of 8 units were finished before" in more.stderr
 
@@ -238,6 +226,28 @@ def test_synthesize_then_verify(tmp_path):
     assert json.loads((tmp_path / "report.json").read_text())["valid"] is True
     other = ncs("verify", file, "--env", "ncs_gym/TruckTrailerCruise-v0")
     assert_one_sentence(other, "does not verify")
+
+
+@pytest.mark.parametrize("arguments", [["verify", "--help"], ["compare", "--steps", "0"], ["verify", "nowhere.json"]])
+def test_command_does_the_same_in_this_process_and_in_one_of_its_own(arguments, tmp_path):
+    own = ncs_process(*arguments, cwd=tmp_path)
+    assert ncs(*arguments, cwd=tmp_path) == (own.returncode, own.stdout, own.stderr)
+
+
+def test_command_in_this_process_hides_no_warning_and_changes_nothing_outside(monkeypatch, tmp_path):
+    def warn(chosen):
+        Path("here").write_text(os.environ["SAID"])
+        warnings.warn("loud", stacklevel=1)
+        os.system("echo native >&2")
+
+    before = os.getcwd(), sys.argv, sys.stdout, sys.stderr, signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr("experiments.audit.audit", warn)
+    run = ncs("audit", cwd=tmp_path, SAID="this")
+    assert (run.returncode, (tmp_path / "here").read_text()) == (0, "this")
+    assert "UserWarning: loud" in run.stderr
+    assert run.stderr.endswith("native\n")
+    assert before == (os.getcwd(), sys.argv, sys.stdout, sys.stderr, signal.getsignal(signal.SIGTERM))
+    assert "SAID" not in os.environ
 
 
 @pytest.mark.parametrize(

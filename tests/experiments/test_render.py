@@ -1,5 +1,7 @@
 """The command that draws an episode, and the policies it plays."""
 
+import importlib.util
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from experiments.render import render
 from experiments.settings import RenderSettings
 from ncs_gym.rendering import theme
 from shields import SafetyShield
-from tests.experiments.test_command_line import assert_one_sentence, ncs
+from tests.command import assert_one_sentence, ncs
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 
@@ -170,16 +172,10 @@ def test_errors_of_the_command_are_one_sentence(tmp_path):
     assert not (tmp_path / "a.gif").exists()
 
 
-def test_missing_pygame_is_one_sentence(tmp_path):
-    (tmp_path / "sitecustomize.py").write_text(
-        "import importlib.util as u\nfind = u.find_spec\n"
-        "u.find_spec = lambda name, *rest: None if name == 'pygame' else find(name, *rest)\n"
+def test_missing_pygame_is_one_sentence(tmp_path, monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *rest: find(name, *rest) if name != "pygame" else None
     )
-    run = ncs("render", cwd=tmp_path, PYTHONPATH=f"{tmp_path}:{_root()}")
+    run = ncs("render", cwd=tmp_path)
     assert_one_sentence(run, "this command needs pygame", "pip install 'ncs-gym[render]'")
-
-
-def _root():
-    import experiments
-
-    return experiments.__path__[0].rsplit("/", 1)[0]

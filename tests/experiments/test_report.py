@@ -1,4 +1,5 @@
 import base64
+import json
 import re
 from html.parser import HTMLParser
 
@@ -97,6 +98,56 @@ def test_captions_findings_and_conditions_are_escaped():
     page = html_report(summary, Report((flag(ATTACK, False),)), {f'"{ATTACK}. B': PNG}, [ATTACK])
     assert "<script" not in page
     assert Reader(page).open == []
+
+
+def attacked(value, text, path=()):
+    """Pairs of a path and a copy of a JSON value with `text` in one place: instead of a leaf, or as a key more."""
+    yield path, text
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield (*path, key, "as a key"), {text if other == key else other: value[other] for other in value}
+            yield from ((at, value | {key: change}) for at, change in attacked(inner, text, (*path, key)))
+    elif isinstance(value, list):
+        for i, inner in enumerate(value):
+            yield from ((at, [*value[:i], change, *value[i + 1 :]]) for at, change in attacked(inner, text, (*path, i)))
+
+
+TEXTS = {
+    ("settings", "env"),
+    ("settings", "algo"),
+    ("settings", "certificate"),
+    ("certificate",),
+    ("plant", "fingerprint"),
+    ("versions", "python"),
+    ("settings", "ppo", "envs"),
+    ("settings", "ppo", "envs", "as a key"),
+    ("references", "zero input", "as a key"),
+}
+
+
+@pytest.mark.parametrize(
+    "text", [ATTACK, '"><script>1</script>', "' onerror='1", "</code></td><img src=x>", "</style>"]
+)
+def test_a_text_anywhere_in_a_summary_stays_text(text):
+    summary = summary_of({name: [run(name)] for name in ("unshielded", "shielded")})
+    summary["references"] = {"zero input": summary["arms"]["unshielded"] | {"train_steps": 0}}
+    summary = json.loads(json.dumps(summary))
+    honest = tags_of(html_report(summary, VERIFIED, {"A. B.": PNG}, []))
+    shown = set()
+    for path, change in attacked(summary, text):
+        try:
+            page = html_report(change, VERIFIED, {"A. B.": PNG}, [])
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError):
+            continue  # no page is as good as a harmless one
+        assert tags_of(page) <= honest, path
+        if text in "".join(Reader(page).text):
+            shown.add(path)
+    assert shown >= TEXTS
+
+
+def tags_of(page):
+    """Tags of a page with the names of their attributes."""
+    return {" ".join([tag, *sorted(attributes)]) for tag, attributes in Reader(page).tags}
 
 
 def test_figures_are_embedded_with_their_captions():

@@ -1,6 +1,4 @@
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -8,6 +6,7 @@ import pytest
 from experiments.printed_case import PrintedCase
 from experiments.reproduce import StateFeedback, _outcome
 from ncs_gym.scenarios import CASE_STUDY_BOX
+from tests.command import ncs
 
 
 def test_outcome_counts_what_left_the_set_the_box_and_the_limit():
@@ -24,19 +23,7 @@ def test_outcome_counts_what_left_the_set_the_box_and_the_limit():
 
 
 def test_command_leaves_figures_and_summary(tmp_path):
-    command = [
-        sys.executable,
-        "-m",
-        "experiments",
-        "reproduce",
-        "--starts",
-        "4",
-        "--steps",
-        "50",
-        "--out",
-        str(tmp_path / "out"),
-    ]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    run = ncs("reproduce", "--starts", 4, "--steps", 50, "--out", tmp_path / "out")
     assert run.returncode == 0, run.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert len(summary) == 3
@@ -50,8 +37,7 @@ def test_command_leaves_figures_and_summary(tmp_path):
 
 @pytest.mark.parametrize("arguments", [["--starts", "0"], ["--steps", "-1"], ["--seed", "-1"]])
 def test_bad_settings_are_one_sentence(arguments, tmp_path):
-    command = [sys.executable, "-m", "experiments", "reproduce", *arguments, "--out", str(tmp_path / "out")]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    run = ncs("reproduce", *arguments, "--out", tmp_path / "out")
     assert run.returncode == 2
     assert run.stderr.startswith(f"ncs: {arguments[0]} must be")
     assert not (tmp_path / "out").exists()

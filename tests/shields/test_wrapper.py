@@ -206,11 +206,11 @@ def test_boundary_overrides_more_often_than_switch(certificate):
 
 
 def test_certificate_is_synthesized_once_per_plant(monkeypatch):
-    from shields import wrapper
+    from shields import synthesis, wrapper
 
     calls = []
     monkeypatch.setattr(wrapper, "_synthesized", {})
-    monkeypatch.setattr(wrapper, "synthesize", lambda plant, contract: calls.append(plant) or synthesize(plant))
+    monkeypatch.setattr(synthesis, "synthesize", lambda plant, contract: calls.append(plant) or synthesize(plant))
     one, other = SafetyShield(gym.make(CRUISE)), SafetyShield(gym.make(CRUISE))
     assert one.certificate is other.certificate
     assert len(calls) == 1

@@ -1,4 +1,4 @@
-"""What a worker process does first."""
+"""The process that workers belong to; imported by those that import nothing else, so that they start at once."""
 
 from __future__ import annotations
 

@@ -1,0 +1,114 @@
+"""The `ncs` command: in this process, which has imported everything, or in one of its own as a user starts it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+from unittest import mock
+
+from experiments.__main__ import main
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+class Run(NamedTuple):
+    """What a command left."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def environment(*first: str | os.PathLike[str], **changes: str) -> dict[str, str]:
+    """Environment variables of a process that imports from the folders given, then from this tree."""
+    path = os.pathsep.join(map(str, filter(None, [*first, ROOT, os.environ.get("PYTHONPATH")])))
+    return os.environ | {"PYTHONPATH": path} | changes
+
+
+def ncs_process(*arguments, cwd=None, **changes: str) -> subprocess.CompletedProcess[str]:
+    """Runs `ncs` in a process of its own: for what depends on how it starts or ends."""
+    command = [sys.executable, "-m", "experiments", *map(str, arguments)]
+    given = environment() | changes
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, env=given, timeout=300)
+
+
+def ncs(*arguments, cwd=None, **changes: str) -> Run:
+    """Runs `ncs` in this process: exit code and everything written, warnings and worker processes included."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        _captured("stdout", 1, Path(folder) / "out") as out,
+        _captured("stderr", 2, Path(folder) / "err") as err,
+        mock.patch.object(sys, "argv", ["ncs", *map(str, arguments)]),
+        mock.patch.dict(os.environ, changes),
+        contextlib.chdir(cwd or os.curdir),
+        _warnings_as_at_the_start(),
+        _signals_kept(),
+    ):
+        code = _exit_code()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        return Run(code, out.read_text("utf-8"), err.read_text("utf-8"))
+
+
+def assert_one_sentence(run, *words):
+    assert run.returncode == 2, run.stderr
+    assert "Traceback" not in run.stderr
+    lines = run.stderr.strip().splitlines()
+    assert len(lines) == 1, run.stderr
+    assert lines[0].startswith("ncs: ")
+    assert all(word in lines[0] for word in words), lines[0]
+
+
+def _exit_code() -> int:
+    try:
+        main()
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    return 0
+
+
+@contextlib.contextmanager
+def _captured(name: str, descriptor: int, file: Path) -> Iterator[Path]:
+    """Sends a stream to a file, also what compiled code and worker processes write to its descriptor."""
+    getattr(sys, name).flush()
+    before = os.dup(descriptor)
+    try:
+        with file.open("w", buffering=1, encoding="utf-8") as stream, mock.patch.object(sys, name, stream):
+            os.dup2(stream.fileno(), descriptor)
+            yield file
+    finally:
+        os.dup2(before, descriptor)
+        os.close(before)
+
+
+@contextlib.contextmanager
+def _warnings_as_at_the_start() -> Iterator[None]:
+    """Warnings are filtered and shown as in a new process, not as pytest does."""
+
+    def show(message, category, filename, lineno, file=None, line=None) -> None:
+        sys.stderr.write(warnings.formatwarning(message, category, filename, lineno, line))
+
+    with warnings.catch_warnings():
+        warnings.resetwarnings()
+        for ignored in (ResourceWarning, ImportWarning, PendingDeprecationWarning, DeprecationWarning):
+            warnings.simplefilter("ignore", ignored)
+        warnings.filterwarnings("default", category=DeprecationWarning, module="__main__")
+        warnings.showwarning = show
+        yield
+
+
+@contextlib.contextmanager
+def _signals_kept() -> Iterator[None]:
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
