@@ -15,11 +15,11 @@ compare: $(INSTALLED)
 	$(BIN)/ncs compare --out $(OUT)
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest -n auto --dist worksteal
+	$(BIN)/python -m pytest -n auto --dist worksteal $(TEST_FLAGS)
 
 # The suite, and the share of lines and branches it runs, by package. Tracing takes half as much time again.
 coverage: $(INSTALLED)
-	$(BIN)/python -m pytest -n auto --dist worksteal --cov --cov-report=
+	$(MAKE) test TEST_FLAGS='--cov --cov-report='
 	@echo 'lines and branches run by the tests [%], without worker processes; loops that numba compiles count as not run:'
 	@for package in $(PACKAGES) '*'; do \
 		printf '%-12s' "$$package"; $(BIN)/coverage report --include="$$package/*" --format=total || exit; done

@@ -18,8 +18,8 @@ from tqdm import tqdm
 
 from experiments.block import Block, Campaign, run_block
 from experiments.cases import Case, cases
-from experiments.parent import belong_to_parent
 from experiments.errors import SafetyBroken
+from experiments.parent import belong_to_parent
 from experiments.settings import CertifySettings
 from experiments.tally import Tally
 from experiments.tally_store import TallyStore
