@@ -9,7 +9,7 @@ DOCS_INSTALLED := $(VENV)/.installed-docs
 AUDIT_INSTALLED := $(VENV)/.installed-audit
 ZOO_INSTALLED := $(VENV)/.installed-rl-zoo
 
-.PHONY: compare test coverage test-slow lint types benchmark docs audit clean
+.PHONY: compare test coverage coverage-report test-slow lint types benchmark docs audit clean
 
 compare: $(INSTALLED)
 	$(BIN)/ncs compare --out $(OUT)
@@ -20,6 +20,9 @@ test: $(INSTALLED)
 # The suite, and the share of lines and branches it runs, by package. Tracing takes half as much time again.
 coverage: $(INSTALLED)
 	$(MAKE) test TEST_FLAGS='--cov --cov-report='
+	$(MAKE) coverage-report
+
+coverage-report:
 	@echo 'lines and branches run by the tests [%], without worker processes; loops that numba compiles count as not run:'
 	@for package in $(PACKAGES) '*'; do \
 		printf '%-12s' "$$package"; $(BIN)/coverage report --include="$$package/*" --format=total || exit; done
