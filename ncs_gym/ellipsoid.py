@@ -122,20 +122,14 @@ class Ellipsoid(FrozenArrays):
 
     def farthest_points(self, centers: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """Returns what `farthest_point` does for each row of centers (count, n), shape (count, n)."""
-        from ncs_gym.roots import fill_largest_roots  # the compiler takes half a second to import
+        from ncs_gym.roots import fill_farthest  # the compiler takes half a second to import
 
         factor = self.factor
         values, vectors = np.linalg.eigh(factor.T @ weight @ factor)
-        slopes, roots = np.ascontiguousarray(centers @ (weight @ factor @ vectors)), np.empty(len(centers))
-        fill_largest_roots(slopes, values, roots)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            coordinates = slopes / (roots[:, None] - values)
-        coordinates[~np.isfinite(coordinates).all(axis=1)] = 0.0
-        missing = np.maximum(1.0 - (coordinates**2).sum(axis=1), 0.0)
-        longest = coordinates[:, -1]
-        coordinates[:, -1] += np.where(missing > 1e-9, np.copysign(np.sqrt(missing), longest), 0.0)
-        lengths = np.maximum(1.0, np.linalg.norm(coordinates, axis=1))
-        return (coordinates / lengths[:, None]) @ (factor @ vectors).T
+        outward, points = factor @ vectors, np.empty(centers.shape)
+        inward = np.ascontiguousarray(outward.T @ weight)
+        fill_farthest(np.ascontiguousarray(centers), inward, values, np.ascontiguousarray(outward), points)
+        return points
 
     def farthest_point(self, center: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """Returns z of the ellipsoid that maximizes (center + z)' W (center + z).

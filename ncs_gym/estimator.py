@@ -12,7 +12,7 @@ from scipy.linalg import solve_triangular
 from ncs_gym.channel import Channel, Packet
 from ncs_gym.ellipsoid import is_inside, outer_sum
 from ncs_gym.error_set import ErrorSet, certified_error_set
-from ncs_gym.minkowski import outside_sum
+from ncs_gym.minkowski import common_axes, outside_sum
 from ncs_gym.plant import FLAT_INFLATION, INFLATION, LinearPlant
 
 # Per dimension, the growth of computed shapes that covers the rounding of F S F' (see `_grown`).
@@ -303,6 +303,10 @@ class Estimator:
     def are_impossible(self, residuals: np.ndarray, spread: np.ndarray) -> np.ndarray:
         """Returns which residuals, shape (k, p), lie outside E(spread) + E(N), spread = H Sigma_k H'."""
         return outside_sum(residuals, spread, self._noise, ALARM_TOLERANCE)
+
+    def residual_axes(self, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the axes common to H Sigma_k H' and N, in which `are_impossible` is quick; see `common_axes`."""
+        return common_axes(spread, self._noise)
 
     def inverse_of_bound(self, spread: np.ndarray) -> np.ndarray:
         """Returns (spread + N)^-1, shape (p, p), of the quick test: r'(spread + N)^-1 r <= 1 is possible."""

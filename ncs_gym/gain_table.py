@@ -60,7 +60,8 @@ class GainTable:
             shape (edges, 4).
         weights: Its gain, zero where it is not used, n * p numbers, and (seen + N)^-1 of the monitor's quick test,
             p * p numbers; shape (buffer + 1, n * p + p * p, edges).
-        seen: H Sigma_k H' before each update, shape (edges, buffer + 1, p, p).
+        turns: F of the axes common to H Sigma_k H' before each update and to N, shape (edges, buffer + 1, p, p).
+        values: Squares of the former's half-axes there, shape (edges, buffer + 1, p); see `minkowski.common_axes`.
     """
 
     def __init__(self, estimator: Estimator) -> None:
@@ -81,7 +82,8 @@ class GainTable:
         self.shapes = np.zeros((n * n, FIRST_CAPACITY))
         self.edges = np.zeros((FIRST_CAPACITY, 4), np.int32)
         self.weights = np.zeros((ages, n * p + p * p, FIRST_CAPACITY))
-        self.seen = np.zeros((FIRST_CAPACITY, ages, p, p))
+        self.turns = np.zeros((FIRST_CAPACITY, ages, p, p))
+        self.values = np.zeros((FIRST_CAPACITY, ages, p))
         first = self._spread(plant.initial_cov, plant.initial_error.shape, 0)
         self.root = self._node(Node(first, (UNKNOWN,) * ages, (False,) * ages))
 
@@ -181,7 +183,7 @@ class GainTable:
             if held[each]:
                 seen = estimator.plant.H @ self._spreads[spread].shape @ estimator.plant.H.T
                 spread, gain = self._updated(spread)
-                self.seen[edge, each] = seen
+                self.turns[edge, each], self.values[edge, each] = estimator.residual_axes(seen)
                 self.edges[edge, HELD] |= 1 << min(each, LAST_BIT)
                 self.weights[each, :, edge] = np.append(gain, estimator.inverse_of_bound(seen))
             if each > 0:
@@ -198,6 +200,6 @@ class GainTable:
         edge = self._edges
         self._edges += 1
         if edge == len(self.edges):
-            for name in ("edges", "weights", "seen"):
+            for name in ("edges", "weights", "turns", "values"):
                 self._double(name)
         return edge

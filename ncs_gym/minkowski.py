@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from ncs_gym.ellipsoid import sum_gauge
 
@@ -24,15 +23,12 @@ def outside_sum(points: np.ndarray, first: np.ndarray, second: np.ndarray, toler
         second: P2, shape (p, p), positive definite; where it is not, in float64, each point takes much longer.
         tolerance: Relative.
     """
-    try:
-        root = np.linalg.cholesky(second)
-    except np.linalg.LinAlgError:
+    turn, values = common_axes(first, second)
+    if not np.isfinite(turn).all():
         return np.array([sum_gauge(point, first, second) > 1.0 + tolerance for point in points], np.bool_)
-    half = solve_triangular(root, 0.5 * (first + first.T), lower=True)
-    values, axes = np.linalg.eigh(solve_triangular(root, half.T, lower=True))
-    values = np.maximum(values, 0.0)[:, None]
+    values = values[:, None]
     with np.errstate(invalid="ignore", over="ignore"):
-        squares = np.square(axes.T @ solve_triangular(root, points.T, lower=True, check_finite=False))
+        squares = np.square(turn @ points.T)
     outside, limit = np.ones(len(points), np.bool_), (1.0 + tolerance) ** 2
     unsettled, low, high = np.arange(len(points)), np.zeros(len(points)), np.ones(len(points))
     for _ in range(HALVINGS):
@@ -51,3 +47,13 @@ def outside_sum(points: np.ndarray, first: np.ndarray, second: np.ndarray, toler
         low, high = np.where(rises, share, low)[rest], np.where(rises, high, share)[rest]
         unsettled, squares = unsettled[rest], squares[:, rest]
     return outside
+
+
+def common_axes(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns F, shape (p, p), and j >= 0, shape (p,), with F P1 F' = diag(j) and F P2 F' = I; NaN if P2 is flat."""
+    try:
+        inverse = np.linalg.inv(np.linalg.cholesky(second))
+    except np.linalg.LinAlgError:
+        return np.full_like(second, np.nan), np.full(len(second), np.nan)
+    values, axes = np.linalg.eigh(inverse @ (0.5 * (first + first.T)) @ inverse.T)
+    return axes.T @ inverse, np.maximum(values, 0.0)

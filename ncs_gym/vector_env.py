@@ -14,12 +14,14 @@ from ncs_gym.channel import GilbertElliott
 from ncs_gym.disturbance import checked_many, stays_inside
 from ncs_gym.draws import fill_keys
 from ncs_gym.env import NCSEnv, RenderModeError
+from ncs_gym.estimator import ALARM_TOLERANCE
 from ncs_gym.fleet import fleet_of, rows_of
 from ncs_gym.frozen import as_count, as_numbers
 from ncs_gym.gain_table import GainTable
 from ncs_gym.law import law_of_disturbance
 from ncs_gym.motion import DRAW, LAST, MOVE, PREDICT, RECEIVE, clip, read_actions, run
 from ncs_gym.report import Layout, Report
+from ncs_gym.residuals import are_outside
 from ncs_gym.system import packed, system_of
 from ncs_gym.task import Regulation
 
@@ -248,13 +250,10 @@ class NCSVectorEnv(VectorEnv):
 
     def _look_closer(self, doubtful: int) -> None:
         """Raises the alarm for residuals beyond the quick test that are beyond the exact one, too."""
-        _, who, edges, ages = self._doubts[:doubtful].T
-        seen, residuals = self._table.seen[edges, ages], self._residuals[:doubtful]
-        groups, group = np.unique(np.column_stack([edges, ages]), axis=0, return_inverse=True)
-        for number in range(len(groups)):
-            rows = group.ravel() == number
-            impossible = self.single.estimator.are_impossible(residuals[rows], seen[rows][0])
-            self._fleet.alarm[who[rows][impossible]] = 1
+        suspects, residuals, table = self._doubts[:doubtful, 1:], self._residuals[:doubtful], self._table
+        outside, limit = np.empty(doubtful, np.bool_), (1.0 + ALARM_TOLERANCE) ** 2
+        are_outside(suspects, residuals, table.turns, table.values, limit, outside)
+        self._fleet.alarm[suspects[outside, 0]] = 1
 
     def _begin(self, mask: np.ndarray, starts: np.ndarray | None) -> None:
         """Starts episodes where `mask` says so, at `starts` (N, n) or drawn from the initial set."""
