@@ -6,6 +6,7 @@ OUT ?= runs/compare
 INSTALLED := $(VENV)/.installed
 DOCS_INSTALLED := $(VENV)/.installed-docs
 ZOO_INSTALLED := $(VENV)/.installed-rl-zoo
+RAY_INSTALLED := $(VENV)/.installed-ray
 
 .PHONY: compare test test-slow lint types benchmark docs clean
 
@@ -15,7 +16,7 @@ compare: $(INSTALLED)
 test: $(INSTALLED)
 	$(BIN)/python -m pytest -n auto --dist worksteal
 
-test-slow: $(INSTALLED) $(ZOO_INSTALLED)
+test-slow: $(INSTALLED) $(ZOO_INSTALLED) $(RAY_INSTALLED)
 	$(BIN)/python -m pytest -n auto --dist worksteal -m slow
 
 lint: $(INSTALLED)
@@ -25,7 +26,7 @@ lint: $(INSTALLED)
 types: $(INSTALLED)
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-benchmark: $(INSTALLED)
+benchmark: $(INSTALLED) $(RAY_INSTALLED)
 	$(BIN)/python benchmarks/shield_decision.py
 	$(BIN)/python benchmarks/containment.py
 	$(BIN)/python benchmarks/synthesis.py
@@ -34,6 +35,7 @@ benchmark: $(INSTALLED)
 	$(BIN)/python benchmarks/codesign_grid.py
 	$(BIN)/python benchmarks/rendering.py
 	$(BIN)/python benchmarks/ppo_settings.py
+	$(BIN)/python benchmarks/ray_overhead.py
 
 # Fails on a broken link, anchor or reference. Look at it: python -m http.server -d site (from a file the search is missing).
 docs: $(DOCS_INSTALLED)
@@ -47,6 +49,10 @@ $(INSTALLED): pyproject.toml constraints.txt
 
 $(DOCS_INSTALLED): $(INSTALLED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	touch $@
+
+$(RAY_INSTALLED): $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[ray]'
 	touch $@
 
 # rl-zoo3 declares older versions than it runs with (docs/other_code.md).
