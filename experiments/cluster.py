@@ -44,7 +44,7 @@ LOOK_UP = 10.0
 
 
 class ClusterError(RuntimeError):
-    """The cluster cannot be reached, is too small for a run, or its nodes have other versions than the driver."""
+    """The cluster cannot be reached or ended, is too small for a run, or has other versions than the driver."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import ray  # pyright: ignore[reportMissingImports]
-from ray.exceptions import RayError, RayTaskError  # pyright: ignore[reportMissingImports]
+from ray.exceptions import LocalRayletDiedError, RayError, RayTaskError  # pyright: ignore[reportMissingImports]
 
 from experiments.cluster import ClusterError, Need, Room, carried_work, collect, require_answer, stream
 from experiments.engine import OWN_RAY, EngineSettings
@@ -134,7 +134,7 @@ def _result(unit: Unit, reference: Any) -> UnitResult:
     """Returns the result of a finished unit.
 
     Raises:
-        ClusterError: If the node that ran it has other versions.
+        ClusterError: If the node that ran it has other versions, or Ray has ended here.
         UnitError: If it failed.
     """
     try:
@@ -143,6 +143,8 @@ def _result(unit: Unit, reference: Any) -> UnitResult:
         if isinstance(error.cause, ClusterError):
             raise error.cause from error
         raise unit_error(unit, error.cause) from error
+    except LocalRayletDiedError as error:
+        raise ClusterError("Ray has ended on this machine: the same command goes on from what is stored") from error
     except RayError as error:
         lost = f"its worker died, {RETRIES} retries included ({type(error).__name__})"
         raise UnitError(f"run {unit.name}: {lost}") from error

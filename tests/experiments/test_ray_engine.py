@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 import zipfile
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -341,8 +342,8 @@ class _Named:
 NAMED = _Named()
 
 
-@pytest.fixture(scope="module")
-def head(tmp_path_factory):
+@contextmanager
+def running_head(tmp_path_factory):
     """Address, environment and process of a cluster as in docs/scaling.md, with a home and a token of its own."""
     own = {"HOME": str(tmp_path_factory.mktemp("home")), "RAY_AUTH_MODE": "token"}
     own |= {"RAY_TMPDIR": str(tmp_path_factory.mktemp("r")), "RAY_USAGE_STATS_ENABLED": "0"}
@@ -362,6 +363,12 @@ def head(tmp_path_factory):
     for pid in processes:
         if is_alive(pid):
             os.kill(pid, signal.SIGKILL)
+
+
+@pytest.fixture(scope="module")
+def head(tmp_path_factory):
+    with running_head(tmp_path_factory) as found:
+        yield found
 
 
 def test_running_cluster_is_used_and_outlives_the_driver(head, local, tmp_path):
@@ -387,3 +394,20 @@ def test_cluster_that_asks_for_a_token_is_one_sentence_in_bounded_time(head, tmp
     run = ncs("sweep", *GRID, "--engine", "ray", "--ray-address", address, "--out", tmp_path / "out", **other)
     assert "it asks for a token (RAY_AUTH_MODE=token" in one_sentence(run)
     assert time.monotonic() - start < 2 * cluster.PATIENCE
+
+
+def test_cluster_that_ends_is_one_sentence_and_costs_nothing_that_is_stored(tmp_path_factory, local, tmp_path):
+    out = tmp_path / "out"
+    with running_head(tmp_path_factory) as (address, own, process):
+        run = started("sweep", *GRID, "--engine", "ray", "--ray-address", address, "--out", out, **own)
+        until_stored(out, 1, run)
+        process.terminate()
+        _, errors = run.communicate(timeout=PATIENCE)
+    assert run.returncode == 2
+    assert errors.strip().splitlines()[-1].startswith("ncs: Ray has ended on this machine")
+    assert "Traceback" not in errors
+    finished = stored(out)
+    assert 1 <= finished < UNITS
+    again = ncs("sweep", *GRID, "--jobs", "2", "--out", out)
+    assert f"{finished} of {UNITS} units were finished before" in again.stderr
+    assert_same(out, local)
