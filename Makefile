@@ -8,6 +8,7 @@ INSTALLED := $(VENV)/.installed
 DOCS_INSTALLED := $(VENV)/.installed-docs
 AUDIT_INSTALLED := $(VENV)/.installed-audit
 ZOO_INSTALLED := $(VENV)/.installed-rl-zoo
+RAY_INSTALLED := $(VENV)/.installed-ray
 
 .PHONY: compare test coverage coverage-report test-slow lint types benchmark docs audit clean
 
@@ -27,7 +28,7 @@ coverage-report:
 	@for package in $(PACKAGES) '*'; do \
 		printf '%-12s' "$$package"; $(BIN)/coverage report --include="$$package/*" --format=total || exit; done
 
-test-slow: $(INSTALLED) $(ZOO_INSTALLED)
+test-slow: $(INSTALLED) $(ZOO_INSTALLED) $(RAY_INSTALLED)
 	$(BIN)/python -m pytest -n auto --dist worksteal -m slow
 
 lint: $(INSTALLED)
@@ -37,7 +38,7 @@ lint: $(INSTALLED)
 types: $(INSTALLED)
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-benchmark: $(INSTALLED)
+benchmark: $(INSTALLED) $(RAY_INSTALLED)
 	$(BIN)/python benchmarks/shield_decision.py
 	$(BIN)/python benchmarks/containment.py
 	$(BIN)/python benchmarks/synthesis.py
@@ -46,6 +47,7 @@ benchmark: $(INSTALLED)
 	$(BIN)/python benchmarks/codesign_grid.py
 	$(BIN)/python benchmarks/rendering.py
 	$(BIN)/python benchmarks/ppo_settings.py
+	$(BIN)/python benchmarks/ray_overhead.py
 
 # Fails on a broken link, anchor or reference. Look at it: python -m http.server -d site (from a file the search is missing).
 docs: $(DOCS_INSTALLED)
@@ -67,6 +69,10 @@ $(DOCS_INSTALLED): $(INSTALLED)
 
 $(AUDIT_INSTALLED): $(INSTALLED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[audit]'
+	touch $@
+
+$(RAY_INSTALLED): $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[ray]'
 	touch $@
 
 # rl-zoo3 declares older versions than it runs with (docs/other_code.md).

@@ -69,6 +69,8 @@ def _run(chosen: object) -> None:
     _, target, extras = next(entry for entry in COMMANDS.values() if entry[0] == type(chosen).__name__)
     for extra, packages in extras.items():
         require_extra(extra, *packages)
+    if getattr(chosen, "engine", "local") == "ray":
+        require_extra("ray", "ray")
     module, _, function = target.partition(":")
     getattr(importlib.import_module(module), function)(chosen)
 
@@ -91,7 +93,8 @@ def _require_own_agents() -> None:
 
 def _sentence(error: Exception) -> str:
     """Returns an error as one line; only the unexpected ones show their type."""
-    expected = isinstance(error, (ValueError, OSError, ImportError))
+    ours = type(error).__module__.partition(".")[0] == "experiments"
+    expected = ours or isinstance(error, (ValueError, OSError, ImportError))
     if isinstance(error, OSError) and error.strerror:
         text = f"{error.strerror}: {error.filename}" if error.filename else error.strerror
     else:

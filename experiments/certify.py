@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import multiprocessing
-import sys
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -20,14 +19,12 @@ from experiments.block import Block, Campaign, run_block
 from experiments.cases import Case, cases
 from experiments.errors import SafetyBroken
 from experiments.parent import belong_to_parent
+from experiments.progress import progress_bar
 from experiments.settings import CertifySettings
 from experiments.tally import Tally
 from experiments.tally_store import TallyStore
 from experiments.versions import versions
 from shields.storage import write_atomically
-
-# How often the progress bar is drawn [s]; where nobody watches, this often is enough.
-REFRESH, QUIET_REFRESH = 0.5, 20.0
 
 
 def certify(settings: CertifySettings) -> None:
@@ -94,13 +91,8 @@ def _run(
     """
     count = sum(len(some) for some in missing.values())
     context = multiprocessing.get_context("spawn")
-    interval = REFRESH if sys.stderr.isatty() else QUIET_REFRESH
     with ExitStack() as stack:
-        bar = stack.enter_context(
-            tqdm(
-                total=count * campaign.block_steps, unit="step", unit_scale=True, mininterval=interval, file=sys.stderr
-            )
-        )
+        bar = stack.enter_context(progress_bar(count * campaign.block_steps))
         waiting = deque(missing)
         pending: dict[Future, tuple[ProcessPoolExecutor, Block]] = {}
         turns: dict[ProcessPoolExecutor, Iterator[Block]] = {}

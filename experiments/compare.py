@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from experiments import engine
 from experiments.arms import arm_of
 from experiments.execution import results_of
 from experiments.figures import figures_of
@@ -25,7 +26,7 @@ from shields.storage import write_atomically
 SMOKE = {"steps": 4_096, "episodes": 10, "seeds": 2}
 REFERENCES: dict[str, Learner] = {"zero input": "zero", "K x_hat": "gain", "untrained": "untrained"}
 # Settings that results do not depend on.
-INCIDENTAL = ("out", "jobs")
+INCIDENTAL = ("out", *engine.NAMES)
 
 
 def compare(settings: CompareSettings) -> None:
@@ -36,6 +37,8 @@ def compare(settings: CompareSettings) -> None:
         OSError: If the output folder cannot be written.
         CertificateError: If a given certificate does not verify.
         Infeasible: If no certificate is found.
+        UnitError: If a run fails.
+        ClusterError: If a cluster cannot run them.
     """
     if settings.smoke:
         settings = replace(settings, **SMOKE)
@@ -48,7 +51,7 @@ def compare(settings: CompareSettings) -> None:
     print(world.title, flush=True)
     units = [unit for index in range(settings.seeds) for unit in _units(settings, world, index)]
     units.sort(key=lambda unit: unit.learner != "agent")  # the longer ones first
-    results = results_of(units, settings.out, settings.jobs)
+    results = results_of(units, settings.out, settings)
     summary = _summary(settings, world, units, results)
     findings = _findings(summary)
     _write(settings.out, summary, results, world, findings)

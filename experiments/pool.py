@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import multiprocessing
 import queue
-import sys
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from multiprocessing.managers import SyncManager
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
+from experiments.failure import unit_error
 from experiments.parent import belong_to_parent
+from experiments.progress import REFRESH, progress_bar, show_result
 from experiments.unit import Unit, UnitResult, run_unit
 
-# How often the progress bar looks for news [s].
-REFRESH = 0.5
-# Where nobody watches (output to a file), a line this often is enough [s].
-QUIET_REFRESH = 20.0
 # Workers tell about at least this many steps at a time.
 NEWSWORTHY = 1000
 
@@ -39,15 +36,17 @@ def run_all(
         total_steps: Training and evaluation steps of all units, for the progress bar.
         on_result: Called with every unit and its result as soon as it is there.
         log_folder: TensorBoard's events of a unit go to a folder in it, of the unit's name.
+
+    Raises:
+        UnitError: If a unit fails.
     """
     context = multiprocessing.get_context("spawn")
-    interval = REFRESH if sys.stderr.isatty() else QUIET_REFRESH
     manager = SyncManager(ctx=context)
     manager.start(belong_to_parent)
     with (
         manager,
         ProcessPoolExecutor(jobs, mp_context=context, initializer=belong_to_parent) as executor,
-        tqdm(total=total_steps, unit="step", unit_scale=True, mininterval=interval, file=sys.stderr) as bar,
+        progress_bar(total_steps) as bar,
     ):
         news, stop = manager.Queue(), manager.Event()
         logs = [None if log_folder is None else log_folder / unit.name for unit in units]
@@ -93,13 +92,20 @@ def _watch(units: dict[Future, Unit], news: Any, bar: tqdm, on_result: Callable[
             except queue.Empty:
                 break
         for future in sorted(done, key=lambda one: one.exception() is not None):
-            result = future.result()
+            result = _result(units[future], future)
             on_result(units[future], result)
-            bar.write(_line(units[future], result), file=sys.stderr)
+            show_result(bar, units[future], result)
 
 
-def _line(unit: Unit, result: UnitResult) -> str:
-    violating = sum(episode.violation_steps > 0 for episode in result.episodes)
-    mean = sum(episode.episode_return for episode in result.episodes) / len(result.episodes)
-    training = f"{result.train_violation_steps:,} violating training steps, " if result.train_steps else ""
-    return f"{unit.name}: {training}{violating} of {len(result.episodes)} episodes violating, return {mean:.2f}"
+def _result(unit: Unit, future: Future) -> UnitResult:
+    """Returns the result of a finished unit.
+
+    Raises:
+        UnitError: If it failed.
+    """
+    try:
+        return future.result()
+    except (BrokenExecutor, Stopped):
+        raise  # not its own fault
+    except Exception as error:
+        raise unit_error(unit, error) from error

@@ -10,6 +10,7 @@ import tyro
 
 from agents.settings import A2CSettings, AgentSettings, OffPolicySettings, PPOSettings
 from experiments.channels import ChannelSettings
+from experiments.engine import EngineSettings
 
 Algorithm = Literal["PPO", "A2C", "SAC", "TD3", "TRPO", "TQC", "CrossQ"]
 Mode = Literal["project", "switch", "boundary"]
@@ -59,7 +60,7 @@ class LearningSettings:
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
-        for name in ("seeds", "steps", "episodes", "jobs"):
+        for name in ("seeds", "steps", "episodes"):
             if getattr(self, name, 1) < 1:
                 raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
         if self.seed < 0:
@@ -70,7 +71,7 @@ class LearningSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareSettings(LearningSettings):
+class CompareSettings(EngineSettings, LearningSettings):
     """Trains agents with and without the shield and compares violations, return and interventions.
 
     Synthesizes and exactly verifies a certificate, trains paired runs (equal seeds), evaluates each on the same
@@ -83,15 +84,18 @@ class CompareSettings(LearningSettings):
         seeds: Paired training runs per arm.
         arms: unshielded, monitor (unshielded, counts what the shield would have done), penalized (unshielded, pays for
             violations), shielded, shielded:MODE, and each shielded one with +penalty (pays for interventions).
-        jobs: Worker processes.
         smoke: Shrink the run, whatever else is asked for, to see that everything works.
     """
 
     out: Path = Path("runs/compare")
     seeds: int = 3
     arms: tuple[str, ...] = ("unshielded", "penalized", "shielded")
-    jobs: int = 2
     smoke: bool = False
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        LearningSettings.__post_init__(self)
+        EngineSettings.__post_init__(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +142,7 @@ class EvaluateSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepSettings(LearningSettings):
+class SweepSettings(EngineSettings, LearningSettings):
     """Compares arms over a grid of channels: how violations, return and interventions depend on its quality.
 
     Every point of the grid is a comparison of its own with the same seeds. Leaves sweep.parquet, summary.json,
@@ -155,7 +159,6 @@ class SweepSettings(LearningSettings):
         delays: Steps that every packet is late.
         quantization_steps: Measurements are rounded to multiples of these; the environment's own if none is given.
         burst_lengths: Mean numbers of packets lost in a row; 0 loses independently.
-        jobs: Worker processes.
     """
 
     out: Path = Path("runs/sweep")
@@ -167,7 +170,11 @@ class SweepSettings(LearningSettings):
     delays: tuple[int, ...] = (0, 2, 4)
     quantization_steps: tuple[float, ...] = ()
     burst_lengths: tuple[float, ...] = (0.0,)
-    jobs: int = 2
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        LearningSettings.__post_init__(self)
+        EngineSettings.__post_init__(self)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,6 +11,7 @@ from agents.evaluation import evaluate
 from experiments.arms import arm_of
 from experiments.channels import channel_of
 from experiments.compare import prepare, provenance, unit_of
+from experiments.engine import EngineSettings
 from experiments.execution import results_of
 from experiments.settings import EvaluateSettings, TrainSettings
 from experiments.settings_file import save_settings
@@ -30,13 +31,14 @@ def train_agent(settings: TrainSettings) -> None:
         OSError: If the output folder cannot be written.
         CertificateError: If a given certificate does not verify.
         Infeasible: If no certificate is found.
+        UnitError: If the run fails.
     """
     arm_of(settings.arm, settings.mode)
     world = world_of(settings.env, settings.channel, settings.certificate)
     prepare(settings.out)
     save_settings(settings.out / "settings.json", "train", settings)
     unit = unit_of(settings, world, settings.arm, 0)
-    results = results_of([unit], settings.out, jobs=1)
+    results = results_of([unit], settings.out, EngineSettings(jobs=1))
     summary = {settings.arm: _described(results, unit.mode)}
     world.certificate.save(settings.out / "certificate.json")
     content = {"arms": summary} | provenance("train", settings, world)

@@ -60,6 +60,8 @@ def sweep(settings: SweepSettings) -> None:
         OSError: If the output folder cannot be written.
         CertificateError: If a given certificate does not verify.
         Infeasible: If no certificate is found.
+        UnitError: If a run fails.
+        ClusterError: If a cluster cannot run them.
     """
     cells = cells_of(settings)
     for name in ("loss", "delay", "burst_length"):
@@ -71,7 +73,7 @@ def sweep(settings: SweepSettings) -> None:
     prepare(settings.out)
     save_settings(settings.out / "settings.json", "sweep", settings)
     units = [unit for cell, world in zip(cells, worlds, strict=True) for unit in _units(settings, cell, world)]
-    results = results_of(units, settings.out, settings.jobs)
+    results = results_of(units, settings.out, settings)
     per_cell = len(units) // len(cells)
     parts = [results[i * per_cell : (i + 1) * per_cell] for i in range(len(cells))]
     rows = [row for cell, part in zip(cells, parts, strict=True) for row in _rows(cell, part)]

@@ -16,11 +16,17 @@ OURS = ("ncs_gym", "shields", "agents", "experiments")
 
 def versions() -> dict[str, str]:
     """Returns the versions of what results depend on, as far as installed, and a digest of this project's source."""
-    found = {"python": platform.python_version()}
+    return {"python": platform.python_version()} | _installed() | {"source": _source_digest()}
+
+
+@cache
+def _installed() -> dict[str, str]:
+    """Returns the versions of packages: looked up once, since every unit's key asks."""
+    found = {}
     for name in PACKAGES:
         with suppress(PackageNotFoundError):
             found[name] = version(name)
-    return found | {"source": _source_digest()}
+    return found
 
 
 @cache

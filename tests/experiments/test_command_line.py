@@ -273,6 +273,11 @@ def test_every_command_has_help_seed_and_out(command):
         (["compare", "--seed", "-1"], "--seed must be >= 0"),
         (["compare", "--violation-penalty", "nan"], "--violation-penalty must be"),
         (["compare", "--ppo.discount", "2"], "discount must be in"),
+        (["compare", "--engine", "hope"], "hope"),
+        (["compare", "--ray-address", "auto"], "--ray-address is a setting of --engine ray"),
+        (["sweep", "--engine", "ray", "--ray-address", "head"], "--ray-address must be local, auto or HOST:PORT"),
+        (["sweep", "--engine", "ray", "--cpus-per-run", "0"], "--cpus-per-run must be at least"),
+        (["sweep", "--engine", "ray", "--gpus-per-run", "1.5"], "--gpus-per-run must be"),
         (["evaluate", "nowhere", "--episodes", "0"], "--episodes must be at least 1"),
     ],
 )

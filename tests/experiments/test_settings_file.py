@@ -31,6 +31,10 @@ def parsed(kind, arguments):
         ),
         ("sweep", SweepSettings(losses=(0.0, 1 / 3), quantization_steps=(0.05,))),
         ("sweep", SweepSettings()),
+        (
+            "sweep",
+            SweepSettings(engine="ray", ray_address="head:6379", cpus_per_run=0.5, gpus_per_run=2.0, ray_wait=60.0),
+        ),
     ],
 )
 def test_settings_come_back_exactly(command, settings, tmp_path):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from agents.settings import PPOSettings
+from experiments.engine import EngineSettings
 from experiments.errors import ResultsError
 from experiments.execution import results_of
 from experiments.unit import Unit, run_unit
@@ -106,7 +107,7 @@ def test_changed_source_is_another_key(unit, monkeypatch):
 
 def test_units_of_one_name_are_refused(unit, tmp_path):
     with pytest.raises(ValueError, match="same name"):
-        results_of([unit, unit], tmp_path, jobs=1)
+        results_of([unit, unit], tmp_path, EngineSettings(jobs=1))
 
 
 def test_nothing_stored_is_nothing_loaded(unit, tmp_path):
@@ -127,11 +128,12 @@ def test_finished_units_are_not_run_again(store, unit, result, tmp_path, monkeyp
             ran.append(one.name)
             on_result(one, replace(result, index=one.index))
 
-    monkeypatch.setattr("experiments.execution.run_all", record)
+    monkeypatch.setattr("experiments.pool.run_all", record)
     missing = replace(unit, index=2)
-    results = results_of([unit, missing], tmp_path, jobs=1)
+    results = results_of([unit, missing], tmp_path, EngineSettings(jobs=1))
     assert ran == [missing.name]
     assert [one.index for one in results] == [1, 2]
+    assert [one.files for one in results] == [{}, {}]  # those of many units would fill the memory
     assert "1 of 2 units were finished before" in capsys.readouterr().err
-    results_of([missing, unit], tmp_path, jobs=1)
+    results_of([missing, unit], tmp_path, EngineSettings(jobs=1))
     assert ran == [missing.name]
