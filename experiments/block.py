@@ -95,7 +95,7 @@ def run_block(campaign: Campaign, block: Block, certificate: Path) -> Tally:
     seeds = np.random.SeedSequence([campaign.seed, zlib.crc32(block.case.encode()), block.index])
     seed, policy_seed = seeds.generate_state(2, np.uint64).tolist()
     _, info = shield.reset(seed=seed >> 1)
-    agents = HostileAgents(shield.unwrapped, plan, np.random.default_rng(policy_seed))
+    agents = HostileAgents(campaign.envs, shield.filter.plant, plan, np.random.default_rng(policy_seed))
     exits = violations = interventions = unproved = 0
     broken, level = np.zeros(campaign.envs, np.bool_), 0.0
     for _ in range(EPISODE_STEPS):

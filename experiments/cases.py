@@ -8,9 +8,9 @@ from functools import cache
 import gymnasium as gym
 import numpy as np
 
-from ncs_gym import Channel, ChannelContract, GilbertElliott, LinearPlant
+from ncs_gym import Channel, ChannelContract, GilbertElliott, LinearPlant, truck_trailer
 from ncs_gym.env import ncs_env
-from ncs_gym.scenarios import ENTRY_POINTS, TRUCK_TRAILER, TRUCK_TRAILER_CRUISE
+from ncs_gym.scenarios import ENTRY_POINTS, loaded_truck_trailer
 from shields import Certificate
 from shields.wrapper import certificate_for
 
@@ -65,7 +65,7 @@ def cases(seed: int, random_plants: int) -> dict[str, Case]:
         if env.contract is not None:
             for kind, channel in (("late", LATE), ("rare", RARE)):
                 found[f"{short}, {kind}"] = Case(env.plant, channel, env.contract)
-    plants = {"TruckTrailer-v0": TRUCK_TRAILER.plant(), "TruckTrailerCruise-v0": TRUCK_TRAILER_CRUISE.plant()}
+    plants = {"TruckTrailer-v0": truck_trailer(), "TruckTrailerCruise-v0": loaded_truck_trailer()}
     plants |= {f"random plant {index}": _random_plant(seed, index) for index in range(random_plants)}
     for name, plant in plants.items():
         found |= {f"{name}, {kind}": Case(plant, channel) for kind, channel in CHANNELS.items()}

@@ -125,7 +125,7 @@ def _turn(missing: dict[str, deque[Block]], waiting: deque[str]) -> Iterator[Blo
 def _table(tallies: dict[str, Tally], total: Tally) -> str:
     """Returns the results as text."""
     head = ("case", "steps", "exits", "box", "episodes", "broken", "<= 95 %", "margin", "overridden")
-    rows = [head]
+    rows: list[tuple[str, ...]] = [head]
     for name, tally in [*tallies.items(), ("all", total)]:
         counts = tally.steps, tally.exits, tally.violations, tally.episodes, tally.broken_episodes
         shares = f"{tally.bound:.1e}", f"{tally.margin:.4f}", f"{tally.interventions / tally.steps:.1%}"

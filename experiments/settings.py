@@ -233,7 +233,7 @@ class CertifySettings:
     steps: float = 1e8
     out: Path = Path("runs/certify")
     random_plants: int = 4
-    envs: int = 2048
+    envs: int = 8192
     jobs: int = 2
     unshielded: bool = False
     seed: int = 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 from experiments.statistics import clopper_pearson
 
@@ -33,8 +34,11 @@ class Tally:
 
     def __add__(self, other: Tally) -> Tally:
         """Returns the tally of both."""
-        sums = {each.name: getattr(self, each.name) + getattr(other, each.name) for each in fields(self)}
-        return Tally(**sums | {"level": max(self.level, other.level)})
+        sums: dict[str, Any] = {
+            each.name: getattr(self, each.name) + getattr(other, each.name) for each in fields(self)
+        }
+        sums["level"] = max(self.level, other.level)
+        return Tally(**sums)
 
     @property
     def margin(self) -> float:

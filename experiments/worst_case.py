@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym import AdversarialDisturbance, NCSVectorEnv
+from ncs_gym import AdversarialDisturbance, LinearPlant, NCSVectorEnv
 from ncs_gym.law import SPHERE, Law
 from ncs_gym.system import packed, system_of
 from shields import Certificate
@@ -46,18 +46,19 @@ class HostileAgents:
     """Actions for N environments, a quarter each: random, outwards, the certified gain turned round, and bang-bang.
 
     Args:
-        env: The environments.
+        num_envs: N.
+        plant: The plant.
         certificate: Whose set and gain they turn against.
         rng: Source of randomness.
     """
 
-    def __init__(self, env: NCSVectorEnv, certificate: Certificate, rng: np.random.Generator) -> None:
-        plant, self._rng = env.plant, rng
+    def __init__(self, num_envs: int, plant: LinearPlant, certificate: Certificate, rng: np.random.Generator) -> None:
+        self._rng = rng
         self._outwards = (plant.B.T @ certificate.M @ plant.A).T
         self._turned = -1e3 * (certificate.K / plant.u_max[:, None]).T
-        ends = [env.num_envs * quarter // 4 for quarter in range(5)]
+        ends = [num_envs * quarter // 4 for quarter in range(5)]
         self._random, self._out, self._back, self._bang = (slice(*pair) for pair in itertools.pairwise(ends))
-        self._actions = np.zeros((env.num_envs, plant.m), np.float32)
+        self._actions = np.zeros((num_envs, plant.m), np.float32)
         self._signs = rng.choice([-1.0, 1.0], self._actions[self._bang].shape)
 
     def act(self, estimates: np.ndarray) -> np.ndarray:

@@ -1,0 +1,178 @@
+"""The campaign behind `ncs certify`: exact under any split, resumable, and able to see a failure."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from experiments import certify as command
+from experiments.block import Block, Campaign, run_block
+from experiments.cases import Case, cases
+from experiments.certify import certify
+from experiments.errors import ResultsError, SafetyBroken
+from experiments.settings import CertifySettings
+from experiments.tally import Tally
+from experiments.tally_store import TallyStore
+from ncs_gym import truck_trailer
+from ncs_gym.ellipsoid import Ellipsoid
+from shields import Certificate
+
+CAMPAIGN = Campaign(seed=0, random_plants=1, envs=32, shielded=True)
+CRUISE = "TruckTrailerCruise-v0, overtaking"
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("certificates")
+    chosen = {name: case for name, case in cases(0, 1).items() if name.startswith(("TruckTrailerCruise", "CartPole"))}
+    return command._certificates(chosen, folder)
+
+
+def test_every_kind_of_plant_and_channel_is_attacked():
+    found = cases(3, 5)
+    assert len(found) == 2 * 1 + 2 * 3 + (2 + 5) * 4
+    assert {case.contract is None for case in found.values()} == {True, False}
+    assert cases(3, 5)["random plant 4, perfect"].plant.fingerprint == found["random plant 4, bursts"].plant.fingerprint
+    others = cases(4, 5)["random plant 4, perfect"].plant.fingerprint
+    assert others != found["random plant 4, perfect"].plant.fingerprint
+
+
+def test_a_block_is_the_same_after_any_other(files):
+    blocks = [Block(CRUISE, 0), Block(CRUISE, 1), Block("CartPole-v0, rare", 2)]
+    first = [run_block(CAMPAIGN, block, files[block.case]) for block in blocks]
+    again = [run_block(CAMPAIGN, block, files[block.case]) for block in reversed(blocks)]
+    assert first == again[::-1]
+    assert first[0] != first[1]
+    total = sum(first, Tally())
+    assert (total.steps, total.episodes) == (3 * 32 * 200, 96)
+    assert (total.exits, total.violations, total.broken_episodes, total.unproved) == (0, 0, 0, 0)
+    assert 0 < total.interventions < total.steps
+    assert 0.99 < total.level <= 1.0
+
+
+def test_without_the_shield_the_attack_breaks_out_and_is_counted(files):
+    watching = replace(CAMPAIGN, shielded=False)
+    tally = run_block(watching, Block(CRUISE, 0), files[CRUISE])
+    assert tally.exits > 1000
+    assert tally.violations > 1000
+    assert tally.broken_episodes > 16
+    assert tally.level > 1.5
+    assert tally.unproved > 0
+    assert tally.margin < 0.0
+
+
+def test_nature_attains_every_bound(files):
+    from experiments.block import _shields
+
+    case, certificate = cases(0, 1)[CRUISE], Certificate.load(files[CRUISE])
+    shield = _shields(CAMPAIGN, CRUISE, files[CRUISE])["project"]
+    _, info = shield.reset(seed=1)
+    np.testing.assert_allclose([certificate.safe_set.gauge(x) for x in info["state"]], 1.0, atol=1e-8)
+    errors, initial = info["estimation_error"], Ellipsoid(case.plant.initial_noise.bound.shape)
+    np.testing.assert_allclose([initial.gauge(error) for error in errors], 1.0, atol=1e-8)
+    before = info["state"]
+    _, _, _, _, info = shield.step(np.zeros((32, 1), np.float32))
+    pushed = info["state"] - before @ case.plant.A.T - info["input"] @ case.plant.B.T
+    np.testing.assert_allclose(case.plant.nominal_disturbance.gauges(pushed), 1.0, atol=1e-6)
+    shield.step(np.zeros((32, 1), np.float32))
+    noise = shield.unwrapped._fleet.noise
+    np.testing.assert_allclose([case.plant.sensor_noise.bound.gauge(v) for v in noise.T], 1.0, atol=1e-6)
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """A campaign of two cases."""
+    chosen = {name: cases(0, 1)[name] for name in (CRUISE, "TruckTrailer-v0, perfect")}
+    monkeypatch.setattr(command, "cases", lambda seed, random_plants: chosen)
+
+
+def settings(out, **changes):
+    return CertifySettings(**{"steps": 4 * 16 * 200, "out": out, "random_plants": 1, "envs": 16, "jobs": 2, **changes})
+
+
+def document(folder):
+    return json.loads((folder / "certify.json").read_text())
+
+
+def test_results_do_not_depend_on_jobs_and_an_interrupted_campaign_goes_on(tmp_path, small, capsys):
+    certify(settings(tmp_path / "two"))
+    table = capsys.readouterr().out
+    assert "all" in table.splitlines()[-2]
+    certify(settings(tmp_path / "one", jobs=1))
+    assert document(tmp_path / "one") == document(tmp_path / "two")
+    assert document(tmp_path / "one")["total"]["steps"] == 4 * 16 * 200
+    log = tmp_path / "one" / "tallies.jsonl"
+    lines = log.read_bytes().splitlines(keepends=True)
+    log.write_bytes(b"".join(lines[:2]) + lines[2][:40])  # killed while it wrote the third
+    certify(settings(tmp_path / "one", jobs=1))
+    assert document(tmp_path / "one") == document(tmp_path / "two")
+    assert len(log.read_bytes().splitlines()) == 4
+    capsys.readouterr()
+    certify(settings(tmp_path / "one", jobs=1))  # all there
+    assert "per second" not in capsys.readouterr().out
+    certify(settings(tmp_path / "one", steps=5 * 16 * 200, jobs=1))
+    assert document(tmp_path / "one")["total"]["steps"] == 5 * 16 * 200
+    assert len(log.read_bytes().splitlines()) == 5
+
+
+def test_a_shield_that_fails_ends_with_an_error(tmp_path, small, monkeypatch, capsys):
+    monkeypatch.setattr(
+        command,
+        "_run",
+        lambda campaign, missing, certificates, store, jobs: store.add(
+            Block(CRUISE, 0), Tally(steps=3200, episodes=16, exits=2, broken_episodes=1, level=1.1)
+        ),
+    )
+    monkeypatch.setattr(command, "_blocks", lambda names, count: {CRUISE: [Block(CRUISE, 0)]})
+    with pytest.raises(SafetyBroken, match="2 steps outside S, 0 outside the box, 0 without a proof"):
+        certify(settings(tmp_path))
+    assert "-0.1000" in capsys.readouterr().out
+    certify(settings(tmp_path / "watching", unshielded=True))
+
+
+def test_damaged_tallies_are_refused(tmp_path):
+    path = tmp_path / "tallies.jsonl"
+    store = TallyStore(path, "key")
+    for index in range(3):
+        store.add(Block("case", index), Tally(steps=index, episodes=1))
+    whole = path.read_bytes()
+    assert TallyStore(path, "key").tallies == store.tallies
+    assert TallyStore(path, "other").tallies == {}
+    second = whole.splitlines(keepends=True)[1]
+    start = whole.index(second)
+    for position in range(start, start + len(second) - 1):
+        path.write_bytes(whole[:position] + bytes([whole[position] ^ 1]) + whole[position + 1 :])
+        with pytest.raises(ResultsError, match=r"line [23] of .* was altered"):
+            TallyStore(path, "key")
+    path.write_bytes(whole + b'{"sha256": "torn')
+    assert TallyStore(path, "key").tallies == store.tallies
+    assert path.read_bytes() == whole
+
+
+def test_tallies_add_up_and_bound_the_probability():
+    tally = sum([Tally(steps=2, episodes=300, level=0.5), Tally(steps=3, episodes=300, level=0.9)], Tally())
+    assert (tally.steps, tally.episodes, tally.level) == (5, 600, 0.9)
+    assert tally.margin == pytest.approx(0.1)
+    assert tally.bound == pytest.approx(1.0 - 0.025 ** (1.0 / 600))
+
+
+@pytest.mark.parametrize(
+    ("changes", "flag"),
+    [
+        ({"steps": 0.5}, "steps"),
+        ({"steps": float("nan")}, "steps"),
+        ({"envs": 3}, "envs"),
+        ({"jobs": 0}, "jobs"),
+        ({"seed": -1}, "seed"),
+        ({"random_plants": -1}, "random-plants"),
+    ],
+)
+def test_wrong_settings_are_named(changes, flag, tmp_path):
+    with pytest.raises(ValueError, match=f"--{flag} must be at least"):
+        settings(tmp_path, **changes)
+
+
+def test_the_certificate_of_a_case_fits_its_plant_and_contract():
+    case = Case(truck_trailer(), cases(0, 1)[CRUISE].channel)
+    assert case.certificate.fingerprint == truck_trailer().fingerprint
