@@ -26,6 +26,9 @@ from experiments.tally_store import TallyStore
 from experiments.versions import versions
 from shields.storage import write_atomically
 
+LEGEND = """failed: episodes that left S or the box; p <: upper end of the exact 95 % interval of its probability;
+margin: smallest 1 - sqrt(x'Mx) of a true state; overridden: steps in which the shield intervened"""
+
 
 def certify(settings: CertifySettings) -> None:
     """Runs `ncs certify`.
@@ -53,6 +56,7 @@ def certify(settings: CertifySettings) -> None:
     tallies = {case: sum((store.tallies[block] for block in some), Tally()) for case, some in blocks.items()}
     total = sum(tallies.values(), Tally())
     print(_table(tallies, total))
+    print(LEGEND)
     if steps > 0:
         print(f"{steps:,} steps in {seconds:.0f} s: {steps / seconds / 1e6:.2f} million per second")
     document = {"settings": asdict(campaign), "versions": versions(), "total": total.document()}
@@ -124,11 +128,11 @@ def _turn(missing: dict[str, deque[Block]], waiting: deque[str]) -> Iterator[Blo
 
 def _table(tallies: dict[str, Tally], total: Tally) -> str:
     """Returns the results as text."""
-    head = ("case", "steps", "exits", "box", "episodes", "broken", "<= 95 %", "margin", "overridden")
+    head = ("case", "steps", "outside S", "outside box", "episodes", "failed", "p <", "margin", "overridden")
     rows: list[tuple[str, ...]] = [head]
     for name, tally in [*tallies.items(), ("all", total)]:
         counts = tally.steps, tally.exits, tally.violations, tally.episodes, tally.broken_episodes
-        shares = f"{tally.bound:.1e}", f"{tally.margin:.4f}", f"{tally.interventions / tally.steps:.1%}"
+        shares = f"{tally.bound:.1e}", f"{tally.margin:.1e}", f"{tally.interventions / tally.steps:.1%}"
         rows.append((name, *(f"{count:,}" for count in counts), *shares))
     widths = [max(len(row[column]) for row in rows) for column in range(len(head))]
     lines = [

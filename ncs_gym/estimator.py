@@ -177,7 +177,7 @@ class Estimator:
         the contract no set is certified; the trace-optimal shape still holds the error.
         """
         A, D, certified = self.plant.A, self.plant.disturbance.shape, self.error_set.shape_at(age + 1)
-        extent = self._abs_A @ np.sqrt(np.diag(shape))
+        extent = self._abs_A @ np.sqrt(shape.diagonal())
         moved = _grown(A @ shape @ A.T, extent)
         predicted = self._settled_shape(outer_sum(moved, D, self.plant.weight))
         if certified is None or is_inside(predicted, certified):
@@ -251,7 +251,7 @@ class Estimator:
         """Returns (I-TH) Sigma_k (I-TH)'/mu + T N T'/(1-mu) with the trace-optimal mu: sound for any gain T."""
         kept = self._identity - gain @ self.plant.H
         size = np.abs(gain)
-        extent = np.sqrt(np.diag(shape))
+        extent = np.sqrt(shape.diagonal())
         carried = _grown(kept @ shape @ kept.T, extent + size @ (self._abs_H @ extent))
         noise = _grown(gain @ self._noise @ gain.T, size @ self._noise_extent)
         return self._settled_shape(
@@ -264,13 +264,13 @@ class Estimator:
         Rounding moves an entry by half a step, hence no direction by more than n halves of one, which is added before.
         """
         inward, outward = self._to_ball, self._ball
-        inner = _grown(inward @ shape @ inward.T, np.abs(inward) @ np.sqrt(np.abs(np.diag(shape))))
+        inner = _grown(inward @ shape @ inward.T, np.abs(inward) @ np.sqrt(np.abs(shape.diagonal())))
         inner.flat[:: len(inner) + 1] += len(inner) * self._step
         inner = self._step * np.round(inner / self._step)
-        settled = _grown(outward @ inner @ outward.T, np.abs(outward) @ np.sqrt(np.diag(inner)))
+        settled = _grown(outward @ inner @ outward.T, np.abs(outward) @ np.sqrt(inner.diagonal()))
         # Both products together move the shape S by at most E S + S E', |E| at most `ball_error`; with s the extent and
         # a = max |E| s / s that is at most 2 n a diag(s^2).
-        extent = np.sqrt(np.abs(np.diag(shape)))
+        extent = np.sqrt(np.abs(shape.diagonal()))
         turned = float(np.max(self._ball_error @ extent / np.maximum(extent, 1e-300)))
         settled.flat[:: len(inner) + 1] += 2.0 * len(inner) * turned * extent**2
         return settled
@@ -327,7 +327,7 @@ def _settled(covariance: np.ndarray, bits: int) -> np.ndarray:
         factor = np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError:
         return covariance
-    steps = np.exp2(np.ceil(0.5 * np.log2(np.diag(covariance))) - bits)[:, None]
+    steps = np.exp2(np.ceil(0.5 * np.log2(covariance.diagonal())) - bits)[:, None]
     factor = steps * np.round(factor / steps)
     return factor @ factor.T
 

@@ -98,7 +98,7 @@ def document(folder):
 def test_results_do_not_depend_on_jobs_and_an_interrupted_campaign_goes_on(tmp_path, small, capsys):
     certify(settings(tmp_path / "two"))
     table = capsys.readouterr().out
-    assert "all" in table.splitlines()[-2]
+    assert any(line.startswith("all  ") for line in table.splitlines())
     certify(settings(tmp_path / "one", jobs=1))
     assert document(tmp_path / "one") == document(tmp_path / "two")
     assert document(tmp_path / "one")["total"]["steps"] == 4 * 16 * 200
@@ -127,7 +127,7 @@ def test_a_shield_that_fails_ends_with_an_error(tmp_path, small, monkeypatch, ca
     monkeypatch.setattr(command, "_blocks", lambda names, count: {CRUISE: [Block(CRUISE, 0)]})
     with pytest.raises(SafetyBroken, match="2 steps outside S, 0 outside the box, 0 without a proof"):
         certify(settings(tmp_path))
-    assert "-0.1000" in capsys.readouterr().out
+    assert "-1.0e-01" in capsys.readouterr().out
     certify(settings(tmp_path / "watching", unshielded=True))
 
 
