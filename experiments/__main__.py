@@ -52,11 +52,12 @@ COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
 def _parse(arguments: list[str]) -> object:
     import tyro
 
-    from experiments import settings
+    from experiments import proof_settings, settings
     from experiments.settings_file import with_config
 
+    kinds = vars(settings) | vars(proof_settings)
     return tyro.extras.subcommand_cli_from_dict(
-        {name: getattr(settings, kind) for name, (kind, _, _) in COMMANDS.items()},
+        {name: kinds[kind] for name, (kind, _, _) in COMMANDS.items()},
         prog="ncs",
         description="Safe learning control over imperfect networks.",
         args=with_config(arguments),

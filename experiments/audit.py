@@ -11,7 +11,7 @@ import numpy as np
 
 from experiments.counterexample import OneStep, stays_inside, worst_step
 from experiments.printed_case import PrintedCase
-from experiments.settings import AuditSettings
+from experiments.proof_settings import AuditSettings
 from shields.feasibility import FeasibilityScan, largest_gamma, largest_scale
 from shields.paper_bounds import PaperModel, safety_margin, uplink_error_bound
 from shields.storage import write_atomically

@@ -8,7 +8,7 @@ from dataclasses import asdict
 import gymnasium as gym
 from tqdm import tqdm
 
-from experiments.settings import SynthesizeSettings, VerifySettings
+from experiments.proof_settings import SynthesizeSettings, VerifySettings
 from ncs_gym import ChannelContract, LinearPlant, scenarios
 from ncs_gym.env import ncs_env
 from ncs_gym.scenarios import ENTRY_POINTS

@@ -20,7 +20,7 @@ from experiments.cases import Case, cases
 from experiments.errors import SafetyBroken
 from experiments.parent import belong_to_parent
 from experiments.progress import progress_bar
-from experiments.settings import CertifySettings
+from experiments.proof_settings import CertifySettings
 from experiments.tally import Tally
 from experiments.tally_store import TallyStore
 from experiments.versions import versions

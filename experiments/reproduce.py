@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from experiments.plotting import STYLE, as_png
 from experiments.printed_case import PrintedCase
-from experiments.settings import ReproduceSettings
+from experiments.proof_settings import ReproduceSettings
 from ncs_gym import BoxDisturbance, Ellipsoid, LinearPlant
 from ncs_gym.scenarios import CASE_STUDY_BOX
 from shields import synthesize

@@ -11,7 +11,7 @@ from experiments.block import Block, Campaign, run_block
 from experiments.cases import Case, cases
 from experiments.certify import certify
 from experiments.errors import ResultsError, SafetyBroken
-from experiments.settings import CertifySettings
+from experiments.proof_settings import CertifySettings
 from experiments.tally import Tally
 from experiments.tally_store import TallyStore
 from ncs_gym import truck_trailer

@@ -1,0 +1,114 @@
+"""What the commands that train nothing can be told; importing this is cheap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+
+@dataclass(frozen=True, kw_only=True)
+class SynthesizeSettings:
+    """Synthesizes a certificate for an environment's plant, verifies it exactly and saves it.
+
+    Attributes:
+        env: Id of a registered environment.
+        method: The certified method, or the published one as printed.
+        out: File for the certificate (JSON).
+        max_age: Channel contract to rest on, in steps; by default the environment's own, if it needs one.
+        seed: Accepted by every command; the synthesis is deterministic and does not use it.
+    """
+
+    env: str = "ncs_gym/TruckTrailerCruise-v0"
+    method: Literal["certified", "paper"] = "certified"
+    out: Path = Path("certificate.json")
+    max_age: int | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerifySettings:
+    """Verifies a certificate in exact rational arithmetic against the plant it was made for.
+
+    Attributes:
+        file: The certificate (JSON).
+        env: Id of a registered environment; without it, the one whose plant has the certificate's fingerprint.
+        out: File for the verdicts (JSON).
+        seed: Accepted by every command; the verification is deterministic and does not use it.
+    """
+
+    file: tyro.conf.Positional[Path]
+    env: str | None = None
+    out: Path | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class CertifySettings:
+    """Attacks shielded loops with everything the assumptions allow, and counts what leaves the safe set.
+
+    Registered environments and random plants, behind every kind of channel; disturbances that push the next state
+    farthest out, starts, first errors and sensor noise of full size; random and hostile agents.
+
+    Attributes:
+        steps: In all, at least; whole blocks of `envs` episodes are run, one of every case at the least.
+        out: Folder; an interrupted campaign goes on where it was, and one with more steps adds to it.
+        random_plants: How many random plants, each behind four kinds of channels.
+        envs: Episodes of a block, run side by side.
+        jobs: Worker processes.
+        unshielded: Let the shield only watch: what happens without it.
+        seed: Of the campaign, >= 0.
+    """
+
+    steps: float = 1e8
+    out: Path = Path("runs/certify")
+    random_plants: int = 4
+    envs: int = 8192
+    jobs: int = 2
+    unshielded: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        if not 1.0 <= self.steps < 1e15:
+            raise ValueError(f"--steps must be at least 1 and below 1e15, got {self.steps:g}")
+        for name, least in (("random_plants", 0), ("envs", 4), ("jobs", 1), ("seed", 0)):
+            if getattr(self, name) < least:
+                flag = name.replace("_", "-")
+                raise ValueError(f"--{flag} must be at least {least}, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AuditSettings:
+    """Checks the printed numbers of the paper (Liu et al. Section 5) claim by claim, from its own data.
+
+    Attributes:
+        json: Print JSON instead of the table.
+        out: File for the rows (JSON).
+        seed: Accepted by every command; the audit is deterministic and does not use it.
+    """
+
+    json: bool = False
+    out: Path | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReproduceSettings:
+    """Simulates Section 5 of Liu et al.: printed (K, M), certified (K, M), and OP's at the nearest feasible bounds.
+
+    Random starts in each safe set, all four impairments; prints a table and leaves figures and summary.json.
+
+    Attributes:
+        out: Output folder.
+        starts: Random initial states per design.
+        steps: Steps of each simulation.
+        seed: Of starts, disturbances and channel, alike for all designs.
+    """
+
+    out: Path = Path("runs/reproduce")
+    starts: int = 100
+    steps: int = 200
+    seed: int = 0
