@@ -11,7 +11,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ncs_gym.ellipsoid import Ellipsoid
-from ncs_gym.frozen import FILLED_IN, FrozenArrays, as_covariance, as_matrix, as_number, read_only
+from ncs_gym.frozen import (
+    FILLED_IN,
+    LARGEST,
+    SMALLEST,
+    FrozenArrays,
+    as_covariance,
+    as_matrix,
+    as_names,
+    as_number,
+    as_setting,
+    read_only,
+    shown,
+)
 from ncs_gym.noise import SMALLEST_KEPT, TruncatedGaussian, chi2_quantile
 
 if TYPE_CHECKING:
@@ -104,8 +116,9 @@ class LinearPlant(FrozenArrays):
         self._set("A", A)
         self._set("B", B)
         self._set("C", as_matrix(self.C, (None, n), "C"))
-        if not np.abs(H).max(axis=1).all():
-            raise ValueError(f"every row of H must measure something, got {H.tolist()}")
+        for name, matrix, does in (("C", self.C, "limit"), ("H", H, "measure")):
+            if (np.abs(matrix).max(axis=1) < SMALLEST).any():
+                raise ValueError(f"every row of {name} must {does} something, got {shown(matrix.tolist())}")
         self._set("H", H)
         self._set("u_max", _as_limits(self.u_max, m))
         self._set("dt", as_number(self.dt, "dt", low=0.0, low_open=True))
@@ -117,12 +130,9 @@ class LinearPlant(FrozenArrays):
         if self.error_gain is not None:
             self._set("error_gain", as_matrix(self.error_gain, (m, n), "error_gain"))
         for name, size, letter in (("state", n, "x"), ("input", m, "u")):
-            names = tuple(getattr(self, f"{name}_names")) or tuple(f"{letter}{i + 1}" for i in range(size))
-            units = tuple(getattr(self, f"{name}_units")) or ("",) * size
-            if len(names) != size or len(units) != size:
-                raise ValueError(f"{name}_names and {name}_units must have {size} entries, got {names} and {units}")
-            self._set(f"{name}_names", names)
-            self._set(f"{name}_units", units)
+            names = tuple(f"{letter}{i + 1}" for i in range(size))
+            for field_name, default in ((f"{name}_names", names), (f"{name}_units", ("",) * size)):
+                self._set(field_name, as_names(getattr(self, field_name), default, field_name))
         self._freeze_arrays()
 
     def _set(self, name: str, value: Any) -> None:
@@ -248,12 +258,9 @@ class LinearPlant(FrozenArrays):
 
 def _as_limits(value: Any, size: int) -> np.ndarray:
     """Returns input limits as a positive finite array of shape (size,)."""
-    try:
-        limits = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"u_max must be a positive number or shape ({size},), got {value!r}") from error
-    if limits.shape not in ((), (size,)) or not np.isfinite(limits).all() or (limits <= 0.0).any():
-        raise ValueError(f"u_max must be a positive number or shape ({size},), got {value!r}")
+    limits = as_setting(value)
+    if limits is None or limits.shape not in ((), (size,)) or not ((limits >= SMALLEST) & (limits < LARGEST)).all():
+        raise ValueError(f"u_max must be a positive number or shape ({size},), got {shown(value)}")
     return np.broadcast_to(limits, (size,)).copy()
 
 

@@ -11,7 +11,7 @@ from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, S
 
 from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv
 from ncs_gym.env import applied_input, ncs_env
-from ncs_gym.frozen import as_number
+from ncs_gym.frozen import as_number, shown
 from shields.certificate import Certificate
 from shields.filter import SafetyFilter
 from shields.proof import ProofTracker, starts_inside
@@ -68,11 +68,11 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         penalty: float = 0.0,
     ) -> None:
         RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty)
-        gym.Wrapper.__init__(self, env)
         plant = _plant_behind(env)
+        gym.Wrapper.__init__(self, env)
         self.penalty = as_number(penalty, "penalty", low=0.0)
         if certificate is not None and not isinstance(certificate, Certificate):
-            raise ValueError(f"certificate must be a Certificate or None, got {certificate!r}")
+            raise ValueError(f"certificate must be a Certificate or None, got {shown(certificate)}")
         contract = ncs_env(env).contract
         self.certificate = certificate_for(plant, contract) if certificate is None else certificate
         self.filter = SafetyFilter(self.certificate, plant, mode)
