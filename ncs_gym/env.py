@@ -55,7 +55,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     | rest | the task's own, perfectly known entries | those of the task |
 
     ## Step
-    x+ = A x + B u + d. The sensor measures y = H x+ + v; the channel quantizes, rations, loses and delays it;
+    x+ = A x + B u + d (where an unstable plant runs away, up to `plant.farthest`). The sensor measures y = H x+ + v;
+    the channel quantizes, rations, loses and delays it;
     the estimator predicts with the input really applied and takes in what arrived (`theory.md` section 1).
 
     ## Rewards
@@ -198,7 +199,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._consistent = False
         rng = self.np_random
         nominal_next = self.plant.A @ self._state + self.plant.B @ u
-        self._state = nominal_next + self._draw_disturbance(nominal_next)
+        moved, farthest = nominal_next + self._draw_disturbance(nominal_next), self.plant.farthest
+        self._state = np.clip(moved, -farthest, farthest)
         self._task_memory = self.task.advance(rng, self.plant, self._task_memory, u)
         self.steps += 1
         sample = self._measure() if self._link.sends_at(self.steps) else None

@@ -172,7 +172,8 @@ def as_number(
     below = number < high if high_open else number <= high
     if not (np.isfinite(number) and above and below):
         raise ValueError(f"{name} must be a number {wanted}, got {shown(value)}")
-    if not (number == 0.0 or SMALLEST <= abs(number) < LARGEST):
+    bounded = np.isfinite(low) and np.isfinite(high)
+    if not (bounded or number == 0.0 or SMALLEST <= abs(number) < LARGEST):
         raise ValueError(f"{name} must be between {SMALLEST:g} and {LARGEST:g} in size, got {number!r}")
     return number
 

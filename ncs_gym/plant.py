@@ -37,6 +37,8 @@ FLAT_INFLATION = 1e-12
 THINNEST = 1e-19
 # Simulating a step in float64 rounds; the disturbance bound has room for that up to this many half-widths out.
 SIMULATED_REACH = 100.0
+# An unstable plant that nobody holds runs away no further than this many half-widths: what lies beyond ends in NaN.
+FARTHEST = 1e30
 # Smaller truncation levels have no finite quantile in float64.
 SMALLEST_DELTA = 1e-12
 
@@ -168,6 +170,11 @@ class LinearPlant(FrozenArrays):
     def half_widths(self) -> np.ndarray:
         """Half-widths of the ellipsoid {x : x'Wx <= 1} around the safe box' center, shape (n,)."""
         return read_only(np.sqrt(np.diag(np.linalg.inv(self.weight))))
+
+    @cached_property
+    def farthest(self) -> np.ndarray:
+        """Where a simulation stops a state that runs away, shape (n,); infinite for a stable plant."""
+        return read_only(FARTHEST * self.half_widths if self.spectral_radius >= 1.0 else np.full(self.n, np.inf))
 
     @cached_property
     def process_noise(self) -> TruncatedGaussian:

@@ -340,7 +340,7 @@ class NCSVectorEnv(VectorEnv):
         n, starts = self.plant.n, as_numbers(options["state"])
         if starts is None or starts.shape not in {(n,), (self.num_envs, n)} or not np.isfinite(starts).all():
             raise ValueError(
-                f"options['state'] must be finite with shape ({n},) or ({self.num_envs}, {n}), got {shown(options['state'])}"
+                f"options['state'] must be finite with shape ({n},) or ({self.num_envs}, {n}), got {shown(starts)}"
             )
         return mask, np.broadcast_to(starts, (self.num_envs, n))
 
