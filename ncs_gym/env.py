@@ -167,8 +167,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             ValueError: If an option is unknown or x0 has a wrong shape or is not finite.
         """
         start = _start_option(options, self.plant.n)
-        self._consistent = False
         super().reset(seed=seed)
+        self._consistent = False
         rng = self.np_random
         self.start = self.initial_set if start is None else read_only(start)
         self._state = (1.0 - SAMPLE_ROUNDING) * self.initial_set.sample(rng) if start is None else start

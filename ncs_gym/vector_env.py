@@ -128,7 +128,8 @@ class NCSVectorEnv(VectorEnv):
         """
         mask, starts = self._reset_options(options)
         if isinstance(seed, (list, tuple, np.ndarray)):
-            seed = int(np.random.SeedSequence([int(each) for each in seed]).generate_state(1, np.uint64)[0] >> 1)
+            seeds = [as_count(each, "each seed", low=0, high=2**64) for each in seed]
+            seed = int(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0] >> 1)
         super().reset(seed=seed)
         if seed is not None or not self._consistent:
             fill_keys(self.np_random.integers(2**64, dtype=np.uint64), self._fleet.keys)

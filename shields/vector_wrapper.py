@@ -124,8 +124,13 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
     ) -> tuple[Any, dict[str, Any]]:
         """Starts episodes; see `NCSVectorEnv.reset`."""
         before, self._clock = self._clock or self._interrupted, self._clock and self._interrupted
-        # gymnasium's annotation leaves out the lists that its own vector environments take.
-        observation, info = self.env.reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
+        try:
+            # gymnasium's annotation leaves out the lists that its own vector environments take.
+            observation, info = self.env.reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
+        except ValueError:
+            if self._clock and all(np.array_equal(*pair) for pair in zip(before, self._read_clock(), strict=True)):
+                self._clock = before  # refused before anything moved
+            raise
         now = self._read_clock()
         restarted = now.episodes != before.episodes
         unmoved = (now.steps == before.steps) & (now.ticks == before.ticks)

@@ -82,10 +82,15 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode; see `NCSEnv.reset`."""
-        self._clock = self._clock and INTERRUPTED
+        before, self._clock = self._clock, self._clock and INTERRUPTED
         if self._is_drawn:
             self._annotate(None, 0, intervened=False)
-        observation, info = self.env.reset(seed=seed, options=options)
+        try:
+            observation, info = self.env.reset(seed=seed, options=options)
+        except ValueError:
+            if self._read_clock() == before:  # refused before anything moved
+                self._clock = before
+            raise
         clock = self._read_clock()
         self._proof.start(starts_inside(self.certificate, ncs_env(self.env).start), clock[1] == 0, info)
         self._estimate, self._error_shape = np.array(info["estimate"]), np.array(info["error_shape"])
