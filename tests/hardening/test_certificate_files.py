@@ -43,16 +43,22 @@ def damaged(data, at, kind):
     return data[:at] + changed + (b"" if kind == "truncate" else data[at + 1 :])
 
 
+def loaded_from(path):
+    """The certificate in a file; None if it is refused in one sentence."""
+    try:
+        return Certificate.load(path)
+    except CertificateError as error:
+        sentence = str(error)
+    assert "\n" not in sentence
+    return None
+
+
 def assert_noticed(data, certificate, path):
     """A damaged file is refused in one sentence, or says exactly the same."""
     path.write_bytes(data)
-    try:
-        loaded = Certificate.load(path)
-    except CertificateError as error:
-        assert "\n" not in str(error)
-        return 1
-    assert loaded.document == certificate.document
-    return 0
+    loaded = loaded_from(path)
+    assert loaded is None or loaded.document == certificate.document
+    return loaded is None
 
 
 def assert_every_byte_counts(name, positions, path):
@@ -105,11 +111,7 @@ def forged(content, path):
     text = json.dumps(content)
     literal = json.loads(text, parse_float=str, parse_int=str)
     path.write_text(json.dumps({"format": "ncs-gym certificate 2", "sha256": _digest(literal), "certificate": content}))
-    try:
-        return Certificate.load(path)
-    except CertificateError as error:
-        assert "\n" not in str(error)
-        return None
+    return loaded_from(path)
 
 
 def support(shape, directions):
@@ -154,7 +156,7 @@ def judged(content, plant, path):
 @pytest.mark.parametrize("name", ["stable", "contract"])
 def test_every_number_forged_in_turn_fails_or_leaves_the_certificate_true(name, tmp_path):
     plant, certificate = case(name)
-    content = certificate.document["certificate"]
+    content = json.loads(json.dumps(certificate.document["certificate"]))
     assert judged(content, plant, tmp_path / "c.json")
     numbers = [leaf for leaf in leaves(content) if leaf[0] not in ("provenance", "fingerprint", "method")]
     factors = [0.0, -1.0, 0.5, 1.0 - 1e-4, 1.0 + 1e-4, 2.0]
@@ -173,7 +175,7 @@ def test_every_number_forged_in_turn_fails_or_leaves_the_certificate_true(name, 
 def test_certificates_forged_at_random_are_refused_or_true(tmp_path_factory, data):
     path = tmp_path_factory.getbasetemp() / "forged.json"
     plant, certificate = case(data.draw(st.sampled_from(["stable", "contract"])))
-    content = certificate.document["certificate"]
+    content = json.loads(json.dumps(certificate.document["certificate"]))
     for _ in range(data.draw(st.integers(1, 3))):
         places = leaves(content)
         containers = sorted({leaf[:depth] for leaf in places for depth in range(1, len(leaf))}, key=str)
