@@ -55,12 +55,15 @@ def _parse(arguments: list[str]) -> object:
     from experiments import settings
     from experiments.settings_file import with_config
 
-    return tyro.extras.subcommand_cli_from_dict(
-        {name: getattr(settings, kind) for name, (kind, _, _) in COMMANDS.items()},
-        prog="ncs",
-        description="Safe learning control over imperfect networks.",
-        args=with_config(arguments),
-    )
+    def parsed(given: list[str]) -> object:
+        return tyro.extras.subcommand_cli_from_dict(
+            {name: getattr(settings, kind) for name, (kind, _, _) in COMMANDS.items()},
+            prog="ncs",
+            description="Safe learning control over imperfect networks.",
+            args=given,
+        )
+
+    return parsed(with_config(arguments, parsed))
 
 
 def _run(chosen: object) -> None:
