@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ncs_gym.ellipsoid import Ellipsoid
+from ncs_gym.ellipsoid import Ellipsoid, outer_sum
 from ncs_gym.frozen import (
     FILLED_IN,
     LARGEST,
@@ -167,6 +167,11 @@ class LinearPlant(FrozenArrays):
         return read_only(gram + 1e-6 * np.diag(np.diag(gram) + np.trace(gram) / self.n * (np.diag(gram) == 0.0)))
 
     @cached_property
+    def relative_weight(self) -> np.ndarray:
+        """W in units of its largest entry, shape (n, n): the identity exactly if the box is a cube."""
+        return read_only(self.weight / self.weight.max())
+
+    @cached_property
     def half_widths(self) -> np.ndarray:
         """Half-widths of the ellipsoid {x : x'Wx <= 1} around the safe box' center, shape (n,)."""
         return read_only(np.sqrt(np.diag(np.linalg.inv(self.weight))))
@@ -219,7 +224,7 @@ class LinearPlant(FrozenArrays):
     def nominal_disturbance(self) -> Ellipsoid:
         """D before inflation: where extremal disturbances are drawn, so that their rounding stays inside E(D)."""
         ball = Ellipsoid(self.gamma * np.eye(self.n))
-        return _sum_or_other(ball, self.process_noise.bound)
+        return _sum_or_other(ball, self.process_noise.bound, self.relative_weight)
 
     @cached_property
     def sensor_error(self) -> Ellipsoid:
@@ -229,7 +234,7 @@ class LinearPlant(FrozenArrays):
     def sensor_error_with(self, quantization_step: float) -> Ellipsoid:
         """Returns N, shape (p, p): sensor noise plus the ball of squared radius p q^2/4 around a quantizer's box."""
         ball = Ellipsoid(self.p * quantization_step**2 / 4.0 * np.eye(self.p))
-        return Ellipsoid(_inflated(_sum_or_other(ball, self.sensor_noise.bound).shape))
+        return Ellipsoid(_inflated(_sum_or_other(ball, self.sensor_noise.bound, np.eye(self.p)).shape))
 
     @cached_property
     def initial_error(self) -> Ellipsoid:
@@ -276,10 +281,10 @@ def _inflated(shape: np.ndarray) -> np.ndarray:
     return INFLATION * shape + FLAT_INFLATION * np.diag(np.diag(shape))
 
 
-def _sum_or_other(first: Ellipsoid, second: Ellipsoid) -> Ellipsoid:
-    """Returns an ellipsoid around the sum; where one of them is a point, the other alone."""
+def _sum_or_other(first: Ellipsoid, second: Ellipsoid, weight: np.ndarray) -> Ellipsoid:
+    """Returns an ellipsoid around the sum, of the smallest tr(W P); where one of them is a point, the other alone."""
     if not np.any(first.shape):
         return second
     if not np.any(second.shape):
         return first
-    return first.outer_sum(second)
+    return Ellipsoid(outer_sum(first.shape, second.shape, weight))
