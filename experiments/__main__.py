@@ -56,12 +56,16 @@ def _parse(arguments: list[str]) -> object:
     from experiments.settings_file import with_config
 
     kinds = vars(settings) | vars(proof_settings)
-    return tyro.extras.subcommand_cli_from_dict(
-        {name: kinds[kind] for name, (kind, _, _) in COMMANDS.items()},
-        prog="ncs",
-        description="Safe learning control over imperfect networks.",
-        args=with_config(arguments),
-    )
+
+    def parsed(given: list[str]) -> object:
+        return tyro.extras.subcommand_cli_from_dict(
+            {name: kinds[kind] for name, (kind, _, _) in COMMANDS.items()},
+            prog="ncs",
+            description="Safe learning control over imperfect networks.",
+            args=given,
+        )
+
+    return parsed(with_config(arguments, parsed))
 
 
 def _run(chosen: object) -> None:

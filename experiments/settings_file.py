@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from ncs_gym.frozen import LONGEST_QUOTE
 from shields.storage import write_atomically
 
 FORMAT = "ncs-gym settings 1"
@@ -32,11 +36,15 @@ def save_settings(path: Path, command: str, settings: Any) -> None:
     write_atomically(path, json.dumps(settings_json(command, settings), indent=1) + "\n")
 
 
-def with_config(arguments: list[str]) -> list[str]:
+def with_config(arguments: list[str], parse: Callable[[list[str]], Any] | None = None) -> list[str]:
     """Returns the command line with `--config FILE` replaced by the flags in the file, before the user's own flags.
 
+    Args:
+        arguments: The command line.
+        parse: Returns the settings that a command line stands for, or exits; None does not look at the values.
+
     Raises:
-        SettingsError: If the file is missing, damaged or another command's.
+        SettingsError: If the file is missing, damaged or another command's, or holds what `parse` does not take.
     """
     given = [i for i, argument in enumerate(arguments) if argument == FLAG or argument.startswith(f"{FLAG}=")]
     if not given or not arguments[0:1] or arguments[0].startswith("-"):
@@ -48,7 +56,39 @@ def with_config(arguments: list[str]) -> list[str]:
     if not value or value.startswith("--"):
         raise SettingsError(f"{FLAG} needs a file")
     rest = arguments[1:at] + arguments[at + (1 if "=" in arguments[at] else 2) :]
-    return [arguments[0], *_flags(_read(Path(value), arguments[0])), *rest]
+    command, values = arguments[0], _read(Path(value), arguments[0])
+    if parse is not None:
+        _require_meaning(Path(value), command, values, parse)
+    return [command, *_flags(values), *rest]
+
+
+def _require_meaning(path: Path, command: str, values: dict[str, Any], parse: Callable[[list[str]], Any]) -> None:
+    """Raises unless every value in a file is what the command makes of its flag.
+
+    Raises:
+        SettingsError: Naming the first that is not.
+    """
+    for name, value in values.items():
+        flags, unheard = _flags({name: value}), io.StringIO()
+        try:
+            with contextlib.redirect_stdout(unheard), contextlib.redirect_stderr(unheard):
+                read = settings_json(command, parse([command, *flags]))["settings"]
+        except (SystemExit, ValueError):
+            read = {}
+        if name not in read or not _is_same(value, read[name]):
+            text = " ".join(f"{name} = {json.dumps(value)}".split())
+            raise SettingsError(f"settings {path} hold what ncs {command} does not take: {text[:LONGEST_QUOTE]}")
+
+
+def _is_same(given: Any, read: Any) -> bool:
+    """Returns whether a value in a file means what was read; what is not given in it is not compared."""
+    if isinstance(given, dict) and isinstance(read, dict):
+        return all(key in read and _is_same(value, read[key]) for key, value in given.items())
+    if isinstance(given, list) and isinstance(read, list):
+        return len(given) == len(read) and all(map(_is_same, given, read))
+    if isinstance(given, str) and isinstance(read, str):
+        return given == read or str(Path(given)) == read
+    return isinstance(given, bool) == isinstance(read, bool) and given == read
 
 
 def _read(path: Path, command: str) -> dict[str, Any]:

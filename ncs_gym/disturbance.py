@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ncs_gym.ellipsoid import Ellipsoid
-from ncs_gym.frozen import FrozenArrays, as_covariance, as_number, as_vector, forget_batches
+from ncs_gym.frozen import LARGEST, FrozenArrays, as_covariance, as_number, as_setting, as_vector, forget_batches, shown
 from ncs_gym.plant import LinearPlant
 
 # Extreme points are pulled in, and points out by rounding pushed in, by this much.
@@ -279,9 +279,9 @@ def checked_many(plant: LinearPlant, d: Any, count: int, *, allow_assumption_vio
     Raises:
         ValueError: If one is not finite, wrongly shaped, or further outside than TOLERANCE and that is not allowed.
     """
-    d = np.array(d, dtype=np.float64)
-    if d.shape != (count, plant.n) or not np.isfinite(d).all():
-        raise ValueError(f"the disturbances must be finite with shape ({count}, {plant.n}), got {d!r}")
+    given, d = d, as_setting(d)
+    if d is None or d.shape != (count, plant.n) or not (np.abs(d) < LARGEST).all():
+        raise ValueError(f"the disturbances must be finite with shape ({count}, {plant.n}), got {shown(given)}")
     if allow_assumption_violation:
         return d
     outside = np.flatnonzero(plant.allowed_disturbance.gauges(d) > 1.0 - ROUNDING)
@@ -312,11 +312,13 @@ def as_disturbance(value: Any, plant: LinearPlant, allow_assumption_violation: b
     """
     if isinstance(value, str) and value in BY_NAME:
         value = BY_NAME[value]()
-    elif not isinstance(value, Disturbance) and callable(value):
+    elif not isinstance(value, Disturbance | type) and callable(value):
         function: Any = value
         value = CallableDisturbance(function)
     if not isinstance(value, Disturbance):
-        raise ValueError(f"disturbance must be one of {sorted(BY_NAME)}, a Disturbance or a callable, got {value!r}")
+        raise ValueError(
+            f"disturbance must be one of {sorted(BY_NAME)}, a Disturbance or a callable, got {shown(value)}"
+        )
     problem = value.check(plant)
     if not problem and not allow_assumption_violation:
         problem = value.excess(plant)

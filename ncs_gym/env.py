@@ -14,7 +14,7 @@ from ncs_gym.disturbance import as_disturbance, checked, stays_inside
 from ncs_gym.ellipsoid import Ellipsoid
 from ncs_gym.error_set import UnstablePlantError, certified_error_set
 from ncs_gym.estimator import Estimator
-from ncs_gym.frozen import as_count, as_flag, as_numbers, as_vector, read_only
+from ncs_gym.frozen import as_count, as_flag, as_numbers, as_vector, read_only, shown
 from ncs_gym.plant import LinearPlant
 from ncs_gym.rendering import Annotation, Film, Scene, scene_of
 from ncs_gym.task import Regulation, SpeedProfile, Task
@@ -27,6 +27,8 @@ START_SHARE = 0.1
 SAMPLE_ROUNDING = 1e-9
 # Observations of an unstable plant end this many half-widths of the box out: what lies beyond is lost anyway.
 FARTHEST_OBSERVED = 1e6
+# The steps the observation space is sized for are gone through one by one.
+LONGEST_HORIZON = 100_000
 # Widens the observation box: float32 rounding, and estimates a little off the reachable set.
 OBSERVATION_MARGIN = 1.01
 RENDER_MODES = ["human", "rgb_array"]
@@ -53,7 +55,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     | rest | the task's own, perfectly known entries | those of the task |
 
     ## Step
-    x+ = A x + B u + d. The sensor measures y = H x+ + v; the channel quantizes, rations, loses and delays it;
+    x+ = A x + B u + d (where an unstable plant runs away, up to `plant.farthest`). The sensor measures y = H x+ + v;
+    the channel quantizes, rations, loses and delays it;
     the estimator predicts with the input really applied and takes in what arrived (`theory.md` section 1).
 
     ## Rewards
@@ -127,25 +130,25 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self.plant = _expect(plant, LinearPlant, "plant")
         self.channel = Channel() if channel is None else _expect(channel, Channel, "channel")
         self.task = Regulation() if task is None else _expect(task, Task, "task")
-        self.disturbance = as_disturbance(disturbance, plant, bool(allow_assumption_violation))
+        self.terminate_on_violation = as_flag(terminate_on_violation, "terminate_on_violation")
+        self.allow_assumption_violation = as_flag(allow_assumption_violation, "allow_assumption_violation")
+        self.disturbance = as_disturbance(disturbance, plant, self.allow_assumption_violation)
         self.initial_set = default_initial_set(plant) if initial_set is None else initial_set
         _expect(self.initial_set, Ellipsoid, "initial_set")
         if self.initial_set.dim != plant.n:
             raise ValueError(f"initial_set must have dimension {plant.n}, got {self.initial_set.dim}")
         if problem := self.task.check(plant):
             raise ValueError(f"{type(self.task).__name__}: {problem}")
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            raise RenderModeError(f"render_mode must be None or one of {RENDER_MODES}, got {render_mode!r}")
+        if render_mode is not None and not (isinstance(render_mode, str) and render_mode in RENDER_MODES):
+            raise RenderModeError(f"render_mode must be None or one of {RENDER_MODES}, got {shown(render_mode)}")
         self.render_mode = render_mode
         self._film = None if render_mode is None else Film(plant, "ncs-gym", RENDER_FPS)
-        self.terminate_on_violation = as_flag(terminate_on_violation, "terminate_on_violation")
-        self.allow_assumption_violation = as_flag(allow_assumption_violation, "allow_assumption_violation")
         self.contract = _contract(plant, self.channel, contract)
         self.error_set = certified_error_set(plant, self.contract)
         self.estimator = Estimator(plant, self.channel, self.error_set)
-        self.horizon = as_count(horizon, "horizon", low=1)
+        self.horizon = as_count(horizon, "horizon", low=1, high=LONGEST_HORIZON)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)
-        bound = observation_bound(self).astype(np.float32)
+        bound = _as_float32(observation_bound(self))
         self.observation_space = Box(-bound, bound, dtype=np.float32)
         self.steps = self.episodes = 0
         self.start: Ellipsoid | np.ndarray = self.initial_set
@@ -164,8 +167,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             ValueError: If an option is unknown or x0 has a wrong shape or is not finite.
         """
         start = _start_option(options, self.plant.n)
-        self._consistent = False
         super().reset(seed=seed)
+        self._consistent = False
         rng = self.np_random
         self.start = self.initial_set if start is None else read_only(start)
         self._state = (1.0 - SAMPLE_ROUNDING) * self.initial_set.sample(rng) if start is None else start
@@ -196,7 +199,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._consistent = False
         rng = self.np_random
         nominal_next = self.plant.A @ self._state + self.plant.B @ u
-        self._state = nominal_next + self._draw_disturbance(nominal_next)
+        moved, farthest = nominal_next + self._draw_disturbance(nominal_next), self.plant.farthest
+        self._state = np.clip(moved, -farthest, farthest)
         self._task_memory = self.task.advance(rng, self.plant, self._task_memory, u)
         self.steps += 1
         sample = self._measure() if self._link.sends_at(self.steps) else None
@@ -293,7 +297,7 @@ def applied_input(plant: LinearPlant, action: Any) -> np.ndarray:
     """
     normalized = as_numbers(action)
     if normalized is None or normalized.shape != (plant.m,) or not np.isfinite(normalized).all():
-        raise ValueError(f"the action must be finite with shape ({plant.m},), got {action!r}")
+        raise ValueError(f"the action must be finite with shape ({plant.m},), got {shown(action)}")
     return plant.u_max * np.clip(normalized, -1.0, 1.0)
 
 
@@ -326,6 +330,20 @@ def observation_bound(env: NCSEnv) -> np.ndarray:
     return OBSERVATION_MARGIN * bound
 
 
+def _as_float32(bound: np.ndarray) -> np.ndarray:
+    """Returns the bounds of observations in single precision.
+
+    Raises:
+        ValueError: If one is beyond its range, so that observations would be infinite, or always zero.
+    """
+    numbers = np.finfo(np.float32)
+    if not ((bound >= numbers.tiny) & (bound <= numbers.max)).all():
+        raise ValueError(
+            f"observations of up to {shown(bound.tolist())} are out of float32's range: choose other units"
+        )
+    return bound.astype(np.float32)
+
+
 def _contract(plant: LinearPlant, channel: Channel, contract: ChannelContract | None) -> ChannelContract | None:
     """Returns the contract that the estimator's error sets rest on.
 
@@ -349,12 +367,23 @@ def _contract(plant: LinearPlant, channel: Channel, contract: ChannelContract | 
 
 def _start_option(options: dict[str, Any] | None, n: int) -> np.ndarray | None:
     """Returns options["state"] as a finite array of shape (n,), or None without one."""
-    options = options or {}
-    if unknown := sorted(set(options) - {"state"}):
-        raise ValueError(f"reset knows the option 'state' only, got {unknown}")
+    options = known_options(options, {"state"})
     if "state" not in options:
         return None
     return as_vector(options["state"], n, "options['state']")
+
+
+def known_options(options: Any, known: set[str]) -> dict[str, Any]:
+    """Returns the options of a reset; an empty dict for None.
+
+    Raises:
+        ValueError: If they are no dict, or have other keys.
+    """
+    if options is not None and not isinstance(options, dict):
+        raise ValueError(f"the options of reset must be a dict, got {shown(options)}")
+    if unknown := [key for key in options or {} if key not in known]:
+        raise ValueError(f"reset knows the options {sorted(known)} only, got {shown(unknown)}")
+    return options or {}
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:

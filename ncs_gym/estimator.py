@@ -19,7 +19,7 @@ from ncs_gym.plant import FLAT_INFLATION, INFLATION, LinearPlant
 ROUNDING = 1e-13
 # An innovation this far beyond its exact bound counts as rounding, not as an alarm.
 ALARM_TOLERANCE = 1e-9
-# Covariances grow no further than this (in squared units of the state).
+# Covariances grow no further than this, in squared half-widths of the safe box.
 LARGEST_COVARIANCE = 1e12
 # Factors of covariances keep this many bits, and shapes are rounded up to multiples of this in coordinates where the
 # certified set of age 0 is the unit ball. Then both recur when a pattern of arrivals does, and can be tabulated.
@@ -165,10 +165,12 @@ class Estimator:
         kalman = self._filter
         kalman.x, kalman.P = belief.mean, belief.covariance
         kalman.predict(u)
+        mean = np.clip(kalman.x, -self.plant.farthest, self.plant.farthest)
         # The covariance of an unstable plant grows without end in an outage; it picks gains and may stop growing.
-        covariance = kalman.P if np.trace(kalman.P) < LARGEST_COVARIANCE else belief.covariance
+        grows = np.vdot(self.plant.weight, kalman.P) < LARGEST_COVARIANCE
+        covariance = kalman.P if grows else belief.covariance
         covariance = _settled(covariance, self._bits)
-        return Belief(kalman.x, covariance, self._predicted_shape(belief.shape, age), belief.newest)
+        return Belief(mean, covariance, self._predicted_shape(belief.shape, age), belief.newest)
 
     def _predicted_shape(self, shape: np.ndarray, age: int) -> np.ndarray:
         """Returns the first of: trace-optimal lam, certified rate, certified set, that lies inside the next age's set.
@@ -180,14 +182,21 @@ class Estimator:
         extent = self._abs_A @ np.sqrt(shape.diagonal())
         moved = _grown(A @ shape @ A.T, extent)
         predicted = self._settled_shape(outer_sum(moved, D, self.plant.weight))
-        if certified is None or is_inside(predicted, certified):
+        if certified is None:
+            return self._bounded(predicted)
+        if is_inside(predicted, certified):
             return predicted
         rate = self.error_set.rate_at(age)
         carried = self._settled_shape(moved / rate + D / (1.0 - rate))
         if is_inside(carried, certified):
             return carried
         present = self.error_set.shape_at(age)
-        return certified if present is not None and is_inside(shape, present) else predicted
+        return certified if present is not None and is_inside(shape, present) else self._bounded(predicted)
+
+    def _bounded(self, shape: np.ndarray) -> np.ndarray:
+        """Returns a shape, or one around all differences of states that do not lie beyond `plant.farthest`."""
+        widest = (2.0 * self.plant.farthest) ** 2
+        return shape if (np.diag(shape) <= widest).all() else self.plant.n * np.diag(widest)
 
     def _update(self, belief: Belief, measurement: np.ndarray, step: int) -> Belief:
         """Returns the belief after a measurement; the same if the guard turns it down."""

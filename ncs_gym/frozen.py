@@ -6,8 +6,12 @@ from typing import Any, Self
 
 import numpy as np
 
-# Entries beyond this would overflow when squared twice.
-LARGEST = 1e75
+# Entries beyond this would overflow when squared twice; what is divided by is no smaller than its inverse.
+LARGEST, SMALLEST = 1e75, 1e-75
+# Steps and environments are counted in 32 bits.
+MOST = 2**31 - 1
+# Messages quote no more of a value than this many letters.
+LONGEST_QUOTE = 200
 # Default of a field that `__post_init__` puts a value in place of: None, but never seen as that from outside.
 FILLED_IN: Any = None
 
@@ -58,6 +62,21 @@ def as_numbers(value: Any) -> np.ndarray | None:
         return None
 
 
+def shown(value: Any) -> str:
+    """Returns a value as messages quote it: on one line, and not without end."""
+    try:
+        text = " ".join(repr(value).split())
+    except Exception:
+        text = f"a {type(value).__name__}"
+    return text if len(text) <= LONGEST_QUOTE else f"{text[:LONGEST_QUOTE]}..."
+
+
+def as_setting(value: Any) -> np.ndarray | None:
+    """Returns a new float64 array; None for what is not real numbers: text, truth values, complex or masked ones."""
+    numbers = as_numbers(value)
+    return None if numbers is None or np.asarray(value).dtype.kind == "b" else np.array(numbers)
+
+
 def as_matrix(value: Any, shape: tuple[int | None, int | None], name: str) -> np.ndarray:
     """Returns `value` as a finite float64 matrix of the expected shape.
 
@@ -69,10 +88,9 @@ def as_matrix(value: Any, shape: tuple[int | None, int | None], name: str) -> np
     Raises:
         ValueError: If it is not numeric, has another shape, or holds a NaN or an infinity.
     """
-    try:
-        matrix = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be a matrix of numbers, got {value!r}") from error
+    matrix = as_setting(value)
+    if matrix is None:
+        raise ValueError(f"{name} must be a matrix of numbers, got {shown(value)}")
     expected = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"
     fits = matrix.ndim == 2 and all(
         have > 0 and (want is None or have == want) for have, want in zip(matrix.shape, shape, strict=True)
@@ -80,7 +98,7 @@ def as_matrix(value: Any, shape: tuple[int | None, int | None], name: str) -> np
     if not fits:
         raise ValueError(f"{name} must have shape {expected}, got {matrix.shape}")
     if not (np.abs(matrix) < LARGEST).all():
-        raise ValueError(f"{name} must be finite and below {LARGEST:g} in size, got {matrix.tolist()}")
+        raise ValueError(f"{name} must be finite and below {LARGEST:g} in size, got {shown(matrix.tolist())}")
     return matrix
 
 
@@ -90,14 +108,13 @@ def as_vector(value: Any, size: int | None, name: str) -> np.ndarray:
     Raises:
         ValueError: If it is not numeric, has another shape, or holds a NaN or an infinity.
     """
-    try:
-        vector = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be a vector of numbers, got {value!r}") from error
+    vector = as_setting(value)
+    if vector is None:
+        raise ValueError(f"{name} must be a vector of numbers, got {shown(value)}")
     if vector.ndim != 1 or vector.size == 0 or size not in (None, vector.size):
         raise ValueError(f"{name} must have shape ({'any' if size is None else size},), got {vector.shape}")
     if not (np.abs(vector) < LARGEST).all():
-        raise ValueError(f"{name} must be finite with shape {vector.shape}, got {value!r}")
+        raise ValueError(f"{name} must be finite and below {LARGEST:g} in size, got {shown(vector.tolist())}")
     return vector
 
 
@@ -112,12 +129,20 @@ def as_covariance(value: Any, size: int | None, name: str) -> np.ndarray:
     matrix = as_matrix(matrix, (len(matrix), len(matrix)), name)
     scale = np.abs(matrix).max()
     if not np.allclose(matrix, matrix.T, rtol=0.0, atol=1e-12 * scale):
-        raise ValueError(f"{name} must be symmetric, got {matrix.tolist()}")
+        raise ValueError(f"{name} must be symmetric, got {shown(matrix.tolist())}")
     matrix = 0.5 * (matrix + matrix.T)
     smallest = float(np.linalg.eigvalsh(matrix)[0])
-    if smallest < -1e-12 * scale:
+    if smallest < -1e-12 * scale or not _has_covariances(matrix):
         raise ValueError(f"{name} must be positive semidefinite, its smallest eigenvalue is {smallest:.3g}")
     return matrix
+
+
+def _has_covariances(matrix: np.ndarray) -> bool:
+    """Returns whether no covariance is larger than the variances allow, each in its own units, but for rounding."""
+    variances = np.diag(matrix)
+    with np.errstate(invalid="ignore"):
+        deviations = np.sqrt(variances)
+        return bool((np.abs(matrix) <= (1.0 + 1e-6) * np.outer(deviations, deviations)).all())
 
 
 def as_number(
@@ -135,19 +160,35 @@ def as_number(
         ValueError: If it is not a finite real number or lies outside the interval.
     """
     wanted = f"{'>' if low_open else '>='} {low:g}" if np.isfinite(low) else "finite"
-    if np.isfinite(high):
-        wanted += f" and {'<' if high_open else '<='} {high:g}"
+    wanted += f" and {'<' if high_open else '<='} {high:g}" if np.isfinite(high) else ""
     try:
-        if isinstance(value, (str, bytes, bool, np.bool_)):
-            raise TypeError("text and truth values are no numbers")
-        number = float(value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be a number {wanted}, got {value!r}") from error
+        single = as_setting(float(value) if type(value) is int else value)  # numpy knows no longer ones
+    except OverflowError:
+        single = None
+    if single is None or single.ndim:
+        raise ValueError(f"{name} must be a number {wanted}, got {shown(value)}")
+    number = float(single)
     above = number > low if low_open else number >= low
     below = number < high if high_open else number <= high
     if not (np.isfinite(number) and above and below):
-        raise ValueError(f"{name} must be a number {wanted}, got {value!r}")
+        raise ValueError(f"{name} must be a number {wanted}, got {shown(value)}")
+    bounded = np.isfinite(low) and np.isfinite(high)
+    if not (bounded or number == 0.0 or SMALLEST <= abs(number) < LARGEST):
+        raise ValueError(f"{name} must be between {SMALLEST:g} and {LARGEST:g} in size, got {number!r}")
     return number
+
+
+def as_names(value: Any, default: tuple[str, ...], name: str) -> tuple[str, ...]:
+    """Returns texts as a tuple of the length of `default`, which stands for none at all.
+
+    Raises:
+        ValueError: If it is no sequence of texts, or of another length.
+    """
+    if not isinstance(value, (list, tuple)) or not all(isinstance(each, str) for each in value):
+        raise ValueError(f"{name} must be a list of texts, got {shown(value)}")
+    if value and len(value) != len(default):
+        raise ValueError(f"{name} must have {len(default)} entries, got {shown(value)}")
+    return tuple(value) or default
 
 
 def as_flag(value: Any, name: str) -> bool:
@@ -157,18 +198,20 @@ def as_flag(value: Any, name: str) -> bool:
         ValueError: If it is anything else.
     """
     if not isinstance(value, (bool, np.bool_)):
-        raise ValueError(f"{name} must be True or False, got {value!r}")
+        raise ValueError(f"{name} must be True or False, got {shown(value)}")
     return bool(value)
 
 
-def as_count(value: Any, name: str, *, low: int) -> int:
-    """Returns `value` as an int of at least `low`.
+def as_count(value: Any, name: str, *, low: int, high: int = MOST) -> int:
+    """Returns `value` as an int of at least `low` and at most `high`.
 
     Raises:
-        ValueError: If it is not a whole number (a bool is not one) or is below `low`.
+        ValueError: If it is not a whole number (a bool is not one) or out of range.
     """
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < low:
-        raise ValueError(f"{name} must be a whole number >= {low}, got {value!r}")
+        raise ValueError(f"{name} must be a whole number >= {low}, got {shown(value)}")
+    if value > high:
+        raise ValueError(f"{name} must be a whole number <= {high}, got {shown(value)}")
     return int(value)
 
 

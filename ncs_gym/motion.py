@@ -10,7 +10,7 @@ from ncs_gym.draws import fill_uniform
 from ncs_gym.fleet import fleet_of
 from ncs_gym.law import add_drawn
 from ncs_gym.packets import Doubts, Transitions, follow_predictions, receive
-from ncs_gym.product import add_product, copy_rows, set_product
+from ncs_gym.product import add_product, copy_rows, hold_rows, set_product
 from ncs_gym.report import Report, report
 from ncs_gym.samples import CHAIN, send, switch
 from ncs_gym.system import unpacked
@@ -65,26 +65,28 @@ def draw(system, fleet, number):
 def move(system, fleet, tick, u):
     """Moves states to A x + B u + d, with d in `fleet.disturbance`, and predicts means one step on."""
     slot = tick % system.slots
-    advance(system.A, system.B, fleet.state, u, fleet.disturbance)
-    predict(system.A, system.B, fleet.mean, u, fleet.priors[slot], fleet.inputs[slot])
+    advance(system, fleet.state, u, fleet.disturbance)
+    predict(system, fleet.mean, u, fleet.priors[slot], fleet.inputs[slot])
     count(fleet.steps, fleet.age, fleet.wait, fleet.arrived)
 
 
 @inner
-def advance(A, B, state, u, d):
+def advance(system, state, u, d):
     """Moves states, shape (n, N), to A x + B u + d."""
     moved = np.empty_like(state)
     copy_rows(d, moved)
-    add_product(A, state, moved)
-    add_product(B, u, moved)
+    add_product(system.A, state, moved)
+    add_product(system.B, u, moved)
+    hold_rows(system.farthest, moved)
     copy_rows(moved, state)
 
 
 @inner
-def predict(A, B, mean, u, prior, inputs):
+def predict(system, mean, u, prior, inputs):
     """Moves means, shape (n, N), to A x_hat + B u, and remembers them and the inputs."""
-    set_product(A, mean, prior)
-    add_product(B, u, prior)
+    set_product(system.A, mean, prior)
+    add_product(system.B, u, prior)
+    hold_rows(system.farthest, prior)
     copy_rows(prior, mean)
     copy_rows(u, inputs)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ncs_gym.compiled import inner
 from ncs_gym.gain_table import ACCEPTED, FRESH, HELD, LAST_BIT, TARGET
-from ncs_gym.product import add_product, set_product
+from ncs_gym.product import add_product, hold_rows, set_product
 
 
 class Transitions(NamedTuple):
@@ -92,7 +92,7 @@ def receive(system, table, fleet, tick, age, doubts, doubtful):
             doubtful = _suspect(table.edges, each, edges, who, residual, square, doubts, doubtful)
         if each > 0:
             inputs = _gathered(fleet.inputs, (tick - each + 1) % slots, who)
-            chain = _predicted(system.A, system.B, inputs, chain)
+            chain = _predicted(system, inputs, chain)
     _keep(accepted, who, chain, fleet.mean)
     _arrive(table.edges, edges, who, fleet.arrived, fleet.node, fleet.age)
     return 0, doubtful
@@ -174,11 +174,12 @@ def _keep(accepted, who, chain, out):
 
 
 @inner
-def _predicted(A, B, inputs, chain):
+def _predicted(system, inputs, chain):
     """Returns A chain + B inputs, shape (n, count)."""
     out = np.empty_like(chain)
-    set_product(A, chain, out)
-    add_product(B, inputs, out)
+    set_product(system.A, chain, out)
+    add_product(system.B, inputs, out)
+    hold_rows(system.farthest, out)
     return out
 
 

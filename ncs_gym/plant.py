@@ -10,8 +10,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ncs_gym.ellipsoid import Ellipsoid
-from ncs_gym.frozen import FILLED_IN, FrozenArrays, as_covariance, as_matrix, as_number, read_only
+from ncs_gym.ellipsoid import Ellipsoid, outer_sum
+from ncs_gym.frozen import (
+    FILLED_IN,
+    LARGEST,
+    SMALLEST,
+    FrozenArrays,
+    as_covariance,
+    as_matrix,
+    as_names,
+    as_number,
+    as_setting,
+    read_only,
+    shown,
+)
 from ncs_gym.noise import SMALLEST_KEPT, TruncatedGaussian, chi2_quantile
 
 if TYPE_CHECKING:
@@ -25,6 +37,8 @@ FLAT_INFLATION = 1e-12
 THINNEST = 1e-19
 # Simulating a step in float64 rounds; the disturbance bound has room for that up to this many half-widths out.
 SIMULATED_REACH = 100.0
+# An unstable plant that nobody holds runs away no further than this many half-widths: what lies beyond ends in NaN.
+FARTHEST = 1e30
 # Smaller truncation levels have no finite quantile in float64.
 SMALLEST_DELTA = 1e-12
 
@@ -104,8 +118,9 @@ class LinearPlant(FrozenArrays):
         self._set("A", A)
         self._set("B", B)
         self._set("C", as_matrix(self.C, (None, n), "C"))
-        if not np.abs(H).max(axis=1).all():
-            raise ValueError(f"every row of H must measure something, got {H.tolist()}")
+        for name, matrix, does in (("C", self.C, "limit"), ("H", H, "measure")):
+            if (np.abs(matrix).max(axis=1) < SMALLEST).any():
+                raise ValueError(f"every row of {name} must {does} something, got {shown(matrix.tolist())}")
         self._set("H", H)
         self._set("u_max", _as_limits(self.u_max, m))
         self._set("dt", as_number(self.dt, "dt", low=0.0, low_open=True))
@@ -117,12 +132,9 @@ class LinearPlant(FrozenArrays):
         if self.error_gain is not None:
             self._set("error_gain", as_matrix(self.error_gain, (m, n), "error_gain"))
         for name, size, letter in (("state", n, "x"), ("input", m, "u")):
-            names = tuple(getattr(self, f"{name}_names")) or tuple(f"{letter}{i + 1}" for i in range(size))
-            units = tuple(getattr(self, f"{name}_units")) or ("",) * size
-            if len(names) != size or len(units) != size:
-                raise ValueError(f"{name}_names and {name}_units must have {size} entries, got {names} and {units}")
-            self._set(f"{name}_names", names)
-            self._set(f"{name}_units", units)
+            names = tuple(f"{letter}{i + 1}" for i in range(size))
+            for field_name, default in ((f"{name}_names", names), (f"{name}_units", ("",) * size)):
+                self._set(field_name, as_names(getattr(self, field_name), default, field_name))
         self._freeze_arrays()
 
     def _set(self, name: str, value: Any) -> None:
@@ -155,9 +167,19 @@ class LinearPlant(FrozenArrays):
         return read_only(gram + 1e-6 * np.diag(np.diag(gram) + np.trace(gram) / self.n * (np.diag(gram) == 0.0)))
 
     @cached_property
+    def relative_weight(self) -> np.ndarray:
+        """W in units of its largest entry, shape (n, n): the identity exactly if the box is a cube."""
+        return read_only(self.weight / self.weight.max())
+
+    @cached_property
     def half_widths(self) -> np.ndarray:
         """Half-widths of the ellipsoid {x : x'Wx <= 1} around the safe box' center, shape (n,)."""
         return read_only(np.sqrt(np.diag(np.linalg.inv(self.weight))))
+
+    @cached_property
+    def farthest(self) -> np.ndarray:
+        """Where a simulation stops a state that runs away, shape (n,); infinite for a stable plant."""
+        return read_only(FARTHEST * self.half_widths if self.spectral_radius >= 1.0 else np.full(self.n, np.inf))
 
     @cached_property
     def process_noise(self) -> TruncatedGaussian:
@@ -202,7 +224,7 @@ class LinearPlant(FrozenArrays):
     def nominal_disturbance(self) -> Ellipsoid:
         """D before inflation: where extremal disturbances are drawn, so that their rounding stays inside E(D)."""
         ball = Ellipsoid(self.gamma * np.eye(self.n))
-        return _sum_or_other(ball, self.process_noise.bound)
+        return _sum_or_other(ball, self.process_noise.bound, self.relative_weight)
 
     @cached_property
     def sensor_error(self) -> Ellipsoid:
@@ -212,7 +234,7 @@ class LinearPlant(FrozenArrays):
     def sensor_error_with(self, quantization_step: float) -> Ellipsoid:
         """Returns N, shape (p, p): sensor noise plus the ball of squared radius p q^2/4 around a quantizer's box."""
         ball = Ellipsoid(self.p * quantization_step**2 / 4.0 * np.eye(self.p))
-        return Ellipsoid(_inflated(_sum_or_other(ball, self.sensor_noise.bound).shape))
+        return Ellipsoid(_inflated(_sum_or_other(ball, self.sensor_noise.bound, np.eye(self.p)).shape))
 
     @cached_property
     def initial_error(self) -> Ellipsoid:
@@ -248,12 +270,9 @@ class LinearPlant(FrozenArrays):
 
 def _as_limits(value: Any, size: int) -> np.ndarray:
     """Returns input limits as a positive finite array of shape (size,)."""
-    try:
-        limits = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"u_max must be a positive number or shape ({size},), got {value!r}") from error
-    if limits.shape not in ((), (size,)) or not np.isfinite(limits).all() or (limits <= 0.0).any():
-        raise ValueError(f"u_max must be a positive number or shape ({size},), got {value!r}")
+    limits = as_setting(value)
+    if limits is None or limits.shape not in ((), (size,)) or not ((limits >= SMALLEST) & (limits < LARGEST)).all():
+        raise ValueError(f"u_max must be a positive number or shape ({size},), got {shown(value)}")
     return np.broadcast_to(limits, (size,)).copy()
 
 
@@ -262,10 +281,10 @@ def _inflated(shape: np.ndarray) -> np.ndarray:
     return INFLATION * shape + FLAT_INFLATION * np.diag(np.diag(shape))
 
 
-def _sum_or_other(first: Ellipsoid, second: Ellipsoid) -> Ellipsoid:
-    """Returns an ellipsoid around the sum; where one of them is a point, the other alone."""
+def _sum_or_other(first: Ellipsoid, second: Ellipsoid, weight: np.ndarray) -> Ellipsoid:
+    """Returns an ellipsoid around the sum, of the smallest tr(W P); where one of them is a point, the other alone."""
     if not np.any(first.shape):
         return second
     if not np.any(second.shape):
         return first
-    return first.outer_sum(second)
+    return Ellipsoid(outer_sum(first.shape, second.shape, weight))

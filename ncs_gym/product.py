@@ -5,6 +5,8 @@ Compiled leaves take bare arrays and index them whole: numba counts references o
 
 from __future__ import annotations
 
+import numpy as np
+
 from ncs_gym.compiled import inner
 
 
@@ -14,6 +16,15 @@ def copy_rows(x, out):
     for i in range(x.shape[0]):
         for e in range(x.shape[1]):
             out[i, e] = x[i, e]
+
+
+@inner
+def hold_rows(farthest, x):
+    """Stops the rows of x, shape (n, N), at `farthest`, shape (n,)."""
+    for i in range(x.shape[0]):
+        if farthest[i] < np.inf:
+            for e in range(x.shape[1]):
+                x[i, e] = min(max(x[i, e], -farthest[i]), farthest[i])
 
 
 @inner

@@ -33,6 +33,7 @@ class System(NamedTuple):
         pays: Whether the reward is -(x'Qx + u'Ru).
         Q, R: Shapes (n, n), (m, m).
         slots: Of rings, longest delay + 1.
+        farthest: Of the plant, shape (n,).
     """
 
     A: np.ndarray
@@ -61,6 +62,7 @@ class System(NamedTuple):
     Q: np.ndarray
     R: np.ndarray
     slots: int
+    farthest: np.ndarray
 
 
 def system_of(env: NCSEnv, max_episode_steps: int | None) -> System:
@@ -103,6 +105,7 @@ def system_of(env: NCSEnv, max_episode_steps: int | None) -> System:
         Q=Q,
         R=R,
         slots=channel.longest_delay + 1,
+        farthest=plant.farthest,
     )
 
 
@@ -113,7 +116,7 @@ def packed(system: System) -> tuple[np.ndarray, np.ndarray]:
     counts = [n, m, p, k, *(law.kind for law in laws), system.period, system.delay, system.jitter, system.most_lost]
     counts += [system.bursts, system.uniforms, system.most_age, system.limit, system.terminates, system.pays]
     numbers = [system.A, system.B, system.H, system.C, system.u_max, *(law.factor for law in laws)]
-    numbers += [system.losses, system.moves, system.low, system.high, system.Q, system.R]
+    numbers += [system.losses, system.moves, system.low, system.high, system.Q, system.R, system.farthest]
     numbers += [np.array([*(law.energy for law in laws), system.step])]
     flat = np.concatenate([np.asarray(each, dtype=np.float64).ravel() for each in numbers])
     return np.array([*counts, system.slots], dtype=np.int64), flat
@@ -142,6 +145,7 @@ def unpacked(counts, numbers):
     bounds, at = _taken(numbers, at, 2, n)
     Q, at = _taken(numbers, at, n, n)
     R, at = _taken(numbers, at, m, m)
+    farthest, at = _taken(numbers, at, 1, n)
     disturbance = Law(counts[4], D, numbers[at])
     process, sensor = Law(counts[5], W, numbers[at + 1]), Law(counts[6], V, numbers[at + 2])
     return System(
@@ -171,4 +175,5 @@ def unpacked(counts, numbers):
         Q,
         R,
         counts[17],
+        farthest[0],
     )

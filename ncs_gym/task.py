@@ -250,8 +250,8 @@ class SetpointTracking(Task):
     change_probability: float = 0.02
 
     def __post_init__(self) -> None:
-        output = np.atleast_1d(np.array(self.output, dtype=np.float64))
-        object.__setattr__(self, "output", as_vector(output, output.size, "output"))
+        output = [self.output] if isinstance(self.output, int | float) else self.output
+        object.__setattr__(self, "output", as_vector(output, None, "output"))
         for name in ("reach", "width"):
             object.__setattr__(self, name, as_number(getattr(self, name), name, low=0.0, low_open=True))
         probability = as_number(self.change_probability, "change_probability", low=0.0, high=1.0)

@@ -13,10 +13,10 @@ from ncs_gym import gain_table
 from ncs_gym.channel import GilbertElliott
 from ncs_gym.disturbance import checked_many, stays_inside
 from ncs_gym.draws import fill_keys
-from ncs_gym.env import NCSEnv, RenderModeError
+from ncs_gym.env import NCSEnv, RenderModeError, known_options
 from ncs_gym.estimator import ALARM_TOLERANCE
 from ncs_gym.fleet import fleet_of, rows_of
-from ncs_gym.frozen import as_count, as_numbers
+from ncs_gym.frozen import as_count, as_numbers, shown
 from ncs_gym.gain_table import GainTable
 from ncs_gym.law import law_of_disturbance
 from ncs_gym.motion import DRAW, LAST, MOVE, PREDICT, RECEIVE, clip, read_actions, run
@@ -61,7 +61,11 @@ class NCSVectorEnv(VectorEnv):
         self.num_envs = as_count(num_envs, "num_envs", low=1)
         limit = max_episode_steps
         self.max_episode_steps = None if limit is None else as_count(limit, "max_episode_steps", low=1)
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        modes = [mode for mode in AutoresetMode if autoreset_mode is mode or _is_text(autoreset_mode, mode.value)]
+        if not modes:
+            names = [mode.value for mode in AutoresetMode]
+            raise ValueError(f"autoreset_mode must be one of {names}, got {shown(autoreset_mode)}")
+        self.autoreset_mode = modes[0]
         self.metadata = NCSEnv.metadata | {"autoreset_mode": self.autoreset_mode, "render_modes": []}
         if settings.get("render_mode") is not None:
             raise RenderModeError("a vector environment draws nothing: use gym.make(..., render_mode=...)")
@@ -126,7 +130,8 @@ class NCSVectorEnv(VectorEnv):
         """
         mask, starts = self._reset_options(options)
         if isinstance(seed, (list, tuple, np.ndarray)):
-            seed = int(np.random.SeedSequence([int(each) for each in seed]).generate_state(1, np.uint64)[0] >> 1)
+            seeds = [as_count(each, "each seed", low=0, high=2**64) for each in seed]
+            seed = int(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0] >> 1)
         super().reset(seed=seed)
         if seed is not None or not self._consistent:
             fill_keys(self.np_random.integers(2**64, dtype=np.uint64), self._fleet.keys)
@@ -190,7 +195,7 @@ class NCSVectorEnv(VectorEnv):
         if not (type(actions) is np.ndarray and actions.dtype == np.float32 and actions.flags.c_contiguous):
             numbers = as_numbers(actions)
         if numbers is None or numbers.shape != wanted or not read_actions(numbers, self.plant.u_max, rows):
-            raise ValueError(f"the actions must be finite with shape {wanted}, got {actions!r}")
+            raise ValueError(f"the actions must be finite with shape {wanted}, got {shown(actions)}")
 
     def _start_step(self, filled: Report) -> int:
         """Does what compiled loops cannot, for what a user wrote; returns the stage to go on from."""
@@ -323,19 +328,23 @@ class NCSVectorEnv(VectorEnv):
 
     def _reset_options(self, options: dict[str, Any] | None) -> tuple[np.ndarray, np.ndarray | None]:
         """Returns which environments to reset, shape (N,), and where they start, (N, n) or None."""
-        options = options or {}
-        if unknown := sorted(set(options) - {"state", "reset_mask"}):
-            raise ValueError(f"reset knows the options 'state' and 'reset_mask' only, got {unknown}")
-        mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs, np.bool_)))
+        options = known_options(options, {"state", "reset_mask"})
+        given = options.get("reset_mask", np.ones(self.num_envs, np.bool_))
+        mask = np.zeros(0, np.bool_) if as_numbers(given) is None else np.asarray(given)
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
             raise ValueError(
-                f"options['reset_mask'] must be bool with shape ({self.num_envs},), some True, got {mask!r}"
+                f"options['reset_mask'] must be bool with shape ({self.num_envs},), some True, got {shown(given)}"
             )
         if "state" not in options:
             return mask, None
         n, starts = self.plant.n, as_numbers(options["state"])
         if starts is None or starts.shape not in {(n,), (self.num_envs, n)} or not np.isfinite(starts).all():
             raise ValueError(
-                f"options['state'] must be finite with shape ({n},) or ({self.num_envs}, {n}), got {options['state']!r}"
+                f"options['state'] must be finite with shape ({n},) or ({self.num_envs}, {n}), got {shown(starts)}"
             )
         return mask, np.broadcast_to(starts, (self.num_envs, n))
+
+
+def _is_text(value: Any, text: str) -> bool:
+    """Returns whether a value is a text, and which one."""
+    return isinstance(value, str) and value == text

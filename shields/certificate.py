@@ -15,7 +15,7 @@ import numpy as np
 from ncs_gym import Ellipsoid
 from ncs_gym.age_sets import AgeSets
 from ncs_gym.contract import ChannelContract
-from ncs_gym.frozen import FrozenArrays, as_matrix, as_number, read_only
+from ncs_gym.frozen import FrozenArrays, as_matrix, as_number, as_setting, read_only, shown
 from shields.storage import write_atomically
 
 FORMAT = "ncs-gym certificate 2"
@@ -62,8 +62,8 @@ class Multipliers:
         """Raises CertificateError if a share is not a number."""
         try:
             for name in ("error", "state", "estimate", "disturbance", "rounding"):
-                object.__setattr__(self, name, float(getattr(self, name)))
-            object.__setattr__(self, "inputs", tuple(float(share) for share in self.inputs))
+                object.__setattr__(self, name, _as_float(getattr(self, name)))
+            object.__setattr__(self, "inputs", tuple(_as_float(share) for share in self.inputs))
         except (TypeError, ValueError) as error:
             raise CertificateError(f"not a certificate: its multipliers must be numbers, {error}") from error
 
@@ -90,7 +90,9 @@ class AgeProof(FrozenArrays):
                 raise ValueError("its contract is no ChannelContract")
             n, p = len(sets.shapes[0]), len(sets.noise)
             expected = {"shapes": (steps + 1, n, n), "rates": (steps,), "gains": (steps, n, p), "shares": (steps,)}
-            arrays = {name: np.array(getattr(sets, name), dtype=np.float64) for name in (*expected, "noise")}
+            arrays = {
+                name: np.array(as_setting(getattr(sets, name)), dtype=np.float64) for name in (*expected, "noise")
+            }
             expected |= {"noise": (p, p)}
             for name, shape in expected.items():
                 if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
@@ -150,9 +152,11 @@ class Certificate(FrozenArrays):
             n = len(np.atleast_2d(self.L))
             own, foreign = (PROOF, CONSTANTS) if self.method == "certified" else (CONSTANTS, PROOF)
             if self.method not in ("certified", "paper"):
-                raise ValueError(f"its method must be 'certified' or 'paper', got {self.method!r}")
+                raise ValueError(f"its method must be 'certified' or 'paper', got {shown(self.method)}")
             wrong = [name for name in own if getattr(self, name) is None]
             wrong += [name for name in foreign if getattr(self, name) is not None]
+            if not (isinstance(self.provenance, dict) and isinstance(self.fingerprint, str)):
+                raise ValueError("its provenance must be a dict, and its fingerprint a text")
             if wrong:
                 raise ValueError(f"one of method {self.method!r} has other entries: {', '.join(wrong)}")
             if self.ages is not None and own is CONSTANTS:
@@ -272,10 +276,22 @@ def _from_content(content: dict[str, Any]) -> dict[str, Any]:
         values["multipliers"] = Multipliers(**values["multipliers"])
     if values["ages"] is not None:
         ages = values["ages"]
-        arrays = {name: np.array(ages["sets"][name], dtype=np.float64) for name in SET_ARRAYS}
+        arrays = {name: np.array(as_setting(ages["sets"][name]), dtype=np.float64) for name in SET_ARRAYS}
         sets = AgeSets(contract=ChannelContract(**ages["contract"]), **arrays)
         values["ages"] = AgeProof(sets=sets, shares=ages["shares"], inputs=ages["inputs"])
     return values
+
+
+def _as_float(value: Any) -> float:
+    """Returns a number as a float.
+
+    Raises:
+        ValueError: If it is none: a text that looks like one, or a truth value.
+    """
+    single = as_setting(value)
+    if single is None or single.ndim:
+        raise ValueError(f"got {shown(value)}")
+    return float(single)
 
 
 def _digest(content: Any) -> str:

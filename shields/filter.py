@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym import LinearPlant
-from ncs_gym.frozen import FrozenArrays, as_numbers
+from ncs_gym.frozen import FrozenArrays, as_numbers, shown
 from shields.certificate import Certificate, CertificateError
 from shields.one_step import MOST_INPUTS_WITH_VERTICES, OneStepTest, Outlook
 from shields.plane import PlaneOutlook
@@ -76,8 +76,8 @@ class SafetyFilter(FrozenArrays):
     test: OneStepTest = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if self.mode not in MODES:
-            raise ValueError(f"mode must be one of {list(MODES)}, got {self.mode!r}")
+        if not (isinstance(self.mode, str) and self.mode in MODES):
+            raise ValueError(f"mode must be one of {list(MODES)}, got {shown(self.mode)}")
         if not isinstance(self.certificate, Certificate) or not isinstance(self.plant, LinearPlant):
             kinds = f"{type(self.certificate).__name__} and {type(self.plant).__name__}"
             raise ValueError(f"SafetyFilter takes a Certificate and a LinearPlant, got {kinds}")
@@ -149,7 +149,7 @@ class SafetyFilter(FrozenArrays):
         """
         u = self._gained(_as_array(estimate))
         if u is None:
-            raise ValueError(f"the estimate must be finite with shape ({self.plant.n},), got {estimate!r}")
+            raise ValueError(f"the estimate must be finite with shape ({self.plant.n},), got {shown(estimate)}")
         return np.array(u)
 
     def _fallback(

@@ -9,6 +9,7 @@ import numpy as np
 
 from ncs_gym import ErrorSet, LinearPlant
 from ncs_gym.contract import ChannelContract
+from ncs_gym.frozen import shown
 from shields.certificate import AgeProof, Certificate
 from shields.design_problem import GROWTH, design_problem
 from shields.diagnosis import diagnosis, with_what_works
@@ -68,14 +69,14 @@ def synthesize(
     """
     if not isinstance(plant, LinearPlant):
         raise ValueError(f"plant must be a LinearPlant, got {type(plant).__name__}")
+    if not (isinstance(method, str) and method in ("certified", "paper")):
+        raise ValueError(f"method must be 'certified' or 'paper', got {shown(method)}")
     if method == "paper":
         certificate = paper_certificate(plant, dkappa=dkappa, drho=drho, search=search)
         exact = {"exact_conditions_hold": _is_certifiable(plant, certificate.L, certificate.K)}
         return replace(certificate, provenance=certificate.provenance | exact)
-    if method != "certified":
-        raise ValueError(f"method must be 'certified' or 'paper', got {method!r}")
     if contract is not None and not isinstance(contract, ChannelContract):
-        raise ValueError(f"contract must be a ChannelContract or None, got {contract!r}")
+        raise ValueError(f"contract must be a ChannelContract or None, got {shown(contract)}")
     return _certified(plant, contract, progress or (lambda line: None))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 
-from ncs_gym.frozen import as_number, as_numbers
+from ncs_gym.frozen import as_number, as_numbers, shown
 from ncs_gym.gain_table import GainTable
 from ncs_gym.plant import SIMULATED_REACH
 from ncs_gym.vector_env import NCSVectorEnv
@@ -90,7 +90,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         VectorWrapper.__init__(self, env)
         self.penalty = as_number(penalty, "penalty", low=0.0)
         if certificate is not None and not isinstance(certificate, Certificate):
-            raise ValueError(f"certificate must be a Certificate or None, got {certificate!r}")
+            raise ValueError(f"certificate must be a Certificate or None, got {shown(certificate)}")
         self.certificate = certificate_for(inner.plant, inner.contract) if certificate is None else certificate
         self.filter = SafetyFilter(self.certificate, inner.plant, mode)
         self._batch = VectorFilter(self.filter)
@@ -124,8 +124,13 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
     ) -> tuple[Any, dict[str, Any]]:
         """Starts episodes; see `NCSVectorEnv.reset`."""
         before, self._clock = self._clock or self._interrupted, self._clock and self._interrupted
-        # gymnasium's annotation leaves out the lists that its own vector environments take.
-        observation, info = self.env.reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
+        try:
+            # gymnasium's annotation leaves out the lists that its own vector environments take.
+            observation, info = self.env.reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
+        except ValueError:
+            if self._clock and all(np.array_equal(*pair) for pair in zip(before, self._read_clock(), strict=True)):
+                self._clock = before  # refused before anything moved
+            raise
         now = self._read_clock()
         restarted = now.episodes != before.episodes
         unmoved = (now.steps == before.steps) & (now.ticks == before.ticks)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym import LinearPlant
+from ncs_gym.ellipsoid import SMALLEST_SHARE
 from shields.certificate import AgeProof, Certificate, CertificateError, Proof
 from shields.condition import Condition, flag, matrix_condition, scalar
 from shields.exact import (
@@ -132,7 +133,7 @@ def _bounds(proof: Proof, plant: LinearPlant) -> Iterator[Condition]:
     energy = Fraction(plant.process_noise.energy)
     ball = scale(Fraction(plant.gamma), identity)
     ellipsoid = scale(energy, noise)
-    need = _sum_bound(ball, ellipsoid)
+    need = _sum_bound(ball, ellipsoid, rational(plant.relative_weight))
     bound = rational(plant.disturbance.shape)
     yield matrix_condition("D: the plant's holds the disturbance and the process noise", subtract(bound, need))
     yield matrix_condition("D: the certificate's holds the plant's", subtract(rational(proof.D), bound))
@@ -143,7 +144,7 @@ def _bounds(proof: Proof, plant: LinearPlant) -> Iterator[Condition]:
         sets = proof.ages.sets
         step = Fraction(sets.contract.quantization_step)
         ball = scale(plant.p * step * step / 4, rational(np.eye(plant.p)))
-        need = _sum_bound(ball, sensor)
+        need = _sum_bound(ball, sensor, rational(np.eye(plant.p)))
         yield matrix_condition("N: holds the sensor noise and the rounding", subtract(rational(sets.noise), need))
     first = scale(Fraction(plant.initial_noise.energy), rational(plant.initial_cov))
     yield matrix_condition(
@@ -234,16 +235,23 @@ def _with_action_rounding(D: Matrix, B: Matrix, u_max: np.ndarray, growth: Fract
     return add(scale(1 + growth, D), scale(1 + 1 / growth, congruence(B, spread)))
 
 
-def _sum_bound(first: Matrix, second: Matrix) -> Matrix:
+def _sum_bound(first: Matrix, second: Matrix, weight: Matrix) -> Matrix:
     """Returns a shape around E(first) + E(second): P1/nu + P2/(1-nu), or the sum if one of them is zero."""
-    share = _trace_share(first, second)
+    share = _trace_share(first, second, weight)
     return add(first, second) if share is None else add(scale(1 / share, first), scale(1 / (1 - share), second))
 
 
-def _trace_share(first: Matrix, second: Matrix) -> Fraction | None:
-    """Returns a rational nu near the trace-optimal one (any in (0, 1) proves containment); None if a term is zero."""
-    a, b = (sum((matrix[i][i] for i in range(len(matrix))), Fraction(0)) for matrix in (first, second))
-    if a == 0 or b == 0:
+def _trace_share(first: Matrix, second: Matrix, weight: Matrix) -> Fraction | None:
+    """Returns a rational nu near the one of the smallest tr(W P) (any in (0, 1) proves containment).
+
+    None if a term is zero.
+    """
+    a, b = (float(_trace(multiply(weight, matrix))) ** 0.5 for matrix in (first, second))
+    if not (any(map(any, first)) and any(map(any, second))):
         return None
-    a, b = Fraction(float(a) ** 0.5), Fraction(float(b) ** 0.5)
-    return a / (a + b)
+    share = Fraction(a) / (Fraction(a) + Fraction(b)) if a + b > 0.0 else Fraction(1, 2)
+    return min(max(share, Fraction(SMALLEST_SHARE)), 1 - Fraction(SMALLEST_SHARE))
+
+
+def _trace(matrix: Matrix) -> Fraction:
+    return sum((matrix[i][i] for i in range(len(matrix))), Fraction(0))

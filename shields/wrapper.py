@@ -11,7 +11,7 @@ from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, S
 
 from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv
 from ncs_gym.env import applied_input, ncs_env
-from ncs_gym.frozen import as_number
+from ncs_gym.frozen import as_number, shown
 from shields.certificate import Certificate
 from shields.filter import SafetyFilter
 from shields.proof import ProofTracker, starts_inside
@@ -68,11 +68,11 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         penalty: float = 0.0,
     ) -> None:
         RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty)
-        gym.Wrapper.__init__(self, env)
         plant = _plant_behind(env)
+        gym.Wrapper.__init__(self, env)
         self.penalty = as_number(penalty, "penalty", low=0.0)
         if certificate is not None and not isinstance(certificate, Certificate):
-            raise ValueError(f"certificate must be a Certificate or None, got {certificate!r}")
+            raise ValueError(f"certificate must be a Certificate or None, got {shown(certificate)}")
         contract = ncs_env(env).contract
         self.certificate = certificate_for(plant, contract) if certificate is None else certificate
         self.filter = SafetyFilter(self.certificate, plant, mode)
@@ -82,10 +82,15 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode; see `NCSEnv.reset`."""
-        self._clock = self._clock and INTERRUPTED
+        before, self._clock = self._clock, self._clock and INTERRUPTED
         if self._is_drawn:
             self._annotate(None, 0, intervened=False)
-        observation, info = self.env.reset(seed=seed, options=options)
+        try:
+            observation, info = self.env.reset(seed=seed, options=options)
+        except ValueError:
+            if self._read_clock() == before:  # refused before anything moved
+                self._clock = before
+            raise
         clock = self._read_clock()
         self._proof.start(starts_inside(self.certificate, ncs_env(self.env).start), clock[1] == 0, info)
         self._estimate, self._error_shape = np.array(info["estimate"]), np.array(info["error_shape"])

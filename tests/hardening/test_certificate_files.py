@@ -1,0 +1,198 @@
+"""Certificate files damaged at every byte, and forged with a checksum that fits."""
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ncs_gym import ChannelContract, LinearPlant
+from shields import Certificate, CertificateError, synthesize, verify
+from shields.certificate import _digest
+from tests.fuzz import examples
+
+STEP = 7
+KINDS = ["flip", "delete", "insert", "high bit", "digit", "truncate"]
+REPLACEMENTS = [None, True, "0.5", "", [], {}, [[1.0]], float("nan"), float("inf"), 0, 0.0, -1, 1e300, 5e-324, 10**400]
+
+
+@cache
+def case(name):
+    """A plant, and a certificate for it: of a stable one, or under a contract of an unstable one."""
+    sizes = {"B": [[0.1], [0.2]], "C": np.eye(2), "u_max": 2.0, "dt": 0.1, "gamma": 1e-5}
+    sizes |= {"process_noise_cov": 1e-6 * np.eye(2), "measurement_noise_cov": 1e-6 * np.eye(2)}
+    if name == "stable":
+        plant, contract = LinearPlant(A=[[0.9, 0.1], [0.0, 0.8]], initial_cov=1e-6 * np.eye(2), **sizes), None
+    else:
+        plant, contract = LinearPlant(A=[[1.02, 0.1], [0.0, 0.8]], **sizes), ChannelContract(1, 0.001)
+    return plant, synthesize(plant, contract=contract)
+
+
+def damaged(data, at, kind):
+    byte = data[at]
+    changed = {
+        "flip": bytes([byte ^ (1 << at % 7)]),
+        "high bit": bytes([byte ^ 0x80]),
+        "delete": b"",
+        "insert": bytes([byte, byte]),
+        "digit": bytes([byte ^ 1]) if chr(byte).isdigit() else b"0",
+        "truncate": b"",
+    }[kind]
+    return data[:at] + changed + (b"" if kind == "truncate" else data[at + 1 :])
+
+
+def loaded_from(path):
+    """The certificate in a file; None if it is refused in one sentence."""
+    try:
+        return Certificate.load(path)
+    except CertificateError as error:
+        sentence = str(error)
+    assert "\n" not in sentence
+    return None
+
+
+def assert_noticed(data, certificate, path):
+    """A damaged file is refused in one sentence, or says exactly the same."""
+    path.write_bytes(data)
+    loaded = loaded_from(path)
+    assert loaded is None or loaded.document == certificate.document
+    return loaded is None
+
+
+def assert_every_byte_counts(name, positions, path):
+    _, certificate = case(name)
+    certificate.save(path)
+    data, refused = path.read_bytes(), 0
+    assert assert_noticed(data, certificate, path) == 0
+    places = [(at, kind) for at, kind in positions(len(data)) if at < len(data)]
+    for at, kind in places:
+        refused += assert_noticed(damaged(data, at, kind), certificate, path)
+    # What may change unnoticed is white space: most of the file is none.
+    assert refused > 0.5 * len(places)
+
+
+@pytest.mark.parametrize("name", ["stable", "contract"])
+def test_damage_at_any_byte_is_noticed(name, tmp_path):
+    def some(length):
+        return [(at, KINDS[at // STEP % len(KINDS)]) for at in range(0, length, STEP)]
+
+    assert_every_byte_counts(name, some, tmp_path / "c.json")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", ["stable", "contract"])
+def test_damage_at_every_byte_is_noticed(name, kind, tmp_path):
+    assert_every_byte_counts(name, lambda length: [(at, kind) for at in range(length)], tmp_path / "c.json")
+
+
+def leaves(value, path=()):
+    """Paths of everything that is no container."""
+    if isinstance(value, dict | list):
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        return [leaf for key, each in items for leaf in leaves(each, (*path, key))]
+    return [path]
+
+
+def changed(content, path, change):
+    """A copy of a certificate's content in which one entry is another."""
+    copy = json.loads(json.dumps(content))
+    inner = copy
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = change(inner[path[-1]])
+    return copy
+
+
+def forged(content, path):
+    """The certificate in a file with a fitting checksum; None if it is refused."""
+    text = json.dumps(content)
+    literal = json.loads(text, parse_float=str, parse_int=str)
+    path.write_text(json.dumps({"format": "ncs-gym certificate 2", "sha256": _digest(literal), "certificate": content}))
+    return loaded_from(path)
+
+
+def support(shape, directions):
+    return np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", directions, shape, directions), 0.0))
+
+
+def assert_true(certificate, plant):
+    """What a certificate claims, by support functions of sums of ellipsoids: no multiplier, no matrix inequality."""
+    angles = np.linspace(0.0, np.pi, 361)
+    a = np.column_stack([np.cos(angles), np.sin(angles)])
+    L, K, room = certificate.L, certificate.K, 1.0 + 1e-9
+    D = support(plant.disturbance.shape, a)
+    closed, gain = plant.A + plant.B @ K, plant.B @ K
+    assert (support(L, plant.C) <= room).all()
+    assert (np.linalg.eigvalsh(L) > 0.0).all()
+    for Sigma in certificate.error_shapes:
+        moved = support(closed @ L @ closed.T, a) + support(gain @ Sigma @ gain.T, a) + D
+        assert (moved <= room * support(L, a)).all()
+        assert (support(L, K) + support(Sigma, K) <= room * plant.u_max).all()
+    shapes = [certificate.Sigma, certificate.Sigma] if certificate.ages is None else certificate.ages.sets.shapes
+    assert (support(plant.initial_error.shape, a) <= room * support(shapes[0], a)).all()
+    for older, newer in zip(shapes[1:], shapes[:-1], strict=True):
+        assert (support(plant.A @ newer @ plant.A.T, a) + D <= room * support(older, a)).all()
+    if certificate.ages is not None:
+        sets = certificate.ages.sets
+        noise = plant.sensor_error_with(sets.contract.quantization_step).shape
+        for shape, T in zip(shapes[1:], sets.gains, strict=True):
+            kept = np.eye(2) - T @ plant.H
+            updated = support(kept @ shape @ kept.T, a) + support(T @ noise @ T.T, a)
+            assert (updated <= room * support(shapes[0], a)).all()
+
+
+def judged(content, plant, path):
+    """Whether a forged certificate is loaded and verifies; what verifies must be true."""
+    certificate = forged(content, path)
+    if certificate is None or not verify(certificate, plant).valid:
+        return False
+    assert_true(certificate, plant)
+    return True
+
+
+@pytest.mark.parametrize("name", ["stable", "contract"])
+def test_every_number_forged_in_turn_fails_or_leaves_the_certificate_true(name, tmp_path):
+    plant, certificate = case(name)
+    content = json.loads(json.dumps(certificate.document["certificate"]))
+    assert judged(content, plant, tmp_path / "c.json")
+    numbers = [leaf for leaf in leaves(content) if leaf[0] not in ("provenance", "fingerprint", "method")]
+    factors = [0.0, -1.0, 0.5, 1.0 - 1e-4, 1.0 + 1e-4, 2.0]
+    verdicts = [
+        judged(
+            changed(content, leaf, lambda value, f=factor: None if value is None else f * value), plant, tmp_path / "c"
+        )
+        for number, leaf in enumerate(numbers)
+        for factor in (factors if name == "stable" else factors[number % 2 :: 2])
+    ]
+    assert verdicts.count(False) > 0.4 * len(verdicts)
+
+
+@given(data=st.data())
+@examples(150)
+def test_certificates_forged_at_random_are_refused_or_true(tmp_path_factory, data):
+    path = tmp_path_factory.getbasetemp() / "forged.json"
+    plant, certificate = case(data.draw(st.sampled_from(["stable", "contract"])))
+    content = json.loads(json.dumps(certificate.document["certificate"]))
+    for _ in range(data.draw(st.integers(1, 3))):
+        places = leaves(content)
+        containers = sorted({leaf[:depth] for leaf in places for depth in range(1, len(leaf))}, key=str)
+        leaf = data.draw(st.sampled_from(places + containers))
+        replacement = data.draw(st.sampled_from(REPLACEMENTS) | st.floats(allow_nan=True) | st.integers())
+        content = changed(content, leaf, lambda value, new=replacement: new)
+        if not leaves(content):
+            break
+    judged(content, plant, path)
+
+
+@given(extra=st.dictionaries(st.text(max_size=5), st.none() | st.integers() | st.text(max_size=5), max_size=3))
+@examples(30)
+def test_documents_of_any_structure_are_refused(tmp_path_factory, extra):
+    path = tmp_path_factory.getbasetemp() / "any.json"
+    for document in (extra, [extra], {"format": "ncs-gym certificate 2"} | extra, {"certificate": extra, "sha256": ""}):
+        path.write_text(json.dumps(document))
+        with pytest.raises(CertificateError):
+            Certificate.load(path)
+    assert forged(extra, path) is None

