@@ -1,4 +1,4 @@
-"""A block of worst-case episodes: a pure function of its settings."""
+"""A block of episodes under attack: a pure function of its settings."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ from shields import Certificate, VectorSafetyShield
 
 # Modes of the shield, in turn.
 MODES = ("project", "switch", "boundary")
+# Episodes start on the boundary of S; the level counts from this step on.
+SETTLED = 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +42,7 @@ class Campaign:
 
     @property
     def key(self) -> str:
-        """A digest of everything that results depend on."""
+        """A digest of everything that results depend on but the certificates."""
         content = json.dumps(asdict(self) | {"versions": versions()}, sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()
 
@@ -96,9 +98,10 @@ def run_block(campaign: Campaign, block: Block, certificate: Path) -> Tally:
     seed, policy_seed = seeds.generate_state(2, np.uint64).tolist()
     _, info = shield.reset(seed=seed >> 1)
     agents = HostileAgents(campaign.envs, shield.filter.plant, plan, np.random.default_rng(policy_seed))
-    exits = violations = interventions = unproved = 0
+    exits = violations = interventions = 0
+    unproved = campaign.envs - np.count_nonzero(info["shield_guaranteed"])
     broken, level = np.zeros(campaign.envs, np.bool_), 0.0
-    for _ in range(EPISODE_STEPS):
+    for step in range(EPISODE_STEPS):
         *_, info = shield.step(agents.act(info["estimate"]))
         squares = np.square(root @ info["state"].T).sum(axis=0)
         outside, beyond = ~(squares <= 1.0), info["cost"] != 0.0
@@ -107,7 +110,8 @@ def run_block(campaign: Campaign, block: Block, certificate: Path) -> Tally:
         interventions += np.count_nonzero(info["shield_intervened"])
         unproved += campaign.envs - np.count_nonzero(info["shield_guaranteed"])
         broken |= outside | beyond
-        level = max(level, float(squares.max()))
+        if step >= SETTLED:
+            level = max(level, float(np.nan_to_num(squares, nan=np.inf).max()))
     return Tally(
         steps=campaign.block_steps,
         episodes=campaign.envs,

@@ -21,9 +21,6 @@ CHANNELS = {
     "bursts": Channel(loss=GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.1), send_period=2, quantization_step=0.01),
     "overtaking": Channel(loss=0.2, quantization_step=0.01, send_period=2, delay=1, jitter=3),
 }
-# For plants that need a contract: the oldest sample each time, and the longest gap each time.
-LATE = Channel(delay=2, quantization_step=1e-4)
-RARE = Channel(loss=1.0, max_consecutive_losses=2, quantization_step=1e-4)
 # Numbers of states, inputs and outputs of random plants, in turn.
 SIZES = ((2, 1, 2), (2, 2, 1), (3, 2, 3), (4, 1, 4))
 
@@ -63,13 +60,20 @@ def cases(seed: int, random_plants: int) -> dict[str, Case]:
         env, short = ncs_env(gym.make(env_id)), env_id.removeprefix("ncs_gym/")
         found[f"{short}, its channel"] = Case(env.plant, env.channel, env.contract)
         if env.contract is not None:
-            for kind, channel in (("late", LATE), ("rare", RARE)):
+            for kind, channel in _extremes(env.contract).items():
                 found[f"{short}, {kind}"] = Case(env.plant, channel, env.contract)
     plants = {"TruckTrailer-v0": truck_trailer(), "TruckTrailerCruise-v0": loaded_truck_trailer()}
     plants |= {f"random plant {index}": _random_plant(seed, index) for index in range(random_plants)}
     for name, plant in plants.items():
         found |= {f"{name}, {kind}": Case(plant, channel) for kind, channel in CHANNELS.items()}
     return found
+
+
+def _extremes(contract: ChannelContract) -> dict[str, Channel]:
+    """Returns channels that use up a contract: the oldest sample each time, and the longest gap each time."""
+    age, step = contract.max_age, contract.quantization_step
+    rare = Channel(loss=1.0, max_consecutive_losses=age, quantization_step=step)
+    return {"late": Channel(delay=age, quantization_step=step), "rare": rare}
 
 
 def _random_plant(seed: int, index: int) -> LinearPlant:

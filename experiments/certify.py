@@ -1,4 +1,4 @@
-"""A billion worst-case steps: the Monte Carlo campaign behind `ncs certify`."""
+"""Shielded loops under attack: the Monte Carlo campaign behind `ncs certify`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from experiments.block import Block, Campaign, run_block
+from experiments.block import MODES, Block, Campaign, run_block
 from experiments.cases import Case, cases
 from experiments.errors import SafetyBroken
 from experiments.parent import belong_to_parent
@@ -24,10 +24,11 @@ from experiments.proof_settings import CertifySettings
 from experiments.tally import Tally
 from experiments.tally_store import TallyStore
 from experiments.versions import versions
+from shields import Certificate
 from shields.storage import write_atomically
 
-LEGEND = """failed: episodes that left S or the box; p <: upper end of the exact 95 % interval of its probability;
-margin: smallest 1 - sqrt(x'Mx) of a true state; overridden: steps in which the shield intervened"""
+LEGEND = """failed: episodes that left S or the box; p <: upper end of the exact 95 % interval of its probability here;
+margin: smallest 1 - sqrt(x'Mx) from step 20 on (starts are on the boundary); overridden: steps with an intervention"""
 
 
 def certify(settings: CertifySettings) -> None:
@@ -47,8 +48,10 @@ def certify(settings: CertifySettings) -> None:
     )
     attacked = cases(campaign.seed, campaign.random_plants)
     certificates = _certificates(attacked, settings.out / "certificates")
-    store = TallyStore(settings.out / "tallies.jsonl", campaign.key)
-    blocks = _blocks(list(attacked), settings.steps / campaign.block_steps)
+    keys = {case: f"{campaign.key} {Certificate.load(file).checksum}" for case, file in certificates.items()}
+    store = TallyStore(settings.out / "tallies.jsonl", keys)
+    least = len(MODES) if campaign.shielded else 1
+    blocks = _blocks(list(attacked), settings.steps / campaign.block_steps, least)
     missing = {case: deque(block for block in some if block not in store.tallies) for case, some in blocks.items()}
     start, steps = time.perf_counter(), campaign.block_steps * sum(len(some) for some in missing.values())
     _run(campaign, missing, certificates, store, settings.jobs)
@@ -80,9 +83,9 @@ def _certificates(attacked: dict[str, Case], folder: Path) -> dict[str, Path]:
     return files
 
 
-def _blocks(names: list[str], count: float) -> dict[str, list[Block]]:
-    """Returns at least so many blocks in all, by case, as evenly as possible: earlier cases first."""
-    each, extra = divmod(max(math.ceil(count), len(names)), len(names))
+def _blocks(names: list[str], count: float, least: int) -> dict[str, list[Block]]:
+    """Returns at least so many blocks in all, and `least` of each case, as evenly as possible: earlier cases first."""
+    each, extra = divmod(max(math.ceil(count), least * len(names)), len(names))
     return {name: [Block(name, index) for index in range(each + (number < extra))] for number, name in enumerate(names)}
 
 

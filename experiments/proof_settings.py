@@ -47,13 +47,14 @@ class VerifySettings:
 
 @dataclass(frozen=True, kw_only=True)
 class CertifySettings:
-    """Attacks shielded loops with everything the assumptions allow, and counts what leaves the safe set.
+    """Attacks shielded loops within the assumptions, and counts what leaves the safe set.
 
     Registered environments and random plants, behind every kind of channel; disturbances that push the next state
-    farthest out, starts, first errors and sensor noise of full size; random and hostile agents.
+    farthest out, starts and first errors on the boundaries of their sets, sensor noise of full size in random
+    directions; random and hostile agents.
 
     Attributes:
-        steps: In all, at least; whole blocks of `envs` episodes are run, one of every case at the least.
+        steps: In all, at least; whole blocks of `envs` episodes are run, at least one per case and mode of the shield.
         out: Folder; an interrupted campaign goes on where it was, and one with more steps adds to it.
         random_plants: How many random plants, each behind four kinds of channels.
         envs: Episodes of a block, run side by side.
@@ -65,7 +66,7 @@ class CertifySettings:
     steps: float = 1e8
     out: Path = Path("runs/certify")
     random_plants: int = 4
-    envs: int = 8192
+    envs: int = 4096
     jobs: int = 2
     unshielded: bool = False
     seed: int = 0

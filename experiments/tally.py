@@ -20,7 +20,7 @@ class Tally:
         broken_episodes: With an exit or a violation.
         interventions: Steps in which the shield intervened.
         unproved: Steps at which the shield's proof did not hold.
-        level: Largest sqrt(x'Mx) of a true state.
+        level: Largest sqrt(x'Mx) of a true state, from the step on that `block.SETTLED` says.
     """
 
     steps: int = 0

@@ -18,15 +18,15 @@ class TallyStore:
 
     Args:
         path: File; made if it is missing.
-        key: Of the campaign; lines of others are left alone and not read.
+        keys: Of the cases by name; lines with others are left alone and not read.
 
     Raises:
         ResultsError: If the file is damaged.
         OSError: If it cannot be read or written.
     """
 
-    def __init__(self, path: Path, key: str) -> None:
-        self._path, self._key = path, key
+    def __init__(self, path: Path, keys: dict[str, str]) -> None:
+        self._path, self._keys = path, keys
         self.tallies: dict[Block, Tally] = {}
         content = path.read_bytes() if path.exists() else b""
         whole = content[: content.rfind(b"\n") + 1]
@@ -41,7 +41,7 @@ class TallyStore:
         Raises:
             OSError: If the file cannot be written.
         """
-        content = {"key": self._key, "case": block.case, "index": block.index, "tally": tally.counts()}
+        content = {"key": self._keys[block.case], "case": block.case, "index": block.index, "tally": tally.counts()}
         line = json.dumps({"sha256": _digest(content), **content}) + "\n"
         with self._path.open("ab") as file:
             file.write(line.encode())
@@ -52,7 +52,7 @@ class TallyStore:
             document = json.loads(line)
             if document.pop("sha256") != _digest(document):
                 raise ValueError("checksum")
-            if document["key"] == self._key:
+            if document["key"] == self._keys.get(document["case"]):
                 self.tallies[Block(document["case"], document["index"])] = Tally(**document["tally"])
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ResultsError(

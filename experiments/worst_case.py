@@ -1,4 +1,4 @@
-"""Nature and agents at their worst within the assumptions."""
+"""Nature and agents that do harm within the assumptions."""
 
 from __future__ import annotations
 

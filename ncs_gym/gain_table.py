@@ -62,6 +62,7 @@ class GainTable:
             p * p numbers; shape (buffer + 1, n * p + p * p, edges).
         turns: F of the axes common to H Sigma_k H' before each update and to N, shape (edges, buffer + 1, p, p).
         values: Squares of the former's half-axes there, shape (edges, buffer + 1, p); see `minkowski.common_axes`.
+            NaN where N is flat in float64: such a residual always raises the alarm.
     """
 
     def __init__(self, estimator: Estimator) -> None:

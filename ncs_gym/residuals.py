@@ -5,13 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ncs_gym.compiled import entry
-from ncs_gym.minkowski import HALVINGS
-
-STEPS = HALVINGS
 
 
 @entry
-def are_outside(suspects, residuals, turns, values, limit, out):
+def are_outside(suspects, residuals, turns, values, limit, halvings, out):
     """Fills which residuals lie outside the sum of two ellipsoids; see `minkowski.outside_sum`.
 
     Args:
@@ -20,6 +17,7 @@ def are_outside(suspects, residuals, turns, values, limit, out):
         turns: Of the gain table, shape (edges, ages, p, p).
         values: Of the gain table, shape (edges, ages, p).
         limit: Square of what counts as outside.
+        halvings: Of the share, at most.
         out: Filled, shape (k,).
     """
     p = residuals.shape[1]
@@ -31,14 +29,14 @@ def are_outside(suspects, residuals, turns, values, limit, out):
             for j in range(p):
                 turned += turns[edge, age, i, j] * residuals[k, j]
             squares[i] = turned * turned
-        out[k] = _is_outside(squares, values[edge, age], limit)
+        out[k] = _is_outside(squares, values[edge, age], limit, halvings)
 
 
 @entry
-def _is_outside(squares, values, limit):
+def _is_outside(squares, values, limit, halvings):
     """Returns whether no share splits the residual into parts that lie in their ellipsoids."""
     low, high, outside = 0.0, 1.0, True
-    for _ in range(STEPS):
+    for _ in range(halvings):
         share = 0.5 * (low + high)
         form = first = second = 0.0
         for i in range(squares.size):

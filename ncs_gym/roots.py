@@ -10,9 +10,7 @@ from ncs_gym.compiled import entry
 MOST_STEPS = 40
 # A step below this share of nu is rounding.
 PRECISION = 1e-15
-
-
-# Of the length of a solution.
+# A point whose squared length lacks more than this is in the hard case.
 ENOUGH = 1e-9
 
 
@@ -45,7 +43,7 @@ def fill_farthest(centers, inward, values, outward, out):
             point[:] = 0.0
             length = 0.0
         if 1.0 - length > ENOUGH:
-            point[n - 1] += np.copysign(np.sqrt(1.0 - length), point[n - 1])
+            point[n - 1] = np.copysign(np.sqrt(point[n - 1] ** 2 + 1.0 - length), point[n - 1])
             length = 1.0
         shrink = 1.0 / np.sqrt(max(length, 1.0))
         for i in range(n):

@@ -19,6 +19,7 @@ from ncs_gym.fleet import fleet_of, rows_of
 from ncs_gym.frozen import as_count, as_numbers, shown
 from ncs_gym.gain_table import GainTable
 from ncs_gym.law import law_of_disturbance
+from ncs_gym.minkowski import HALVINGS
 from ncs_gym.motion import DRAW, LAST, MOVE, PREDICT, RECEIVE, clip, read_actions, run
 from ncs_gym.report import Layout, Report
 from ncs_gym.residuals import are_outside
@@ -257,7 +258,7 @@ class NCSVectorEnv(VectorEnv):
         """Raises the alarm for residuals beyond the quick test that are beyond the exact one, too."""
         suspects, residuals, table = self._doubts[:doubtful, 1:], self._residuals[:doubtful], self._table
         outside, limit = np.empty(doubtful, np.bool_), (1.0 + ALARM_TOLERANCE) ** 2
-        are_outside(suspects, residuals, table.turns, table.values, limit, outside)
+        are_outside(suspects, residuals, table.turns, table.values, limit, HALVINGS, outside)
         self._fleet.alarm[suspects[outside, 0]] = 1
 
     def _begin(self, mask: np.ndarray, starts: np.ndarray | None) -> None:

@@ -64,7 +64,9 @@ class ShapeBook:
 
     def _add(self, k: int, shape: np.ndarray) -> None:
         if k == self.seen.shape[1]:
-            self.outlooks, self.seen = (np.concatenate([rows, rows], axis=1) for rows in (self.outlooks, self.seen))
+            self.outlooks, self.seen = (
+                np.concatenate([rows, np.zeros_like(rows)], axis=1) for rows in (self.outlooks, self.seen)
+            )
         outlook, seen = self.outlooks[:, k], self.seen[:, k]
         outlook[:] = seen[:] = 0.0
         view = self._filter.test.shape_view(shape)

@@ -15,8 +15,10 @@ from experiments.proof_settings import CertifySettings
 from experiments.tally import Tally
 from experiments.tally_store import TallyStore
 from ncs_gym import truck_trailer
+from ncs_gym.contract import contract_of
 from ncs_gym.ellipsoid import Ellipsoid
 from shields import Certificate
+from shields import certify as smaller_set
 
 CAMPAIGN = Campaign(seed=0, random_plants=1, envs=32, shielded=True)
 CRUISE = "TruckTrailerCruise-v0, overtaking"
@@ -36,6 +38,14 @@ def test_every_kind_of_plant_and_channel_is_attacked():
     assert cases(3, 5)["random plant 4, perfect"].plant.fingerprint == found["random plant 4, bursts"].plant.fingerprint
     others = cases(4, 5)["random plant 4, perfect"].plant.fingerprint
     assert others != found["random plant 4, perfect"].plant.fingerprint
+
+
+def test_contracts_are_used_up():
+    found = cases(0, 0)
+    for name in ("CartPole-v0", "BatchReactor-v0"):
+        for kind in ("late", "rare"):
+            case = found[f"{name}, {kind}"]
+            assert contract_of(case.channel) == case.contract
 
 
 def test_a_block_is_the_same_after_any_other(files):
@@ -88,7 +98,7 @@ def small(monkeypatch):
 
 
 def settings(out, **changes):
-    return CertifySettings(**{"steps": 4 * 16 * 200, "out": out, "random_plants": 1, "envs": 16, "jobs": 2, **changes})
+    return CertifySettings(**{"steps": 1, "out": out, "random_plants": 1, "envs": 16, "jobs": 2, **changes})
 
 
 def document(folder):
@@ -101,19 +111,33 @@ def test_results_do_not_depend_on_jobs_and_an_interrupted_campaign_goes_on(tmp_p
     assert any(line.startswith("all  ") for line in table.splitlines())
     certify(settings(tmp_path / "one", jobs=1))
     assert document(tmp_path / "one") == document(tmp_path / "two")
-    assert document(tmp_path / "one")["total"]["steps"] == 4 * 16 * 200
+    assert document(tmp_path / "one")["total"]["steps"] == 6 * 16 * 200
     log = tmp_path / "one" / "tallies.jsonl"
     lines = log.read_bytes().splitlines(keepends=True)
     log.write_bytes(b"".join(lines[:2]) + lines[2][:40])  # killed while it wrote the third
     certify(settings(tmp_path / "one", jobs=1))
     assert document(tmp_path / "one") == document(tmp_path / "two")
-    assert len(log.read_bytes().splitlines()) == 4
+    assert len(log.read_bytes().splitlines()) == 6
     capsys.readouterr()
     certify(settings(tmp_path / "one", jobs=1))  # all there
     assert "per second" not in capsys.readouterr().out
-    certify(settings(tmp_path / "one", steps=5 * 16 * 200, jobs=1))
-    assert document(tmp_path / "one")["total"]["steps"] == 5 * 16 * 200
-    assert len(log.read_bytes().splitlines()) == 5
+    certify(settings(tmp_path / "one", steps=6 * 16 * 200 + 1, jobs=1))
+    assert document(tmp_path / "one")["total"]["steps"] == 7 * 16 * 200
+    assert len(log.read_bytes().splitlines()) == 7
+
+
+def test_another_certificate_makes_stored_tallies_void(tmp_path, small, capsys):
+    certify(settings(tmp_path, jobs=1))
+    first = document(tmp_path)["cases"]
+    for file in (tmp_path / "certificates").iterdir():
+        certificate = Certificate.load(file)
+        if certificate.fingerprint == truck_trailer().fingerprint:
+            smaller_set(truck_trailer(), 0.95 * certificate.L, certificate.K).save(file)
+    certify(settings(tmp_path, jobs=1))
+    assert len((tmp_path / "tallies.jsonl").read_bytes().splitlines()) == 9
+    second = document(tmp_path)["cases"]
+    assert second[CRUISE] == first[CRUISE]
+    assert second["TruckTrailer-v0, perfect"] != first["TruckTrailer-v0, perfect"]
 
 
 def test_a_shield_that_fails_ends_with_an_error(tmp_path, small, monkeypatch, capsys):
@@ -124,7 +148,7 @@ def test_a_shield_that_fails_ends_with_an_error(tmp_path, small, monkeypatch, ca
             Block(CRUISE, 0), Tally(steps=3200, episodes=16, exits=2, broken_episodes=1, level=1.1)
         ),
     )
-    monkeypatch.setattr(command, "_blocks", lambda names, count: {CRUISE: [Block(CRUISE, 0)]})
+    monkeypatch.setattr(command, "_blocks", lambda names, count, least: {CRUISE: [Block(CRUISE, 0)]})
     with pytest.raises(SafetyBroken, match="2 steps outside S, 0 outside the box, 0 without a proof"):
         certify(settings(tmp_path))
     assert "-1.0e-01" in capsys.readouterr().out
@@ -133,20 +157,20 @@ def test_a_shield_that_fails_ends_with_an_error(tmp_path, small, monkeypatch, ca
 
 def test_damaged_tallies_are_refused(tmp_path):
     path = tmp_path / "tallies.jsonl"
-    store = TallyStore(path, "key")
+    store = TallyStore(path, {"case": "key"})
     for index in range(3):
         store.add(Block("case", index), Tally(steps=index, episodes=1))
     whole = path.read_bytes()
-    assert TallyStore(path, "key").tallies == store.tallies
-    assert TallyStore(path, "other").tallies == {}
+    assert TallyStore(path, {"case": "key"}).tallies == store.tallies
+    assert TallyStore(path, {"case": "other", "else": "key"}).tallies == {}
     second = whole.splitlines(keepends=True)[1]
     start = whole.index(second)
     for position in range(start, start + len(second) - 1):
         path.write_bytes(whole[:position] + bytes([whole[position] ^ 1]) + whole[position + 1 :])
         with pytest.raises(ResultsError, match=r"line [23] of .* was altered"):
-            TallyStore(path, "key")
+            TallyStore(path, {"case": "key"})
     path.write_bytes(whole + b'{"sha256": "torn')
-    assert TallyStore(path, "key").tallies == store.tallies
+    assert TallyStore(path, {"case": "key"}).tallies == store.tallies
     assert path.read_bytes() == whole
 
 

@@ -209,3 +209,21 @@ def test_what_is_not_a_number_lies_outside_a_sum_and_a_flat_second_set_is_allowe
     flat = np.diag([1.0, 0.0])
     np.testing.assert_array_equal(outside_sum(points[2:], shape, flat, 0.0), [False, True, True])
     assert outside_sum(np.zeros((0, 2)), shape, flat, 0.0).dtype == np.bool_
+
+
+@pytest.mark.parametrize("size", [1, 2, 4])
+def test_the_farthest_of_many_points_stay_inside_and_are_the_farthest(size):
+    rng = np.random.default_rng(size)
+    for trial in range(60):
+        ellipsoid = Ellipsoid(random_shape(rng, size))
+        values = rng.choice([0.0, 0.5, 1.0, 1.0, 3.0], size)
+        axes = np.linalg.qr(rng.standard_normal((size, size)))[0]
+        weight = (axes * values) @ axes.T if trial % 3 else np.diag(values)
+        # Pulls along the longest axis from none to strong: at and near the "hard case".
+        centers = rng.standard_normal((50, size)) * 10.0 ** rng.uniform(-18, 1, (50, size))
+        centers[:5] = 0.0
+        points = ellipsoid.farthest_points(centers, 0.5 * (weight + weight.T))
+        assert ellipsoid.gauges(points).max() <= 1.0 + 1e-9
+        single = np.array([ellipsoid.farthest_point(center, 0.5 * (weight + weight.T)) for center in centers])
+        reached, wanted = (np.sum((centers + z) @ weight * (centers + z), axis=1) for z in (points, single))
+        assert (reached >= wanted * (1.0 - 1e-6) - 1e-12).all()
