@@ -43,6 +43,7 @@ benchmark: $(INSTALLED) $(RAY_INSTALLED)
 	$(BIN)/python benchmarks/containment.py
 	$(BIN)/python benchmarks/synthesis.py
 	$(BIN)/python benchmarks/contracts.py
+	$(BIN)/python benchmarks/numerical_trust.py
 	$(BIN)/python benchmarks/vector_env.py
 	$(BIN)/python benchmarks/codesign_grid.py
 	$(BIN)/python benchmarks/rendering.py

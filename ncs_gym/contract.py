@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from ncs_gym.channel import Channel
 from ncs_gym.frozen import as_count, as_number
 
+# There is an error set for every age.
+LONGEST_AGE = 1000
+
 
 @dataclass(frozen=True)
 class ChannelContract:
@@ -16,7 +19,7 @@ class ChannelContract:
     promise; for a stable one it makes the bound smaller.
 
     Attributes:
-        max_age: h, >= 0 [steps].
+        max_age: h, 0 to 1000 [steps].
         quantization_step: The coarsest rounding of a measurement, in the units of y.
 
     Raises:
@@ -27,7 +30,7 @@ class ChannelContract:
     quantization_step: float = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "max_age", as_count(self.max_age, "max_age", low=0))
+        object.__setattr__(self, "max_age", as_count(self.max_age, "max_age", low=0, high=LONGEST_AGE))
         step = as_number(self.quantization_step, "quantization_step", low=0.0)
         object.__setattr__(self, "quantization_step", step)
 
@@ -42,7 +45,9 @@ class ChannelContract:
 
 
 def contract_of(channel: Channel) -> ChannelContract | None:
-    """Returns the contract a channel keeps by its settings: h = (l+1) M + delay - 1; None if it may lose for ever.
+    """Returns the contract a channel keeps by its settings: h = (l+1) M + delay - 1.
+
+    None if it may lose for ever, or for so long that it is as good as that.
 
     With a sample every M steps, at most l losses in a row and a longest delay of `delay` steps: among l+1 consecutive
     samples one arrives, so at every step a sample at most (l+1) M - 1 + delay steps old has arrived.
@@ -51,4 +56,4 @@ def contract_of(channel: Channel) -> ChannelContract | None:
     if losses is None:
         return None
     age = (losses + 1) * channel.send_period + channel.longest_delay - 1
-    return ChannelContract(age, channel.quantization_step)
+    return ChannelContract(age, channel.quantization_step) if age <= LONGEST_AGE else None

@@ -97,7 +97,7 @@ CASES = [
     *setting(Channel, "send_period", counts(1)),
     *[case for name in ("delay", "jitter") for case in setting(Channel, name, [*counts(0), 1001, None])],
     *setting(Channel, "max_consecutive_losses", counts(0)),
-    *setting(ChannelContract, "max_age", [*counts(0), None]),
+    *setting(ChannelContract, "max_age", [*counts(0), None, 1001]),
     *[
         case
         for make, name in ((Regulation, "state_cost"), (AdversarialDisturbance, "M"), (Ellipsoid, "shape"))

@@ -38,17 +38,16 @@ def test_the_disturbance_bound_does_not_depend_on_units():
 
 def judged(plant, contract=None):
     """A verified certificate of a plant, or None with a reason."""
-    certificate, refusal = None, None
     try:
         certificate = synthesize(plant, contract=contract)
     except Infeasible as infeasible:
-        refusal = infeasible
-    if certificate is None:
-        assert refusal.binding
-        assert "\n" not in str(refusal)
-        return None
-    assert verify(certificate, plant).valid
-    return certificate
+        reason, binding = str(infeasible), infeasible.binding
+    else:
+        assert verify(certificate, plant).valid
+        return certificate
+    assert binding
+    assert "\n" not in reason
+    return None
 
 
 @given(plant=plants(most_states=3, most_inputs=2, radius=(0.9, 0.9999)))

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, NCSVectorEnv
+from ncs_gym import Channel, NCSVectorEnv, gain_table
 from ncs_gym.channel import Packet
 from ncs_gym.env import NCSEnv
 from ncs_gym.estimator import Belief, Estimator
@@ -130,6 +130,19 @@ def restored(env):
 def test_a_long_run_neither_grows_nor_drifts(loaded):
     assert soak_many(loaded, 64, 1600, 900) < MOST_GROWTH
     assert soak_one(loaded, 3000, 1000) < MOST_GROWTH
+
+
+def test_a_table_that_forgets_patterns_does_not_drift(loaded, monkeypatch):
+    monkeypatch.setattr(gain_table, "MOST_NODES", 300)
+    tables, keeping = set(), gain_table.GainTable.keeping
+
+    def counted(table, live):
+        tables.add(id(table))
+        return keeping(table, live)
+
+    monkeypatch.setattr(gain_table.GainTable, "keeping", counted)
+    soak_many(loaded, 16, 1000, 900)
+    assert tables
 
 
 @pytest.mark.slow

@@ -1,0 +1,38 @@
+"""The same seed gives the same bits: twice in one process, and in another process with other hashes."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from tests.command import ROOT, environment
+from tests.runs import everything
+
+
+def in_another_process(seed, steps, hashes):
+    command = [sys.executable, "-m", "tests.runs", str(seed), str(steps)]
+    given = environment(PYTHONHASHSEED=hashes, OPENBLAS_NUM_THREADS=os.environ["OPENBLAS_NUM_THREADS"])
+    ended = subprocess.run(command, cwd=ROOT, env=given, capture_output=True, text=True, timeout=600)
+    assert ended.returncode == 0, ended.stderr
+    return json.loads(ended.stdout)
+
+
+def assert_seeds_decide(steps, hashes):
+    first, second, other = everything(3, steps), everything(3, steps), everything(4, steps)
+    assert first == second
+    assert {name: in_another_process(3, steps, each) == first for name, each in enumerate(hashes)} == dict.fromkeys(
+        range(len(hashes)), True
+    )
+    # What has a seed depends on it.
+    assert {name for name in first if first[name] == other[name]} == {"certified", "contract", "paper"}
+
+
+def test_same_seed_gives_the_same_bits_in_every_process():
+    assert_seeds_decide(30, ["1"])
+
+
+@pytest.mark.slow
+def test_same_seed_gives_the_same_bits_in_every_process_for_long():
+    assert_seeds_decide(1500, ["0", "1", "random"])

@@ -1,0 +1,95 @@
+"""Runs that must come out equal bit for bit, in one process and in another (python -m tests.runs SEED STEPS)."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from agents.control_loop import ControlLoop
+from agents.settings import PPOSettings
+from agents.training import train
+from ncs_gym import Channel, ChannelContract, GilbertElliott, LinearPlant
+from shields import SafetyShield, VectorSafetyShield, synthesize
+
+CHANNEL = Channel(GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.4), 0.05, 2, 1, 2)
+IDS = ("TruckTrailer-v0", "TruckTrailerCruise-v0", "CartPole-v0")
+
+
+def digest_of(*values: Any) -> str:
+    """SHA-256 of values, down to the kinds and bits of numbers and the order of keys."""
+    digest = hashlib.sha256()
+    for value in values:
+        if isinstance(value, dict):
+            value = [part for key, each in value.items() for part in (key, digest_of(each))]
+        if isinstance(value, list | tuple):
+            digest.update(f"{len(value)}".encode() + "".join(map(digest_of, value)).encode())
+        elif isinstance(value, np.ndarray) and value.dtype != object:
+            digest.update(f"{value.dtype}{value.shape}".encode() + np.ascontiguousarray(value).tobytes())
+        else:
+            listed = value.tolist() if isinstance(value, np.ndarray) else value
+            digest.update(f"{type(value).__name__}{listed!r}".encode())
+    return digest.hexdigest()
+
+
+def stepped(env: Any, seed: int, steps: int, shape: tuple[int, ...]) -> str:
+    """Digest of everything that an environment returns."""
+    rng, returned = np.random.default_rng(0), [env.reset(seed=seed)]
+    for _ in range(steps):
+        returned.append(env.step(rng.uniform(-1.0, 1.0, shape).astype(np.float32)))
+    return digest_of(*returned)
+
+
+def scalar_runs(seed: int, steps: int) -> dict[str, str]:
+    """Trajectories of scalar environments, one behind a shield."""
+    runs = {}
+    for name in IDS:
+        changes = {"channel": CHANNEL, "disturbance": "sphere"} if name != "CartPole-v0" else {}
+        runs[name] = stepped(gym.make(f"ncs_gym/{name}", **changes), seed, steps, (1,))
+    runs["shield"] = stepped(SafetyShield(gym.make(f"ncs_gym/{IDS[1]}")), seed, steps, (1,))
+    return runs
+
+
+def vector_runs(seed: int, steps: int) -> dict[str, str]:
+    """Trajectories of vector environments, one behind a shield."""
+    runs = {}
+    for name in IDS:
+        changes = {"channel": CHANNEL} if name != "CartPole-v0" else {}
+        env = gym.make_vec(f"ncs_gym/{name}", num_envs=8, max_episode_steps=20, **changes)
+        runs[f"{name} many"] = stepped(env, seed, steps, (8, 1))
+    env = VectorSafetyShield(gym.make_vec(f"ncs_gym/{IDS[1]}", num_envs=8))
+    return runs | {"shields": stepped(env, seed, steps, (8, 1))}
+
+
+def synthesized() -> dict[str, str]:
+    """Whole certificate files, without a contract and with one, and of the published method."""
+    sizes = {"B": [[0.1], [0.2]], "C": np.eye(2), "u_max": 2.0, "dt": 0.1, "gamma": 1e-6}
+    stable = LinearPlant(A=[[0.9, 0.1], [0.0, 0.8]], **sizes)
+    unstable = LinearPlant(A=[[1.02, 0.1], [0.0, 0.8]], measurement_noise_cov=1e-6 * np.eye(2), **sizes)
+    certificates = {
+        "certified": synthesize(stable),
+        "contract": synthesize(unstable, contract=ChannelContract(1)),
+        "paper": synthesize(stable, method="paper"),
+    }
+    return {name: json.dumps(certificate.document) for name, certificate in certificates.items()}
+
+
+def trained(seed: int, steps: int) -> dict[str, str]:
+    """Every weight of an agent."""
+    settings = PPOSettings(envs=4, rollout=32, batch_size=64, epochs=2)
+    model = train(ControlLoop(env=f"ncs_gym/{IDS[1]}"), steps, seed, settings=settings).agent.model
+    weights = {name: value.detach().numpy() for name, value in model.policy.state_dict().items()}
+    return {"PPO": digest_of(weights)}
+
+
+def everything(seed: int, steps: int) -> dict[str, str]:
+    """All runs, by name."""
+    return scalar_runs(seed, steps) | vector_runs(seed, steps) | synthesized() | trained(seed, 16 * steps)
+
+
+if __name__ == "__main__":
+    json.dump(everything(int(sys.argv[1]), int(sys.argv[2])), sys.stdout)
