@@ -164,6 +164,33 @@ def test_mutation_of_a_proof_by_age_is_rejected_for_the_right_condition(name, pr
         assert any(mark in found for found in broken), (mark, broken)
 
 
+def test_margins_by_age_agree_with_floating_point(promised):
+    plant, certificate = promised
+    margins = {c.name.split(" ")[0] + c.name[-1]: [] for c in verify(certificate, plant).conditions}
+    for condition in verify(certificate, plant).conditions:
+        margins[condition.name.split(" ")[0] + condition.name[-1]].append(condition.margin)
+    s, ages, growth = certificate.ages.sets, certificate.ages, certificate.multipliers.rounding
+    smallest = lambda matrix: np.linalg.eigvalsh(matrix)[0]  # noqa: E731
+    assert margins["(C0)0"] == [pytest.approx(smallest(s.shapes[0] - plant.initial_error.shape), rel=1e-6)]
+    for j, found in enumerate(margins["(C1)0"]):
+        grown = plant.A @ s.shapes[j] @ plant.A.T / s.rates[j] + certificate.D / (1 - s.rates[j])
+        assert found == pytest.approx(smallest(s.shapes[j + 1] - grown), rel=1e-4)
+    for j, found in enumerate(margins["(C2)0"]):
+        kept = np.eye(plant.n) - s.gains[j] @ plant.H
+        updated = kept @ s.shapes[j + 1] @ kept.T / s.shares[j]
+        updated += s.gains[j] @ s.noise @ s.gains[j].T / (1 - s.shares[j])
+        assert found == pytest.approx(smallest(s.shapes[0] - updated), rel=1e-4)
+    closed, gain = plant.A + plant.B @ certificate.K, plant.B @ certificate.K
+    spread = plant.m * plant.B @ np.diag((plant.u_max * 2.0**-24) ** 2) @ plant.B.T
+    D_u = (1 + growth) * certificate.D + (1 + 1 / growth) * spread
+    for j, (lx, le, ld) in enumerate(ages.shares):
+        grown = closed @ certificate.L @ closed.T / lx + gain @ s.shapes[j] @ gain.T / le + D_u / ld
+        assert margins[f"(I){j}"] == [pytest.approx(smallest(certificate.L - grown), rel=1e-4)]
+        for k, mu, limit, found in zip(certificate.K, ages.inputs[j], plant.u_max, margins[f"(U){j}"], strict=True):
+            used = k @ certificate.L @ k / mu + k @ s.shapes[j] @ k / (1 - mu)
+            assert found == pytest.approx((limit * (1 - 2.0**-24)) ** 2 - used, rel=1e-9)
+
+
 @pytest.mark.parametrize(
     "change",
     [

@@ -1,4 +1,4 @@
-from dataclasses import replace
+from dataclasses import FrozenInstanceError, replace
 from functools import cache
 from itertools import product
 
@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ncs_gym import Ellipsoid
+from ncs_gym import Ellipsoid, truck_trailer
 from ncs_gym.ellipsoid import outer_sum
 from shields import CertificateError, SafetyFilter, synthesize
 from shields.filter import MARGIN, MODES
@@ -80,6 +80,7 @@ def test_projected_input_is_expressible_in_float32_and_the_closest(case):
         if decision.reason != "projected":
             continue
         checked += 1
+        assert (decision.intervened, decision.passed, decision.fallback) == (True, True, False)
         action = (decision.input / plant.u_max).astype(np.float32)
         np.testing.assert_array_equal(plant.u_max * action.astype(np.float64), decision.input)
         # No random admissible input is closer by more than the rounding.
@@ -207,6 +208,19 @@ def test_decide_never_raises(states):
             assert np.isfinite(decision.input).all()
 
 
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("states", [2, 3])
+def test_what_underflows_raises_nothing(states, mode):
+    plant = replace(random_plant(3, states, states - 1), u_max=10.0)
+    shield = SafetyFilter(certificate_of(plant), plant, mode)
+    for size in (1e-160, 1e-310):
+        with np.errstate(all="raise"):
+            decision = shield.decide(size * np.ones(states), 1e-4 * np.eye(states), plant.u_max)
+        assert decision.intervened
+        # A state known better than perfectly, by rounding.
+        assert shield.knows_inside(np.zeros(states), -1e-310 * np.eye(states)) is (states > 2)
+
+
 def test_wrongly_projected_input_is_not_applied(certificate, loaded, monkeypatch):
     shield = SafetyFilter(certificate, loaded)
     monkeypatch.setattr("shields.plane.closest_on_line", lambda wanted, *rest: wanted)
@@ -232,6 +246,7 @@ def test_known_inside_ends_at_the_edge(certificate, loaded):
     radius = np.sqrt(np.linalg.eigvals(certificate.M @ shape).real.max())
     assert shield.knows_inside((1.0 - radius - 1e-6) * direction, shape)
     assert not shield.knows_inside((1.0 - radius + 1e-9) * direction, shape)
+    assert not shield.knows_inside((1.0 - radius - 0.5 * MARGIN) * direction, shape)  # inside, but by too little
 
 
 @pytest.mark.parametrize("proposed", ["left", None, [[1.0]], [1.0, 2.0], object()])
@@ -355,8 +370,18 @@ def test_filter_refuses_what_does_not_verify(certificate, loaded, plant):
         SafetyFilter(certificate, plant)
     with pytest.raises(ValueError, match="SafetyFilter takes a Certificate"):
         SafetyFilter(loaded, certificate)
+    for certified, known in ((certificate, "plant"), ("certificate", loaded)):
+        with pytest.raises(ValueError, match="SafetyFilter takes a Certificate"):
+            SafetyFilter(certified, known)
     with pytest.raises(ValueError, match="mode must be one of"):
         SafetyFilter(certificate, loaded, "hope")
+
+
+def test_filter_cannot_be_changed_once_it_is_verified(certificate, loaded):
+    shield = SafetyFilter(certificate, loaded)
+    for name, value in (("mode", "monitor"), ("plant", truck_trailer()), ("certificate", certificate), ("test", None)):
+        with pytest.raises(FrozenInstanceError):
+            setattr(shield, name, value)
 
 
 def test_the_test_is_passed_with_a_margin_or_not_at_all(certificate, loaded):

@@ -10,7 +10,8 @@ import pytest
 from ncs_gym import Channel, LinearPlant, NCSEnv
 from shields import CertificateError, Infeasible, SafetyFilter, SafetyShield, synthesize
 from shields.exact import congruence, is_positive_semidefinite, multiply, rational, subtract
-from shields.one_step import certified_root
+from shields.filter import require_computable
+from shields.one_step import OneStepTest, certified_root
 from shields.proof import FAR_OUT, NOT_KNOWN_INSIDE
 
 SINGULAR = np.array([[0.5, -0.3], [0.25, -0.15]])
@@ -110,6 +111,35 @@ def test_root_never_understates_the_norm(size):
         assert not is_positive_semidefinite(subtract(congruence(rational((1 - 1e-8) * root), rational(L)), identity))
 
 
+@pytest.mark.parametrize(("seed", "n", "span"), [(0, 2, 3), (23, 4, 5), (37, 2, 6)])
+def test_root_grows_no_more_than_it_must_for_thin_sets(seed, n, span):
+    # The first root is enough for the first of these; the others need one that is ten and a hundred times larger.
+    rng = np.random.default_rng(seed)
+    G = rng.standard_normal((n, n)) * 10.0 ** rng.uniform(-span, 0, n)[:, None]
+    L = 0.5 * (G @ G.T + (G @ G.T).T)
+    root, identity = certified_root(L), rational(np.eye(n))
+    assert is_positive_semidefinite(subtract(congruence(rational(root), rational(L)), identity))
+    best = np.linalg.inv(np.linalg.cholesky(L))
+    assert np.linalg.norm(root) <= (1 + 2e-9) * np.linalg.norm(best)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 2.0**10, 2.0**20])
+def test_known_inside_is_true_to_the_last_bit_without_any_margin(tilt):
+    # The root of this L is exact; only products with it round, by terms of size `tilt` that cancel.
+    factor = np.array([[1.0, 0.0], [tilt, 1.0]])
+    test, rng = OneStepTest(factor @ factor.T, slanted(10.0)), np.random.default_rng(0)
+    for _ in range(60):
+        x = factor @ rng.standard_normal(2)
+        low, high = 0.0, 1e3
+        for _ in range(70):  # to the edge of what is known to be inside
+            middle = 0.5 * (low + high)
+            known = test.knows_inside(middle * x, np.zeros((2, 2)), 0.0)
+            low, high = (middle, high) if known else (low, middle)
+        p, q = (Fraction(float(entry)) for entry in low * x)
+        assert low > 0.0
+        assert p * p + (q - Fraction(tilt) * p) ** 2 <= 1
+
+
 def test_safe_set_too_thin_for_float64_is_refused():
     with pytest.raises(CertificateError, match="too thin"):
         certified_root(np.array([[1.0, 1.0], [1.0, 1.0]]))
@@ -124,6 +154,17 @@ def test_gain_too_large_for_float64_is_refused(monkeypatch, certificate, loaded)
     monkeypatch.setattr("shields.filter.require_valid", lambda *_: None)
     with pytest.raises(CertificateError, match="gain is too large"):
         SafetyFilter(replace(certificate, K=1e9 * np.array([[1.0, -1.0]])), loaded)
+
+
+def test_gain_may_be_as_large_as_float64_computes_it_accurately(certificate, loaded):
+    # A quarter of a float32 step of the limit, against n + 2 roundings of sums of |K| |x_hat|.
+    thin = replace(certificate, Sigma=certificate.Sigma * [[1.0, 0.1], [0.1, 0.01]])
+    extent = np.sqrt(np.diag(thin.L)) + np.sqrt(np.diag(thin.Sigma))
+    assert extent[0] > 1.05 * extent[1] or extent[1] > 1.05 * extent[0]
+    largest = 0.25 * 2.0**-24 * 4.0 / (4 * 2.0**-52 * extent.sum())
+    require_computable(replace(thin, K=0.99 * largest * np.array([[1.0, -1.0]])), loaded)
+    with pytest.raises(CertificateError, match="gain is too large"):
+        require_computable(replace(thin, K=1.01 * largest * np.array([[1.0, -1.0]])), loaded)
 
 
 @pytest.mark.parametrize("first_error", [0.0, 1e-6])
