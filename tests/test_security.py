@@ -26,6 +26,12 @@ SAFE_WITH |= {"stable_baselines3.common.save_util.load_from_zip_file": ("load_da
 UNPICKLING = {"pickle", "cPickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}
 NETWORK = {"socket", "ssl", "urllib", "urllib3", "http", "ftplib", "smtplib", "requests", "httpx", "aiohttp"}
 
+# What goes from a driver to its own workers, over Ray, which unpickles what it is sent itself (SECURITY.md).
+BETWEEN_DRIVER_AND_WORKERS = {
+    "experiments/cluster.py": ["pickle", "socket"],
+    "experiments/ray_engine.py": ["pickle"],
+}
+
 
 def imported(tree):
     """What names stand for in a module: the dotted name of everything it imports, by the name it has there."""
@@ -64,7 +70,10 @@ def dangers(source):
 def test_nothing_that_runs_what_a_file_holds_is_called_in(package):
     files = sorted((ROOT / package).rglob("*.py"))
     assert files
-    assert {str(path): found for path in files if (found := dangers(path.read_text()))} == {}
+    found = {path.relative_to(ROOT).as_posix(): dangers(path.read_text()) for path in files}
+    assert {name: those for name, those in found.items() if those} == {
+        name: those for name, those in BETWEEN_DRIVER_AND_WORKERS.items() if name.startswith(package)
+    }
 
 
 @pytest.mark.parametrize(

@@ -101,7 +101,7 @@ def test_half_stored_result_of_other_settings_leaves_nothing_behind(store, unit,
 
 def test_changed_source_is_another_key(unit, monkeypatch):
     before = unit.key
-    monkeypatch.setattr("experiments.unit._source_digest", lambda: "changed")
+    monkeypatch.setattr("experiments.versions._source_digest", lambda: "changed")
     assert unit.key != before
 
 
