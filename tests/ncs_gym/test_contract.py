@@ -283,3 +283,20 @@ def test_prediction_falls_back_to_the_certified_set(monkeypatch):
     np.testing.assert_array_equal(shape, sets.ages.shapes[2])
     outside = 2.0 * sets.ages.shapes[1]  # a broken contract: no certified set applies
     assert not is_inside(estimator._predicted_shape(outside, 1), sets.ages.shapes[2])
+
+
+def test_certified_gain_proves_nothing_for_an_error_outside_the_certified_set(monkeypatch):
+    plant, contract = PLANTS["batch reactor"]
+    sets = certified_error_set(plant, contract)
+    estimator = Estimator(plant, Channel(), sets)
+    monkeypatch.setattr(estimator, "_membership_gain", lambda shape: np.full((4, 2), 50.0))
+    monkeypatch.setattr(estimator, "_kalman_update", lambda covariance: None)
+    oldest = contract.max_age + 1
+    for age in (1, oldest):
+        inside = estimator.update_of(np.eye(4), sets.ages.shapes[age], age)
+        np.testing.assert_array_equal(inside.gain, sets.ages.gains[age - 1])
+        np.testing.assert_array_equal(inside.shape, sets.ages.shapes[0])
+        outside = estimator.update_of(np.eye(4), 1.1 * sets.ages.shapes[age], age)
+        assert not is_inside(outside.shape, sets.ages.shapes[0])
+    late = estimator.update_of(np.eye(4), sets.ages.shapes[0], oldest + 1)  # beyond the contract there is no set
+    assert not is_inside(late.shape, sets.ages.shapes[0])

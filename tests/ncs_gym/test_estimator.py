@@ -280,3 +280,22 @@ def test_rounded_shapes_are_no_smaller_where_the_certified_set_is_ill_conditione
     # Coordinates of the unit ball and back are not the identity here; a shape is smaller if that is not made up for.
     estimator._ball_error = np.zeros((n, n))
     assert smallest_growth() < -1e-8
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0])
+@pytest.mark.parametrize("p", [None, 1, 2])
+def test_set_membership_gain_leaves_the_smallest_ellipsoid(p, size):
+    plant = random_plant(2, 3, 1, p)
+    estimator = Estimator(plant, Channel(quantization_step=0.01))
+    shape, N, H = size * estimator.error_set.Sigma, estimator._noise, plant.H
+
+    def left(gain):
+        """Size of what an update leaves, with the best share for this gain."""
+        kept = np.eye(3) - gain @ H
+        first, second = kept @ shape @ kept.T, gain @ N @ gain.T
+        return (np.sqrt(np.vdot(plant.weight, first)) + np.sqrt(np.vdot(plant.weight, second))) ** 2
+
+    others = [shape @ H.T / mu @ np.linalg.inv(H @ shape @ H.T / mu + N / (1 - mu)) for mu in np.linspace(0.005, 0.995)]
+    found = left(estimator._membership_gain(shape))
+    assert found <= min(map(left, others)) * (1 + 1e-2)
+    assert found < 0.95 * max(map(left, others))
