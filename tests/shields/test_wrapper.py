@@ -488,7 +488,11 @@ def test_fallback_proves_nothing_while_the_error_is_not_certified(certificate):
     assert tracker.reason == ""
 
 
-def test_unusable_report_ends_the_proof_for_the_rest_of_the_episode(certificate, loaded):
+@pytest.mark.parametrize(
+    "change",
+    [{"estimate": np.full(2, np.nan)}, {"estimate": None}, {"error_shape": "none"}, {"error_shape": -np.eye(2)}],
+)
+def test_unusable_report_ends_the_proof_for_the_rest_of_the_episode(certificate, loaded, change):
     tracker = ProofTracker(SafetyFilter(certificate, loaded))
     info = {
         "estimate": np.zeros(2),
@@ -499,7 +503,7 @@ def test_unusable_report_ends_the_proof_for_the_rest_of_the_episode(certificate,
     passed = Decision(np.zeros(1), False, True, False, 0.1, "safe")
     tracker.start(True, True, info)
     assert tracker.reason == ""
-    tracker.step(passed, True, info | {"estimate": np.full(2, np.nan)})
+    tracker.step(passed, True, info | change)
     tracker.step(passed, True, info)
     assert tracker.reason == UNUSABLE
     tracker.start(True, True, info)
