@@ -4,7 +4,7 @@ import pytest
 from gymnasium.vector import VectorActionWrapper, VectorObservationWrapper, VectorWrapper
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 
-from ncs_gym import Channel, ChannelContract, NCSVectorEnv, SphereDisturbance, batch_reactor, truck_trailer
+from ncs_gym import Channel, ChannelContract, LinearPlant, NCSVectorEnv, SphereDisturbance, batch_reactor, truck_trailer
 from shields import CertificateError, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.filter import MODES
 from shields.proof import ProofTracker, starts_inside
@@ -64,6 +64,32 @@ def test_decisions_equal_those_of_the_scalar_filter(plant, mode):
         np.testing.assert_allclose(found.margin[e], one.margin, atol=1e-6 if one.reason == "projected" else 1e-12)
     assert {"safe", "invalid"} <= seen
     assert seen & {"projected", "fallback", "unsafe"}
+
+
+def test_rounding_counts_as_in_the_scalar_filter():
+    # Estimates that A annihilates, so far out that rounding shows, and errors that nearly fill the safe set.
+    A = np.array([[0.5, -0.3], [0.25, -0.15]])
+    plant = LinearPlant(A=A, B=np.ones((2, 1)), C=np.eye(2), u_max=1.0, dt=0.1, gamma=1e-6)
+    certificate = certificate_of(plant)
+    safety_filter = SafetyFilter(certificate, plant)
+    batch, test = VectorFilter(safety_filter), safety_filter.test
+    u = np.zeros(1)
+
+    def margins(estimate, shape):
+        found = batch.decide(estimate[:, None].copy(), np.array([batch.book.number(shape)]), u[:, None])
+        return found.margin[0], safety_filter.margin(estimate, shape, u)
+
+    for size in (1e5, 1e6, 1e7):
+        estimate = size * np.array([3.0, 5.0])
+        loss = test.rounding * float(test.columns @ np.abs(estimate))
+        assert margins(estimate, 1e-4 * certificate.Sigma) == pytest.approx(
+            (margins(0.0 * estimate, 1e-4 * certificate.Sigma)[1] - loss,) * 2, abs=0.1 * loss
+        )
+    low, high = 0.0, 1e6
+    for _ in range(60):  # to a radius too small for weights
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if 1.0 - test._in_space(np.zeros(2), middle * np.eye(2)).h > 5e-6 else (low, middle)
+    assert margins(np.zeros(2), low * np.eye(2)) == pytest.approx((0.0, 0.0), abs=1e-12)
 
 
 def drive(env, steps, policy):
