@@ -183,7 +183,7 @@ def test_one_state_leaves_nothing_to_be_sharper_about():
     certificate = synthesize(plant)
     test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(0)
     for estimate, shape, u in cases(certificate, plant, rng, 50):
-        _, P, h = predicted(certificate, plant, shape)
+        *_, h = predicted(certificate, plant, shape)
         room, margin = test.at(estimate, shape).judge(u.tolist())
         center = abs(plant.A @ estimate + plant.B @ u).item() / np.sqrt(certificate.L.item())
         assert room == pytest.approx(margin, abs=1e-12)
