@@ -8,7 +8,7 @@ from ncs_gym import Channel, ChannelContract, LinearPlant, NCSVectorEnv, SphereD
 from shields import CertificateError, SafetyFilter, SafetyShield, VectorSafetyShield, proof
 from shields.filter import MARGIN, MODES, Decision
 from shields.proof import ProofTracker, starts_inside
-from shields.tracking import Knowledge, track
+from shields.tracking import Knowledge, compare_clocks, track
 from shields.vector_filter import REASONS, VectorFilter
 from shields.vector_wrapper import WHY
 from tests.attacks import CHANNELS, RANDOM, TRUCKS, certificate_of, harmful
@@ -219,6 +219,16 @@ def test_proofs_break_and_recover_as_scalar_trackers_do_whatever_is_reported():
         seen |= set(WHY[reason])
     assert seen == {"", *(proof.ALARM, proof.OTHER_INPUT, proof.OTHER_STEPS, proof.LARGE_ERROR, proof.FAR_OUT),
                     proof.UNUSABLE, proof.NOT_KNOWN_INSIDE}  # fmt: skip
+
+
+@pytest.mark.parametrize("next_tick", [True, False])
+def test_one_step_is_one_of_the_environments_own_clock(next_tick):
+    episodes_before, steps_before = np.array([1, 1, 1, 1, 1, 1]), np.array([5, 5, 5, 9, 9, 9])
+    episodes, steps = np.array([1, 1, 1, 2, 3, 2]), np.array([6, 7, 5, 0, 0, 1])
+    restarted, once = np.empty((2, 6), np.bool_)
+    assert compare_clocks(episodes, steps, episodes_before, steps_before, next_tick, restarted, once) == 3
+    np.testing.assert_array_equal(restarted, [False, False, False, True, True, True])
+    np.testing.assert_array_equal(once, np.array([True, False, False, True, False, False]) & next_tick)
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
