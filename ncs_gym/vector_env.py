@@ -92,7 +92,8 @@ class NCSVectorEnv(VectorEnv):
         sizes = plant.n, plant.m, plant.p, slots
         rows, marks = rows_of(*sizes)
         self._kept = np.zeros((rows, count)), np.zeros((marks, count), np.int32)
-        self._fleet = fleet_of.py_func(*sizes, *self._kept)
+        # With NUMBA_DISABLE_JIT=1, for debuggers and mutants, it is a function of Python's already.
+        self._fleet = getattr(fleet_of, "py_func", fleet_of)(*sizes, *self._kept)
         self._fleet.counted[:] = 1
         self._doubts, self._residuals = np.empty((count * slots, 4), np.int32), np.empty((count * slots, plant.p))
         self._progress, self._done = np.zeros(4, np.int64), np.zeros(count, np.bool_)

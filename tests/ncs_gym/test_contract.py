@@ -24,6 +24,7 @@ from ncs_gym import (
 )
 from ncs_gym.channel import Link
 from ncs_gym.ellipsoid import is_inside
+from ncs_gym.error_set import _check_ages
 from ncs_gym.estimator import Estimator
 from shields.exact import add, congruence, is_positive_semidefinite, multiply, rational, scale, subtract
 
@@ -283,3 +284,44 @@ def test_prediction_falls_back_to_the_certified_set(monkeypatch):
     np.testing.assert_array_equal(shape, sets.ages.shapes[2])
     outside = 2.0 * sets.ages.shapes[1]  # a broken contract: no certified set applies
     assert not is_inside(estimator._predicted_shape(outside, 1), sets.ages.shapes[2])
+
+
+def test_certified_gain_proves_nothing_for_an_error_outside_the_certified_set(monkeypatch):
+    plant, contract = PLANTS["batch reactor"]
+    sets = certified_error_set(plant, contract)
+    estimator = Estimator(plant, Channel(), sets)
+    monkeypatch.setattr(estimator, "_membership_gain", lambda shape: np.full((4, 2), 50.0))
+    monkeypatch.setattr(estimator, "_kalman_update", lambda covariance: None)
+    oldest = contract.max_age + 1
+    for age in (1, oldest):
+        inside = estimator.update_of(np.eye(4), sets.ages.shapes[age], age)
+        np.testing.assert_array_equal(inside.gain, sets.ages.gains[age - 1])
+        np.testing.assert_array_equal(inside.shape, sets.ages.shapes[0])
+        outside = estimator.update_of(np.eye(4), 1.1 * sets.ages.shapes[age], age)
+        assert not is_inside(outside.shape, sets.ages.shapes[0])
+    late = estimator.update_of(np.eye(4), sets.ages.shapes[0], oldest + 1)  # beyond the contract there is no set
+    assert not is_inside(late.shape, sets.ages.shapes[0])
+
+
+def test_sets_by_age_that_fail_a_condition_are_an_error():
+    plant, contract = PLANTS["cart-pole"]
+    plant = replace(plant, initial_cov=np.zeros((4, 4)))
+    errors = certified_error_set(plant, contract)
+    _check_ages(errors.ages, plant)
+    # The first set would hold no update, and the last not what the one before it moves into.
+    for age, name in ((0, r"\(C2\)"), (contract.max_age + 1, r"\(C1\)")):
+        shapes = errors.ages.shapes.copy()
+        shapes[age] *= 0.5
+        with pytest.raises(ErrorSetError, match=name):
+            _check_ages(replace(errors.ages, shapes=shapes), plant)
+    worse = replace(plant, initial_cov=np.eye(4))
+    with pytest.raises(ErrorSetError, match=r"\(C0\)"):
+        _check_ages(errors.ages, worse)
+
+
+def test_every_age_has_a_set_and_a_rate_of_its_own():
+    errors = certified_error_set(*PLANTS["batch reactor"])
+    rates = [errors.rate_at(age) for age in range(len(errors.ages.rates))]
+    assert rates == errors.ages.rates.tolist()
+    assert len(set(rates)) == len(rates)
+    assert errors.shape_at(len(errors.ages.shapes)) is None

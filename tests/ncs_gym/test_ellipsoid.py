@@ -200,6 +200,9 @@ def test_points_outside_a_sum_are_found_as_by_minimization(seed, size):
         if abs(factor - 1.0) > 1e-5:
             assert (sum_gauge(point, first, second) > 1.0) == (factor > 1.0)
     assert not outside_sum(boundary, first, second, 1e-9).any()
+    # A tolerance is one of lengths.
+    np.testing.assert_array_equal(outside_sum(1.09 * boundary[:5], first, second, 0.1), False)
+    np.testing.assert_array_equal(outside_sum(1.11 * boundary[:5], first, second, 0.1), True)
 
 
 def test_what_is_not_a_number_lies_outside_a_sum_and_a_flat_second_set_is_allowed():

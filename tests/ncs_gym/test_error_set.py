@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid, ErrorSetError, LinearPlant, UnstablePlantError, certified_error_set, truck_trailer
+from ncs_gym.error_set import _check
 from shields.exact import add, congruence, is_positive_semidefinite, rational, scale, subtract
 from tests.plants import random_plant
 
@@ -109,3 +110,15 @@ def test_unstable_plant_is_refused_with_its_spectral_radius():
     plant = LinearPlant(A=[[1.02]], B=[[1.0]], C=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-3)
     with pytest.raises(UnstablePlantError, match=r"spectral radius of A is 1\.02"):
         certified_error_set(plant)
+
+
+def test_set_that_fails_a_condition_in_one_direction_is_an_error():
+    # With A = I/2 and a rate of 1/2, (E1) says Sigma >= 2 D/(1/2) = 4.
+    A, D, first = 0.5 * np.eye(2), np.eye(2), np.diag([2.0, 1.0])
+    _check(4.01 * np.eye(2), A, D, first, 0.5)
+    with pytest.raises(ErrorSetError, match=r"\(E1\)"):
+        _check(np.diag([4.01, 3.99]), A, D, first, 0.5)
+    with pytest.raises(ErrorSetError, match=r"\(E0\)"):
+        _check(4.01 * np.eye(2), A, D, np.diag([5.0, 1.0]), 0.5)
+    with pytest.raises(ErrorSetError), np.errstate(invalid="ignore"):
+        _check(np.full((2, 2), np.inf), A, D, first, 0.5)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from ncs_gym import Channel, Ellipsoid, ErrorSet, Estimator, LinearPlant, Packet, certified_error_set, truck_trailer
 from ncs_gym.channel import GilbertElliott, Link
 from ncs_gym.estimator import _grown
+from ncs_gym.plant import FLAT_INFLATION
 from shields.exact import congruence, is_positive_semidefinite, rational, subtract
 from tests.plants import random_plant
 
@@ -280,3 +281,37 @@ def test_rounded_shapes_are_no_smaller_where_the_certified_set_is_ill_conditione
     # Coordinates of the unit ball and back are not the identity here; a shape is smaller if that is not made up for.
     estimator._ball_error = np.zeros((n, n))
     assert smallest_growth() < -1e-8
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0])
+@pytest.mark.parametrize("p", [None, 1, 2])
+def test_set_membership_gain_leaves_the_smallest_ellipsoid(p, size):
+    plant = random_plant(2, 3, 1, p)
+    estimator = Estimator(plant, Channel(quantization_step=0.01))
+    shape, N, H = size * estimator.error_set.Sigma, estimator._noise, plant.H
+
+    def left(gain):
+        """Size of what an update leaves, with the best share for this gain."""
+        kept = np.eye(3) - gain @ H
+        first, second = kept @ shape @ kept.T, gain @ N @ gain.T
+        return (np.sqrt(np.vdot(plant.weight, first)) + np.sqrt(np.vdot(plant.weight, second))) ** 2
+
+    others = [shape @ H.T / mu @ np.linalg.inv(H @ shape @ H.T / mu + N / (1 - mu)) for mu in np.linspace(0.005, 0.995)]
+    found = left(estimator._membership_gain(shape))
+    assert found <= min(map(left, others)) * (1 + 1e-2)
+    assert found < 0.95 * max(map(left, others))
+
+
+def test_shape_without_any_extent_is_rounded_up_to_a_finite_one():
+    estimator = Estimator(truck_trailer(), Channel())
+    values = np.linalg.eigvalsh(estimator._settled_shape(np.zeros((2, 2))))
+    assert values[0] >= 0.0
+    assert values[1] < 0.01 * np.linalg.eigvalsh(estimator.error_set.Sigma)[1]
+
+
+@pytest.mark.parametrize("perfect", [(True, True), (True, False)])
+def test_perfect_sensors_get_a_little_noise_in_their_own_units(perfect):
+    # Otherwise a filter that knows the state has a singular innovation covariance.
+    plant = truck_trailer(H=np.diag([2.0, 3.0]), measurement_noise_cov=np.diag(np.where(perfect, 0.0, 1e-4)))
+    noise = Estimator(plant, Channel())._filter.R - plant.measurement_noise_cov
+    np.testing.assert_allclose(noise, FLAT_INFLATION * np.diag((plant.half_widths * [2.0, 3.0]) ** 2), rtol=1e-6)

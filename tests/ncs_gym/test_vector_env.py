@@ -550,3 +550,11 @@ def test_own_plant_by_id():
     assert env.step(np.zeros((3, 1), np.float32))[4]["error_shape"].shape == (3, 1, 1)
     with pytest.raises(ValueError, match="no plant of its own"):
         make("LinearNCS", 3)
+
+
+def test_environment_can_be_made_without_a_compiler(monkeypatch):
+    # As with NUMBA_DISABLE_JIT=1, which leaves functions of Python's.
+    from ncs_gym import vector_env
+
+    monkeypatch.setattr(vector_env, "fleet_of", vector_env.fleet_of.py_func)
+    assert NCSVectorEnv(2, plant=truck_trailer()).reset(seed=0)[0].shape[0] == 2

@@ -5,7 +5,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shields.exact import congruence, is_positive_semidefinite, quadratic, rational, subtract, to_float
+from shields.exact import (
+    add,
+    congruence,
+    is_positive_semidefinite,
+    multiply,
+    quadratic,
+    rational,
+    subtract,
+    to_float,
+    transpose,
+)
 
 
 def minors_say_semidefinite(matrix: np.ndarray) -> bool:
@@ -68,3 +78,13 @@ def test_congruence_agrees_with_numpy():
 def test_non_finite_floats_cannot_enter():
     with pytest.raises((ValueError, OverflowError)):
         rational(np.array([[np.nan]]))
+
+
+def test_what_does_not_fit_together_is_an_error_not_a_shorter_sum():
+    square, row, ragged = rational(np.eye(2)), rational(np.ones((1, 3))), [[Fraction(1), Fraction(2)], [Fraction(3)]]
+    for wrong in (lambda: multiply(square, row), lambda: multiply(square, ragged), lambda: transpose(ragged)):
+        with pytest.raises(ValueError, match="zip"):
+            wrong()
+    for wrong in (lambda: add(square, row), lambda: subtract(square, ragged)):
+        with pytest.raises(ValueError, match="zip"):
+            wrong()

@@ -1,4 +1,5 @@
 from copy import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -175,6 +176,48 @@ def test_decomposition_that_fails_says_nothing(monkeypatch):
 
     monkeypatch.setattr(one_step, "dsyev", lambda matrix: (np.ones(3), np.eye(3), 1))
     assert test.at(np.zeros(3), 0.01 * np.eye(3)) is None
+
+
+def test_one_state_leaves_nothing_to_be_sharper_about():
+    plant = random_plant(3, 1, 1)
+    certificate = synthesize(plant)
+    test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(0)
+    for estimate, shape, u in cases(certificate, plant, rng, 50):
+        *_, h = predicted(certificate, plant, shape)
+        room, margin = test.at(estimate, shape).judge(u.tolist())
+        center = abs(plant.A @ estimate + plant.B @ u).item() / np.sqrt(certificate.L.item())
+        assert room == pytest.approx(margin, abs=1e-12)
+        assert room == pytest.approx(1.0 - h - center, abs=1e-9)
+
+
+def test_bounds_on_rounding_hold_column_by_column():
+    # A plant whose states differ much in size, and a disturbance that is far from the unit ball of the safe set.
+    A = np.array([[0.5, 40.0, 0.0], [0.0, 0.4, -300.0], [0.0, 0.0, 0.3]])
+    plant = replace(random_plant(3, 3, 2), A=A)
+    L = np.diag([4.0, 9.0, 1.0]) + 0.5
+    test = OneStepTest(L, plant)
+    G, D = np.abs(test.root), plant.disturbance.shape
+    columns = G @ np.abs(A)
+    for i in range(3):
+        assert test.columns[i] == pytest.approx(np.linalg.norm(columns[:, i]))
+        assert test.own_columns[i] == pytest.approx(np.linalg.norm(G[:, i]))
+    extent = np.linalg.norm(G, axis=0) @ np.sqrt(np.diag(D))
+    room = np.linalg.eigvalsh(test.D - test.root @ D @ test.root.T)
+    np.testing.assert_allclose(room, test.rounding * extent**2, rtol=0.2)
+    # The radius is smaller by what rounding does to the estimate, its error and the input.
+    estimate, shape = np.array([1.0, 2.0, -1.0]), 1e-7 * np.diag([1.0, 2.0, 3.0])
+    for state, error in (
+        (estimate, shape),
+        (1e3 * estimate, shape),
+        (0.0 * estimate, shape),
+        (0.0 * estimate, 10 * shape),
+    ):
+        found = test.at(state, error)
+        reach, spread = test.columns @ np.abs(state), test.columns @ np.sqrt(np.diag(error))
+        pushed = np.linalg.norm(G @ np.abs(plant.B), axis=0) @ plant.u_max
+        loss = 1.0 - found.h - found.radius
+        assert found.h < 1.0
+        assert loss == pytest.approx(test.rounding * (reach + spread + pushed), abs=3e-16)
 
 
 def test_perfect_estimate_and_huge_error_are_handled(case):

@@ -4,11 +4,13 @@ import pytest
 from gymnasium.vector import VectorActionWrapper, VectorObservationWrapper, VectorWrapper
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 
-from ncs_gym import Channel, ChannelContract, NCSVectorEnv, SphereDisturbance, batch_reactor, truck_trailer
-from shields import CertificateError, SafetyFilter, SafetyShield, VectorSafetyShield
-from shields.filter import MODES
+from ncs_gym import Channel, ChannelContract, LinearPlant, NCSVectorEnv, SphereDisturbance, batch_reactor, truck_trailer
+from shields import CertificateError, SafetyFilter, SafetyShield, VectorSafetyShield, proof
+from shields.filter import MARGIN, MODES, Decision
 from shields.proof import ProofTracker, starts_inside
+from shields.tracking import Knowledge, compare_clocks, track
 from shields.vector_filter import REASONS, VectorFilter
+from shields.vector_wrapper import WHY
 from tests.attacks import CHANNELS, RANDOM, TRUCKS, certificate_of, harmful
 
 KEYS = {
@@ -64,6 +66,49 @@ def test_decisions_equal_those_of_the_scalar_filter(plant, mode):
         np.testing.assert_allclose(found.margin[e], one.margin, atol=1e-6 if one.reason == "projected" else 1e-12)
     assert {"safe", "invalid"} <= seen
     assert seen & {"projected", "fallback", "unsafe"}
+
+
+@pytest.mark.parametrize("name", ["4000 kg", "n=4 m=3 p=2"])
+def test_the_test_is_passed_with_the_margin_of_the_scalar_filter(name):
+    plant = (TRUCKS | RANDOM)[name]
+    certificate = certificate_of(plant)
+    safety_filter = SafetyFilter(certificate, plant, "switch")
+    batch, shape = VectorFilter(safety_filter), 0.1 * certificate.Sigma
+    number, u = np.array([batch.book.number(shape)]), 0.01 * plant.u_max
+    edge = certificate.safe_set.extreme_point(np.ones(plant.n))
+    low, high = 0.0, 50.0
+    for _ in range(60):  # to the last estimate at which it passes
+        middle = 0.5 * (low + high)
+        passed = REASONS[batch.decide((middle * edge)[:, None], number, u[:, None]).reason[0]] == "safe"
+        low, high = (middle, high) if passed else (low, middle)
+    assert 0.0 < low < 49.0
+    assert MARGIN <= safety_filter.test.at(low * edge, shape).judge(u.tolist())[0] <= 1.01 * MARGIN
+
+
+def test_rounding_counts_as_in_the_scalar_filter():
+    # Estimates that A annihilates, so far out that rounding shows, and errors that nearly fill the safe set.
+    A = np.array([[0.5, -0.3], [0.25, -0.15]])
+    plant = LinearPlant(A=A, B=np.ones((2, 1)), C=np.eye(2), u_max=1.0, dt=0.1, gamma=1e-6)
+    certificate = certificate_of(plant)
+    safety_filter = SafetyFilter(certificate, plant)
+    batch, test = VectorFilter(safety_filter), safety_filter.test
+    u = np.zeros(1)
+
+    def margins(estimate, shape):
+        found = batch.decide(estimate[:, None].copy(), np.array([batch.book.number(shape)]), u[:, None])
+        return found.margin[0], safety_filter.margin(estimate, shape, u)
+
+    for size in (1e5, 1e6, 1e7):
+        estimate = size * np.array([3.0, 5.0])
+        loss = test.rounding * float(test.columns @ np.abs(estimate))
+        assert margins(estimate, 1e-4 * certificate.Sigma) == pytest.approx(
+            (margins(0.0 * estimate, 1e-4 * certificate.Sigma)[1] - loss,) * 2, abs=0.1 * loss
+        )
+    low, high = 0.0, 1e6
+    for _ in range(60):  # to a radius too small for weights
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if 1.0 - test._in_space(np.zeros(2), middle * np.eye(2)).h > 5e-6 else (low, middle)
+    assert margins(np.zeros(2), low * np.eye(2)) == pytest.approx((0.0, 0.0), abs=1e-12)
 
 
 def drive(env, steps, policy):
@@ -138,6 +183,52 @@ def test_reasons_of_broken_proofs_equal_those_of_scalar_shields():
     rng = np.random.default_rng(0)
     totals = drive(shielded, 100, lambda info: rng.uniform(-1, 1, (8, 2)))
     assert len(totals["reasons"]) >= 4
+
+
+def test_proofs_break_and_recover_as_scalar_trackers_do_whatever_is_reported():
+    plant, count, rng = TRUCKS["4000 kg"], 200, np.random.default_rng(0)
+    shield = VectorSafetyShield(NCSVectorEnv(count, plant=plant), certificate_of(plant))
+    safety_filter, Sigma = shield.filter, shield.certificate.Sigma
+    shapes = [0.2 * Sigma, Sigma, 1.1 * Sigma, -Sigma, 1e5 * np.eye(2)]
+    numbers = np.array([shield._batch.book.number(shape) for shape in shapes])
+    trackers = [ProofTracker(safety_filter) for _ in range(count)]
+    knowledge = Knowledge(np.zeros(count, np.int64), *np.zeros((2, count), np.bool_))
+    reason, seen, kinds = np.empty(count, np.int64), set(), [0.3, 1.0, 1.5, 1e7, np.nan]
+    for step in range(12):
+        rare = lambda share: rng.random(count) < share  # noqa: E731
+        restarted = rare(0.1) if step else np.ones(count, np.bool_)
+        once, passed, fallback, known, alarm = ~rare(0.03), rare(0.7), rare(0.7), rare(0.5), rare(0.03)
+        drawn = rng.choice(5, count, p=[0.5, 0.3, 0.14, 0.03, 0.03])
+        sizes = rng.choice(kinds, count, p=[0.3, 0.3, 0.34, 0.03, 0.03])
+        estimate = (shield.certificate.safe_set.sample_boundary_many(rng, count) * sizes[:, None]).T.copy()
+        decided, inputs = np.zeros((1, count)), rare(0.03)[None] * 1.0
+        wrong = track(
+            shield._ground, shield._batch.book.seen, numbers[drawn], knowledge, restarted, once,
+            decided, passed, fallback, known, inputs, estimate, alarm, reason,
+        )  # fmt: skip
+        for e, tracker in enumerate(trackers):
+            info = {"estimate": estimate[:, e], "error_shape": shapes[drawn[e]], "input": inputs[:, e]}
+            info["assumption_violated"] = bool(alarm[e])
+            if restarted[e]:
+                tracker.start(bool(known[e]), bool(once[e]), info)
+            else:
+                decision = Decision(decided[:, e], False, bool(passed[e]), bool(fallback[e]), 0.0, "")
+                tracker.step(decision, bool(once[e]), info)
+            assert WHY[reason[e]] == tracker.reason
+        assert wrong == np.count_nonzero(reason)
+        seen |= set(WHY[reason])
+    assert seen == {"", *(proof.ALARM, proof.OTHER_INPUT, proof.OTHER_STEPS, proof.LARGE_ERROR, proof.FAR_OUT),
+                    proof.UNUSABLE, proof.NOT_KNOWN_INSIDE}  # fmt: skip
+
+
+@pytest.mark.parametrize("next_tick", [True, False])
+def test_one_step_is_one_of_the_environments_own_clock(next_tick):
+    episodes_before, steps_before = np.array([1, 1, 1, 1, 1, 1]), np.array([5, 5, 5, 9, 9, 9])
+    episodes, steps = np.array([1, 1, 1, 2, 3, 2]), np.array([6, 7, 5, 0, 0, 1])
+    restarted, once = np.empty((2, 6), np.bool_)
+    assert compare_clocks(episodes, steps, episodes_before, steps_before, next_tick, restarted, once) == 3
+    np.testing.assert_array_equal(restarted, [False, False, False, True, True, True])
+    np.testing.assert_array_equal(once, np.array([True, False, False, True, False, False]) & next_tick)
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
