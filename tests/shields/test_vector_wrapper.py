@@ -5,7 +5,7 @@ from gymnasium.vector import VectorActionWrapper, VectorObservationWrapper, Vect
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 
 from ncs_gym import Channel, ChannelContract, LinearPlant, NCSVectorEnv, SphereDisturbance, batch_reactor, truck_trailer
-from shields import CertificateError, SafetyFilter, SafetyShield, VectorSafetyShield, proof
+from shields import CertificateError, SafetyFilter, SafetyShield, VectorSafetyShield, proof, routine
 from shields.filter import MARGIN, MODES, Decision
 from shields.proof import ProofTracker, starts_inside
 from shields.tracking import Knowledge, compare_clocks, track
@@ -229,6 +229,42 @@ def test_one_step_is_one_of_the_environments_own_clock(next_tick):
     assert compare_clocks(episodes, steps, episodes_before, steps_before, next_tick, restarted, once) == 3
     np.testing.assert_array_equal(restarted, [False, False, False, True, True, True])
     np.testing.assert_array_equal(once, np.array([True, False, False, True, False, False]) & next_tick)
+
+
+def test_shortcut_is_taken_only_where_nothing_is_in_doubt():
+    hold, move_once = (getattr(loop, "py_func", loop) for loop in (routine._hold, routine._move_once))
+    reach, widest, none = np.array([10.0, 20.0]), np.array([1.0, 2.0]), np.zeros(3, np.bool_)
+    ones, estimate = np.ones((2, 3)), np.array([[9.0, 0.0, -9.0], [18.0, 0.0, -18.0]])
+
+    def holds(broken=0, passed=True, applied=1.0, shift=0.0, alarm=False, e=2):
+        """Whether all proofs hold with something else in environment e."""
+        changed = [np.zeros(3, np.int64), ~none, ones.copy(), estimate.copy(), none.copy()]
+        changed[0][e], changed[1][e], changed[2][1, e], changed[4][e] = broken, passed, applied, alarm
+        changed[3][1, e] += shift
+        broken, passed, applied, seen, alarm = changed
+        return hold(reach, widest, broken, ones, passed, applied, seen, alarm)
+
+    assert holds()
+    for doubt in (
+        {"broken": 3},
+        {"passed": False},
+        {"applied": 0.5},
+        {"shift": -0.1},
+        {"shift": np.nan},
+        {"alarm": True},
+    ):
+        assert not holds(**doubt), doubt
+    assert not holds(shift=0.1, e=0)
+    assert holds(shift=1.0, e=1)
+    first, then = np.array([1, 1]), np.array([5, 6])
+    assert move_once(first, then + 1, first, then)
+    for episodes, steps in (
+        (first, then),
+        (first, then + first * 2),
+        (first * [1, 2], then + 1),
+        (first + 1, then + 1),
+    ):
+        assert not move_once(episodes, steps, first, then)
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
