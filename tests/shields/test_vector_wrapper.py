@@ -250,6 +250,14 @@ def test_steps_behind_the_shields_back_are_seen_once_every_pattern_is_known(monk
     assert returned[-1] == 4
 
 
+def test_start_on_the_boundary_of_the_safe_set_is_known_in_batches_too():
+    plant, certificate = TRUCKS["4000 kg"], certificate_of(TRUCKS["4000 kg"])
+    shield = VectorSafetyShield(NCSVectorEnv(2, plant=plant), certificate)
+    edge = certificate.safe_set.extreme_point(np.array([1.0, 0.4]))
+    for factor in (1 - 1e-12, 1 + 1e-9):
+        assert (shield.reset(options={"state": factor * edge})[1]["shield_guaranteed"] == (factor < 1.0)).all()
+
+
 def test_book_of_shapes_grows_and_knows_the_widest_of_them():
     plant = TRUCKS["4000 kg"]
     safety_filter, Sigma = SafetyFilter(certificate_of(plant), plant), certificate_of(plant).Sigma
