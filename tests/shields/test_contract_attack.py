@@ -107,6 +107,7 @@ def test_certificate_under_a_contract_is_valid_and_survives_its_file(promised, t
     assert loaded.ages.sets.contract == certificate.ages.sets.contract
     np.testing.assert_array_equal(loaded.ages.sets.shapes, certificate.ages.sets.shapes)
     np.testing.assert_array_equal(loaded.ages.inputs, certificate.ages.inputs)
+    np.testing.assert_array_equal(loaded.error_shapes, certificate.ages.sets.shapes[:3])
     names = [condition.name for condition in verify(certificate, plant).conditions]
     assert sum(name.startswith("(C1)") for name in names) == sum(name.startswith("(C2)") for name in names) == 3
     assert sum(name.startswith("(I)") for name in names) == 3

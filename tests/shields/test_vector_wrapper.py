@@ -5,11 +5,11 @@ from gymnasium.vector import VectorActionWrapper, VectorObservationWrapper, Vect
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 
 from ncs_gym import Channel, ChannelContract, LinearPlant, NCSVectorEnv, SphereDisturbance, batch_reactor, truck_trailer
-from shields import CertificateError, SafetyFilter, SafetyShield, VectorSafetyShield, proof
+from shields import CertificateError, SafetyFilter, SafetyShield, VectorSafetyShield, proof, routine, vector_wrapper
 from shields.filter import MARGIN, MODES, Decision
 from shields.proof import ProofTracker, starts_inside
 from shields.tracking import Knowledge, compare_clocks, track
-from shields.vector_filter import REASONS, VectorFilter
+from shields.vector_filter import REASONS, Decisions, VectorFilter, overridden
 from shields.vector_wrapper import WHY
 from tests.attacks import CHANNELS, RANDOM, TRUCKS, certificate_of, harmful
 
@@ -229,6 +229,106 @@ def test_one_step_is_one_of_the_environments_own_clock(next_tick):
     assert compare_clocks(episodes, steps, episodes_before, steps_before, next_tick, restarted, once) == 3
     np.testing.assert_array_equal(restarted, [False, False, False, True, True, True])
     np.testing.assert_array_equal(once, np.array([True, False, False, True, False, False]) & next_tick)
+
+
+def test_steps_behind_the_shields_back_are_seen_once_every_pattern_is_known(monkeypatch):
+    plant, returned = TRUCKS["4000 kg"], []
+    env = NCSVectorEnv(4, plant=plant, disturbance=harmful(plant), max_episode_steps=200)
+    shield = VectorSafetyShield(env, certificate_of(plant))
+
+    def recorded(*arguments):
+        returned.append(routine.follow(*arguments))
+        return returned[-1]
+
+    monkeypatch.setattr(vector_wrapper, "follow", recorded)
+    shield.reset(seed=0)
+    for _ in range(60):
+        assert shield.step(np.zeros((4, 1)))[4]["shield_guaranteed"].all()
+    assert returned[-1] == 0  # nothing new: the compiled routine did everything
+    env.step(np.zeros((4, 1)))
+    assert not shield.step(np.zeros((4, 1)))[4]["shield_guaranteed"].any()
+    assert returned[-1] == 4
+
+
+def test_start_on_the_boundary_of_the_safe_set_is_known_in_batches_too():
+    plant, certificate = TRUCKS["4000 kg"], certificate_of(TRUCKS["4000 kg"])
+    shield = VectorSafetyShield(NCSVectorEnv(2, plant=plant), certificate)
+    edge = certificate.safe_set.extreme_point(np.array([1.0, 0.4]))
+    for factor in (1 - 1e-12, 1 + 1e-9):
+        assert (shield.reset(options={"state": factor * edge})[1]["shield_guaranteed"] == (factor < 1.0)).all()
+
+
+def test_book_of_shapes_grows_and_knows_the_widest_of_them():
+    plant = TRUCKS["4000 kg"]
+    safety_filter, Sigma = SafetyFilter(certificate_of(plant), plant), certificate_of(plant).Sigma
+    book = VectorFilter(safety_filter).book
+    shapes = [Sigma * share for share in np.linspace(0.1, 0.9, 300)]
+    assert [book.number(shape) for shape in [*shapes, shapes[7]]] == [*range(300), 7]
+    np.testing.assert_allclose(book.widest, np.sqrt(np.diag(shapes[-1])))
+    for k in (0, 255, 256, 299):
+        fresh = VectorFilter(safety_filter).book
+        fresh.number(shapes[k])
+        np.testing.assert_array_equal(book.outlooks[:, k], fresh.outlooks[:, 0])
+        np.testing.assert_array_equal(book.seen[:, k], fresh.seen[:, 0])
+    book.number(1.1 * Sigma)
+    assert np.isinf(book.widest).all()
+
+
+def test_margins_are_those_of_no_input_even_where_it_does_not_pass():
+    plant = TRUCKS["4000 kg"]
+    safety_filter, shape = SafetyFilter(certificate_of(plant), plant), 0.1 * certificate_of(plant).Sigma
+    batch, rng = VectorFilter(safety_filter), np.random.default_rng(0)
+    estimates = 1.5 * certificate_of(plant).safe_set.sample_boundary_many(rng, 50)
+    found = batch.margins(np.ascontiguousarray(estimates.T), np.full(50, batch.book.number(shape)))
+    expected = [safety_filter.margin(estimate, shape, np.zeros(1)) for estimate in estimates]
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert min(expected) < -0.1
+
+
+@pytest.mark.parametrize(
+    ("given", "kept"), [(np.float32, np.float32), (np.float64, np.float64), (np.int64, np.float64)]
+)
+def test_overridden_actions_are_numbers_of_the_callers_kind(given, kept):
+    decisions = Decisions(np.array([[1.0, 3.0]]), np.array([True, False]), *np.zeros((4, 2)))
+    actions = overridden(np.array([[1], [1]], given), decisions, np.array([4.0]))
+    assert actions.dtype == kept
+    np.testing.assert_array_equal(actions, [[0.25], [1.0]])
+
+
+def test_shortcut_is_taken_only_where_nothing_is_in_doubt():
+    hold, move_once = (getattr(loop, "py_func", loop) for loop in (routine._hold, routine._move_once))
+    reach, widest, none = np.array([10.0, 20.0]), np.array([1.0, 2.0]), np.zeros(3, np.bool_)
+    ones, estimate = np.ones((2, 3)), np.array([[9.0, 0.0, -9.0], [18.0, 0.0, -18.0]])
+
+    def holds(broken=0, passed=True, applied=1.0, shift=0.0, alarm=False, e=2):
+        """Whether all proofs hold with something else in environment e."""
+        changed = [np.zeros(3, np.int64), ~none, ones.copy(), estimate.copy(), none.copy()]
+        changed[0][e], changed[1][e], changed[2][1, e], changed[4][e] = broken, passed, applied, alarm
+        changed[3][1, e] += shift
+        broken, passed, applied, seen, alarm = changed
+        return hold(reach, widest, broken, ones, passed, applied, seen, alarm)
+
+    assert holds()
+    for doubt in (
+        {"broken": 3},
+        {"passed": False},
+        {"applied": 0.5},
+        {"shift": -0.1},
+        {"shift": np.nan},
+        {"alarm": True},
+    ):
+        assert not holds(**doubt), doubt
+    assert not holds(shift=0.1, e=0)
+    assert holds(shift=1.0, e=1)
+    first, then = np.array([1, 1]), np.array([5, 6])
+    assert move_once(first, then + 1, first, then)
+    for episodes, steps in (
+        (first, then),
+        (first, then + first * 2),
+        (first * [1, 2], then + 1),
+        (first + 1, then + 1),
+    ):
+        assert not move_once(episodes, steps, first, then)
 
 
 @pytest.mark.parametrize("channel", CHANNELS)

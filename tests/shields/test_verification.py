@@ -196,3 +196,9 @@ def test_every_condition_has_been_broken_alone(certificate, loaded):
     names = [condition.name for condition in verify(certificate, loaded).conditions]
     untested = [name for name in names if not any(mark in name for mark in (*ALONE, "L > 0"))]
     assert untested == []
+
+
+@pytest.mark.parametrize("change", [{"process_noise_cov": np.zeros((2, 2))}, {"gamma": 0.0}])
+def test_disturbance_of_one_part_only_is_verified(change):
+    plant = truck_trailer(**change)
+    assert verify(synthesize(plant), plant).valid
