@@ -32,7 +32,7 @@ class NCSVectorEnv(VectorEnv):
 
     Means run in compiled loops. Gains and error shapes depend on what arrived when and on nothing else, so that they
     are computed once per pattern of arrivals (`GainTable`), with the estimator's own methods. The first steps of a
-    process are therefore slower than the rest, and the very first waits a few seconds for the compiler.
+    process are therefore slower than the rest, and the very first on a machine waits half a minute for the compiler.
 
     Args:
         num_envs: N.
