@@ -15,7 +15,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from experiments.block import MODES, Block, Campaign, run_block
+from experiments.block import MODES, SETTLED, Block, Campaign, run_block
 from experiments.cases import Case, cases
 from experiments.errors import SafetyBroken
 from experiments.parent import belong_to_parent
@@ -27,8 +27,8 @@ from experiments.versions import versions
 from shields import Certificate
 from shields.storage import write_atomically
 
-LEGEND = """failed: episodes that left S or the box; p <: upper end of the exact 95 % interval of its probability here;
-margin: smallest 1 - sqrt(x'Mx) from step 20 on (starts are on the boundary); overridden: steps with an intervention"""
+LEGEND = f"""failed: episodes that left S or the box; p <: upper end of the exact 95 % interval of its probability here;
+margin: smallest 1 - sqrt(x'Mx) from step {SETTLED} on (starts are on the boundary); overridden: steps intervened in"""
 
 
 def certify(settings: CertifySettings) -> None:

@@ -62,8 +62,9 @@ class Clock(NamedTuple):
 class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
     """`SafetyShield` for an `NCSVectorEnv`: the same decisions, proof and info keys, in batches.
 
-    Every info value has N as its first axis; `shield_reason` is an array of str objects. A step that only resets an
-    environment counts no intervention. With SAME_STEP autoreset `final_info` holds the last step's values.
+    Every info value has N as its first axis; `shield_reason` is an array of str objects, read-only while
+    all proofs hold. A step that only resets an environment counts no intervention. With SAME_STEP autoreset
+    `final_info` holds the last step's values.
 
     Args:
         env: An `NCSVectorEnv`, possibly wrapped; not by wrappers that change actions.
