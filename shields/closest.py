@@ -131,8 +131,6 @@ def _onto_ball(P, q, c, target, u, free):
         return False
     if count == 1:
         values, axes = np.array([block[0, 0]]), np.ones((1, 1))
-    elif count == 2:
-        values, axes = _axes_of_two(block)
     else:
         values, axes = np.linalg.eigh(block)
     flat = 1e-26 * values[-1]
@@ -165,20 +163,3 @@ def _onto_ball(P, q, c, target, u, free):
         for a in range(count):
             u[free[b]] += axes[b, a] * (away[a] / (1.0 + multiplier * values[a]) - away[a])
     return True
-
-
-@inner
-def _axes_of_two(block):
-    """Returns eigenvalues, ascending, and eigenvectors of a symmetric matrix, shape (2, 2), by one Jacobi rotation."""
-    off, slope = block[0, 1], 0.0
-    if off != 0.0:
-        twist = (block[1, 1] - block[0, 0]) / (2.0 * off)
-        slope = np.copysign(1.0, twist) / (abs(twist) + np.sqrt(1.0 + twist * twist))
-    cosine = 1.0 / np.sqrt(1.0 + slope * slope)
-    sine, values, axes = slope * cosine, np.empty(2), np.empty((2, 2))
-    values[0], values[1] = block[0, 0] - slope * off, block[1, 1] + slope * off
-    axes[0, 0], axes[1, 0], axes[0, 1], axes[1, 1] = cosine, -sine, sine, cosine
-    if values[0] > values[1]:
-        values[0], values[1] = values[1], values[0]
-        axes[0, 0], axes[1, 0], axes[0, 1], axes[1, 1] = sine, cosine, cosine, -sine
-    return values, axes

@@ -9,6 +9,7 @@ from ncs_gym import product
 from ncs_gym.compiled import entry, inner, version_of
 from ncs_gym.product import add_product, copy_rows, set_product
 from shields.closest import closest_in_space, closest_on_lines
+from shields.closest_pair import closest_pairs
 from shields.rule import unpacked
 
 # What became of an input; the names are those of `Decision.reason`.
@@ -159,6 +160,8 @@ def _closest(rule, look, offset, wanted):
                     weight[i * n + j, k] = 1.0 if i == j else 0.0
     if m == 1:
         closest_on_lines(rule.effect, rule.reserve, rule.limits, weight, offset, look[RADIUS], wanted, closest)
+    elif m == 2:
+        closest_pairs(rule.effect, rule.reserve, rule.limits, weight, offset, look[RADIUS], wanted, closest)
     else:
         for k in range(count):
             norm, target = weight[:, k].copy().reshape(n, n), look[RADIUS, k] - rule.reserve
@@ -250,4 +253,4 @@ def _compiled_decide(version, other):
     return decide
 
 
-decide = _compiled_decide(version_of(__file__, "closest", "rule"), version_of(product.__file__))
+decide = _compiled_decide(version_of(__file__, "closest", "closest_pair", "rule"), version_of(product.__file__))

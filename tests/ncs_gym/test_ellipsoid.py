@@ -230,3 +230,12 @@ def test_the_farthest_of_many_points_stay_inside_and_are_the_farthest(size):
         single = np.array([ellipsoid.farthest_point(center, 0.5 * (weight + weight.T)) for center in centers])
         reached, wanted = (np.sum((centers + z) @ weight * (centers + z), axis=1) for z in (points, single))
         assert (reached >= wanted * (1.0 - 1e-6) - 1e-12).all()
+
+
+def test_what_is_farthest_does_not_depend_on_the_points_it_is_found_with():
+    rng, ellipsoid, weight = np.random.default_rng(0), Ellipsoid(np.diag([1.0, 2.0, 3.0])), np.diag([3.0, 1.0, 2.0])
+    centers = rng.standard_normal((300, 3)) * 10.0 ** rng.uniform(-9, 2, (300, 3))
+    centers[::7] = 0.0
+    together = ellipsoid.farthest_points(centers, weight)
+    alone = np.concatenate([ellipsoid.farthest_points(center[None], weight) for center in centers])
+    np.testing.assert_array_equal(together, alone)

@@ -1,7 +1,10 @@
 import cvxpy as cp
 import numpy as np
 import pytest
+from numba import njit
 
+from shields.closest import closest_in_space
+from shields.closest_pair import closest_pairs
 from shields.projection import closest_admissible, closest_on_line
 
 
@@ -117,6 +120,43 @@ def test_projection_agrees_with_a_conic_solver_where_limits_bind():
         assert distance <= best * (1 + 1e-4) + 1e-6
         branched += bool((np.abs(found) == 1.0).any())
     assert branched > 200
+
+
+@njit
+def compiled_search(pairwise, effect, limits, weight, target, offset, wanted):
+    """What the batched shield does for two inputs, and for more."""
+    closest = np.full((2, 1), np.nan)
+    if pairwise:
+        rows, columns = weight.copy().reshape(-1, 1), offset.copy().reshape(-1, 1)
+        closest_pairs(effect, 0.0, limits, rows, columns, np.array([target]), wanted.copy().reshape(2, 1), closest)
+    else:
+        closest[:, 0] = closest_in_space(effect, limits, weight, target, offset, wanted)
+    return closest[:, 0]
+
+
+@pytest.mark.parametrize("pairwise", [True, False])
+def test_compiled_searches_find_what_the_scalar_one_does_in_any_norm(pairwise):
+    rng, outcomes = np.random.default_rng(0), {"none": 0, "limits": 0, "inside": 0}
+    for trial in range(2000):
+        wanted, offset, effect, radius, limit = random_case(rng, 2)
+        if trial % 9 == 0:  # only one direction moves, or none
+            effect[:, 1] = rng.choice([0.0, -2.0]) * effect[:, 0]
+        n = len(offset)
+        root = np.eye(n) + 0.3 * rng.standard_normal((n, n))
+        if trial % 2:  # some input passes, barely
+            wanted, inside = rng.choice([-1.0, 1.0], 2) * limit, rng.choice([-1.0, -0.3, 0.3, 1.0], 2) * limit
+            radius = 1.01 * np.linalg.norm(root @ (offset + effect @ inside))
+        found = compiled_search(pairwise, effect, limit, root.T @ root, radius, offset, wanted)
+        expected = closest_admissible(wanted, root @ offset, root @ effect, radius, limit)
+        if expected is None:
+            outcomes["none"] += 1
+            assert np.isnan(found).all()
+            continue
+        outcomes["limits" if (np.abs(found) == limit).any() else "inside"] += 1
+        assert (np.abs(found) <= limit).all()
+        assert np.linalg.norm(root @ (offset + effect @ found)) <= radius * (1.0 + 1e-9)
+        assert np.linalg.norm(found - wanted) == pytest.approx(np.linalg.norm(expected - wanted), rel=1e-6, abs=1e-9)
+    assert min(outcomes.values()) > 100
 
 
 @pytest.mark.parametrize("ratio", [1e3, 1e6, 1e9])
