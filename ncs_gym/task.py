@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
+from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +18,12 @@ from ncs_gym.frozen import FrozenArrays, as_count, as_covariance, as_number, as_
 from ncs_gym.plant import LinearPlant
 
 BATCHES = {name: f"{name}_many" for name in ("begin", "advance", "observe", "reward")}
+
+
+@cache
+def _compiled(name: str) -> Any:
+    """Returns a module of compiled loops, at first use: the compiler takes half a second to import."""
+    return import_module(f"ncs_gym.{name}")
 
 
 class Task(FrozenArrays, ABC):
@@ -204,21 +211,17 @@ class SpeedTracking(Task):
         return self.fastest * rng.random((2, count)).T
 
     def advance_many(self, rng, plant, memory, inputs):  # noqa: D102
-        from ncs_gym.profile import follow_profile
-
-        moved, draws = np.empty_like(memory), rng.random((2, len(memory)))
+        moved, draws = np.empty_like(memory), _compiled("draws").uniform_many(rng, 2, len(memory))
         effort = inputs[:, self.input_index]
-        follow_profile(memory, effort, plant.dt, draws, self.change_probability, self.fastest, moved)
+        _compiled("profile").follow_profile(memory, effort, plant.dt, draws, self.change_probability, self.fastest, moved)
         return moved
 
     def observe_many(self, memory):  # noqa: D102
         return memory[:, 1:] - memory[:, :1]
 
     def reward_many(self, plant, memory, states, inputs):  # noqa: D102
-        from ncs_gym.profile import profile_reward
-
-        rewards = np.empty(len(memory))
-        profile_reward(memory, inputs[:, self.input_index], self.error_weight, self.input_weight, rewards)
+        rewards, effort = np.empty(len(memory)), inputs[:, self.input_index]
+        _compiled("profile").profile_reward(memory, effort, self.error_weight, self.input_weight, rewards)
         return rewards
 
     def check(self, plant):  # noqa: D102
@@ -278,15 +281,17 @@ class SetpointTracking(Task):
         return self.reach * (2.0 * rng.random((count, 1)) - 1.0)
 
     def advance_many(self, rng, plant, memory, inputs):  # noqa: D102
-        changes, targets = rng.random((2, len(memory)))
-        targets = self.reach * (2.0 * targets - 1.0)
-        return np.where(changes < self.change_probability, targets, memory[:, 0])[:, None]
+        moved, draws = np.empty_like(memory), _compiled("draws").uniform_many(rng, 2, len(memory))
+        _compiled("profile").follow_targets(memory, draws, self.change_probability, self.reach, moved)
+        return moved
 
     def observe_many(self, memory):  # noqa: D102
         return memory
 
     def reward_many(self, plant, memory, states, inputs):  # noqa: D102
-        return 1.0 - np.minimum(np.abs(states @ self.output - memory[:, 0]) / self.width, 1.0)
+        rewards = np.empty(len(memory))
+        _compiled("profile").target_reward(memory, states, self.output, self.width, rewards)
+        return rewards
 
     def check(self, plant):  # noqa: D102
         if self.output.shape != (plant.n,):

@@ -2,7 +2,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest, norm, truncnorm
 
-from ncs_gym.draws import fill_directions, fill_keys, fill_normal, fill_truncated, fill_uniform, normals
+from ncs_gym.draws import (
+    fill_directions,
+    fill_keys,
+    fill_normal,
+    fill_stream,
+    fill_truncated,
+    fill_uniform,
+    normals,
+    uniform_many,
+)
 from ncs_gym.law import BALL, BOX, SPHERE, add_drawn
 
 COUNT = 200_000
@@ -39,6 +48,22 @@ def test_one_key_draws_independent_numbers_over_time():
     assert all(kstest(row, "uniform").pvalue > 1e-3 for row in series.T)
     both = np.column_stack([series[:-1], series[1:]])
     assert np.abs(np.corrcoef(both.T) - np.eye(4)).max() < 0.03
+
+
+def test_numbers_of_a_seed_are_the_published_ones_of_splitmix64():
+    published = [6457827717110365317, 3203168211198807973, 9817491932198370423, 4593380528125082431]
+    numbers = np.empty((2, 2))
+    fill_stream(np.uint64(1234567), numbers)
+    np.testing.assert_allclose(numbers.ravel() * 2.0**64, published, rtol=1e-14)
+
+
+def test_numbers_drawn_for_many_are_uniform_and_follow_from_the_generator():
+    rng = np.random.default_rng(0)
+    numbers = np.concatenate([uniform_many(rng, 2, 100) for _ in range(COUNT // 100)], axis=1)
+    assert all(kstest(row, "uniform").pvalue > 1e-3 for row in numbers)
+    assert np.abs(np.corrcoef(np.vstack([numbers[:, 1:], numbers[:, :-1]])) - np.eye(4)).max() < 0.01
+    first, second = np.random.default_rng(5), np.random.default_rng(5)
+    np.testing.assert_array_equal(uniform_many(first, 2, 3), uniform_many(second, 2, 3))
 
 
 @pytest.mark.parametrize("rank", [1, 2, 3, 4])

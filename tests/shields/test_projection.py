@@ -1,7 +1,6 @@
 import cvxpy as cp
 import numpy as np
 import pytest
-from numba import njit
 
 from shields.closest import closest_in_space
 from shields.closest_pair import closest_pairs
@@ -122,15 +121,13 @@ def test_projection_agrees_with_a_conic_solver_where_limits_bind():
     assert branched > 200
 
 
-@njit
 def compiled_search(pairwise, effect, limits, weight, target, offset, wanted):
     """What the batched shield does for two inputs, and for more."""
+    if not pairwise:
+        return closest_in_space(effect, limits, weight, target, offset, wanted)
     closest = np.full((2, 1), np.nan)
-    if pairwise:
-        rows, columns = weight.copy().reshape(-1, 1), offset.copy().reshape(-1, 1)
-        closest_pairs(effect, 0.0, limits, rows, columns, np.array([target]), wanted.copy().reshape(2, 1), closest)
-    else:
-        closest[:, 0] = closest_in_space(effect, limits, weight, target, offset, wanted)
+    columns = weight.reshape(-1, 1), offset[:, None], np.array([target]), wanted[:, None]
+    closest_pairs(effect, 0.0, limits, *columns, closest)
     return closest[:, 0]
 
 
