@@ -197,10 +197,7 @@ def _update(H, table, age, edges, residual, square, chain):
         chain: Means, shape (n, count), changed in place.
     """
     (p, count), n = residual.shape, chain.shape[0]
-    weights = np.empty((table.shape[1], count))
-    for i in range(table.shape[1]):
-        for k in range(count):
-            weights[i, k] = table[age, i, edges[k]]
+    weights = np.empty(count)
     for i in range(p):
         for j in range(n):
             share = H[i, j]
@@ -208,13 +205,23 @@ def _update(H, table, age, edges, residual, square, chain):
                 for k in range(count):
                     residual[i, k] -= share * chain[j, k]
     for i in range(p):
-        for j in range(p):
+        for j in range(i + 1):
+            factor = 1.0 if i == j else 2.0
+            _look_up(table, age, n * p + i * p + j, edges, weights)
             for k in range(count):
-                square[k] += residual[i, k] * weights[n * p + i * p + j, k] * residual[j, k]
+                square[k] += factor * residual[i, k] * weights[k] * residual[j, k]
     for i in range(n):
         for j in range(p):
+            _look_up(table, age, i * p + j, edges, weights)
             for k in range(count):
-                chain[i, k] += weights[i * p + j, k] * residual[j, k]
+                chain[i, k] += weights[k] * residual[j, k]
+
+
+@inner
+def _look_up(table, age, row, edges, weights):
+    """Fills one of the weights of edges, shape (count,)."""
+    for k in range(edges.size):
+        weights[k] = table[age, row, edges[k]]
 
 
 @inner

@@ -98,7 +98,9 @@ class NCSVectorEnv(VectorEnv):
         self._doubts, self._residuals = np.empty((count * slots, 4), np.int32), np.empty((count * slots, plant.p))
         self._progress, self._done = np.zeros(4, np.int64), np.zeros(count, np.bool_)
         self._layout = Layout(count, plant.n, plant.m, len(plant.C), len(self.single.observation_space.low))
-        self._actions_shape = count, plant.m
+        self._actions_shape, self._m = (count, plant.m), plant.m
+        bounds = self.single.observation_space
+        self._extra_low, self._extra_high = bounds.low[plant.n :], bounds.high[plant.n :]
         self._pays = type(self.task) is Regulation
         # Disturbances that are not drawn by compiled loops.
         self._disturbs = law_of_disturbance(self.single.disturbance, plant) is None
@@ -160,7 +162,8 @@ class NCSVectorEnv(VectorEnv):
         if self._some_done and self.autoreset_mode is AutoresetMode.DISABLED and self._done.any():
             raise gym.error.ResetNeeded("some episodes are over: reset them with options={'reset_mask': ...}")
         self._consistent = False
-        first, resetting, u = self._start_step(filled), None, filled.numbers[: self.plant.m]
+        u, resetting = filled.numbers[: self._m], None
+        first = self._start_step(filled, u)
         if self._some_done and self.autoreset_mode is AutoresetMode.NEXT_STEP:
             first, resetting = self._run(first, LAST, filled), self._done.copy()
             self._begin(resetting, None)
@@ -199,11 +202,10 @@ class NCSVectorEnv(VectorEnv):
         if numbers is None or numbers.shape != wanted or not read_actions(numbers, self.plant.u_max, rows):
             raise ValueError(f"the actions must be finite with shape {wanted}, got {shown(actions)}")
 
-    def _start_step(self, filled: Report) -> int:
+    def _start_step(self, filled: Report, u: np.ndarray) -> int:
         """Does what compiled loops cannot, for what a user wrote; returns the stage to go on from."""
         self._tick += 1
         self._moment += 1
-        u = filled.numbers[: self.plant.m]
         if self._disturbs:
             self._run(DRAW, MOVE, filled)
             self._disturb(u)
@@ -293,7 +295,7 @@ class NCSVectorEnv(VectorEnv):
     def _report(self, counted: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
         """Returns observations (N, n + extra) and infos of now, without inputs; counts violations of some."""
         filled = self._layout.new()
-        filled.numbers[: self.plant.m] = 0.0
+        filled.numbers[: self._m] = 0.0
         self._fleet.counted[:] = counted
         self._run(LAST, LAST + 1, filled)
         self._fleet.counted[:] = 1
@@ -301,11 +303,11 @@ class NCSVectorEnv(VectorEnv):
 
     def _observed(self, filled: Report) -> np.ndarray:
         """Returns the observations, shape (N, n + extra)."""
-        n, space = self.plant.n, self.single.observation_space
-        if len(filled.observation) > n:
+        low, observation = self._extra_low, filled.observation
+        if low.size > 0:
             extra = np.ascontiguousarray(self.task.observe_many(self._memory), dtype=np.float64)
-            clip(extra, space.low[n:], space.high[n:], filled.observation[n:])
-        return filled.observation.T
+            clip(extra, low, self._extra_high, observation[-low.size :])
+        return observation.T
 
     def _restarted(self, observation: np.ndarray, info: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
         """Returns the first of new episodes where old ones ended, whose last go to final_obs and final_info."""

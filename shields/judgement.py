@@ -125,7 +125,9 @@ def _judge(effect, smallest, look, offset, u, room, margin):
     for e in range(count):
         margin[e] = look[RADIUS, e] - np.sqrt(plain[e])
     for e in range(count):
-        room[e] = look[RADIUS, e] - np.sqrt(abs(room[e] if look[RADIUS, e] >= smallest else plain[e]))
+        room[e] = abs(room[e]) if look[RADIUS, e] >= smallest else plain[e]
+    for e in range(count):  # together with the choice it would not run in parallel lanes
+        room[e] = look[RADIUS, e] - np.sqrt(room[e])
 
 
 @inner
