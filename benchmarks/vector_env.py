@@ -1,10 +1,10 @@
 """Environment steps per second, ours against others', in one run; and what an environment costs in memory.
 
-    python benchmarks/vector_env.py [--seconds 1.0] [--warm 3.0]
+    python benchmarks/vector_env.py [--seconds 2.0] [--warm 3.0]
 
 Ours run the cruise and the case study after `--warm` seconds of stepping (the gain table fills with patterns of
 arrivals at first; compiling is excluded too), with random actions. In brackets the ratio to gymnasium's CartPole vector
-environment of the same size.
+environment of the same size, the median over rounds.
 """
 
 from __future__ import annotations
@@ -23,22 +23,23 @@ from ncs_gym.draws import fill_keys, fill_normal, fill_truncated
 from shields import VectorSafetyShield
 
 SIZES = (1, 64, 1024, 16384)
+ROUNDS = 20
 CRUISE, CASE_STUDY = "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/TruckTrailer-v0"
 
 
-def rate(step, count: int, seconds: float, warm: float) -> float:
-    """Median over five stretches of environment steps per second."""
-    end = time.perf_counter() + warm
-    while time.perf_counter() < end:
+def run_for(step, seconds: float) -> float:
+    """Calls per second."""
+    start, calls = time.perf_counter(), 0
+    while calls == 0 or time.perf_counter() - start < seconds:
         step()
-    rates = []
-    for _ in range(5):
-        start, steps = time.perf_counter(), 0
-        while time.perf_counter() - start < seconds / 5:
-            step()
-            steps += 1
-        rates.append(steps * count / (time.perf_counter() - start))
-    return float(np.median(rates))
+        calls += 1
+    return calls / (time.perf_counter() - start)
+
+
+def rate(step, count: int, seconds: float, warm: float) -> float:
+    """Median over five stretches of results per second, `count` a call."""
+    run_for(step, warm)
+    return float(np.median([count * run_for(step, seconds / 5) for _ in range(5)]))
 
 
 def stepper(env, actions):
@@ -92,13 +93,32 @@ def memory(count: int) -> float:
     return sum(array.nbytes for array in arrays) / count
 
 
+def column(rows: dict, count: int, options: argparse.Namespace) -> dict[str, str]:
+    """Cells for one number of environments: medians over rounds in which everything runs in turn.
+
+    A machine that is slow for a while is slow for all of them.
+    """
+    steppers = {name: make(count) for name, make in rows.items()}
+    running = {name: step for name, step in steppers.items() if step is not None}
+    for step in running.values():
+        run_for(step, options.warm)
+    share = options.seconds / ROUNDS
+    found = np.array([[count * run_for(step, share) for step in running.values()] for _ in range(ROUNDS)])
+    ratios = np.median(found / found[:, :1], axis=0)
+    cells = {
+        name: f"{shown(each)} ({ratio:.2f})"
+        for name, each, ratio in zip(running, np.median(found, axis=0), ratios, strict=True)
+    }
+    return {name: cells.get(name, "-") for name in rows}
+
+
 def shown(value: float) -> str:
     return f"{value / 1e6:.2f}M" if value >= 1e6 else f"{value / 1e3:.1f}k"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=1.0)
+    parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--warm", type=float, default=3.0)
     options = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -112,19 +132,10 @@ def main() -> None:
         "ours, cruise, DummyVecEnv": lambda n: dummy(CRUISE, n)[1] if n <= 64 else None,
         "gymnasium Pendulum, DummyVecEnv": lambda n: dummy("Pendulum-v1", n)[1] if n <= 64 else None,
     }
+    columns = {count: column(rows, count, options) for count in SIZES}
     print(f"{'environment steps per second':34s}" + "".join(f"{f'N = {n}':>17s}" for n in SIZES))
-    base: dict[int, float] = {}
-    for name, make in rows.items():
-        cells = []
-        for count in SIZES:
-            step = make(count)
-            if step is None:
-                cells.append("-")
-                continue
-            found = rate(step, count, options.seconds, options.warm)
-            base.setdefault(count, found)
-            cells.append(f"{shown(found)} ({found / base[count]:.2f})")
-        print(f"{name:34s}" + "".join(f"{cell:>17s}" for cell in cells), flush=True)
+    for name in rows:
+        print(f"{name:34s}" + "".join(f"{columns[count][name]:>17s}" for count in SIZES))
     decide(options)
     draws(options)
     print("bytes per environment: " + ", ".join(f"{memory(count):.0f} at N = {count}" for count in SIZES[1:]))

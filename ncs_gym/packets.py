@@ -46,14 +46,19 @@ def follow_predictions(nodes, node, missing):
     Returns:
         How many are missing; nothing has moved then.
     """
-    missed = 0
+    missed, after = 0, np.empty(node.size, np.int32)
     for e in range(node.size):
-        if nodes[node[e], 0] < 0:
-            missing[missed] = node[e]
-            missed += 1
-    if missed == 0:
+        after[e] = nodes[node[e], 0]
+        missed += after[e] < 0
+    if missed > 0:
+        missed = 0
         for e in range(node.size):
-            node[e] = nodes[node[e], 0]
+            if after[e] < 0:
+                missing[missed] = node[e]
+                missed += 1
+    else:
+        for e in range(node.size):
+            node[e] = after[e]
     return missed
 
 

@@ -88,7 +88,7 @@ def report(system, fleet, shapes, filled):
     (n, m), k, rows = system.B.shape, len(system.C), filled.numbers
     _estimate(fleet.state, fleet.mean, m, rows)
     _observe(fleet.mean, system.low, system.high, filled.observation)
-    _shape(shapes, fleet.node, m + 3 * n, rows)
+    _shape(n, shapes, fleet.node, m + 3 * n, rows)
     start = m + 3 * n + n * n
     cost = rows[start + k]
     _judge(system.C, fleet.state, rows[start : start + k], cost)
@@ -126,11 +126,15 @@ def _observe(mean, low, high, out):
 
 
 @inner
-def _shape(shapes, node, start, rows):
-    """Fills the error shapes from row `start` on."""
-    for i in range(shapes.shape[0]):
-        for e in range(node.size):
-            rows[start + i, e] = shapes[i, node[e]]
+def _shape(n, shapes, node, start, rows):
+    """Fills the error shapes, which are symmetric, from row `start` on."""
+    for i in range(n):
+        for j in range(i + 1):
+            for e in range(node.size):
+                rows[start + i * n + j, e] = shapes[i * n + j, node[e]]
+            if j < i:
+                for e in range(node.size):
+                    rows[start + j * n + i, e] = rows[start + i * n + j, e]
 
 
 @inner

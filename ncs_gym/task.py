@@ -212,8 +212,8 @@ class SpeedTracking(Task):
 
     def advance_many(self, rng, plant, memory, inputs):  # noqa: D102
         moved, draws = np.empty_like(memory), _compiled("draws").uniform_many(rng, 2, len(memory))
-        effort = inputs[:, self.input_index]
-        _compiled("profile").follow_profile(memory, effort, plant.dt, draws, self.change_probability, self.fastest, moved)
+        effort, chance = inputs[:, self.input_index], self.change_probability
+        _compiled("profile").follow_profile(memory, effort, plant.dt, draws, chance, self.fastest, moved)
         return moved
 
     def observe_many(self, memory):  # noqa: D102
