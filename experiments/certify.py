@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from experiments.block import MODES, SETTLED, Block, Campaign, run_block
 from experiments.cases import Case, cases
+from experiments.compiling import compile_first
 from experiments.errors import SafetyBroken
 from experiments.parent import belong_to_parent
 from experiments.progress import progress_bar
@@ -97,6 +98,8 @@ def _run(
     The first failure stops the rest and is raised; tallies of finished blocks are stored.
     """
     count = sum(len(some) for some in missing.values())
+    if count > 0:
+        compile_first()
     context = multiprocessing.get_context("spawn")
     with ExitStack() as stack:
         bar = stack.enter_context(progress_bar(count * campaign.block_steps))

@@ -12,6 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from experiments.compiling import compile_first
 from experiments.failure import unit_error
 from experiments.parent import belong_to_parent
 from experiments.progress import REFRESH, progress_bar, show_result
@@ -40,6 +41,7 @@ def run_all(
     Raises:
         UnitError: If a unit fails.
     """
+    compile_first()
     context = multiprocessing.get_context("spawn")
     manager = SyncManager(ctx=context)
     manager.start(belong_to_parent)
