@@ -138,7 +138,10 @@ class Agent:
         try:
             document, weights = json.loads((folder / "agent.json").read_bytes()), (folder / "model.zip").read_bytes()
         except OSError as error:
-            raise AgentError(f"cannot read the agent in {folder}: {error.strerror}") from error
+            raise AgentError(
+                f"no agent in {folder}: cannot read {Path(error.filename).name} ({error.strerror}); `ncs compare` "
+                "leaves agents in OUT/models"
+            ) from error
         except (ValueError, RecursionError) as error:
             raise AgentError(f"{folder / 'agent.json'} is damaged: it is not valid JSON") from error
         if not isinstance(document, dict) or document.get("format") != FORMAT:

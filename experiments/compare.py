@@ -44,7 +44,7 @@ def compare(settings: CompareSettings) -> None:
         settings = replace(settings, **SMOKE)
     arms = [arm_of(name, settings.mode) for name in settings.arms]
     if len({arm.name for arm in arms}) != len(arms) or not arms:
-        raise ValueError(f"--arms must be different ones, at least one, got {' '.join(settings.arms)}")
+        raise ValueError(f"--arms must be different ones, at least one, got {' '.join(settings.arms) or 'none'}")
     world = world_of(settings.env, settings.channel, settings.certificate)
     prepare(settings.out)
     save_settings(settings.out / "settings.json", "compare", settings)
@@ -55,7 +55,8 @@ def compare(settings: CompareSettings) -> None:
     summary = _summary(settings, world, units, results)
     findings = _findings(summary)
     _write(settings.out, summary, results, world, findings)
-    print(f"\n{settings.env}: {settings.seeds} runs per arm, {settings.episodes} evaluation episodes per run\n")
+    runs = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
+    print(f"\n{settings.env}: {runs} per arm, {settings.episodes} evaluation episodes per run\n")
     print(table_text(summary["arms"], summary["references"]), *findings, f"files: {settings.out}", sep="\n")
 
 

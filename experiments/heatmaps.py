@@ -18,6 +18,8 @@ from experiments.plotting import STYLE, as_png, label, thousands, with_unit
 
 # Panels side by side at most.
 COLUMNS = 4
+# The longest label of a color scale fits into a figure this high [in].
+LEAST_HEIGHT = 2.8
 # Fields darker than this have light numbers; relative luminance, which weighs colors as eyes do.
 DARK = 0.45
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -116,7 +118,7 @@ def heatmap_figure(cells: Sequence[dict[str, Any]], arms: Sequence[str], quantit
     height = 0.5 * len(delays) + (0.65 if len(others) > 1 else 0.45)
     with matplotlib.rc_context(STYLE), matplotlib.rc_context({"axes.grid": False}):
         width = 1.8 + max(0.68 * len(losses) + 0.15, 1.7) * columns
-        figure = Figure(figsize=(width, 0.7 + max(height, 1.3) * rows), layout="constrained")
+        figure = Figure(figsize=(width, max(0.7 + max(height, 1.3) * rows, LEAST_HEIGHT)), layout="constrained")
         panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
         for at, panel in enumerate(panels.flat):
             row, column = divmod(at, columns)

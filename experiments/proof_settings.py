@@ -14,7 +14,7 @@ class SynthesizeSettings:
     """Synthesizes a certificate for an environment's plant, verifies it exactly and saves it.
 
     Attributes:
-        env: Id of a registered environment.
+        env: Id of one of the four environments with a plant of their own.
         method: The certified method, or the published one as printed.
         out: File for the certificate (JSON).
         max_age: Channel contract to rest on, in steps; by default the environment's own, if it needs one.
@@ -34,7 +34,8 @@ class VerifySettings:
 
     Attributes:
         file: The certificate (JSON).
-        env: Id of a registered environment; without it, the one whose plant has the certificate's fingerprint.
+        env: Id of one of the four environments with a plant of their own; without it, the one whose plant has the
+            certificate's fingerprint.
         out: File for the verdicts (JSON).
         seed: Accepted by every command; the verification is deterministic and does not use it.
     """

@@ -22,9 +22,9 @@ class LearningSettings:
 
     Attributes:
         config: A settings.json of an earlier run; its settings hold where none are given here.
-        env: Id of a registered environment.
+        env: Id of one of the four environments with a plant of their own.
         seed: Of the experiment, >= 0; all runs derive theirs from it.
-        steps: Training steps per run.
+        steps: Training steps per run, rounded up to whole rollouts.
         episodes: Evaluation episodes per run.
         algo: Learning algorithm; TRPO, TQC and CrossQ need sb3-contrib.
         mode: What the shield does with an unsafe action: the closest safe input ("project"), or the certified K x_hat
@@ -152,7 +152,7 @@ class SweepSettings(EngineSettings, LearningSettings):
     Attributes:
         out: Output folder; created if it does not exist.
         seeds: Paired training runs per arm and channel.
-        steps: Training steps per run.
+        steps: Training steps per run, rounded up to whole rollouts.
         episodes: Evaluation episodes per run.
         arms: See `ncs compare`.
         losses: Probabilities that a packet is lost.
@@ -182,7 +182,7 @@ class RenderSettings:
     """Plays an episode with a policy and draws it, as an animation or its last picture (docs/rendering.md).
 
     Attributes:
-        env: Id of a registered environment.
+        env: Id of one of the four environments with a plant of their own.
         out: File to write: .gif, .mp4, or .png for the last picture alone.
         policy: "greedy" (toward the task's goal as hard as it can), "zero", "random", or the folder of a
             trained agent.

@@ -90,7 +90,8 @@ def sweep(settings: SweepSettings) -> None:
     page = sweep_report(summary, worlds[0].verification, {caption: png for caption, png in figures.values()})
     write_atomically(settings.out / "report.html", page)
     write_atomically(settings.out / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    print(f"{settings.env}: {settings.seeds} runs per arm and channel\n", sweep_text(summary), sep="\n")
+    runs = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
+    print(f"{settings.env}: {runs} per arm and channel\n", sweep_text(summary), sep="\n")
     print(f"files: {settings.out}")
 
 

@@ -21,6 +21,8 @@ ROUNDING = 1e-13
 ALARM_TOLERANCE = 1e-9
 # Covariances grow no further than this, in squared half-widths of the safe box.
 LARGEST_COVARIANCE = 1e12
+# Up to this condition number an inverse says which residuals are possible to within 1e-3.
+FAITHFUL = 1e7
 # Factors of covariances keep this many bits, and shapes are rounded up to multiples of this in coordinates where the
 # certified set of age 0 is the unit ball. Then both recur when a pattern of arrivals does, and can be tabulated.
 COVARIANCE_BITS, SHAPE_STEP = 6, 2.0**-13
@@ -318,8 +320,15 @@ class Estimator:
         return common_axes(spread, self._noise)
 
     def inverse_of_bound(self, spread: np.ndarray) -> np.ndarray:
-        """Returns (spread + N)^-1, shape (p, p), of the quick test: r'(spread + N)^-1 r <= 1 is possible."""
-        return _solved(spread + self._noise, np.eye(self.plant.p))
+        """Returns (spread + N)^-1, shape (p, p), of the quick test: r'(spread + N)^-1 r <= 1 is possible.
+
+        Infinite on the diagonal where an inverse would be too inexact to vouch for anything: no residual passes then.
+        """
+        bound = spread + self._noise
+        extent = np.sqrt(bound.diagonal())
+        if not np.linalg.cond(bound / np.outer(extent, extent)) <= FAITHFUL:  # in units of its own, or not a number
+            return np.diag(np.full(self.plant.p, np.inf))
+        return _solved(bound, np.eye(self.plant.p))
 
 
 def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:

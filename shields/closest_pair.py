@@ -15,7 +15,9 @@ def closest_pairs(effect, reserve, limits, weight, offset, radius, wanted, close
     """Fills what `closest_in_space` finds for two inputs, shape (2, count).
 
     Where the closest pair without limits is beyond some of them, at least one of those is attained at the closest pair
-    within all (see `projection.closest_admissible`): it lies on one of at most two edges of the box.
+    within all (see `projection.closest_admissible`): it lies on one of at most two edges of the box. Not on both: if
+    points of both passed, so would the corner between them, closer to what is wanted than the pair without limits.
+    Where G B and G A x_hat are 1e7 times the radius, rounding may hide a pair that exists.
 
     Args:
         effect: G B, shape (n, 2).
@@ -42,17 +44,15 @@ def closest_pairs(effect, reserve, limits, weight, offset, radius, wanted, close
         if abs(first) <= limits[0] and abs(second) <= limits[1]:
             closest[0, k], closest[1, k] = first, second
             continue
-        distance = np.inf
         if abs(first) > limits[0]:
             held = np.copysign(limits[0], first)
             other = _on_edge(d, g + b * held, c + (2.0 * f + a * held) * held, level, limits[1], y)
             if np.isfinite(other):
-                distance = (held - x) ** 2 + (other - y) ** 2
                 closest[0, k], closest[1, k] = held, other
         if abs(second) > limits[1]:
             held = np.copysign(limits[1], second)
             other = _on_edge(a, f + b * held, c + (2.0 * g + d * held) * held, level, limits[0], x)
-            if (other - x) ** 2 + (held - y) ** 2 < distance:
+            if np.isfinite(other):
                 closest[0, k], closest[1, k] = other, held
 
 

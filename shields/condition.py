@@ -37,7 +37,8 @@ def scalar(name: str, slack: Fraction) -> Condition:
         margin = float(slack)
     except OverflowError:
         margin = np.inf if slack >= 0 else -np.inf
-    return Condition(name, margin, slack >= 0)
+    # A negative slack may be too small for a float.
+    return Condition(name, margin if slack >= 0 else min(margin, -5e-324), slack >= 0)
 
 
 def matrix_condition(name: str, matrix: Matrix, *, strict: bool = False) -> Condition:

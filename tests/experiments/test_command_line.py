@@ -291,7 +291,7 @@ def test_usage_errors_are_the_parsers(arguments, words):
         (["compare", "--config", "nowhere.json"], ["cannot read settings nowhere.json"]),
         (["compare", "--channel.loss", "1.5"], ["loss"]),
         (["train", "--arm", "hope"], ["unknown arm 'hope'"]),
-        (["evaluate", "nowhere"], ["cannot read the agent in nowhere"]),
+        (["evaluate", "nowhere"], ["no agent in nowhere"]),
         (["sweep", "--losses", "0.1", "0.1"], ["--losses must be different"]),
         (["sweep", "--losses", "0.9", "--burst-lengths", "2"], ["bursts of mean length 2"]),
         (["sweep", "--channel.loss", "0.5"], ["--channel.loss is a side of the grid"]),

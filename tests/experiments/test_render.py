@@ -155,7 +155,7 @@ def test_model_of_another_environment_is_refused(model):
         ({"width": 10}, "--width must be at least 160"),
         ({"side_by_side": True, "shield": "none"}, "--side-by-side compares with a shield"),
         ({"out": "nowhere/a.gif"}, "No such file or directory"),
-        ({"policy": "nowhere"}, "cannot read the agent in nowhere"),
+        ({"policy": "nowhere"}, "no agent in nowhere"),
     ],
 )
 def test_wrong_settings_raise_before_anything_is_played(changes, words, tmp_path, monkeypatch):

@@ -7,6 +7,7 @@ from scipy.optimize import minimize
 from ncs_gym import Ellipsoid
 from ncs_gym.ellipsoid import is_inside, joined, outer_sum, sum_gauge
 from ncs_gym.minkowski import outside_sum
+from ncs_gym.roots import fill_farthest
 
 seeds = st.integers(0, 10_000)
 
@@ -50,6 +51,26 @@ def test_flat_ellipsoid_contains_only_its_plane():
     point = Ellipsoid(np.zeros((2, 2)))
     assert point.contains([0.0, 0.0])
     assert not point.contains([0.0, 1e-300])
+
+
+def test_points_off_a_flat_ellipsoid_have_no_gauge_in_whatever_direction_it_lies():
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        shape = random_shape(rng, 4, rank=2)
+        flat, off = Ellipsoid(shape), np.linalg.svd(shape)[0][:, -1]
+        inside = 0.5 * flat.extreme_point(rng.standard_normal(4))
+        assert flat.gauge(inside) == pytest.approx(0.5)
+        points = np.array([inside, inside + 1e-6 * off])
+        assert flat.gauge(points[1]) == np.inf
+        np.testing.assert_allclose(flat.gauges(points), [0.5, np.inf])
+
+
+@pytest.mark.parametrize("size", [1, 3, 5])
+def test_many_samples_fill_the_ellipsoid_evenly(size):
+    rng = np.random.default_rng(5)
+    ellipsoid = Ellipsoid(random_shape(rng, size))
+    share = np.mean(ellipsoid.gauges(ellipsoid.sample_many(rng, 8000)) <= 0.8)
+    assert share == pytest.approx(0.8**size, abs=0.02)
 
 
 def test_uniform_samples_fill_the_ellipsoid_evenly():
@@ -135,6 +156,14 @@ def test_membership_in_a_sum_is_exact_at_its_boundary():
         direction = rng.standard_normal(3)
         boundary = first.extreme_point(direction) + second.extreme_point(direction)
         assert sum_gauge(boundary, first.shape, second.shape) == pytest.approx(1.0, abs=1e-7)
+
+
+def test_flat_ellipsoids_lie_in_one_another_where_they_have_the_same_plane():
+    flat, other = np.diag([0.0, 1.0, 4.0]), np.diag([1.0, 0.0, 4.0])
+    assert is_inside(0.5 * flat, flat)
+    assert not is_inside(flat, 0.5 * flat)
+    assert not is_inside(flat, other)
+    assert is_inside(flat, np.diag([1.0, 1.0, 4.0]))
 
 
 def test_inclusion_has_no_tolerance():
@@ -239,3 +268,43 @@ def test_what_is_farthest_does_not_depend_on_the_points_it_is_found_with():
     together = ellipsoid.farthest_points(centers, weight)
     alone = np.concatenate([ellipsoid.farthest_points(center[None], weight) for center in centers])
     np.testing.assert_array_equal(together, alone)
+
+
+def largest_value(slope, values):
+    """The most that s' diag(values) s + 2 slope's is for |s| <= 1: the least nu + sum slope_i^2 / (nu - value_i)."""
+    pulls = slope != 0.0
+    low, high = 0.0, float(np.linalg.norm(slope))
+    while low < (middle := 0.5 * (low + high)) < high:
+        length = np.linalg.norm(slope[pulls] / (values[-1] - values[pulls] + middle))
+        low, high = (middle, high) if length > 1.0 else (low, middle)
+    return values[-1] + high + np.sum(slope[pulls] ** 2 / (values[-1] - values[pulls] + high))
+
+
+@pytest.mark.parametrize("last", [0.0, 1e-16, -1e-12, 1e-10, -1e-9, 1e-6, -1e-3])
+def test_the_farthest_of_many_points_are_exact_at_and_near_the_hard_case(last):
+    values = np.array([0.0, 1.0, 2.0])
+    angles, sizes = np.meshgrid([0.0, 0.3, 1.2], [0.5, 1.0 - 1e-9, 1.0, 1.0 + 1e-9, 1.001])
+    # Without the last entry, the solution at nu = max(values) is as long as `sizes`.
+    slopes = np.stack([2.0 * sizes * np.sin(angles), sizes * np.cos(angles), np.full_like(sizes, last)], axis=-1)
+    slopes = slopes.reshape(-1, 3)
+    points = np.empty_like(slopes)
+    fill_farthest(slopes, np.eye(3), values, np.eye(3), points)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1.0, rtol=1e-11)
+    reached = points**2 @ values + 2.0 * np.sum(points * slopes, axis=1)
+    wanted = [largest_value(slope, values) for slope in slopes]
+    np.testing.assert_allclose(reached, wanted, rtol=2e-11)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300, 1e-300, 5e-324])
+@pytest.mark.parametrize("size", [0.0, 1e-300, 1.0, 1e200])
+def test_points_stay_inside_whatever_the_center(bad, size):
+    ellipsoid = Ellipsoid(np.diag([1.0, 4.0, 9.0]))
+    centers = np.array([[bad, 0.0, 0.0], [0.0, 0.0, bad], [1.0, bad, -bad]])
+    points = ellipsoid.farthest_points(centers, size * np.diag([3.0, 2.0, 1.0]))
+    assert ellipsoid.gauges(points).max() <= 1.0 + 1e-12
+
+
+def test_gauges_are_infinite_off_an_axis_of_no_width_however_little():
+    ellipsoid, points = Ellipsoid(np.diag([4.0, 0.0])), np.array([[1.0, 0.0], [1.0, 1e-300], [0.0, -1.0]])
+    np.testing.assert_array_equal(ellipsoid.gauges(points), [0.5, np.inf, np.inf])
+    np.testing.assert_array_equal([ellipsoid.gauge(point) for point in points], [0.5, np.inf, np.inf])

@@ -315,3 +315,20 @@ def test_perfect_sensors_get_a_little_noise_in_their_own_units(perfect):
     plant = truck_trailer(H=np.diag([2.0, 3.0]), measurement_noise_cov=np.diag(np.where(perfect, 0.0, 1e-4)))
     noise = Estimator(plant, Channel())._filter.R - plant.measurement_noise_cov
     np.testing.assert_allclose(noise, FLAT_INFLATION * np.diag((plant.half_widths * [2.0, 3.0]) ** 2), rtol=1e-6)
+
+
+@pytest.mark.parametrize("condition", [1e4, 1e8, 1e12, 1e16])
+def test_quick_test_passes_no_impossible_residual_however_ill_conditioned_the_bound_is(condition):
+    rng = np.random.default_rng(0)
+    plant = replace(truck_trailer(), measurement_noise_cov=np.eye(2))
+    estimator, noise = Estimator(plant, Channel(), certified_error_set(plant)), plant.sensor_noise.bound.shape
+    passed = np.zeros(2, dtype=int)
+    for _ in range(200):
+        along = np.linalg.qr(rng.standard_normal((2, 2)))[0].T
+        spread = condition * noise[0, 0] * np.outer(along[0], along[0])
+        inverse = estimator.inverse_of_bound(spread)
+        for share, times in ((0, 0.2), (1, 3.0)):  # across the long axis, where the noise alone decides
+            residual = np.sqrt(noise[0, 0]) * (0.5 * np.sqrt(condition) * along[0] + times * along[1])
+            passed[share] += residual @ inverse @ residual <= 1.0
+    assert passed[1] == 0
+    assert passed[0] == 200 or condition > 1e4  # what is not vouched for goes to the exact test

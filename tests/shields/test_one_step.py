@@ -142,6 +142,32 @@ def test_plain_floats_agree_with_arrays():
     assert reached > 500
 
 
+def test_plain_floats_take_off_as_much_for_rounding_as_arrays_do():
+    # As if float64 had five digits, for asymmetric shapes (which are rounding, too).
+    plant = PLANTS["truck"]
+    fast = OneStepTest(synthesize(plant).L, plant)
+    *most, _, limit = fast._plane
+    fast.rounding, fast._plane = 1e-5, (*most, 1e-5, limit)
+    slow = copy(fast)
+    slow._plane = None
+    rng = np.random.default_rng(5)
+    for estimate, shape, u in cases(synthesize(plant), plant, rng, 200):
+        shape[0, 1] *= 1.0 - 1e-4
+        a, b = (test.at(100.0 * estimate, shape) for test in (fast, slow))
+        assert a.radius == pytest.approx(b.radius, abs=1e-6)
+        np.testing.assert_allclose(a.judge(u.tolist()), b.judge(u.tolist()), rtol=1e-6)
+
+
+@pytest.mark.parametrize("size", [1e-12, 1e-3, 1.0])
+@pytest.mark.parametrize("key", ["truck", "3, 2"])
+def test_nothing_is_said_about_indefinite_shapes_of_any_size(key, size):
+    plant = PLANTS[key]
+    test, shape = OneStepTest(np.eye(plant.n), plant), 1e-3 * size * np.eye(plant.n)
+    assert test.at(np.zeros(plant.n), shape) is not None
+    shape[0, 1] = shape[1, 0] = 1.001 * shape[0, 0]
+    assert test.at(np.zeros(plant.n), shape) is None
+
+
 @pytest.mark.parametrize("key", ["truck", "3, 2"])
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_nothing_is_said_about_what_is_not_finite(key, bad):

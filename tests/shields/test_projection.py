@@ -156,6 +156,38 @@ def test_compiled_searches_find_what_the_scalar_one_does_in_any_norm(pairwise):
     assert min(outcomes.values()) > 100
 
 
+@pytest.mark.parametrize("pairwise", [True, False])
+def test_compiled_searches_find_nothing_without_room(pairwise):
+    still = np.zeros(2)
+    found = compiled_search(pairwise, np.eye(2), np.ones(2), np.eye(2), -1e-9, still, still)
+    assert np.isnan(found).all()
+    found = compiled_search(pairwise, np.eye(2), np.ones(2), np.eye(2), 0.0, still, still)
+    np.testing.assert_array_equal(found, still)
+
+
+@pytest.mark.parametrize("pairwise", [True, False])
+@pytest.mark.parametrize("ratio", [1e-9, 1e-6, 1e-3, 1e3, 1e6, 1e9])
+def test_compiled_searches_do_not_depend_on_the_units_of_inputs_that_are_held(pairwise, ratio):
+    # The second input stays where it is, at its limit: the first goes where the test is met.
+    effect, limits = np.array([[1.0, 0.0], [0.0, 1.0 / ratio]]), np.array([1.0, ratio])
+    found = compiled_search(pairwise, effect, limits, np.eye(2), 1.25, np.array([1.0, -2.0]), limits)
+    np.testing.assert_allclose(found / limits, [-0.25, 1.0], rtol=1e-9)
+
+
+@pytest.mark.parametrize("pairwise", [True, False])
+def test_compiled_searches_converge_where_one_input_does_far_more_than_the_other(pairwise):
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        effect = np.array([[1.0, 0.2], [0.1, 1.0]]) * 10.0 ** rng.uniform(-4, 4, 2)
+        center = rng.standard_normal(2)
+        offset, limits = -effect @ center, np.full(2, 1e6)
+        radius = np.linalg.norm(offset) * 10.0 ** rng.uniform(-2, 0)
+        wanted = center + 100.0 * rng.standard_normal(2)
+        found = compiled_search(pairwise, effect, limits, np.eye(2), radius, offset, wanted)
+        expected = closest_admissible(wanted, offset, effect, radius, limits)
+        assert np.linalg.norm(found - wanted) == pytest.approx(np.linalg.norm(expected - wanted), rel=1e-9)
+
+
 @pytest.mark.parametrize("ratio", [1e3, 1e6, 1e9])
 def test_inputs_in_very_different_units_are_both_used(ratio):
     units = np.array([1.0, ratio])
