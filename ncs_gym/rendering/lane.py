@@ -7,8 +7,8 @@ from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.history import Flight
 from ncs_gym.rendering.scene import Scene
 
-# A lost packet falls off the lane for this many steps.
-FALL = 2
+# A lost packet is seen for this many steps more, each so many pixels farther on: what is below the lane stays clear.
+FADE, DRIFT = 2, 27.0
 # Pixels between the sensor and a packet just sent, and between one that arrives and the controller.
 DEPART, ARRIVE = 40.0, 22.0
 # Packets closer than this share a label, the oldest one's [pixels].
@@ -61,10 +61,10 @@ def _color(age: int) -> theme.Color:
 
 
 def _draw_lost(canvas: Canvas, middle: float, age: int) -> None:
-    """Draws a lost packet that fades while it falls off the lane."""
-    if age > FALL:
+    """Draws a lost packet that fades while it drifts on."""
+    if age > FADE:
         return
-    center, fading = (middle + 6.0 * age, theme.LANE + 11.0 * age), 0.3 * age
+    center, fading = (middle + DRIFT * age, theme.LANE), 0.3 * age
     draw_envelope(canvas, center, theme.blend(theme.FAINT, theme.MIST, fading), 0.9)
     canvas.cross(center, 8.0, theme.blend(theme.DANGER, theme.MIST, fading), 3.0)
     if age == 0:
