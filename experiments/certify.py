@@ -29,8 +29,8 @@ from shields import Certificate
 from shields.storage import write_atomically
 
 LEGEND = f"""failed: episodes that left S or the box; p <: upper end of the exact 95 % interval of its probability here;
-margin: smallest 1 - sqrt(x'Mx) from step {SETTLED} on (starts are on the boundary); overridden: steps the shield changed
-or, unshielded, would have changed"""
+margin: smallest 1 - sqrt(x'Mx) from step {SETTLED} on (starts are on the boundary); overridden: steps that
+the shield changed or, unshielded, would have changed"""
 
 
 def certify(settings: CertifySettings) -> None:
