@@ -21,7 +21,7 @@ from agents.control_loop import ControlLoop
 from agents.sb3_vec_env import SB3VecEnv
 from agents.settings import AgentSettings
 from ncs_gym import Channel, GilbertElliott
-from shields.storage import write_atomically
+from shields.atomic_write import write_atomically
 
 FORMAT = "ncs-gym agent 1"
 

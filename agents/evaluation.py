@@ -11,7 +11,7 @@ import numpy as np
 from agents.control_loop import ControlLoop
 from agents.trajectory import Trajectory, trajectory_of
 from ncs_gym import NCSVectorEnv
-from ncs_gym.env import ncs_env
+from ncs_gym.envs.env import ncs_env
 
 # Episodes played side by side at most.
 SIDE_BY_SIDE = 1000

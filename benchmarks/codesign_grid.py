@@ -14,8 +14,8 @@ import time
 import numpy as np
 
 from ncs_gym import truck_trailer
-from shields.codesign import MarginProgram, VolumeProgram, solve_op
-from shields.paper_bounds import PaperModel
+from shields.paper.bounds import PaperModel
+from shields.paper.optimization_problem import MarginProgram, VolumeProgram, solve_op
 
 
 def main() -> None:

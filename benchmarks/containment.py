@@ -16,9 +16,9 @@ import gymnasium as gym
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from ncs_gym.ellipsoid import outer_sum
+from ncs_gym.uncertainty.ellipsoid import outer_sum
 from shields import SafetyFilter, SafetyShield, synthesize
-from shields.filter import MARGIN
+from shields.runtime.filter import MARGIN
 
 STEPS = 200
 

@@ -17,12 +17,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from ncs_gym import ChannelContract, LinearPlant, batch_reactor, cart_pole
-from ncs_gym.noise import chi2_quantile
+from ncs_gym.uncertainty.truncated_gaussian import chi2_quantile
 from shields import Infeasible, synthesize
-from shields.design_problem import design_problem
-from shields.semidefinite import InvariantSetProgram
-from shields.starts import best_start
-from shields.synthesis import SLACKS
+from shields.synthesis.design_problem import design_problem
+from shields.synthesis.initial_designs import best_start
+from shields.synthesis.semidefinite_programs import InvariantSetProgram
+from shields.synthesis.synthesize import SLACKS
 
 PLANTS = {
     "cart-pole, full state": cart_pole(),

@@ -27,7 +27,7 @@ from experiments.settings import SweepSettings
 from experiments.unit import Unit, run_unit
 from experiments.unit_store import UnitStore
 from experiments.versions import versions
-from ncs_gym.env import ncs_env
+from ncs_gym.envs.env import ncs_env
 from shields import synthesize
 
 ENV = "ncs_gym/TruckTrailerCruise-v0"

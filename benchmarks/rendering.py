@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 
 import ncs_gym  # noqa: F401
-from ncs_gym.scenarios import ENTRY_POINTS
+from ncs_gym.registration import ENTRY_POINTS
 
 FRAMES, REPEATS = 200, 5
 

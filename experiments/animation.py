@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from ncs_gym.rendering import theme
-from shields.storage import write_atomically
+from shields.atomic_write import write_atomically
 
 FORMATS = (".gif", ".mp4", ".png")
 # How long an animation rests on its last picture [ms].

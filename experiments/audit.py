@@ -12,9 +12,9 @@ import numpy as np
 from experiments.counterexample import OneStep, stays_inside, worst_step
 from experiments.printed_case import PrintedCase
 from experiments.proof_settings import AuditSettings
-from shields.feasibility import FeasibilityScan, largest_gamma, largest_scale
-from shields.paper_bounds import PaperModel, safety_margin, uplink_error_bound
-from shields.storage import write_atomically
+from shields.atomic_write import write_atomically
+from shields.paper.bounds import PaperModel, safety_margin, uplink_error_bound
+from shields.paper.feasibility import FeasibilityScan, largest_gamma, largest_scale
 
 HOLDS, ROUNDED, FAILS, UNDECIDED = "holds", "holds, rounded", "does not hold", "undecided"
 # Agreement within the last printed digit of a four-digit number.

@@ -15,7 +15,7 @@ from experiments.cases import cases
 from experiments.tally import Tally
 from experiments.versions import versions
 from experiments.worst_case import HostileAgents, WorstCaseVectorEnv
-from ncs_gym.scenarios import EPISODE_STEPS
+from ncs_gym.registration import EPISODE_STEPS
 from shields import Certificate, VectorSafetyShield
 
 # Modes of the shield, in turn.

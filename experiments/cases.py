@@ -9,10 +9,10 @@ import gymnasium as gym
 import numpy as np
 
 from ncs_gym import Channel, ChannelContract, GilbertElliott, LinearPlant, truck_trailer
-from ncs_gym.env import ncs_env
-from ncs_gym.scenarios import ENTRY_POINTS, loaded_truck_trailer
+from ncs_gym.envs.env import ncs_env
+from ncs_gym.registration import ENTRY_POINTS, loaded_truck_trailer
 from shields import Certificate
-from shields.wrapper import certificate_for
+from shields.runtime.wrapper import certificate_for
 
 # One of each kind: nothing is lost; everything is; losses come in bursts; packets overtake one another.
 CHANNELS = {

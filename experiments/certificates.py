@@ -10,10 +10,10 @@ from tqdm import tqdm
 
 from experiments.proof_settings import SynthesizeSettings, VerifySettings
 from ncs_gym import ChannelContract, LinearPlant, scenarios
-from ncs_gym.env import ncs_env
-from ncs_gym.scenarios import ENTRY_POINTS
+from ncs_gym.envs.env import ncs_env
+from ncs_gym.registration import ENTRY_POINTS
 from shields import Certificate, CertificateError, Report, synthesize, verify
-from shields.storage import write_atomically
+from shields.atomic_write import write_atomically
 
 
 def synthesize_file(settings: SynthesizeSettings) -> None:

@@ -26,7 +26,7 @@ from experiments.tally import Tally
 from experiments.tally_store import TallyStore
 from experiments.versions import versions
 from shields import Certificate
-from shields.storage import write_atomically
+from shields.atomic_write import write_atomically
 
 LEGEND = f"""failed: episodes that left S or the box; p <: upper end of the exact 95 % interval of its probability here;
 margin: smallest 1 - sqrt(x'Mx) from step {SETTLED} on (starts are on the boundary); overridden: steps that

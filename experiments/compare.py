@@ -20,7 +20,7 @@ from experiments.tables import write_tables
 from experiments.unit import Learner, Unit, UnitResult
 from experiments.versions import versions
 from experiments.worlds import World, world_of
-from shields.storage import write_atomically
+from shields.atomic_write import write_atomically
 
 # What `--smoke` shrinks the run to: enough to pass through every part.
 SMOKE = {"steps": 4_096, "episodes": 10, "seeds": 2}

@@ -9,7 +9,7 @@ from operator import itemgetter
 import numpy as np
 
 from ncs_gym import Ellipsoid
-from shields.exact import (
+from shields.verification.rational_matrix import (
     add,
     congruence,
     is_positive_semidefinite,

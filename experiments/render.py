@@ -15,7 +15,7 @@ from experiments.certificates import plant_of
 from experiments.extras import require_extra
 from experiments.policies import UNTRAINED, policy_by_name
 from experiments.settings import RenderSettings
-from ncs_gym.env import ncs_env
+from ncs_gym.envs.env import ncs_env
 from shields import Certificate, SafetyShield
 
 FASTEST = 50

@@ -17,10 +17,10 @@ from experiments.plotting import STYLE, as_png
 from experiments.printed_case import PrintedCase
 from experiments.proof_settings import ReproduceSettings
 from ncs_gym import BoxDisturbance, Ellipsoid, LinearPlant
-from ncs_gym.scenarios import CASE_STUDY_BOX
+from ncs_gym.registration import CASE_STUDY_BOX
 from shields import synthesize
-from shields.feasibility import FeasibilityScan, largest_scale
-from shields.storage import write_atomically
+from shields.atomic_write import write_atomically
+from shields.paper.feasibility import FeasibilityScan, largest_scale
 
 ENV = "ncs_gym/TruckTrailer-v0"
 # OP's design is asked for at this share of the largest feasible scale, away from the very edge, on a fine grid.

@@ -10,8 +10,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ncs_gym.frozen import LONGEST_QUOTE
-from shields.storage import write_atomically
+from ncs_gym.validation import LONGEST_QUOTE
+from shields.atomic_write import write_atomically
 
 FORMAT = "ncs-gym settings 1"
 FLAG = "--config"

@@ -19,8 +19,8 @@ from experiments.summary import summarize_arm, table_text
 from experiments.unit import UnitResult
 from experiments.versions import versions
 from experiments.worlds import world_of
-from ncs_gym.env import ncs_env
-from shields.storage import write_atomically
+from ncs_gym.envs.env import ncs_env
+from shields.atomic_write import write_atomically
 
 
 def train_agent(settings: TrainSettings) -> None:

@@ -20,7 +20,7 @@ from experiments.summary import summarize_arm
 from experiments.tables import parquet
 from experiments.unit import Unit, UnitResult
 from experiments.worlds import World, world_of
-from shields.storage import write_atomically
+from shields.atomic_write import write_atomically
 
 
 @dataclass(frozen=True)

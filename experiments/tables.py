@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from experiments.unit import UnitResult
-from shields.storage import write_atomically
+from shields.atomic_write import write_atomically
 
 # Under this key a file's metadata says where it comes from.
 METADATA = b"ncs-gym"

@@ -19,7 +19,7 @@ from agents.settings import AgentSettings
 from agents.trajectory import Trajectory
 from experiments.versions import versions
 from ncs_gym import Channel
-from ncs_gym.env import ncs_env
+from ncs_gym.envs.env import ncs_env
 from shields import Certificate
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from agents.history import TrainingPoint
 from agents.trajectory import Trajectory
 from experiments.errors import ResultsError
 from experiments.unit import Unit, UnitResult
-from shields.storage import write_atomically
+from shields.atomic_write import write_atomically
 
 FORMAT = "ncs-gym unit 1"
 

@@ -11,10 +11,10 @@ import gymnasium as gym
 from experiments.certificates import plant_of
 from experiments.channels import ChannelSettings, channel_of
 from ncs_gym import Channel, LinearPlant
-from ncs_gym.env import ncs_env
+from ncs_gym.envs.env import ncs_env
 from shields import Certificate, Report, verify
-from shields.verification import require_valid
-from shields.wrapper import certificate_for
+from shields.runtime.wrapper import certificate_for
+from shields.verification.verify import require_valid
 
 
 @dataclass(frozen=True, eq=False)

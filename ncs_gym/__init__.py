@@ -3,9 +3,18 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from ncs_gym.channel import Channel, GilbertElliott, Packet
-from ncs_gym.contract import ChannelContract, contract_of
-from ncs_gym.disturbance import (
+from ncs_gym.envs.env import NCSEnv
+from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlantError, certified_error_set
+from ncs_gym.estimation.estimator import Estimator
+from ncs_gym.network.channel import Channel, GilbertElliott, Packet
+from ncs_gym.network.contract import ChannelContract, contract_of
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.plants.truck_trailer import truck_trailer
+from ncs_gym.plants.unstable import batch_reactor, cart_pole
+from ncs_gym.registration import register_all
+from ncs_gym.rendering import Annotation
+from ncs_gym.tasks.task import Regulation, SetpointTracking, SpeedTracking, Task
+from ncs_gym.uncertainty.disturbance import (
     AdversarialDisturbance,
     BallDisturbance,
     BoxDisturbance,
@@ -13,19 +22,10 @@ from ncs_gym.disturbance import (
     SinusoidDisturbance,
     SphereDisturbance,
 )
-from ncs_gym.ellipsoid import Ellipsoid
-from ncs_gym.env import NCSEnv
-from ncs_gym.error_set import ErrorSet, ErrorSetError, UnstablePlantError, certified_error_set
-from ncs_gym.estimator import Estimator
-from ncs_gym.plant import LinearPlant
-from ncs_gym.rendering import Annotation
-from ncs_gym.scenarios import register_all
-from ncs_gym.task import Regulation, SetpointTracking, SpeedTracking, Task
-from ncs_gym.truck import truck_trailer
-from ncs_gym.unstable import batch_reactor, cart_pole
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 
 if TYPE_CHECKING:
-    from ncs_gym.vector_env import NCSVectorEnv
+    from ncs_gym.envs.vector_env import NCSVectorEnv
 
 register_all()
 
@@ -64,5 +64,5 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """Imports what needs the compiler only when it is asked for."""
     if name == "NCSVectorEnv":
-        return import_module("ncs_gym.vector_env").NCSVectorEnv
+        return import_module("ncs_gym.envs.vector_env").NCSVectorEnv
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

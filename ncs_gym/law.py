@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym.compiled import inner
-from ncs_gym.disturbance import ROUNDING, BallDisturbance, BoxDisturbance, Disturbance, SphereDisturbance
 from ncs_gym.draws import fill_directions, fill_truncated, fill_uniform, normals
-from ncs_gym.noise import TruncatedGaussian
-from ncs_gym.plant import LinearPlant
+from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.product import add_product
+from ncs_gym.uncertainty.disturbance import ROUNDING, BallDisturbance, BoxDisturbance, Disturbance, SphereDisturbance
+from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian
 
 # What h in F h is: nothing, uniform in a box, truncated normal, uniform in a ball, uniform on a sphere.
 NOTHING, BOX, NORMAL, BALL, SPHERE = range(5)

@@ -19,7 +19,7 @@ from ncs_gym.system import unpacked
 DRAW, MOVE, PREDICT, RECEIVE = range(4)
 LAST = 1 << 30
 # What `run` is made of, next to this file.
-SOURCES = ("disturbance", "draws", "fleet", "gain_table", "law", "packets", "product", "report", "samples", "system")
+SOURCES = ("draws", "fleet", "law", "packets", "product", "report", "samples", "system")
 # Numbers of draws: each purpose has this many per step.
 DISTURBANCE, PROCESS, SENSOR, NETWORK, PURPOSES = range(5)
 WIDTH = 1024

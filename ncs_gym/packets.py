@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym.compiled import inner
-from ncs_gym.gain_table import ACCEPTED, FRESH, HELD, LAST_BIT, TARGET
+from ncs_gym.estimation.gain_table import ACCEPTED, FRESH, HELD, LAST_BIT, TARGET
 from ncs_gym.product import add_product, hold_rows, set_product
 
 

@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ncs_gym.channel import GilbertElliott
 from ncs_gym.compiled import inner
-from ncs_gym.env import NCSEnv
+from ncs_gym.envs.env import NCSEnv
 from ncs_gym.law import NOTHING, Law, law_of_disturbance, law_of_noise
-from ncs_gym.task import Regulation
+from ncs_gym.network.channel import GilbertElliott
+from ncs_gym.tasks.task import Regulation
 
 
 class System(NamedTuple):

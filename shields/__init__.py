@@ -4,15 +4,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from shields.certificate import Certificate, CertificateError, Multipliers
-from shields.condition import Condition
-from shields.filter import Decision, SafetyFilter
-from shields.infeasible import Infeasible
-from shields.verification import Report, verify
-from shields.wrapper import SafetyShield
+from shields.errors import Infeasible
+from shields.runtime.filter import Decision, SafetyFilter
+from shields.runtime.wrapper import SafetyShield
+from shields.verification.conditions import Condition
+from shields.verification.verify import Report, verify
 
 if TYPE_CHECKING:
-    from shields.synthesis import certify, synthesize
-    from shields.vector_wrapper import VectorSafetyShield
+    from shields.runtime.vector_wrapper import VectorSafetyShield
+    from shields.synthesis.synthesize import certify, synthesize
 
 __all__ = [
     "Certificate",
@@ -32,7 +32,11 @@ __all__ = [
 
 
 # Imported when they are asked for: what needs the solver, and what needs the compiler.
-LATER = {"certify": "synthesis", "synthesize": "synthesis", "VectorSafetyShield": "vector_wrapper"}
+LATER = {
+    "certify": "synthesis.synthesize",
+    "synthesize": "synthesis.synthesize",
+    "VectorSafetyShield": "runtime.vector_wrapper",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym import Ellipsoid
-from ncs_gym.age_sets import AgeSets
-from ncs_gym.contract import ChannelContract
-from ncs_gym.frozen import FrozenArrays, as_matrix, as_number, as_setting, read_only, shown
-from shields.storage import write_atomically
+from ncs_gym.estimation.error_bounds_by_age import AgeSets
+from ncs_gym.network.contract import ChannelContract
+from ncs_gym.validation import FrozenArrays, as_matrix, as_number, as_setting, read_only, shown
+from shields.atomic_write import write_atomically
 
 FORMAT = "ncs-gym certificate 2"
 # What a certificate of each method carries besides L and K.

@@ -16,7 +16,7 @@ from ncs_gym import (
     NCSEnv,
     truck_trailer,
 )
-from ncs_gym.ellipsoid import is_inside
+from ncs_gym.uncertainty.ellipsoid import is_inside
 from shields import Certificate, SafetyShield, synthesize
 from tests.plants import random_plant
 

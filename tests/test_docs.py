@@ -90,7 +90,7 @@ def test_errors_has_every_exception_class_and_no_other():
     assert all(name == target.rpartition(".")[2] for name, target, _ in rows)
     listed = {target: bases for _, target, bases in rows}
     defined = exceptions()
-    assert ("shields.infeasible", "Infeasible") in defined
+    assert ("shields.errors", "Infeasible") in defined
     assert sorted(name.rpartition(".")[2] for name in listed) == sorted(name for _, name in defined)
     for name, bases in listed.items():
         error = resolved(name)

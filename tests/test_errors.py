@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ncs_gym.env import NCSEnv, RenderModeError
+from ncs_gym.envs.env import NCSEnv, RenderModeError
 from shields import Infeasible
 from tests.test_docs import PACKAGES, ROOT, exceptions, resolved
 

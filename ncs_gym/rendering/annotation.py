@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ncs_gym.ellipsoid import Ellipsoid
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

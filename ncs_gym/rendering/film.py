@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym.plant import LinearPlant
+from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.rendering.history import History
 from ncs_gym.rendering.picture import Picture
 from ncs_gym.rendering.scene import Scene

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ncs_gym.channel import Link, Packet
+from ncs_gym.network.channel import Link, Packet
 from ncs_gym.rendering.annotation import Annotation
 
 # Steps of the path and of the packet strip that are kept.

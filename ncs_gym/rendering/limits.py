@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ncs_gym.plant import LinearPlant
+from ncs_gym.plants.linear_plant import LinearPlant
 
 # Corners of a polygon outside any axis, in units of the axes' reach.
 FAR = 10.0

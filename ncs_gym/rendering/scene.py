@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym.estimator import Estimator
-from ncs_gym.plant import LinearPlant
+from ncs_gym.estimation.estimator import Estimator
+from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.rendering.annotation import Annotation
 from ncs_gym.rendering.history import Flight, History
-from ncs_gym.task import SetpointTracking, SpeedTracking, Task
+from ncs_gym.tasks.task import SetpointTracking, SpeedTracking, Task
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ncs_gym.plant import LinearPlant
+from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.lane import draw_lane

@@ -6,7 +6,7 @@ import pytest
 
 from agents.control_loop import ControlLoop, Shielding
 from agents.evaluation import STREAM, evaluate
-from shields.wrapper import certificate_for
+from shields.runtime.wrapper import certificate_for
 
 CRUISE = ControlLoop(env="ncs_gym/TruckTrailerCruise-v0")
 

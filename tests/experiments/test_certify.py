@@ -15,8 +15,8 @@ from experiments.proof_settings import CertifySettings
 from experiments.tally import Tally
 from experiments.tally_store import TallyStore
 from ncs_gym import truck_trailer
-from ncs_gym.contract import contract_of
-from ncs_gym.ellipsoid import Ellipsoid
+from ncs_gym.network.contract import contract_of
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from shields import Certificate
 from shields import certify as smaller_set
 

@@ -5,7 +5,7 @@ from experiments.channels import ChannelSettings, bursts, channel_of
 from experiments.settings import SweepSettings
 from experiments.sweep import cells_of
 from ncs_gym import Channel, GilbertElliott
-from ncs_gym.channel import Link
+from ncs_gym.network.channel import Link
 
 OWN = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
 

@@ -8,7 +8,7 @@ import pytest
 from experiments.arms import arm_of
 from experiments.report import html_report, sweep_report
 from shields import Report
-from shields.condition import flag
+from shields.verification.conditions import flag
 from tests.experiments.results import ALL_ARMS, provenance, run, summary_of
 
 VERIFIED = Report((flag("(E1) Sigma - A Sigma A' >= 0", True), flag("(S) the safe set", True)))

@@ -5,7 +5,7 @@ import pytest
 
 from experiments.printed_case import PrintedCase
 from experiments.reproduce import StateFeedback, _outcome
-from ncs_gym.scenarios import CASE_STUDY_BOX
+from ncs_gym.registration import CASE_STUDY_BOX
 from tests.command import ncs
 
 

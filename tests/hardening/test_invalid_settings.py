@@ -24,9 +24,9 @@ from ncs_gym import (
     SpeedTracking,
     truck_trailer,
 )
-from ncs_gym.env import NCSEnv
+from ncs_gym.envs.env import NCSEnv
 from shields import SafetyShield, VectorSafetyShield, synthesize, verify
-from shields.filter import SafetyFilter
+from shields.runtime.filter import SafetyFilter
 from tests.fuzz import NOTHING_USABLE, WRONG_NUMBERS, examples
 
 PLANT = truck_trailer()

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ncs_gym import Channel, NCSVectorEnv
-from ncs_gym.env import NCSEnv
+from ncs_gym.envs.env import NCSEnv
 from shields import SafetyShield, VectorSafetyShield
 from tests.fuzz import NOTHING_USABLE, examples
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from benchmarks.numerical_trust import badly_scaled_plant, outcome
 from ncs_gym import Channel, ChannelContract, certified_error_set
-from ncs_gym.env import NCSEnv
+from ncs_gym.envs.env import NCSEnv
 from shields import Infeasible, SafetyShield, synthesize, verify
 from tests.fuzz import examples, plants
 

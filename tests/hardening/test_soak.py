@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, NCSVectorEnv, gain_table
-from ncs_gym.channel import Packet
-from ncs_gym.env import NCSEnv
-from ncs_gym.estimator import Belief, Estimator
+from ncs_gym.envs.env import NCSEnv
+from ncs_gym.estimation.estimator import Belief, Estimator
+from ncs_gym.network.channel import Packet
 
 EPISODE = 300
 # Environments of the vector whose last episodes are computed again.

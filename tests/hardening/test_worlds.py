@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ncs_gym import Channel, ChannelContract, ErrorSetError, NCSVectorEnv, cart_pole
-from ncs_gym.env import NCSEnv
+from ncs_gym.envs.env import NCSEnv
 from tests.fuzz import examples, plants, worlds
 
 # A plant so strongly coupled that float64 holds no error set is refused by name.

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, GilbertElliott
-from ncs_gym.channel import Link
+from ncs_gym.network.channel import Link
 
 
 def transmit(channel: Channel, steps: int, seed: int = 0) -> dict[int, list[int]]:

@@ -22,11 +22,19 @@ from ncs_gym import (
     contract_of,
     truck_trailer,
 )
-from ncs_gym.channel import Link
-from ncs_gym.ellipsoid import is_inside
-from ncs_gym.error_set import _check_ages
-from ncs_gym.estimator import Estimator
-from shields.exact import add, congruence, is_positive_semidefinite, multiply, rational, scale, subtract
+from ncs_gym.estimation.error_bound import _check_ages
+from ncs_gym.estimation.estimator import Estimator
+from ncs_gym.network.channel import Link
+from ncs_gym.uncertainty.ellipsoid import is_inside
+from shields.verification.rational_matrix import (
+    add,
+    congruence,
+    is_positive_semidefinite,
+    multiply,
+    rational,
+    scale,
+    subtract,
+)
 
 PLANTS = {
     "cart-pole": (cart_pole(), ChannelContract(4, 1e-4)),
@@ -278,7 +286,7 @@ def test_prediction_falls_back_to_the_certified_set(monkeypatch):
     plant, contract = PLANTS["cart-pole"]
     sets = certified_error_set(plant, contract)
     estimator = Estimator(plant, Channel(), sets)
-    monkeypatch.setattr("ncs_gym.estimator.outer_sum", lambda first, second, weight: 1e3 * (first + second))
+    monkeypatch.setattr("ncs_gym.estimation.estimator.outer_sum", lambda first, second, weight: 1e3 * (first + second))
     monkeypatch.setattr(type(sets), "rate_at", lambda self, age: 1e-6)
     shape = estimator._predicted_shape(sets.ages.shapes[1], 1)
     np.testing.assert_array_equal(shape, sets.ages.shapes[2])

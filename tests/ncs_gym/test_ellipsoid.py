@@ -5,9 +5,9 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from ncs_gym import Ellipsoid
-from ncs_gym.ellipsoid import is_inside, joined, outer_sum, sum_gauge
-from ncs_gym.minkowski import outside_sum
 from ncs_gym.roots import fill_farthest
+from ncs_gym.uncertainty.ellipsoid import is_inside, joined, outer_sum, sum_gauge
+from ncs_gym.uncertainty.minkowski_sum import outside_sum
 
 seeds = st.integers(0, 10_000)
 

@@ -13,7 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import ncs_gym
 from ncs_gym import BoxDisturbance, Channel, Ellipsoid, GilbertElliott, LinearPlant, NCSEnv, Regulation, SpeedTracking
-from ncs_gym.env import ncs_env
+from ncs_gym.envs.env import ncs_env
 from tests.plants import random_plant
 
 IDS = ["ncs_gym/TruckTrailer-v0", "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/LinearNCS-v0"]
@@ -60,7 +60,7 @@ def test_module_prefix_registers(tmp_path):
 
 
 def test_factories_carry_metadata():
-    assert ncs_gym.scenarios.TRUCK_TRAILER.metadata == NCSEnv.metadata
+    assert ncs_gym.registration.TRUCK_TRAILER.metadata == NCSEnv.metadata
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -390,7 +390,7 @@ def test_a_plant_of_another_size_gets_defaults_that_fit():
 
 def test_a_variant_of_the_truck_keeps_the_case_studys_disturbance_and_starts():
     env = make(IDS[0], plant=ncs_gym.truck_trailer(mass=1500.0)).unwrapped
-    assert env.disturbance is ncs_gym.scenarios.CASE_STUDY_BOX
+    assert env.disturbance is ncs_gym.registration.CASE_STUDY_BOX
     assert env.initial_set.shape[0, 0] == pytest.approx(1.9**2)
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid, ErrorSetError, LinearPlant, UnstablePlantError, certified_error_set, truck_trailer
-from ncs_gym.error_set import _check
-from shields.exact import add, congruence, is_positive_semidefinite, rational, scale, subtract
+from ncs_gym.estimation.error_bound import _check
+from shields.verification.rational_matrix import add, congruence, is_positive_semidefinite, rational, scale, subtract
 from tests.plants import random_plant
 
 

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ncs_gym import Channel, Ellipsoid, ErrorSet, Estimator, LinearPlant, Packet, certified_error_set, truck_trailer
-from ncs_gym.channel import GilbertElliott, Link
-from ncs_gym.estimator import _grown
-from ncs_gym.plant import FLAT_INFLATION
-from shields.exact import congruence, is_positive_semidefinite, rational, subtract
+from ncs_gym.estimation.estimator import _grown
+from ncs_gym.network.channel import GilbertElliott, Link
+from ncs_gym.plants.linear_plant import FLAT_INFLATION
+from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
 from tests.plants import random_plant
 
 # So fine that rounding of covariances and shapes does not show.

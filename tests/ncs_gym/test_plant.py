@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.stats import chi2
 
 from ncs_gym import LinearPlant, truck_trailer
-from ncs_gym.noise import TruncatedGaussian, chi2_quantile
+from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, chi2_quantile
 
 
 def test_truck_trailer_reproduces_the_printed_matrices():

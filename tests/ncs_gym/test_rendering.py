@@ -17,9 +17,9 @@ from gymnasium.wrappers import RecordVideo
 from stable_baselines3.common.env_util import make_vec_env
 
 from ncs_gym import Annotation, Channel, Ellipsoid, LinearPlant
+from ncs_gym.registration import ENTRY_POINTS
 from ncs_gym.rendering import Picture, theme
 from ncs_gym.rendering.history import RECENT, Flight
-from ncs_gym.scenarios import ENTRY_POINTS
 from tests.plants import random_plant
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Regulation, SpeedTracking, truck_trailer
-from ncs_gym.task import SpeedProfile
+from ncs_gym.tasks.task import SpeedProfile
 
 
 def test_regulation_costs_about_one_at_the_edge_of_the_box(plant):

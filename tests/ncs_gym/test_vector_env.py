@@ -15,16 +15,21 @@ from ncs_gym import (
     batch_reactor,
     cart_pole,
     draws,
-    gain_table,
     truck_trailer,
 )
-from ncs_gym.channel import Link
-from ncs_gym.disturbance import AdversarialDisturbance, BallDisturbance, SinusoidDisturbance, SphereDisturbance
 from ncs_gym.draws import uniform_many
-from ncs_gym.regulator import regulator_gain
+from ncs_gym.envs.vector_env import NCSVectorEnv
+from ncs_gym.estimation import gain_table
+from ncs_gym.network.channel import Link
+from ncs_gym.plants.lqr import regulator_gain
 from ncs_gym.system import unpacked
-from ncs_gym.task import SetpointTracking, SpeedProfile, SpeedTracking
-from ncs_gym.vector_env import NCSVectorEnv
+from ncs_gym.tasks.task import SetpointTracking, SpeedProfile, SpeedTracking
+from ncs_gym.uncertainty.disturbance import (
+    AdversarialDisturbance,
+    BallDisturbance,
+    SinusoidDisturbance,
+    SphereDisturbance,
+)
 from tests.plants import random_plant
 
 IDS = ("TruckTrailer", "TruckTrailerCruise", "CartPole", "BatchReactor")
@@ -549,7 +554,7 @@ def test_own_plant_by_id():
 
 def test_environment_can_be_made_without_a_compiler(monkeypatch):
     # As with NUMBA_DISABLE_JIT=1, which leaves functions of Python's.
-    from ncs_gym import vector_env
+    from ncs_gym.envs import vector_env
 
     monkeypatch.setattr(vector_env, "fleet_of", vector_env.fleet_of.py_func)
     assert NCSVectorEnv(2, plant=truck_trailer()).reset(seed=0)[0].shape[0] == 2

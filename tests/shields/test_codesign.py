@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from ncs_gym import truck_trailer
-from shields.codesign import MarginProgram, VolumeProgram, codesign, grid, solve_op
-from shields.paper_bounds import PaperModel
+from shields.paper.bounds import PaperModel
+from shields.paper.optimization_problem import MarginProgram, VolumeProgram, codesign, grid, solve_op
 
 SMALL = truck_trailer(gamma=1e-6, process_noise_cov=1e-6 * np.eye(2))
 POINTS = [(k, 1.0 + (1.0 / k - 1.0) * s) for k in (0.8, 0.86, 0.9, 0.94, 0.98) for s in (0.0, 0.05, 0.3, 0.8)]

@@ -3,7 +3,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from shields.condition import flag, matrix_condition, scalar
+from shields.verification.conditions import flag, matrix_condition, scalar
 
 BEYOND_FLOATS = Fraction(10) ** 400
 

@@ -8,7 +8,7 @@ import pytest
 
 from ncs_gym import Channel, ChannelContract, batch_reactor, cart_pole
 from shields import Certificate, CertificateError, SafetyShield, synthesize, verify
-from shields.proof import LARGE_ERROR, NOT_KNOWN_INSIDE
+from shields.runtime.guarantee import LARGE_ERROR, NOT_KNOWN_INSIDE
 from tests.attacks import attack, certificate_of, harmful
 
 PLANTS = {

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shields.exact import (
+from shields.verification.rational_matrix import (
     add,
     congruence,
     is_positive_semidefinite,

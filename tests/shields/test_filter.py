@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ncs_gym import Ellipsoid, truck_trailer
-from ncs_gym.ellipsoid import outer_sum
+from ncs_gym.uncertainty.ellipsoid import outer_sum
 from shields import CertificateError, SafetyFilter, synthesize
-from shields.filter import MARGIN, MODES
+from shields.runtime.filter import MARGIN, MODES
 from tests.plants import random_plant
 
 TWO_STATES = random_plant(3, 2, 1)
@@ -223,7 +223,7 @@ def test_what_underflows_raises_nothing(states, mode):
 
 def test_wrongly_projected_input_is_not_applied(certificate, loaded, monkeypatch):
     shield = SafetyFilter(certificate, loaded)
-    monkeypatch.setattr("shields.plane.closest_on_line", lambda wanted, *rest: wanted)
+    monkeypatch.setattr("shields.runtime.plane.closest_on_line", lambda wanted, *rest: wanted)
     decision = shield.decide(np.array([1.6, 0.5]), 0.1 * certificate.Sigma, np.array([4.0]))
     assert decision.reason == "fallback"
 

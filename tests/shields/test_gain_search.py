@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from ncs_gym import ChannelContract, batch_reactor, cart_pole
-from ncs_gym.noise import chi2_quantile
-from ncs_gym.regulator import regulator_gain
+from ncs_gym.plants.lqr import regulator_gain
+from ncs_gym.uncertainty.truncated_gaussian import chi2_quantile
 from shields import Infeasible, synthesize, verify
-from shields.design_problem import design_problem
-from shields.gain_search import _Search, _starts, roomiest_gain
+from shields.synthesis.design_problem import design_problem
+from shields.synthesis.max_margin_gain import _Search, _starts, roomiest_gain
 from tests.plants import random_plant
 
 CONTRACT = ChannelContract(2, 1e-4)

@@ -7,8 +7,8 @@ from scipy.optimize import minimize_scalar
 
 from ncs_gym import Ellipsoid, truck_trailer
 from shields import SafetyFilter, one_step, synthesize
-from shields.one_step import OneStepTest
-from shields.plane import PlaneOutlook
+from shields.runtime.one_step_test import OneStepTest
+from shields.runtime.plane import PlaneOutlook
 from tests.plants import random_plant
 
 PLANTS = {"truck": truck_trailer(mass=4000.0)} | {

@@ -7,9 +7,9 @@ import pytest
 
 from ncs_gym import LinearPlant, truck_trailer
 from shields import Certificate, CertificateError, Infeasible, SafetyShield, certify, synthesize, verify
-from shields.feasibility import FeasibilityScan, largest_gamma, largest_scale
-from shields.paper_bounds import PaperModel
-from shields.proof import NO_ERROR_SET
+from shields.paper.bounds import PaperModel
+from shields.paper.feasibility import FeasibilityScan, largest_gamma, largest_scale
+from shields.runtime.guarantee import NO_ERROR_SET
 
 SMALL = truck_trailer(gamma=1e-6, process_noise_cov=1e-6 * np.eye(2))
 

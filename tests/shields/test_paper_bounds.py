@@ -3,7 +3,7 @@ import pytest
 from scipy.stats import chi2
 
 from ncs_gym import truck_trailer
-from shields.paper_bounds import (
+from shields.paper.bounds import (
     PaperModel,
     covariance_bound,
     process_bound,

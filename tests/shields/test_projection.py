@@ -2,9 +2,9 @@ import cvxpy as cp
 import numpy as np
 import pytest
 
-from shields.closest import closest_in_space
-from shields.closest_pair import closest_pairs
-from shields.projection import closest_admissible, closest_on_line
+from shields.runtime.closest import closest_in_space
+from shields.runtime.closest_pair import closest_pairs
+from shields.runtime.projection import closest_admissible, closest_on_line
 
 
 class Reference:

@@ -7,7 +7,7 @@ import pytest
 
 from ncs_gym import ChannelContract, LinearPlant, truck_trailer
 from shields import Infeasible, SafetyShield, synthesize, verify
-from shields.semidefinite import largest_box_ellipsoid
+from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from tests.plants import random_plant
 
 

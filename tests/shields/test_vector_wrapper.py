@@ -6,11 +6,11 @@ from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatist
 
 from ncs_gym import Channel, ChannelContract, LinearPlant, NCSVectorEnv, SphereDisturbance, batch_reactor, truck_trailer
 from shields import CertificateError, SafetyFilter, SafetyShield, VectorSafetyShield, proof, routine, vector_wrapper
-from shields.filter import MARGIN, MODES, Decision
-from shields.proof import ProofTracker, starts_inside
-from shields.tracking import Knowledge, compare_clocks, track
-from shields.vector_filter import REASONS, Decisions, VectorFilter, overridden
-from shields.vector_wrapper import WHY
+from shields.runtime.filter import MARGIN, MODES, Decision
+from shields.runtime.guarantee import ProofTracker, starts_inside
+from shields.runtime.tracking import Knowledge, compare_clocks, track
+from shields.runtime.vector_filter import REASONS, Decisions, VectorFilter, overridden
+from shields.runtime.vector_wrapper import WHY
 from tests.attacks import CHANNELS, RANDOM, TRUCKS, certificate_of, harmful
 
 KEYS = {

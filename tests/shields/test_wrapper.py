@@ -24,8 +24,8 @@ from stable_baselines3.common.monitor import Monitor
 
 from ncs_gym import AdversarialDisturbance, Channel, Ellipsoid, NCSEnv
 from shields import Certificate, CertificateError, SafetyShield, synthesize
-from shields.filter import Decision, SafetyFilter
-from shields.proof import (
+from shields.runtime.filter import Decision, SafetyFilter
+from shields.runtime.guarantee import (
     ALARM,
     FAR_OUT,
     LARGE_ERROR,
@@ -215,7 +215,8 @@ def test_boundary_overrides_more_often_than_switch(certificate):
 
 
 def test_certificate_is_synthesized_once_per_plant(monkeypatch):
-    from shields import synthesis, wrapper
+    from shields.runtime import wrapper
+    from shields.synthesis import synthesize as synthesis
 
     calls = []
     monkeypatch.setattr(wrapper, "_synthesized", {})

@@ -1,0 +1,1 @@
+"""The delay-aware Kalman filter and the ellipsoids its error never leaves."""

@@ -1,0 +1,193 @@
+"""The certified error set: an ellipsoid the estimation error never leaves, whatever the channel does."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Literal, overload
+
+import numpy as np
+from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov
+from scipy.optimize import minimize_scalar
+
+from ncs_gym.estimation.error_bounds_by_age import AgeSets, age_sets
+from ncs_gym.network.contract import ChannelContract
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.validation import FrozenArrays
+
+# Growth c of the optimal set: gives (E1) slack that an exact check can see, and updates room (theory.md section 3).
+GROWTH = 1.1
+# Beyond this many roundings of its largest entry a checked inequality is taken to hold.
+ROUNDINGS = 100.0
+# Flat disturbances are thickened by this share of their mean extent, so that (E1) has slack in every direction.
+THICKENING = 1e-9
+# No set is thinner than this, in half-widths of the safe box (a perfectly known plant has no error at all).
+THINNEST = 1e-6
+
+
+class UnstablePlantError(ValueError):
+    """Without a promise from the channel no error bound exists for a plant that is not Schur stable."""
+
+
+class ErrorSetError(ValueError):
+    """No error set could be computed accurately enough."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ErrorSet(FrozenArrays):
+    """What the estimation error never leaves: one set for every age, or one per age under a contract.
+
+    Without a contract, E(Sigma) with (E0) Sigma >= r0^2 I and (E1) Sigma >= A Sigma A'/rate + D/(1 - rate).
+
+    Attributes:
+        Sigma: Shape (n, n) [squares of the units of the state]; under a contract that of the largest age promised.
+        rate: lam_e in (0, 1); under a contract that of the largest age.
+        ages: The sets by age; None without a contract.
+    """
+
+    Sigma: np.ndarray
+    rate: float
+    ages: AgeSets | None = None
+
+    def __post_init__(self) -> None:
+        self._freeze_arrays()
+
+    @overload
+    def shape_at(self, age: Literal[0]) -> np.ndarray: ...
+
+    @overload
+    def shape_at(self, age: int) -> np.ndarray | None: ...
+
+    def shape_at(self, age: int) -> np.ndarray | None:
+        """Returns the certified shape, (n, n), for a newest sample `age` steps old; None beyond the contract."""
+        if self.ages is None:
+            return self.Sigma
+        return self.ages.shapes[age] if age < len(self.ages.shapes) else None
+
+    def rate_at(self, age: int) -> float:
+        """Returns the rate that carries the set of one age into that of the next."""
+        return self.rate if self.ages is None else float(self.ages.rates[age])
+
+
+def certified_error_set(plant: LinearPlant, contract: ChannelContract | None = None) -> ErrorSet:
+    """Returns the error set of a plant: of a stable one without a promise, of any under a contract.
+
+    Raises:
+        UnstablePlantError: If the plant is not Schur stable and there is no contract.
+        ErrorSetError: If none is found, or the plant is too ill-conditioned to compute it.
+    """
+    if contract is None:
+        return _unconditional_set(plant)
+    key = plant.fingerprint, contract
+    if key not in _by_contract:
+        _by_contract[key] = _conditional_set(plant, contract)
+    return _by_contract[key]
+
+
+_by_contract: dict[tuple[str, ChannelContract], ErrorSet] = {}
+
+
+def _conditional_set(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
+    """Returns the error sets by age under a contract; see `age_sets`."""
+    sets = age_sets(plant, contract)
+    if sets is None:
+        raise ErrorSetError(
+            f"no error set was found under a contract of max_age = {contract.max_age}: promise less age"
+        )
+    _check_ages(sets, plant)
+    return ErrorSet(Sigma=sets.shapes[contract.max_age], rate=float(sets.rates[-1]), ages=sets)
+
+
+def _check_ages(sets: AgeSets, plant: LinearPlant) -> None:
+    """Raises unless (C0), (C1) and (C2) hold by more than rounding.
+
+    Raises:
+        ErrorSetError: Naming the condition.
+    """
+    inverse = np.linalg.inv(np.linalg.cholesky(np.linalg.inv(plant.weight)))
+    for name, pairs in sets.needs(plant).items():
+        for outer, inner in pairs:
+            gap = inverse @ (outer - inner) @ inverse.T
+            rounding = ROUNDINGS * plant.n * np.finfo(float).eps * np.abs(inverse @ outer @ inverse.T).max()
+            if not (np.isfinite(gap).all() and np.linalg.eigvalsh(gap)[0] > rounding):
+                raise ErrorSetError(
+                    f"no error set found: the plant is too ill-conditioned for {name} to hold in float64"
+                )
+
+
+def _unconditional_set(plant: LinearPlant) -> ErrorSet:
+    """Returns the error set of a stable plant in closed form (theory.md section 3, (E0) and (E1)).
+
+    For a fixed rate the smallest solution of (E1) is a Lyapunov series; where it does not cover the first
+    estimate, the missing part is added as a source to the same series. The rate minimizes tr(W Sigma), W the
+    weight of the safe box. Multiplying by c = 1.1 keeps both conditions and gives them slack.
+
+    Proof of the bound: e_0 lies in E(r0^2 I). The error obeys e+ = A e - d, so with e in E(Sigma) its support
+    is at most that of A Sigma A'/rate + D/(1 - rate), which is inside E(Sigma) by (E1); by induction e_k lies
+    in E(Sigma) for all k with no packet at all.
+
+    Raises:
+        UnstablePlantError: If the spectral radius of A is 1 or more.
+        ErrorSetError: If the plant is so ill-conditioned that the result fails (E0) or (E1).
+    """
+    radius = plant.spectral_radius
+    if not radius < 1.0:
+        raise UnstablePlantError(
+            f"no error bound exists without packets: the spectral radius of A is {radius:.6g}, it must be < 1"
+        )
+    # In coordinates z = T^-1 x, with W = (T T')^-1, the weight is the identity and units do not matter.
+    T = np.linalg.cholesky(np.linalg.inv(plant.weight))
+    inverse, identity = np.linalg.inv(T), np.eye(plant.n)
+    A = inverse @ plant.A @ T
+    D = inverse @ plant.disturbance.shape @ inverse.T
+    D = D + THICKENING * float(np.trace(D)) / plant.n * identity
+    first = inverse @ plant.initial_error.shape @ inverse.T + THINNEST**2 * identity
+
+    def size(rate: float) -> float:
+        return float(np.trace(_smallest_solution(A, D, first, rate)))
+
+    slowest = max(radius**2, 1e-6)
+    margin = 1e-4 * (1.0 - slowest)
+    best = minimize_scalar(size, bounds=(slowest + margin, 1.0 - margin), method="bounded", options={"xatol": margin})
+    rate = float(best.x)
+    scaled = GROWTH * _smallest_solution(A, D, first, rate)
+    _check(scaled, A, D, first, rate)
+    Sigma = T @ scaled @ T.T
+    return ErrorSet(Sigma=0.5 * (Sigma + Sigma.T), rate=rate)
+
+
+def _check(Sigma: np.ndarray, A: np.ndarray, D: np.ndarray, first: np.ndarray, rate: float) -> None:
+    """Raises unless (E0) and (E1) hold by more than rounding, in scaled coordinates.
+
+    Raises:
+        ErrorSetError: Naming the condition.
+    """
+    needs = {"(E0)": first, "(E1)": A @ Sigma @ A.T / rate + D / (1.0 - rate)}
+    for name, need in needs.items():
+        finite = np.isfinite(Sigma).all() and np.isfinite(need).all()
+        rounding = ROUNDINGS * len(A) * np.finfo(float).eps * np.abs(Sigma).max()
+        if not (finite and np.linalg.eigvalsh(Sigma - need)[0] > rounding):
+            raise ErrorSetError(f"no error set found: the plant is too ill-conditioned for {name} to hold in float64")
+
+
+def _smallest_solution(A: np.ndarray, D: np.ndarray, first: np.ndarray, rate: float) -> np.ndarray:
+    """Returns the Lyapunov solution of (E1) for one rate, enlarged until it covers `first`, shape (n, n).
+
+    What cannot be solved is infinite; what is solved badly, `_check` sees.
+    """
+    try:
+        solution = _lyapunov(A / np.sqrt(rate), D / (1.0 - rate))
+        values, vectors = np.linalg.eigh(first - solution)
+        if values[-1] > 0.0:
+            missing = (vectors * np.maximum(values, 0.0)) @ vectors.T
+            solution = solution + _lyapunov(A / np.sqrt(rate), missing)
+    except np.linalg.LinAlgError:
+        return np.full_like(A, np.inf)
+    return 0.5 * (solution + solution.T)
+
+
+def _lyapunov(A: np.ndarray, source: np.ndarray) -> np.ndarray:
+    """Returns X = A X A' + source by the direct method (the other fails silently)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LinAlgWarning)
+        return solve_discrete_lyapunov(A, source, method="direct")

@@ -1,0 +1,181 @@
+"""Error sets by age: how far an estimate may be off when its newest sample is j steps old."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ncs_gym.network.contract import ChannelContract
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.plants.lqr import regulator_gain
+from ncs_gym.uncertainty.ellipsoid import SMALLEST_SHARE, is_inside, joined, outer_sum
+from ncs_gym.validation import FrozenArrays
+
+# The sets are made for noise this much larger than allowed, so that at run time good gains nearly always fit in.
+NOISE_GROWTH = 1.2
+# Strict inequalities at the end.
+SLACK = 1.0 + 1e-7
+# Growth per iteration; it doubles now and then, which ends cycles between shares that are equally good.
+SMALLEST_GROWTH, DOUBLING = 1e-6, 50.0
+# Shares mu that gains are chosen from: fine sensors want it close to 1.
+SHARES = np.concatenate([np.linspace(0.01, 0.99, 99), 1.0 - np.logspace(-2.1, -4.0, 20)])
+ITERATIONS = 1000
+# The regulator whose answer to an error counts, in units of the box and of the input limits, and how much it counts:
+# of a few tried, the one that leaves the unstable plants of benchmarks/contracts.py the largest disturbances.
+EFFORT, DECAY, ANSWER = 10.0, 0.75, 10.0
+# How much the answer counts of a gain that the plant names.
+NAMED_ANSWER = 1000.0
+# Sets this much larger than the safe box are of no use.
+LARGEST = 1e6
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AgeSets(FrozenArrays):
+    """E(Sigma_0) .. E(Sigma_{h+1}), h the contract's largest age (docs/theory.md section 6).
+
+        (C0) Sigma_0 >= r0^2 I
+        (C1) Sigma_{j+1} >= A Sigma_j A'/lam_j + D/(1-lam_j)                             j = 0..h
+        (C2) Sigma_0 >= (I-T_j H) Sigma_j (I-T_j H)'/mu_j + T_j N T_j'/(1-mu_j)          j = 1..h+1
+
+    Attributes:
+        contract: The promise they rest on.
+        shapes: Sigma_j, shape (h+2, n, n).
+        rates: lam_j, shape (h+1,).
+        gains: T_1 .. T_{h+1}, shape (h+1, n, p).
+        shares: mu_1 .. mu_{h+1}, shape (h+1,).
+        noise: N of the contract's quantizer, shape (p, p).
+    """
+
+    contract: ChannelContract
+    shapes: np.ndarray
+    rates: np.ndarray
+    gains: np.ndarray
+    shares: np.ndarray
+    noise: np.ndarray
+
+    def __post_init__(self) -> None:
+        self._freeze_arrays()
+
+    def needs(self, plant: LinearPlant) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
+        """Returns, per condition, pairs (outer, inner) of shapes of which each outer must hold the inner one."""
+        D, first = plant.disturbance.shape, plant.initial_error.shape
+        identity = np.eye(plant.n)
+        grown = [
+            plant.A @ shape @ plant.A.T / rate + D / (1.0 - rate)
+            for shape, rate in zip(self.shapes, self.rates, strict=False)
+        ]
+        updated = [
+            (kept := identity - gain @ plant.H) @ shape @ kept.T / share + gain @ self.noise @ gain.T / (1.0 - share)
+            for shape, gain, share in zip(self.shapes[1:], self.gains, self.shares, strict=True)
+        ]
+        return {
+            "(C0)": [(self.shapes[0], first)],
+            "(C1)": list(zip(self.shapes[1:], grown, strict=True)),
+            "(C2)": [(self.shapes[0], update) for update in updated],
+        }
+
+
+def age_sets(plant: LinearPlant, contract: ChannelContract) -> AgeSets | None:
+    """Returns error sets by age, without a solver; None if the iteration finds none, or none that float64 can hold."""
+    with np.errstate(all="ignore"):
+        try:
+            return _age_sets(plant, contract)
+        except np.linalg.LinAlgError:
+            return None
+
+
+def _age_sets(plant: LinearPlant, contract: ChannelContract) -> AgeSets | None:
+    """Returns error sets by age; None if the iteration finds none.
+
+    From Sigma_0 = r0^2 I: carry it through the longest gap, update after every possible gap with the set-membership
+    gain, and let Sigma_0 be the smallest ellipsoid around the results that pairwise joins give; until it holds what
+    comes of it, which is (C0), (C1) and (C2). Shares minimize traces weighted with what errors cost.
+
+    Args:
+        plant: The plant with its bounds.
+        contract: The channel's promise.
+    """
+    # Coordinates z = T^-1 x with W = (T T')^-1, so that units do not matter.
+    T = np.linalg.cholesky(np.linalg.inv(_cost(plant)))
+    inverse = np.linalg.inv(T)
+    A, H = inverse @ plant.A @ T, plant.H @ T
+    D = inverse @ plant.disturbance.shape @ inverse.T
+    D = D + 1e-9 * float(np.trace(D)) / plant.n * np.eye(plant.n)
+    first = inverse @ plant.initial_error.shape @ inverse.T + 1e-12 * np.eye(plant.n)
+    exact = plant.sensor_error_with(contract.quantization_step).shape
+    noise = NOISE_GROWTH * exact + 1e-12 * np.diag(np.diag(H @ H.T)) * float(np.trace(D)) / plant.n
+    start, steps = first, contract.max_age + 1
+    for turn in range(ITERATIONS):
+        shapes = _carried(start, A, D, steps)
+        if not float(np.trace(shapes[-1])) < LARGEST**2:
+            return None
+        updates = [_update(shape, H, noise) for shape in shapes[1:]]
+        grown = first
+        for _, _, shape in reversed(updates):
+            grown = joined(grown, shape)
+        if not float(np.trace(grown)) < LARGEST:
+            return None
+        if is_inside(SLACK * grown, start):
+            break
+        start = (1.0 + SMALLEST_GROWTH * 2.0 ** (turn / DOUBLING)) * grown
+    else:
+        return None
+    shapes = _carried(start, A, D, steps)
+    gains, shares, _ = zip(*(_update(shape, H, noise) for shape in shapes[1:]), strict=True)
+    return AgeSets(
+        contract=contract,
+        shapes=np.stack([_symmetric(T @ shape @ T.T) for shape in shapes]),
+        rates=np.array([_rate(shape, A, D) for shape in shapes[:-1]]),
+        gains=np.stack([T @ gain for gain in gains]),
+        shares=np.array(shares),
+        noise=exact,
+    )
+
+
+def _cost(plant: LinearPlant) -> np.ndarray:
+    """Returns W, shape (n, n): the size of an error in the box, and that of a gain's answer to it."""
+    if plant.error_gain is not None:
+        K = plant.error_gain / plant.u_max[:, None]
+        return plant.weight + NAMED_ANSWER * K.T @ K
+    T = np.linalg.cholesky(np.linalg.inv(plant.weight))
+    inverse = np.linalg.inv(T)
+    K = regulator_gain(inverse @ plant.A @ T, inverse @ plant.B * plant.u_max, EFFORT, DECAY)
+    if K is None:
+        return plant.weight
+    K = K @ inverse
+    return plant.weight + ANSWER * K.T @ K
+
+
+def _carried(start: np.ndarray, A: np.ndarray, D: np.ndarray, steps: int) -> list[np.ndarray]:
+    """Returns Sigma_0 .. Sigma_steps, each a little more than the trace-smallest ellipsoid the last one moves into."""
+    shapes = [start]
+    for _ in range(steps):
+        shapes.append(SLACK * _symmetric(outer_sum(A @ shapes[-1] @ A.T, D, np.eye(len(A)))))
+    return shapes
+
+
+def _rate(shape: np.ndarray, A: np.ndarray, D: np.ndarray) -> float:
+    """Returns the lam of `_carried`."""
+    a, b = np.sqrt(np.trace(A @ shape @ A.T)), np.sqrt(np.trace(D))
+    return float(np.clip(a / (a + b), SMALLEST_SHARE, 1.0 - SMALLEST_SHARE))
+
+
+def _update(shape: np.ndarray, H: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+    """Returns the set-membership gain T, its share mu and the updated shape, for the trace-smallest of SHARES."""
+    values, vectors = np.linalg.eigh(shape)
+    factor = vectors * np.sqrt(np.maximum(values, 0.0))
+    seen = H @ factor
+    gains, basis = np.linalg.eigh(seen.T @ np.linalg.solve(noise, seen))
+    axes, gains = factor @ basis, np.maximum(gains, 0.0)
+    sizes = (axes * axes).sum(axis=0)
+    traces = (sizes / (SHARES[:, None] + (1.0 - SHARES[:, None]) * gains)).sum(axis=1)
+    mu = float(SHARES[int(np.argmin(traces))])
+    updated = (axes / (mu + (1.0 - mu) * gains)) @ axes.T
+    spread = shape @ H.T / mu
+    gain = np.linalg.solve(H @ spread + noise / (1.0 - mu), spread.T).T
+    return gain, mu, _symmetric(updated)
+
+
+def _symmetric(matrix: np.ndarray) -> np.ndarray:
+    return 0.5 * (matrix + matrix.T)

@@ -1,0 +1,1 @@
+"""The network between sensor and controller: what it does to packets, and what it guarantees."""

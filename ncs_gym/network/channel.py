@@ -1,0 +1,157 @@
+"""The network between sensor and controller: loss, rationing, rounding and delay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ncs_gym.validation import MOST, as_count, as_number
+
+# Packets in flight are kept in memory, for every environment [steps].
+LONGEST_DELAY = 1000
+
+
+class Packet(NamedTuple):
+    """A sample on its way: the step it was taken at, and the (quantized) measurement, shape (p,)."""
+
+    stamp: int
+    measurement: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class GilbertElliott:
+    """Bursty loss: a two-state Markov chain that moves once per control step.
+
+    Attributes:
+        p_good_to_bad: Probability to go from good to bad.
+        p_bad_to_good: Probability to go from bad to good.
+        loss_good: Loss probability of a packet sent in the good state.
+        loss_bad: Loss probability of a packet sent in the bad state.
+
+    Raises:
+        ValueError: If a value is not a probability.
+    """
+
+    p_good_to_bad: float
+    p_bad_to_good: float
+    loss_good: float = 0.0
+    loss_bad: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("p_good_to_bad", "p_bad_to_good", "loss_good", "loss_bad"):
+            object.__setattr__(self, name, as_number(getattr(self, name), name, low=0.0, high=1.0))
+
+    @property
+    def stationary_bad(self) -> float:
+        """Long-run probability of the bad state (0 if the chain never moves)."""
+        total = self.p_good_to_bad + self.p_bad_to_good
+        return self.p_good_to_bad / total if total > 0.0 else 0.0
+
+
+@dataclass(frozen=True)
+class Channel:
+    """What the network does to the samples; every impairment works alone and with the others.
+
+    At each step k >= 1 that is a multiple of `send_period` the measurement is quantized, stamped with k
+    and sent. It is lost with probability `loss`; otherwise it arrives `delay` steps later plus a
+    uniformly random 0..`jitter` more, so packets may overtake each other.
+
+    Attributes:
+        loss: Probability of losing a packet (1.0 is a blackout), or a `GilbertElliott`.
+        quantization_step: Step q of the uniform mid-tread quantizer, in the units of y; 0 does not round.
+        send_period: Steps between samples.
+        delay: Fixed delay [steps].
+        jitter: Largest extra random delay [steps].
+        max_consecutive_losses: Never lose more packets in a row than this; None promises nothing.
+
+    Raises:
+        ValueError: If a value is out of range.
+    """
+
+    loss: float | GilbertElliott = 0.0
+    quantization_step: float = 0.0
+    send_period: int = 1
+    delay: int = 0
+    jitter: int = 0
+    max_consecutive_losses: int | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.loss, GilbertElliott):
+            object.__setattr__(self, "loss", as_number(self.loss, "loss", low=0.0, high=1.0))
+        step = as_number(self.quantization_step, "quantization_step", low=0.0)
+        object.__setattr__(self, "quantization_step", step)
+        for name, low, high in (("send_period", 1, MOST), ("delay", 0, LONGEST_DELAY), ("jitter", 0, LONGEST_DELAY)):
+            object.__setattr__(self, name, as_count(getattr(self, name), name, low=low, high=high))
+        if self.max_consecutive_losses is not None:
+            most = as_count(self.max_consecutive_losses, "max_consecutive_losses", low=0)
+            object.__setattr__(self, "max_consecutive_losses", most)
+
+    @property
+    def most_consecutive_losses(self) -> int | None:
+        """How many packets can be lost in a row; None if there is no limit."""
+        never = self.loss == 0.0 or (
+            isinstance(self.loss, GilbertElliott) and self.loss.loss_good == self.loss.loss_bad == 0.0
+        )
+        return 0 if never else self.max_consecutive_losses
+
+    @property
+    def longest_delay(self) -> int:
+        """The largest number of steps between a sample and its arrival."""
+        return self.delay + self.jitter
+
+    def quantize(self, measurement: np.ndarray) -> np.ndarray:
+        """Returns the measurement rounded to multiples of the quantization step."""
+        q = self.quantization_step
+        return np.round(measurement / q) * q if q > 0.0 else measurement
+
+
+class Link:
+    """One channel during one episode: the loss process and the packets in flight.
+
+    Args:
+        channel: The settings.
+        rng: Draws the first state of a Gilbert-Elliott chain from its stationary distribution.
+    """
+
+    def __init__(self, channel: Channel, rng: np.random.Generator) -> None:
+        self.channel = channel
+        self._in_flight: dict[int, list[Packet]] = {}
+        self._lost_in_a_row = 0
+        self._bad = isinstance(channel.loss, GilbertElliott) and rng.random() < channel.loss.stationary_bad
+
+    @property
+    def in_flight(self) -> dict[int, list[Packet]]:
+        """The packets on their way, by the step they arrive at."""
+        return self._in_flight
+
+    def sends_at(self, step: int) -> bool:
+        """Returns whether the sensor sends at this step."""
+        return step % self.channel.send_period == 0
+
+    def exchange(self, rng: np.random.Generator, step: int, measurement: np.ndarray | None) -> list[Packet]:
+        """Puts a sample on the channel and takes off what arrives.
+
+        Args:
+            rng: Source of randomness; how much is drawn does not depend on the measurement.
+            step: The current step.
+            measurement: y, shape (p,), to be quantized, stamped and sent; None where `sends_at` is False.
+
+        Returns:
+            The packets that arrive at this step, in the order they were sent.
+        """
+        loss = self.channel.loss
+        if isinstance(loss, GilbertElliott):
+            flip = rng.random() < (loss.p_bad_to_good if self._bad else loss.p_good_to_bad)
+            self._bad = self._bad != flip
+            loss = loss.loss_bad if self._bad else loss.loss_good
+        if measurement is not None:
+            most = self.channel.max_consecutive_losses
+            lost = rng.random() < loss and (most is None or self._lost_in_a_row < most)
+            self._lost_in_a_row = self._lost_in_a_row + 1 if lost else 0
+            extra = int(rng.integers(self.channel.jitter + 1)) if self.channel.jitter else 0
+            if not lost:
+                packet = Packet(step, self.channel.quantize(measurement))
+                self._in_flight.setdefault(step + self.channel.delay + extra, []).append(packet)
+        return self._in_flight.pop(step, [])

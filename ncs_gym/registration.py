@@ -1,0 +1,204 @@
+"""The registered environments: the only place with numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+
+from ncs_gym.envs.env import NCSEnv
+from ncs_gym.network.channel import Channel
+from ncs_gym.network.contract import ChannelContract, contract_of
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.plants.truck_trailer import truck_trailer
+from ncs_gym.plants.unstable import batch_reactor, cart_pole
+from ncs_gym.tasks.task import Regulation, SetpointTracking, SpeedTracking, Task
+from ncs_gym.uncertainty.disturbance import BoxDisturbance
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
+
+if TYPE_CHECKING:
+    from ncs_gym.envs.vector_env import NCSVectorEnv
+
+# Steps per episode of every registered environment (Liu et al. Section 5).
+EPISODE_STEPS = 200
+# The four impairments of Liu et al. Section 5, all at once.
+CASE_STUDY_CHANNEL = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
+# The disturbance box of Liu et al. Section 5 [m, m/s]; its corner has squared length gamma = 5e-4.
+CASE_STUDY_BOX = BoxDisturbance((0.02, 0.01))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenario:
+    """Defaults of a registered environment; calling it makes the environment.
+
+    Attributes:
+        plant: Makes the default plant; None if the user has to give one.
+        channel: Default channel.
+        task: Default task.
+        box: Default disturbance where it suits the plant; "ball" elsewhere.
+        contract: What the default channel promises; for the scenario's own plant only.
+        terminates: Whether a violation ends the episode by default: an unstable plant does not come back.
+        start: Radius of the disc of starts, for plants of two states; None and elsewhere: `NCSEnv`'s default.
+    """
+
+    plant: Callable[[], LinearPlant] | None
+    channel: Channel
+    task: Task
+    box: BoxDisturbance | None = None
+    contract: ChannelContract | None = None
+    terminates: bool = False
+    start: float | None = None
+    metadata: ClassVar[dict[str, Any]] = NCSEnv.metadata
+
+    def __call__(self, **settings: Any) -> NCSEnv:
+        """Returns the environment; see `settings` for the keywords.
+
+        Raises:
+            ValueError: If the scenario has no plant of its own and none is given, or a setting is wrong.
+        """
+        return NCSEnv(**self.settings(**settings))
+
+    def settings(
+        self,
+        *,
+        plant: LinearPlant | None = None,
+        channel: Channel | None = None,
+        task: Task | None = None,
+        disturbance: Any = None,
+        initial_set: Ellipsoid | None = None,
+        terminate_on_violation: bool | None = None,
+        allow_assumption_violation: bool = False,
+        contract: ChannelContract | None = None,
+        render_mode: str | None = None,
+    ) -> dict[str, Any]:
+        """Returns the arguments of `NCSEnv`; None stands for the scenario's own value.
+
+        Raises:
+            ValueError: If the scenario has no plant of its own and none is given.
+        """
+        if plant is None:
+            if self.plant is None:
+                raise ValueError("this environment has no plant of its own: give plant=LinearPlant(...)")
+            plant, contract = self.plant(), self.contract if contract is None else contract
+        if initial_set is None and self.start is not None and getattr(plant, "n", 0) == 2:
+            initial_set = Ellipsoid(self.start**2 * np.eye(2))
+        return {
+            "plant": plant,
+            "channel": self.channel if channel is None else channel,
+            "task": self.task if task is None else task,
+            "disturbance": self._disturbance(plant) if disturbance is None else disturbance,
+            "initial_set": initial_set,
+            "terminate_on_violation": self.terminates if terminate_on_violation is None else terminate_on_violation,
+            "allow_assumption_violation": allow_assumption_violation,
+            "contract": contract,
+            "render_mode": render_mode,
+            "horizon": EPISODE_STEPS,
+        }
+
+    def _disturbance(self, plant: LinearPlant) -> Any:
+        if self.box is None or not isinstance(plant, LinearPlant) or self.box.check(plant) or self.box.excess(plant):
+            return "ball"
+        return self.box
+
+
+# Liu et al. Section 5: 1000 kg, dt 0.5 s, gamma 5e-4, Q = P0 = R = 1e-4 I (the paper prints no R), delta 0.05; starts
+# uniformly in the disc of radius 1.9.
+TRUCK_TRAILER = Scenario(
+    plant=truck_trailer, channel=CASE_STUDY_CHANNEL, task=Regulation(), box=CASE_STUDY_BOX, start=1.9
+)
+
+
+def loaded_truck_trailer() -> LinearPlant:
+    """Returns the truck with a trailer of 4000 kg: full throttle overstretches its coupling (theory.md section 5)."""
+    return truck_trailer(mass=4000.0)
+
+
+# The loaded trailer on the same coupling, noise and channel; the truck follows a random speed profile and starts within
+# 0.2 of rest of the coupling.
+TRUCK_TRAILER_CRUISE = Scenario(
+    plant=loaded_truck_trailer, channel=CASE_STUDY_CHANNEL, task=SpeedTracking(), box=CASE_STUDY_BOX, start=0.2
+)
+
+# Any plant of the user's, behind a perfect channel unless given.
+LINEAR_NCS = Scenario(plant=None, channel=Channel(), task=Regulation())
+
+# One sample per step that is 1 to 2 steps late; 20 % are lost, never more than two in a row: no sample in use is older
+# than 4 steps. Measurements are rounded to 1e-4 of their units.
+CART_POLE_CHANNEL = Channel(loss=0.2, delay=1, jitter=1, max_consecutive_losses=2, quantization_step=1e-4)
+CART_POLE = Scenario(
+    plant=cart_pole,
+    channel=CART_POLE_CHANNEL,
+    task=SetpointTracking(output=np.array([1.0, 0.0, 0.0, 0.0]), reach=2.0, width=2.0, change_probability=0.02),
+    contract=contract_of(CART_POLE_CHANNEL),
+    terminates=True,
+)
+
+# A sample per step, one step late; 20 % are lost, never more than two in a row: none in use is older than 3 steps.
+BATCH_REACTOR_CHANNEL = Channel(loss=0.2, delay=1, max_consecutive_losses=2, quantization_step=1e-3)
+BATCH_REACTOR = Scenario(
+    plant=batch_reactor,
+    channel=BATCH_REACTOR_CHANNEL,
+    task=SetpointTracking(output=np.array([0.0, 1.0, 0.0, 0.0]), reach=1.0, width=1.0, change_probability=0.05),
+    contract=contract_of(BATCH_REACTOR_CHANNEL),
+    terminates=True,
+)
+
+ENTRY_POINTS = {
+    "ncs_gym/TruckTrailer-v0": "TRUCK_TRAILER",
+    "ncs_gym/TruckTrailerCruise-v0": "TRUCK_TRAILER_CRUISE",
+    "ncs_gym/LinearNCS-v0": "LINEAR_NCS",
+    "ncs_gym/CartPole-v0": "CART_POLE",
+    "ncs_gym/BatchReactor-v0": "BATCH_REACTOR",
+}
+
+
+class VectorScenario:
+    """Makes vector environments of a scenario.
+
+    Args:
+        scenario: Gives the settings.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = NCSEnv.metadata | {"render_modes": []}
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+
+    def __call__(
+        self,
+        num_envs: int = 1,
+        max_episode_steps: int | None = None,
+        autoreset_mode: Any = "NextStep",
+        **settings: Any,
+    ) -> NCSVectorEnv:
+        """Returns the vector environment; see `NCSVectorEnv`, and `Scenario.settings` for the rest."""
+        from ncs_gym.envs.vector_env import NCSVectorEnv  # the compiler takes half a second to import
+
+        return NCSVectorEnv(
+            num_envs,
+            max_episode_steps=max_episode_steps,
+            autoreset_mode=autoreset_mode,
+            **self.scenario.settings(**settings),
+        )
+
+
+TRUCK_TRAILER_VECTOR = VectorScenario(TRUCK_TRAILER)
+TRUCK_TRAILER_CRUISE_VECTOR = VectorScenario(TRUCK_TRAILER_CRUISE)
+LINEAR_NCS_VECTOR = VectorScenario(LINEAR_NCS)
+CART_POLE_VECTOR = VectorScenario(CART_POLE)
+BATCH_REACTOR_VECTOR = VectorScenario(BATCH_REACTOR)
+
+
+def register_all() -> None:
+    """Registers the ids with gymnasium; `import ncs_gym` calls it."""
+    for env_id, name in ENTRY_POINTS.items():
+        if env_id not in gym.registry:
+            gym.register(
+                id=env_id,
+                entry_point=f"{__name__}:{name}",
+                vector_entry_point=f"{__name__}:{name}_VECTOR",
+                max_episode_steps=EPISODE_STEPS,
+            )

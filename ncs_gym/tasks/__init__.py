@@ -1,0 +1,1 @@
+"""Tasks: what an agent is rewarded for."""

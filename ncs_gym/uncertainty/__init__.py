@@ -1,0 +1,1 @@
+"""Ellipsoids, sums of them, truncated noise and disturbances: what the guarantees assume about nature."""

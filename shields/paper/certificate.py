@@ -1,0 +1,114 @@
+"""The certificate of the published method, or the reason why there is none."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ncs_gym import LinearPlant
+from shields.certificate import Certificate
+from shields.errors import Infeasible
+from shields.paper.conditions import paper_conditions
+from shields.paper.feasibility import FeasibilityScan, largest_gamma, largest_noise_scale, largest_scale
+from shields.paper.optimization_problem import PaperDesign, codesign
+
+
+def paper_certificate(plant: LinearPlant, *, dkappa: float, drho: float, search: str) -> Certificate:
+    """Returns the certificate of OP and Algorithm 1 (Liu et al. Definition 2), as printed.
+
+    It carries the guarantee of the paper's own definitions, which assumes e'e <= eps; no error set, so a shield made of
+    it is never guaranteed.
+
+    Args:
+        plant: The plant with its bounds.
+        dkappa: Step of kappa, > 0.
+        drho: Step of rho, > 0.
+        search: "first" or "largest".
+
+    Raises:
+        Infeasible: If OP has no solution on the grid that meets (C1)-(C7) exactly.
+        ValueError: If an argument is out of range.
+    """
+    free = plant.n - int(np.linalg.matrix_rank(plant.C))
+    if free:
+        raise Infeasible(f"the safe box leaves {free} of {plant.n} directions unbounded: add rows to C", "S", free)
+    provenance = {"search": search, "dkappa": dkappa, "drho": drho}
+    found: list[Certificate] = []
+
+    def accept(design: PaperDesign) -> bool:
+        certificate = _certificate(plant, design, provenance)
+        if all(condition.holds for condition in paper_conditions(certificate, plant)):
+            found.append(certificate)
+        return bool(found)
+
+    try:
+        codesign(plant, dkappa=dkappa, drho=drho, search=search, accept=accept)
+    except LookupError:
+        raise paper_diagnosis(plant) from None
+    return found[0]
+
+
+def _certificate(plant: LinearPlant, design: PaperDesign, provenance: dict[str, Any]) -> Certificate:
+    return Certificate(
+        L=design.L,
+        K=design.K,
+        method="paper",
+        fingerprint=plant.fingerprint,
+        kappa=design.bounds.kappa,
+        rho=design.bounds.rho,
+        epsilon=design.bounds.epsilon,
+        epsilon_up=design.bounds.epsilon_up,
+        provenance={
+            "source": "Liu et al. Definition 2 and Algorithm 1",
+            **provenance,
+            "alpha": design.bounds.alpha,
+            "guarantee": "the paper's own: invariance if e'e <= epsilon at every step",
+        },
+    )
+
+
+def paper_diagnosis(plant: LinearPlant) -> Infeasible:
+    """Returns the exception that says which constraint binds, how far off it is and what would be feasible."""
+    scan = FeasibilityScan(plant)
+    try:
+        best = scan.best(plant)
+    except LookupError as error:
+        return Infeasible(f"OP is infeasible: {error}", "C1", np.inf)
+    full = scan.full_ratio(plant) if best.ratio >= 1.0 else best.ratio
+    if best.ratio >= 1.0 > full:
+        return Infeasible(
+            f"OP is infeasible, the input limit with the communication error (C4)-(C6) binds: with it the largest "
+            f"lambda_min(L)/alpha found is {full:.3g} (without it {best.ratio:.3g}) and must be at least 1",
+            "C5",
+            1.0 - full,
+        )
+    if full >= 1.0:
+        return Infeasible(
+            f"OP has no solution on this grid, but has one near kappa = {best.kappa:.3f}, rho = {best.rho:.3f}: use "
+            "smaller steps dkappa and drho",
+            "grid",
+            0.0,
+        )
+    gamma, noise, scale = largest_gamma(scan, plant), largest_noise_scale(scan, plant), largest_scale(scan, plant)
+    return Infeasible(
+        f"OP is infeasible, (C2) binds: over the whole domain the largest lambda_min(L)/alpha is {best.ratio:.3g} (at "
+        f"kappa = {best.kappa:.3f}, rho = {best.rho:.3f}) and must be at least 1; it is feasible for "
+        f"{_tolerated(gamma, noise)}, or with gamma, Q and P0 all scaled by {scale:.3g}",
+        "C2",
+        1.0 - best.ratio,
+        {
+            "ratio": best.ratio,
+            "kappa": best.kappa,
+            "rho": best.rho,
+            "largest_gamma": gamma,
+            "largest_noise_scale": noise,
+            "largest_scale": scale,
+        },
+    )
+
+
+def _tolerated(gamma: float, noise: float) -> str:
+    by_gamma = f"gamma up to {gamma:.3g}" if gamma > 0.0 else "no gamma"
+    by_noise = f"Q scaled by up to {noise:.3g}" if noise > 0.0 else "no scale of Q"
+    return f"{by_gamma} alone, {by_noise} alone"

@@ -1,0 +1,188 @@
+"""The shield as a Gymnasium wrapper."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, StickyAction
+
+from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv
+from ncs_gym.envs.env import applied_input, ncs_env
+from ncs_gym.validation import as_number, shown
+from shields.certificate import Certificate
+from shields.runtime.filter import SafetyFilter
+from shields.runtime.guarantee import ProofTracker, starts_inside
+
+# What changes, repeats or swallows actions between the shield and the plant.
+REFUSED = (gym.ActionWrapper, RepeatAction, StickyAction, MaxAndSkipObservation, Autoreset)
+
+# What the clock reads while a step is under way: if it raises, the next one does not follow from what is known.
+INTERRUPTED = (-1, -1)
+
+_synthesized: dict[tuple[str, ChannelContract | None], Certificate] = {}
+
+
+class SafetyShield(gym.Wrapper, RecordConstructorArgs):
+    """Overrides an action whenever the safe set could be left (docs/shield.md).
+
+    The action passes unchanged if every state the estimate allows stays in S; otherwise "project" applies the closest
+    input that keeps it there, "switch" (and "project" where there is none) the certified u = K x_hat. From a start in S
+    the true state then stays in S for ever, for any policy, disturbance and channel within the assumptions;
+    `info["shield_guaranteed"]` says whether they still hold as far as can be seen. "boundary" trusts the agent only
+    where no input at all could leave S. "monitor" never changes the action and counts what "switch" would have done.
+
+    Wrap it directly around what `gym.make` returns; wrappers that change or repeat actions go outside it.
+
+    ## Info (added to the environment's, at reset too)
+    | key | meaning |
+    |---|---|
+    | `shield_intervened` | whether the action was overridden; in mode "monitor" whether "switch" would have |
+    | `input_proposed` | the agent's input, shape (m,) [physical units]; zeros at reset |
+    | `shield_correction` | Euclidean norm of input - input_proposed |
+    | `shield_margin` | 1 - h - norm(A x_hat + B u)_M for the input applied (`Decision.margin`); at reset for u = 0 |
+    | `shield_guaranteed` | whether x in S is proved now |
+    | `shield_reason` | why not; empty while guaranteed |
+    | `episode_interventions` | running number in this episode |
+
+    Args:
+        env: An `NCSEnv`, possibly wrapped.
+        certificate: None synthesizes one for the environment's plant and contract, once per process.
+        mode: "project", "switch", "boundary" or "monitor"; see `SafetyFilter`.
+        penalty: Subtracted from the reward per intervention counted, >= 0.
+
+    Raises:
+        CertificateError: If the certificate does not verify for the environment's plant.
+        Infeasible: If none is given and none is found.
+        ValueError: If the environment is not an `NCSEnv`, an inner wrapper changes or repeats actions, or a setting
+            is wrong.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        certificate: Certificate | None = None,
+        mode: str = "project",
+        penalty: float = 0.0,
+    ) -> None:
+        RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty)
+        plant = _plant_behind(env)
+        gym.Wrapper.__init__(self, env)
+        self.penalty = as_number(penalty, "penalty", low=0.0)
+        if certificate is not None and not isinstance(certificate, Certificate):
+            raise ValueError(f"certificate must be a Certificate or None, got {shown(certificate)}")
+        contract = ncs_env(env).contract
+        self.certificate = certificate_for(plant, contract) if certificate is None else certificate
+        self.filter = SafetyFilter(self.certificate, plant, mode)
+        self._proof = ProofTracker(self.filter)
+        self._clock: tuple[int, int] | None = None
+        self._is_drawn = env.unwrapped.render_mode is not None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Starts an episode; see `NCSEnv.reset`."""
+        before, self._clock = self._clock, self._clock and INTERRUPTED
+        if self._is_drawn:
+            self._annotate(None, 0, intervened=False)
+        try:
+            observation, info = self.env.reset(seed=seed, options=options)
+        except ValueError:
+            if self._read_clock() == before:  # refused before anything moved
+                self._clock = before
+            raise
+        clock = self._read_clock()
+        self._proof.start(starts_inside(self.certificate, ncs_env(self.env).start), clock[1] == 0, info)
+        self._estimate, self._error_shape = np.array(info["estimate"]), np.array(info["error_shape"])
+        self._interventions = 0
+        u = np.zeros(self.filter.plant.m)
+        margin = self.filter.margin(self._estimate, self._error_shape, u)
+        self._clock = clock
+        return observation, info | self._info(u, u, margin, intervened=False)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Applies the action, or what the shield puts in its place.
+
+        Raises:
+            ValueError: If the action is not finite or wrongly shaped; nothing has moved then.
+            gymnasium.error.ResetNeeded: If there was no reset.
+        """
+        if self._clock is None:
+            raise gym.error.ResetNeeded("call reset before the first step")
+        proposed = applied_input(self.filter.plant, action)
+        decision = self.filter.decide(self._estimate, self._error_shape, proposed)
+        if decision.intervened and self.filter.mode != "monitor":
+            action = (decision.input / self.filter.plant.u_max).astype(np.float32)
+        if self._is_drawn:
+            self._annotate(proposed, self._interventions + decision.intervened, intervened=decision.intervened)
+        (episode, step), self._clock = self._clock, INTERRUPTED
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        clock = self._read_clock()
+        self._proof.step(decision, clock == (episode, step + 1), info)
+        self._estimate, self._error_shape = np.array(info["estimate"]), np.array(info["error_shape"])
+        self._interventions += decision.intervened
+        self._clock = clock
+        info = info | self._info(proposed, decision.input, decision.margin, intervened=decision.intervened)
+        return observation, float(reward) - self.penalty * decision.intervened, terminated, truncated, info
+
+    def _read_clock(self) -> tuple[int, int]:
+        """Returns the number of episodes begun and of steps taken in this one."""
+        inner = ncs_env(self.env)
+        return inner.episodes, inner.steps
+
+    def _annotate(self, proposed: np.ndarray | None, interventions: int, *, intervened: bool) -> None:
+        """Tells the picture of the step that follows what the shield does in it."""
+        note = Annotation(
+            safe_set=self.certificate.safe_set,
+            label=self.filter.mode,
+            proposed=proposed,
+            intervened=intervened,
+            interventions=interventions,
+            protects=self.filter.mode != "monitor",
+        )
+        ncs_env(self.env).annotate(note)
+
+    def _info(self, proposed: np.ndarray, applied: np.ndarray, margin: float, *, intervened: bool) -> dict[str, Any]:
+        reason = self._proof.reason
+        return {
+            "shield_intervened": intervened,
+            "input_proposed": proposed.copy(),
+            "shield_correction": float(np.linalg.norm(applied - proposed)),
+            "shield_margin": margin,
+            "shield_guaranteed": not reason,
+            "shield_reason": reason,
+            "episode_interventions": self._interventions,
+        }
+
+
+def certificate_for(plant: LinearPlant, contract: ChannelContract | None = None) -> Certificate:
+    """Returns a synthesized certificate, made once per process, plant and channel contract.
+
+    Raises:
+        Infeasible: If none is found.
+    """
+    key = plant.fingerprint, contract
+    if key not in _synthesized:
+        from shields.synthesis.synthesize import (
+            synthesize,  # takes the solver, which who has a certificate does without
+        )
+
+        _synthesized[key] = synthesize(plant, contract=contract)
+    return _synthesized[key]
+
+
+def _plant_behind(env: gym.Env) -> LinearPlant:
+    """Returns the plant of the innermost environment after looking at every wrapper around it."""
+    layer = env
+    while isinstance(layer, gym.Wrapper):
+        if isinstance(layer, (*REFUSED, SafetyShield)):
+            raise ValueError(
+                f"the shield must be inside {type(layer).__name__}, which changes or repeats actions: wrap the shield "
+                "around the environment first"
+            )
+        layer = layer.env
+    if not isinstance(layer, NCSEnv):
+        raise ValueError(f"the shield needs an NCSEnv inside, got {type(layer).__name__}")
+    if env.action_space != layer.action_space:
+        raise ValueError(f"a wrapper inside the shield changes the action space to {env.action_space}")
+    return layer.plant

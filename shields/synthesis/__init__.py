@@ -1,0 +1,1 @@
+"""Offline synthesis of a safe set and its gain by semidefinite programming."""

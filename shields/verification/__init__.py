@@ -1,0 +1,1 @@
+"""Exact verification of certificates in rational arithmetic: no solver, no tolerance."""

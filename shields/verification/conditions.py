@@ -1,0 +1,53 @@
+"""One exactly checked condition of a certificate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+
+from shields.verification.rational_matrix import Matrix, is_positive_semidefinite, to_float
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One checked condition.
+
+    Attributes:
+        name: Its name in theory.md section 3, and what it says.
+        margin: Signed and rounded to float: the smallest eigenvalue of a matrix inequality or the slack of a
+            scalar one; at least 0 exactly if it holds.
+        holds: Decided in exact arithmetic.
+    """
+
+    name: str
+    margin: float
+    holds: bool
+
+
+def flag(name: str, holds: bool) -> Condition:
+    """Returns a yes-or-no condition."""
+    return Condition(name, 0.0 if holds else -1.0, holds)
+
+
+def scalar(name: str, slack: Fraction) -> Condition:
+    """Returns the condition slack >= 0."""
+    try:
+        margin = float(slack)
+    except OverflowError:
+        margin = np.inf if slack >= 0 else -np.inf
+    # A negative slack may be too small for a float.
+    return Condition(name, margin if slack >= 0 else min(margin, -5e-324), slack >= 0)
+
+
+def matrix_condition(name: str, matrix: Matrix, *, strict: bool = False) -> Condition:
+    """Returns the condition that a symmetric matrix is positive semidefinite (definite if `strict`)."""
+    holds = is_positive_semidefinite(matrix, strict=strict)
+    try:
+        smallest = float(np.linalg.eigvalsh(to_float(matrix))[0])
+    except OverflowError:  # exact, but beyond any float
+        smallest = np.inf if holds else -np.inf
+    # Rounding may give the float the wrong sign; the exact verdict rules.
+    margin = max(smallest, 0.0) if holds else min(smallest, -5e-324)
+    return Condition(name, margin, holds)
