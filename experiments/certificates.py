@@ -9,7 +9,7 @@ import gymnasium as gym
 from tqdm import tqdm
 
 from experiments.proof_settings import SynthesizeSettings, VerifySettings
-from ncs_gym import ChannelContract, LinearPlant, scenarios
+from ncs_gym import ChannelContract, LinearPlant, registration
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.registration import ENTRY_POINTS
 from shields import Certificate, CertificateError, Report, synthesize, verify
@@ -77,7 +77,7 @@ def contract_of_env(env_id: str) -> ChannelContract | None:
 
 
 def _with_plant() -> list[str]:
-    return [env_id for env_id, name in ENTRY_POINTS.items() if getattr(scenarios, name).plant is not None]
+    return [env_id for env_id, name in ENTRY_POINTS.items() if getattr(registration, name).plant is not None]
 
 
 def _matching_env(certificate: Certificate) -> str:
