@@ -6,7 +6,8 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from ncs_gym import Ellipsoid, truck_trailer
-from shields import SafetyFilter, one_step, synthesize
+from shields import SafetyFilter, synthesize
+from shields.runtime import one_step_test as one_step
 from shields.runtime.one_step_test import OneStepTest
 from shields.runtime.plane import PlaneOutlook
 from tests.plants import random_plant

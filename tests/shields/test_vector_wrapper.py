@@ -5,7 +5,9 @@ from gymnasium.vector import VectorActionWrapper, VectorObservationWrapper, Vect
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 
 from ncs_gym import Channel, ChannelContract, LinearPlant, NCSVectorEnv, SphereDisturbance, batch_reactor, truck_trailer
-from shields import CertificateError, SafetyFilter, SafetyShield, VectorSafetyShield, proof, routine, vector_wrapper
+from shields import CertificateError, SafetyFilter, SafetyShield, VectorSafetyShield
+from shields.runtime import guarantee as proof
+from shields.runtime import routine, vector_wrapper
 from shields.runtime.filter import MARGIN, MODES, Decision
 from shields.runtime.guarantee import ProofTracker, starts_inside
 from shields.runtime.tracking import Knowledge, compare_clocks, track
