@@ -36,8 +36,8 @@ class WorstCaseVectorEnv(NCSVectorEnv):
         """Starts episodes on the boundary of S, with first estimates on the boundary of their errors' set."""
         super()._begin(mask, starts)
         chosen, rng = np.flatnonzero(mask), self.np_random
-        states = self.single.initial_set.sample_boundary_many(rng, len(chosen))
-        errors = self.plant.initial_noise.bound.sample_boundary_many(rng, len(chosen))
+        states = self.single.initial_set.sample_boundary(rng, len(chosen))
+        errors = self.plant.initial_noise.bound.sample_boundary(rng, len(chosen))
         self._fleet.state[:, chosen] = (1.0 - 1e-9) * states.T
         self._fleet.mean[:, chosen] = self._fleet.state[:, chosen] + INWARD * errors.T
 

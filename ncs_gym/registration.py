@@ -4,23 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 
 from ncs_gym.envs.env import NCSEnv
+from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.truck_trailer import truck_trailer
 from ncs_gym.plants.unstable import batch_reactor, cart_pole
-from ncs_gym.tasks.task import Regulation, SetpointTracking, SpeedTracking, Task
-from ncs_gym.uncertainty.disturbance import BoxDisturbance
+from ncs_gym.tasks.regulation import Regulation
+from ncs_gym.tasks.setpoint_tracking import SetpointTracking
+from ncs_gym.tasks.speed_tracking import SpeedTracking
+from ncs_gym.tasks.task import Task
+from ncs_gym.uncertainty.bounded_disturbances import BoxDisturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-
-if TYPE_CHECKING:
-    from ncs_gym.envs.vector_env import NCSVectorEnv
 
 # Steps per episode of every registered environment (Liu et al. Section 5).
 EPISODE_STEPS = 200
@@ -175,8 +176,6 @@ class VectorScenario:
         **settings: Any,
     ) -> NCSVectorEnv:
         """Returns the vector environment; see `NCSVectorEnv`, and `Scenario.settings` for the rest."""
-        from ncs_gym.envs.vector_env import NCSVectorEnv  # the compiler takes half a second to import
-
         return NCSVectorEnv(
             num_envs,
             max_episode_steps=max_episode_steps,

@@ -213,19 +213,3 @@ def as_count(value: Any, name: str, *, low: int, high: int = MOST) -> int:
     if value > high:
         raise ValueError(f"{name} must be a whole number <= {high}, got {shown(value)}")
     return int(value)
-
-
-def forget_batches(kind: type, base: type, pairs: dict[str, str]) -> None:
-    """Gives a subclass the base's one-by-one batch methods if it overrides a scalar method without its batch.
-
-    All of them, because the layouts of memories belong together.
-
-    Args:
-        kind: The subclass.
-        base: Whose batch methods call the scalar ones.
-        pairs: Name of the batch method of each scalar method.
-    """
-    own = vars(kind)
-    if any(scalar in own and batch not in own for scalar, batch in pairs.items()):
-        for batch in pairs.values():
-            setattr(kind, batch, getattr(base, batch))

@@ -8,29 +8,31 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
-from ncs_gym.estimation.error_bound import UnstablePlantError, certified_error_set
+from ncs_gym.envs.info import loop_info
+from ncs_gym.envs.reset_options import start_option
+from ncs_gym.envs.spaces import applied_input, default_initial_set, observation_space
+from ncs_gym.estimation.arrival_patterns import arrival_patterns
+from ncs_gym.estimation.error_bound import UnstablePlantError
 from ncs_gym.estimation.estimator import Estimator
-from ncs_gym.network.channel import Channel, Link
+from ncs_gym.network.channel import Channel
+from ncs_gym.network.channel_state import ChannelState
 from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.plants.process import LinearProcess
 from ncs_gym.rendering import Annotation, Film, Scene, scene_of
-from ncs_gym.tasks.task import Regulation, SpeedProfile, Task
-from ncs_gym.uncertainty.disturbance import as_disturbance, checked, stays_inside
+from ncs_gym.tasks.regulation import Regulation
+from ncs_gym.tasks.speed_tracking import SpeedTracking
+from ncs_gym.tasks.task import Task
+from ncs_gym.uncertainty.disturbance_settings import as_disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import as_count, as_flag, as_numbers, as_vector, read_only, shown
+from ncs_gym.validation import as_count, as_flag, read_only, shown
 
 T = TypeVar("T")
 
-# The default start covers this share of the half-width of the safe box in every direction.
-START_SHARE = 0.1
 # Keeps the rounding of a sampled start inside the initial set.
 SAMPLE_ROUNDING = 1e-9
-# Observations of an unstable plant end this many half-widths of the box out: what lies beyond is lost anyway.
-FARTHEST_OBSERVED = 1e6
 # The steps the observation space is sized for are gone through one by one.
 LONGEST_HORIZON = 100_000
-# Widens the observation box: float32 rounding, and estimates a little off the reachable set.
-OBSERVATION_MARGIN = 1.01
 RENDER_MODES = ["human", "rgb_array"]
 RENDER_FPS = 30
 
@@ -55,9 +57,9 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     | rest | the task's own, perfectly known entries | those of the task |
 
     ## Step
-    x+ = A x + B u + d (where an unstable plant runs away, up to `plant.farthest`). The sensor measures y = H x+ + v;
-    the channel quantizes, rations, loses and delays it;
-    the estimator predicts with the input really applied and takes in what arrived (`theory.md` section 1).
+    x+ = A x + B u + d (where an unstable plant runs away, up to `plant.state_limit`). The sensor measures y = H x+ + v;
+    the channel quantizes it, sends it every few steps, loses and delays it; the estimator predicts with the input that
+    was really applied and takes in what arrived (`theory.md` section 1).
 
     ## Rewards
     The task's; see `Regulation` and `SpeedTracking`.
@@ -144,12 +146,14 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self.render_mode = render_mode
         self._film = None if render_mode is None else Film(plant, "ncs-gym", RENDER_FPS)
         self.contract = _contract(plant, self.channel, contract)
-        self.error_set = certified_error_set(plant, self.contract)
-        self.estimator = Estimator(plant, self.channel, self.error_set)
+        patterns = arrival_patterns(plant, self.channel, self.contract)
+        self.error_set = patterns.recursion.error_set
+        self.estimator = Estimator(plant, self.channel, patterns=patterns)
+        self._process = LinearProcess(plant, self.disturbance, self.allow_assumption_violation)
         self.horizon = as_count(horizon, "horizon", low=1, high=LONGEST_HORIZON)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)
-        bound = _as_float32(observation_bound(self))
-        self.observation_space = Box(-bound, bound, dtype=np.float32)
+        self.observation_space = observation_space(plant, self.task, self.error_set, self.initial_set, self.horizon)
+        self._low, self._high = self.observation_space.low, self.observation_space.high
         self.steps = self.episodes = 0
         self.start: Ellipsoid | np.ndarray = self.initial_set
         self._consistent = False
@@ -166,21 +170,23 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         Raises:
             ValueError: If an option is unknown or x0 has a wrong shape or is not finite.
         """
-        start = _start_option(options, self.plant.n)
+        start = start_option(options, self.plant.n)
         super().reset(seed=seed)
         self._consistent = False
+        if seed is not None:
+            self._process.forget()
         rng = self.np_random
         self.start = self.initial_set if start is None else read_only(start)
         self._state = (1.0 - SAMPLE_ROUNDING) * self.initial_set.sample(rng) if start is None else start
-        self._task_memory = self.task.begin(rng, self.plant)
-        self._disturbance_memory = self.disturbance.begin(rng, self.plant)
-        self._link = Link(self.channel, rng)
+        self._task_state = self.task.begin(rng, self.plant)
+        self._disturbance_memory = self._process.begin(rng)
+        self._channel_state = ChannelState(self.channel, rng)
         self.estimator.reset(self._state + self.plant.initial_noise.sample(rng))
         self.steps = 0
         self.episodes += 1
         self._violations = 0.0
         self._consistent = True
-        info = self._info(np.zeros(self.plant.m), packet_arrived=False)
+        info = self._info(np.zeros(self.plant.m), arrived=False)
         if self._film is not None:
             self._film.history.begin(self._state)
             self._show()
@@ -198,23 +204,22 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             raise gym.error.ResetNeeded("call reset: there was none, or an earlier step failed half-way")
         self._consistent = False
         rng = self.np_random
-        nominal_next = self.plant.A @ self._state + self.plant.B @ u
-        moved, farthest = nominal_next + self._draw_disturbance(nominal_next), self.plant.farthest
-        self._state = np.clip(moved, -farthest, farthest)
-        self._task_memory = self.task.advance(rng, self.plant, self._task_memory, u)
+        self._state = self._process.advance(rng, self._state, u, self.steps, self._disturbance_memory)
+        self._task_state = self.task.advance(rng, self.plant, self._task_state, u)
         self.steps += 1
-        sample = self._measure() if self._link.sends_at(self.steps) else None
-        packets = self._link.exchange(rng, self.steps, sample)
+        sends = self._channel_state.sends_at(self.steps)
+        sample = self._process.measure(rng, self._state) if sends else None
+        packets = self._channel_state.exchange(rng, self.steps, sample)
         self.estimator.advance(u, packets)
-        reward = self.task.reward(self.plant, self._task_memory, self._state, u)
-        info = self._info(u, packet_arrived=bool(packets))
+        reward = float(self.task.reward(self.plant, self._task_state, self._state, u))
+        info = self._info(u, arrived=bool(packets))
         terminated = self.terminate_on_violation and info["cost"] > 0.0
         self._consistent = True
         if self._film is not None:
-            speed = self._task_memory.speed if isinstance(self._task_memory, SpeedProfile) else 0.0
-            self._film.history.add(self._state, u, self._link, packets, self.plant.dt * speed)
+            speed = self._task_state[0] if isinstance(self.task, SpeedTracking) else 0.0
+            self._film.history.add(self._state, u, self._channel_state, packets, self.plant.dt * speed)
             self._show()
-        return self._observation(), float(reward), terminated, False, info
+        return self._observation(), reward, terminated, False, info
 
     def render(self) -> np.ndarray | None:
         """Returns an image, shape (height, width, 3), uint8; None in mode "human", which shows every step by itself.
@@ -247,101 +252,19 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             self._film.show(self._scene(self._film))
 
     def _scene(self, film: Film) -> Scene:
-        memory, violations = self._task_memory, int(self._violations)
-        return scene_of(self.plant, self.task, memory, self.estimator, film.history, violations)
-
-    def _draw_disturbance(self, nominal_next: np.ndarray) -> np.ndarray:
-        rng, source = self.np_random, self.disturbance
-        d = source.draw(rng, self.plant, nominal_next, self.steps, self._disturbance_memory)
-        if not source.replaces_process_noise:
-            d = d + self.plant.process_noise.sample(rng)
-        if stays_inside(source):
-            return d
-        return checked(self.plant, d, allow_assumption_violation=self.allow_assumption_violation)
-
-    def _measure(self) -> np.ndarray:
-        return self.plant.H @ self._state + self.plant.sensor_noise.sample(self.np_random)
+        return scene_of(self.plant, self.task, self._task_state, self.estimator, film.history, int(self._violations))
 
     def _observation(self) -> np.ndarray:
-        entries = np.concatenate([self.estimator.belief.mean, self.task.observe(self._task_memory)])
-        space = self.observation_space
-        return np.clip(entries, space.low, space.high).astype(np.float32)
+        entries = np.concatenate([self.estimator.mean, self.task.observe(self._task_state)])
+        return np.minimum(np.maximum(entries, self._low), self._high).astype(np.float32)
 
-    def _info(self, u: np.ndarray, *, packet_arrived: bool) -> dict[str, Any]:
-        belief = self.estimator.belief
+    def _info(self, u: np.ndarray, *, arrived: bool) -> dict[str, Any]:
         values = self.plant.constraint_values(self._state)
-        cost = float(values.max() > 0.0)
+        cost = 1.0 if max(values.tolist()) > 0.0 else 0.0
         self._violations += cost
-        return {
-            "state": self._state.copy(),
-            "estimate": belief.mean.copy(),
-            "estimation_error": belief.mean - self._state,
-            "error_shape": belief.shape.copy(),
-            "input": u.copy(),
-            "constraint_values": values,
-            "cost": cost,
-            "measurement_age": self.estimator.age,
-            "packet_arrived": packet_arrived,
-            "assumption_violated": self.estimator.alarm,
-            "episode_violations": self._violations,
-            "is_success": float(self._violations == 0.0),
-            "contract_broken": self.contract is not None and self.estimator.age > self.contract.max_age,
-        }
-
-
-def applied_input(plant: LinearPlant, action: Any) -> np.ndarray:
-    """Returns the float64 input u = u_max * clip(action, -1, 1), shape (m,), that an action stands for.
-
-    Raises:
-        ValueError: If the action is not finite or does not have shape (m,).
-    """
-    normalized = as_numbers(action)
-    if normalized is None or normalized.shape != (plant.m,) or not np.isfinite(normalized).all():
-        raise ValueError(f"the action must be finite with shape ({plant.m},), got {shown(action)}")
-    return plant.u_max * np.clip(normalized, -1.0, 1.0)
-
-
-def default_initial_set(plant: LinearPlant) -> Ellipsoid:
-    """Returns the starts {x : |C x|^2 <= 0.1^2}, well inside the safe box; W bounds directions C leaves free."""
-    return Ellipsoid(START_SHARE**2 * np.linalg.inv(plant.weight))
-
-
-def observation_bound(env: NCSEnv) -> np.ndarray:
-    """Returns the largest absolute value of each observation entry, shape (n + extra,).
-
-    The reach of x_hat is that of x from the initial set under every input and disturbance within the horizon,
-    plus the certified error.
-    """
-    plant = env.plant
-    reach = np.zeros(plant.n)
-    power = np.eye(plant.n)
-    largest = env.initial_set.support(power)
-    for _ in range(env.horizon):
-        reach += np.abs(power @ plant.B) @ plant.u_max + plant.disturbance.support(power)
-        power = power @ plant.A
-        largest = np.maximum(largest, reach + env.initial_set.support(power))
-    ages = env.error_set.ages
-    shapes = env.error_set.Sigma[None] if ages is None else ages.shapes
-    estimate = largest + np.sqrt(np.diagonal(shapes, axis1=1, axis2=2).max(axis=0))
-    estimate = np.minimum(
-        estimate, np.maximum(FARTHEST_OBSERVED * plant.half_widths, env.initial_set.support(np.eye(plant.n)))
-    )
-    bound = np.concatenate([estimate, env.task.observation_bound(plant, env.horizon)])
-    return OBSERVATION_MARGIN * bound
-
-
-def _as_float32(bound: np.ndarray) -> np.ndarray:
-    """Returns the bounds of observations in single precision.
-
-    Raises:
-        ValueError: If one is beyond its range, so that observations would be infinite, or always zero.
-    """
-    numbers = np.finfo(np.float32)
-    if not ((bound >= numbers.tiny) & (bound <= numbers.max)).all():
-        raise ValueError(
-            f"observations of up to {shown(bound.tolist())} are out of float32's range: choose other units"
-        )
-    return bound.astype(np.float32)
+        constraints = values, cost, self._violations
+        shape = self.estimator.shape.copy()
+        return loop_info(self.estimator, self.contract, self._state, u, shape, arrived, constraints)
 
 
 def _contract(plant: LinearPlant, channel: Channel, contract: ChannelContract | None) -> ChannelContract | None:
@@ -363,27 +286,6 @@ def _contract(plant: LinearPlant, channel: Channel, contract: ChannelContract | 
             f"the channel rounds to {channel.quantization_step}, the contract allows {contract.quantization_step}"
         )
     return contract
-
-
-def _start_option(options: dict[str, Any] | None, n: int) -> np.ndarray | None:
-    """Returns options["state"] as a finite array of shape (n,), or None without one."""
-    options = known_options(options, {"state"})
-    if "state" not in options:
-        return None
-    return as_vector(options["state"], n, "options['state']")
-
-
-def known_options(options: Any, known: set[str]) -> dict[str, Any]:
-    """Returns the options of a reset; an empty dict for None.
-
-    Raises:
-        ValueError: If they are no dict, or have other keys.
-    """
-    if options is not None and not isinstance(options, dict):
-        raise ValueError(f"the options of reset must be a dict, got {shown(options)}")
-    if unknown := [key for key in options or {} if key not in known]:
-        raise ValueError(f"reset knows the options {sorted(known)} only, got {shown(unknown)}")
-    return options or {}
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:

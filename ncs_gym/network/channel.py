@@ -1,4 +1,4 @@
-"""The network between sensor and controller: loss, rationing, rounding and delay."""
+"""The settings of a network between sensor and controller: loss, transmission period, quantization and delay."""
 
 from __future__ import annotations
 
@@ -102,56 +102,6 @@ class Channel:
         return self.delay + self.jitter
 
     def quantize(self, measurement: np.ndarray) -> np.ndarray:
-        """Returns the measurement rounded to multiples of the quantization step."""
+        """Returns the measurement, of any shape, rounded to multiples of the quantization step."""
         q = self.quantization_step
-        return np.round(measurement / q) * q if q > 0.0 else measurement
-
-
-class Link:
-    """One channel during one episode: the loss process and the packets in flight.
-
-    Args:
-        channel: The settings.
-        rng: Draws the first state of a Gilbert-Elliott chain from its stationary distribution.
-    """
-
-    def __init__(self, channel: Channel, rng: np.random.Generator) -> None:
-        self.channel = channel
-        self._in_flight: dict[int, list[Packet]] = {}
-        self._lost_in_a_row = 0
-        self._bad = isinstance(channel.loss, GilbertElliott) and rng.random() < channel.loss.stationary_bad
-
-    @property
-    def in_flight(self) -> dict[int, list[Packet]]:
-        """The packets on their way, by the step they arrive at."""
-        return self._in_flight
-
-    def sends_at(self, step: int) -> bool:
-        """Returns whether the sensor sends at this step."""
-        return step % self.channel.send_period == 0
-
-    def exchange(self, rng: np.random.Generator, step: int, measurement: np.ndarray | None) -> list[Packet]:
-        """Puts a sample on the channel and takes off what arrives.
-
-        Args:
-            rng: Source of randomness; how much is drawn does not depend on the measurement.
-            step: The current step.
-            measurement: y, shape (p,), to be quantized, stamped and sent; None where `sends_at` is False.
-
-        Returns:
-            The packets that arrive at this step, in the order they were sent.
-        """
-        loss = self.channel.loss
-        if isinstance(loss, GilbertElliott):
-            flip = rng.random() < (loss.p_bad_to_good if self._bad else loss.p_good_to_bad)
-            self._bad = self._bad != flip
-            loss = loss.loss_bad if self._bad else loss.loss_good
-        if measurement is not None:
-            most = self.channel.max_consecutive_losses
-            lost = rng.random() < loss and (most is None or self._lost_in_a_row < most)
-            self._lost_in_a_row = self._lost_in_a_row + 1 if lost else 0
-            extra = int(rng.integers(self.channel.jitter + 1)) if self.channel.jitter else 0
-            if not lost:
-                packet = Packet(step, self.channel.quantize(measurement))
-                self._in_flight.setdefault(step + self.channel.delay + extra, []).append(packet)
-        return self._in_flight.pop(step, [])
+        return np.rint(measurement / q) * q if q > 0.0 else measurement

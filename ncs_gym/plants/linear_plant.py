@@ -177,7 +177,7 @@ class LinearPlant(FrozenArrays):
         return read_only(np.sqrt(np.diag(np.linalg.inv(self.weight))))
 
     @cached_property
-    def farthest(self) -> np.ndarray:
+    def state_limit(self) -> np.ndarray:
         """Where a simulation stops a state that runs away, shape (n,); infinite for a stable plant."""
         return read_only(FARTHEST * self.half_widths if self.spectral_radius >= 1.0 else np.full(self.n, np.inf))
 
@@ -264,8 +264,8 @@ class LinearPlant(FrozenArrays):
         return digest.hexdigest()
 
     def constraint_values(self, state: np.ndarray) -> np.ndarray:
-        """Returns |c_j x| - 1 for each row of the safe box, shape (k,); positive means violated."""
-        return np.abs(self.C @ state) - 1.0
+        """Returns |c_j x| - 1 for each row of the safe box, shape (k,) or (k, N); positive is violated."""
+        return np.abs(self.C.dot(state)) - 1.0
 
 
 def _as_limits(value: Any, size: int) -> np.ndarray:

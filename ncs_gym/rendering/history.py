@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ncs_gym.network.channel import Link, Packet
+from ncs_gym.network.channel import Packet
+from ncs_gym.network.channel_state import ChannelState
 from ncs_gym.rendering.annotation import Annotation
 
 # Steps of the path and of the packet strip that are kept.
@@ -52,7 +53,7 @@ class History:
         """Takes what is to be shown with the next step or reset."""
         self._pending = annotation
 
-    def add(self, state: np.ndarray, u: np.ndarray, link: Link, packets: list[Packet], driven: float) -> None:
+    def add(self, state: np.ndarray, u: np.ndarray, link: ChannelState, packets: list[Packet], driven: float) -> None:
         """Takes in a step.
 
         Args:
@@ -72,7 +73,7 @@ class History:
             self.flights.append(Flight(self.step, _arrival(self.step, link, packets)))
 
 
-def _arrival(stamp: int, link: Link, packets: list[Packet]) -> int | None:
+def _arrival(stamp: int, link: ChannelState, packets: list[Packet]) -> int | None:
     """Returns when the packet sent at this very step arrives; None if it was lost."""
     if any(packet.stamp == stamp for packet in packets):
         return stamp

@@ -11,7 +11,9 @@ from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.rendering.annotation import Annotation
 from ncs_gym.rendering.history import Flight, History
-from ncs_gym.tasks.task import SetpointTracking, SpeedTracking, Task
+from ncs_gym.tasks.setpoint_tracking import SetpointTracking
+from ncs_gym.tasks.speed_tracking import SpeedTracking
+from ncs_gym.tasks.task import Task
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +108,9 @@ def scene_of(
 def goal_of(task: Task, plant: LinearPlant, memory: Any, state: np.ndarray) -> Goal | None:
     """Returns what the task wants of one quantity; None for tasks that are not about one."""
     if isinstance(task, SpeedTracking):
-        return Goal(name="speed", unit="m/s", value=memory.speed, target=memory.target, low=0.0, high=task.fastest)
+        return Goal(
+            name="speed", unit="m/s", value=float(memory[0]), target=float(memory[1]), low=0.0, high=task.fastest
+        )
     if isinstance(task, SetpointTracking):
         used, name, unit = np.flatnonzero(task.output), "output", ""
         if len(used) == 1:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.optimize import brentq, minimize_scalar
+from scipy.optimize import minimize_scalar
 
 from ncs_gym.validation import FrozenArrays, as_covariance, read_only
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 # Directions whose variance is below this share of the largest count as flat: about 100 float64 roundings.
 FLAT = 2e-14
@@ -16,6 +20,11 @@ FLAT = 2e-14
 OFF_FLAT = 1e-12
 # The share of a term in an outer sum stays this far from 0 and 1, so that no division overflows.
 SMALLEST_SHARE = 1e-9
+# Newton's method for farthest points converges in about five steps, near the hard case in at most 25 of those tried;
+# a step below this fraction of nu is rounding.
+NEWTON_STEPS, NEWTON_PRECISION = 40, 1e-15
+# A farthest point whose squared length lacks more than this is in the hard case.
+HARD_CASE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,47 +79,34 @@ class Ellipsoid(FrozenArrays):
         height = np.sqrt(max(float(direction @ image), 0.0))
         return image / height if height > 0.0 else np.zeros(self.dim)
 
-    def gauge(self, point: np.ndarray) -> float:
-        """Returns sqrt(z' P^-1 z): 0 at the center, 1 on the boundary, inf off a flat ellipsoid."""
-        scale, values, vectors = self._principal_axes
-        point = np.asarray(point, dtype=np.float64)
-        if np.any(point[scale == 0.0] != 0.0):
-            return float("inf")
-        coordinates = vectors.T @ (point / np.where(scale > 0.0, scale, 1.0))
-        flat = values == 0.0
-        if np.any(np.abs(coordinates[flat]) > OFF_FLAT):
-            return float("inf")
-        return float(np.sqrt((coordinates[~flat] ** 2 / values[~flat]).sum()))
+    def gauge(self, points: ArrayLike) -> Any:
+        """Returns sqrt(z' P^-1 z): 0 at the center, 1 on the boundary, infinite off a flat ellipsoid.
 
-    def gauges(self, points: np.ndarray) -> np.ndarray:
-        """Returns the gauge of each row of points (count, n), shape (count,)."""
+        Args:
+            points: z, shape (n,), which gives a float, or (count, n), which gives shape (count,).
+        """
         scale, values, vectors = self._principal_axes
+        points = np.asarray(points, dtype=np.float64)
         coordinates = (points / np.where(scale > 0.0, scale, 1.0)) @ vectors
         flat = values == 0.0
-        off = (np.abs(coordinates[:, flat]) > OFF_FLAT).any(axis=1) | (points[:, scale == 0.0] != 0.0).any(axis=1)
-        return np.where(off, np.inf, np.sqrt((coordinates[:, ~flat] ** 2 / values[~flat]).sum(axis=1)))
+        off = (np.abs(coordinates[..., flat]) > OFF_FLAT).any(axis=-1)
+        off |= (points[..., scale == 0.0] != 0.0).any(axis=-1)
+        gauges = np.where(off, np.inf, np.sqrt((coordinates[..., ~flat] ** 2 / values[~flat]).sum(axis=-1)))
+        return float(gauges) if gauges.ndim == 0 else gauges
 
     def contains(self, point: np.ndarray) -> bool:
         """Returns whether a point, shape (n,), lies inside or on the boundary (in float64, no tolerance)."""
         return self.gauge(point) <= 1.0
 
-    def sample(self, rng: np.random.Generator) -> np.ndarray:
-        """Returns a uniformly distributed point, shape (n,)."""
-        return self.sample_boundary(rng) * rng.random() ** (1.0 / self.dim)
+    def sample(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
+        """Returns a uniformly distributed point, shape (n,), or `count` of them, shape (count, n)."""
+        radius = rng.random(None if count is None else (count, 1)) ** (1.0 / self.dim)
+        return self.sample_boundary(rng, count) * radius
 
-    def sample_many(self, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Returns uniformly distributed points, shape (count, n)."""
-        return self.sample_boundary_many(rng, count) * rng.random((count, 1)) ** (1.0 / self.dim)
-
-    def sample_boundary_many(self, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Returns boundary points as `sample_boundary` does, shape (count, n)."""
-        directions = rng.standard_normal((count, self.dim))
-        return (directions / np.linalg.norm(directions, axis=1, keepdims=True)) @ self.factor.T
-
-    def sample_boundary(self, rng: np.random.Generator) -> np.ndarray:
-        """Returns a boundary point, shape (n,): the image of a uniform direction of the unit sphere."""
-        direction = rng.standard_normal(self.dim)
-        return self.factor @ (direction / np.linalg.norm(direction))
+    def sample_boundary(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
+        """Returns boundary points, shape (n,) or (count, n): images of uniform directions of the unit sphere."""
+        directions = rng.standard_normal(self.dim if count is None else (count, self.dim))
+        return (directions / np.linalg.norm(directions, axis=-1, keepdims=True)) @ self.factor.T
 
     def outer_sum(self, other: Ellipsoid) -> Ellipsoid:
         """Returns the trace-smallest ellipsoid of the family P1/nu + P2/(1-nu) around the Minkowski sum."""
@@ -120,48 +116,72 @@ class Ellipsoid(FrozenArrays):
         """Returns whether a point lies in the Minkowski sum of both ellipsoids (see `sum_gauge`)."""
         return sum_gauge(point, self.shape, other.shape) <= 1.0
 
-    def farthest_points(self, centers: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """Returns what `farthest_point` does for each row of centers (count, n), shape (count, n)."""
-        from ncs_gym.roots import fill_farthest  # the compiler takes half a second to import
-
-        factor = self.factor
-        values, vectors = np.linalg.eigh(factor.T @ weight @ factor)
-        outward, points = factor @ vectors, np.empty(centers.shape)
-        inward = np.ascontiguousarray(outward.T @ weight)
-        fill_farthest(np.ascontiguousarray(centers), inward, values, np.ascontiguousarray(outward), points)
-        return points
-
-    def farthest_point(self, center: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    def farthest_point(self, centers: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """Returns z of the ellipsoid that maximizes (center + z)' W (center + z).
 
+        With z = G s and G'WG = V diag(values) V' it solves (nu I - G'WG) s = G'W center, |s| = 1, nu >= max(values):
+        the trust-region problem with its sign turned. Where the center does not pull along the longest axis (the hard
+        case), that axis takes what is missing to length 1.
+
         Args:
-            center: Shape (n,).
+            centers: Shape (n,) or (count, n).
             weight: W, shape (n, n), symmetric positive semidefinite.
 
         Returns:
-            The maximizer, shape (n,): with z = G s it solves (nu I - G'WG) s = G'W center, |s| = 1,
-            nu >= lambda_max (the trust-region problem with its sign turned).
+            The maximizers, of the shape of `centers`.
         """
-        factor = self.factor
-        values, vectors = np.linalg.eigh(factor.T @ weight @ factor)
-        slope = vectors.T @ (factor.T @ (weight @ center))
-        length = float(np.linalg.norm(slope))
-        top = float(values[-1])
-        coordinates = np.zeros(self.dim)
-        if length > 0.0:
-            lowest = top + 1e-12 * max(top, length)
+        values, vectors = np.linalg.eigh(self.factor.T @ weight @ self.factor)
+        axes = self.factor @ vectors
+        slopes = np.einsum("ij,kj->ik", axes.T @ weight, np.atleast_2d(centers))
+        points = np.einsum("ij,jk->ki", axes, _farthest_coordinates(slopes, values))
+        return points[0] if np.ndim(centers) == 1 else points
 
-            def excess(multiplier: float) -> float:
-                return 1.0 - 1.0 / float(np.linalg.norm(slope / (multiplier - values)))
 
-            if excess(lowest) > 0.0:
-                multiplier = brentq(excess, lowest, top + 2.0 * length, xtol=1e-14 * (top + length))
-            else:  # the "hard case": no pull along the longest axis
-                multiplier = lowest
-            coordinates = slope / (multiplier - values)
-        missing = max(1.0 - float(coordinates @ coordinates), 0.0)
-        coordinates[-1] += np.copysign(np.sqrt(missing), coordinates[-1]) if missing > 1e-9 else 0.0
-        return factor @ (vectors @ (coordinates / max(1.0, float(np.linalg.norm(coordinates)))))
+@np.errstate(all="ignore")  # a slope of zero on the longest axis ends in 0/0, centers far away in infinity
+def _farthest_coordinates(slopes: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Returns the s, |s| <= 1, that maximize s' diag(values) s + 2 slope's, in columns, shape (n, count).
+
+    Args:
+        slopes: Shape (n, count).
+        values: Ascending, shape (n,).
+    """
+    coordinates = slopes / (_trust_region_root(slopes, values) - values[:, None])
+    squares = np.square(coordinates).sum(axis=0)
+    coordinates = np.where(np.isfinite(squares), coordinates, 0.0)
+    squares = np.where(np.isfinite(squares), squares, 0.0)
+    last, missing = coordinates[-1], 1.0 - squares
+    filled = np.copysign(np.sqrt(last * last + np.maximum(missing, 0.0)), last)
+    coordinates[-1] = np.where(missing > HARD_CASE, filled, last)
+    return coordinates / np.sqrt(np.maximum(squares, 1.0))
+
+
+def _trust_region_root(slopes: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Returns nu >= max(values) with sum_i (slope_i / (nu - value_i))^2 = 1 for each column of slopes, shape (count,).
+
+    The norm as a function of nu is convex and falling, its inverse concave: Newton's method on 1/norm from the left of
+    the root rises monotonically. Every term of the sum is at most 1, which is where it starts. A column that has
+    converged moves no more, so that it does not depend on the others.
+
+    Args:
+        slopes: Shape (n, count).
+        values: Ascending, shape (n,).
+    """
+    values = values[:, None]
+    length = np.sqrt(np.square(slopes).sum(axis=0))
+    root = np.maximum((values + np.abs(slopes)).max(axis=0), values[0] + length)
+    root = np.maximum(root, values[-1] + 1e-12 * np.maximum(values[-1], length))
+    moving = np.ones(root.shape, np.bool_)
+    for _ in range(NEWTON_STEPS):
+        inverses = 1.0 / (root - values)
+        parts = np.square(slopes * inverses)
+        square = parts.sum(axis=0)
+        step = square * (np.sqrt(square) - 1.0) / np.maximum((parts * inverses).sum(axis=0), 1e-300)
+        step = np.where(moving & (square > 1.0), step, 0.0)
+        root = root + step
+        moving = step > NEWTON_PRECISION * root
+        if not moving.any():
+            break
+    return root
 
 
 def is_inside(inner: np.ndarray, outer: np.ndarray) -> bool:

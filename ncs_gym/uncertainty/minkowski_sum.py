@@ -6,16 +6,12 @@ import numpy as np
 
 from ncs_gym.uncertainty.ellipsoid import sum_gauge
 
-# Halvings of the share nu after which the point at which both parts are equally long is known to float64.
+# Halvings of the multiplier nu after which the point at which both parts are equally long is known to float64.
 HALVINGS = 60
 
 
 def outside_sum(points: np.ndarray, first: np.ndarray, second: np.ndarray, tolerance: float) -> np.ndarray:
     """Returns which points lie outside E(P1) + E(P2) by more than a tolerance, bool of shape (k,); NaN lies outside.
-
-    Any share nu splits r into P1 w / nu + P2 w / (1-nu) with w = (P1/nu + P2/(1-nu))^-1 r. If both parts lie in their
-    ellipsoids, r lies in the sum; if r'w > 1, it does not (see `sum_gauge`). r'w is concave in nu, and its slope is the
-    difference of the parts' squared gauges, so that halving finds a share that settles the matter.
 
     Args:
         points: r, shape (k, p).
@@ -23,29 +19,43 @@ def outside_sum(points: np.ndarray, first: np.ndarray, second: np.ndarray, toler
         second: P2, shape (p, p), positive definite; where it is not, in float64, each point takes much longer.
         tolerance: Relative.
     """
-    turn, values = common_axes(first, second)
-    if not np.isfinite(turn).all():
+    axes, values = common_axes(first, second)
+    if not np.isfinite(axes).all():
         return np.array([sum_gauge(point, first, second) > 1.0 + tolerance for point in points], np.bool_)
-    values = values[:, None]
     with np.errstate(invalid="ignore", over="ignore"):
-        squares = np.square(turn @ points.T)
-    outside, limit = np.ones(len(points), np.bool_), (1.0 + tolerance) ** 2
-    unsettled, low, high = np.arange(len(points)), np.zeros(len(points)), np.ones(len(points))
+        squares = np.square(axes @ points.T)
+    return outside_sum_in_axes(squares, values[:, None], tolerance)
+
+
+def outside_sum_in_axes(squares: np.ndarray, values: np.ndarray, tolerance: float) -> np.ndarray:
+    """Returns which points lie outside E(P1) + E(P2), in axes in which both are diagonal, bool of shape (k,).
+
+    Any multiplier nu splits r into P1 w / nu + P2 w / (1-nu) with w = (P1/nu + P2/(1-nu))^-1 r. If both parts lie in
+    their ellipsoids, r lies in the sum; if r'w > 1, it does not (see `sum_gauge`). r'w is concave in nu, and its slope
+    is the difference of the parts' squared gauges, so that halving finds a multiplier that decides.
+
+    Args:
+        squares: Squared coordinates of the points in the axes F of `common_axes`, shape (p, k); NaN lies outside.
+        values: Diagonals of F P1 F' where F P2 F' = I, shape (p, k) or (p, 1).
+        tolerance: Relative.
+    """
+    count, limit = squares.shape[1], (1.0 + tolerance) ** 2
+    values = np.broadcast_to(values, squares.shape)
+    outside, undecided = np.ones(count, np.bool_), np.arange(count)
+    low, high = np.zeros(count), np.ones(count)
     for _ in range(HALVINGS):
-        share = 0.5 * (low + high)
-        weights = share * (1.0 - share) / (values * (1.0 - share) + share)
+        nu = 0.5 * (low + high)
+        weights = nu * (1.0 - nu) / (values * (1.0 - nu) + nu)
         form = (squares * weights).sum(axis=0)
-        parts = (
-            (squares * values * (weights / share) ** 2).sum(axis=0),
-            (squares * (weights / (1.0 - share)) ** 2).sum(0),
-        )
-        outside[unsettled] = ~(form <= limit)
-        rest = (form <= limit) & (np.maximum(*parts) > limit)
+        in_first = (squares * values * (weights / nu) ** 2).sum(axis=0)
+        in_second = (squares * (weights / (1.0 - nu)) ** 2).sum(axis=0)
+        outside[undecided] = ~(form <= limit)
+        rest = (form <= limit) & (np.maximum(in_first, in_second) > limit)
         if not rest.any():
             break
-        rises = parts[0] > parts[1]
-        low, high = np.where(rises, share, low)[rest], np.where(rises, high, share)[rest]
-        unsettled, squares = unsettled[rest], squares[:, rest]
+        rises = in_first > in_second
+        low, high = np.where(rises, nu, low)[rest], np.where(rises, high, nu)[rest]
+        undecided, squares, values = undecided[rest], squares[:, rest], values[:, rest]
     return outside
 
 

@@ -40,26 +40,24 @@ class TruncatedGaussian(FrozenArrays):
         """G with G G' = covariance; None when there is no noise (then no random number is drawn)."""
         return Ellipsoid(self.covariance).factor if np.any(self.covariance) else None
 
-    def sample(self, rng: np.random.Generator) -> np.ndarray:
-        """Returns one draw, shape (n,), by rejection."""
-        factor = self.factor
-        if factor is None:
-            return np.zeros(self.covariance.shape[0])
-        while True:
-            direction = rng.standard_normal(factor.shape[0])
-            if direction @ direction <= self.energy:
-                return factor @ direction
-
-    def sample_many(self, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Returns draws, shape (count, n), by compiled loops."""
-        from ncs_gym.draws import fill_truncated, normals
-
+    def sample(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
+        """Returns one draw, shape (n,), or `count` of them, shape (count, n), by rejection."""
+        size = 1 if count is None else count
         if self.factor is None:
-            return np.zeros((count, self.covariance.shape[0]))
-        rank = self.factor.shape[1]
-        keys, drawn = rng.integers(2**64, size=count, dtype=np.uint64), normals(rank, count)
-        fill_truncated(keys, 0, self.energy, rank, drawn)
-        return (self.factor @ drawn[:rank]).T
+            points = np.zeros((size, self.covariance.shape[0]))
+        else:
+            points = (self.factor @ self._truncated_normals(rng, size)).T
+        return points[0] if count is None else points
+
+    def _truncated_normals(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Returns standard normal columns, shape (n, count), each with a sum of squares of at most `energy`."""
+        normals = rng.standard_normal((self.covariance.shape[0], count))
+        rejected = np.flatnonzero(~(np.square(normals).sum(axis=0) <= self.energy))
+        while rejected.size:
+            again = rng.standard_normal((len(normals), rejected.size))
+            normals[:, rejected] = again
+            rejected = rejected[~(np.square(again).sum(axis=0) <= self.energy)]
+        return normals
 
 
 @cache

@@ -5,7 +5,7 @@ from experiments.channels import ChannelSettings, bursts, channel_of
 from experiments.settings import SweepSettings
 from experiments.sweep import cells_of
 from ncs_gym import Channel, GilbertElliott
-from ncs_gym.network.channel import Link
+from ncs_gym.network.channel_state import ChannelState
 
 OWN = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
 
@@ -27,7 +27,7 @@ def test_what_is_asked_for_replaces_the_environments_own():
 def test_bursts_have_the_loss_rate_and_the_length_asked_for(loss, length, period):
     # What the channel itself does, packet by packet.
     channel, rng = Channel(loss=bursts(loss, length, period), send_period=period), np.random.default_rng(0)
-    link, states = Link(channel, rng), []
+    link, states = ChannelState(channel, rng), []
     for step in range(1, 200_000):
         if link.sends_at(step):
             states.append(not link.exchange(rng, step, np.zeros(1)))

@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, GilbertElliott
-from ncs_gym.network.channel import Link
+from ncs_gym.network.channel_state import ChannelState
 
 
 def transmit(channel: Channel, steps: int, seed: int = 0) -> dict[int, list[int]]:
     """Sends the step number at every step; returns the stamps that arrive at each step."""
     rng = np.random.default_rng(seed)
-    link = Link(channel, rng)
+    link = ChannelState(channel, rng)
     arrivals = {}
     for step in range(1, steps + 1):
         sample = np.array([float(step)]) if link.sends_at(step) else None
@@ -96,7 +96,7 @@ def test_random_draws_do_not_depend_on_the_measurement():
     patterns = []
     for value in (0.0, 1e6):
         rng = np.random.default_rng(7)
-        link = Link(channel, rng)
+        link = ChannelState(channel, rng)
         patterns.append(
             [
                 [packet.stamp for packet in link.exchange(rng, k, np.array([value]) if link.sends_at(k) else None)]

@@ -24,7 +24,7 @@ from ncs_gym import (
 )
 from ncs_gym.estimation.error_bound import _check_ages
 from ncs_gym.estimation.estimator import Estimator
-from ncs_gym.network.channel import Link
+from ncs_gym.network.channel_state import ChannelState
 from ncs_gym.uncertainty.ellipsoid import is_inside
 from shields.verification.rational_matrix import (
     add,
@@ -56,7 +56,7 @@ CHANNELS = [
 def test_channel_keeps_the_contract_derived_from_it_and_no_better_one(channel):
     # By another route: the newest sample that has arrived, counted packet by packet.
     contract, rng = contract_of(channel), np.random.default_rng(0)
-    link, newest, oldest = Link(channel, rng), 0, 0
+    link, newest, oldest = ChannelState(channel, rng), 0, 0
     for step in range(1, 20_000):
         sample = np.zeros(1) if link.sends_at(step) else None
         newest = max([newest, *(packet.stamp for packet in link.exchange(rng, step, sample))])
@@ -67,7 +67,7 @@ def test_channel_keeps_the_contract_derived_from_it_and_no_better_one(channel):
 @pytest.mark.parametrize("most", [0, 1, 3])
 def test_channel_never_loses_more_in_a_row_than_it_promises(most):
     channel, rng = Channel(loss=0.9, max_consecutive_losses=most), np.random.default_rng(1)
-    link = Link(channel, rng)
+    link = ChannelState(channel, rng)
     arrived = [bool(link.exchange(rng, step, np.zeros(1))) for step in range(1, 3000)]
     runs = "".join("1" if here else "0" for here in arrived).split("1")
     assert max(map(len, runs)) == most
@@ -148,7 +148,7 @@ def test_update_falls_back_to_the_certified_gain_and_never_skips(monkeypatch):
     rng, x = np.random.default_rng(0), 1e-4 * np.ones(4)
     estimator.reset(x.copy())
     monkeypatch.setattr(estimator._filter, "update", lambda z: setattr(estimator._filter, "K", np.full((4, 2), 50.0)))
-    link, used = Link(channel, rng), 0
+    link, used = ChannelState(channel, rng), 0
     for step in range(1, 100):  # the plant is unstable and not controlled; only the error matters here
         x = plant.A @ x + (1 - 1e-9) * plant.nominal_disturbance.sample_boundary(rng)
         packets = link.exchange(rng, step, plant.H @ x + (1 - 1e-9) * plant.sensor_noise.bound.sample_boundary(rng))

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from ncs_gym import Channel, Ellipsoid, ErrorSet, Estimator, LinearPlant, Packet, certified_error_set, truck_trailer
 from ncs_gym.estimation.estimator import _grown
-from ncs_gym.network.channel import GilbertElliott, Link
+from ncs_gym.network.channel import GilbertElliott
+from ncs_gym.network.channel_state import ChannelState
 from ncs_gym.plants.linear_plant import FLAT_INFLATION
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
 from tests.plants import random_plant
@@ -58,7 +59,7 @@ def test_estimate_equals_batch_least_squares_with_late_and_reordered_packets(see
     estimator = Estimator(plant, channel, roomy(plant), **FINE)
     first = rng.standard_normal(3)
     estimator.reset(first)
-    link, inputs, used = Link(channel, rng), [], []
+    link, inputs, used = ChannelState(channel, rng), [], []
     # The samples are the truth's; the hard bound on them keeps the monitor silent.
     x = first + plant.initial_noise.sample(rng)
     for step in range(1, 31):
@@ -131,7 +132,7 @@ def drive(plant, channel, seed, steps, push):
     x = rng.uniform(-0.5, 0.5, plant.n)
     e0 = plant.initial_noise.bound.sample_boundary(rng)
     estimator.reset(x + e0)
-    link = Link(channel, rng)
+    link = ChannelState(channel, rng)
     for step in range(1, steps + 1):
         u = rng.uniform(-1, 1, plant.m) * plant.u_max
         e = estimator.belief.mean - x

@@ -4,6 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from ncs_gym.draws import uniform_many
+from ncs_gym.system import unpacked
 
 from ncs_gym import (
     BoxDisturbance,
@@ -17,12 +19,10 @@ from ncs_gym import (
     draws,
     truck_trailer,
 )
-from ncs_gym.draws import uniform_many
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.estimation import gain_table
-from ncs_gym.network.channel import Link
+from ncs_gym.network.channel_state import ChannelState
 from ncs_gym.plants.lqr import regulator_gain
-from ncs_gym.system import unpacked
 from ncs_gym.tasks.task import SetpointTracking, SpeedProfile, SpeedTracking
 from ncs_gym.uncertainty.disturbance import (
     AdversarialDisturbance,
@@ -103,7 +103,7 @@ class Replayed(NCSEnv):
         memory = log.start["memory"][index]
         self._task_memory = SpeedProfile(*memory) if isinstance(self.task, SpeedTracking) else memory.sum()
         self.script.numbers = [0.5]
-        self._link = Link(self.channel, self.script)
+        self._link = ChannelState(self.channel, self.script)
         self._link._bad = bool(log.start["bad"][index])
         self.np_random = self.script
         return self._observation(), self._info(np.zeros(self.plant.m), packet_arrived=False)
@@ -260,7 +260,7 @@ def test_disturbances_stay_in_their_bound_and_move_the_state(name):
         before = info["state"]
         _, _, _, _, info = env.step(np.zeros((50, 1), np.float32))
         d = info["state"] - before @ plant.A.T
-        gauges.append(plant.disturbance.gauges(d))
+        gauges.append(plant.disturbance.gauge(d))
     assert np.max(gauges) <= 1.0 + 1e-9
     assert np.mean(gauges) > 0.02
     if name in ("sphere", "adversarial", "adversarial in M"):
@@ -287,8 +287,8 @@ def test_batched_draws_are_distributed_like_scalar_ones():
         few = np.array([draw(rng, plant, np.zeros(2), 0, None) for _ in range(5000)])
         np.testing.assert_allclose(np.cov(many.T), np.cov(few.T), atol=0.05 * np.trace(np.cov(few.T)))
     for noise in (plant.process_noise, plant.sensor_noise):
-        many, few = noise.sample_many(rng, 20000), np.array([noise.sample(rng) for _ in range(5000)])
-        assert noise.bound.gauges(many).max() <= 1.0 + 1e-12
+        many, few = noise.sample(rng, 20000), np.array([noise.sample(rng) for _ in range(5000)])
+        assert noise.bound.gauge(many).max() <= 1.0 + 1e-12
         np.testing.assert_allclose(np.cov(many.T), np.cov(few.T), atol=0.05 * np.trace(np.cov(few.T)))
 
 

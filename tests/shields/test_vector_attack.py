@@ -37,7 +37,7 @@ class ExtremalVectorNoise(NCSVectorEnv):
     def _begin(self, mask, starts):
         super()._begin(mask, starts)
         chosen = np.flatnonzero(mask)
-        errors = self.plant.initial_noise.bound.sample_boundary_many(self.np_random, len(chosen)) * (1.0 - 1e-12)
+        errors = self.plant.initial_noise.bound.sample_boundary(self.np_random, len(chosen)) * (1.0 - 1e-12)
         self._fleet.mean[:, chosen] = self._fleet.state[:, chosen] + errors.T
 
 

@@ -47,7 +47,7 @@ def random_shapes(rng, plant, count):
 def test_decisions_equal_those_of_the_scalar_filter(plant, mode):
     safety_filter = SafetyFilter(certificate_of(plant), plant, mode)
     batch, rng, count = VectorFilter(safety_filter), np.random.default_rng(0), 400
-    estimates = certificate_of(plant).safe_set.sample_boundary_many(rng, count) * rng.uniform(0, 1.3, (count, 1))
+    estimates = certificate_of(plant).safe_set.sample_boundary(rng, count) * rng.uniform(0, 1.3, (count, 1))
     estimates[3], estimates[4], estimates[5] = 1e200, np.nan, 0.0
     shapes = random_shapes(rng, plant, 60)[rng.integers(60, size=count)]
     proposed = rng.uniform(-1, 1, (count, plant.m)) * plant.u_max
@@ -202,7 +202,7 @@ def test_proofs_break_and_recover_as_scalar_trackers_do_whatever_is_reported():
         once, passed, fallback, known, alarm = ~rare(0.03), rare(0.7), rare(0.7), rare(0.5), rare(0.03)
         drawn = rng.choice(5, count, p=[0.5, 0.3, 0.14, 0.03, 0.03])
         sizes = rng.choice(kinds, count, p=[0.3, 0.3, 0.34, 0.03, 0.03])
-        estimate = (shield.certificate.safe_set.sample_boundary_many(rng, count) * sizes[:, None]).T.copy()
+        estimate = (shield.certificate.safe_set.sample_boundary(rng, count) * sizes[:, None]).T.copy()
         decided, inputs = np.zeros((1, count)), rare(0.03)[None] * 1.0
         wrong = track(
             shield._ground, shield._batch.book.seen, numbers[drawn], knowledge, restarted, once,
@@ -280,7 +280,7 @@ def test_margins_are_those_of_no_input_even_where_it_does_not_pass():
     plant = TRUCKS["4000 kg"]
     safety_filter, shape = SafetyFilter(certificate_of(plant), plant), 0.1 * certificate_of(plant).Sigma
     batch, rng = VectorFilter(safety_filter), np.random.default_rng(0)
-    estimates = 1.5 * certificate_of(plant).safe_set.sample_boundary_many(rng, 50)
+    estimates = 1.5 * certificate_of(plant).safe_set.sample_boundary(rng, 50)
     found = batch.margins(np.ascontiguousarray(estimates.T), np.full(50, batch.book.number(shape)))
     expected = [safety_filter.margin(estimate, shape, np.zeros(1)) for estimate in estimates]
     np.testing.assert_allclose(found, expected, atol=1e-12)

@@ -1,0 +1,83 @@
+"""The observation and action spaces of the control loop, and what actions stand for."""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box
+
+from ncs_gym.estimation.error_bound import ErrorSet
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.tasks.task import Task
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
+from ncs_gym.validation import as_numbers, shown
+
+# The default start covers this fraction of the half-width of the safe box in every direction.
+START_FRACTION = 0.1
+# Observations of an unstable plant end this many half-widths of the box out: what lies beyond is lost anyway.
+FARTHEST_OBSERVED = 1e6
+# Widens the observation box: float32 rounding, and estimates a little off the reachable set.
+OBSERVATION_MARGIN = 1.01
+
+
+def default_initial_set(plant: LinearPlant) -> Ellipsoid:
+    """Returns the starts {x : |C x|^2 <= 0.1^2}, well inside the safe box; W bounds directions C leaves free."""
+    return Ellipsoid(START_FRACTION**2 * np.linalg.inv(plant.weight))
+
+
+def observation_space(plant: LinearPlant, task: Task, error_set: ErrorSet, initial_set: Ellipsoid, horizon: int) -> Box:
+    """Returns the finite box of estimate and task entries that can be reached within some steps, float32.
+
+    The reach of x_hat is that of x from the initial set under every input and disturbance within the horizon,
+    plus the certified error.
+
+    Raises:
+        ValueError: If an entry is beyond float32's range, so that observations would be infinite, or always zero.
+    """
+    reach = np.zeros(plant.n)
+    power = np.eye(plant.n)
+    largest = initial_set.support(power)
+    for _ in range(horizon):
+        reach += np.abs(power @ plant.B) @ plant.u_max + plant.disturbance.support(power)
+        power = power @ plant.A
+        largest = np.maximum(largest, reach + initial_set.support(power))
+    ages = error_set.ages
+    shapes = error_set.Sigma[None] if ages is None else ages.shapes
+    estimate = largest + np.sqrt(np.diagonal(shapes, axis1=1, axis2=2).max(axis=0))
+    start = initial_set.support(np.eye(plant.n))
+    estimate = np.minimum(estimate, np.maximum(FARTHEST_OBSERVED * plant.half_widths, start))
+    bound = OBSERVATION_MARGIN * np.concatenate([estimate, task.observation_bound(plant, horizon)])
+    numbers = np.finfo(np.float32)
+    if not ((bound >= numbers.tiny) & (bound <= numbers.max)).all():
+        raise ValueError(
+            f"observations of up to {shown(bound.tolist())} are out of float32's range: choose other units"
+        )
+    return Box(-bound.astype(np.float32), bound.astype(np.float32), dtype=np.float32)
+
+
+def applied_input(plant: LinearPlant, action: Any) -> np.ndarray:
+    """Returns the float64 input u = u_max * clip(action, -1, 1), shape (m,), that an action stands for.
+
+    Raises:
+        ValueError: If the action is not finite or does not have shape (m,).
+    """
+    numbers = action if type(action) is np.ndarray and action.dtype.char in "fd" else as_numbers(action)
+    if numbers is not None and numbers.shape == (plant.m,):
+        values = numbers.tolist()
+        if all(map(isfinite, values)):
+            return plant.u_max * [1.0 if value > 1.0 else -1.0 if value < -1.0 else value for value in values]
+    raise ValueError(f"the action must be finite with shape ({plant.m},), got {shown(action)}")
+
+
+def applied_inputs(plant: LinearPlant, actions: Any, count: int) -> np.ndarray:
+    """Returns the float64 inputs, shape (m, count), that actions of shape (count, m) stand for.
+
+    Raises:
+        ValueError: If one is not finite or the shape is wrong.
+    """
+    numbers = actions if type(actions) is np.ndarray and actions.dtype.char in "fd" else as_numbers(actions)
+    if numbers is None or numbers.shape != (count, plant.m) or not np.isfinite(np.abs(numbers).max()):
+        raise ValueError(f"the actions must be finite with shape ({count}, {plant.m}), got {shown(actions)}")
+    return plant.u_max[:, None] * np.minimum(np.maximum(numbers.T, -1.0), 1.0, dtype=np.float64)

@@ -1,0 +1,288 @@
+"""Arrival patterns: everything of an estimator but its means, computed once for whatever arrived when.
+
+Covariances, gains, error shapes and the choice of a history depend only on when packets arrive, never on what they say.
+Patterns form a graph: its nodes are patterns, its edges are steps in time and arrivals. The scalar estimator follows it
+one node at a time, the vectorized one for all environments at once.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ncs_gym.estimation.error_bound import ErrorSet, certified_error_set
+from ncs_gym.estimation.error_statistics import ErrorRecursion, ErrorStatistics
+from ncs_gym.estimation.innovation_test import InnovationTest
+from ncs_gym.estimation.pattern_arrays import PatternArrays
+from ncs_gym.network.channel import Channel
+from ncs_gym.network.contract import ChannelContract
+from ncs_gym.plants.linear_plant import LinearPlant
+
+# Patterns beyond this number are forgotten but for those in use.
+MAX_PATTERNS = 1 << 17
+# Number of what is not worked out yet; a pattern without a history to replay.
+UNKNOWN = NO_REPLAY = -1
+# Number of the statistics that stand for "no sample is used here": their gain is zero.
+NO_SAMPLE = 0
+
+
+class Pattern(NamedTuple):
+    """What an estimator remembers besides means, inputs and samples.
+
+    Attributes:
+        present: Number of the statistics of the present estimate.
+        priors: Numbers of the statistics before the update at the step of each age 0..buffer; UNKNOWN before the first
+            step of the episode.
+        held: For each age, whether the sample taken then has arrived.
+        replay_from: Age of the oldest sample that arrived at this step and is not used yet, or NO_REPLAY.
+    """
+
+    present: int
+    priors: tuple[int, ...]
+    held: tuple[bool, ...]
+    replay_from: int
+
+
+class Replay(NamedTuple):
+    """What becomes of the arrivals of a pattern: the history from its oldest new sample on, once more.
+
+    Attributes:
+        oldest: Age at which the replay begins.
+        used: For each age 0..oldest, the number of the statistics before the update there; NO_SAMPLE without one.
+        accepted: Whether the replayed history is kept.
+        new_age: Age of the newest sample used afterwards; UNKNOWN where it is the same as before.
+        target: Number of the pattern afterwards.
+    """
+
+    oldest: int
+    used: tuple[int, ...]
+    accepted: bool
+    new_age: int
+    target: int
+
+
+class ArrivalPatterns:
+    """The graph of arrival patterns of a plant behind a channel, filled as patterns are met.
+
+    Statistics are rounded by the recursion, so that they recur; patterns with equal statistics are one.
+
+    Args:
+        recursion: Moves the error statistics.
+        channel: Gives the ages at which packets can arrive, and the length of the replay buffer.
+
+    Attributes:
+        root: Number of the pattern at the start of an episode.
+        statistics: The distinct statistics met so far; the first stands for NO_SAMPLE.
+        arrays: What vectorized environments look up.
+    """
+
+    def __init__(self, recursion: ErrorRecursion, channel: Channel) -> None:
+        self.recursion, self.channel = recursion, channel
+        plant, ages = recursion.plant, recursion.error_set.ages
+        self.test = InnovationTest(plant.H, recursion.sets.noise)
+        self.buffer = channel.longest_delay
+        # Ages above this make no difference: neither to a certified set nor to what the buffer holds.
+        self._oldest = max(self.buffer + 1, 0 if ages is None else len(ages.shapes))
+        self.arrays = PatternArrays(plant.n, plant.p, channel)
+        zero = np.zeros((plant.n, plant.p))
+        self.statistics: list[ErrorStatistics] = [recursion.first]
+        self._statistics_numbers: dict[tuple[bytes, bytes, int], int] = {}
+        self._predictions: list[int] = [UNKNOWN]
+        self._updates: list[tuple[int, np.ndarray, np.ndarray] | None] = [(NO_SAMPLE, zero, np.zeros((plant.p,) * 2))]
+        self.arrays.add_statistics(recursion.first.shape)
+        self._patterns: list[Pattern] = []
+        self._pattern_numbers: dict[Pattern, int] = {}
+        self._next: list[int] = []
+        self._arrivals: dict[tuple[int, int], int] = {}
+        self._replays: dict[int, Replay] = {}
+        self._axes: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._lock = threading.RLock()
+        self._successor: ArrivalPatterns | None = None
+        ages_held = self.buffer + 1
+        first = self._number_of_statistics(recursion.first)
+        self.root = self._number_of_pattern(Pattern(first, (UNKNOWN,) * ages_held, (False,) * ages_held, NO_REPLAY))
+
+    def __len__(self) -> int:
+        return len(self._patterns)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> ArrivalPatterns:
+        return self  # shared by all estimators; nothing in it belongs to one of them
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leaves out the lock, which cannot be pickled."""
+        return vars(self) | {"_lock": None, "_successor": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state | {"_lock": threading.RLock()})
+
+    @property
+    def is_full(self) -> bool:
+        """Whether it is time to forget patterns that are not in use (`keeping`)."""
+        return len(self._patterns) >= MAX_PATTERNS
+
+    def error_statistics(self, pattern: int) -> ErrorStatistics:
+        """Returns the statistics of the present estimate."""
+        return self.statistics[self._patterns[pattern].present]
+
+    def after_step(self, pattern: int) -> int:
+        """Returns the number of the pattern one step later, before anything arrives."""
+        if self._next[pattern] == UNKNOWN:
+            with self._lock:
+                present, priors, held, _ = self._patterns[pattern]
+                moved = self._predicted(present)
+                after = self._number_of_pattern(Pattern(moved, (moved, *priors[:-1]), (False, *held[:-1]), NO_REPLAY))
+                self._next[pattern] = self.arrays.next[pattern] = after
+        return self._next[pattern]
+
+    def after_arrival(self, pattern: int, age: int) -> int:
+        """Returns the number of the pattern with one more sample, of some age; the same where it is of no use.
+
+        Samples older than the buffer, from before the first step or received before are of no use.
+        """
+        after = self._arrivals.get((pattern, age))
+        if after is None:
+            with self._lock:
+                present, priors, held, replay_from = self._patterns[pattern]
+                after = pattern
+                if 0 <= age <= self.buffer and priors[age] != UNKNOWN and not held[age]:
+                    held = (*held[:age], True, *held[age + 1 :])
+                    after = self._number_of_pattern(Pattern(present, priors, held, max(replay_from, age)))
+                if 0 <= age <= self.buffer:
+                    self._arrivals[pattern, age] = after
+                    self.arrays.set_arrival(pattern, age, after)
+        return after
+
+    def replay(self, pattern: int) -> Replay:
+        """Returns what becomes of the samples that arrived at this step."""
+        if pattern not in self._replays:
+            with self._lock:
+                self._replays[pattern] = replay = self._replayed(self._patterns[pattern])
+                self.arrays.set_replay(pattern, replay)
+        return self._replays[pattern]
+
+    def gain(self, statistics: int) -> np.ndarray:
+        """Returns the gain, shape (n, p), of an update of some statistics; zero if the sample must not be used."""
+        return self._updated(statistics)[1]
+
+    def quick_test(self, statistics: int) -> np.ndarray:
+        """Returns W of the innovation test before an update of some statistics; see `InnovationTest`."""
+        return self._updated(statistics)[2]
+
+    def innovation_axes(self, statistics: int) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the axes in which residuals before an update of some statistics are tested exactly."""
+        if statistics not in self._axes:
+            self._axes[statistics] = self.test.axes(self.test.spread(self.statistics[statistics].shape))
+        return self._axes[statistics]
+
+    def keeping(self, patterns: np.ndarray) -> tuple[ArrivalPatterns, np.ndarray]:
+        """Returns a graph with some patterns, shape (k,), only, and their numbers there."""
+        with self._lock:
+            successor = self._successor
+            if successor is None or successor.is_full:
+                successor = self._successor = ArrivalPatterns(self.recursion, self.channel)
+            for key, shared in _shared.items():
+                if shared is self:
+                    _shared[key] = successor
+            numbers = {each: successor._adopted(self, each) for each in np.unique(patterns).tolist()}
+        return successor, np.array([numbers[each] for each in patterns.tolist()], np.int64)
+
+    def _adopted(self, other: ArrivalPatterns, pattern: int) -> int:
+        """Returns the number of another graph's pattern."""
+
+        def same(number: int) -> int:
+            return number if number == UNKNOWN else self._number_of_statistics(other.statistics[number])
+
+        present, priors, held, replay_from = other._patterns[pattern]
+        return self._number_of_pattern(Pattern(same(present), tuple(map(same, priors)), held, replay_from))
+
+    def _number_of_statistics(self, statistics: ErrorStatistics) -> int:
+        """Returns the number of statistics, a new one if they have not occurred."""
+        covariance, shape, age = statistics
+        age = min(age, self._oldest)
+        key = covariance.tobytes(), shape.tobytes(), age
+        if key not in self._statistics_numbers:
+            self._statistics_numbers[key] = len(self.statistics)
+            self.statistics.append(ErrorStatistics(covariance, shape, age))
+            self._predictions.append(UNKNOWN)
+            self._updates.append(None)
+            self.arrays.add_statistics(shape)
+        return self._statistics_numbers[key]
+
+    def _number_of_pattern(self, pattern: Pattern) -> int:
+        """Returns the number of a pattern, a new one if it has not occurred."""
+        if pattern not in self._pattern_numbers:
+            self.arrays.add_pattern(pattern.present, replays=pattern.replay_from != NO_REPLAY)
+            self._pattern_numbers[pattern] = len(self._patterns)
+            self._patterns.append(pattern)
+            self._next.append(UNKNOWN)
+        return self._pattern_numbers[pattern]
+
+    def _predicted(self, number: int) -> int:
+        """Returns the number of the statistics one step later."""
+        if self._predictions[number] == UNKNOWN:
+            self._predictions[number] = self._number_of_statistics(self.recursion.predicted(self.statistics[number]))
+        return self._predictions[number]
+
+    def _updated(self, number: int) -> tuple[int, np.ndarray, np.ndarray]:
+        """Returns the number of the statistics after an update, its gain (n, p), and W of the innovation test (p, p).
+
+        The gain is zero and the statistics are the same where the sample must not be used.
+        """
+        found = self._updates[number]
+        if found is None:
+            statistics = self.statistics[number]
+            update = self.recursion.updated(statistics)
+            spread = self.test.spread(statistics.shape)
+            quick = self.test.inverse_of_bound(spread)
+            if update is None:
+                plant = self.recursion.plant
+                found = number, np.zeros((plant.n, plant.p)), quick
+            else:
+                found = self._number_of_statistics(update.statistics), update.gain, quick
+            self._updates[number] = found
+            self.arrays.set_update(number, found[1], quick)
+        return found
+
+    def _replayed(self, pattern: Pattern) -> Replay:
+        """Returns the history from the oldest new sample on, and whether it is kept."""
+        present, priors, held, oldest = pattern
+        replayed, used, number = list(priors), [NO_SAMPLE] * (oldest + 1), priors[oldest]
+        for age in range(oldest, -1, -1):
+            number = replayed[age]
+            if held[age]:
+                used[age] = number
+                number = self._updated(number)[0]
+            if age > 0:
+                replayed[age - 1] = self._predicted(number)
+        accepted = self.recursion.prefers(self.statistics[number], self.statistics[present])
+        age = self.statistics[number].age
+        new_age = age if accepted and age < self._oldest else UNKNOWN
+        if accepted:
+            present, priors = number, tuple(replayed)
+        target = self._number_of_pattern(Pattern(present, priors, held, NO_REPLAY))
+        return Replay(oldest, tuple(used), accepted, new_age, target)
+
+
+_shared: dict[tuple[str, Channel, ChannelContract | None], ArrivalPatterns] = {}
+
+
+def arrival_patterns(plant: LinearPlant, channel: Channel, contract: ChannelContract | None) -> ArrivalPatterns:
+    """Returns the graph that all estimators of a plant behind a channel share in this process.
+
+    Raises:
+        UnstablePlantError: If the plant is not Schur stable and there is no contract.
+        ErrorSetError: If no error set is found.
+    """
+    # Only delays and quantization matter to it, not how packets are lost or when they are sent.
+    kept = Channel(quantization_step=channel.quantization_step, delay=channel.delay, jitter=channel.jitter)
+    key = plant.fingerprint, kept, contract
+    if key not in _shared:
+        _shared[key] = patterns_of(plant, kept, certified_error_set(plant, contract))
+    return _shared[key]
+
+
+def patterns_of(plant: LinearPlant, channel: Channel, error_set: ErrorSet, **precision: Any) -> ArrivalPatterns:
+    """Returns a graph of its own; see `ErrorRecursion` for the precision of covariances and shapes."""
+    return ArrivalPatterns(ErrorRecursion(plant, channel.quantization_step, error_set, **precision), channel)

@@ -1,0 +1,151 @@
+"""The running error ellipsoid: how a prediction and an update change the set that holds the estimation error."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from ncs_gym.estimation.error_bound import ErrorSet
+from ncs_gym.plants.linear_plant import FLAT_INFLATION, INFLATION, LinearPlant
+from ncs_gym.uncertainty.ellipsoid import is_inside, outer_sum
+
+# Per dimension, the growth of computed shapes that covers the rounding of F S F' (see `enlarged_by_rounding`).
+ROUNDING = 1e-13
+# Shapes are rounded up to multiples of this in coordinates where the certified set of age 0 is the unit ball: then they
+# recur when a pattern of arrivals does, and can be looked up.
+SHAPE_STEP = 2.0**-13
+# Multipliers mu that the set-membership gain is chosen from; any of them is sound.
+MULTIPLIERS = np.linspace(0.01, 0.99, 99)[:, None]
+
+
+class SetMembership:
+    """Moves the shape Sigma_k of the running ellipsoid: the error x_hat - x lies in E(Sigma_k) (theory.md section 3).
+
+    Args:
+        plant: The plant with its bounds.
+        quantization_step: Step of the channel's quantizer, in the units of y.
+        error_set: The certified sets that shapes stay inside.
+        shape_step: What shapes are rounded up to, as a fraction of the certified set's square extent.
+
+    Attributes:
+        noise: N, shape (p, p): holds sensor noise and quantization error.
+    """
+
+    def __init__(
+        self, plant: LinearPlant, quantization_step: float, error_set: ErrorSet, shape_step: float = SHAPE_STEP
+    ) -> None:
+        self.plant, self.error_set, self._step = plant, error_set, shape_step
+        Sigma = error_set.Sigma
+        self._ball = np.linalg.cholesky(error_set.shape_at(0))
+        self._to_ball = solve_triangular(self._ball, np.eye(plant.n), lower=True)
+        self._abs_ball, self._abs_to_ball = np.abs(self._ball), np.abs(self._to_ball)
+        # Entries of |ball to_ball - I| are at most these.
+        self._ball_error = 4.0 * plant.n * np.finfo(float).eps * (self._abs_ball @ self._abs_to_ball)
+        noise = plant.sensor_error_with(quantization_step).shape
+        # Perfect sensors get a little noise, relative to what they measure: a larger bound is a bound.
+        self.noise = noise + FLAT_INFLATION * np.diag(np.diag(plant.H @ Sigma @ plant.H.T))
+        self._noise_extent = np.sqrt(np.diag(self.noise))
+        self._abs_A, self._abs_H = np.abs(plant.A), np.abs(plant.H)
+        self._information = plant.H.T @ np.linalg.solve(self.noise, plant.H)
+        self._identity = np.eye(plant.n)
+        self._largest_extent = (2.0 * plant.state_limit) ** 2
+
+    def predicted(self, shape: np.ndarray, age: int) -> np.ndarray:
+        """Returns the shape one step later, without a sample, shape (n, n).
+
+        It is the first of these that lies inside the set of the next age: A Sigma_k A'/lam + D/(1-lam) with the
+        trace-optimal lam, the same with the certified rate, the certified set itself. That one is sound if E(Sigma_k)
+        lies inside the set of its own age, which (E1) or (C1) maps into it. Beyond the contract no set is certified;
+        the trace-optimal shape still holds the error.
+
+        Args:
+            shape: Sigma_k, shape (n, n).
+            age: Steps since the newest sample used was taken.
+        """
+        A, D, certified = self.plant.A, self.plant.disturbance.shape, self.error_set.shape_at(age + 1)
+        extent = self._abs_A @ np.sqrt(shape.diagonal())
+        moved = enlarged_by_rounding(A @ shape @ A.T, extent)
+        predicted = self.rounded_up(outer_sum(moved, D, self.plant.weight))
+        if certified is None:
+            return self._bounded(predicted)
+        if is_inside(predicted, certified):
+            return predicted
+        rate = self.error_set.rate_at(age)
+        carried = self.rounded_up(moved / rate + D / (1.0 - rate))
+        if is_inside(carried, certified):
+            return carried
+        present = self.error_set.shape_at(age)
+        return certified if present is not None and is_inside(shape, present) else self._bounded(predicted)
+
+    def _bounded(self, shape: np.ndarray) -> np.ndarray:
+        """Returns a shape, or one around all differences of states that do not lie beyond `plant.state_limit`."""
+        limit = self._largest_extent
+        return shape if (np.diag(shape) <= limit).all() else self.plant.n * np.diag(limit)
+
+    def updated(self, shape: np.ndarray, gain: np.ndarray) -> np.ndarray:
+        """Returns (I-TH) Sigma_k (I-TH)'/mu + T N T'/(1-mu) with the trace-optimal mu: sound for any gain T, (n, p)."""
+        kept = self._identity - gain @ self.plant.H
+        size = np.abs(gain)
+        extent = np.sqrt(shape.diagonal())
+        carried = enlarged_by_rounding(kept @ shape @ kept.T, extent + size @ (self._abs_H @ extent))
+        noise = enlarged_by_rounding(gain @ self.noise @ gain.T, size @ self._noise_extent)
+        total = INFLATION * outer_sum(carried, noise, self.plant.weight) + self.plant.estimate_rounding
+        return self.rounded_up(total)
+
+    def gain(self, shape: np.ndarray) -> np.ndarray:
+        """Returns T_mu = S H'/mu (H S H'/mu + N/(1-mu))^-1, shape (n, p), S = Sigma_k, with the trace-optimal mu.
+
+        Its updated shape is (mu S^-1 + (1-mu) H' N^-1 H)^-1 (theory.md section 3); with S = G G' and
+        G'H'N^-1HG = V diag(j) V' the weighted trace is a sum of w_i / (mu + (1-mu) j_i).
+        """
+        H = self.plant.H
+        values, vectors = np.linalg.eigh(shape)
+        factor = vectors * np.sqrt(np.maximum(values, 0.0))
+        gains, basis = np.linalg.eigh(factor.T @ self._information @ factor)
+        axes = factor @ basis
+        weights = (axes * (self.plant.weight @ axes)).sum(axis=0)
+        traces = (weights / (MULTIPLIERS + (1.0 - MULTIPLIERS) * np.maximum(gains, 0.0))).sum(axis=1)
+        mu = float(MULTIPLIERS[int(np.argmin(traces)), 0])
+        spread = shape @ H.T / mu
+        return solved(H @ spread + self.noise / (1.0 - mu), spread.T).T
+
+    def rounded_up(self, shape: np.ndarray) -> np.ndarray:
+        """Returns a shape rounded up to multiples of a step where the certified set of age 0 is the unit ball.
+
+        Rounding moves an entry by half a step, hence no direction by more than n halves of one, which is added before.
+        """
+        inward, outward, size = self._to_ball, self._ball, len(shape)
+        extent = np.sqrt(np.abs(shape.diagonal()))
+        inner = enlarged_by_rounding(inward @ shape @ inward.T, self._abs_to_ball @ extent)
+        inner.flat[:: size + 1] += size * self._step
+        inner = self._step * np.rint(inner / self._step)
+        rounded = enlarged_by_rounding(outward @ inner @ outward.T, self._abs_ball @ np.sqrt(inner.diagonal()))
+        # Both products together move the shape S by at most E S + S E', |E| at most `ball_error`; with s the extent and
+        # a = max |E| s / s that is at most 2 n a diag(s^2).
+        turned = float(np.max(self._ball_error @ extent / np.maximum(extent, 1e-300)))
+        rounded.flat[:: size + 1] += 2.0 * size * turned * extent**2
+        return rounded
+
+
+def enlarged_by_rounding(product: np.ndarray, extent: np.ndarray) -> np.ndarray:
+    """Returns a computed F S F', symmetric and enlarged by its rounding in whatever units.
+
+    With a = |F| sqrt(diag S) entry (i, j) is off by at most c eps a_i a_j, c of the order of n, and by Cauchy-Schwarz
+    such a matrix is at most n c eps diag(a^2). The few roundings of what follows are covered by D's own inflation.
+
+    Args:
+        product: F S F' as computed, shape (n, n).
+        extent: a, shape (n,).
+    """
+    size = len(extent)
+    product = 0.5 * (product + product.T)
+    product.flat[:: size + 1] += ROUNDING * size * extent**2
+    return product
+
+
+def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Returns matrix^-1 right, by the pseudo-inverse where the matrix is singular in float64 (after long outages)."""
+    try:
+        return np.linalg.solve(matrix, right)
+    except np.linalg.LinAlgError:
+        return np.linalg.pinv(matrix) @ right

@@ -1,0 +1,152 @@
+"""The estimators of many environments at once; the last axis of every array is the environment."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ncs_gym.estimation.arrival_patterns import NO_REPLAY, NO_SAMPLE, UNKNOWN, ArrivalPatterns
+from ncs_gym.estimation.innovation_test import ALARM_TOLERANCE
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.uncertainty.minkowski_sum import outside_sum_in_axes
+
+
+class VectorEstimator:
+    """What `Estimator` does, for N environments.
+
+    Args:
+        plant: The plant.
+        patterns: The graph of arrival patterns, shared with all other estimators of the plant and channel.
+        size: N.
+
+    Attributes:
+        mean: x_hat, shape (n, N).
+        age: Steps since the newest sample used was taken, shape (N,).
+        alarm: Whether a measurement contradicted the assumed bounds in the episode, shape (N,).
+        patterns: The graph in use; another one after patterns were forgotten.
+        pattern: Number of each environment's pattern, shape (N,).
+    """
+
+    def __init__(self, plant: LinearPlant, patterns: ArrivalPatterns, size: int) -> None:
+        self.plant, self.patterns = plant, patterns
+        self.mean, self.age = np.zeros((plant.n, size)), np.zeros(size, np.int64)
+        self.alarm, self.pattern = np.zeros(size, np.bool_), np.full(size, patterns.root)
+        self._limit = plant.state_limit[:, None] if np.isfinite(plant.state_limit).all() else None
+        # By age: means before updates, inputs that led there, and samples (None where nobody sent).
+        self._priors: deque[np.ndarray] = deque(maxlen=patterns.buffer + 1)
+        self._inputs: deque[np.ndarray] = deque(maxlen=patterns.buffer + 1)
+        self._samples: deque[np.ndarray | None] = deque(maxlen=patterns.buffer + 1)
+
+    @property
+    def statistics(self) -> np.ndarray:
+        """Numbers of the error statistics, whose shapes are `patterns.arrays.shapes`, shape (N,)."""
+        return self.patterns.arrays.present.take(self.pattern)
+
+    def begin(self, chosen: Any, mean: np.ndarray) -> None:
+        """Starts episodes in some environments with first estimates, shape (n, count)."""
+        self.mean = self.mean.copy()  # the old array is kept as a mean before an update
+        self.mean[:, chosen] = mean
+        self.age[chosen], self.alarm[chosen], self.pattern[chosen] = 0, False, self.patterns.root
+
+    def advance(self, u: np.ndarray, samples: np.ndarray | None, arrivals: list[tuple[int, np.ndarray]]) -> None:
+        """Moves one step on: predicts with the inputs really applied, then takes in what arrived.
+
+        Args:
+            u: Applied inputs, shape (m, N) [physical units]; kept, not copied.
+            samples: What was measured at this step, shape (p, N); None if nobody sends.
+            arrivals: Ages of samples that arrive now, oldest first, each with the environments, shape (N,).
+        """
+        if self.patterns.is_full:
+            self.patterns, self.pattern = self.patterns.keeping(self.pattern)
+        self.mean = self._predicted(self.mean, u)
+        self._priors.appendleft(self.mean)
+        self._inputs.appendleft(u)
+        self._samples.appendleft(samples)
+        self.age += 1
+        patterns = self.patterns
+        self.pattern = self._follow(self.pattern, "next", patterns.after_step)
+        for age, arrives in arrivals:
+            self.pattern = self._follow(self.pattern, "arrival", partial(patterns.after_arrival, age=age), arrives, age)
+        if arrivals:
+            self._replay()
+
+    def _follow(
+        self,
+        pattern: np.ndarray,
+        table: str,
+        work_out: Callable[[int], Any],
+        where: np.ndarray | None = None,
+        age: int | None = None,
+    ) -> np.ndarray:
+        """Returns the patterns, shape (N,), that patterns lead to; missing entries of the table are worked out first.
+
+        Args:
+            pattern: Where to go from, shape (N,).
+            table: Name of one of the `PatternArrays`.
+            work_out: Called with the number of a pattern whose entry is missing.
+            where: Which environments move, shape (N,); all by default.
+            age: Of the samples that arrive, if any.
+        """
+        row = None if age is None else age - self.patterns.channel.delay
+        after = self.patterns.arrays.row(table, row).take(pattern)
+        missing = after == UNKNOWN if where is None else (after == UNKNOWN) & where
+        if missing.any():
+            for number in np.unique(pattern[missing]).tolist():
+                work_out(number)
+            after = self.patterns.arrays.row(table, row).take(pattern)
+        return after if where is None else np.where(where, after, pattern)
+
+    def _replay(self) -> None:
+        """Replays from the oldest new sample on, and keeps whichever history is better.
+
+        Environments without new samples are carried along: they use no sample and keep what they have.
+        """
+        target = self._follow(self.pattern, "target", self.patterns.replay)
+        arrays, H = self.patterns.arrays, self.plant.H
+        begins, accepted = arrays.replay_from.take(self.pattern), arrays.accepted.take(self.pattern)
+        used, new_age = arrays.used.take(self.pattern, axis=1), arrays.new_age.take(self.pattern)
+        oldest = int(begins.max())
+        if oldest == NO_REPLAY:
+            return
+        mean = self._priors[oldest]
+        for age in range(oldest, -1, -1):
+            if age < oldest:
+                mean = np.where(begins > age, self._predicted(mean, self._inputs[age]), self._priors[age])
+                self._priors[age] = np.where(accepted, mean, self._priors[age])
+            statistics, samples = used[age], self._samples[age]
+            if samples is not None and statistics.any():
+                residual = samples - H.dot(mean)
+                self._monitor(residual, statistics)
+                mean = mean + np.einsum("ijk,jk->ik", arrays.gains.take(statistics, axis=2), residual)
+        self.mean = np.where(accepted, mean, self.mean)
+        self.age = np.where(new_age == UNKNOWN, self.age, new_age)
+        self.pattern = target
+
+    def _predicted(self, mean: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Returns A x_hat + B u; unstable plants' within the limit of their states."""
+        mean = self.plant.A.dot(mean) + self.plant.B.dot(u)
+        return mean if self._limit is None else np.minimum(np.maximum(mean, -self._limit), self._limit)
+
+    def _monitor(self, residual: np.ndarray, statistics: np.ndarray) -> None:
+        """Latches the alarm of environments whose residual no error and no noise within their bounds explain.
+
+        Args:
+            residual: y - H x_hat, shape (p, N).
+            statistics: Numbers of the statistics before the update, shape (N,); NO_SAMPLE where there is none.
+        """
+        patterns = self.patterns
+        weights = patterns.arrays.quick_tests.take(statistics, axis=2)
+        with np.errstate(invalid="ignore"):  # an infinite weight of a residual of zero
+            quick = np.einsum("ik,ijk,jk->k", residual, weights, residual)
+        doubtful = np.flatnonzero(~(quick <= 1.0) & (statistics != NO_SAMPLE))
+        if doubtful.size:
+            numbers, index = np.unique(statistics[doubtful], return_inverse=True)
+            axes, values = zip(*(patterns.innovation_axes(each) for each in numbers.tolist()), strict=True)
+            with np.errstate(all="ignore"):
+                coordinates = np.einsum("kij,jk->ik", np.stack(axes)[index], residual[:, doubtful])
+                outside = outside_sum_in_axes(np.square(coordinates), np.stack(values)[index].T, ALARM_TOLERANCE)
+            self.alarm[doubtful[outside]] = True

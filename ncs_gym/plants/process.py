@@ -1,0 +1,124 @@
+"""What really moves: the plant's own equations with noise and disturbances, for one environment or for many."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.uncertainty.disturbance import Disturbance, checked, checked_many
+from ncs_gym.uncertainty.disturbance_settings import stays_inside
+
+# Noise is drawn for about this many environment steps at once, for this many steps of one environment at most.
+BLOCK_SIZE, LONGEST_BLOCK = 4096, 256
+
+
+class BlockSampler:
+    """Draws samples for many steps at once, and hands them out step by step.
+
+    Args:
+        draw: Returns `count` samples of dimension n, shape (n, count), given a source of randomness and `count`.
+        size: Number of environments, the last axis of what is handed out; None for one without that axis.
+    """
+
+    def __init__(self, draw: Callable[[np.random.Generator, int], np.ndarray], size: int | None) -> None:
+        self._draw, self._size = draw, size
+        self._count = LONGEST_BLOCK if size is None else min(max(BLOCK_SIZE // size, 1), LONGEST_BLOCK)
+        self._left: list[np.ndarray] = []
+
+    def next(self, rng: np.random.Generator) -> np.ndarray:
+        """Returns samples of one step, shape (n,) or (n, size)."""
+        if not self._left:
+            samples = self._draw(rng, self._count * (self._size or 1))
+            steps = samples.T if self._size is None else samples.reshape(len(samples), self._count, -1).swapaxes(0, 1)
+            self._left = list(np.ascontiguousarray(steps))
+        return self._left.pop()
+
+    def forget(self) -> None:
+        """Forgets what is left, so that the next samples depend on the source of randomness alone."""
+        self._left = []
+
+
+class LinearProcess:
+    """x+ = A x + B u + d and y = H x + v, simulated; the last axis of every array is the environment.
+
+    Args:
+        plant: The plant with its bounds.
+        disturbance: What acts on it; truncated process noise is added unless it replaces that.
+        allow_assumption_violation: Let disturbances outside the certified bound pass instead of raising.
+        size: Number of environments; None for one without that axis.
+    """
+
+    def __init__(
+        self, plant: LinearPlant, disturbance: Disturbance, allow_assumption_violation: bool, size: int | None = None
+    ) -> None:
+        self.plant, self.disturbance, self.size = plant, disturbance, size
+        self._allow = allow_assumption_violation
+        self._limit = plant.state_limit if np.isfinite(plant.state_limit).all() else None
+        if size is not None and self._limit is not None:
+            self._limit = self._limit[:, None]
+        self._is_drawn_ahead = disturbance.memoryless and disturbance.vectorized
+        self._trusted = stays_inside(disturbance)
+        self.sensor_noise = BlockSampler(self._draw_sensor_noise, size)
+        self.process_noise = BlockSampler(self._draw_process_noise, size)
+
+    def _draw_process_noise(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Returns process noise, and the disturbance where it depends on nothing but chance, shape (n, count)."""
+        plant, source = self.plant, self.disturbance
+        noise = np.zeros((plant.n, count))
+        if not source.replaces_process_noise:
+            noise = plant.process_noise.sample(rng, count).T
+        return noise + source.draw(rng, plant, noise, None, None) if self._is_drawn_ahead else noise
+
+    def _draw_sensor_noise(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Returns sensor noise, shape (p, count)."""
+        return self.plant.sensor_noise.sample(rng, count).T
+
+    def forget(self) -> None:
+        """Forgets noise drawn ahead: after seeding, everything depends on the seed alone."""
+        self.sensor_noise.forget()
+        self.process_noise.forget()
+
+    def begin(self, rng: np.random.Generator, count: int | None = None) -> Any:
+        """Returns what the disturbance keeps for an episode, or for `count` of them along the last axis."""
+        if count is None:
+            return self.disturbance.begin(rng, self.plant)
+        return self.disturbance.begin_many(rng, self.plant, count)
+
+    def advance(self, rng: np.random.Generator, state: np.ndarray, u: np.ndarray, steps: Any, memory: Any) -> Any:
+        """Returns the next state, shape (n,) or (n, size).
+
+        Args:
+            rng: Source of randomness.
+            state: x, shape (n,) or (n, size).
+            u: Applied input, shape (m,) or (m, size).
+            steps: Steps taken in the episode before this one, an int or shape (size,).
+            memory: What `begin` returned.
+
+        Raises:
+            ValueError: If a disturbance lies outside its bound and that is not allowed.
+        """
+        nominal = self.plant.A.dot(state) + self.plant.B.dot(u)
+        moved = nominal + self.disturb(rng, nominal, steps, memory)
+        return moved if self._limit is None else np.minimum(np.maximum(moved, -self._limit), self._limit)
+
+    def disturb(self, rng: np.random.Generator, nominal: np.ndarray, steps: Any, memory: Any) -> np.ndarray:
+        """Returns process noise and disturbance, of the shape of A x + B u."""
+        source = self.disturbance
+        if self._is_drawn_ahead:
+            return self.process_noise.next(rng)
+        draw = source.draw if self.size is None else source.draw_many
+        d = draw(rng, self.plant, nominal, steps, memory)
+        if not source.replaces_process_noise:
+            d = d + self.process_noise.next(rng)
+        if self._trusted:
+            return d
+        if self.size is None:
+            return checked(self.plant, d, allow_assumption_violation=self._allow)
+        return checked_many(self.plant, d, self.size, allow_assumption_violation=self._allow)
+
+    def measure(self, rng: np.random.Generator, state: np.ndarray) -> np.ndarray:
+        """Returns y = H x + v, shape (p,) or (p, size)."""
+        return self.plant.H.dot(state) + self.sensor_noise.next(rng)

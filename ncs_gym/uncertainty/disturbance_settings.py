@@ -1,0 +1,47 @@
+"""The disturbances that can be named, and what a setting stands for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.uncertainty.bounded_disturbances import BallDisturbance, BoxDisturbance, SinusoidDisturbance
+from ncs_gym.uncertainty.disturbance import CallableDisturbance, Disturbance
+from ncs_gym.uncertainty.extremal_disturbances import AdversarialDisturbance, SphereDisturbance
+from ncs_gym.validation import shown
+
+BY_NAME: dict[str, type[Disturbance]] = {
+    "ball": BallDisturbance,
+    "box": BoxDisturbance,
+    "sinusoid": SinusoidDisturbance,
+    "sphere": SphereDisturbance,
+    "adversarial": AdversarialDisturbance,
+}
+
+
+def stays_inside(source: Disturbance) -> bool:
+    """Returns whether a disturbance lies in E(D) by construction: that of this module's own classes does."""
+    return type(source) in BY_NAME.values()
+
+
+def as_disturbance(value: Any, plant: LinearPlant, allow_assumption_violation: bool) -> Disturbance:
+    """Returns the settings for a name, a `Disturbance` or a callable (rng, plant, nominal_next) -> d.
+
+    Raises:
+        ValueError: If the name is unknown, the value is none of these, or it does not suit the plant.
+    """
+    if isinstance(value, str) and value in BY_NAME:
+        value = BY_NAME[value]()
+    elif not isinstance(value, Disturbance | type) and callable(value):
+        function: Any = value
+        value = CallableDisturbance(function)
+    if not isinstance(value, Disturbance):
+        raise ValueError(
+            f"disturbance must be one of {sorted(BY_NAME)}, a Disturbance or a callable, got {shown(value)}"
+        )
+    problem = value.check(plant)
+    if not problem and not allow_assumption_violation:
+        problem = value.excess(plant)
+    if problem:
+        raise ValueError(f"{type(value).__name__}: {problem}")
+    return value

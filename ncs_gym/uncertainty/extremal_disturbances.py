@@ -1,0 +1,60 @@
+"""Disturbances of the full size of E(D): a random boundary point, and the one that does the most harm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from ncs_gym.uncertainty.disturbance import ROUNDING, Disturbance
+from ncs_gym.validation import as_covariance
+
+
+@dataclass(frozen=True, eq=False)
+class SphereDisturbance(Disturbance):
+    """A random boundary point of E(D): always as large as allowed."""
+
+    replaces_process_noise: ClassVar[bool] = True
+    vectorized: ClassVar[bool] = True
+    memoryless: ClassVar[bool] = True
+
+    def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
+        count = None if nominal_next.ndim == 1 else nominal_next.shape[1]
+        return (1.0 - ROUNDING) * plant.nominal_disturbance.sample_boundary(rng, count).T
+
+
+@dataclass(frozen=True, eq=False)
+class AdversarialDisturbance(Disturbance):
+    """The point of E(D) that does the most harm to the next state.
+
+    Attributes:
+        M: Shape (n, n): maximize (x+)' M (x+). None: maximize the largest |c_j x+|.
+
+    Raises:
+        ValueError: If M is not symmetric positive semidefinite.
+    """
+
+    M: np.ndarray | None = None
+    replaces_process_noise: ClassVar[bool] = True
+    vectorized: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if self.M is not None:
+            object.__setattr__(self, "M", as_covariance(self.M, None, "M"))
+        self._freeze_arrays()
+
+    def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
+        bound = plant.nominal_disturbance
+        if self.M is not None:
+            return (1.0 - ROUNDING) * bound.farthest_point(nominal_next.T, self.M).T
+        values = plant.C @ nominal_next
+        worst = np.argmax((np.abs(values).T + bound.support(plant.C)).T, axis=0)
+        extremes = np.stack([bound.extreme_point(row) for row in plant.C], axis=1)
+        signs = np.where(np.take_along_axis(values, worst[None], axis=0)[0] >= 0.0, 1.0, -1.0)
+        return (1.0 - ROUNDING) * signs * extremes[:, worst]
+
+    def check(self, plant):  # noqa: D102
+        if self.M is not None and self.M.shape != (plant.n, plant.n):
+            return f"M must have shape ({plant.n}, {plant.n}), got {self.M.shape}"
+        return ""
