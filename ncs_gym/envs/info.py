@@ -35,12 +35,12 @@ def loop_info(
     age, many = estimator.age, state.ndim > 1
     broken = age > contract.max_age if contract is not None else np.zeros(age.shape, np.bool_) if many else False
     return {
-        "state": state.T.copy(),
-        "estimate": estimator.mean.T.copy(),
-        "estimation_error": (estimator.mean - state).T.copy() if many else estimator.mean - state,
+        "state": state.copy().T,
+        "estimate": estimator.mean.copy().T,
+        "estimation_error": (estimator.mean - state).T,
         "error_shape": error_shape,
-        "input": u.T.copy(),
-        "constraint_values": values.T.copy() if many else values,
+        "input": u.copy().T,
+        "constraint_values": values.T,
         "cost": cost,
         "measurement_age": age.copy() if many else age,
         "packet_arrived": arrived,

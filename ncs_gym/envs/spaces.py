@@ -80,4 +80,4 @@ def applied_inputs(plant: LinearPlant, actions: Any, count: int) -> np.ndarray:
     numbers = actions if type(actions) is np.ndarray and actions.dtype.char in "fd" else as_numbers(actions)
     if numbers is None or numbers.shape != (count, plant.m) or not np.isfinite(np.abs(numbers).max()):
         raise ValueError(f"the actions must be finite with shape ({count}, {plant.m}), got {shown(actions)}")
-    return plant.u_max[:, None] * np.minimum(np.maximum(numbers.T, -1.0), 1.0, dtype=np.float64)
+    return plant.u_max[:, None] * np.minimum(np.maximum(numbers.T, -1.0), 1.0)

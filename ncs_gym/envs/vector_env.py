@@ -68,7 +68,8 @@ class NCSVectorEnv(VectorEnv):
         self.single_action_space = single.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._low, self._high = single.observation_space.low[:, None], single.observation_space.high[:, None]
+        bounds = single.observation_space.low, single.observation_space.high
+        self._low, self._high = (np.asarray(bound, dtype=np.float64)[:, None] for bound in bounds)
         self._process = LinearProcess(self.plant, single.disturbance, single.allow_assumption_violation, self.num_envs)
         patterns = arrival_patterns(self.plant, self.channel, self.contract)
         self._estimator = VectorEstimator(self.plant, patterns, self.num_envs)
@@ -209,7 +210,9 @@ class NCSVectorEnv(VectorEnv):
     def _observation(self) -> np.ndarray:
         """Returns the observations, shape (N, n + extra)."""
         entries = np.concatenate([self._estimator.mean, self.task.observe_many(self._task_state)])
-        return np.minimum(np.maximum(entries, self._low), self._high).astype(np.float32).T
+        observation = np.empty(entries.shape, np.float32)
+        np.minimum(np.maximum(entries, self._low), self._high, out=observation, casting="same_kind")
+        return observation.T
 
     def _info(self, u: np.ndarray, arrived: np.ndarray, counted: np.ndarray | None) -> dict[str, Any]:
         """Returns the infos; the costs of environments that are not `counted`, shape (N,), do not count once more."""

@@ -16,8 +16,8 @@ class SpeedTracking(Task):
     """Follow a random piecewise-constant speed profile with a vehicle whose acceleration is an input.
 
     The speed moves by v+ = v + dt u. The observation gains the speed error, target - v [m/s]. The reward is
-    -error_weight min(|error| / 5, 5) - input_weight u^2, at the end of the step. The task's state holds the speed of the
-    vehicle and the one it should have [m/s], shape (2,) or (2, N).
+    -error_weight min(|error| / 5, 5) - input_weight u^2, at the end of the step. The task's state holds the vehicle's
+    speed and its target [m/s], shape (2,) or (2, N).
 
     Attributes:
         fastest: Targets (and the first speed) are uniform in `[0, fastest]` [m/s].
@@ -54,8 +54,9 @@ class SpeedTracking(Task):
 
     def advance(self, rng, plant, task_state, u):  # noqa: D102
         speed, target = task_state
-        chance, drawn = rng.random(task_state.shape)
-        target = np.where(chance < self.change_probability, self.fastest * drawn, target)
+        # One draw decides whether the target changes, and where to: below p, chance / p is uniform.
+        chance, p = rng.random(task_state.shape[1:]), self.change_probability
+        target = np.where(chance < p, chance * (self.fastest / p if p > 0.0 else 0.0), target)
         return np.array([speed + plant.dt * u[self.input_index], target])
 
     def observe(self, task_state):  # noqa: D102
