@@ -6,9 +6,10 @@ from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlan
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet
 from ncs_gym.network.contract import ChannelContract, contract_of
+from ncs_gym.plants.batch_reactor import batch_reactor
+from ncs_gym.plants.cart_pole import cart_pole
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.truck_trailer import truck_trailer
-from ncs_gym.plants.unstable import batch_reactor, cart_pole
 from ncs_gym.registration import register_all
 from ncs_gym.rendering import Annotation
 from ncs_gym.tasks.regulation import Regulation

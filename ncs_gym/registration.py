@@ -13,9 +13,10 @@ from ncs_gym.envs.env import NCSEnv
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract, contract_of
+from ncs_gym.plants.batch_reactor import batch_reactor
+from ncs_gym.plants.cart_pole import cart_pole
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.truck_trailer import truck_trailer
-from ncs_gym.plants.unstable import batch_reactor, cart_pole
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.tasks.setpoint_tracking import SetpointTracking
 from ncs_gym.tasks.speed_tracking import SpeedTracking

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import expm
 
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.plants.sampling import zero_order_hold
 from ncs_gym.validation import as_matrix, as_number
 
 
@@ -50,14 +50,12 @@ def truck_trailer(
     stiffness = as_number(stiffness, "stiffness", low=0.0, low_open=True)
     damping = as_number(damping, "damping", low=0.0)
     dt = as_number(dt, "dt", low=0.0, low_open=True)
-    continuous = np.zeros((3, 3))
-    continuous[0, 1] = 1.0
-    continuous[1] = [-stiffness / mass, -damping / mass, 1.0]
-    step = expm(continuous * dt)
+    A = np.array([[0.0, 1.0], [-stiffness / mass, -damping / mass]])
+    A, B = zero_order_hold(A, np.array([[0.0], [1.0]]), dt)
     p = 2 if H is None else len(as_matrix(H, (None, 2), "H"))
     return LinearPlant(
-        A=step[:2, :2],
-        B=step[:2, 2:],
+        A=A,
+        B=B,
         C=np.eye(2) / 2.0 if C is None else C,
         H=H,
         u_max=u_max,

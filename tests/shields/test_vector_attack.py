@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from ncs_gym.law import SPHERE, Law
+from ncs_gym.system import packed, system_of
 
 from ncs_gym import Channel, NCSVectorEnv, batch_reactor, cart_pole
-from ncs_gym.law import SPHERE, Law
 from ncs_gym.network.contract import contract_of
-from ncs_gym.system import packed, system_of
 from shields import VectorSafetyShield
 from tests.attacks import CHANNELS, RANDOM, TRUCKS, certificate_of, harmful
 
