@@ -162,13 +162,17 @@ class ArrivalPatterns:
                 self.arrays.set_replay(pattern, replay)
         return self._replays[pattern]
 
-    def gain(self, statistics: int) -> np.ndarray:
-        """Returns the gain, shape (n, p), of an update of some statistics; zero if the sample must not be used."""
-        return self._updated(statistics)[1]
+    def update(self, statistics: int) -> tuple[int, np.ndarray, np.ndarray]:
+        """Returns the number of the statistics after an update, its gain (n, p), and W of the innovation test (p, p).
 
-    def quick_test(self, statistics: int) -> np.ndarray:
-        """Returns W of the innovation test before an update of some statistics; see `InnovationTest`."""
-        return self._updated(statistics)[2]
+        The gain is zero and the statistics are the same where the sample must not be used.
+        """
+        found = self._updates[statistics]
+        if found is None:
+            with self._lock:
+                found = self._updates[statistics] = self._updated(statistics)
+                self.arrays.set_update(statistics, found[1], found[2])
+        return found
 
     def innovation_axes(self, statistics: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns the axes in which residuals before an update of some statistics are tested exactly."""
@@ -226,24 +230,14 @@ class ArrivalPatterns:
         return self._predictions[number]
 
     def _updated(self, number: int) -> tuple[int, np.ndarray, np.ndarray]:
-        """Returns the number of the statistics after an update, its gain (n, p), and W of the innovation test (p, p).
-
-        The gain is zero and the statistics are the same where the sample must not be used.
-        """
-        found = self._updates[number]
-        if found is None:
-            statistics = self.statistics[number]
-            update = self.recursion.updated(statistics)
-            spread = self.test.spread(statistics.shape)
-            quick = self.test.inverse_of_bound(spread)
-            if update is None:
-                plant = self.recursion.plant
-                found = number, np.zeros((plant.n, plant.p)), quick
-            else:
-                found = self._number_of_statistics(update.statistics), update.gain, quick
-            self._updates[number] = found
-            self.arrays.set_update(number, found[1], quick)
-        return found
+        """Returns what `update` looks up."""
+        statistics = self.statistics[number]
+        update = self.recursion.updated(statistics)
+        quick_test = self.test.inverse_of_bound(self.test.spread(statistics.shape))
+        if update is None:
+            plant = self.recursion.plant
+            return number, np.zeros((plant.n, plant.p)), quick_test
+        return self._number_of_statistics(update.statistics), update.gain, quick_test
 
     def _replayed(self, pattern: Pattern) -> Replay:
         """Returns the history from the oldest new sample on, and whether it is kept."""
@@ -253,7 +247,7 @@ class ArrivalPatterns:
             number = replayed[age]
             if held[age]:
                 used[age] = number
-                number = self._updated(number)[0]
+                number = self.update(number)[0]
             if age > 0:
                 replayed[age - 1] = self._predicted(number)
         accepted = self.recursion.prefers(self.statistics[number], self.statistics[present])

@@ -137,8 +137,10 @@ class Estimator:
             statistics, sample = replay.used[age], self._samples[age]
             if statistics != NO_SAMPLE and sample is not None:
                 residual = sample - H.dot(mean)
-                self._monitor(residual, statistics)
-                mean = mean + self._patterns.gain(statistics).dot(residual)
+                _, gain, quick_test = self._patterns.update(statistics)
+                if not residual.dot(quick_test.dot(residual)) <= 1.0:
+                    self._test_exactly(residual, statistics)
+                mean = mean + gain.dot(residual)
             if age > 0:
                 mean = self._predicted(mean, self._inputs[age - 1])
         if replay.accepted:
@@ -154,12 +156,11 @@ class Estimator:
         mean = self.plant.A.dot(mean) + self.plant.B.dot(u)
         return mean if self._limit is None else np.minimum(np.maximum(mean, -self._limit), self._limit)
 
-    def _monitor(self, residual: np.ndarray, statistics: int) -> None:
+    def _test_exactly(self, residual: np.ndarray, statistics: int) -> None:
         """Latches the alarm if a residual y - H x_hat lies outside E(H Sigma H') + E(N).
 
-        The ellipsoid of shape H Sigma H' + N lies inside that sum, so passing it settles the matter.
+        The ellipsoid of shape H Sigma H' + N, which the quick test is about, lies inside that sum.
         """
-        if not residual.dot(self._patterns.quick_test(statistics).dot(residual)) <= 1.0:
-            test = self._patterns.test
-            spread = test.spread(self._patterns.statistics[statistics].shape)
-            self.alarm |= bool(test.are_impossible(residual[None], spread)[0])
+        test = self._patterns.test
+        spread = test.spread(self._patterns.statistics[statistics].shape)
+        self.alarm |= bool(test.are_impossible(residual[None], spread)[0])

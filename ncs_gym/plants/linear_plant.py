@@ -265,7 +265,7 @@ class LinearPlant(FrozenArrays):
 
     def constraint_values(self, state: np.ndarray) -> np.ndarray:
         """Returns |c_j x| - 1 for each row of the safe box, shape (k,) or (k, N); positive is violated."""
-        return np.abs(self.C.dot(state)) - 1.0
+        return abs(self.C.dot(state)) - 1.0
 
 
 def _as_limits(value: Any, size: int) -> np.ndarray:

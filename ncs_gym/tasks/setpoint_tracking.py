@@ -57,7 +57,7 @@ class SetpointTracking(Task):
         return np.array([self.reach])
 
     def reward(self, plant, task_state, state, u):  # noqa: D102
-        return 1.0 - np.minimum(np.abs(self.output @ state - task_state) / self.width, 1.0)
+        return 1.0 - np.minimum(abs(self.output.dot(state) - task_state) / self.width, 1.0)
 
     def check(self, plant):  # noqa: D102
         if self.output.shape != (plant.n,):
