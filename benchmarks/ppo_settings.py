@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from agents import SB3VecEnv
 from agents.agent import Normalization
-from agents.algorithms import build
+from agents.algorithms import build_model
 from agents.control_loop import ControlLoop
 from agents.evaluation import evaluate
 from agents.settings import PPOSettings
@@ -48,7 +48,9 @@ def trained(scalar: bool, settings: PPOSettings | dict | None, steps: int, seed:
         environments(scalar, settings.envs if ours else SB3_ENVS), gamma=settings.discount if ours else 0.99
     )
     model = (
-        build("PPO", env, settings, seed) if ours else PPO("MlpPolicy", env, seed=seed, device="cpu", **settings or {})
+        build_model("PPO", env, settings, seed)
+        if ours
+        else PPO("MlpPolicy", env, seed=seed, device="cpu", **settings or {})
     )
     return model.learn(steps), env
 
