@@ -18,7 +18,7 @@ from ncs_gym import NCSVectorEnv
 _WITH_RESET_MASK = (NCSVectorEnv, SyncVectorEnv, AsyncVectorEnv)
 # Infos of an episode's last step that become part of info["episode"], as with `Monitor(info_keywords=...)`.
 _EPISODE_KEYS = ("episode_violations", "is_success")
-# Attributes that `NCSVectorEnv` and its scalar prototype both have, but which the prototype never changes.
+# Attributes that change with the episodes of an `NCSVectorEnv`, but never in its scalar prototype.
 _STATEFUL_ATTRIBUTES = ("steps", "episodes", "np_random", "starts", "spec", "num_envs", "metadata")
 
 
