@@ -112,8 +112,8 @@ class FrameRecord:
     @property
     def intervened(self) -> bool:
         """Whether a shield that protects replaced the input that led here."""
-        note = self.annotation
-        return note is not None and note.intervened and note.protects
+        annotation = self.annotation
+        return annotation is not None and annotation.intervened and annotation.protects
 
 
 class EpisodeRecord:

@@ -69,17 +69,17 @@ def draw_legend(canvas: Canvas, *, shielded: bool) -> None:
 
 def _draw_shield(canvas: Canvas, frame: FrameRecord, right: float) -> None:
     """Writes into the header whether there is a shield and what it does."""
-    note = frame.annotation
-    if note is None:
+    annotation = frame.annotation
+    if annotation is None:
         _draw_label(canvas, right, "no shield", theme.INK, theme.GRID, filled=False)
         return
-    count = f"{note.interventions}\N{MULTIPLICATION SIGN}"
-    if not note.protects:
+    count = f"{annotation.interventions}\N{MULTIPLICATION SIGN}"
+    if not annotation.protects:
         text = f"shield only watches: would act {count}"
-    elif note.intervened:
+    elif annotation.intervened:
         text = f"SHIELD ACTS {count}"
     else:
-        text = f"shield ({note.label}): acted {count}"
+        text = f"shield ({annotation.label}): acted {count}"
     _draw_label(canvas, right, text, theme.SHIELD, theme.SHIELD_FILL, filled=frame.intervened)
 
 
@@ -125,9 +125,9 @@ def _draw_input(canvas: Canvas, frame: FrameRecord, index: int, y: float) -> Non
     x = x_of(value)
     canvas.rect(theme.Rect(min(x, middle), bar.y + 2, abs(x - middle), bar.h - 4), color)
     canvas.line([(middle, bar.y - 2), (middle, bar.bottom + 2)], theme.MUTED, 1.0)
-    note = frame.annotation
-    if note is not None and note.intervened and note.proposed is not None:
-        _draw_correction(canvas, x_of(float(note.proposed[index])), x, bar.y + bar.h / 2)
+    annotation = frame.annotation
+    if annotation is not None and annotation.intervened and annotation.proposed is not None:
+        _draw_correction(canvas, x_of(float(annotation.proposed[index])), x, bar.y + bar.h / 2)
 
 
 def _draw_correction(canvas: Canvas, start: float, end: float, y: float) -> None:

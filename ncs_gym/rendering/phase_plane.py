@@ -111,8 +111,8 @@ class PhasePlane:
         _draw_titles(
             canvas,
             rect,
-            theme.axis_title(plant.state_names[i], plant.state_units[i]),
-            theme.axis_title(plant.state_names[j], plant.state_units[j]),
+            _axis_title(plant.state_names[i], plant.state_units[i]),
+            _axis_title(plant.state_names[j], plant.state_units[j]),
         )
 
 
@@ -148,7 +148,7 @@ class TimePlot:
         canvas.rect(rect, theme.FAINT, width=0.5)
         for age in (0, RECENT_STEPS // 2, RECENT_STEPS):
             canvas.text(theme.tick_label(-age), (self._x(age), rect.bottom + 11), theme.MUTED, align=0.5)
-        title = theme.axis_title(self._plant.state_names[0], self._plant.state_units[0])
+        title = _axis_title(self._plant.state_names[0], self._plant.state_units[0])
         _draw_titles(canvas, rect, "time [steps]", title)
 
     def draw(self, canvas: Canvas, frame: FrameRecord) -> None:
@@ -178,6 +178,11 @@ class TimePlot:
         """Returns where a value is [pixels]."""
         half = self._rect.h / 2
         return self._rect.y + half - (half - 2) * float(np.clip(value / (_AXIS_REACH * self._limit), -1.0, 1.0))
+
+
+def _axis_title(name: str, unit: str) -> str:
+    """Returns the title of an axis: the name of a quantity and its unit in brackets."""
+    return f"{name} [{theme.unit_label(unit)}]" if unit else name
 
 
 def _draw_titles(canvas: Canvas, rect: theme.Rect, horizontal: str, vertical: str) -> None:

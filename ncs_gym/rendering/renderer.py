@@ -42,7 +42,7 @@ class Renderer:
     def __init__(self, plant: LinearPlant, task: Task, render_mode: str, fps: int) -> None:
         self._plant, self._render_mode, self._fps = plant, render_mode, fps
         self._episode = EpisodeRecord(plant, task)
-        self._picture: Picture | None = None
+        self._picture: _Picture | None = None
         self._window: Window | None = None
 
     def begin(self, info: Mapping[str, Any], task_state: Any) -> None:
@@ -108,14 +108,14 @@ class Renderer:
 
     def _draw(self) -> Canvas:
         if self._picture is None:
-            self._picture = Picture(self._plant)
+            self._picture = _Picture(self._plant)
         return self._picture.draw(self.frame_record())
 
     def __getstate__(self) -> dict[str, Any]:
         return vars(self) | {"_picture": None, "_window": None}
 
 
-class Picture:
+class _Picture:
     """Draws frames of one plant; it needs no display.
 
     Args:
@@ -144,8 +144,8 @@ class Picture:
 
     def _background(self, frame: FrameRecord) -> Any:
         """Returns a snapshot of everything that stays the same as long as the safe set does."""
-        note, color = frame.annotation, _background_color(frame)
-        safe_set = None if note is None else note.safe_set
+        annotation, color = frame.annotation, _background_color(frame)
+        safe_set = None if annotation is None else annotation.safe_set
         key = id(safe_set), color
         if key not in self._backgrounds:
             if len(self._backgrounds) >= _MAX_BACKGROUNDS:

@@ -96,8 +96,3 @@ def value_label(value: float, limit: float, unit: str = "") -> str:
 def unit_label(unit: str) -> str:
     """Returns a unit with its powers as superscripts."""
     return unit.replace("^2", "\N{SUPERSCRIPT TWO}").replace("^3", "\N{SUPERSCRIPT THREE}")
-
-
-def axis_title(name: str, unit: str) -> str:
-    """Returns the title of an axis: the name of a quantity and its unit in brackets."""
-    return f"{name} [{unit_label(unit)}]" if unit else name

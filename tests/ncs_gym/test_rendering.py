@@ -20,7 +20,7 @@ from ncs_gym import Annotation, Channel, Ellipsoid, LinearPlant
 from ncs_gym.registration import ENTRY_POINTS
 from ncs_gym.rendering import PacketRecord, theme
 from ncs_gym.rendering.episode_record import RECENT_STEPS
-from ncs_gym.rendering.renderer import Picture
+from ncs_gym.rendering.renderer import _Picture
 from tests.plants import random_plant
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -53,7 +53,7 @@ def record(state=(0.0, 0.0), **changes):
 
 @pytest.fixture(scope="module")
 def picture(loaded):
-    return Picture(loaded)
+    return _Picture(loaded)
 
 
 def pixels_of(picture, frame):
