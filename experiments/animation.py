@@ -85,9 +85,9 @@ def _palette() -> Image.Image:
     grounds = (theme.PAPER, theme.MIST, theme.SAFE_FILL, theme.DANGER_FILL, theme.ERROR_FILL, theme.SHIELD_FILL)
     marks = (theme.INK, theme.MUTED, theme.STEEL, theme.FAINT, theme.SAFE, theme.DANGER, theme.ESTIMATE, theme.LATE)
     marks = (*marks, theme.LATE_TEXT, theme.SHIELD, theme.BODYWORK)
-    ramp = [theme.strain(share) for share in np.linspace(0.6, 0.95, 9)]
+    ramp = [theme.load_color(fraction) for fraction in np.linspace(0.6, 0.95, 9)]
     edges = [theme.blend(mark, ground, share) for mark, ground, share in product(marks, grounds, EDGE_SHARES)]
-    colors = list(dict.fromkeys([*grounds, *marks, theme.GRID, theme.LOAD, theme.CRATE, theme.GLASS, *ramp, *edges]))[
+    colors = list(dict.fromkeys([*grounds, *marks, theme.GRID, theme.CARGO, theme.CRATE, theme.GLASS, *ramp, *edges]))[
         :255
     ]
     image = Image.new("P", (1, 1))

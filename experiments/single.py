@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict
 from typing import Any
 
-from agents.control_loop import ControlLoop, Shielding
+from agents.control_loop import ControlLoop, ShieldSettings
 from agents.evaluation import evaluate
 from experiments.arms import arm_of
 from experiments.channels import channel_of
@@ -64,7 +64,7 @@ def evaluate_agent(settings: EvaluateSettings) -> None:
     world = world_of(agent.env, channel, settings.certificate)
     mode = None if settings.shield == "none" else settings.shield
     loop = ControlLoop(
-        env=agent.env, channel=channel, shielding=None if mode is None else Shielding(world.certificate, mode)
+        env=agent.env, channel=channel, shield=None if mode is None else ShieldSettings(world.certificate, mode)
     )
     played = evaluate(
         loop, lambda observations, infos: agent.act(observations), settings.episodes, settings.seed, world.certificate.M

@@ -12,7 +12,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from agents.trajectory import Trajectory
+from agents.results import Trajectory
 from experiments.arm_style import style_of
 from experiments.arms import arm_of
 from experiments.plotting import STYLE, label, legend_below, with_unit

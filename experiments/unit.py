@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from agents.control_loop import ControlLoop, Shielding
-from agents.evaluation import Episode, Policy, evaluate
-from agents.history import TrainingPoint
+from agents.control_loop import ControlLoop, ShieldSettings
+from agents.evaluation import Policy, evaluate
+from agents.results import Episode, TrainingPoint, Trajectory
 from agents.settings import AgentSettings
-from agents.trajectory import Trajectory
 from experiments.versions import versions
 from ncs_gym import Channel
 from ncs_gym.envs.env import ncs_env
@@ -74,12 +73,10 @@ class Unit:
     @property
     def loop(self) -> ControlLoop:
         """What the policy is trained and evaluated in."""
-        shielding = None
+        shield = None
         if self.mode is not None:
-            shielding = Shielding(self.certificate, self.mode, self.intervention_penalty)
-        return ControlLoop(
-            env=self.env, channel=self.channel, shielding=shielding, violation_penalty=self.violation_penalty
-        )
+            shield = ShieldSettings(self.certificate, self.mode, self.intervention_penalty)
+        return ControlLoop(env=self.env, channel=self.channel, shield=shield, violation_penalty=self.violation_penalty)
 
     @property
     def training_seed(self) -> int:

@@ -10,9 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.evaluation import Episode
-from agents.history import TrainingPoint
-from agents.trajectory import Trajectory
+from agents.results import Episode, TrainingPoint, Trajectory
 from experiments.errors import ResultsError
 from experiments.unit import Unit, UnitResult
 from shields.atomic_write import write_atomically

@@ -6,9 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.evaluation import Episode
-from agents.history import TrainingPoint
-from agents.trajectory import Trajectory
+from agents.results import Episode, TrainingPoint, Trajectory
 from experiments.arms import arm_of
 from experiments.summary import paired_differences, summarize_arm
 from experiments.unit import UnitResult

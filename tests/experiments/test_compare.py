@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents.evaluation import Episode
+from agents.results import Episode
 from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
 from experiments.arms import arm_of
 from experiments.compare import _units, grouped, prepare
@@ -50,7 +50,7 @@ def test_any_seed_is_usable(world, seed):
 def test_each_arm_has_its_shield_and_its_prices(world):
     chosen = units(world, arms=ALL_ARMS, seeds=1, mode="switch", intervention_penalty=0.3, violation_penalty=2.0)
     loops = {unit.arm: unit.loop for unit in chosen}
-    modes = {name: loop.shielding and loop.shielding.mode for name, loop in loops.items()}
+    modes = {name: loop.shield and loop.shield.mode for name, loop in loops.items()}
     assert modes == {
         "unshielded": None,
         "monitor": "monitor",
@@ -62,7 +62,7 @@ def test_each_arm_has_its_shield_and_its_prices(world):
         "K x_hat": None,
         "untrained": None,
     }
-    priced = {name for name, loop in loops.items() if loop.shielding and loop.shielding.penalty == 0.3}
+    priced = {name for name, loop in loops.items() if loop.shield and loop.shield.penalty == 0.3}
     assert priced == {"shielded:switch+penalty"}
     assert {name for name, loop in loops.items() if loop.violation_penalty == 2.0} == {"penalized"}
 
