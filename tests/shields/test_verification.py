@@ -6,7 +6,7 @@ import pytest
 
 from ncs_gym import Ellipsoid, truck_trailer
 from shields import CertificateError, synthesize, verify
-from shields.verification.verify import require_valid
+from shields.verification import require_valid
 from tests.plants import random_plant
 
 

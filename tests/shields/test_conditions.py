@@ -3,7 +3,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from shields.verification.conditions import flag, matrix_condition, scalar
+from shields.verification.conditions import flag, matrix_condition, scalar_condition
 
 BEYOND_FLOATS = Fraction(10) ** 400
 
@@ -11,14 +11,14 @@ BEYOND_FLOATS = Fraction(10) ** 400
 @pytest.mark.parametrize("slack", [0, 1, Fraction(1, 3), 1 / BEYOND_FLOATS, BEYOND_FLOATS])
 def test_scalar_conditions_hold_from_zero_on_and_not_below(slack):
     slack = Fraction(slack)
-    assert scalar("(S)", slack).holds
-    assert scalar("(S)", slack).margin >= 0.0
-    assert scalar("(S)", -slack).holds == (slack == 0)
-    assert scalar("(S)", -slack).margin <= 0.0
+    assert scalar_condition("(S)", slack).holds
+    assert scalar_condition("(S)", slack).margin >= 0.0
+    assert scalar_condition("(S)", -slack).holds == (slack == 0)
+    assert scalar_condition("(S)", -slack).margin <= 0.0
 
 
 def test_slacks_beyond_any_float_keep_their_sign():
-    assert [scalar("(S)", slack).margin for slack in (BEYOND_FLOATS, -BEYOND_FLOATS)] == [np.inf, -np.inf]
+    assert [scalar_condition("(S)", slack).margin for slack in (BEYOND_FLOATS, -BEYOND_FLOATS)] == [np.inf, -np.inf]
     for factor, margin in ((1, np.inf), (-1, -np.inf)):
         condition = matrix_condition("(M)", [[factor * BEYOND_FLOATS]])
         assert condition.margin == margin
