@@ -26,7 +26,7 @@ from shields.synthesis.multipliers import (
 from shields.verification import Report, verify
 
 # Relative tightenings of the semidefinite programs, tried in turn until the result verifies exactly.
-SLACKS = (1e-6, 1e-5, 1e-4, 1e-3)
+_SLACKS = (1e-6, 1e-5, 1e-4, 1e-3)
 # Multipliers from which those of a given set and gain are sought.
 _INITIAL_MULTIPLIERS = (0.9, 0.03, 0.07)
 
@@ -109,7 +109,7 @@ def _largest_certificate(plant: LinearPlant, contract: ChannelContract | None, p
     except Infeasible as infeasible:
         raise with_feasible_bounds(infeasible, plant, contract) from infeasible
     failure = None
-    for slack in SLACKS:
+    for slack in _SLACKS:
         design = largest_set(problem, slack, progress)
         if design is None:
             break
