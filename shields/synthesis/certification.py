@@ -12,17 +12,12 @@ from ncs_gym.network.contract import ChannelContract
 from ncs_gym.validation import shown
 from shields.certificate import Certificate
 from shields.errors import Infeasible
-from shields.proof import ContractProof
+from shields.proof import ContractProof, Multipliers
 from shields.synthesis.alternation import largest_set, with_best_multipliers
 from shields.synthesis.design_problem import INFLATION, CandidateDesign, DesignProblem, design_problem
 from shields.synthesis.diagnosis import infeasibility, with_feasible_bounds
 from shields.synthesis.initial_designs import Progress
-from shields.synthesis.multipliers import (
-    best_input_multipliers,
-    best_multipliers,
-    certificate_multipliers,
-    rounded_down,
-)
+from shields.synthesis.multipliers import best_input_multipliers, best_multipliers
 from shields.verification import Report, verify
 
 # Relative tightenings of the semidefinite programs, tried in turn until the result verifies exactly.
@@ -139,7 +134,7 @@ def _certificate(
     ages = None
     if errors.ages is not None:
         by_age = [with_best_multipliers(problem, design, Sigma[None]) for Sigma in problem.error_shapes]
-        multipliers = np.array([rounded_down(each.multipliers) for each in by_age])
+        multipliers = np.array([_rounded_down(each.multipliers) for each in by_age])
         inputs = np.array([each.inputs for each in by_age])
         ages = ContractProof(sets=errors.ages, multipliers=multipliers, inputs=inputs)
         design = by_age[-1]
@@ -148,7 +143,7 @@ def _certificate(
         K=K,
         Sigma=errors.Sigma,
         D=INFLATION * plant.disturbance.shape,
-        multipliers=certificate_multipliers(problem, design, errors.rate),
+        multipliers=_multipliers(problem, design, errors.rate),
         ages=ages,
         method="certified",
         fingerprint=plant.fingerprint,
@@ -159,3 +154,15 @@ def _certificate(
             "volume_of_box_ellipsoid": float(np.exp(0.5 * design.log_det)),
         },
     )
+
+
+def _multipliers(problem: DesignProblem, design: CandidateDesign, lam_e: float) -> Multipliers:
+    """Returns a design's multipliers as a certificate has them, with those of the error set and of the rounding."""
+    lx, le, ld = _rounded_down(design.multipliers)
+    inputs = tuple(float(mu) for mu in design.inputs)
+    return Multipliers(error=lam_e, state=lx, estimate=le, disturbance=ld, inputs=inputs, rounding=problem.rounding)
+
+
+def _rounded_down(multipliers: tuple[float, float, float]) -> tuple[float, ...]:
+    """Returns multipliers so much smaller that rounding cannot lift lx + le + ld above 1."""
+    return tuple(multiplier * (1.0 - 1e-15) for multiplier in multipliers)

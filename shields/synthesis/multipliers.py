@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import minimize
 
-from shields.proof import Multipliers
-from shields.synthesis.design_problem import CandidateDesign, DesignProblem
+from shields.synthesis.design_problem import DesignProblem
 
 
 def best_multipliers(
@@ -53,15 +52,3 @@ def best_input_multipliers(error_shapes: np.ndarray, L: np.ndarray, K: np.ndarra
     a = np.sqrt(np.maximum(((K @ L) * K).sum(axis=1), 0.0))
     b = np.sqrt(np.maximum(((K @ error_shapes) * K).sum(axis=-1), 0.0)).max(axis=0)
     return np.clip(a / np.maximum(a + b, 1e-300), 1e-6, 1.0 - 1e-6)
-
-
-def certificate_multipliers(problem: DesignProblem, design: CandidateDesign, lam_e: float) -> Multipliers:
-    """Returns a design's multipliers as a certificate has them, with those of the error set and of the rounding."""
-    lx, le, ld = rounded_down(design.multipliers)
-    inputs = tuple(float(mu) for mu in design.inputs)
-    return Multipliers(error=lam_e, state=lx, estimate=le, disturbance=ld, inputs=inputs, rounding=problem.rounding)
-
-
-def rounded_down(multipliers: tuple[float, float, float]) -> tuple[float, ...]:
-    """Returns multipliers so much smaller that rounding cannot lift lx + le + ld above 1."""
-    return tuple(multiplier * (1.0 - 1e-15) for multiplier in multipliers)

@@ -198,4 +198,5 @@ def _smallest_trace_multiplier(first: Matrix, second: Matrix, weight: Matrix) ->
 
 
 def _trace(matrix: Matrix) -> Fraction:
+    """Returns the trace."""
     return sum((matrix[i][i] for i in range(len(matrix))), Fraction(0))

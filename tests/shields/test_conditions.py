@@ -36,7 +36,7 @@ def test_singular_matrices_pass_unless_the_condition_is_strict():
 
 @pytest.mark.parametrize("size", [Fraction(1), Fraction(10) ** 20, 1 / Fraction(10) ** 20])
 def test_margins_have_the_sign_of_the_exact_verdict(size):
-    # Singular but for a share of 1e-40, which no float shows.
+    # Singular but for a fraction of 1e-40, which no float shows.
     for tiny in (Fraction(1, 10**40), -Fraction(1, 10**40)):
         matrix = [[size * Fraction(1, 9), size * Fraction(1, 3)], [size * Fraction(1, 3), size * (1 + tiny)]]
         condition = matrix_condition("(M)", matrix)
