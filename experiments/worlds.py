@@ -14,7 +14,7 @@ from ncs_gym import Channel, LinearPlant
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, Report, verify
 from shields.runtime.wrapper import certificate_for
-from shields.verification.verify import require_valid
+from shields.verification import require_valid
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from ncs_gym.validation import FrozenArrays, as_numbers, shown
 from shields.certificate import Certificate, CertificateError
 from shields.runtime.one_step_test import MOST_INPUTS_WITH_VERTICES, OneStepTest, Outlook
 from shields.runtime.plane import PlaneOutlook
-from shields.verification.verify import ACTION_ROUNDING, require_valid
+from shields.verification import ACTION_ROUNDING, require_valid
 
 MODES = ("project", "switch", "boundary", "monitor")
 # The test must be passed by this much, in units of the safe set: far more than the rounding of its computation.

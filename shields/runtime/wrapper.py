@@ -163,7 +163,7 @@ def certificate_for(plant: LinearPlant, contract: ChannelContract | None = None)
     """
     key = plant.fingerprint, contract
     if key not in _synthesized:
-        from shields.synthesis.synthesize import (
+        from shields.synthesis import (
             synthesize,  # takes the solver, which who has a certificate does without
         )
 

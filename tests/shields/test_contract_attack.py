@@ -141,7 +141,7 @@ MUTATIONS = {
     ),
     "another Sigma": (lambda c, s: replace(c, Sigma=1.1 * c.Sigma), ["Sigma is the set of the largest age"]),
     "shares of (I)": (
-        lambda c, s: replace(c, ages=replace(c.ages, shares=at(c.ages.shares, (1, 1), 1e-6))),
+        lambda c, s: replace(c, ages=replace(c.ages, multipliers=at(c.ages.multipliers, (1, 1), 1e-6))),
         ["(I) L - (A+BK) L (A+BK)'/lx - BK Sigma K'B'/le - D_u/ld >= 0 at age 1"],
     ),
     "shares of (U)": (
@@ -149,7 +149,7 @@ MUTATIONS = {
         ["(U) input 2 stays within u_max (1 - 2^-24) at age 0"],
     ),
     "shares above one": (
-        lambda c, s: replace(c, ages=replace(c.ages, shares=at(c.ages.shares, (2, 0), 1.5))),
+        lambda c, s: replace(c, ages=replace(c.ages, multipliers=at(c.ages.multipliers, (2, 0), 1.5))),
         ["lx + le + ld <= 1"],
     ),
 }
@@ -184,7 +184,7 @@ def test_margins_by_age_agree_with_floating_point(promised):
     closed, gain = plant.A + plant.B @ certificate.K, plant.B @ certificate.K
     spread = plant.m * plant.B @ np.diag((plant.u_max * 2.0**-24) ** 2) @ plant.B.T
     D_u = (1 + growth) * certificate.D + (1 + 1 / growth) * spread
-    for j, (lx, le, ld) in enumerate(ages.shares):
+    for j, (lx, le, ld) in enumerate(ages.multipliers):
         grown = closed @ certificate.L @ closed.T / lx + gain @ s.shapes[j] @ gain.T / le + D_u / ld
         assert margins[f"(I){j}"] == [pytest.approx(smallest(certificate.L - grown), rel=1e-4)]
         for k, mu, limit, found in zip(certificate.K, ages.inputs[j], plant.u_max, margins[f"(U){j}"], strict=True):

@@ -215,8 +215,8 @@ def test_boundary_overrides_more_often_than_switch(certificate):
 
 
 def test_certificate_is_synthesized_once_per_plant(monkeypatch):
+    from shields import synthesis
     from shields.runtime import wrapper
-    from shields.synthesis import synthesize as synthesis
 
     calls = []
     monkeypatch.setattr(wrapper, "_synthesized", {})

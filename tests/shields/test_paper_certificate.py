@@ -93,7 +93,7 @@ def test_exact_conditions_are_checked_separately(paper):
     assert certify(SMALL, paper.L, 2.5 * paper.K) is None
 
 
-def test_shield_from_a_paper_certificate_works_but_promises_nothing(paper):
+def test_shield_with_a_paper_certificate_works_but_is_never_guaranteed(paper):
     env = SafetyShield(gym.make("ncs_gym/TruckTrailer-v0", plant=SMALL), paper)
     _, info = env.reset(seed=0)
     assert info["shield_reason"] == NO_ERROR_SET
