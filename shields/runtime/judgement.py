@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from ncs_gym.compiled import entry, inner, version_of
+from ncs_gym.product import add_product, copy_rows, set_product
 from numba import njit
 
 from ncs_gym import product
-from ncs_gym.compiled import entry, inner, version_of
-from ncs_gym.product import add_product, copy_rows, set_product
 from shields.runtime.closest import closest_in_space, closest_on_lines
 from shields.runtime.closest_pair import closest_pairs
 from shields.runtime.rule import unpacked

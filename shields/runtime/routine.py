@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from ncs_gym.compiled import inner, version_of
+from ncs_gym.product import copy_rows
 from numba import njit
 
 from ncs_gym import product
-from ncs_gym.compiled import inner, version_of
-from ncs_gym.product import copy_rows
 from shields.runtime.tracking import Ground, Knowledge, compare_clocks, count_interventions, number, track
 
 # Rows of what is kept from step to step: whole numbers and flags.

@@ -8,9 +8,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
+from ncs_gym.estimation.gain_table import GainTable
 
 from ncs_gym.envs.vector_env import NCSVectorEnv
-from ncs_gym.estimation.gain_table import GainTable
 from ncs_gym.plants.linear_plant import SIMULATED_REACH
 from ncs_gym.validation import as_number, as_numbers, shown
 from shields.certificate import Certificate
