@@ -5,13 +5,11 @@ from typing import TYPE_CHECKING, Any
 
 from shields.certificate import Certificate, CertificateError, Multipliers
 from shields.errors import Infeasible
-from shields.runtime.filter import Decision, SafetyFilter
-from shields.runtime.wrapper import SafetyShield
+from shields.runtime import Decision, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.verification.conditions import Condition
 from shields.verification.verify import Report, verify
 
 if TYPE_CHECKING:
-    from shields.runtime.vector_wrapper import VectorSafetyShield
     from shields.synthesis.synthesize import certify, synthesize
 
 __all__ = [
@@ -31,12 +29,8 @@ __all__ = [
 ]
 
 
-# Imported when they are asked for: what needs the solver, and what needs the compiler.
-LATER = {
-    "certify": "synthesis.synthesize",
-    "synthesize": "synthesis.synthesize",
-    "VectorSafetyShield": "runtime.vector_wrapper",
-}
+# Imported when they are asked for: what needs the solver.
+LATER = {"certify": "synthesis.synthesize", "synthesize": "synthesis.synthesize"}
 
 
 def __getattr__(name: str) -> Any:

@@ -85,6 +85,7 @@ class NCSVectorEnv(VectorEnv):
         self.episodes = np.zeros(self.num_envs, dtype=np.int64)
         self.starts = np.full((self.num_envs, self.plant.n), np.nan)
         self._consistent = False
+        self._shapes: _Shapes | None = None
 
     def _allocate(self) -> None:
         """Makes the arrays that are kept."""
@@ -114,6 +115,13 @@ class NCSVectorEnv(VectorEnv):
     def ticks(self) -> int:
         """Steps of the whole vector since it was made."""
         return self._tick
+
+    @property
+    def error_shapes(self) -> tuple[Any, np.ndarray]:
+        """The distinct error shapes met so far, as an object with `shapes` (k, n, n), and which each one has, (N,)."""
+        if self._shapes is None or self._shapes.table is not self._table:
+            self._shapes = _Shapes(self._table, self.plant.n)
+        return self._shapes, self._fleet.node
 
     @property
     def patterns(self) -> tuple[GainTable, np.ndarray]:
@@ -347,6 +355,20 @@ class NCSVectorEnv(VectorEnv):
                 f"options['state'] must be finite with shape ({n},) or ({self.num_envs}, {n}), got {shown(starts)}"
             )
         return mask, np.broadcast_to(starts, (self.num_envs, n))
+
+
+class _Shapes:
+    """The error shapes of a gain table, one per node."""
+
+    def __init__(self, table: GainTable, n: int) -> None:
+        self.table, self._n, self._shapes = table, n, np.empty((0, n, n))
+
+    @property
+    def shapes(self) -> np.ndarray:
+        """Shape (k, n, n)."""
+        if len(self.table) > len(self._shapes):
+            self._shapes = self.table.shapes[:, : len(self.table)].T.reshape(-1, self._n, self._n).copy()
+        return self._shapes
 
 
 def _is_text(value: Any, text: str) -> bool:
