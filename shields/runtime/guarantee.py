@@ -114,20 +114,24 @@ class GuaranteeMonitor:
         size = np.abs(estimate)
         reach = self._reach if estimate.ndim == 1 else self._reach[:, None]
         near = (size + errors.half_widths <= reach).all(axis=0)  # never without a usable estimate and error shape
-        broken = _first(broken, alarm, ALARM)
-        certified = errors.certified & near
-        if np.count_nonzero(near) < np.size(near):
+        broken, certified = _first(broken, alarm, ALARM), errors.certified
+        if not _all(near):
             usable = (self._test.columns.dot(size) < FARTHEST) & (errors.radius == errors.radius)
             broken = _first(_first(broken, usable == False, UNUSABLE), near == False, FAR_OUT)  # noqa: E712
-            certified = errors.certified & usable
-        if np.count_nonzero(inside) < np.size(inside):
+            certified = certified & usable
+        if not _all(inside):
             inside = inside | self._test.knows_inside(estimate, errors, MARGIN)
         return MonitorState(broken, inside, certified)
 
 
+def _all(conditions: Any) -> bool:
+    """Returns whether one truth value, or every one of an array, holds."""
+    return conditions is True or np.count_nonzero(conditions) == np.size(conditions)
+
+
 def _first(broken: Any, condition: Any, explanation: str) -> Any:
     """Returns the code of what broke first: that of the explanation where nothing had and the condition holds."""
-    if not np.count_nonzero(condition):
+    if condition is False or not np.count_nonzero(condition):  # the usual case
         return broken
     return broken + (broken == 0) * condition * CODES[explanation]
 

@@ -77,10 +77,11 @@ class OneStepTest:
         """
         reach = self.columns @ np.abs(estimates)
         radius = errors.radius - self.rounding * reach
-        # What is too far out or not finite has no radius; a radius too small for the weights lets nothing pass.
-        radius[~(reach < FARTHEST)] = np.nan
-        small = radius < SMALLEST_RADIUS
-        radius[small] = np.minimum(radius[small], 0.0)
+        near, small = reach < FARTHEST, radius < SMALLEST_RADIUS
+        if np.count_nonzero(near) < len(near):  # what is too far out or not finite has no radius
+            radius[~near] = np.nan
+        if np.count_nonzero(small):  # too small for the weights: nothing passes
+            radius[small] = np.minimum(radius[small], 0.0)
         return ReachableSets(self, self.moved @ estimates, errors.turn, radius)
 
     @np.errstate(all="ignore")

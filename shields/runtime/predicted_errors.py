@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -29,14 +29,23 @@ class PredictedErrors(NamedTuple):
     """
 
     turn: np.ndarray
-    radius: np.ndarray
+    radius: Any
     half_widths: np.ndarray
-    largest: np.ndarray
-    certified: np.ndarray
+    largest: Any
+    certified: Any
 
     def of(self, numbers: np.ndarray) -> PredictedErrors:
         """Returns those of environments that have the shapes with these numbers, shape (N,)."""
         return PredictedErrors(*(array.take(numbers, axis=-1) for array in self))
+
+    def single(self) -> PredictedErrors:
+        """Returns the first without a last axis."""
+        turn, half_widths = self.turn[..., 0].copy(), self.half_widths[..., 0].copy()
+        return PredictedErrors(turn, self.radius.item(0), half_widths, self.largest.item(0), self.certified.item(0))
+
+    def batch(self) -> PredictedErrors:
+        """Returns a single one as a batch of one."""
+        return PredictedErrors(*(np.asarray(each)[..., None] for each in self))
 
     def followed_by(self, other: PredictedErrors) -> PredictedErrors:
         """Returns these shapes and then the others."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 # A gain below this fraction of the largest counts as a direction that does not move the state.
@@ -11,7 +13,6 @@ NEWTON_STEPS = 60
 RELATIVE_TOLERANCE = 1e-12
 
 
-@np.errstate(all="ignore")  # what has no solution is NaN
 def closest_admissible(
     wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, radius: np.ndarray, limit: np.ndarray
 ) -> np.ndarray:
@@ -33,7 +34,9 @@ def closest_admissible(
         Shape (m, N).
     """
     if len(wanted) == 1:
-        return _closest_on_lines(wanted[0], offset, effect[:, 0], radius, limit[0])[None]
+        effect = effect[:, 0]
+        form = (effect * effect).sum(axis=0), (effect * offset).sum(axis=0), (offset * offset).sum(axis=0)
+        return closest_on_lines(wanted, *form, radius, limit[0])
     closest, distance = np.full(wanted.shape, np.nan), np.full(len(radius), np.inf)
     problem = np.flatnonzero(radius >= 0.0)
     held = np.zeros((len(wanted), len(problem)))  # the sign of the limit at which an input is held, 0 if it is free
@@ -55,18 +58,20 @@ def closest_admissible(
     return closest
 
 
-def _closest_on_lines(
-    wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, radius: np.ndarray, limit: float
-) -> np.ndarray:
-    """Returns what `closest_admissible` does for one input, shape (N,), where a u^2 + 2 b u + c <= radius^2."""
-    a, b, c = (effect * effect).sum(axis=0), (effect * offset).sum(axis=0), (offset * offset).sum(axis=0)
+def closest_on_lines(wanted: Any, a: Any, b: Any, c: Any, radius: Any, limit: Any) -> Any:
+    """Returns argmin |u - wanted| over a u^2 + 2 b u + c <= radius^2, |u| <= limit; NaN where there is none.
+
+    Numbers or arrays of them; |wanted| <= limit.
+    """
     excess = c - radius * radius
     half = np.sqrt(b * b - a * excess)
     low, high = (-b - half) / a, (-b + half) / a
-    meets = (low <= limit) & (high >= -limit)
-    inside = np.minimum(np.maximum(wanted, low), high)
-    still = a <= 0.0  # the input moves nothing
-    return np.where((radius >= 0.0) & np.where(still, excess <= 0.0, meets), np.where(still, wanted, inside), np.nan)
+    closest = np.minimum(np.maximum(wanted, low), high)
+    found = (radius >= 0.0) & (low <= limit) & (high >= -limit)
+    if not np.all(a):  # an input that moves nothing
+        found = np.where(a > 0.0, found, (radius >= 0.0) & (excess <= 0.0))
+        closest = np.where(a > 0.0, closest, wanted)
+    return np.where(found, closest, np.nan)
 
 
 def _onto_balls(

@@ -124,18 +124,17 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         before, self._clock = self._clock, self._interrupted
         observation, rewards, terminated, truncated, info = self.env.step(actions)
         now, state = self._read_clock(), self._state
-        restarted, moved_once = now.episodes != before.episodes, now.steps == before.steps + 1
+        restarted, moved_once = _moved(before, now)
         self._report = self._observed(info)
-        self._state = self._advanced(state, decided, moved_once & (now.ticks == before.ticks + 1), info, self._report)
+        self._state = self._advanced(state, decided, moved_once, info, self._report)
         self._interventions = self._interventions + decided.intervened
         added, charged = {}, decided.intervened
         if np.count_nonzero(restarted):
-            begun = (now.steps == 0) & (now.episodes == before.episodes + 1) & (now.ticks == before.ticks + 1)
             if "final_info" in info:  # SAME_STEP: the step ended an episode before it began the next
-                added["final_info"] = self._final_info(info, state, decided, proposed, begun)
+                added["final_info"] = self._final_info(info, state, decided, proposed, moved_once)
             else:
                 charged = charged & ~restarted
-            self._start(restarted, begun)
+            self._start(restarted, moved_once)
             decided.input[:, restarted], proposed[:, restarted], decided.intervened[restarted] = 0.0, 0.0, False
             decided.margin[restarted] = self._idle_margins(np.flatnonzero(restarted))
         self._clock = now
@@ -225,6 +224,13 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             "shield_reason": REASONS[reasons] if doubted else self._no_reason[: len(reasons)],
             "episode_interventions": interventions.copy(),
         }
+
+
+def _moved(before: Clock, now: Clock) -> tuple[np.ndarray, np.ndarray]:
+    """Returns where a new episode began, and which environments moved just one step (to its start, where it began)."""
+    restarted, once = now.episodes != before.episodes, now.ticks == before.ticks + 1
+    to_start = (now.steps == 0) & (now.episodes == before.episodes + 1)
+    return restarted, once & np.where(restarted, to_start, now.steps == before.steps + 1)
 
 
 def overridden(actions: Any, decided: Decision, limits: np.ndarray) -> np.ndarray:

@@ -156,7 +156,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         return {
             "shield_intervened": intervened,
             "input_proposed": proposed.copy(),
-            "shield_correction": float(np.linalg.norm(applied - proposed)),
+            "shield_correction": float(np.linalg.norm(applied - proposed)) if intervened else 0.0,
             "shield_margin": margin,
             "shield_guaranteed": not reason,
             "shield_reason": reason,
