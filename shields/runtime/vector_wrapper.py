@@ -132,6 +132,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         if np.count_nonzero(restarted):
             if "final_info" in info:  # SAME_STEP: the step ended an episode before it began the next
                 added["final_info"] = self._final_info(info, state, decided, proposed, moved_once)
+                charged = charged.copy()
             else:
                 charged = charged & ~restarted
             self._start(restarted, moved_once)
