@@ -11,12 +11,10 @@ from typing import TYPE_CHECKING, Any
 from shields.certificate import Certificate
 from shields.errors import CertificateError, Infeasible
 from shields.proof import Multipliers
-from shields.runtime.filter import Decision, SafetyFilter
-from shields.runtime.wrapper import SafetyShield
+from shields.runtime import Decision, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.verification import Condition, Report, verify
 
 if TYPE_CHECKING:
-    from shields.runtime.vector_wrapper import VectorSafetyShield
     from shields.synthesis import certify, synthesize
 
 __all__ = [
@@ -36,12 +34,8 @@ __all__ = [
 ]
 
 
-# These are imported at first use: the first two need the solver, the last one the compiler.
-_LAZY = {
-    "certify": "synthesis",
-    "synthesize": "synthesis",
-    "VectorSafetyShield": "runtime.vector_wrapper",
-}
+# Imported at first use: these need the solver.
+_LAZY = {"certify": "synthesis", "synthesize": "synthesis"}
 
 
 def __getattr__(name: str) -> Any:

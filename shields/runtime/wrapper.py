@@ -11,10 +11,10 @@ from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, S
 
 from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv
 from ncs_gym.envs.env import applied_input, ncs_env
-from ncs_gym.validation import as_number, shown
+from ncs_gym.validation import as_number, as_numbers, shown
 from shields.certificate import Certificate
 from shields.runtime.filter import SafetyFilter
-from shields.runtime.guarantee import ProofTracker, starts_inside
+from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, Report, starts_inside
 
 # What changes, repeats or swallows actions between the shield and the plant.
 REFUSED = (gym.ActionWrapper, RepeatAction, StickyAction, MaxAndSkipObservation, Autoreset)
@@ -76,7 +76,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         contract = ncs_env(env).contract
         self.certificate = certificate_for(plant, contract) if certificate is None else certificate
         self.filter = SafetyFilter(self.certificate, plant, mode)
-        self._proof = ProofTracker(self.filter)
+        self._monitor = GuaranteeMonitor(self.filter)
         self._clock: tuple[int, int] | None = None
         self._is_drawn = env.unwrapped.render_mode is not None
 
@@ -91,12 +91,12 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             if self._read_clock() == before:  # refused before anything moved
                 self._clock = before
             raise
-        clock = self._read_clock()
-        self._proof.start(starts_inside(self.certificate, ncs_env(self.env).start), clock[1] == 0, info)
-        self._estimate, self._error_shape = np.array(info["estimate"]), np.array(info["error_shape"])
+        clock, self._report = self._read_clock(), self._observed(info)
+        known_inside = starts_inside(self.certificate, ncs_env(self.env).start)
+        self._state = self._monitor.start(known_inside, clock[1] == 0, self._report)
         self._interventions = 0
         u = np.zeros(self.filter.plant.m)
-        margin = self.filter.margin(self._estimate, self._error_shape, u)
+        margin = self.filter.margin(self._report.estimate, info["error_shape"], u)
         self._clock = clock
         return observation, info | self._info(u, u, margin, intervened=False)
 
@@ -110,20 +110,29 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         if self._clock is None:
             raise gym.error.ResetNeeded("call reset before the first step")
         proposed = applied_input(self.filter.plant, action)
-        decision = self.filter.decide(self._estimate, self._error_shape, proposed)
+        decision = self.filter.decide_knowing(self._report.estimate, self._report.errors, proposed)
         if decision.intervened and self.filter.mode != "monitor":
             action = (decision.input / self.filter.plant.u_max).astype(np.float32)
         if self._is_drawn:
             self._annotate(proposed, self._interventions + decision.intervened, intervened=decision.intervened)
         (episode, step), self._clock = self._clock, INTERRUPTED
         observation, reward, terminated, truncated, info = self.env.step(action)
-        clock = self._read_clock()
-        self._proof.step(decision, clock == (episode, step + 1), info)
-        self._estimate, self._error_shape = np.array(info["estimate"]), np.array(info["error_shape"])
+        clock, self._report = self._read_clock(), self._observed(info)
+        applied = as_numbers(info["input"])
+        same_input = applied is not None and applied.tolist() == decision.input.tolist()
+        moved_once = clock == (episode, step + 1)
+        self._state = self._monitor.advance(self._state, decision, moved_once, same_input, self._report)
         self._interventions += decision.intervened
         self._clock = clock
         info = info | self._info(proposed, decision.input, decision.margin, intervened=decision.intervened)
         return observation, float(reward) - self.penalty * decision.intervened, terminated, truncated, info
+
+    def _observed(self, info: dict[str, Any]) -> Report:
+        """Returns what the decision and the guarantee need of an info, as copies: callers may write into theirs."""
+        estimate, n = as_numbers(info["estimate"]), self.filter.plant.n
+        fits = estimate is not None and estimate.shape == (n,)
+        estimate = np.array(estimate) if fits else np.full(n, np.nan)
+        return Report(estimate, self.filter.errors_of(info["error_shape"]), info["assumption_violated"] not in (False,))
 
     def _read_clock(self) -> tuple[int, int]:
         """Returns the number of episodes begun and of steps taken in this one."""
@@ -143,11 +152,11 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         ncs_env(self.env).annotate(note)
 
     def _info(self, proposed: np.ndarray, applied: np.ndarray, margin: float, *, intervened: bool) -> dict[str, Any]:
-        reason = self._proof.reason
+        reason = EXPLANATIONS[self._monitor.reasons(self._state)]
         return {
             "shield_intervened": intervened,
             "input_proposed": proposed.copy(),
-            "shield_correction": float(np.linalg.norm(applied - proposed)),
+            "shield_correction": float(np.linalg.norm(applied - proposed)) if intervened else 0.0,
             "shield_margin": margin,
             "shield_guaranteed": not reason,
             "shield_reason": reason,
