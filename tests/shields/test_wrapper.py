@@ -449,9 +449,9 @@ def test_writing_into_the_infos_changes_no_decision(certificate):
 def test_forged_packet_is_noticed(certificate):
     env = shielded(certificate, channel=Channel())
     env.reset(seed=0)
-    core = env.unwrapped
-    honest = core._measure
-    core._measure = lambda: honest() + 0.6
+    process = env.unwrapped._process
+    honest = process.measure
+    process.measure = lambda rng, state: honest(rng, state) + 0.6
     assert env.step(full(None))[4]["shield_reason"] == ALARM
 
 
@@ -542,12 +542,12 @@ def test_wrapper_that_changes_the_action_space_is_refused_inside(certificate):
 
 def test_alarm_is_cleared_by_a_new_episode(certificate):
     env = shielded(certificate, channel=Channel())
-    core = env.unwrapped
+    process = env.unwrapped._process
     env.reset(seed=0)
-    honest = core._measure
-    core._measure = lambda: honest() + 0.6
+    honest = process.measure
+    process.measure = lambda rng, state: honest(rng, state) + 0.6
     env.step(full(None))
-    core._measure = honest
+    process.measure = honest
     assert env.reset()[1]["shield_guaranteed"]
 
 
