@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ncs_gym.validation import LONGEST_QUOTE
+from ncs_gym.validation import MAX_QUOTED_LENGTH
 from shields.atomic_write import write_atomically
 
 FORMAT = "ncs-gym settings 1"
@@ -77,7 +77,7 @@ def _require_meaning(path: Path, command: str, values: dict[str, Any], parse: Ca
             read = {}
         if name not in read or not _is_same(value, read[name]):
             text = " ".join(f"{name} = {json.dumps(value)}".split())
-            raise SettingsError(f"settings {path} hold what ncs {command} does not take: {text[:LONGEST_QUOTE]}")
+            raise SettingsError(f"settings {path} hold what ncs {command} does not take: {text[:MAX_QUOTED_LENGTH]}")
 
 
 def _is_same(given: Any, read: Any) -> bool:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import Ellipsoid
-from ncs_gym.validation import FrozenArrays, as_matrix, as_number, read_only, shown
+from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_number, read_only, shown
 from shields import certificate_file
 from shields.errors import CertificateError
 from shields.proof import CertifiedProof, ContractProof, Multipliers, PaperConstants
@@ -23,7 +23,7 @@ _FIELDS = {
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Certificate(FrozenArrays):
+class Certificate(ReadOnlyArrays):
     """A robust control invariant set S = {x : x'Mx <= 1} inside the safe box, its gain, and the numbers that prove it.
 
     A certificate is not trusted until `shields.verify` has checked it in exact arithmetic.
@@ -70,7 +70,7 @@ class Certificate(FrozenArrays):
                 object.__setattr__(self, name, as_number(getattr(self, name), name))
         except (TypeError, ValueError) as error:
             raise CertificateError(f"not a certificate: {error}") from error
-        self._freeze_arrays()
+        self._make_arrays_read_only()
 
     def _check_fields(self) -> None:
         """Raises ValueError unless exactly the fields of the certificate's method are given."""

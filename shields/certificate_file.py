@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym.estimation.error_bounds_by_age import AgeSets
+from ncs_gym.estimation.error_bounds_by_age import ErrorSetsByAge
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.validation import as_setting
 from shields.atomic_write import write_atomically
@@ -20,8 +20,8 @@ from shields.errors import CertificateError
 from shields.proof import ContractProof, Multipliers
 
 _FORMAT = "ncs-gym certificate 2"
-# The arrays of the error sets by age: these are keys of the file and attributes of `AgeSets`.
-_SET_ARRAYS = ("shapes", "rates", "gains", "shares", "noise")
+# The arrays of the error sets by age: keys of the file, and the attributes of `ErrorSetsByAge` they stand for.
+_SET_ARRAYS = {"shapes": "shapes", "rates": "rates", "gains": "gains", "shares": "multipliers", "noise": "noise"}
 
 
 def document_of(fields: dict[str, Any]) -> dict[str, Any]:
@@ -82,7 +82,7 @@ def _contract_proof_content(proof: ContractProof) -> dict[str, Any]:
     """Returns the JSON values of a proof by age."""
     return {
         "contract": asdict(proof.sets.contract),
-        "sets": {name: getattr(proof.sets, name).tolist() for name in _SET_ARRAYS},
+        "sets": {key: getattr(proof.sets, name).tolist() for key, name in _SET_ARRAYS.items()},
         "shares": proof.multipliers.tolist(),
         "inputs": proof.inputs.tolist(),
     }
@@ -90,8 +90,9 @@ def _contract_proof_content(proof: ContractProof) -> dict[str, Any]:
 
 def _contract_proof(content: dict[str, Any]) -> ContractProof:
     """Returns the proof by age of a file's content."""
-    arrays = {name: np.array(as_setting(content["sets"][name]), dtype=np.float64) for name in _SET_ARRAYS}
-    sets = AgeSets(contract=ChannelContract(**content["contract"]), **arrays)
+    given = {name: as_setting(content["sets"][key]) for key, name in _SET_ARRAYS.items()}
+    arrays = {name: np.array(value, dtype=np.float64) for name, value in given.items()}
+    sets = ErrorSetsByAge(contract=ChannelContract(**content["contract"]), **arrays)
     return ContractProof(sets=sets, multipliers=content["shares"], inputs=content["inputs"])
 
 

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ncs_gym.estimation.error_bounds_by_age import AgeSets
+from ncs_gym.estimation.error_bounds_by_age import ErrorSetsByAge
 from ncs_gym.network.contract import ChannelContract
-from ncs_gym.validation import FrozenArrays, as_matrix, as_setting, shown
+from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_setting, shown
 from shields.errors import CertificateError
 
 
@@ -44,7 +44,7 @@ class Multipliers:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ContractProof(FrozenArrays):
+class ContractProof(ReadOnlyArrays):
     """The proof under a channel contract, one set of multipliers per age of the newest sample (theory.md section 6).
 
     Attributes:
@@ -53,7 +53,7 @@ class ContractProof(FrozenArrays):
         inputs: Multipliers mu_i of (U) for each age 0..h, shape (h+1, m).
     """
 
-    sets: AgeSets
+    sets: ErrorSetsByAge
     multipliers: np.ndarray
     inputs: np.ndarray
 
@@ -66,7 +66,7 @@ class ContractProof(FrozenArrays):
             object.__setattr__(self, "inputs", as_matrix(self.inputs, (steps, None), "inputs"))
         except (AttributeError, IndexError, TypeError, ValueError) as error:
             raise CertificateError(f"not a certificate: in its proof by age, {error}") from error
-        self._freeze_arrays()
+        self._make_arrays_read_only()
 
 
 class CertifiedProof(NamedTuple):
@@ -87,7 +87,7 @@ class PaperConstants(NamedTuple):
     epsilon_up: float
 
 
-def _as_age_sets(sets: AgeSets) -> AgeSets:
+def _as_age_sets(sets: ErrorSetsByAge) -> ErrorSetsByAge:
     """Returns error sets by age whose arrays are float64.
 
     Raises:
@@ -107,7 +107,7 @@ def _as_age_sets(sets: AgeSets) -> AgeSets:
     for name, shape in expected.items():
         if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
             raise ValueError(f"{name} must be finite with shape {shape}")
-    return AgeSets(contract=sets.contract, **arrays)
+    return ErrorSetsByAge(contract=sets.contract, **arrays)
 
 
 def _as_float(value: Any) -> float:

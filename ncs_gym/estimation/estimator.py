@@ -63,8 +63,9 @@ class Estimator:
     ) -> None:
         self.plant, self.channel, self.buffer = plant, channel, channel.longest_delay
         if patterns is None:
-            patterns = arrival_patterns(plant, channel, None) if error_set is None else None
-        self._patterns = patterns_of(plant, channel, error_set) if patterns is None else patterns
+            shared = error_set is None
+            patterns = arrival_patterns(plant, channel, None) if shared else patterns_of(plant, channel, error_set)
+        self._patterns = patterns
         self.error_set = self._patterns.recursion.error_set
         ages = self.error_set.ages
         if ages is not None and not ages.contract.is_fine_enough_for(channel):

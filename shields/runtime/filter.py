@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym import LinearPlant
-from ncs_gym.validation import FrozenArrays, as_numbers, shown
+from ncs_gym.validation import ReadOnlyArrays, as_numbers, shown
 from shields.certificate import Certificate
 from shields.errors import CertificateError
 from shields.runtime.one_step_test import MOST_INPUTS_WITH_VERTICES, OneStepTest, ReachableSets
@@ -52,7 +52,7 @@ class Decision(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class SafetyFilter(FrozenArrays):
+class SafetyFilter(ReadOnlyArrays):
     """A certificate made ready to judge inputs (docs/shield.md).
 
     An input passes if everything that one step can reach with it, for every error in E(Sigma_k) and disturbance in

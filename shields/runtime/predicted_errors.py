@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ncs_gym.uncertainty.ellipsoid import SMALLEST_SHARE, is_inside
+from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER, is_inside
 
 if TYPE_CHECKING:
     from shields.runtime.one_step_test import OneStepTest
@@ -75,7 +75,7 @@ def predicted_errors(test: OneStepTest, shapes: np.ndarray, certified_shapes: np
     spread = half_widths @ test.columns
     moved = test.moved @ symmetric @ test.moved.T + (spread**2)[:, None, None] * identity
     second = np.trace(test.D) ** 0.5
-    first = np.maximum(np.abs(np.trace(moved, axis1=1, axis2=2)) ** 0.5, SMALLEST_SHARE * second)[:, None, None]
+    first = np.maximum(np.abs(np.trace(moved, axis1=1, axis2=2)) ** 0.5, SMALLEST_MULTIPLIER * second)[:, None, None]
     squares, axes = _eigh(moved * (1.0 + second / first) + test.D * (1.0 + first / second))
     h = np.sqrt(squares[:, -1])
     radius = 1.0 - h - test.rounding * (spread + test.pushed)

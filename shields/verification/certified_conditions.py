@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym import LinearPlant
-from ncs_gym.uncertainty.ellipsoid import SMALLEST_SHARE
+from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER
 from shields.certificate import Certificate
 from shields.proof import CertifiedProof, ContractProof
 from shields.verification.conditions import Condition, flag, matrix_condition, scalar_condition
@@ -55,7 +55,7 @@ def multipliers_fit(proof: CertifiedProof, plant: LinearPlant) -> bool:
 def _multiplier_conditions(proof: CertifiedProof) -> Iterator[Condition]:
     """Checks the ranges of all multipliers."""
     ages, rounding = proof.ages, proof.multipliers.rounding
-    rates = [proof.multipliers.error] if ages is None else [*ages.sets.rates, *ages.sets.shares]
+    rates = [proof.multipliers.error] if ages is None else [*ages.sets.rates, *ages.sets.multipliers]
     proofs = _invariance_proofs(proof)
     inputs = [mu for each in proofs for mu in each.inputs]
     triples = [[float(multiplier) for multiplier in each.multipliers] for each in proofs]
@@ -114,7 +114,7 @@ def _age_conditions(proof: CertifiedProof, ages: ContractProof, plant: LinearPla
         predicted = add(scale(1 / lam, congruence(A, shapes[j])), scale(1 / (1 - lam), D))
         name = f"(C1) Sigma_{j + 1} - A Sigma_{j} A'/lam - D/(1-lam) >= 0"
         yield matrix_condition(name, subtract(shapes[j + 1], predicted))
-    for j, (gain, mu) in enumerate(zip(sets.gains, map(Fraction, sets.shares), strict=True), start=1):
+    for j, (gain, mu) in enumerate(zip(sets.gains, map(Fraction, sets.multipliers), strict=True), start=1):
         T = rational(gain)
         kept = congruence(subtract(identity, multiply(T, H)), shapes[j])
         updated = add(scale(1 / mu, kept), scale(1 / (1 - mu), congruence(T, N)))
@@ -194,7 +194,7 @@ def _smallest_trace_multiplier(first: Matrix, second: Matrix, weight: Matrix) ->
     """Returns a rational nu near the minimizer of tr(W P); every nu in (0, 1) proves containment."""
     a, b = (float(_trace(multiply(weight, matrix))) ** 0.5 for matrix in (first, second))
     nu = Fraction(a) / (Fraction(a) + Fraction(b)) if a + b > 0.0 else Fraction(1, 2)
-    return min(max(nu, Fraction(SMALLEST_SHARE)), 1 - Fraction(SMALLEST_SHARE))
+    return min(max(nu, Fraction(SMALLEST_MULTIPLIER)), 1 - Fraction(SMALLEST_MULTIPLIER))
 
 
 def _trace(matrix: Matrix) -> Fraction:

@@ -132,7 +132,7 @@ MUTATIONS = {
     "no gain": (lambda c, s: sets(c, gains=at(s.gains, 2, 0.0)), ["(C2)"]),
     "a rate": (lambda c, s: sets(c, rates=at(s.rates, 0, 0.5)), ["(C1) Sigma_1"]),
     "a rate above one": (lambda c, s: sets(c, rates=at(s.rates, 0, 5.0)), ["0 < lam_e < 1"]),
-    "a share": (lambda c, s: sets(c, shares=at(s.shares, 0, 0.01)), ["(C2)"]),
+    "a multiplier": (lambda c, s: sets(c, multipliers=at(s.multipliers, 0, 0.01)), ["(C2)"]),
     "less noise": (lambda c, s: sets(c, noise=0.9 * s.noise), ["N:"]),
     "coarser rounding": (lambda c, s: sets(c, contract=ChannelContract(2, 5e-3)), ["N:"]),
     "idle multipliers": (
@@ -178,8 +178,8 @@ def test_margins_by_age_agree_with_floating_point(promised):
         assert found == pytest.approx(smallest(s.shapes[j + 1] - grown), rel=1e-4)
     for j, found in enumerate(margins["(C2)0"]):
         kept = np.eye(plant.n) - s.gains[j] @ plant.H
-        updated = kept @ s.shapes[j + 1] @ kept.T / s.shares[j]
-        updated += s.gains[j] @ s.noise @ s.gains[j].T / (1 - s.shares[j])
+        updated = kept @ s.shapes[j + 1] @ kept.T / s.multipliers[j]
+        updated += s.gains[j] @ s.noise @ s.gains[j].T / (1 - s.multipliers[j])
         assert found == pytest.approx(smallest(s.shapes[0] - updated), rel=1e-4)
     closed, gain = plant.A + plant.B @ certificate.K, plant.B @ certificate.K
     spread = plant.m * plant.B @ np.diag((plant.u_max * 2.0**-24) ** 2) @ plant.B.T
