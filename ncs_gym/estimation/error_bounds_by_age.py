@@ -162,7 +162,7 @@ def _rate(shape: np.ndarray, A: np.ndarray, D: np.ndarray) -> float:
 
 
 def _update(shape: np.ndarray, H: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
-    """Returns the set-membership gain T, its multiplier mu and the updated shape, for the trace-smallest of MULTIPLIERS."""
+    """Returns the set-membership gain T, its multiplier mu and the updated shape, of the smallest trace."""
     values, vectors = np.linalg.eigh(shape)
     factor = vectors * np.sqrt(np.maximum(values, 0.0))
     seen = H @ factor

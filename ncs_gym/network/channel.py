@@ -82,12 +82,9 @@ class Channel:
             object.__setattr__(self, "loss", as_number(self.loss, "loss", low=0.0, high=1.0))
         step = as_number(self.quantization_step, "quantization_step", low=0.0)
         object.__setattr__(self, "quantization_step", step)
-        for name, low, high in (
-            ("send_period", 1, LARGEST_COUNT),
-            ("delay", 0, LONGEST_DELAY),
-            ("jitter", 0, LONGEST_DELAY),
-        ):
-            object.__setattr__(self, name, as_count(getattr(self, name), name, low=low, high=high))
+        object.__setattr__(self, "send_period", as_count(self.send_period, "send_period", low=1))
+        for name in ("delay", "jitter"):
+            object.__setattr__(self, name, as_count(getattr(self, name), name, low=0, high=LONGEST_DELAY))
         if self.max_consecutive_losses is not None:
             most = as_count(self.max_consecutive_losses, "max_consecutive_losses", low=0)
             object.__setattr__(self, "max_consecutive_losses", most)
