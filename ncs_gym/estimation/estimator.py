@@ -159,7 +159,9 @@ class Estimator:
 
         The ellipsoid of shape H Sigma H' + N lies inside that sum, so passing it settles the matter.
         """
-        if not residual.dot(self._patterns.quick_test(statistics).dot(residual)) <= 1.0:
+        with np.errstate(invalid="ignore", over="ignore"):  # an infinite weight of a residual of zero, a huge residual
+            quick = residual.dot(self._patterns.quick_test(statistics).dot(residual))
+        if not quick <= 1.0:
             test = self._patterns.test
             spread = test.spread(self._patterns.statistics[statistics].shape)
             self.alarm |= bool(test.are_impossible(residual[None], spread)[0])
