@@ -20,8 +20,11 @@ from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
 
-# Patterns beyond this number are forgotten but for those in use.
-MAX_PATTERNS = 1 << 17
+# Patterns beyond this number, and beyond this number of ages in all of them together, are forgotten but for those in
+# use (an age takes about 40 bytes).
+MAX_PATTERNS, MAX_AGES = 1 << 17, 1 << 21
+# A graph takes at least this many times the patterns it began with, or it would be forgotten at every step.
+SMALLEST_GROWTH = 4
 # Number of what is not worked out yet; a pattern without a history to replay.
 UNKNOWN = NO_REPLAY = -1
 # Number of the statistics that stand for "no sample is used here": their gain is zero.
@@ -100,6 +103,7 @@ class ArrivalPatterns:
         self._axes: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._lock = threading.RLock()
         self._successor: ArrivalPatterns | None = None
+        self._adopted_count = 0
         ages_held = self.buffer + 1
         first = self._number_of_statistics(recursion.first)
         self.root = self._number_of_pattern(Pattern(first, (UNKNOWN,) * ages_held, (False,) * ages_held, NO_REPLAY))
@@ -120,7 +124,8 @@ class ArrivalPatterns:
     @property
     def is_full(self) -> bool:
         """Whether it is time to forget patterns that are not in use (`keeping`)."""
-        return len(self._patterns) >= MAX_PATTERNS
+        most = min(MAX_PATTERNS, MAX_AGES // (self.buffer + 1))
+        return len(self._patterns) >= max(most, SMALLEST_GROWTH * self._adopted_count)
 
     def error_statistics(self, pattern: int) -> ErrorStatistics:
         """Returns the statistics of the present estimate."""
@@ -133,7 +138,7 @@ class ArrivalPatterns:
                 present, priors, held, _ = self._patterns[pattern]
                 moved = self._predicted(present)
                 after = self._number_of_pattern(Pattern(moved, (moved, *priors[:-1]), (False, *held[:-1]), NO_REPLAY))
-                self._next[pattern] = self.arrays.next[pattern] = after
+                self.arrays.next[pattern] = self._next[pattern] = after
         return self._next[pattern]
 
     def after_arrival(self, pattern: int, age: int) -> int:
@@ -150,16 +155,17 @@ class ArrivalPatterns:
                     held = (*held[:age], True, *held[age + 1 :])
                     after = self._number_of_pattern(Pattern(present, priors, held, max(replay_from, age)))
                 if 0 <= age <= self.buffer:
-                    self._arrivals[pattern, age] = after
                     self.arrays.set_arrival(pattern, age, after)
+                    self._arrivals[pattern, age] = after
         return after
 
     def replay(self, pattern: int) -> Replay:
         """Returns what becomes of the samples that arrived at this step."""
         if pattern not in self._replays:
             with self._lock:
-                self._replays[pattern] = replay = self._replayed(self._patterns[pattern])
+                replay = self._replayed(self._patterns[pattern])
                 self.arrays.set_replay(pattern, replay)
+                self._replays[pattern] = replay
         return self._replays[pattern]
 
     def update(self, statistics: int) -> tuple[int, np.ndarray, np.ndarray]:
@@ -186,20 +192,26 @@ class ArrivalPatterns:
             successor = self._successor
             if successor is None or successor.is_full:
                 successor = self._successor = ArrivalPatterns(self.recursion, self.channel)
+                successor._lock = self._lock  # the recursion, which belongs to both, has a filter that moves
             for key, shared in _shared.items():
                 if shared is self:
                     _shared[key] = successor
-            numbers = {each: successor._adopted(self, each) for each in np.unique(patterns).tolist()}
+            numbers = successor._adopted(self, np.unique(patterns).tolist())
         return successor, np.array([numbers[each] for each in patterns.tolist()], np.int64)
 
-    def _adopted(self, other: ArrivalPatterns, pattern: int) -> int:
-        """Returns the number of another graph's pattern."""
+    def _adopted(self, other: ArrivalPatterns, patterns: list[int]) -> dict[int, int]:
+        """Returns the numbers of another graph's patterns."""
 
         def same(number: int) -> int:
             return number if number == UNKNOWN else self._number_of_statistics(other.statistics[number])
 
-        present, priors, held, replay_from = other._patterns[pattern]
-        return self._number_of_pattern(Pattern(same(present), tuple(map(same, priors)), held, replay_from))
+        numbers = {}
+        for each in patterns:
+            present, priors, held, replay_from = other._patterns[each]
+            adopted = Pattern(same(present), tuple(map(same, priors)), held, replay_from)
+            numbers[each] = self._number_of_pattern(adopted)
+        self._adopted_count = max(self._adopted_count, len(patterns))
+        return numbers
 
     def _number_of_statistics(self, statistics: ErrorStatistics) -> int:
         """Returns the number of statistics, a new one if they have not occurred."""

@@ -129,6 +129,7 @@ class Estimator:
         self._samples[age] = packet.measurement
         return after
 
+    @np.errstate(invalid="ignore", over="ignore")  # an infinite weight of a residual of zero, a huge residual
     def _replayed(self, pattern: int) -> int:
         """Replays from the oldest new sample on, keeps whichever history is better, and returns the pattern then."""
         replay, H = self._patterns.replay(pattern), self.plant.H

@@ -94,9 +94,10 @@ class PatternArrays:
 
     def set_replay(self, pattern: int, replay: Replay) -> None:
         """Notes what becomes of the new samples of a pattern."""
-        self.target[pattern], self.accepted[pattern] = replay.target, replay.accepted
-        self.replay_from[pattern], self.new_age[pattern] = replay.oldest, replay.new_age
+        self.accepted[pattern], self.new_age[pattern] = replay.accepted, replay.new_age
+        self.replay_from[pattern] = replay.oldest
         self.used[: replay.oldest + 1, pattern] = replay.used
+        self.target[pattern] = replay.target  # last: another thread may look it up, and then wants the rest too
 
 
 def _unknown(*shape: int) -> np.ndarray:

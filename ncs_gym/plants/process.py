@@ -70,7 +70,14 @@ class LinearProcess:
         noise = np.zeros((plant.n, count))
         if not source.replaces_process_noise:
             noise = plant.process_noise.sample(rng, count).T
-        return noise + source.draw(rng, plant, noise, None, None) if self._is_drawn_ahead else noise
+        if not self._is_drawn_ahead:
+            return noise
+        d = source.draw(rng, plant, noise, None, None)
+        if self._trusted:
+            return noise + d
+        if np.shape(d) == noise.shape:  # of another shape it could be broadcast; the check refuses it
+            d = noise + d
+        return checked_many(plant, d, count, allow_assumption_violation=self._allow)
 
     def _draw_sensor_noise(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Returns sensor noise, shape (p, count)."""

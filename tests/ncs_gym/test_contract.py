@@ -22,8 +22,12 @@ from ncs_gym import (
     contract_of,
     truck_trailer,
 )
+from ncs_gym.estimation import set_membership
+from ncs_gym.estimation.arrival_patterns import patterns_of
 from ncs_gym.estimation.error_bound import _check_ages
+from ncs_gym.estimation.error_statistics import ErrorRecursion, ErrorStatistics
 from ncs_gym.estimation.estimator import Estimator
+from ncs_gym.estimation.set_membership import SetMembership
 from ncs_gym.network.channel_state import ChannelState
 from ncs_gym.uncertainty.ellipsoid import is_inside
 from shields.verification.rational_matrix import (
@@ -141,13 +145,13 @@ def test_unstable_plant_needs_a_promise():
 def test_update_falls_back_to_the_certified_gain_and_never_skips(monkeypatch):
     plant, contract = PLANTS["batch reactor"]
     channel = Channel(loss=0.5, max_consecutive_losses=3)
-    estimator = Estimator(plant, channel, certified_error_set(plant, contract))
+    patterns = patterns_of(plant, channel, certified_error_set(plant, contract))
+    estimator, recursion = Estimator(plant, channel, patterns=patterns), patterns.recursion
     # Bad gains: neither the Kalman nor the set-membership gain will do.
-    monkeypatch.setattr(estimator, "_membership_gain", lambda shape: np.full((4, 2), 50.0))
-    estimator._filter.P = np.eye(4)
+    monkeypatch.setattr(recursion.sets, "gain", lambda shape: np.full((4, 2), 50.0))
     rng, x = np.random.default_rng(0), 1e-4 * np.ones(4)
     estimator.reset(x.copy())
-    monkeypatch.setattr(estimator._filter, "update", lambda z: setattr(estimator._filter, "K", np.full((4, 2), 50.0)))
+    monkeypatch.setattr(recursion._kalman, "update", lambda z: setattr(recursion._kalman, "K", np.full((4, 2), 50.0)))
     link, used = ChannelState(channel, rng), 0
     for step in range(1, 100):  # the plant is unstable and not controlled; only the error matters here
         x = plant.A @ x + (1 - 1e-9) * plant.nominal_disturbance.sample_boundary(rng)
@@ -285,30 +289,34 @@ def test_observation_box_holds_estimates_of_every_age_and_is_finite():
 def test_prediction_falls_back_to_the_certified_set(monkeypatch):
     plant, contract = PLANTS["cart-pole"]
     sets = certified_error_set(plant, contract)
-    estimator = Estimator(plant, Channel(), sets)
-    monkeypatch.setattr("ncs_gym.estimation.estimator.outer_sum", lambda first, second, weight: 1e3 * (first + second))
+    membership = SetMembership(plant, 0.0, sets)
+    monkeypatch.setattr(set_membership, "outer_sum", lambda first, second, weight: 1e3 * (first + second))
     monkeypatch.setattr(type(sets), "rate_at", lambda self, age: 1e-6)
-    shape = estimator._predicted_shape(sets.ages.shapes[1], 1)
+    shape = membership.predicted(sets.ages.shapes[1], 1)
     np.testing.assert_array_equal(shape, sets.ages.shapes[2])
     outside = 2.0 * sets.ages.shapes[1]  # a broken contract: no certified set applies
-    assert not is_inside(estimator._predicted_shape(outside, 1), sets.ages.shapes[2])
+    assert not is_inside(membership.predicted(outside, 1), sets.ages.shapes[2])
 
 
 def test_certified_gain_proves_nothing_for_an_error_outside_the_certified_set(monkeypatch):
     plant, contract = PLANTS["batch reactor"]
     sets = certified_error_set(plant, contract)
-    estimator = Estimator(plant, Channel(), sets)
-    monkeypatch.setattr(estimator, "_membership_gain", lambda shape: np.full((4, 2), 50.0))
-    monkeypatch.setattr(estimator, "_kalman_update", lambda covariance: None)
+    recursion = ErrorRecursion(plant, 0.0, sets)
+    monkeypatch.setattr(recursion.sets, "gain", lambda shape: np.full((4, 2), 50.0))
+    monkeypatch.setattr(recursion, "_kalman_update", lambda covariance: None)
+
+    def updated(shape, age):
+        return recursion.updated(ErrorStatistics(np.eye(4), shape, age))
+
     oldest = contract.max_age + 1
     for age in (1, oldest):
-        inside = estimator.update_of(np.eye(4), sets.ages.shapes[age], age)
+        inside = updated(sets.ages.shapes[age], age)
         np.testing.assert_array_equal(inside.gain, sets.ages.gains[age - 1])
-        np.testing.assert_array_equal(inside.shape, sets.ages.shapes[0])
-        outside = estimator.update_of(np.eye(4), 1.1 * sets.ages.shapes[age], age)
-        assert not is_inside(outside.shape, sets.ages.shapes[0])
-    late = estimator.update_of(np.eye(4), sets.ages.shapes[0], oldest + 1)  # beyond the contract there is no set
-    assert not is_inside(late.shape, sets.ages.shapes[0])
+        np.testing.assert_array_equal(inside.statistics.shape, sets.ages.shapes[0])
+        outside = updated(1.1 * sets.ages.shapes[age], age)
+        assert not is_inside(outside.statistics.shape, sets.ages.shapes[0])
+    late = updated(sets.ages.shapes[0], oldest + 1)  # beyond the contract there is no set
+    assert not is_inside(late.statistics.shape, sets.ages.shapes[0])
 
 
 def test_sets_by_age_that_fail_a_condition_are_an_error():

@@ -8,7 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ncs_gym import Channel, Ellipsoid, ErrorSet, Estimator, LinearPlant, Packet, certified_error_set, truck_trailer
-from ncs_gym.estimation.estimator import _grown
+from ncs_gym.estimation.arrival_patterns import patterns_of
+from ncs_gym.estimation.error_statistics import ErrorRecursion
+from ncs_gym.estimation.innovation_test import InnovationTest
+from ncs_gym.estimation.set_membership import SetMembership, enlarged_by_rounding
 from ncs_gym.network.channel import GilbertElliott
 from ncs_gym.network.channel_state import ChannelState
 from ncs_gym.plants.linear_plant import FLAT_INFLATION
@@ -23,6 +26,11 @@ def roomy(plant, factor=1e4):
     """An error set so large that the guard accepts every Kalman update."""
     errors = certified_error_set(plant)
     return ErrorSet(Sigma=factor * errors.Sigma, rate=errors.rate)
+
+
+def sets_of(plant, channel=None):
+    """What moves the shapes of an estimator."""
+    return SetMembership(plant, (channel or Channel()).quantization_step, certified_error_set(plant))
 
 
 def batch_estimate(plant, first, inputs, packets, noise_cov):
@@ -56,7 +64,7 @@ def test_estimate_equals_batch_least_squares_with_late_and_reordered_packets(see
     plant = replace(plant, measurement_noise_cov=1e-7 * np.eye(plant.p))
     channel = Channel(loss=0.3, quantization_step=0.001, delay=1, jitter=3)
     rng = np.random.default_rng(seed)
-    estimator = Estimator(plant, channel, roomy(plant), **FINE)
+    estimator = Estimator(plant, channel, patterns=patterns_of(plant, channel, roomy(plant), **FINE))
     first = rng.standard_normal(3)
     estimator.reset(first)
     link, inputs, used = ChannelState(channel, rng), [], []
@@ -78,9 +86,9 @@ def test_order_of_arrival_does_not_matter():
     plant = truck_trailer()
     rng = np.random.default_rng(0)
     samples = {stamp: 0.05 * rng.standard_normal(2) for stamp in (1, 2, 3, 4)}
-    ends = []
+    channel, ends = Channel(delay=8), []
     for order in itertools.permutations(samples):
-        estimator = Estimator(plant, Channel(delay=8), roomy(plant), **FINE)
+        estimator = Estimator(plant, channel, patterns=patterns_of(plant, channel, roomy(plant), **FINE))
         for _ in range(4):
             estimator.advance(np.zeros(1), [])
         estimator.advance(np.array([0.5]), [Packet(stamp, samples[stamp]) for stamp in order])
@@ -103,11 +111,17 @@ def test_packets_from_nowhere_are_discarded(stamp):
     # At step 4 with a buffer of 2, stamps 2..4 could be used; 2 is sent twice here.
     plant = truck_trailer()
     estimator = Estimator(plant, Channel(delay=2))
-    for packets in ([], [Packet(2, np.full(2, 0.01))], [], []):
+    for packets in ([], [Packet(2, np.full(2, 0.01))], []):
         estimator.advance(np.zeros(1), packets)
-    belief = estimator.belief
-    estimator._receive(Packet(stamp, np.full(2, 0.02)))
-    assert estimator.belief is belief
+    ignoring = copy.deepcopy(estimator)
+    estimator.advance(np.zeros(1), [Packet(stamp, np.full(2, 0.02))])
+    ignoring.advance(np.zeros(1), [])
+    for value, wanted in zip(estimator.belief, ignoring.belief, strict=True):
+        np.testing.assert_array_equal(value, wanted)
+    assert not estimator.alarm
+    # One that could be used does make a difference.
+    ignoring.advance(np.zeros(1), [Packet(3, np.full(2, 0.02))])
+    assert ignoring.age == 2
 
 
 def test_age_counts_from_the_newest_sample_used():
@@ -217,18 +231,18 @@ def test_damaged_packet_is_not_used_and_raises_the_alarm():
 def test_innovation_at_the_edge_of_both_bounds_is_no_alarm():
     # The test against E(H Sigma H' + N) would raise it; the exact Minkowski test must not.
     plant = truck_trailer()
-    estimator = Estimator(plant, Channel())
-    estimator.advance(np.zeros(1), [])
-    spread = Ellipsoid(plant.H @ estimator.belief.shape @ plant.H.T)
+    prior = Estimator(plant, Channel())
+    prior.advance(np.zeros(1), [])
+    spread = Ellipsoid(plant.H @ prior.belief.shape @ plant.H.T)
     direction = np.array([1.0, 0.3])
-    noise = Ellipsoid(estimator._noise)
+    noise = Ellipsoid(sets_of(plant).noise)
     edge = spread.extreme_point(direction) + noise.extreme_point(direction)
     naive = Ellipsoid(spread.shape + noise.shape)
     assert not naive.contains(edge)
-    estimator._monitor(edge, spread.shape)
-    assert not estimator.alarm
-    estimator._monitor(1.001 * edge, spread.shape)
-    assert estimator.alarm
+    for residual, alarm in ((edge, False), (1.001 * edge, True)):
+        estimator = Estimator(plant, Channel())
+        estimator.advance(np.zeros(1), [Packet(1, plant.H @ prior.belief.mean + residual)])
+        assert estimator.alarm is alarm
 
 
 @given(st.integers(0, 10_000))
@@ -254,33 +268,33 @@ def test_computed_shapes_hold_the_exact_ones():
         A = T @ np.array([[0.8, 0.1], [-0.05, 0.7]]) @ np.linalg.inv(T)
         shape = T @ T.T
         shape = 0.5 * (shape + shape.T)
-        grown = _grown(A @ shape @ A.T, np.abs(A) @ np.sqrt(np.diag(shape)))
+        grown = enlarged_by_rounding(A @ shape @ A.T, np.abs(A) @ np.sqrt(np.diag(shape)))
         exact = congruence(rational(A), rational(shape))
         assert is_positive_semidefinite(subtract(rational(grown), exact))
         if aspect <= 1e3:  # ... and no more than that
             assert np.trace(grown) <= np.trace(A @ shape @ A.T) * (1 + 1e-7)
 
 
-def ill_conditioned_estimator(n):
+def ill_conditioned_sets(n):
     """Its certified set has a triangular factor whose inverse has entries of 2^(n - 2)."""
     factor = np.eye(n) - np.tril(np.ones((n, n)), -1)
     plant = LinearPlant(A=0.5 * np.eye(n), B=np.ones((n, 1)), C=np.eye(n), u_max=1.0, dt=0.1, gamma=1e-6)
-    return Estimator(plant, Channel(), ErrorSet(Sigma=factor @ factor.T, rate=0.5))
+    return SetMembership(plant, 0.0, ErrorSet(Sigma=factor @ factor.T, rate=0.5))
 
 
 @pytest.mark.parametrize("size", [1e-6, 1.0, 1e3])
 def test_rounded_shapes_are_no_smaller_where_the_certified_set_is_ill_conditioned(size):
-    estimator, n = ill_conditioned_estimator(44), 44
+    sets, n = ill_conditioned_sets(44), 44
     shape = np.random.default_rng(0).standard_normal((n, n))
-    shape = size * estimator._ball @ shape @ shape.T @ estimator._ball.T
+    shape = size * sets._ball @ shape @ shape.T @ sets._ball.T
     shape = 0.5 * (shape + shape.T)
 
     def smallest_growth():
-        return np.linalg.eigvalsh(estimator._settled_shape(shape) - shape)[0] / np.linalg.norm(shape)
+        return np.linalg.eigvalsh(sets.rounded_up(shape) - shape)[0] / np.linalg.norm(shape)
 
     assert smallest_growth() > 0.0
     # Coordinates of the unit ball and back are not the identity here; a shape is smaller if that is not made up for.
-    estimator._ball_error = np.zeros((n, n))
+    sets._ball_error = np.zeros((n, n))
     assert smallest_growth() < -1e-8
 
 
@@ -288,8 +302,8 @@ def test_rounded_shapes_are_no_smaller_where_the_certified_set_is_ill_conditione
 @pytest.mark.parametrize("p", [None, 1, 2])
 def test_set_membership_gain_leaves_the_smallest_ellipsoid(p, size):
     plant = random_plant(2, 3, 1, p)
-    estimator = Estimator(plant, Channel(quantization_step=0.01))
-    shape, N, H = size * estimator.error_set.Sigma, estimator._noise, plant.H
+    sets = sets_of(plant, Channel(quantization_step=0.01))
+    shape, N, H = size * sets.error_set.Sigma, sets.noise, plant.H
 
     def left(gain):
         """Size of what an update leaves, with the best share for this gain."""
@@ -298,23 +312,23 @@ def test_set_membership_gain_leaves_the_smallest_ellipsoid(p, size):
         return (np.sqrt(np.vdot(plant.weight, first)) + np.sqrt(np.vdot(plant.weight, second))) ** 2
 
     others = [shape @ H.T / mu @ np.linalg.inv(H @ shape @ H.T / mu + N / (1 - mu)) for mu in np.linspace(0.005, 0.995)]
-    found = left(estimator._membership_gain(shape))
+    found = left(sets.gain(shape))
     assert found <= min(map(left, others)) * (1 + 1e-2)
     assert found < 0.95 * max(map(left, others))
 
 
 def test_shape_without_any_extent_is_rounded_up_to_a_finite_one():
-    estimator = Estimator(truck_trailer(), Channel())
-    values = np.linalg.eigvalsh(estimator._settled_shape(np.zeros((2, 2))))
+    sets = sets_of(truck_trailer())
+    values = np.linalg.eigvalsh(sets.rounded_up(np.zeros((2, 2))))
     assert values[0] >= 0.0
-    assert values[1] < 0.01 * np.linalg.eigvalsh(estimator.error_set.Sigma)[1]
+    assert values[1] < 0.01 * np.linalg.eigvalsh(sets.error_set.Sigma)[1]
 
 
 @pytest.mark.parametrize("perfect", [(True, True), (True, False)])
 def test_perfect_sensors_get_a_little_noise_in_their_own_units(perfect):
     # Otherwise a filter that knows the state has a singular innovation covariance.
     plant = truck_trailer(H=np.diag([2.0, 3.0]), measurement_noise_cov=np.diag(np.where(perfect, 0.0, 1e-4)))
-    noise = Estimator(plant, Channel())._filter.R - plant.measurement_noise_cov
+    noise = ErrorRecursion(plant, 0.0, certified_error_set(plant))._kalman.R - plant.measurement_noise_cov
     np.testing.assert_allclose(noise, FLAT_INFLATION * np.diag((plant.half_widths * [2.0, 3.0]) ** 2), rtol=1e-6)
 
 
@@ -322,12 +336,12 @@ def test_perfect_sensors_get_a_little_noise_in_their_own_units(perfect):
 def test_quick_test_passes_no_impossible_residual_however_ill_conditioned_the_bound_is(condition):
     rng = np.random.default_rng(0)
     plant = replace(truck_trailer(), measurement_noise_cov=np.eye(2))
-    estimator, noise = Estimator(plant, Channel(), certified_error_set(plant)), plant.sensor_noise.bound.shape
+    test, noise = InnovationTest(plant.H, sets_of(plant).noise), plant.sensor_noise.bound.shape
     passed = np.zeros(2, dtype=int)
     for _ in range(200):
         along = np.linalg.qr(rng.standard_normal((2, 2)))[0].T
         spread = condition * noise[0, 0] * np.outer(along[0], along[0])
-        inverse = estimator.inverse_of_bound(spread)
+        inverse = test.inverse_of_bound(spread)
         for share, times in ((0, 0.2), (1, 3.0)):  # across the long axis, where the noise alone decides
             residual = np.sqrt(noise[0, 0]) * (0.5 * np.sqrt(condition) * along[0] + times * along[1])
             passed[share] += residual @ inverse @ residual <= 1.0

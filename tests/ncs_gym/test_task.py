@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from ncs_gym import Regulation, SpeedTracking, truck_trailer
-from ncs_gym.tasks.task import SpeedProfile
 
 
 def test_regulation_costs_about_one_at_the_edge_of_the_box(plant):
@@ -17,24 +16,24 @@ def test_regulation_takes_the_users_costs(plant):
 
 def test_speed_integrates_the_acceleration(plant):
     task = SpeedTracking(change_probability=0.0)
-    memory = task.advance(np.random.default_rng(0), plant, SpeedProfile(10.0, 20.0), np.array([3.0]))
-    assert memory == SpeedProfile(10.0 + plant.dt * 3.0, 20.0)
-    assert task.observe(memory) == pytest.approx([8.5])
+    task_state = task.advance(np.random.default_rng(0), plant, np.array([10.0, 20.0]), np.array([3.0]))
+    np.testing.assert_array_equal(task_state, [10.0 + plant.dt * 3.0, 20.0])
+    assert task.observe(task_state) == pytest.approx([8.5])
 
 
 def test_speed_reward_is_the_documented_one(plant):
     task = SpeedTracking()
-    assert task.reward(plant, SpeedProfile(10.0, 15.0), np.zeros(2), np.array([2.0])) == pytest.approx(-0.2 - 0.008)
-    assert task.reward(plant, SpeedProfile(0.0, 500.0), np.zeros(2), np.zeros(1)) == pytest.approx(-1.0)
+    assert task.reward(plant, np.array([10.0, 15.0]), np.zeros(2), np.array([2.0])) == pytest.approx(-0.2 - 0.008)
+    assert task.reward(plant, np.array([0.0, 500.0]), np.zeros(2), np.zeros(1)) == pytest.approx(-1.0)
 
 
 def test_profile_is_piecewise_constant_in_range_and_changes_at_its_rate(plant):
     task, rng = SpeedTracking(), np.random.default_rng(0)
-    memory = task.begin(rng, plant)
+    task_state = task.begin(rng, plant)
     targets = []
     for _ in range(20_000):
-        memory = task.advance(rng, plant, memory, np.zeros(1))
-        targets.append(memory.target)
+        task_state = task.advance(rng, plant, task_state, np.zeros(1))
+        targets.append(task_state[1])
     changes = np.mean(np.diff(targets) != 0.0)
     assert changes == pytest.approx(0.02, abs=0.004)
     assert 0.0 <= min(targets) < 1.0
@@ -44,10 +43,10 @@ def test_profile_is_piecewise_constant_in_range_and_changes_at_its_rate(plant):
 def test_observation_bound_is_never_exceeded_at_full_throttle():
     plant, task = truck_trailer(), SpeedTracking()
     rng = np.random.default_rng(0)
-    memory = SpeedProfile(25.0, 0.0)
+    task_state = np.array([25.0, 0.0])
     for _ in range(200):
-        memory = task.advance(rng, plant, memory, plant.u_max)
-        assert abs(task.observe(memory)[0]) <= task.observation_bound(plant, 200)[0]
+        task_state = task.advance(rng, plant, task_state, plant.u_max)
+        assert abs(task.observe(task_state)[0]) <= task.observation_bound(plant, 200)[0]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,169 @@
+"""Scalar environments that are fed with what a vector environment draws, and the comparison of both at every step."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+from ncs_gym import LinearPlant, NCSEnv, NCSVectorEnv
+from ncs_gym.network.channel_state import ChannelState, LossState
+from ncs_gym.plants.lqr import regulator_gain
+from ncs_gym.plants.process import LinearProcess
+
+
+class RecordingGenerator:
+    """A source of randomness that notes the uniform numbers it hands out in a step; other draws are passed on."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng, self.drawn, self.notes = rng, [], True
+
+    def random(self, size: Any = None) -> np.ndarray:
+        numbers = self.rng.random(size)
+        if self.notes:
+            self.drawn.append(numbers)
+        return numbers
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.rng, name)
+
+
+class ScriptedGenerator:
+    """Hands out what was drawn for one environment of a vector, in the same order."""
+
+    def __init__(self) -> None:
+        self.numbers: list[np.ndarray] = []
+
+    def random(self, size: Any = None) -> Any:
+        number = self.numbers.pop(0)
+        assert np.shape(number) == (() if size is None else size)
+        return number
+
+
+class RecordedProcess(LinearProcess):
+    """The process of a vector, which notes noise and disturbances; those do not count among the uniform numbers."""
+
+    def disturb(self, rng: Any, nominal: np.ndarray, steps: Any, memory: Any) -> np.ndarray:
+        self.steps, self.disturbance_now = np.copy(steps), super().disturb(rng.rng, nominal, steps, memory)
+        return self.disturbance_now
+
+    def measure(self, rng: Any, state: np.ndarray) -> np.ndarray:
+        measured = super().measure(rng.rng, state)
+        self.noise_now = measured - self.plant.H @ state
+        return measured
+
+
+class ScriptedProcess(LinearProcess):
+    """The process of a scalar environment with the noise and the disturbances of one environment of a vector."""
+
+    def disturb(self, rng: Any, nominal: np.ndarray, steps: Any, memory: Any) -> np.ndarray:
+        source = self.disturbance
+        if source.vectorized and not source.memoryless and source.replaces_process_noise:  # it is a function of these
+            own = super().disturb(rng, nominal, steps, memory)
+            np.testing.assert_allclose(own, self.disturbance_now, atol=1e-7)
+        return self.disturbance_now
+
+    def measure(self, rng: Any, state: np.ndarray) -> np.ndarray:
+        return self.plant.H @ state + self.noise_now
+
+
+class ScriptedEnv(NCSEnv):
+    """The scalar environment fed with what one environment of a vector drew."""
+
+    def follow(self, many: NCSVectorEnv, index: int) -> None:
+        """Begins in the state of an episode of the vector that has just begun."""
+        self.many, self.index = many, index
+        self.np_random = np.random.default_rng(0)
+        self.reset(options={"state": many._state[:, index]})
+        self._process = ScriptedProcess(self.plant, self.disturbance, self.allow_assumption_violation)
+        self.estimator.reset(many._estimator.mean[:, index])
+        self._task_state = np.copy(many._task_state[..., index])[()]
+        self._disturbance_memory = np.copy(many._disturbance_memory[..., index])[()]
+        self._channel_state = ChannelState(self.channel, np.random.default_rng(0))
+        self._channel_state._loss_state = LossState(*(kept[index] for kept in many._channel_state._loss_state))
+        self.np_random = ScriptedGenerator()
+
+    def replay(self, action: np.ndarray) -> tuple:
+        """Steps with what the vector drew at its last step."""
+        process, rng = self.many._process, self.many.np_random
+        self._process.disturbance_now = process.disturbance_now[:, self.index]
+        self._process.noise_now = process.noise_now[:, self.index]
+        self.np_random.numbers = [drawn[..., self.index] for drawn in rng.drawn]
+        sends = self._channel_state.sends_at(self.steps + 1)
+        result = self.step(action)
+        assert not (sends and self.np_random.numbers)  # where nothing is sent, less is drawn
+        return result
+
+
+def scalar_versions(many: NCSVectorEnv) -> list[ScriptedEnv]:
+    """Scalar environments that follow each environment of a vector, which is made to record."""
+    single = many.single
+    many._process = RecordedProcess(many.plant, single.disturbance, single.allow_assumption_violation, many.num_envs)
+    many._process.noise_now = np.zeros((many.plant.p, many.num_envs))
+    many.np_random = rng = RecordingGenerator(many.np_random)
+    begin = many._begin
+
+    def begin_unnoticed(*arguments: Any) -> None:
+        rng.notes = False
+        begin(*arguments)
+        rng.notes = True
+
+    many._begin = begin_unnoticed
+    names = ("plant", "channel", "task", "disturbance", "initial_set", "terminate_on_violation", "contract", "horizon")
+    settings = {name: getattr(single, name) for name in names}
+    settings["allow_assumption_violation"] = single.allow_assumption_violation
+    singles = [ScriptedEnv(**settings) for _ in range(many.num_envs)]
+    for index, each in enumerate(singles):
+        each.follow(many, index)
+    return singles
+
+
+def holding_gain(plant: LinearPlant) -> np.ndarray:
+    """A gain on actions that keeps an unstable plant near zero, where rounding does not grow without end."""
+    if plant.spectral_radius < 1.0:
+        return np.zeros((plant.m, plant.n))
+    scale = np.diag(plant.half_widths)
+    inverse = np.linalg.inv(scale)
+    return regulator_gain(inverse @ plant.A @ scale, inverse @ plant.B * plant.u_max, 1, 1) @ inverse
+
+
+def compare(many: NCSVectorEnv, steps: int) -> int:
+    """Steps a vector and, with the same draws, scalar ones; compares everything; returns how many alarms there were."""
+    many.reset(seed=3)
+    singles, rng, gain = scalar_versions(many), np.random.default_rng(0), holding_gain(many.plant)
+    width, alarms, estimates = 0.1 if gain.any() else 1.2, 0, np.zeros((many.num_envs, many.plant.n))
+    for number in range(steps):
+        actions = rng.uniform(-width, width, many.action_space.shape) + estimates @ gain.T
+        actions, episodes = actions.astype(np.float32), many.episodes.copy()
+        many.np_random.drawn = []
+        observations, rewards, terminated, _, infos = many.step(actions)
+        for index, single in enumerate(singles):
+            begun, last = many.episodes[index] != episodes[index], (observations, infos)
+            if begun and many.autoreset_mode is AutoresetMode.SAME_STEP:
+                last = infos["final_obs"], infos["final_info"]
+            elif begun:
+                single.follow(many, index)
+                continue
+            observation, reward, done, _, info = single.replay(actions[index])
+            np.testing.assert_allclose(last[0][index], observation, rtol=1e-6, atol=1e-10)
+            assert rewards[index] == pytest.approx(reward, rel=1e-10, abs=1e-10)
+            assert terminated[index] == done
+            assert_same(number, info, last[1], index)
+            if begun:
+                single.follow(many, index)
+                continue
+            statistics = many._estimator.patterns.statistics[many._estimator.statistics[index]]
+            np.testing.assert_allclose(statistics.covariance, single.estimator.belief.covariance, rtol=1e-10)
+            if gain.any():  # an unstable plant makes 1e-17 of rounding 1e-10 in an episode
+                single._state = infos["state"][index].copy()
+        estimates = infos["estimate"]
+        alarms += int(infos["assumption_violated"].sum())
+    return alarms
+
+
+def assert_same(number: int, single: dict[str, Any], many: dict[str, Any], index: int) -> None:
+    for key, value in single.items():
+        np.testing.assert_allclose(many[key][index], value, rtol=1e-10, atol=1e-10, err_msg=f"step {number}: {key}")
+        assert np.asarray(value).dtype.kind == many[key].dtype.kind, key

@@ -1,0 +1,238 @@
+"""The vector environment equals the scalar one, fed with the same draws; shared graphs and copies change nothing."""
+
+import copy
+import pickle
+import sys
+import threading
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from ncs_gym import (
+    Channel,
+    ChannelContract,
+    GilbertElliott,
+    NCSEnv,
+    NCSVectorEnv,
+    SetpointTracking,
+    SpeedTracking,
+    batch_reactor,
+    cart_pole,
+    truck_trailer,
+)
+from ncs_gym.estimation import arrival_patterns
+from tests.ncs_gym.same_draws import compare
+from tests.plants import random_plant
+
+IDS = ("TruckTrailer", "TruckTrailerCruise", "CartPole", "BatchReactor")
+BURSTS = GilbertElliott(p_good_to_bad=0.15, p_bad_to_good=0.3, loss_good=0.05, loss_bad=0.9)
+CHANNELS = {
+    "perfect": Channel(),
+    "case study": Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2),
+    "blackout": Channel(loss=1.0),
+    "overtaking": Channel(loss=0.2, quantization_step=0.02, delay=1, jitter=4),
+    "bursts": Channel(loss=BURSTS, jitter=2),
+    "rare bursts": Channel(loss=BURSTS, send_period=3, delay=4, quantization_step=0.01),
+    "limited losses": Channel(loss=0.6, max_consecutive_losses=2, delay=1),
+}
+OVERTAKING = {"plant": truck_trailer(mass=4000.0), "channel": CHANNELS["overtaking"], "task": SpeedTracking()}
+
+
+def make(name, count, **settings):
+    return gym.make_vec(f"ncs_gym/{name}-v0", num_envs=count, **settings)
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+@pytest.mark.parametrize("mass", [1000.0, 4000.0])
+def test_equals_the_scalar_environment_for_every_channel(channel, mass):
+    task = SpeedTracking(change_probability=0.2)
+    compare(NCSVectorEnv(3, plant=truck_trailer(mass=mass), channel=CHANNELS[channel], task=task), 200)
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_registered_environments_equal_their_scalar_versions(name):
+    compare(make(name, 3, max_episode_steps=None, terminate_on_violation=False).unwrapped, 200)
+
+
+@pytest.mark.parametrize("channel", ["case study", "overtaking", "rare bursts"])
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_episodes_that_begin_anew_equal_scalar_ones(channel, mode):
+    # They end at different times, so that some environments send while others do not.
+    settings = {"plant": truck_trailer(mass=4000.0), "task": SpeedTracking(), "terminate_on_violation": True}
+    env = NCSVectorEnv(4, channel=CHANNELS[channel], max_episode_steps=41, autoreset_mode=mode, **settings)
+    compare(env, 200)
+    assert env.episodes.min() >= 4
+    assert len(np.unique(env.steps)) > 1
+
+
+@pytest.mark.parametrize("disturbance", ["adversarial", "sinusoid", "sphere", "box"])
+def test_disturbances_and_set_points_equal_scalar_ones(disturbance):
+    task = SetpointTracking(output=(1.0, 0.5), reach=1.0, width=0.3, change_probability=0.3)
+    settings = {"plant": truck_trailer(), "channel": CHANNELS["bursts"], "task": task, "disturbance": disturbance}
+    compare(NCSVectorEnv(3, **settings), 100)
+
+
+@pytest.mark.parametrize(
+    ("plant", "channel", "contract"),
+    [
+        (cart_pole(full_state=False), Channel(loss=0.3, delay=1, quantization_step=1e-4), ChannelContract(2, 1e-4)),
+        (batch_reactor(), Channel(loss=0.5, jitter=3), ChannelContract(3)),
+        (random_plant(5, 3, 2, p=1), Channel(loss=0.4, delay=1, jitter=2), None),
+        (random_plant(6, 5, 3, p=2), Channel(loss=BURSTS, send_period=2), None),
+    ],
+)
+def test_partial_measurements_and_broken_contracts_are_the_same(plant, channel, contract):
+    env = NCSVectorEnv(3, plant=plant, channel=channel, contract=contract)
+    compare(env, 120)
+    if contract is not None:
+        env = NCSVectorEnv(3, plant=plant, channel=channel, contract=contract)
+        env.reset(seed=0)
+        broken = [env.step(np.zeros((3, plant.m), np.float32))[4]["contract_broken"] for _ in range(60)]
+        assert np.any(broken)
+
+
+def test_alarms_are_raised_where_the_scalar_estimator_raises_them():
+    # Noise three times as large as allowed: many residuals fail the quick test, some the exact one.
+    env = NCSVectorEnv(
+        4,
+        plant=truck_trailer(),
+        channel=Channel(loss=0.2, delay=1, jitter=1),
+        disturbance=lambda rng, plant, nominal: 1.5 * plant.disturbance.sample_boundary(rng),
+        allow_assumption_violation=True,
+    )
+    assert 0 < compare(env, 60) < 4 * 60
+
+
+@pytest.mark.parametrize("name", ["TruckTrailerCruise", "BatchReactor"])
+def test_a_graph_that_forgets_changes_nothing(name, monkeypatch):
+    monkeypatch.setattr(arrival_patterns, "_shared", {})
+    monkeypatch.setattr(arrival_patterns, "MAX_PATTERNS", 40)
+    env = make(name, 3, channel=Channel(loss=0.3, max_consecutive_losses=2, jitter=2), max_episode_steps=None).unwrapped
+    before = env._estimator.patterns
+    compare(env, 200)
+    assert env._estimator.patterns is not before
+    assert len(env._estimator.patterns) <= 60
+
+
+def steps_of(env, count, seed=0):
+    """What an environment returns for random actions; one step at a time."""
+    rng, returned = np.random.default_rng(seed), None
+    for _ in range(count):
+        returned = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32))
+        yield [*returned[:4], *returned[4].values()]
+
+
+def assert_equal(some, others):
+    for one, other in zip(some, others, strict=True):
+        for value, wanted in zip(one, other, strict=True):
+            np.testing.assert_array_equal(value, wanted)
+
+
+KINDS = {
+    "scalar": lambda: NCSEnv(**OVERTAKING),
+    "vector": lambda: NCSVectorEnv(3, max_episode_steps=17, **OVERTAKING),
+}
+
+
+@pytest.mark.parametrize("most", [1 << 17, 60])
+@pytest.mark.parametrize("kind", KINDS)
+def test_environments_that_share_a_graph_do_not_notice_each_other(kind, most, monkeypatch):
+    monkeypatch.setattr(arrival_patterns, "MAX_PATTERNS", most)
+    monkeypatch.setattr(arrival_patterns, "_shared", {})
+    alone = KINDS[kind]()
+    alone.reset(seed=1)
+    wanted = list(steps_of(alone, 120))
+    monkeypatch.setattr(arrival_patterns, "_shared", {})
+    envs = [KINDS[kind](), KINDS["scalar"](), KINDS["vector"]()]
+    graphs = {id(getattr(env, "estimator", None) and env.estimator._patterns) for env in envs[:2] if kind == "scalar"}
+    assert len(graphs) <= 1
+    for seed, env in enumerate(envs, 1):
+        env.reset(seed=seed)
+    runs = zip(*(steps_of(env, 120, seed) for seed, env in enumerate(envs)), strict=True)
+    assert_equal([run[0] for run in runs], wanted)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_copy_made_in_the_middle_of_an_episode_goes_on_like_the_original(kind, copied):
+    env = KINDS[kind]()
+    env.reset(seed=0)
+    list(steps_of(env, 29))
+    twin = copied(env)
+    wanted = list(steps_of(env, 60, seed=1))
+    assert_equal(steps_of(twin, 60, seed=1), wanted)
+
+
+@pytest.mark.parametrize("most", [1 << 17, 300])
+def test_threads_share_a_graph(most, monkeypatch):
+    settings = {"plant": truck_trailer(), "channel": Channel(loss=0.3, jitter=3, delay=1)}
+
+    def run(seed, returned):
+        env = NCSVectorEnv(8, **settings)
+        env.reset(seed=seed)
+        returned[seed] = list(steps_of(env, 100))
+
+    alone, together = {}, {}
+    for seed in range(4):
+        run(seed, alone)
+    monkeypatch.setattr(arrival_patterns, "MAX_PATTERNS", most)
+    interval = sys.getswitchinterval()
+    try:
+        sys.setswitchinterval(1e-6)
+        for _ in range(4):
+            monkeypatch.setattr(arrival_patterns, "_shared", {})
+            threads = [threading.Thread(target=run, args=(seed, together)) for seed in range(4)]
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
+            for seed in range(4):
+                assert_equal(together.pop(seed), alone[seed])
+    finally:
+        sys.setswitchinterval(interval)
+
+
+def test_a_long_buffer_holds_few_patterns():
+    # Every pattern of a buffer of 600 steps takes 20 kB.
+    env = NCSEnv(truck_trailer(), Channel(loss=0.3, delay=100, jitter=500))
+    limit = arrival_patterns.MAX_AGES // 601
+    env.reset(seed=0)
+    sizes = set()
+    for _ in range(2500):
+        env.step(np.zeros(1, np.float32))
+        sizes.add(len(env.estimator._patterns))
+    assert 0.9 * limit < max(sizes) < 1.1 * limit
+
+
+def test_a_graph_has_room_for_many_environments(monkeypatch):
+    # With fewer patterns than environments it would be forgotten at every step.
+    monkeypatch.setattr(arrival_patterns, "_shared", {})
+    monkeypatch.setattr(arrival_patterns, "MAX_PATTERNS", 20)
+    env = NCSVectorEnv(100, plant=truck_trailer(), channel=Channel(loss=0.3, jitter=3))
+    env.reset(seed=0)
+    graphs = []
+    for _ in range(100):
+        env.step(np.zeros((100, 1), np.float32))
+        graphs.append(env._estimator.patterns)
+    assert 2 < len(set(map(id, graphs))) < 60
+
+
+def test_a_damaged_measurement_is_not_used_and_harms_no_other():
+    env = NCSVectorEnv(3, plant=truck_trailer(), channel=Channel(jitter=3))
+    env.reset(seed=0)
+    measure, count = env._process.measure, 0
+
+    def damaged(rng, state):
+        nonlocal count
+        count += 1
+        measured = measure(rng, state)
+        if count % 5 == 0:
+            measured[:, 1] = np.nan
+        return measured
+
+    env._process.measure = damaged
+    for _ in range(60):
+        *_, info = env.step(np.zeros((3, 1), np.float32))
+        assert np.isfinite(info["estimate"]).all()
+    np.testing.assert_array_equal(info["assumption_violated"], [False, True, False])
