@@ -100,7 +100,7 @@ def _as_age_sets(sets: ErrorSetsByAge) -> ErrorSetsByAge:
         "shapes": (steps + 1, n, n),
         "rates": (steps,),
         "gains": (steps, n, p),
-        "shares": (steps,),
+        "multipliers": (steps,),
         "noise": (p, p),
     }
     arrays = {name: np.array(as_setting(getattr(sets, name)), dtype=np.float64) for name in expected}

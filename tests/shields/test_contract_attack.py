@@ -148,7 +148,7 @@ MUTATIONS = {
         lambda c, s: replace(c, ages=replace(c.ages, inputs=at(c.ages.inputs, (0, 1), 1e-9))),
         ["(U) input 2 stays within u_max (1 - 2^-24) at age 0"],
     ),
-    "shares above one": (
+    "multipliers above one": (
         lambda c, s: replace(c, ages=replace(c.ages, multipliers=at(c.ages.multipliers, (2, 0), 1.5))),
         ["lx + le + ld <= 1"],
     ),
