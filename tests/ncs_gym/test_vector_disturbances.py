@@ -1,0 +1,111 @@
+"""Disturbances of many environments at once: within their bound, and like those of one."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from ncs_gym import (
+    AdversarialDisturbance,
+    BallDisturbance,
+    BoxDisturbance,
+    NCSEnv,
+    NCSVectorEnv,
+    SinusoidDisturbance,
+    SphereDisturbance,
+    truck_trailer,
+)
+
+DISTURBANCES = {
+    "ball": BallDisturbance(),
+    "box": BoxDisturbance((0.02, 0.01)),
+    "sinusoid": SinusoidDisturbance(period=7.0),
+    "sphere": SphereDisturbance(),
+    "adversarial": AdversarialDisturbance(),
+    "adversarial in M": AdversarialDisturbance(np.array([[2.0, 0.3], [0.3, 1.0]])),
+    "callable": lambda rng, plant, nominal: 0.5 * plant.disturbance.sample_boundary(rng),
+}
+
+
+@pytest.mark.parametrize("name", DISTURBANCES)
+def test_disturbances_stay_in_their_bound_and_move_the_state(name):
+    plant = truck_trailer()
+    env = NCSVectorEnv(50, plant=plant, disturbance=DISTURBANCES[name])
+    _, info = env.reset(seed=1)
+    gauges = []
+    for _ in range(40):
+        before = info["state"]
+        _, _, _, _, info = env.step(np.zeros((50, 1), np.float32))
+        d = info["state"] - before @ plant.A.T
+        gauges.append(plant.disturbance.gauge(d))
+    assert np.max(gauges) <= 1.0 + 1e-9
+    assert np.mean(gauges) > 0.02
+    if name in ("sphere", "adversarial", "adversarial in M"):
+        assert np.min(gauges) > 1.0 - 1e-6
+
+
+@pytest.mark.parametrize("name", ["sinusoid", "adversarial", "adversarial in M"])
+def test_batched_draws_equal_scalar_ones(name):
+    plant, rng, source = truck_trailer(), np.random.default_rng(0), DISTURBANCES[name]
+    memory = source.begin_many(rng, plant, 30)
+    nominal, steps = rng.standard_normal((2, 30)), rng.integers(0, 50, 30)
+    drawn = source.draw_many(rng, plant, nominal, steps, memory)
+    for i in range(30):
+        one = source.draw(rng, plant, nominal[:, i], int(steps[i]), memory[:, i])
+        np.testing.assert_allclose(drawn[:, i], one, atol=1e-7)
+
+
+def test_batched_draws_are_distributed_like_scalar_ones():
+    plant, rng = truck_trailer(), np.random.default_rng(0)
+    pairs = [(source.draw, source.draw_many) for source in (BallDisturbance(), BoxDisturbance(), SphereDisturbance())]
+    for draw, draw_many in pairs:
+        many = draw_many(rng, plant, np.zeros((2, 20000)), np.zeros(20000), None).T
+        few = np.array([draw(rng, plant, np.zeros(2), 0, None) for _ in range(5000)])
+        np.testing.assert_allclose(np.cov(many.T), np.cov(few.T), atol=0.05 * np.trace(np.cov(few.T)))
+    for noise in (plant.process_noise, plant.sensor_noise):
+        many, few = noise.sample(rng, 20000), np.array([noise.sample(rng) for _ in range(5000)])
+        assert noise.bound.gauge(many).max() <= 1.0 + 1e-12
+        np.testing.assert_allclose(np.cov(many.T), np.cov(few.T), atol=0.05 * np.trace(np.cov(few.T)))
+
+
+def test_a_disturbance_beyond_its_bound_raises():
+    env = NCSVectorEnv(3, plant=truck_trailer(), disturbance=lambda rng, plant, nominal: np.ones(2))
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="outside its bound"):
+        env.step(np.zeros((3, 1), np.float32))
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(np.zeros((3, 1), np.float32))
+
+
+class Loud(BoxDisturbance):
+    """A user's class that may be drawn ahead, with one draw outside every bound."""
+
+    vectorized = True
+    memoryless = True
+    size = 5.0
+
+    def draw(self, rng, plant, nominal_next, step, memory):
+        drawn = np.zeros(nominal_next.shape)
+        drawn[:, -1] = self.size
+        return drawn
+
+
+class Misshapen(Loud):
+    """A user's class that returns one disturbance for all steps."""
+
+    vectorized = True
+    memoryless = True
+
+    def draw(self, rng, plant, nominal_next, step, memory):
+        return np.zeros((plant.n, 1))
+
+
+@pytest.mark.parametrize("kind", [NCSEnv, lambda **settings: NCSVectorEnv(2, **settings)])
+def test_disturbances_that_are_drawn_ahead_are_checked(kind):
+    for source, words in ((Loud(), "outside its bound"), (Misshapen(), "finite with shape")):
+        env = kind(plant=truck_trailer(), disturbance=source)
+        env.reset(seed=0)
+        with pytest.raises(ValueError, match=words):
+            env.step(np.zeros(env.action_space.shape, np.float32))
+    env = kind(plant=truck_trailer(), disturbance=Loud(), allow_assumption_violation=True)
+    env.reset(seed=0)
+    assert np.abs(env.step(np.zeros(env.action_space.shape, np.float32))[4]["state"]).max() > 4.0
