@@ -85,10 +85,7 @@ class SafetyFilter(FrozenArrays):
             kinds = f"{type(self.certificate).__name__} and {type(self.plant).__name__}"
             raise ValueError(f"SafetyFilter takes a Certificate and a LinearPlant, got {kinds}")
         if self.mode == "boundary" and self.plant.m > MOST_INPUTS_WITH_VERTICES:
-            raise ValueError(
-                f'mode "boundary" looks at 2^m vertices and takes at most {MOST_INPUTS_WITH_VERTICES} inputs, '
-                f"got {self.plant.m}"
-            )
+            raise ValueError(f'mode "boundary" takes at most {MOST_INPUTS_WITH_VERTICES} inputs, got {self.plant.m}')
         require_valid(self.certificate, self.plant)
         require_computable(self.certificate, self.plant)
         object.__setattr__(self, "test", OneStepTest(self.certificate.L, self.plant))
@@ -245,8 +242,7 @@ def _as_array(value: Any) -> np.ndarray:
     """Returns float64 numbers; an empty array, which has no usable shape, for what are none."""
     if type(value) is np.ndarray and value.dtype is FLOAT64:  # the common case, without another call
         return value
-    array = as_numbers(value)
-    return np.empty(0) if array is None else array
+    return np.empty(0) if (array := as_numbers(value)) is None else array
 
 
 def _as_column(array: np.ndarray, size: int) -> np.ndarray:
