@@ -27,6 +27,8 @@ from shields.runtime.filter import MARGIN
 
 CHANNEL = Channel(loss=0.3, quantization_step=0.01, send_period=2, delay=2)
 REPEATS = 20
+# Steps are timed in many short blocks: the fastest is one that nothing else interrupted.
+BLOCKS = 60
 REASONS = ("safe", "projected", "fallback")
 
 
@@ -115,9 +117,9 @@ def compare(name: str, env: NCSEnv, steps: int) -> None:
 
 
 def seconds_per_call(call, repeats: int) -> float:
-    """Of the fastest of some blocks of calls."""
+    """Of the fastest block of calls."""
     blocks = []
-    for _ in range(7):
+    for _ in range(BLOCKS):
         start = time.perf_counter()
         for _ in range(repeats):
             call()
@@ -140,11 +142,11 @@ class Stopwatch:
 
 
 def added_by(shield, shape: tuple[int, ...], repeats: int) -> float:
-    """Seconds that a shield adds to a step, in the fastest of some blocks of steps."""
+    """Seconds that a shield adds to a step, in the fastest block of steps."""
     rng, watch, blocks = np.random.default_rng(0), Stopwatch(shield.env), []
     actions = rng.uniform(-1, 1, (100, *shape)).astype(np.float32)
     shield.reset(seed=0)
-    for _ in range(7):
+    for _ in range(BLOCKS):
         watch.seconds = spent = 0.0
         for step in range(repeats):
             start = time.perf_counter()
@@ -160,16 +162,16 @@ def compare_steps() -> None:
     """Prints what the scalar and the vector shield add to a step."""
     pendulum = gym.make("Pendulum-v1", max_episode_steps=10**9)
     pendulum.reset(seed=0)
-    single = seconds_per_call(lambda: pendulum.step(np.zeros(1, np.float32)), 2000)
-    added = added_by(SafetyShield(gym.make("ncs_gym/TruckTrailerCruise-v0")), (1,), 1000)
+    single = seconds_per_call(lambda: pendulum.step(np.zeros(1, np.float32)), 200)
+    added = added_by(SafetyShield(gym.make("ncs_gym/TruckTrailerCruise-v0")), (1,), 200)
     print(f"one environment:  {1e6 * added:6.0f} us, {added / single:.2f} steps of Pendulum-v1")
     for count in (64, 1024):
         poles = gym.make_vec("CartPole-v1", num_envs=count, vectorization_mode="vector_entry_point")
         poles.reset(seed=0)
         actions = poles.action_space.sample()
-        many = seconds_per_call(lambda poles=poles, actions=actions: poles.step(actions), 200)
+        many = seconds_per_call(lambda poles=poles, actions=actions: poles.step(actions), 20)
         shield = VectorSafetyShield(gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=count))
-        added = added_by(shield, (count, 1), 200)
+        added = added_by(shield, (count, 1), 20)
         print(f"{count:4d} environments:{1e6 * added:6.0f} us, {added / many:.2f} steps of the vector CartPole-v1")
 
 
