@@ -114,14 +114,13 @@ class GuaranteeMonitor:
         size = np.abs(estimate)
         reach = self._reach if estimate.ndim == 1 else self._reach[:, None]
         near = (size + errors.half_widths <= reach).all(axis=0)  # never without a usable estimate and error shape
-        broken, certified = _first(broken, alarm, ALARM), errors.certified
+        broken = _first(broken, alarm, ALARM)
         if not _all(near):
             usable = (self._test.columns.dot(size) < FARTHEST) & (errors.radius == errors.radius)
             broken = _first(_first(broken, usable == False, UNUSABLE), near == False, FAR_OUT)  # noqa: E712
-            certified = certified & usable
         if not _all(inside):
             inside = inside | self._test.knows_inside(estimate, errors, MARGIN)
-        return MonitorState(broken, inside, certified)
+        return MonitorState(broken, inside, errors.certified)
 
 
 def _all(conditions: Any) -> bool:

@@ -10,9 +10,10 @@ from scipy.linalg import solve_triangular
 
 from ncs_gym import LinearPlant
 from ncs_gym.validation import read_only
-from shields.certificate import CertificateError
+from shields.certificate import Certificate, CertificateError
 from shields.runtime.predicted_errors import SMALLEST_RADIUS, PredictedErrors
-from shields.runtime.projection import closest_admissible
+from shields.runtime.projection import closest_admissible, closest_on_lines
+from shields.verification import ACTION_ROUNDING
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
 
 # The test of all inputs looks at the 2^m vertices of the input box.
@@ -84,6 +85,11 @@ class OneStepTest:
             radius[small] = np.minimum(radius[small], 0.0)
         return ReachableSets(self, self.moved @ estimates, errors.turn, radius)
 
+    def reachable_alone(self, estimate: np.ndarray, errors: PredictedErrors) -> ReachableSet | None:
+        """Returns what `reachable` does for one estimate, shape (n,), and one error shape; None if nothing passes."""
+        radius = errors.radius - self.rounding * float(self.columns.dot(np.abs(estimate)))
+        return ReachableSet(self, self.moved.dot(estimate), errors.turn, radius) if radius >= SMALLEST_RADIUS else None
+
     @np.errstate(all="ignore")
     def knows_inside(self, estimates: np.ndarray, errors: PredictedErrors, margin: float) -> np.ndarray:
         """Returns whether |x_hat|_M + sqrt(lambda_max(M Sigma_k)) <= 1 - margin, which proves that x is in S.
@@ -147,6 +153,35 @@ class ReachableSets(NamedTuple):
         return closest_admissible(inputs, offset, effect, self.radius - reserve, self.test.plant.u_max)
 
 
+class ReachableSet(NamedTuple):
+    """`ReachableSets` of a single environment: the same formulas without its axis, in a fifth of the time.
+
+    Attributes:
+        test: What holds for all environments.
+        offset: G A x_hat, shape (n,).
+        turn: T of `PredictedErrors`, shape (n, n).
+        radius: 1 - h less rounding, at least SMALLEST_RADIUS.
+    """
+
+    test: OneStepTest
+    offset: np.ndarray
+    turn: np.ndarray
+    radius: float
+
+    def slack(self, u: np.ndarray) -> tuple[float, float]:
+        """Returns slack and margin of an input u, shape (m,)."""
+        center = self.offset + self.test.effect.dot(u)
+        turned = self.turn.dot(center)
+        return self.radius - float(turned.dot(turned)) ** 0.5, self.radius - float(center.dot(center)) ** 0.5
+
+    @np.errstate(all="ignore")
+    def closest(self, u: np.ndarray, reserve: float) -> np.ndarray:
+        """Returns what `ReachableSets.closest` does for plants with a single input, shape (1,)."""
+        effect, offset = self.turn.dot(self.test.effect[:, 0]), self.turn.dot(self.offset)
+        form = effect.dot(effect), effect.dot(offset), offset.dot(offset)
+        return closest_on_lines(u, *form, self.radius - reserve, self.test.plant.u_max)
+
+
 def norms(vectors: np.ndarray) -> np.ndarray:
     """Returns the Euclidean norms of the columns of an array (n, N), shape (N,)."""
     return np.sqrt((vectors * vectors).sum(axis=0))
@@ -168,3 +203,19 @@ def certified_root(L: np.ndarray) -> np.ndarray:
         if is_positive_semidefinite(subtract(congruence(rational(grown), rational(L)), identity)):
             return grown
     raise CertificateError("the safe set is too thin to decide in float64 what lies in it")
+
+
+def require_computable(certificate: Certificate, plant: LinearPlant) -> None:
+    """Raises unless float64 computes K x_hat on S more accurately than (I) and (U) make room for.
+
+    D_u allows a shift by 2^-24 u_max, twice what rounding an action to float32 does; the other half is for this.
+
+    Raises:
+        CertificateError: If it does not.
+    """
+    extent = np.sqrt(np.diag(certificate.L))
+    if len(certificate.error_shapes):
+        extent = extent + np.sqrt(np.diagonal(certificate.error_shapes, axis1=1, axis2=2)).max(axis=0)
+    error = (plant.n + 2) * np.finfo(float).eps * (np.abs(certificate.K) @ extent)
+    if (error > 0.25 * float(ACTION_ROUNDING) * plant.u_max).any():
+        raise CertificateError("the gain is too large against the input limits to compute K x_hat in float64")

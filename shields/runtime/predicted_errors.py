@@ -83,7 +83,7 @@ def predicted_errors(test: OneStepTest, shapes: np.ndarray, certified_shapes: np
     turn = np.sqrt(weights)[:, :, None] * axes.swapaxes(1, 2)
     own_spread = half_widths @ test.own_columns
     own = _eigh(test.root @ symmetric @ test.root.T)[0][:, -1] + test.rounding * own_spread**2
-    usable &= np.isfinite(turn).all(axis=(1, 2)) & np.isfinite(radius) & (h > 0.0)
+    usable &= np.all(np.isfinite(turn), axis=(1, 2)) & np.isfinite(radius) & (h > 0.0)
     unusable = np.where(usable, 0.0, np.nan)
     return PredictedErrors(
         turn=np.ascontiguousarray(np.where(usable[:, None, None], turn, 0.0).transpose(1, 2, 0)),
@@ -101,7 +101,7 @@ def _are_shapes(matrices: np.ndarray) -> np.ndarray:
     """
     widths = np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
     products = widths[:, :, None] * widths[:, None, :]
-    possible = (np.abs(matrices) <= (1.0 + INDEFINITE) * products).all(axis=(1, 2)) & np.isfinite(widths).all(axis=1)
+    possible = np.all(np.abs(matrices) <= (1.0 + INDEFINITE) * products, axis=(1, 2)) & np.all(widths < np.inf, axis=1)
     correlations = np.where(products > 0.0, matrices / products, 0.0)
     correlations = np.where(possible[:, None, None], correlations, 0.0)
     return possible & (_eigh(correlations)[0][:, 0] >= -INDEFINITE)
@@ -109,7 +109,7 @@ def _are_shapes(matrices: np.ndarray) -> np.ndarray:
 
 def _eigh(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns ascending eigenvalues (k, n) and eigenvectors (k, n, n); NaN where they cannot be computed."""
-    finite = np.isfinite(matrices).all(axis=(1, 2))
+    finite = np.all(np.isfinite(matrices), axis=(1, 2))
     try:
         values, axes = np.linalg.eigh(np.where(finite[:, None, None], matrices, 0.0))
     except np.linalg.LinAlgError:

@@ -40,22 +40,30 @@ def closest_admissible(
     closest, distance = np.full(wanted.shape, np.nan), np.full(len(radius), np.inf)
     problem = np.flatnonzero(radius >= 0.0)
     held = np.zeros((len(wanted), len(problem)))  # the sign of the limit at which an input is held, 0 if it is free
-    while problem.size:
+    while problem.size:  # every turn holds one limit more
         start = np.where(held == 0.0, wanted[:, problem], held * limit[:, None])
         u = _onto_balls(start, offset[:, problem], effect[:, :, problem], radius[problem], held == 0.0)
         away = np.sqrt(((u - wanted[:, problem]) ** 2).sum(axis=0))
         beyond = (np.abs(u) > limit[:, None]) & (held == 0.0)
-        open_ones = away < distance[problem]
-        solved = np.flatnonzero(open_ones & ~beyond.any(axis=0))
+        solved = np.flatnonzero((away < distance[problem]) & ~beyond.any(axis=0))
         np.minimum.at(distance, problem[solved], away[solved])
         best = solved[away[solved] == distance[problem[solved]]]
         closest[:, problem[best]] = u[:, best]
-        broken, parent = np.nonzero(beyond & (away < distance[problem]))
-        branches = held[:, parent]
-        branches[broken, np.arange(len(parent))] = np.sign(u[broken, parent])
-        candidates = np.unique(np.vstack([problem[parent], branches]), axis=1)
-        problem, held = candidates[0].astype(np.int64), candidates[1:]
+        problem, held = _branched(problem, held, np.sign(u), beyond & (away < distance[problem]))
     return closest
+
+
+def _branched(
+    problem: np.ndarray, held: np.ndarray, signs: np.ndarray, broken: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the candidates, each once, that hold one more of the limits broken, at the sign it is broken with."""
+    which, parent = np.nonzero(broken)
+    if not parent.size:
+        return parent, held[:, parent]
+    branches = held[:, parent]
+    branches[which, np.arange(len(parent))] = signs[which, parent]
+    candidates = np.unique(np.vstack([problem[parent], branches]), axis=1)
+    return candidates[0].astype(np.int64), candidates[1:]
 
 
 def closest_on_lines(wanted: Any, a: Any, b: Any, c: Any, radius: Any, limit: Any) -> Any:
@@ -121,7 +129,7 @@ def _multipliers(s: np.ndarray, away: np.ndarray, reach: np.ndarray) -> np.ndarr
         parts = s * (away * shrunk) ** 2
         excess = parts.sum(axis=0)
         unmet = excess > reach * (1.0 + RELATIVE_TOLERANCE)
-        if not unmet[reach >= 0.0].any():
+        if not (unmet & (reach >= 0.0)).any():
             break
         growth = excess / (s * parts * shrunk).sum(axis=0) * (np.sqrt(excess / reach) - 1.0)
         multiplier = np.where(unmet, multiplier + np.minimum(growth, 1e300), multiplier)

@@ -23,9 +23,10 @@ from shields.runtime.guarantee import (
     starts_inside,
 )
 from shields.runtime.one_step_test import norms
-from shields.runtime.wrapper import certificate_for
+from shields.runtime.wrapper import certificate_for, environment_behind
 
 REASONS = np.array(EXPLANATIONS, dtype=object)
+FOR_OTHERS = ": for gymnasium's sync and async vector environments give make_vec(..., wrappers=[SafetyShield])"
 
 
 class Clock(NamedTuple):
@@ -64,7 +65,10 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         penalty: float = 0.0,
     ) -> None:
         RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty)
-        self._inner = inner = _environment_behind(env)
+        refused = VectorActionWrapper, VectorSafetyShield
+        inner = self._inner = environment_behind(env, VectorWrapper, refused, NCSVectorEnv, FOR_OTHERS)
+        if env.single_action_space != inner.single_action_space:
+            raise ValueError(f"a wrapper inside the shield changes the action space to {env.single_action_space}")
         VectorWrapper.__init__(self, env)
         self.penalty = as_number(penalty, "penalty", low=0.0)
         if certificate is not None and not isinstance(certificate, Certificate):
@@ -73,8 +77,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         self.filter = SafetyFilter(self.certificate, inner.plant, mode)
         self._monitor = GuaranteeMonitor(self.filter)
         self._starts_inside = starts_inside(self.certificate, inner.single.initial_set)
-        count, self._inner = self.num_envs, inner
-        nothing = np.zeros(count, np.bool_)
+        count, nothing = self.num_envs, np.zeros(self.num_envs, np.bool_)
         self._state = MonitorState(np.full(count, CODES[OTHER_STEPS]), nothing, nothing)
         self._interventions = np.zeros(count, np.int64)
         self._table: Any = None
@@ -99,12 +102,12 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         now = self._read_clock()
         restarted = now.episodes != before.episodes
         unmoved = (now.steps == before.steps) & (now.ticks == before.ticks)
-        idle = self._idle()
-        kept = idle._replace(passed=self._state.inside)  # environments left alone keep what is proved of them
         self._report = self._observed(info)
-        self._state = self._monitor.advance(self._state, kept, unmoved, np.ones_like(restarted), self._report)
+        nothing, none = np.zeros((self.filter.plant.m, self.num_envs)), np.zeros(self.num_envs, np.bool_)
+        idle = Decision(nothing, none, none, none, self._idle_margins(np.arange(self.num_envs)), none)
+        kept = idle._replace(passed=self._state.inside)  # environments left alone keep what is proved of them
+        self._state = self._monitor.advance(self._state, kept, unmoved, ~none, self._report)
         self._start(restarted, now.steps == 0)
-        idle = idle._replace(margin=self._idle_margins(np.arange(self.num_envs)))
         self._clock = now
         return observation, info | self._info(idle, idle.input, self._state, self._interventions)
 
@@ -130,26 +133,25 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         self._interventions = self._interventions + decided.intervened
         added, charged = {}, decided.intervened
         if np.count_nonzero(restarted):
+            charged = charged & ~restarted
             if "final_info" in info:  # SAME_STEP: the step ended an episode before it began the next
                 added["final_info"] = self._final_info(info, state, decided, proposed, moved_once)
-                charged = charged.copy()
-            else:
-                charged = charged & ~restarted
+                charged = decided.intervened.copy()
             self._start(restarted, moved_once)
             decided.input[:, restarted], proposed[:, restarted], decided.intervened[restarted] = 0.0, 0.0, False
             decided.margin[restarted] = self._idle_margins(np.flatnonzero(restarted))
         self._clock = now
         if self.penalty:
             rewards = rewards - self.penalty * charged
-        added |= self._info(decided, proposed, self._state, self._interventions)
-        return observation, rewards, terminated, truncated, info | added
+        info = info | added | self._info(decided, proposed, self._state, self._interventions)
+        return observation, rewards, terminated, truncated, info
 
     def _observed(self, info: dict[str, Any]) -> Report:
         """Returns what decisions and the guarantee need of an info, as copies: callers may write into theirs."""
         table, numbers = self._inner.error_shapes
         if table is not self._table:
-            self._table, self._known = table, self.filter.errors_of_many(table.shapes)
-        elif len(table.shapes) > len(self._known.radius):
+            self._table, self._known = table, self.filter.errors_of_many(table.shapes[:0])
+        if len(table.shapes) > len(self._known.radius):
             new = self.filter.errors_of_many(table.shapes[len(self._known.radius) :])
             self._known = self._known.followed_by(new)
         estimates = _columns(info.get("estimate"), (self.num_envs, self.filter.plant.n))
@@ -187,23 +189,15 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         decided = Decision(*(array[..., done] for array in decided))
         state = self._advanced(state, decided, moved_once[done], ended, report)
         for key, value in self._info(decided, proposed[:, done], state, self._interventions[done]).items():
-            final[key], final[f"_{key}"] = (
-                np.zeros((self.num_envs, *value.shape[1:]), value.dtype),
-                info["_final_info"].copy(),
-            )
-            final[key][done] = value
+            final[key] = np.full((self.num_envs, *value.shape[1:]), "" if value.dtype == object else 0, value.dtype)
+            final[key][done], final[f"_{key}"] = value, info["_final_info"].copy()
         return final
-
-    def _idle(self) -> Decision:
-        """Returns the decision of a step that applied nothing."""
-        nothing = np.zeros(self.num_envs, np.bool_)
-        margin = np.zeros(self.num_envs)
-        return Decision(np.zeros((self.filter.plant.m, self.num_envs)), nothing, nothing, nothing, margin, margin)
 
     def _idle_margins(self, chosen: np.ndarray) -> np.ndarray:
         """Returns the margins of no input in some environments, shape (len(chosen),)."""
-        u = np.zeros((self.filter.plant.m, len(chosen)))
-        return self.filter.margins(self._report.estimate[:, chosen], self._report.errors.of(chosen), u)
+        with np.errstate(all="ignore"):
+            sets = self.filter.test.reachable(self._report.estimate[:, chosen], self._report.errors.of(chosen))
+            return sets.slack(np.zeros((self.filter.plant.m, len(chosen))))[1]
 
     def _read_clock(self) -> Clock:
         """Returns how often the environments moved until now."""
@@ -254,23 +248,3 @@ def _alarms(value: Any, count: int) -> np.ndarray:
     if type(value) is np.ndarray and value.dtype == np.bool_ and value.shape == (count,):
         return value
     return ~(_columns(value, (count,)) == 0.0)
-
-
-def _environment_behind(env: VectorEnv) -> NCSVectorEnv:
-    """Returns the innermost environment after looking at every wrapper around it."""
-    layer = env
-    while isinstance(layer, VectorWrapper):
-        if isinstance(layer, (VectorActionWrapper, VectorSafetyShield)):
-            raise ValueError(
-                f"the shield must be inside {type(layer).__name__}, which changes actions: wrap the shield around the "
-                "environment first"
-            )
-        layer = layer.env
-    if not isinstance(layer, NCSVectorEnv):
-        raise ValueError(
-            f"the shield needs an NCSVectorEnv inside, got {type(layer).__name__}: for gymnasium's sync and async "
-            "vector environments give make_vec(..., wrappers=[SafetyShield])"
-        )
-    if env.single_action_space != layer.single_action_space:
-        raise ValueError(f"a wrapper inside the shield changes the action space to {env.single_action_space}")
-    return layer

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -15,6 +15,8 @@ from ncs_gym.validation import as_number, as_numbers, shown
 from shields.certificate import Certificate
 from shields.runtime.filter import SafetyFilter
 from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, Report, starts_inside
+
+T = TypeVar("T")
 
 # What changes, repeats or swallows actions between the shield and the plant.
 REFUSED = (gym.ActionWrapper, RepeatAction, StickyAction, MaxAndSkipObservation, Autoreset)
@@ -68,14 +70,15 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         penalty: float = 0.0,
     ) -> None:
         RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty)
-        plant = _plant_behind(env)
+        inner = environment_behind(env, gym.Wrapper, (*REFUSED, SafetyShield), NCSEnv)
+        if env.action_space != inner.action_space:
+            raise ValueError(f"a wrapper inside the shield changes the action space to {env.action_space}")
         gym.Wrapper.__init__(self, env)
         self.penalty = as_number(penalty, "penalty", low=0.0)
         if certificate is not None and not isinstance(certificate, Certificate):
             raise ValueError(f"certificate must be a Certificate or None, got {shown(certificate)}")
-        contract = ncs_env(env).contract
-        self.certificate = certificate_for(plant, contract) if certificate is None else certificate
-        self.filter = SafetyFilter(self.certificate, plant, mode)
+        self.certificate = certificate_for(inner.plant, inner.contract) if certificate is None else certificate
+        self.filter = SafetyFilter(self.certificate, inner.plant, mode)
         self._monitor = GuaranteeMonitor(self.filter)
         self._clock: tuple[int, int] | None = None
         self._is_drawn = env.unwrapped.render_mode is not None
@@ -172,26 +175,33 @@ def certificate_for(plant: LinearPlant, contract: ChannelContract | None = None)
     """
     key = plant.fingerprint, contract
     if key not in _synthesized:
-        from shields.synthesis import (
-            synthesize,  # takes the solver, which who has a certificate does without
-        )
+        from shields.synthesis import synthesize  # the solver, which who has a certificate does without
 
         _synthesized[key] = synthesize(plant, contract=contract)
     return _synthesized[key]
 
 
-def _plant_behind(env: gym.Env) -> LinearPlant:
-    """Returns the plant of the innermost environment after looking at every wrapper around it."""
+def environment_behind(env: Any, wrappers: type, refused: tuple[type, ...], wanted: type[T], hint: str = "") -> T:
+    """Returns the innermost environment after looking at every wrapper around it.
+
+    Args:
+        env: Environment or vector environment.
+        wrappers: Base class of its wrappers.
+        refused: Wrappers that may not be inside a shield.
+        wanted: Class of the innermost environment.
+        hint: What to do about another one.
+
+    Raises:
+        ValueError: If a wrapper is refused, or the innermost environment is of another class.
+    """
     layer = env
-    while isinstance(layer, gym.Wrapper):
-        if isinstance(layer, (*REFUSED, SafetyShield)):
+    while isinstance(layer, wrappers):
+        if isinstance(layer, refused):
             raise ValueError(
                 f"the shield must be inside {type(layer).__name__}, which changes or repeats actions: wrap the shield "
                 "around the environment first"
             )
         layer = layer.env
-    if not isinstance(layer, NCSEnv):
-        raise ValueError(f"the shield needs an NCSEnv inside, got {type(layer).__name__}")
-    if env.action_space != layer.action_space:
-        raise ValueError(f"a wrapper inside the shield changes the action space to {env.action_space}")
-    return layer.plant
+    if not isinstance(layer, wanted):
+        raise ValueError(f"the shield needs an {wanted.__name__} inside, got {type(layer).__name__}{hint}")
+    return layer

@@ -50,7 +50,8 @@ def slack_and_margin(sets, u):
 def nothing_is_known(test, estimate, shape):
     sets = reachable(test, estimate, shape)
     with np.errstate(all="ignore"):
-        return np.isnan(slack_and_margin(sets, np.zeros(test.plant.m))).all() and np.isnan(sets.smallest_slack()).all()
+        unknown = np.isnan([*slack_and_margin(sets, np.zeros(test.plant.m)), *sets.smallest_slack()])
+    return bool(unknown.all())
 
 
 def cases(certificate, plant, rng, count):
@@ -174,6 +175,16 @@ def test_nothing_is_said_about_indefinite_shapes_of_any_size(key, size):
     assert nothing_is_known(test, np.zeros(plant.n), shape)
 
 
+@pytest.mark.parametrize("size", [1e-12, 1e-3])
+def test_nothing_is_said_about_shapes_that_are_indefinite_only_as_a_whole(size):
+    # Each pair of states could be correlated like this; all three cannot.
+    test = OneStepTest(np.eye(3), PLANTS["3, 2"])
+    units = np.diag([1.0, 1e-3, 10.0])
+    for correlation, known in ((-0.4999, True), (-0.5 - 1e-8, False), (-0.9, False)):
+        shape = size * units @ (np.eye(3) + correlation * (1.0 - np.eye(3))) @ units
+        assert nothing_is_known(test, np.zeros(3), shape) is not known
+
+
 @pytest.mark.parametrize("key", ["truck", "3, 2"])
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_nothing_is_said_about_what_is_not_finite(key, bad):
@@ -285,6 +296,24 @@ def test_error_shapes_are_enlarged_by_the_rounding_of_moving_them():
     spread = test.columns @ np.sqrt(np.diag(shape))
     h = np.sqrt(np.linalg.eigvalsh(test.moved @ shape @ test.moved.T)[-1] + test.rounding * spread**2)
     assert errors_of(test, shape).radius.item() == pytest.approx(1.0 - h - test.rounding * spread, abs=1e-4 * h)
+
+
+@pytest.mark.parametrize("key", ["truck", "3, 2"])
+def test_nothing_passes_where_the_radius_is_too_small_for_the_weights(key):
+    plant = PLANTS[key]
+    shield = SafetyFilter(synthesize(plant), plant)
+    still, u, low, high = np.zeros((plant.n, 1)), np.zeros(plant.m), 0.0, 1e6
+    for _ in range(80):  # to an error ellipsoid whose h is 5e-6 below 1
+        middle = 0.5 * (low + high)
+        radius = shield.errors_of(middle * np.eye(plant.n)).radius
+        low, high = (middle, high) if radius > 5e-6 else (low, middle)
+    shape = low * np.eye(plant.n)
+    assert 4e-6 < shield.errors_of(shape).radius < 6e-6
+    sets = shield.test.reachable(still, shield.errors_of(shape).batch())
+    np.testing.assert_array_equal([sets.radius, *sets.slack(u[:, None])], 0.0)
+    assert shield.decide(still[:, 0], shape, u).reason == "fallback"
+    assert not shield.decide(still[:, 0], shape, u).passed
+    assert shield.decide(still[:, 0], 0.9 * shape, u).passed
 
 
 def test_perfect_estimate_and_huge_error_are_handled(case):

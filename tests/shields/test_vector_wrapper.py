@@ -9,7 +9,7 @@ from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatist
 from ncs_gym import Channel, ChannelContract, NCSVectorEnv, SphereDisturbance, batch_reactor, truck_trailer
 from shields import CertificateError, Decision, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.runtime.filter import MODES
-from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, Report, starts_inside
+from shields.runtime.guarantee import EXPLANATIONS, OTHER_STEPS, GuaranteeMonitor, Report, starts_inside
 from shields.runtime.vector_wrapper import Clock, _moved, overridden
 from tests.attacks import CHANNELS, TRUCKS, certificate_of, harmful
 
@@ -267,9 +267,10 @@ def assert_honest(shield, info):
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_a_user_who_changes_what_was_returned_changes_no_decision(mode):
     plant = TRUCKS["4000 kg"]
-    env = NCSVectorEnv(20, plant=plant, disturbance=harmful(plant), max_episode_steps=30, autoreset_mode=mode)
-    shield = VectorSafetyShield(env, certificate_of(plant))
+    settings = {"disturbance": harmful(plant), "max_episode_steps": 30, "autoreset_mode": mode}
+    shield, twin = (VectorSafetyShield(NCSVectorEnv(20, plant=plant, **settings), certificate_of(plant)) for _ in "ab")
     _, info = shield.reset(seed=0)
+    twin.reset(seed=0)
     for _ in range(60):
         actions = outwards(shield, info)
         for array in info.values():
@@ -278,6 +279,32 @@ def test_a_user_who_changes_what_was_returned_changes_no_decision(mode):
         _, _, _, _, info = shield.step(actions)
         assert_honest(shield, info)
         assert info["shield_guaranteed"].all()
+        for key, value in twin.step(actions.copy())[4].items():
+            if not key.endswith(("final_info", "final_obs")):
+                np.testing.assert_array_equal(info[key], value)
+
+
+@pytest.mark.parametrize("moved", [True, False])
+def test_interrupted_step_promises_nothing_until_a_reset(moved):
+    class Breaks(VectorWrapper):
+        broken = False
+
+        def step(self, actions):
+            result = self.env.step(actions) if moved or not self.broken else None
+            if self.broken:
+                raise KeyboardInterrupt
+            return result
+
+    inner = Breaks(gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=2))
+    env, actions = VectorSafetyShield(inner), np.ones((2, 1), np.float32)
+    env.reset(seed=0)
+    assert env.step(actions)[4]["shield_guaranteed"].all()
+    inner.broken = True
+    with pytest.raises(KeyboardInterrupt):
+        env.step(actions)
+    inner.broken = False
+    assert set(env.step(actions)[4]["shield_reason"]) == {OTHER_STEPS}
+    assert env.reset(seed=0)[1]["shield_guaranteed"].all()
 
 
 def test_last_steps_behind_the_shields_back_promise_nothing():
