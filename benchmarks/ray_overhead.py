@@ -21,12 +21,12 @@ from pathlib import Path
 import gymnasium as gym
 
 from agents.settings import PPOSettings
-from experiments import ray_engine
-from experiments.cluster import AHEAD, FEWEST, Need, collect, stream
-from experiments.settings import SweepSettings
-from experiments.unit import Unit, run_unit
-from experiments.unit_store import UnitStore
-from experiments.versions import versions
+from experiments.backends import ray_backend as ray_engine
+from experiments.backends.ray_cluster import AHEAD, FEWEST, Need, collect, stream
+from experiments.runs.provenance import versions
+from experiments.runs.run_store import UnitStore
+from experiments.runs.training_run import Unit, run_unit
+from experiments.settings.learning import SweepSettings
 from ncs_gym.envs.env import ncs_env
 from shields import synthesize
 

@@ -36,24 +36,25 @@ def main() -> None:
 TRAINING = {"train": ("stable_baselines3", "torch", "tensorboard", "pyarrow")}
 # What each command runs, and the packages of extras it needs.
 COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
-    "compare": ("CompareSettings", "experiments.compare:compare", TRAINING),
-    "train": ("TrainSettings", "experiments.single:train_agent", TRAINING),
-    "evaluate": ("EvaluateSettings", "experiments.single:evaluate_agent", TRAINING),
-    "sweep": ("SweepSettings", "experiments.sweep:sweep", TRAINING),
-    "render": ("RenderSettings", "experiments.render:render", {"render": ("pygame",)}),
-    "synthesize": ("SynthesizeSettings", "experiments.certificates:synthesize_file", {}),
-    "verify": ("VerifySettings", "experiments.certificates:verify_file", {}),
-    "certify": ("CertifySettings", "experiments.certify:certify", {}),
-    "audit": ("AuditSettings", "experiments.audit:audit", {}),
-    "reproduce": ("ReproduceSettings", "experiments.reproduce:reproduce", {}),
+    "compare": ("CompareSettings", "experiments.commands.compare:compare", TRAINING),
+    "train": ("TrainSettings", "experiments.commands.train:train_agent", TRAINING),
+    "evaluate": ("EvaluateSettings", "experiments.commands.train:evaluate_agent", TRAINING),
+    "sweep": ("SweepSettings", "experiments.commands.sweep:sweep", TRAINING),
+    "render": ("RenderSettings", "experiments.commands.render:render", {"render": ("pygame",)}),
+    "synthesize": ("SynthesizeSettings", "experiments.commands.synthesize:synthesize_file", {}),
+    "verify": ("VerifySettings", "experiments.commands.synthesize:verify_file", {}),
+    "certify": ("CertifySettings", "experiments.commands.certify:certify", {}),
+    "audit": ("AuditSettings", "experiments.paper.audit:audit", {}),
+    "reproduce": ("ReproduceSettings", "experiments.commands.reproduce:reproduce", {}),
 }
 
 
 def _parse(arguments: list[str]) -> object:
     import tyro
 
-    from experiments import proof_settings, settings
-    from experiments.settings_file import with_config
+    from experiments.settings import certificates as proof_settings
+    from experiments.settings import learning as settings
+    from experiments.settings.settings_file import with_config
 
     kinds = vars(settings) | vars(proof_settings)
 
@@ -69,7 +70,7 @@ def _parse(arguments: list[str]) -> object:
 
 
 def _run(chosen: object) -> None:
-    from experiments.extras import require_extra
+    from experiments.commands import require_extra
 
     _, target, extras = next(entry for entry in COMMANDS.values() if entry[0] == type(chosen).__name__)
     for extra, packages in extras.items():

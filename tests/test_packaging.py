@@ -49,8 +49,8 @@ def test_environment_and_shields_do_not_import_the_learners():
     ("module", "later"),
     [
         ("shields", {"cvxpy", "numba", "torch", "matplotlib"}),
-        ("experiments.compare", {"torch", "stable_baselines3"}),
-        ("experiments.parent", {"numpy", "gymnasium"}),
+        ("experiments.commands.compare", {"torch", "stable_baselines3"}),
+        ("experiments.backends.worker_init", {"numpy", "gymnasium"}),
         ("experiments.__main__", {"numpy", "tyro"}),
     ],
 )

@@ -9,9 +9,9 @@ import numpy as np
 from agents.evaluation import Episode
 from agents.history import TrainingPoint
 from agents.trajectory import Trajectory
-from experiments.arms import arm_of
-from experiments.summary import paired_differences, summarize_arm
-from experiments.unit import UnitResult
+from experiments.analysis.summary import paired_differences, summarize_arm
+from experiments.runs.arms import arm_of
+from experiments.runs.training_run import UnitResult
 
 ALL_ARMS = [
     "unshielded",

@@ -8,9 +8,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from experiments.audit import FAILS, HOLDS, ROUNDED, audit_rows, audit_text
-from experiments.counterexample import worst_step
-from experiments.printed_case import PrintedCase
+from experiments.paper.audit import FAILS, HOLDS, ROUNDED, audit_rows, audit_text
+from experiments.paper.counterexample import worst_step
+from experiments.paper.paper_example import PrintedCase
 from tests.command import ncs
 
 
@@ -113,5 +113,5 @@ def test_printed_numbers_are_nowhere_else_in_the_code():
     printed = re.compile(r"0\.9029|0\.0094|0\.0017|2\.0927|0\.3514|9\.8426")
     for package in ("ncs_gym", "shields", "agents", "experiments"):
         for path in (root / package).rglob("*.py"):
-            if path.name != "printed_case.py":
+            if path.name != "paper_example.py":
                 assert not printed.search(path.read_text()), path

@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments import certify as command
-from experiments.block import Block, Campaign, run_block
-from experiments.cases import Case, cases
-from experiments.certify import certify
+from experiments.attack.attack_cases import Case, cases
+from experiments.attack.counts_store import TallyStore
+from experiments.attack.monte_carlo_batch import Block, Campaign, run_block
+from experiments.attack.safety_counts import Tally
+from experiments.commands import certify as command
+from experiments.commands.certify import certify
 from experiments.errors import ResultsError, SafetyBroken
-from experiments.proof_settings import CertifySettings
-from experiments.tally import Tally
-from experiments.tally_store import TallyStore
+from experiments.settings.certificates import CertifySettings
 from ncs_gym import truck_trailer
 from ncs_gym.network.contract import contract_of
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
@@ -73,7 +73,7 @@ def test_without_the_shield_the_attack_breaks_out_and_is_counted(files):
 
 
 def test_nature_attains_every_bound(files):
-    from experiments.block import _shields
+    from experiments.attack.monte_carlo_batch import _shields
 
     case, certificate = cases(0, 1)[CRUISE], Certificate.load(files[CRUISE])
     shield = _shields(CAMPAIGN, CRUISE, files[CRUISE])["project"]

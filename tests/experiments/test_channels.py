@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from experiments.channels import ChannelSettings, bursts, channel_of
-from experiments.settings import SweepSettings
-from experiments.sweep import cells_of
+from experiments.commands.sweep import cells_of
+from experiments.settings.channel import ChannelSettings, bursts, channel_of
+from experiments.settings.learning import SweepSettings
 from ncs_gym import Channel, GilbertElliott
 from ncs_gym.network.channel import Link
 

@@ -10,13 +10,13 @@ from types import SimpleNamespace
 import pytest
 
 from agents.settings import PPOSettings
-from experiments import cluster
-from experiments.cluster import ClusterError, Need, Room, collect, require_answer, stream, work
-from experiments.engine import EngineSettings
-from experiments.execution import results_of
-from experiments.failure import UnitError
-from experiments.unit import Unit, run_unit
-from experiments.versions import versions
+from experiments.backends import ray_cluster as cluster
+from experiments.backends.execution import results_of
+from experiments.backends.ray_cluster import Need, Room, collect, require_answer, stream, work
+from experiments.errors import ClusterError, RunError
+from experiments.runs.provenance import versions
+from experiments.runs.training_run import Unit, run_unit
+from experiments.settings.backend import EngineSettings
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ class Fake:
     def result(self, unit, reference):
         assert unit.name == reference
         if int(reference) in self.fail:
-            raise UnitError(f"run {reference}")
+            raise RunError(f"run {reference}")
         return int(reference)
 
 
@@ -96,7 +96,7 @@ def test_units_are_read_only_as_far_as_there_is_room():
 def test_failure_keeps_what_was_finished_beside_it_and_cancels_the_rest():
     fake, kept = Fake(fail=[4]), []
     batches = stream(fake.units(9), fake.submit, fake.wait, fake.cancelled.extend, lambda: 6)
-    with pytest.raises(UnitError, match="run 4"):
+    with pytest.raises(RunError, match="run 4"):
         collect(batches, fake.result, lambda unit, result: kept.append(result))
     batches.close()
     assert kept == [5]  # the fake finishes 4 and 5 in one batch
@@ -212,8 +212,8 @@ def test_worker_with_a_package_that_the_driver_lacks_refuses():
 
 
 def test_node_without_this_package_says_so(monkeypatch):
-    monkeypatch.setitem(sys.modules, "experiments.cluster", None)
-    monkeypatch.delattr("experiments.cluster")
+    monkeypatch.setitem(sys.modules, "experiments.backends.ray_cluster", None)
+    monkeypatch.delattr("experiments.backends.ray_cluster")
     with pytest.raises(ImportError, match=r"node .* cannot import ncs-gym .*: install the same on every node"):
         cluster.carried_work()({}, b"")
 
@@ -236,7 +236,7 @@ def test_impossible_address_is_one_sentence(address):
 def test_unit_that_fails_locally_is_named_and_the_finished_are_kept(unit, tmp_path):
     # Whichever comes first, the good one is run by then or ends before the pool does.
     bad = replace(unit, learner="agent", index=1, algorithm="SAC")  # with settings of PPO
-    with pytest.raises(UnitError, match=r"run unshielded-1: SAC takes OffPolicySettings, got PPOSettings") as error:
+    with pytest.raises(RunError, match=r"run unshielded-1: SAC takes OffPolicySettings, got PPOSettings") as error:
         results_of([unit, bad], tmp_path, EngineSettings(jobs=1))
     assert isinstance(error.value.__cause__, ValueError)
     assert [path.stem for path in (tmp_path / "units").glob("*.json")] == ["unshielded-0"]

@@ -234,7 +234,7 @@ def test_command_in_this_process_hides_no_warning_and_changes_nothing_outside(mo
         os.system("echo native >&2")
 
     before = os.getcwd(), sys.argv, sys.stdout, sys.stderr, signal.getsignal(signal.SIGTERM)
-    monkeypatch.setattr("experiments.audit.audit", warn)
+    monkeypatch.setattr("experiments.paper.audit.audit", warn)
     run = ncs("audit", cwd=tmp_path, SAID="this")
     assert (run.returncode, (tmp_path / "here").read_text()) == (0, "this")
     assert "UserWarning: loud" in run.stderr

@@ -5,12 +5,12 @@ import pytest
 
 from agents.evaluation import Episode
 from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
-from experiments.arms import arm_of
-from experiments.compare import _units, grouped, prepare
-from experiments.settings import CompareSettings
-from experiments.summary import paired_differences, summarize_arm, table_rows, way_covered
-from experiments.unit import UnitResult
-from experiments.worlds import World
+from experiments.analysis.summary import paired_differences, summarize_arm, table_rows, way_covered
+from experiments.commands.compare import _units, grouped, prepare
+from experiments.runs.arms import arm_of
+from experiments.runs.experiment_setup import World
+from experiments.runs.training_run import UnitResult
+from experiments.settings.learning import CompareSettings
 from shields import verify
 
 ALL_ARMS = ("unshielded", "monitor", "penalized", "shielded", "shielded:switch+penalty", "shielded:boundary")

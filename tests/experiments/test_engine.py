@@ -3,10 +3,10 @@ import sys
 import pytest
 
 from experiments.__main__ import COMMANDS, _run
-from experiments.compare import INCIDENTAL
-from experiments.engine import EngineSettings
-from experiments.settings import CompareSettings, SweepSettings
-from experiments.unit import Unit
+from experiments.commands.compare import INCIDENTAL
+from experiments.runs.training_run import Unit
+from experiments.settings.backend import EngineSettings
+from experiments.settings.learning import CompareSettings, SweepSettings
 
 
 @pytest.mark.parametrize(

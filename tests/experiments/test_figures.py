@@ -8,14 +8,14 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex, to_rgb
 from scipy.optimize import linprog
 
-from experiments.arm_style import LOOKS, style_of
-from experiments.figures import figures_of
-from experiments.phase_plane import phase_caption, phase_figure, plane_of
-from experiments.plotting import thousands
-from experiments.scatter import scatter_caption, scatter_figure
-from experiments.shadow import shadow_of_box, shadow_of_ellipsoid
-from experiments.time_series import episode_caption, episode_figure, shown_arms
-from experiments.training_curves import RATE_WINDOW, common_steps, rates, training_caption, training_figure
+from experiments.plots.arm_style import LOOKS, style_of
+from experiments.plots.ellipsoid_projection import shadow_of_box, shadow_of_ellipsoid
+from experiments.plots.figure_style import thousands
+from experiments.plots.figures import figures_of
+from experiments.plots.phase_plane import phase_caption, phase_figure, plane_of
+from experiments.plots.scatter import scatter_caption, scatter_figure
+from experiments.plots.time_series import episode_caption, episode_figure, shown_arms
+from experiments.plots.training_curves import RATE_WINDOW, common_steps, rates, training_caption, training_figure
 from ncs_gym import Ellipsoid
 from tests.experiments.results import ALL_ARMS, history, run, summary_of, trajectory
 from tests.plants import random_plant

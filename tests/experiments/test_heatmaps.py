@@ -3,7 +3,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from experiments.heatmaps import QUANTITIES, heatmap_caption, heatmap_figure, heatmaps_of
+from experiments.plots.heatmaps import QUANTITIES, heatmap_caption, heatmap_figure, heatmaps_of
 
 
 def cells(arms, losses=(0.0, 0.3, 0.6), delays=(0, 4), roundings=(None,), bursts=(1.0,), rate=None):

@@ -8,8 +8,9 @@ from queue import Queue
 import pytest
 
 from agents.settings import PPOSettings
-from experiments.pool import Stopped, _work, run_all
-from experiments.unit import Unit
+from experiments.backends.processes import _work, run_all
+from experiments.errors import RunStopped
+from experiments.runs.training_run import Unit
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +34,7 @@ def endless(certificate):
 def test_a_unit_told_to_stop_gives_up_at_its_next_report(endless):
     news, stop = Queue(), threading.Event()
     stop.set()
-    with pytest.raises(Stopped, match="zero-input-0"):
+    with pytest.raises(RunStopped, match="zero-input-0"):
         _work(endless, None, news, stop)
     assert news.empty()
 
@@ -43,6 +44,6 @@ def test_the_first_failure_stops_the_others_and_is_the_one_reported(endless):
     begin, kept = time.monotonic(), []
     with pytest.raises(Exception, match="Nowhere") as caught:
         run_all([endless, broken], 2, 1000, lambda unit, result: kept.append(unit))
-    assert not isinstance(caught.value, Stopped)
+    assert not isinstance(caught.value, RunStopped)
     assert kept == []
     assert time.monotonic() - begin < 300.0

@@ -15,10 +15,11 @@ import pytest
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'ncs-gym[ray]'")
 
-from experiments import cluster, ray_engine  # noqa: E402
-from experiments.cluster import ClusterError, Need, require_answer  # noqa: E402
-from experiments.failure import UnitError  # noqa: E402
-from experiments.versions import versions  # noqa: E402
+from experiments.backends import ray_backend as ray_engine  # noqa: E402
+from experiments.backends import ray_cluster as cluster  # noqa: E402
+from experiments.backends.ray_cluster import Need, require_answer  # noqa: E402
+from experiments.errors import ClusterError, RunError  # noqa: E402
+from experiments.runs.provenance import versions  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -253,7 +254,7 @@ def test_error_of_a_run_is_not_retried(own_ray, tmp_path):
         raise KeyError("mine")
 
     reference = ray_engine._task(fail, Need(1.0, 0.0)).remote()
-    with pytest.raises(UnitError, match=r"run its-name: KeyError: 'mine' \(NCS_DEBUG=1") as error:
+    with pytest.raises(RunError, match=r"run its-name: KeyError: 'mine' \(NCS_DEBUG=1") as error:
         ray_engine._result(NAMED, reference)
     assert "mine" in str(error.value.__cause__)
     assert Path(calls).read_text() == "call\n"
@@ -268,7 +269,7 @@ def test_worker_that_always_dies_is_given_up_and_named(own_ray, tmp_path):
         os._exit(1)
 
     reference = ray_engine._task(die, Need(1.0, 0.0)).remote()
-    with pytest.raises(UnitError, match="run its-name: its worker died, 3 retries included"):
+    with pytest.raises(RunError, match="run its-name: its worker died, 3 retries included"):
         ray_engine._result(NAMED, reference)
     assert Path(calls).read_text() == "call\n" * (1 + ray_engine.RETRIES)
 
@@ -296,7 +297,7 @@ def test_node_without_this_package_is_named_in_one_sentence(own_ray, tmp_path):
             sys.path.remove(path)
 
     reference = ray_engine._task(bare, Need(1.0, 0.0)).remote(str(tmp_path))
-    with pytest.raises(UnitError, match=r"run its-name: node .* cannot import ncs-gym .*: install the same on every"):
+    with pytest.raises(RunError, match=r"run its-name: node .* cannot import ncs-gym .*: install the same on every"):
         ray_engine._result(NAMED, reference)
 
 

@@ -9,9 +9,9 @@ from PIL import Image
 
 from agents.control_loop import ControlLoop
 from agents.training import untrained
-from experiments.policies import greedy_action, policy_by_name
-from experiments.render import render
-from experiments.settings import RenderSettings
+from experiments.commands.render import render
+from experiments.runs.policies import greedy_action, policy_by_name
+from experiments.settings.learning import RenderSettings
 from ncs_gym.rendering import theme
 from shields import SafetyShield
 from tests.command import assert_one_sentence, ncs

@@ -5,8 +5,8 @@ from html.parser import HTMLParser
 
 import pytest
 
-from experiments.arms import arm_of
-from experiments.report import html_report, sweep_report
+from experiments.report.comparison import html_report, sweep_report
+from experiments.runs.arms import arm_of
 from shields import Report
 from shields.verification.conditions import flag
 from tests.experiments.results import ALL_ARMS, provenance, run, summary_of

@@ -3,8 +3,8 @@ import json
 import numpy as np
 import pytest
 
-from experiments.printed_case import PrintedCase
-from experiments.reproduce import StateFeedback, _outcome
+from experiments.commands.reproduce import StateFeedback, _outcome
+from experiments.paper.paper_example import PrintedCase
 from ncs_gym.registration import CASE_STUDY_BOX
 from tests.command import ncs
 

@@ -4,9 +4,10 @@ import pytest
 import tyro
 
 from agents.settings import PPOSettings
-from experiments.channels import ChannelSettings
-from experiments.settings import CompareSettings, SweepSettings
-from experiments.settings_file import SettingsError, save_settings, with_config
+from experiments.errors import SettingsError
+from experiments.settings.channel import ChannelSettings
+from experiments.settings.learning import CompareSettings, SweepSettings
+from experiments.settings.settings_file import save_settings, with_config
 
 
 def parsed(kind, arguments):

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from agents.settings import PPOSettings
-from experiments.engine import EngineSettings
+from experiments.backends.execution import results_of
 from experiments.errors import ResultsError
-from experiments.execution import results_of
-from experiments.unit import Unit, run_unit
-from experiments.unit_store import UnitStore
+from experiments.runs.run_store import UnitStore
+from experiments.runs.training_run import Unit, run_unit
+from experiments.settings.backend import EngineSettings
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def test_result_of_other_settings_is_not_taken(store, unit, change):
 def test_result_of_another_certificate_or_version_is_not_taken(store, unit, certificate, monkeypatch):
     other = replace(certificate, provenance=certificate.provenance | {"note": "other"})
     assert store.load(replace(unit, certificate=other)) is None
-    monkeypatch.setattr("experiments.unit.versions", lambda: {"torch": "0"})
+    monkeypatch.setattr("experiments.runs.training_run.versions", lambda: {"torch": "0"})
     assert store.load(unit) is None
 
 
@@ -93,7 +93,7 @@ def test_half_stored_result_of_other_settings_leaves_nothing_behind(store, unit,
             raise KeyboardInterrupt
         path.write_bytes(content)
 
-    monkeypatch.setattr("experiments.unit_store.write_atomically", killed)
+    monkeypatch.setattr("experiments.runs.run_store.write_atomically", killed)
     with pytest.raises(KeyboardInterrupt):
         store.save(replace(unit, steps=257), replace(result, files={"model.zip": b"new", "agent.json": b"new"}))
     assert store.load(unit) is None
@@ -101,7 +101,7 @@ def test_half_stored_result_of_other_settings_leaves_nothing_behind(store, unit,
 
 def test_changed_source_is_another_key(unit, monkeypatch):
     before = unit.key
-    monkeypatch.setattr("experiments.versions._source_digest", lambda: "changed")
+    monkeypatch.setattr("experiments.runs.provenance._source_digest", lambda: "changed")
     assert unit.key != before
 
 
@@ -128,7 +128,7 @@ def test_finished_units_are_not_run_again(store, unit, result, tmp_path, monkeyp
             ran.append(one.name)
             on_result(one, replace(result, index=one.index))
 
-    monkeypatch.setattr("experiments.pool.run_all", record)
+    monkeypatch.setattr("experiments.backends.processes.run_all", record)
     missing = replace(unit, index=2)
     results = results_of([unit, missing], tmp_path, EngineSettings(jobs=1))
     assert ran == [missing.name]

@@ -1,0 +1,1 @@
+"""From evaluation episodes to intervals, summaries and tables."""

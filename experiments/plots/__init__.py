@@ -1,0 +1,1 @@
+"""Figures of comparisons and sweeps, and animations of episodes."""

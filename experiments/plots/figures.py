@@ -1,0 +1,35 @@
+"""The figures of the comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from experiments.plots.figure_style import as_png
+from experiments.plots.phase_plane import phase_caption, phase_figure
+from experiments.plots.scatter import scatter_caption, scatter_figure
+from experiments.plots.time_series import episode_caption, episode_figure
+from experiments.plots.training_curves import training_caption, training_figure
+from experiments.runs.training_run import UnitResult
+from ncs_gym import LinearPlant
+from shields import Certificate
+
+
+def figures_of(
+    plant: LinearPlant, certificate: Certificate, summary: dict[str, Any], results: dict[str, Sequence[UnitResult]]
+) -> dict[str, tuple[str, bytes]]:
+    """Returns caption and PNG of every figure by name.
+
+    Args:
+        plant: Limits, names and units.
+        certificate: Of the safe set.
+        summary: The content of summary.json; its arms are shown, in its order.
+        results: Of every arm's runs.
+    """
+    arms = {name: results[name] for name in summary["arms"]}
+    return {
+        "training": (training_caption(arms), as_png(training_figure(arms))),
+        "scatter": (scatter_caption(arms), as_png(scatter_figure(summary["arms"], arms))),
+        "phase": (phase_caption(plant, certificate, arms), as_png(phase_figure(plant, certificate, arms))),
+        "episode": (episode_caption(arms), as_png(episode_figure(plant, arms))),
+    }

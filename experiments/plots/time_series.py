@@ -1,0 +1,156 @@
+"""One episode over time: distance to the limits, inputs, interventions and packets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import matplotlib
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from agents.trajectory import Trajectory
+from experiments.plots.arm_style import style_of
+from experiments.plots.figure_style import STYLE, label, legend_below, with_unit
+from experiments.runs.arms import arm_of
+from experiments.runs.training_run import UnitResult
+from ncs_gym import LinearPlant
+
+INK = "#222222"
+# Of the lines of the shown arms: where they coincide, the lower one shows.
+WIDTHS = (2.6, 1.2)
+LIMIT = {"color": INK, "lw": 1.0, "ls": (0, (6.0, 3.0))}
+
+Arms = dict[str, Sequence[UnitResult]]
+
+
+def shown_arms(names: Sequence[str]) -> list[str]:
+    """Returns the pair to show: the unshielded arm, or else another one without a shield, and the first shielded one.
+
+    Without a shielded arm, or without any other, fewer.
+    """
+    shielded = [name for name in names if arm_of(name, "project").mode not in (None, "monitor")]
+    bare = sorted((name for name in names if name not in shielded), key=lambda name: name != "unshielded")
+    return bare[:1] + shielded[:1]
+
+
+def episode_figure(plant: LinearPlant, arms: Arms) -> Figure:
+    """Returns the same evaluation episode of the first runs of the shown arms.
+
+    From above: the largest |c_j x| of state and estimate, a panel per input, and a row of ticks per kind of event.
+    """
+    paths = {name: arms[name][0].trajectory for name in shown_arms(list(arms))}
+    events = _events(paths, plant)
+    heights = [1.5, *[1.0] * plant.m, 0.16 + 0.17 * len(events)]
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(11.0, 1.2 + 1.45 * sum(heights)), layout="constrained")
+        axes = figure.subplots(2 + plant.m, 1, sharex=True, height_ratios=heights)
+        handles = _draw_states(axes[0], paths, plant)
+        for i in range(plant.m):
+            handles |= _draw_input(axes[1 + i], paths, plant, i)
+        _draw_events(axes[-1], events)
+        label(axes[-1], "time [s]", "")
+        axes[-1].set_xlim(0.0, plant.dt * max(len(path.inputs) for path in paths.values()))
+        figure.align_ylabels(axes[:-1])
+        legend_below(figure, handles, rows=2)
+        return figure
+
+
+def episode_caption(arms: Arms) -> str:
+    """Returns which episode is seen, and what is marked."""
+    names = shown_arms(list(arms))
+    paths = [arms[name][0].trajectory for name in names]
+    text = f"Time series: the first evaluation episode of the first run, {' and '.join(names)}"
+    text += ", with the same draws of nature." if len(names) > 1 else "."
+    text += (
+        " Above, how close true state and estimate come to the limits: one beyond 1 violates a limit. Below, the"
+        " applied inputs. Ticks mark packet"
+        " arrivals and interventions"
+    )
+    text += "; the monitor's are what the shield would have done." if "monitor" in names else "."
+    if len({len(path.inputs) for path in paths}) > 1:
+        text += " An episode that is shorter ended at its first violation."
+    return text
+
+
+def _draw_states(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant) -> dict[str, Artist]:
+    """Draws the largest |c_j x| of states and estimates, and marks the violations."""
+    handles: dict[str, Artist] = {}
+    crosses: list[Line2D] = []
+    for (name, path), width in zip(paths.items(), WIDTHS, strict=False):
+        color = style_of(name).color
+        time = plant.dt * np.arange(len(path.states))
+        true, estimated = (np.abs(x @ plant.C.T).max(axis=1) for x in (path.states, path.estimates))
+        (handles[name],) = axis.plot(time, true, color=color, lw=width)
+        (handles[f"{name}, estimate"],) = axis.plot(time, estimated, color=_dark(color), lw=1.1, ls=":", zorder=3)
+        if (true > 1.0).any():
+            crosses = axis.plot(time[true > 1.0], true[true > 1.0], "x", color=INK, ms=4.5, mew=1.0, zorder=4)
+    handles["limit"] = axis.axhline(1.0, **LIMIT)
+    if crosses:
+        handles["violation of the true state"] = crosses[0]
+    label(axis, "", "largest |c$_j$ x|", "First evaluation episode of the first run")
+    axis.set_ylim(0.0, max(1.12, axis.get_ylim()[1]))
+    return handles
+
+
+def _dark(color: str) -> tuple[float, ...]:
+    """Returns a color that shows on a line of the given one."""
+    return tuple(0.5 * part for part in to_rgb(color))
+
+
+def _draw_input(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant, i: int) -> dict[str, Artist]:
+    """Draws one input of all arms, and what was proposed in its place."""
+    handles: dict[str, Artist] = {}
+    for (name, path), width in zip(paths.items(), WIDTHS, strict=False):
+        style = style_of(name)
+        edges = plant.dt * np.arange(len(path.inputs) + 1)
+        axis.stairs(path.inputs[:, i], edges, baseline=None, color=style.color, lw=width)
+        changed = (path.inputs != path.proposed).any(axis=1)
+        if changed.any():
+            middle = edges[:-1][changed] + 0.5 * plant.dt
+            axis.vlines(
+                middle, path.inputs[changed, i], path.proposed[changed, i], color=style.color, lw=0.7, alpha=0.6
+            )
+            axis.plot(middle, path.proposed[changed, i], ".", color=INK, ms=4.0)
+            handles["proposed, but overridden"] = Line2D([], [], ls="none", marker=".", color=INK)
+    limit = float(np.atleast_1d(plant.u_max)[i])
+    for end in (-limit, limit):
+        axis.axhline(end, **LIMIT)
+    axis.set_ylim(-1.15 * limit, 1.15 * limit)
+    label(
+        axis,
+        "",
+        with_unit(f"{plant.input_names[i]}\n" if plant.input_units[i] else plant.input_names[i], plant.input_units[i]),
+    )
+    return handles
+
+
+def _events(paths: dict[str, Trajectory], plant: LinearPlant) -> dict[str, tuple[np.ndarray, str]]:
+    """Returns times [s] and color by name of each kind of event, from below."""
+    longest = max(paths, key=lambda name: len(paths[name].arrivals))
+    events: dict[str, tuple[np.ndarray, str]] = {}
+    for name, path in paths.items():
+        count = len(path.arrivals)
+        # Same draws of nature: as a rule packets arrive alike in all arms, and once is enough.
+        if name == longest or not np.array_equal(path.arrivals, paths[longest].arrivals[:count]):
+            row = "packet arrivals" if name == longest else f"packet arrivals, {name}"
+            events[row] = plant.dt * (1.0 + np.flatnonzero(path.arrivals)), INK
+    for name, path in paths.items():
+        mode = arm_of(name, "project").mode
+        if mode is not None:
+            row = f"would override, {name}" if mode == "monitor" else "interventions"
+            events[row] = plant.dt * (0.5 + np.flatnonzero(path.intervened)), style_of(name).color
+    return events
+
+
+def _draw_events(axis: Axes, events: dict[str, tuple[np.ndarray, str]]) -> None:
+    """Draws a row of ticks per kind."""
+    for row, (times, color) in enumerate(events.values()):
+        axis.vlines(times, row - 0.36, row + 0.36, color=color, lw=1.2)
+    axis.set_yticks(range(len(events)), [f"{name} ({len(times):,})" for name, (times, _) in events.items()])
+    axis.set_ylim(-0.6, len(events) - 0.4)
+    axis.tick_params(axis="y", length=0)
+    axis.grid(False)
