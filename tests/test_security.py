@@ -9,8 +9,7 @@ import pytest
 from agents.agent import Agent, AgentError, _digest
 from agents.control_loop import ControlLoop
 from agents.training import untrained
-from experiments.settings.learning import CompareSettings
-from experiments.settings.settings_file import settings_json
+from experiments.settings import CompareSettings, settings_json
 from shields import Certificate, CertificateError
 from tests.command import assert_one_sentence, ncs
 

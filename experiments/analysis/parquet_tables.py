@@ -12,20 +12,20 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from experiments.runs.training_run import UnitResult
+from experiments.runs.training_run import RunResult
 from shields.atomic_write import write_atomically
 
-# Under this key a file's metadata says where it comes from.
-METADATA = b"ncs-gym"
+# Key of the provenance in a file's metadata.
+_METADATA = b"ncs-gym"
 
 
-def write_tables(out: Path, results: Sequence[UnitResult], provenance: dict[str, Any]) -> None:
+def write_tables(out: Path, results: Sequence[RunResult], provenance: dict[str, Any]) -> None:
     """Writes `episodes.parquet`, a row per evaluation episode, and `training.parquet`, a row per point of a history.
 
     Args:
-        out: Folder.
-        results: Of all units.
-        provenance: Settings, plant, certificate and versions; goes into the files' metadata.
+        out: Output folder.
+        results: Results of all training runs.
+        provenance: Settings, plant, certificate and versions; written into the files' metadata.
 
     Raises:
         OSError: If a file cannot be written.
@@ -42,7 +42,7 @@ def write_tables(out: Path, results: Sequence[UnitResult], provenance: dict[str,
 def parquet(rows: list[dict[str, Any]], provenance: dict[str, Any]) -> bytes:
     """Returns rows as the content of a Parquet file."""
     table = pa.Table.from_pylist(rows)
-    table = table.replace_schema_metadata({METADATA: json.dumps(provenance).encode()})
+    table = table.replace_schema_metadata({_METADATA: json.dumps(provenance).encode()})
     buffer = io.BytesIO()
     pq.write_table(table, buffer)
     return buffer.getvalue()

@@ -1,14 +1,16 @@
-"""Intervals that a reader can check."""
+"""Confidence intervals."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.stats import beta, t, trim_mean
+from scipy.stats import binomtest, bootstrap, t, trim_mean
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
+# Resamples held in memory at once.
+_BATCH = 1_000
 
 
 def clopper_pearson(events: int, trials: int) -> tuple[float, float]:
@@ -19,10 +21,8 @@ def clopper_pearson(events: int, trials: int) -> tuple[float, float]:
     """
     if not 0 <= events <= trials or trials < 1:
         raise ValueError(f"events must be between 0 and trials >= 1, got {events} of {trials}")
-    tail = (1.0 - CONFIDENCE) / 2.0
-    low = float(beta.ppf(tail, events, trials - events + 1)) if events > 0 else 0.0
-    high = float(beta.ppf(1.0 - tail, events + 1, trials - events)) if events < trials else 1.0
-    return low, high
+    interval = binomtest(events, trials).proportion_ci(CONFIDENCE, "exact")
+    return float(interval.low), float(interval.high)
 
 
 def mean_interval(values: Sequence[float]) -> tuple[float, float] | None:
@@ -44,16 +44,21 @@ def bootstrap_interval(
 ) -> tuple[float, float] | None:
     """Returns the percentile bootstrap's 95 % interval; None for fewer than two values.
 
-    With a handful of values it is too narrow: with n of them it cannot reach beyond the smallest and the largest.
+    With a handful of values it is too narrow: it cannot reach beyond the smallest and the largest of them.
 
     Args:
         values: Independent values.
-        statistic: Takes (resamples, values) and `axis`.
+        statistic: Function of an array of resampled values and the `axis` over which it is computed.
     """
     if len(values) < 2:
         return None
-    rng = np.random.default_rng(0)
-    drawn = np.asarray(values)[rng.integers(len(values), size=(RESAMPLES, len(values)))]
-    tail = 50.0 * (1.0 - CONFIDENCE)
-    low, high = np.percentile(statistic(drawn, axis=1), [tail, 100.0 - tail])
-    return float(low), float(high)
+    result = bootstrap(
+        (np.asarray(values),),
+        statistic,
+        n_resamples=RESAMPLES,
+        batch=_BATCH,
+        confidence_level=CONFIDENCE,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    )
+    return float(result.confidence_interval.low), float(result.confidence_interval.high)

@@ -1,4 +1,4 @@
-"""From episodes to the numbers people read."""
+"""Summaries of the training runs of an arm."""
 
 from __future__ import annotations
 
@@ -8,17 +8,25 @@ from typing import Any
 import numpy as np
 
 from experiments.analysis.statistics import bootstrap_interval, clopper_pearson, interquartile_mean, mean_interval
-from experiments.runs.training_run import UnitResult
+from experiments.analysis.text_table import text_table
+from experiments.runs.training_run import RunResult
 
 
-def summarize_arm(results: Sequence[UnitResult], *, fixed_policy: bool) -> dict[str, Any]:
+def arm_summary(results: Sequence[RunResult], mode: str | None, *, fixed_policy: bool) -> dict[str, Any]:
+    """Returns the summary of one arm's runs with the mode of its shield; see `summarize_arm`."""
+    shielded = mode not in (None, "monitor")
+    return {"mode": mode, "shielded": shielded} | summarize_arm(results, fixed_policy=fixed_policy)
+
+
+def summarize_arm(results: Sequence[RunResult], *, fixed_policy: bool) -> dict[str, Any]:
     """Returns the summary of one arm's runs, JSON values only.
 
-    `eval_violation_rate_ci95` is Clopper-Pearson's interval on violating episodes given the trained policies;
-    `eval_violation_steps` is a plain count, because steps of one episode are dependent, of the true state;
-    `eval_estimate_violation_steps` that of the estimate. `eval_return_ci95` is Student's interval over the runs' mean
-    returns (null for a single run), because training differs from run to run; for a policy that is the same in all runs
-    (`fixed_policy`) it is over the episodes. The bootstrap's intervals are over the same values.
+    `eval_violation_rate_ci95` is the Clopper-Pearson interval of the probability that an episode violates, given the
+    trained policies. `eval_violation_steps` counts violating steps of the true state and
+    `eval_estimate_violation_steps` those of the estimate; they are plain counts, because the steps of one episode are
+    dependent. `eval_return_ci95` is Student's interval over the mean returns of the runs (null for a single run),
+    because training differs from run to run; for a policy that is the same in all runs (`fixed_policy`) it is over the
+    episodes. The bootstrap intervals are over the same values.
     """
     episodes = [episode for result in results for episode in result.episodes]
     violating = sum(episode.violation_steps > 0 for episode in episodes)
@@ -51,11 +59,11 @@ def summarize_arm(results: Sequence[UnitResult], *, fixed_policy: bool) -> dict[
     }
 
 
-def paired_differences(arms: dict[str, Sequence[UnitResult]], baseline: str) -> dict[str, Any]:
-    """Returns, per other arm, how much more it has than the baseline in the runs with equal index, JSON values.
+def paired_differences(arms: dict[str, Sequence[RunResult]], baseline: str) -> dict[str, Any]:
+    """Returns the differences between each other arm and the baseline in the runs with equal index, JSON values.
 
-    Differences of the runs' mean returns, with Student's and the bootstrap's interval over runs, and of the numbers of
-    violating episodes.
+    They are the differences of the mean returns, with Student's and the bootstrap's interval over the runs, and of the
+    numbers of violating episodes.
     """
     differences = {}
     for name in arms.keys() - {baseline}:
@@ -72,10 +80,10 @@ def paired_differences(arms: dict[str, Sequence[UnitResult]], baseline: str) -> 
     return {name: differences[name] for name in arms if name in differences}
 
 
-def way_covered(summary: dict[str, Any]) -> float | None:
-    """Returns how far the shielded return is on the way from the zero input's (0) to the unshielded agent's (1).
+def covered_fraction(summary: dict[str, Any]) -> float | None:
+    """Returns the fraction of the return from the zero input (0) to the unshielded agent (1) that the shielded one has.
 
-    None without these arms, and where episodes end early: then returns are sums over different numbers of steps.
+    It is None without these arms, and where episodes end early: then returns are sums over different numbers of steps.
     """
     named = summary["references"] | summary["arms"]
     if not {"shielded", "unshielded"} <= named.keys():
@@ -87,7 +95,7 @@ def way_covered(summary: dict[str, Any]) -> float | None:
     return (here - start) / (goal - start) if goal != start else None
 
 
-def table_rows(arms: dict[str, dict[str, Any]]) -> list[list[str]]:
+def summary_rows(arms: dict[str, dict[str, Any]]) -> list[list[str]]:
     """Returns two header rows, then one row of text per summary of an arm."""
     rows = [
         ["", "training:", "", "evaluation, exact 95 % CI:", "violating steps", "", ""],
@@ -118,20 +126,9 @@ def table_rows(arms: dict[str, dict[str, Any]]) -> list[list[str]]:
     return rows
 
 
-def table_text(arms: dict[str, dict[str, Any]], references: dict[str, dict[str, Any]]) -> str:
+def summary_text(arms: dict[str, dict[str, Any]], references: dict[str, dict[str, Any]]) -> str:
     """Returns the table for a terminal; references stand below a rule."""
-    rows = table_rows(arms | references)
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = [
-        "  ".join(
-            [row[0].ljust(widths[0])] + [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)]
-        )
-        for row in rows
-    ]
-    rule = "-" * max(map(len, lines))
-    lines = [line.rstrip() for line in lines]
-    last = 2 + len(arms)
-    return "\n".join([*lines[:2], rule, *lines[2:last], *([rule, *lines[last:]] if references else [])])
+    return text_table(summary_rows(arms | references), rules=(2, 2 + len(arms)))
 
 
 def _overridden(arm: dict[str, Any], key: str) -> str:
@@ -147,11 +144,11 @@ def _return_text(arm: dict[str, Any]) -> str:
     return f"{arm['eval_return_mean']:.1f} [{interval[0]:.1f}, {interval[1]:.1f}]"
 
 
-def _mean_return(result: UnitResult) -> float:
+def _mean_return(result: RunResult) -> float:
     return float(np.mean([episode.episode_return for episode in result.episodes]))
 
 
-def _violating(result: UnitResult) -> int:
+def _violating(result: RunResult) -> int:
     return sum(episode.violation_steps > 0 for episode in result.episodes)
 
 

@@ -14,25 +14,25 @@ from ncs_gym.registration import ENTRY_POINTS, loaded_truck_trailer
 from shields import Certificate
 from shields.runtime.wrapper import certificate_for
 
-# One of each kind: nothing is lost; everything is; losses come in bursts; packets overtake one another.
-CHANNELS = {
+# One channel of each kind: no loss, no packet at all, losses in bursts, and packets that overtake one another.
+_CHANNELS = {
     "perfect": Channel(),
     "blackout": Channel(loss=1.0),
     "bursts": Channel(loss=GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.1), send_period=2, quantization_step=0.01),
     "overtaking": Channel(loss=0.2, quantization_step=0.01, send_period=2, delay=1, jitter=3),
 }
-# Numbers of states, inputs and outputs of random plants, in turn.
-SIZES = ((2, 1, 2), (2, 2, 1), (3, 2, 3), (4, 1, 4))
+# Numbers of states, inputs and measurements of the random plants, in turn.
+_SIZES = ((2, 1, 2), (2, 2, 1), (3, 2, 3), (4, 1, 4))
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class AttackCase:
     """A plant behind a channel.
 
     Attributes:
         plant: The plant.
-        channel: The channel.
-        contract: What the channel promises; None for a stable plant.
+        channel: The channel between sensor and estimator.
+        contract: Channel contract that the certificate assumes; None for a stable plant.
     """
 
     plant: LinearPlant
@@ -46,40 +46,40 @@ class Case:
 
 
 @cache
-def cases(seed: int, random_plants: int) -> dict[str, Case]:
+def attack_cases(seed: int, random_plants: int) -> dict[str, AttackCase]:
     """Returns the cases by name: every registered environment, and all kinds of channels for it and for random plants.
 
     Args:
-        seed: Of the random plants.
-        random_plants: How many.
+        seed: Seed of the random plants.
+        random_plants: Number of random plants.
     """
     found = {}
     for env_id, name in ENTRY_POINTS.items():
         if name == "LINEAR_NCS":  # has no plant of its own
             continue
         env, short = ncs_env(gym.make(env_id)), env_id.removeprefix("ncs_gym/")
-        found[f"{short}, its channel"] = Case(env.plant, env.channel, env.contract)
+        found[f"{short}, its channel"] = AttackCase(env.plant, env.channel, env.contract)
         if env.contract is not None:
             for kind, channel in _extremes(env.contract).items():
-                found[f"{short}, {kind}"] = Case(env.plant, channel, env.contract)
+                found[f"{short}, {kind}"] = AttackCase(env.plant, channel, env.contract)
     plants = {"TruckTrailer-v0": truck_trailer(), "TruckTrailerCruise-v0": loaded_truck_trailer()}
     plants |= {f"random plant {index}": _random_plant(seed, index) for index in range(random_plants)}
     for name, plant in plants.items():
-        found |= {f"{name}, {kind}": Case(plant, channel) for kind, channel in CHANNELS.items()}
+        found |= {f"{name}, {kind}": AttackCase(plant, channel) for kind, channel in _CHANNELS.items()}
     return found
 
 
 def _extremes(contract: ChannelContract) -> dict[str, Channel]:
-    """Returns channels that use up a contract: the oldest sample each time, and the longest gap each time."""
+    """Returns channels that reach the limits of a contract: the oldest sample each time, the longest gap each time."""
     age, step = contract.max_age, contract.quantization_step
-    rare = Channel(loss=1.0, max_consecutive_losses=age, quantization_step=step)
-    return {"late": Channel(delay=age, quantization_step=step), "rare": rare}
+    longest_gap = Channel(loss=1.0, max_consecutive_losses=age, quantization_step=step)
+    return {"late": Channel(delay=age, quantization_step=step), "rare": longest_gap}
 
 
 def _random_plant(seed: int, index: int) -> LinearPlant:
     """Returns a stable plant in the unit box whose inputs are so weak that a shield lets some of them through."""
     rng = np.random.default_rng([seed, index])
-    n, m, p = SIZES[index % len(SIZES)]
+    n, m, p = _SIZES[index % len(_SIZES)]
     A = rng.standard_normal((n, n))
     A *= rng.uniform(0.4, 0.9) / np.abs(np.linalg.eigvals(A)).max()
     return LinearPlant(

@@ -1,9 +1,7 @@
-"""A block of episodes under attack: a pure function of its settings."""
+"""A batch of episodes under attack; its counts are a pure function of its settings."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import zlib
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -11,27 +9,27 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.attack.attack_cases import cases
-from experiments.attack.safety_counts import Tally
+from experiments.attack.attack_cases import attack_cases
+from experiments.attack.safety_counts import SafetyCounts
 from experiments.attack.worst_case import HostileAgents, WorstCaseVectorEnv
-from experiments.runs.provenance import versions
+from experiments.runs.provenance import json_digest, versions
 from ncs_gym.registration import EPISODE_STEPS
 from shields import Certificate, VectorSafetyShield
 
-# Modes of the shield, in turn.
-MODES = ("project", "switch", "boundary")
-# Episodes start on the boundary of S; the level counts from this step on.
-SETTLED = 20
+# Modes of the shield, one per batch in turn.
+SHIELD_MODES = ("project", "switch", "boundary")
+# Episodes start on the boundary of S; the largest level is taken from this step on.
+SETTLING_STEPS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
 class Campaign:
-    """What all blocks share.
+    """Settings that all batches share.
 
     Attributes:
-        seed: All blocks derive theirs from it.
-        random_plants: How many.
-        envs: Environments of a block, an episode each.
+        seed: Seed of the campaign; all batches derive their seeds from it.
+        random_plants: Number of random plants.
+        envs: Number of environments in a batch, each of which runs one episode.
         shielded: Whether the shield acts; otherwise it only watches.
     """
 
@@ -42,78 +40,63 @@ class Campaign:
 
     @property
     def key(self) -> str:
-        """A digest of everything that results depend on but the certificates."""
-        content = json.dumps(asdict(self) | {"versions": versions()}, sort_keys=True)
-        return hashlib.sha256(content.encode()).hexdigest()
+        """SHA-256 of everything that the counts depend on except the certificates."""
+        return json_digest(asdict(self) | {"versions": versions()})
 
     @property
-    def block_steps(self) -> int:
-        """Steps of a block."""
+    def batch_steps(self) -> int:
+        """Number of steps in a batch."""
         return self.envs * EPISODE_STEPS
 
 
 @dataclass(frozen=True)
-class Block:
-    """Episodes of one case.
+class MonteCarloBatch:
+    """A batch of episodes of one attack case.
 
     Attributes:
-        case: Name of the case.
-        index: From 0 on.
+        case: Name of the attack case.
+        index: Number of the batch within its case, from 0 on.
     """
 
     case: str
     index: int
 
 
-@lru_cache(maxsize=1)  # a gain table may hold a hundred megabytes
-def _shields(campaign: Campaign, case: str, certificate: Path) -> dict[str, VectorSafetyShield]:
-    """Returns the shields of all modes around the same worst-case environments.
-
-    Raises:
-        CertificateError: If the certificate is damaged or does not verify for the case's plant.
-    """
-    chosen, loaded = cases(campaign.seed, campaign.random_plants)[case], Certificate.load(certificate)
-    settings = {"plant": chosen.plant, "channel": chosen.channel, "contract": chosen.contract}
-    env = WorstCaseVectorEnv(campaign.envs, loaded, **settings)
-    modes = MODES if campaign.shielded else ("monitor",)
-    return {mode: VectorSafetyShield(env, loaded, mode) for mode in modes}
-
-
-def run_block(campaign: Campaign, block: Block, certificate: Path) -> Tally:
-    """Returns the tally of a block, the same in any process and after any other block.
+def run_batch(campaign: Campaign, batch: MonteCarloBatch, certificate: Path) -> SafetyCounts:
+    """Returns the counts of a batch, the same in any process and after any other batch.
 
     Args:
-        campaign: What all blocks share.
-        block: Which one.
-        certificate: File with the case's certificate.
+        campaign: Settings of the campaign.
+        batch: The batch.
+        certificate: File with the certificate of the batch's case.
 
     Raises:
         CertificateError: If the certificate is damaged or does not verify for the case's plant.
     """
-    shields = list(_shields(campaign, block.case, certificate).values())
-    shield = shields[block.index % len(shields)]
-    plan = shield.certificate
-    root = np.linalg.inv(np.linalg.cholesky(plan.L))
-    seeds = np.random.SeedSequence([campaign.seed, zlib.crc32(block.case.encode()), block.index])
+    shields = list(_shields(campaign, batch.case, certificate).values())
+    shield = shields[batch.index % len(shields)]
+    root = np.linalg.inv(np.linalg.cholesky(shield.certificate.L))
+    seeds = np.random.SeedSequence([campaign.seed, zlib.crc32(batch.case.encode()), batch.index])
     seed, policy_seed = seeds.generate_state(2, np.uint64).tolist()
     _, info = shield.reset(seed=seed >> 1)
-    agents = HostileAgents(campaign.envs, shield.filter.plant, plan, np.random.default_rng(policy_seed))
+    rng = np.random.default_rng(policy_seed)
+    agents = HostileAgents(campaign.envs, shield.filter.plant, shield.certificate, rng)
     exits = violations = interventions = 0
     unproved = campaign.envs - np.count_nonzero(info["shield_guaranteed"])
     broken, level = np.zeros(campaign.envs, np.bool_), 0.0
     for step in range(EPISODE_STEPS):
         *_, info = shield.step(agents.act(info["estimate"]))
         squares = np.square(root @ info["state"].T).sum(axis=0)
-        outside, beyond = ~(squares <= 1.0), info["cost"] != 0.0
-        exits += np.count_nonzero(outside)
-        violations += np.count_nonzero(beyond)
+        outside_set, outside_box = ~(squares <= 1.0), info["cost"] != 0.0
+        exits += np.count_nonzero(outside_set)
+        violations += np.count_nonzero(outside_box)
         interventions += np.count_nonzero(info["shield_intervened"])
         unproved += campaign.envs - np.count_nonzero(info["shield_guaranteed"])
-        broken |= outside | beyond
-        if step >= SETTLED:
+        broken |= outside_set | outside_box
+        if step >= SETTLING_STEPS:
             level = max(level, float(np.nan_to_num(squares, nan=np.inf).max()))
-    return Tally(
-        steps=campaign.block_steps,
+    return SafetyCounts(
+        steps=campaign.batch_steps,
         episodes=campaign.envs,
         exits=int(exits),
         violations=int(violations),
@@ -122,3 +105,17 @@ def run_block(campaign: Campaign, block: Block, certificate: Path) -> Tally:
         unproved=int(unproved),
         level=level**0.5,
     )
+
+
+@lru_cache(maxsize=1)  # a shield's tables may take a hundred megabytes
+def _shields(campaign: Campaign, case: str, certificate: Path) -> dict[str, VectorSafetyShield]:
+    """Returns the shields of all modes around the same worst-case environments.
+
+    Raises:
+        CertificateError: If the certificate is damaged or does not verify for the case's plant.
+    """
+    chosen, loaded = attack_cases(campaign.seed, campaign.random_plants)[case], Certificate.load(certificate)
+    settings = {"plant": chosen.plant, "channel": chosen.channel, "contract": chosen.contract}
+    env = WorstCaseVectorEnv(campaign.envs, loaded, **settings)
+    modes = SHIELD_MODES if campaign.shielded else ("monitor",)
+    return {mode: VectorSafetyShield(env, loaded, mode) for mode in modes}

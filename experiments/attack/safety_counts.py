@@ -9,18 +9,18 @@ from experiments.analysis.statistics import clopper_pearson
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tally:
+class SafetyCounts:
     """Counts of some episodes.
 
     Attributes:
-        steps: Taken.
-        episodes: Taken.
-        exits: Steps whose true state lay outside S.
-        violations: Steps whose true state lay outside the safe box.
-        broken_episodes: With an exit or a violation.
-        interventions: Steps in which the shield intervened.
-        unproved: Steps at which the shield's proof did not hold.
-        level: Largest sqrt(x'Mx) of a true state, from the step on that `block.SETTLED` says.
+        steps: Number of simulated steps.
+        episodes: Number of episodes.
+        exits: Number of steps whose true state lay outside S.
+        violations: Number of steps whose true state lay outside the safe box.
+        broken_episodes: Number of episodes with an exit or a violation.
+        interventions: Number of steps in which the shield intervened.
+        unproved: Number of steps at which the shield's proof did not hold.
+        level: Largest sqrt(x'Mx) of a true state after `monte_carlo_batch.SETTLING_STEPS`.
     """
 
     steps: int = 0
@@ -32,17 +32,17 @@ class Tally:
     unproved: int = 0
     level: float = 0.0
 
-    def __add__(self, other: Tally) -> Tally:
-        """Returns the tally of both."""
+    def __add__(self, other: SafetyCounts) -> SafetyCounts:
+        """Returns the counts of both."""
         sums: dict[str, Any] = {
             each.name: getattr(self, each.name) + getattr(other, each.name) for each in fields(self)
         }
         sums["level"] = max(self.level, other.level)
-        return Tally(**sums)
+        return SafetyCounts(**sums)
 
     @property
     def margin(self) -> float:
-        """The smallest 1 - sqrt(x'Mx): how far from the boundary of S, in its own units, states stayed."""
+        """Smallest 1 - sqrt(x'Mx): the distance of the states from the boundary of S, in units of S."""
         return 1.0 - self.level
 
     @property
@@ -50,10 +50,6 @@ class Tally:
         """Upper end of the exact 95 % interval of the probability that an episode leaves S or the box."""
         return clopper_pearson(self.broken_episodes, self.episodes)[1]
 
-    def counts(self) -> dict[str, float]:
-        """Returns the counts as JSON values."""
-        return asdict(self)
-
     def document(self) -> dict[str, float]:
-        """Returns everything as JSON values."""
-        return self.counts() | {"margin": self.margin, "bound": self.bound}
+        """Returns counts, margin and bound as JSON values."""
+        return asdict(self) | {"margin": self.margin, "bound": self.bound}

@@ -1,4 +1,4 @@
-"""Runs units in worker processes and shows how far they are."""
+"""Executes training runs in worker processes of this machine."""
 
 from __future__ import annotations
 
@@ -10,98 +10,98 @@ from multiprocessing.managers import SyncManager
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
-from experiments.backends.progress import REFRESH, progress_bar, show_result
-from experiments.backends.worker_init import belong_to_parent
+from experiments.backends.worker_init import initialize_worker
 from experiments.errors import RunError, RunStopped
-from experiments.runs.training_run import Unit, UnitResult, run_unit
+from experiments.runs import RunResult, TrainingRun, execute_run
 
-# Workers tell about at least this many steps at a time.
-NEWSWORTHY = 1000
+# Smallest number of steps that a worker reports at a time.
+_REPORTED_STEPS = 1000
+# How often the reports are read [s].
+_READING_PERIOD = 0.5
 
 
-def run_all(
-    units: Sequence[Unit],
+def execute_all(
+    runs: Sequence[TrainingRun],
     jobs: int,
-    total_steps: int,
-    on_result: Callable[[Unit, UnitResult], None],
+    on_result: Callable[[TrainingRun, RunResult], None],
+    on_progress: Callable[[int], object],
     log_folder: Path | None = None,
 ) -> None:
-    """Runs all units; the first failure stops the rest and is raised.
+    """Executes all runs; the first failure stops the others and is raised.
 
     Args:
-        units: What to run.
-        jobs: Worker processes.
-        total_steps: Training and evaluation steps of all units, for the progress bar.
-        on_result: Called with every unit and its result as soon as it is there.
-        log_folder: TensorBoard's events of a unit go to a folder in it, of the unit's name.
+        runs: Training runs.
+        jobs: Number of worker processes.
+        on_result: Called with every run and its result when it is finished.
+        on_progress: Called with the number of steps taken since its last call.
+        log_folder: TensorBoard's events of a run go to a folder of the run's name in this folder.
 
     Raises:
-        RunError: If a unit fails.
+        RunError: If a run fails.
     """
     context = multiprocessing.get_context("spawn")
     manager = SyncManager(ctx=context)
-    manager.start(belong_to_parent)
-    with (
-        manager,
-        ProcessPoolExecutor(jobs, mp_context=context, initializer=belong_to_parent) as executor,
-        progress_bar(total_steps) as bar,
-    ):
-        news, stop = manager.Queue(), manager.Event()
-        logs = [None if log_folder is None else log_folder / unit.name for unit in units]
-        futures = [executor.submit(_work, unit, log, news, stop) for unit, log in zip(units, logs, strict=True)]
+    manager.start(initialize_worker)
+    with manager, ProcessPoolExecutor(jobs, mp_context=context, initializer=initialize_worker) as executor:
+        reports, stop = manager.Queue(), manager.Event()
+        futures = {}
+        for run in runs:
+            log = None if log_folder is None else log_folder / run.name
+            futures[executor.submit(_execute, run, log, reports, stop)] = run
         try:
-            _watch(dict(zip(futures, units, strict=True)), news, bar, on_result)
+            _collect(futures, reports, on_result, on_progress)
         except BaseException:
             stop.set()
             executor.shutdown(cancel_futures=True)
             raise
 
 
-def _work(unit: Unit, log_folder: Path | None, news: Any, stop: Any) -> UnitResult:
-    """Runs a unit in a worker; it ends at its next report once `stop` is set."""
-    due = 0
+def _execute(run: TrainingRun, log_folder: Path | None, reports: Any, stop: Any) -> RunResult:
+    """Executes a run in a worker process; it gives up at its next report after `stop` is set."""
+    unreported = 0
 
     def report(steps: int) -> None:
-        nonlocal due
-        due += steps
-        if due >= NEWSWORTHY:
+        nonlocal unreported
+        unreported += steps
+        if unreported >= _REPORTED_STEPS:
             if stop.is_set():
-                raise RunStopped(f"{unit.name} gave up: another unit failed, or the user interrupted")
-            news.put(due)
-            due = 0
+                raise RunStopped(f"{run.name} gave up: another run failed, or the user interrupted")
+            reports.put(unreported)
+            unreported = 0
 
-    result = run_unit(unit, report, log_folder)
-    news.put(due)
+    result = execute_run(run, report, log_folder)
+    reports.put(unreported)
     return result
 
 
-def _watch(units: dict[Future, Unit], news: Any, bar: tqdm, on_result: Callable[[Unit, UnitResult], None]) -> None:
-    """Updates the bar and hands results on until every future is done; raises the first failure."""
-    pending = set(units)
+def _collect(
+    futures: dict[Future, TrainingRun],
+    reports: Any,
+    on_result: Callable[[TrainingRun, RunResult], None],
+    on_progress: Callable[[int], object],
+) -> None:
+    """Passes reports and results on until every run is finished; raises the first failure."""
+    pending = set(futures)
     while pending:
-        done, pending = wait(pending, timeout=REFRESH, return_when=FIRST_COMPLETED)
+        done, pending = wait(pending, timeout=_READING_PERIOD, return_when=FIRST_COMPLETED)
         while True:
             try:
-                bar.update(news.get_nowait())
+                on_progress(reports.get_nowait())
             except queue.Empty:
                 break
-        for future in sorted(done, key=lambda one: one.exception() is not None):
-            result = _result(units[future], future)
-            on_result(units[future], result)
-            show_result(bar, units[future], result)
+        for future in sorted(done, key=lambda each: each.exception() is not None):
+            on_result(futures[future], _result(futures[future], future))
 
 
-def _result(unit: Unit, future: Future) -> UnitResult:
-    """Returns the result of a finished unit.
+def _result(run: TrainingRun, future: Future) -> RunResult:
+    """Returns the result of a finished run.
 
     Raises:
-        RunError: If it failed.
+        RunError: If the run failed.
     """
     try:
         return future.result()
     except (BrokenExecutor, RunStopped):
-        raise  # not its own fault
+        raise  # not this run's own failure
     except Exception as error:
-        raise RunError.of(unit.name, error) from error
+        raise RunError.of(run.name, error) from error

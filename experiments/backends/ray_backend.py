@@ -1,4 +1,4 @@
-"""Runs units on a Ray cluster. Scheduling and retries are Ray's; the driver alone writes."""
+"""Executes training runs on a Ray cluster. Scheduling and retries are Ray's; the driver alone writes results."""
 
 from __future__ import annotations
 
@@ -8,88 +8,75 @@ import pickle
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import chdir, closing, contextmanager, suppress
+from contextlib import chdir, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import ray  # pyright: ignore[reportMissingImports]
 from ray.exceptions import LocalRayletDiedError, RayError, RayTaskError  # pyright: ignore[reportMissingImports]
 
-from experiments.backends.progress import REFRESH, progress_bar, show_result
-from experiments.backends.ray_cluster import Need, Room, carried_work, collect, require_answer, stream
+from experiments.backends.ray_cluster import execute_submitted, portable_task, require_answer
 from experiments.errors import ClusterError, RunError
-from experiments.runs.provenance import versions
-from experiments.runs.training_run import Unit, UnitResult
-from experiments.settings.backend import OWN_RAY, EngineSettings
+from experiments.runs import RunResult, TrainingRun, versions
+from experiments.settings import BackendSettings
+from experiments.settings.backend import OWN_CLUSTER
 
-# How often Ray starts a unit again whose worker died.
+# How often Ray repeats a run whose worker died.
 RETRIES = 3
-# Where the four packages are.
-ROOT = Path(__file__).resolve().parents[2]
+# How long the driver waits for a result before it updates the progress bar [s].
+_WAITING_PERIOD = 0.5
+_SOURCE_FOLDER = Path(__file__).resolve().parents[2]
 
 
-def run_all(
-    units: Sequence[Unit],
-    steps: Callable[[Unit], int],
-    settings: EngineSettings,
-    on_result: Callable[[Unit, UnitResult], None],
+def execute_all(
+    runs: Sequence[TrainingRun],
+    settings: BackendSettings,
+    on_result: Callable[[TrainingRun, RunResult], None],
+    on_progress: Callable[[int], object],
 ) -> None:
-    """Runs all units; the first failure stops the rest and is raised.
+    """Executes all runs; the first failure stops the others and is raised.
 
     Args:
-        units: What to run.
-        steps: Returns how many steps a unit takes, for the progress bar.
-        settings: Which cluster, and what a run reserves.
-        on_result: Called with every unit and its result as soon as it is there.
+        runs: Training runs.
+        settings: Address of the cluster and resources of a run.
+        on_result: Called with every run and its result when it is finished.
+        on_progress: Called with the number of steps taken since its last call.
 
     Raises:
         ClusterError: If the cluster cannot be reached, is too small, or has other versions.
-        RunError: If a unit fails, or its workers die more often than Ray retries.
+        RunError: If a run fails, or its workers die more often than Ray retries.
     """
-    need, expected = Need(settings.cpus_per_run, settings.gpus_per_run), versions()
+    expected = versions()
+
+    def wait(references: list[Any]) -> list[Any]:
+        on_progress(0)
+        return _finished(references)
+
+    def collect(run: TrainingRun, result: RunResult) -> None:
+        on_result(run, result)
+        on_progress(run.total_steps)
+
     with _connected(settings.ray_address):
-        _require_place(need, settings.ray_wait)
-        task = _task(carried_work(), need)
-
-        def submit(unit: Unit) -> Any:
-            return task.remote(expected, pickle.dumps(unit))
-
-        with progress_bar(sum(map(steps, units))) as bar:
-
-            def keep(unit: Unit, result: UnitResult) -> None:
-                on_result(unit, result)
-                bar.update(steps(unit))
-                show_result(bar, unit, result)
-
-            def wait(references: list[Any]) -> list[Any]:
-                bar.update(0)
-                return finished(references)
-
-            room = Room(lambda: sum(map(need.places, _nodes())))
-            with closing(stream(units, submit, wait, _cancel, room)) as batches:
-                collect(batches, _result, keep)
-
-
-def finished(references: list[Any]) -> list[Any]:
-    """Returns all references that are finished, after a while also none."""
-    some, _ = ray.wait(references, timeout=REFRESH, fetch_local=False)
-    return ray.wait(references, num_returns=len(references), timeout=0, fetch_local=False)[0] if some else []
+        _require_large_node(settings)
+        task = _remote(portable_task(), settings)
+        execute_submitted(runs, lambda run: task.remote(expected, pickle.dumps(run)), wait, _result, _cancel, collect)
 
 
 @contextmanager
 def _connected(address: str) -> Iterator[None]:
     """Joins a cluster, or starts one that ends with this process, and leaves it as it was."""
-    own = address == OWN_RAY
-    if not own:
+    options: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False}
+    if address == OWN_CLUSTER:
+        options["include_dashboard"] = False
+    else:
         require_answer(address)
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     # As many threads of linear algebra as in a local worker: Ray would set their number by the reserved cores.
-    threads = os.environ.get("OMP_NUM_THREADS", str(os.cpu_count()))
-    environment = {"env_vars": {"OMP_NUM_THREADS": threads}}
-    options: dict[str, Any] = {"include_dashboard": False} if own else {}
+    options["runtime_env"] = {"env_vars": {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", str(os.cpu_count()))}}
     try:
-        with chdir(ROOT):  # Ray puts the working folder first on the path of its workers: another one may hide ours
-            ray.init(address, runtime_env=environment, logging_level=logging.ERROR, log_to_driver=False, **options)
+        # Ray puts the working folder first on the path of its workers: another one may hide our packages.
+        with chdir(_SOURCE_FOLDER):
+            ray.init(address, **options)
         for number, handler in handlers.items():
             with suppress(ValueError):  # only the main thread has handlers
                 signal.signal(number, handler)
@@ -98,44 +85,48 @@ def _connected(address: str) -> Iterator[None]:
         ray.shutdown()
 
 
-def _task(function: Callable[..., Any], need: Need) -> Any:
-    """Returns a function that Ray calls on a node with room, again if the worker dies, not if it raises."""
+def _remote(function: Callable[..., Any], settings: BackendSettings) -> Any:
+    """Returns a function that Ray calls on a node with free resources; again if its worker dies, not if it raises."""
     return ray.remote(function).options(
-        num_cpus=need.cpus, num_gpus=need.gpus, max_retries=RETRIES, retry_exceptions=False
+        num_cpus=settings.cpus_per_run, num_gpus=settings.gpus_per_run, max_retries=RETRIES, retry_exceptions=False
     )
 
 
-def _require_place(need: Need, patience: float) -> None:
-    """Returns if a node is large enough for a run, or becomes so.
+def _require_large_node(settings: BackendSettings) -> None:
+    """Returns if a node is large enough for a run, or becomes so while the user lets us wait.
 
     Raises:
         ClusterError: If none is: Ray would wait for one forever.
     """
-    if any(map(need.places, _nodes())):
+    wanted = {"CPU": settings.cpus_per_run, "GPU": settings.gpus_per_run}
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    if any(all(node.get(name, 0.0) >= amount for name, amount in wanted.items()) for node in nodes):
         return
-    if patience:
-        print(f"no node is large enough yet; waiting up to {patience:g} s for one", file=sys.stderr)
-        asked = _task(_nothing, need).remote()  # what a cluster grows by is unmet demand
-        if ray.wait([asked], timeout=patience)[0]:
+    if settings.ray_wait:
+        print(f"no node is large enough yet; waiting up to {settings.ray_wait:g} s for one", file=sys.stderr)
+        request = _remote(lambda: None, settings).remote()  # a cluster grows by unmet demand
+        if ray.wait([request], timeout=settings.ray_wait)[0]:
             return
-        _cancel([asked])
-    raise need.too_small(_nodes())
+        _cancel([request])
+    cores, gpus = (max((node.get(name, 0.0) for node in nodes), default=0.0) for name in wanted)
+    raise ClusterError(
+        f"no node of the cluster has the {wanted['CPU']:g} cores and {wanted['GPU']:g} gpus of a run (--cpus-per-run, "
+        f"--gpus-per-run): the most that one has is {cores:g} cores, {gpus:g} gpus; --ray-wait SECONDS waits for a "
+        "cluster that grows"
+    )
 
 
-def _nothing() -> None:
-    """Does nothing."""
+def _finished(references: list[Any]) -> list[Any]:
+    """Returns all references that are finished; after a while it also returns none."""
+    some, _ = ray.wait(references, timeout=_WAITING_PERIOD, fetch_local=False)
+    return ray.wait(references, num_returns=len(references), timeout=0, fetch_local=False)[0] if some else []
 
 
-def _nodes() -> list[dict[str, float]]:
-    """Returns the resources of every living node."""
-    return [node["Resources"] for node in ray.nodes() if node["Alive"]]
-
-
-def _result(unit: Unit, reference: Any) -> UnitResult:
-    """Returns the result of a finished unit.
+def _result(run: TrainingRun, reference: Any) -> RunResult:
+    """Returns the result of a finished run.
 
     Raises:
-        ClusterError: If the node that ran it has other versions, or Ray has ended here.
+        ClusterError: If the node that executed it has other versions, or Ray has ended here.
         RunError: If it failed.
     """
     try:
@@ -143,15 +134,15 @@ def _result(unit: Unit, reference: Any) -> UnitResult:
     except RayTaskError as error:
         if isinstance(error.cause, ClusterError):
             raise error.cause from error
-        raise RunError.of(unit.name, error.cause) from error
+        raise RunError.of(run.name, error.cause) from error
     except LocalRayletDiedError as error:
         raise ClusterError("Ray has ended on this machine: the same command goes on from what is stored") from error
     except RayError as error:
         lost = f"its worker died, {RETRIES} retries included ({type(error).__name__})"
-        raise RunError(f"run {unit.name}: {lost}") from error
+        raise RunError(f"run {run.name}: {lost}") from error
 
 
 def _cancel(references: list[Any]) -> None:
-    """Stops units at once, also those that are being worked on."""
+    """Stops runs at once, also those that are being executed."""
     for reference in references:
         ray.cancel(reference, force=True)

@@ -1,4 +1,4 @@
-"""The process that workers belong to; imported by those that import nothing else, so that they start at once."""
+"""What a worker process does first; imports nothing large, so that it happens at once."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import signal
 import threading
 
 
-def belong_to_parent() -> None:
-    """Leaves the reaction to Ctrl-C to the parent, and ends this process when the parent does, however it does."""
+def initialize_worker() -> None:
+    """Leaves the reaction to Ctrl-C to the parent, and ends this process when its parent ends, however that happens."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
 

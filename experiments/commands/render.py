@@ -1,4 +1,4 @@
-"""Draws an episode: `ncs render`."""
+"""`ncs render`: draws an episode."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments.commands import require_extra
-from experiments.commands.synthesize import plant_of
 from experiments.plots.animation import FORMATS, save_animation, scaled
-from experiments.runs.policies import UNTRAINED, policy_by_name
-from experiments.settings.learning import RenderSettings
+from experiments.runs.experiment_setup import registered_env
+from experiments.runs.policies import UNTRAINED_POLICIES, policy_by_name
+from experiments.settings import RenderSettings
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, SafetyShield
 
-FASTEST = 50
-NARROWEST = 160
-# Between two pictures side by side [pixels].
-GAP = 8
-GRAY = 120
+_MAX_FPS = 50
+_MIN_WIDTH = 160
+# Width and gray value of the space between two frames side by side [pixels].
+_GAP = 8
+_GRAY = 120
 
 
 def render(settings: RenderSettings) -> None:
@@ -34,25 +34,28 @@ def render(settings: RenderSettings) -> None:
         Infeasible: If a shield is asked for and no certificate is found.
     """
     _check(settings)
-    if settings.policy not in UNTRAINED:
+    if settings.policy not in UNTRAINED_POLICIES:
         require_extra("train", "stable_baselines3", "torch")
     if settings.out.suffix == ".mp4":
         require_extra("render", "moviepy")
     modes = ("none", settings.shield) if settings.side_by_side else (settings.shield,)
-    players = [Player(settings, mode) for mode in modes]
-    pictures = (scaled(_joined(row), settings.width) for row in _rows(players, settings.steps))
-    size = save_animation(pictures, settings.out, settings.fps)
-    for player in players:
-        print(player)
+    renderers = [_EpisodeRenderer(settings, mode) for mode in modes]
+    frames = (scaled(_side_by_side(row), settings.width) for row in _frames(renderers, settings.steps))
+    size = save_animation(frames, settings.out, settings.fps)
+    for renderer in renderers:
+        print(renderer)
     print(f"saved to {settings.out} ({size / 1e6:.2f} MB)")
 
 
-class Player:
-    """One episode that is drawn step by step.
+class _EpisodeRenderer:
+    """Simulates one episode and draws it step by step.
 
     Args:
-        settings: Of the command.
-        mode: The shield's, or "none".
+        settings: Settings of the command.
+        mode: Mode of the shield, or "none".
+
+    Attributes:
+        is_over: Whether the episode has ended.
     """
 
     def __init__(self, settings: RenderSettings, mode: str) -> None:
@@ -65,15 +68,15 @@ class Player:
         self._observation, self._info = self._env.reset(seed=settings.seed)
         self.is_over, self._steps = False, 0
 
-    def picture(self) -> np.ndarray:
-        """Returns the present picture, shape (height, width, 3), uint8."""
-        picture = self._env.render()
-        if not isinstance(picture, np.ndarray):
-            raise TypeError(f"expected a picture, got {type(picture).__name__}")
-        return picture
+    def frame(self) -> np.ndarray:
+        """Returns the frame of the present step, shape (height, width, 3), uint8."""
+        frame = self._env.render()
+        if not isinstance(frame, np.ndarray):
+            raise TypeError(f"expected an image, got {type(frame).__name__}")
+        return frame
 
     def step(self) -> None:
-        """Plays a step, unless the episode is over."""
+        """Simulates a step, unless the episode is over."""
         if not self.is_over:
             action = self._policy(self._observation, self._info)
             self._observation, _, terminated, truncated, self._info = self._env.step(action)
@@ -89,38 +92,38 @@ class Player:
         return f"{line}, shield {acted} {self._info['episode_interventions']} times"
 
 
-def _rows(players: list[Player], steps: int) -> Iterator[list[np.ndarray]]:
-    """Yields the pictures of all players at reset and after each step, until all episodes are over."""
-    yield [player.picture() for player in players]
+def _frames(renderers: list[_EpisodeRenderer], steps: int) -> Iterator[list[np.ndarray]]:
+    """Yields the frames of all episodes at reset and after each step, until all episodes are over."""
+    yield [renderer.frame() for renderer in renderers]
     with tqdm(total=steps, desc="drawing", unit="step", leave=False, disable=None) as bar:
         for _ in range(steps):
-            if all(player.is_over for player in players):
+            if all(renderer.is_over for renderer in renderers):
                 return
-            for player in players:
-                player.step()
-            yield [player.picture() for player in players]
+            for renderer in renderers:
+                renderer.step()
+            yield [renderer.frame() for renderer in renderers]
             bar.update()
 
 
-def _joined(row: list[np.ndarray]) -> np.ndarray:
-    """Returns pictures side by side with a line between them."""
-    gap = np.full((len(row[0]), GAP, 3), 255, np.uint8)
-    gap[:, GAP // 2 - 1 : GAP // 2 + 1] = GRAY
-    parts = [part for picture in row for part in (gap, picture)][1:]
+def _side_by_side(frames: list[np.ndarray]) -> np.ndarray:
+    """Returns frames side by side with a line between them."""
+    gap = np.full((len(frames[0]), _GAP, 3), 255, np.uint8)
+    gap[:, _GAP // 2 - 1 : _GAP // 2 + 1] = _GRAY
+    parts = [part for frame in frames for part in (gap, frame)][1:]
     return np.concatenate(parts, axis=1)
 
 
 def _check(settings: RenderSettings) -> None:
-    """Raises unless the settings make sense.
+    """Checks the settings.
 
     Raises:
-        ValueError: If one does not.
-        OSError: If there is no folder for the file.
+        ValueError: If a setting is wrong.
+        OSError: If the folder of the file does not exist.
     """
-    plant_of(settings.env)
+    registered_env(settings.env)
     if settings.out.suffix not in FORMATS:
         raise ValueError(f"--out must end in one of {', '.join(FORMATS)}, got {settings.out}")
-    for name, low, high in (("seed", 0, None), ("steps", 1, None), ("fps", 1, FASTEST), ("width", NARROWEST, None)):
+    for name, low, high in (("seed", 0, None), ("steps", 1, None), ("fps", 1, _MAX_FPS), ("width", _MIN_WIDTH, None)):
         value = getattr(settings, name)
         if value is not None and (value < low or (high is not None and value > high)):
             limits = f"at least {low}" + (f" and at most {high}" if high is not None else "")

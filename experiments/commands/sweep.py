@@ -1,4 +1,4 @@
-"""The same comparison over a grid of channels."""
+"""`ncs sweep`: the same comparison over a grid of channels."""
 
 from __future__ import annotations
 
@@ -6,31 +6,28 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 from experiments.analysis.parquet_tables import parquet
 from experiments.analysis.summary import summarize_arm
+from experiments.analysis.text_table import text_table
 from experiments.backends.execution import results_of
-from experiments.commands.compare import grouped, prepare, provenance, unit_of
-from experiments.plots.heatmaps import heatmaps_of
-from experiments.report.comparison import sweep_report
-from experiments.runs.arms import arm_of
-from experiments.runs.experiment_setup import World, world_of
-from experiments.runs.training_run import Unit, UnitResult
-from experiments.settings.channel import ChannelSettings
-from experiments.settings.learning import SweepSettings
-from experiments.settings.settings_file import save_settings
+from experiments.plots.heatmaps import sweep_figures
+from experiments.report.sweep import sweep_report
+from experiments.runs import ExperimentSetup, RunResult, arm_of, by_arm, experiment_setup, prepare_output
+from experiments.settings import ChannelSettings, SweepSettings, save_settings
 from shields.atomic_write import write_atomically
 
 
 @dataclass(frozen=True)
-class Cell:
-    """A point of the grid.
+class GridPoint:
+    """One channel of the grid.
 
     Attributes:
         loss: Probability that a packet is lost.
-        delay: [steps].
-        quantization_step: None for the environment's own.
+        delay: Delay of every packet [steps].
+        quantization_step: Quantization step of the measurements; None for the environment's own.
         burst_length: Mean number of packets lost in a row; 0 for independent losses.
     """
 
@@ -41,15 +38,15 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """For files."""
-        rounding = "" if self.quantization_step is None else f"-q{self.quantization_step}"
-        return f"loss{self.loss}-delay{self.delay}{rounding}-burst{self.burst_length}"
+        """Name of the point in file names."""
+        quantization = "" if self.quantization_step is None else f"-q{self.quantization_step}"
+        return f"loss{self.loss}-delay{self.delay}{quantization}-burst{self.burst_length}"
 
     def channel(self, base: ChannelSettings) -> ChannelSettings:
-        """Returns the changes of the environment's channel that make this cell's."""
+        """Returns the changes of the environment's channel that make this point's channel."""
         bursts = None if self.burst_length == 0.0 or self.loss == 0.0 else self.burst_length
-        rounding = base.quantization_step if self.quantization_step is None else self.quantization_step
-        return replace(base, loss=self.loss, delay=self.delay, quantization_step=rounding, burst_length=bursts)
+        quantization = base.quantization_step if self.quantization_step is None else self.quantization_step
+        return replace(base, loss=self.loss, delay=self.delay, quantization_step=quantization, burst_length=bursts)
 
 
 def sweep(settings: SweepSettings) -> None:
@@ -61,45 +58,42 @@ def sweep(settings: SweepSettings) -> None:
         CertificateError: If a given certificate does not verify.
         Infeasible: If no certificate is found.
         RunError: If a run fails.
-        ClusterError: If a cluster cannot run them.
+        ClusterError: If a cluster cannot execute the runs.
     """
-    cells = cells_of(settings)
+    points = grid_points(settings)
     for name in ("loss", "delay", "burst_length"):
         if getattr(settings.channel, name) is not None:
             raise ValueError(f"--channel.{name.replace('_', '-')} is a side of the grid: give its values there")
     for name in settings.arms:
         arm_of(name, settings.mode)
-    worlds = [world_of(settings.env, cell.channel(settings.channel), settings.certificate) for cell in cells]
-    prepare(settings.out)
+    setups = [experiment_setup(settings.env, each.channel(settings.channel), settings.certificate) for each in points]
+    prepare_output(settings.out)
     save_settings(settings.out / "settings.json", "sweep", settings)
-    units = [unit for cell, world in zip(cells, worlds, strict=True) for unit in _units(settings, cell, world)]
-    results = results_of(units, settings.out, settings)
-    per_cell = len(units) // len(cells)
-    parts = [results[i * per_cell : (i + 1) * per_cell] for i in range(len(cells))]
-    rows = [row for cell, part in zip(cells, parts, strict=True) for row in _rows(cell, part)]
+    runs = [
+        setup.training_run(settings, name, index, grid_point=point.name)
+        for point, setup in zip(points, setups, strict=True)
+        for index in range(settings.seeds)
+        for name in settings.arms
+    ]
+    results = results_of(runs, settings.out, settings)
+    per_point = len(runs) // len(points)
+    parts = [results[i * per_point : (i + 1) * per_point] for i in range(len(points))]
     summary = {
-        "cells": [asdict(cell) | {"arms": _arms(part)} for cell, part in zip(cells, parts, strict=True)],
-        "units": {unit.name: unit.key for unit in units},
-        "seeds": {unit.index: {"training": unit.training_seed, "evaluation": unit.evaluation_seed} for unit in units},
-    } | provenance("sweep", settings, worlds[0])
-    figures = heatmaps_of(summary, settings.arms)
-    for name, (_, png) in figures.items():
-        write_atomically(settings.out / "figures" / f"{name}.png", png)
-    worlds[0].certificate.save(settings.out / "certificate.json")
-    write_atomically(settings.out / "sweep.parquet", parquet(rows, provenance("sweep", settings, worlds[0])))
-    page = sweep_report(summary, worlds[0].verification, {caption: png for caption, png in figures.values()})
-    write_atomically(settings.out / "report.html", page)
-    write_atomically(settings.out / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    runs = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
-    print(f"{settings.env}: {runs} per arm and channel\n", sweep_text(summary), sep="\n")
-    print(f"files: {settings.out}")
+        "cells": [asdict(point) | {"arms": _arms(part)} for point, part in zip(points, parts, strict=True)],
+        "units": {run.name: run.key for run in runs},
+        "seeds": {run.index: {"training": run.training_seed, "evaluation": run.evaluation_seed} for run in runs},
+    } | setups[0].provenance("sweep", settings)
+    rows = [row for point, part in zip(points, parts, strict=True) for row in _rows(point, part)]
+    _write(settings, summary, rows, setups[0])
+    count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
+    print(f"{settings.env}: {count} per arm and channel\n", _text(summary), f"files: {settings.out}", sep="\n")
 
 
-def cells_of(settings: SweepSettings) -> list[Cell]:
+def grid_points(settings: SweepSettings) -> list[GridPoint]:
     """Returns the points of the grid.
 
     Raises:
-        ValueError: If a side of it is empty or names a value twice.
+        ValueError: If a side of the grid is empty or names a value twice.
     """
     sides = {
         "losses": settings.losses,
@@ -112,61 +106,52 @@ def cells_of(settings: SweepSettings) -> list[Cell]:
         if not side or len(set(side)) != len(side):
             raise ValueError(f"--{name.replace('_', '-')} must be different values, at least one")
     del sides["arms"]
-    return [Cell(*point) for point in product(*sides.values())]
+    return [GridPoint(*point) for point in product(*sides.values())]
 
 
-def sweep_text(summary: dict[str, Any]) -> str:
+def _write(settings: SweepSettings, summary: dict[str, Any], rows: list[dict], setup: ExperimentSetup) -> None:
+    """Writes every file; summary.json comes last, so that it stands for a complete experiment."""
+    out: Path = settings.out
+    figures = sweep_figures(summary, settings.arms)
+    for name, (_, png) in figures.items():
+        write_atomically(out / "figures" / f"{name}.png", png)
+    setup.certificate.save(out / "certificate.json")
+    write_atomically(out / "sweep.parquet", parquet(rows, setup.provenance("sweep", settings)))
+    write_atomically(out / "report.html", sweep_report(summary, setup.verification, dict(figures.values())))
+    write_atomically(out / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
+
+
+def _text(summary: dict[str, Any]) -> str:
     """Returns the table for a terminal: a row per channel and arm."""
-    header = [
-        "loss",
-        "delay",
-        "rounding",
-        "burst",
-        "arm",
-        "violating episodes",
-        "training steps",
-        "overridden",
-        "return",
-    ]
-    rows = [header]
+    head = ["loss", "delay", "quantization", "burst", "arm", "violating episodes", "training steps", "overridden"]
+    rows = [[*head, "return"]]
     for cell in summary["cells"]:
-        rounding = "own" if cell["quantization_step"] is None else f"{cell['quantization_step']:g}"
-        place = [
+        channel = [
             f"{cell['loss']:g}",
             str(cell["delay"]),
-            rounding,
+            "own" if cell["quantization_step"] is None else f"{cell['quantization_step']:g}",
             f"{cell['burst_length']:g}" if cell["burst_length"] else "none",
         ]
         for name, arm in cell["arms"].items():
-            rows.append(
-                [
-                    *place,
-                    name,
-                    f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,}",
-                    f"{arm['train_violation_steps']:,} of {arm['train_steps']:,}",
-                    "-" if name in ("unshielded", "penalized") else f"{100 * arm['intervention_rate']:.1f} %",
-                    f"{arm['eval_return_mean']:.1f}",
-                ]
-            )
-    widths = [max(len(row[column]) for row in rows) for column in range(len(header))]
-    lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
-    return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:]])
+            outcome = [
+                f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,}",
+                f"{arm['train_violation_steps']:,} of {arm['train_steps']:,}",
+                "-" if arm_of(name).mode is None else f"{100 * arm['intervention_rate']:.1f} %",
+                f"{arm['eval_return_mean']:.1f}",
+            ]
+            rows.append([*channel, name, *outcome])
+    return text_table(rows, left_columns=0)
 
 
-def _units(settings: SweepSettings, cell: Cell, world: World) -> list[Unit]:
-    units = [unit_of(settings, world, name, index) for index in range(settings.seeds) for name in settings.arms]
-    return [replace(unit, place=cell.name) for unit in units]
+def _arms(results: Sequence[RunResult]) -> dict[str, Any]:
+    return {name: summarize_arm(runs, fixed_policy=False) for name, runs in by_arm(results).items()}
 
 
-def _arms(results: Sequence[UnitResult]) -> dict[str, Any]:
-    return {name: summarize_arm(runs, fixed_policy=False) for name, runs in grouped(results).items()}
-
-
-def _rows(cell: Cell, results: Sequence[UnitResult]) -> list[dict[str, Any]]:
-    """Returns one row per unit."""
+def _rows(point: GridPoint, results: Sequence[RunResult]) -> list[dict[str, Any]]:
+    """Returns one row per training run."""
     rows = []
     for result in results:
         summary = summarize_arm([result], fixed_policy=False)
         numbers = {name: value for name, value in summary.items() if isinstance(value, (int, float))}
-        rows.append(asdict(cell) | {"arm": result.arm, "run": result.index} | numbers)
+        rows.append(asdict(point) | {"arm": result.arm, "run": result.index} | numbers)
     return rows

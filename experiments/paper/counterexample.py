@@ -21,17 +21,20 @@ from shields.verification.rational_matrix import (
     transpose,
 )
 
-# Pulls the points found inside their sets by more than rounding.
-INSIDE = 1.0 - 1e-9
-STARTS, ASCENT_STEPS = 200, 200
+# Factor that pulls the points found into their sets by more than rounding.
+_INSIDE = 1.0 - 1e-9
+_STARTS, _ASCENT_STEPS = 200, 200
 
 
 @dataclass(frozen=True, eq=False)
 class OneStep:
-    """The worst step found.
+    """The worst step of the closed loop that was found.
 
     Attributes:
-        state, disturbance, error, following: x, d, e and x+ = (A+BK) x + d + e, shape (n,) each.
+        state: x, shape (n,).
+        disturbance: d, shape (n,).
+        error: e, shape (n,).
+        following: x+ = (A+BK) x + d + e, shape (n,).
         level: x+'M x+ in floating point.
         confirmed: Whether exact arithmetic confirms x in S, d'd <= gamma, e'e <= eps and x+ outside S.
     """
@@ -49,14 +52,14 @@ def worst_step(
 ) -> OneStep:
     """Returns the step from {x'Mx <= 1} with d'd <= gamma, e'e <= epsilon that ends at the largest x+'M x+.
 
-    By ascent: for a fixed slope M x+ each of x, d, e is the extreme point of its own set; many random starts.
+    It is found by ascent from random starts: for a fixed slope M x+ each of x, d, e is the extreme point of its set.
 
     Args:
-        closed: A + B K, shape (n, n).
-        M: Shape (n, n).
-        gamma: Squared radius of d.
-        epsilon: Squared radius of e.
-        direction: Only e along this vector, shape (n,); None: every e in the ball.
+        closed: State matrix of the closed loop, A + B K, shape (n, n).
+        M: Matrix of the safe set, shape (n, n).
+        gamma: Largest d'd.
+        epsilon: Largest e'e.
+        direction: Vector along which e lies, shape (n,); None for every e in the ball.
     """
     n = len(M)
     inverse = np.linalg.inv(M)
@@ -67,7 +70,7 @@ def worst_step(
 
     def ascended() -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
         x, d, e = (source.sample_boundary(rng) for source in (states, disturbances, errors))
-        for _ in range(ASCENT_STEPS):
+        for _ in range(_ASCENT_STEPS):
             slope = M @ (closed @ x + d + e)
             x, d, e = (
                 states.extreme_point(closed.T @ slope),
@@ -75,9 +78,9 @@ def worst_step(
                 errors.extreme_point(slope),
             )
         end = closed @ x + d + e
-        return float(end @ M @ end), INSIDE * x, INSIDE * d, INSIDE * e
+        return float(end @ M @ end), _INSIDE * x, _INSIDE * d, _INSIDE * e
 
-    level, x, d, e = max((ascended() for _ in range(STARTS)), key=itemgetter(0))
+    level, x, d, e = max((ascended() for _ in range(_STARTS)), key=itemgetter(0))
     return OneStep(x, d, e, closed @ x + d + e, level, _confirmed(closed, M, gamma, epsilon, x, d, e))
 
 
@@ -86,27 +89,27 @@ def stays_inside(
 ) -> bool:
     """Returns whether exact arithmetic proves that no such step leaves the set (False: not proved).
 
-    With P the closed loop's image of M^-1, e's shape and gamma I, any shares that sum to 1 give an ellipsoid around the
-    sum of the three; it lies in {x'Mx <= 1} if M - M (sum of P_i / share_i) M >= 0. Arguments as in `worst_step`.
+    With P the closed loop's image of M^-1, e's shape and gamma I, any weights that sum to 1 give an ellipsoid around
+    the sum of the three; it lies in {x'Mx <= 1} if M - M (sum of P_i / weight_i) M >= 0. Arguments as in `worst_step`.
     """
     n = len(M)
     inverse = np.linalg.inv(M)
     spread = np.eye(n) if direction is None else np.outer(direction, direction)
     shapes = [closed @ inverse @ closed.T, epsilon * spread / (1.0 if direction is None else direction @ direction)]
     sizes = np.sqrt([np.trace(M @ shape) for shape in (*shapes, gamma * np.eye(n))])
-    shares = [Fraction(float(size)) for size in sizes]
-    total = sum(shares)
+    weights = [Fraction(float(size)) for size in sizes]
+    total = sum(weights)
     M_, closed_ = rational(M), multiply(rational(M), rational(closed))
-    # M (closed M^-1 closed') M <= share_1 (M - rest): by Schur, in M and closed alone.
+    # M (closed M^-1 closed') M <= weight_1 (M - rest): by Schur, in M and closed alone.
     square = Fraction(1) if direction is None else quadratic(rational(direction), rational(np.eye(n)))
     terms = [
-        (Fraction(epsilon) / square, rational(spread), shares[1]),
-        (Fraction(gamma), rational(np.eye(n)), shares[2]),
+        (Fraction(epsilon) / square, rational(spread), weights[1]),
+        (Fraction(gamma), rational(np.eye(n)), weights[2]),
     ]
     rest = M_
-    for factor, shape, share in terms:
-        rest = subtract(rest, scale(factor * total / share, congruence(M_, shape)))
-    top = [left + right for left, right in zip(scale(shares[0] / total, M_), transpose(closed_), strict=True)]
+    for factor, shape, weight in terms:
+        rest = subtract(rest, scale(factor * total / weight, congruence(M_, shape)))
+    top = [left + right for left, right in zip(scale(weights[0] / total, M_), transpose(closed_), strict=True)]
     bottom = [left + right for left, right in zip(closed_, rest, strict=True)]
     return is_positive_semidefinite(top + bottom)
 

@@ -10,14 +10,15 @@ from ncs_gym import LinearPlant, truck_trailer
 
 
 @dataclass(frozen=True, eq=False)
-class PrintedCase:
-    """The case study as printed.
+class PaperExample:
+    """The numerical example as printed.
 
     Attributes:
-        A, B: Discretized plant.
-        M: Of the safe set.
-        K: Gain (printed as a column).
-        kappa: Contraction factor.
+        A: State matrix of the discretized plant, shape (2, 2).
+        B: Input matrix of the discretized plant, shape (2, 1).
+        M: Matrix of the safe set {x : x'Mx <= 1}, shape (2, 2).
+        K: Feedback gain (printed as a column), shape (1, 2).
+        kappa: Contraction factor of the closed loop.
         epsilon: Bound on e'e.
         largest_error: "The maximum system state error" of the simulation.
     """
@@ -37,11 +38,11 @@ class PrintedCase:
 
     @property
     def L(self) -> np.ndarray:
-        """M^-1, shape (2, 2)."""
+        """Shape of the safe set, M^-1, shape (2, 2)."""
         inverse = np.linalg.inv(self.M)
         return 0.5 * (inverse + inverse.T)
 
     @property
-    def closed(self) -> np.ndarray:
-        """A + B K, shape (2, 2)."""
+    def closed_loop(self) -> np.ndarray:
+        """State matrix of the closed loop, A + B K, shape (2, 2)."""
         return self.A + self.B @ self.K

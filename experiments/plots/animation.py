@@ -1,4 +1,4 @@
-"""Pictures of an episode as a GIF, an MP4 or a PNG file."""
+"""Frames of an episode as a GIF, an MP4 or a PNG file."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from ncs_gym.rendering import theme
 from shields.atomic_write import write_atomically
 
 FORMATS = (".gif", ".mp4", ".png")
-# How long an animation rests on its last picture [ms].
-REST = 2000
-# Mixtures of foreground and background that edges need.
-EDGE_SHARES = (0.35, 0.7)
+# Time that an animation shows its last frame [ms].
+_LAST_FRAME_TIME = 2000
+# Fractions of the foreground in the mixed colors of edges.
+_EDGE_FRACTIONS = (0.35, 0.7)
 
 
 def scaled(picture: np.ndarray, width: int | None) -> Image.Image:
@@ -30,13 +30,13 @@ def scaled(picture: np.ndarray, width: int | None) -> Image.Image:
     return image.resize((width - width % 2, height - height % 2), Image.Resampling.LANCZOS)
 
 
-def save_animation(pictures: Iterable[Image.Image], file: Path, fps: int) -> int:
-    """Writes pictures in the format of the file's name.
+def save_animation(frames: Iterable[Image.Image], file: Path, fps: int) -> int:
+    """Writes frames in the format of the file's name.
 
     Args:
-        pictures: At least one, all of the same size.
-        file: Ends in one of FORMATS.
-        fps: Pictures per second.
+        frames: Frames of the same size, at least one.
+        file: File whose name ends in one of FORMATS.
+        fps: Frames per second.
 
     Returns:
         Size of the file [bytes].
@@ -45,48 +45,48 @@ def save_animation(pictures: Iterable[Image.Image], file: Path, fps: int) -> int
         OSError: If it cannot be written.
     """
     encode = {".gif": _gif, ".mp4": _mp4, ".png": _png}[file.suffix]
-    data = encode(pictures, fps)
+    data = encode(frames, fps)
     write_atomically(file, data)
     return len(data)
 
 
-def _gif(pictures: Iterable[Image.Image], fps: int) -> bytes:
+def _gif(frames: Iterable[Image.Image], fps: int) -> bytes:
     palette, buffer = _palette(), io.BytesIO()
-    first, *others = [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in pictures]
+    first, *others = [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in frames]
     pace = round(1000 / fps)
-    durations = [pace] * len(others) + [REST]
+    durations = [pace] * len(others) + [_LAST_FRAME_TIME]
     first.save(buffer, "GIF", save_all=True, append_images=others, duration=durations, loop=0, optimize=True)
     return buffer.getvalue()
 
 
-def _mp4(pictures: Iterable[Image.Image], fps: int) -> bytes:
+def _mp4(frames: Iterable[Image.Image], fps: int) -> bytes:
     from moviepy.video.io.ImageSequenceClip import ImageSequenceClip
 
-    frames = [np.asarray(each) for each in pictures]
-    frames += frames[-1:] * max(1, REST * fps // 1000)  # moviepy drops the last one
-    clip = ImageSequenceClip(frames, fps=fps)
+    images = [np.asarray(each) for each in frames]
+    images += images[-1:] * max(1, _LAST_FRAME_TIME * fps // 1000)  # moviepy drops the last one
+    clip = ImageSequenceClip(images, fps=fps)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "episode.mp4"
         clip.write_videofile(str(file), audio=False, logger=None)
         return file.read_bytes()
 
 
-def _png(pictures: Iterable[Image.Image], fps: int) -> bytes:
+def _png(frames: Iterable[Image.Image], fps: int) -> bytes:
     buffer, last = io.BytesIO(), None
-    for picture in pictures:
-        last = picture
+    for frame in frames:
+        last = frame
     assert last is not None
     last.save(buffer, "PNG", optimize=True)
     return buffer.getvalue()
 
 
 def _palette() -> Image.Image:
-    """Returns an image that carries the colors of our pictures; one made from the pictures forgets small red things."""
+    """Returns an image with the palette of our frames; one computed from the frames loses small red objects."""
     grounds = (theme.PAPER, theme.MIST, theme.SAFE_FILL, theme.DANGER_FILL, theme.ERROR_FILL, theme.SHIELD_FILL)
     marks = (theme.INK, theme.MUTED, theme.STEEL, theme.FAINT, theme.SAFE, theme.DANGER, theme.ESTIMATE, theme.LATE)
     marks = (*marks, theme.LATE_TEXT, theme.SHIELD, theme.BODYWORK)
-    ramp = [theme.strain(share) for share in np.linspace(0.6, 0.95, 9)]
-    edges = [theme.blend(mark, ground, share) for mark, ground, share in product(marks, grounds, EDGE_SHARES)]
+    ramp = [theme.strain(level) for level in np.linspace(0.6, 0.95, 9)]
+    edges = [theme.blend(mark, ground, fraction) for mark, ground, fraction in product(marks, grounds, _EDGE_FRACTIONS)]
     colors = list(dict.fromkeys([*grounds, *marks, theme.GRID, theme.LOAD, theme.CRATE, theme.GLASS, *ramp, *edges]))[
         :255
     ]

@@ -1,4 +1,4 @@
-"""How an arm looks in every figure."""
+"""The color, line and marker of an arm, the same in every figure."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
 
-from experiments.runs.arms import PENALTY
+from experiments.runs.arms import PENALTY_SUFFIX
 
-# Okabe and Ito's palette, which color-blind readers can tell apart; a marker each, for print without color.
-LOOKS = {
+# Color (Okabe and Ito's palette, which color-blind readers can distinguish) and marker (for print without color).
+ARM_COLORS_AND_MARKERS = {
     "unshielded": ("#D55E00", "o"),
     "monitor": ("#4D4D4D", "D"),
     "penalized": ("#E69F00", "s"),
@@ -20,19 +20,19 @@ LOOKS = {
     "shielded:switch": ("#009E73", "P"),
     "shielded:boundary": ("#CC79A7", "X"),
 }
-SOLID, DOTTED, DASHED = "-", (0, (1.0, 1.3)), (0, (4.5, 1.6))
+_SOLID, _DOTTED, _DASHED = "-", (0, (1.0, 1.3)), (0, (4.5, 1.6))
 
 
 @dataclass(frozen=True)
 class ArmStyle:
-    """Look of an arm.
+    """Style of an arm.
 
     Attributes:
-        color: Hexadecimal.
-        dashes: A line style of matplotlib.
-        marker: A marker of matplotlib.
+        color: Hexadecimal color.
+        dashes: Line style of matplotlib.
+        marker: Marker of matplotlib.
         hollow: Whether markers are outlines.
-        size: Of markers [points].
+        size: Size of the markers [points].
     """
 
     color: str
@@ -43,12 +43,12 @@ class ArmStyle:
 
     @property
     def line(self) -> dict[str, Any]:
-        """Keyword arguments of a line."""
+        """Keyword arguments of matplotlib for lines."""
         return {"color": self.color, "ls": self.dashes}
 
     @property
     def points(self) -> dict[str, Any]:
-        """Keyword arguments of markers, whose fill lets one see others below."""
+        """Keyword arguments of matplotlib for markers; their fill is transparent."""
         return {
             "marker": self.marker,
             "ms": self.size,
@@ -58,21 +58,21 @@ class ArmStyle:
         }
 
     def handle(self, *, line: bool = True, points: bool = False) -> Line2D:
-        """Returns an entry of a legend."""
+        """Returns the arm's entry in a legend."""
         shape = self.line | {"lw": 2.0} if line else {"ls": "none"}
         return Line2D([], [], **shape, **(self.points if points else {}))
 
 
 def style_of(arm: str) -> ArmStyle:
-    """Returns the look of an arm: its color is that of its shield, with a penalty it is dashed and hollow.
+    """Returns the style of an arm: the color stands for the shield, dashed lines and hollow markers for a penalty.
 
-    The monitor's agent is the unshielded one, so its curves lie on the unshielded ones: dotted and hollow, both show.
+    The monitor's agent is the unshielded one, so its curves lie on those of the unshielded arm and are dotted.
 
     Raises:
         KeyError: If the arm is unknown.
     """
-    color, marker = LOOKS[arm.removesuffix(PENALTY)]
+    color, marker = ARM_COLORS_AND_MARKERS[arm.removesuffix(PENALTY_SUFFIX)]
     if arm == "monitor":
-        return ArmStyle(color, DOTTED, marker, hollow=True, size=11.0)
-    priced = arm.endswith(PENALTY)
-    return ArmStyle(color, DASHED if priced else SOLID, marker, hollow=priced, size=10.0 if priced else 7.0)
+        return ArmStyle(color, _DOTTED, marker, hollow=True, size=11.0)
+    penalized = arm.endswith(PENALTY_SUFFIX)
+    return ArmStyle(color, _DASHED if penalized else _SOLID, marker, hollow=penalized, size=10.0 if penalized else 7.0)

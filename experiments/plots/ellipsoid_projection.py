@@ -1,4 +1,4 @@
-"""Shadows of the safe set and of the safe box on the plane of two states."""
+"""Projections of the safe set and of the safe box on the plane of two states."""
 
 from __future__ import annotations
 
@@ -6,35 +6,35 @@ import numpy as np
 from scipy.linalg import null_space, orth
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
-# Directions this much shorter than the others are none.
-FLAT = 1e-9
+# Directions whose projection is shorter than this lie across the plane.
+_FLAT = 1e-9
 
 
-def shadow_of_ellipsoid(shape: np.ndarray, plane: tuple[int, int], points: int = 361) -> np.ndarray:
-    """Returns the outline of the shadow of {x : x' shape^-1 x <= 1} on two coordinates, shape (points, 2).
+def projected_ellipsoid(shape: np.ndarray, plane: tuple[int, int], points: int = 361) -> np.ndarray:
+    """Returns the outline of the projection of {x : x' shape^-1 x <= 1} on two coordinates, shape (points, 2).
 
-    The shadow of an ellipsoid is the ellipse whose shape is the two coordinates' block.
+    The projection of an ellipsoid is the ellipse whose shape is the block of the two coordinates.
 
     Args:
-        shape: Shape (n, n), positive definite.
-        plane: The coordinates.
-        points: How many.
+        shape: Shape of the ellipsoid, positive definite, shape (n, n).
+        plane: The two coordinates.
+        points: Number of points of the outline.
     """
     angle = np.linspace(0.0, 2.0 * np.pi, points)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     return (np.linalg.cholesky(shape[np.ix_(plane, plane)]) @ circle).T
 
 
-def shadow_of_box(rows: np.ndarray, plane: tuple[int, int]) -> np.ndarray | None:
-    """Returns the closed outline of the shadow of {x : |c_j x| <= 1}, shape (corners + 1, 2); None if it is unbounded.
+def projected_box(rows: np.ndarray, plane: tuple[int, int]) -> np.ndarray | None:
+    """Returns the outline of the projection of {x : |c_j x| <= 1}, closed, shape (corners + 1, 2); None if unbounded.
 
     Args:
-        rows: c_j, shape (k, n).
-        plane: The coordinates.
+        rows: Rows c_j, shape (k, n).
+        plane: The two coordinates.
     """
     pick = np.eye(rows.shape[1])[list(plane)]
     free = null_space(rows)
-    if free.size and np.abs(pick @ free).max() > FLAT:
+    if free.size and np.abs(pick @ free).max() > _FLAT:
         return None
     # Along unlimited directions the box is a prism over these coordinates, in which it is bounded.
     basis = orth(rows.T)

@@ -1,4 +1,4 @@
-"""What all figures share."""
+"""Style of all figures: settings of matplotlib, labels, legends and the PNG file."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "figure.dpi": 130,
 }
-# Widths in a legend, on average [inches].
-LETTER, HANDLE = 0.085, 0.6
-SQUARED = "\N{SUPERSCRIPT TWO}"
+# Mean width of a letter and of a handle in a legend [inches].
+_LETTER, _HANDLE = 0.085, 0.6
+_SQUARED = "\N{SUPERSCRIPT TWO}"
 
 
 def as_png(figure: Figure) -> bytes:
@@ -40,7 +40,7 @@ def as_png(figure: Figure) -> bytes:
 
 def with_unit(name: str, unit: str) -> str:
     """Returns an axis label; some plants have no units."""
-    return f"{name} [{unit}]".replace("^2", SQUARED) if unit else name
+    return f"{name} [{unit}]".replace("^2", _SQUARED) if unit else name
 
 
 def label(axis: Axes, x: str, y: str, title: str = "") -> None:
@@ -51,7 +51,7 @@ def label(axis: Axes, x: str, y: str, title: str = "") -> None:
 
 
 def legend_below(figure: Figure, handles: dict[str, Artist], rows: int = 1) -> None:
-    """Puts one legend under a figure, where it covers no data, in at least so many rows and as many as it needs."""
+    """Puts one legend below a figure, where it covers no data, in at least `rows` rows and as many as it needs."""
     names, columns = list(handles), max(1, -(-len(handles) // rows))
     while columns > 1 and _width(names, columns) > figure.get_figwidth():
         columns -= 1
@@ -65,4 +65,4 @@ def thousands(value: float, _: object = None) -> str:
 
 def _width(names: list[str], columns: int) -> float:
     """Returns about how wide a legend is [inches]; matplotlib fills one column after the other."""
-    return sum(LETTER * max(map(len, part)) + HANDLE for part in np.array_split(np.array(names), columns))
+    return sum(_LETTER * max(map(len, part)) + _HANDLE for part in np.array_split(np.array(names), columns))

@@ -16,29 +16,29 @@ from matplotlib.figure import Figure
 from experiments.plots.figure_style import STYLE, as_png, label, thousands, with_unit
 from experiments.runs.arms import arm_of
 
-# Panels side by side at most.
-COLUMNS = 4
-# The longest label of a color scale fits into a figure this high [in].
-LEAST_HEIGHT = 2.8
-# Fields darker than this have light numbers; relative luminance, which weighs colors as eyes do.
-DARK = 0.45
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+# Largest number of panels side by side.
+_COLUMNS = 4
+# Height at which the longest label of a color scale fits [inches].
+_MIN_HEIGHT = 2.8
+# Fields whose relative luminance is smaller than this have light numbers; weights of red, green and blue.
+_DARK = 0.45
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """What a heatmap shows.
+    """Quantity that a heatmap shows.
 
     Attributes:
-        key: In an arm's summary.
-        factor: From the summary's unit to the shown one.
-        title: With what the figure is labeled.
-        unit: The shown one.
-        colors: A color map of matplotlib.
+        key: Key of the quantity in an arm's summary.
+        factor: Factor from the unit in the summary to the unit in the figure.
+        title: Label of the color scale.
+        unit: Unit in the figure.
+        colors: Name of a color map of matplotlib.
         low: Start of the color scale; None for the smallest value.
-        high: Its end, unless a value is larger; None for the largest value.
-        caption: A sentence.
-        of_shields: Whether only arms with a shield have it.
+        high: End of the color scale, unless a value is larger; None for the largest value.
+        caption: First sentence of the caption.
+        of_shields: Whether only arms with a shield have the quantity.
     """
 
     key: str
@@ -61,7 +61,7 @@ QUANTITIES = {
         "OrRd",
         0.0,
         10.0,
-        "Violations: share of evaluation episodes in which the true state violates, over all runs of an arm.",
+        "Violations: fraction of evaluation episodes in which the true state violates, over all runs of an arm.",
     ),
     "return": Quantity(
         "eval_return_mean",
@@ -81,17 +81,17 @@ QUANTITIES = {
         "PuBu",
         0.0,
         None,
-        "Interventions: share of the agent's actions in evaluation that the shield overrides.",
+        "Interventions: fraction of the agent's actions in evaluation that the shield overrides.",
         of_shields=True,
     ),
 }
 
 
-def heatmaps_of(summary: dict[str, Any], arms: Sequence[str]) -> dict[str, tuple[str, bytes]]:
+def sweep_figures(summary: dict[str, Any], arms: Sequence[str]) -> dict[str, tuple[str, bytes]]:
     """Returns caption and PNG of every figure by name; without an arm that has a shield, none of interventions."""
     figures = {}
     for name, quantity in QUANTITIES.items():
-        shown = [arm for arm in arms if not quantity.of_shields or arm_of(arm, "project").mode is not None]
+        shown = [arm for arm in arms if not quantity.of_shields or arm_of(arm).mode is not None]
         if shown:
             figure = heatmap_figure(summary["cells"], shown, quantity)
             figures[name] = (heatmap_caption(quantity, summary["cells"], shown), as_png(figure))
@@ -99,7 +99,7 @@ def heatmaps_of(summary: dict[str, Any], arms: Sequence[str]) -> dict[str, tuple
 
 
 def heatmap_caption(quantity: Quantity, cells: Sequence[dict[str, Any]], arms: Sequence[str]) -> str:
-    """Returns what the fields are."""
+    """Returns the caption."""
     runs = max(cell["arms"][arm]["runs"] for cell in cells for arm in arms)
     text = f"{quantity.caption} {runs} {'run' if runs == 1 else 'runs'} per field."
     if quantity.of_shields and "monitor" in arms:
@@ -108,17 +108,17 @@ def heatmap_caption(quantity: Quantity, cells: Sequence[dict[str, Any]], arms: S
 
 
 def heatmap_figure(cells: Sequence[dict[str, Any]], arms: Sequence[str], quantity: Quantity) -> Figure:
-    """Returns one quantity: a panel per arm, a block of them per combination of rounding and burst length."""
+    """Returns one quantity: a panel per arm, a block of them per combination of quantization step and burst length."""
     losses, delays = (sorted({cell[side] for cell in cells}) for side in ("loss", "delay"))
     others = list(dict.fromkeys((cell["quantization_step"], cell["burst_length"]) for cell in cells))
     fields = {(arm, other): _field(cells, arm, other, quantity, losses, delays) for other in others for arm in arms}
     norm = _norm(list(fields.values()), quantity)
-    block = -(-len(arms) // COLUMNS)
+    block = -(-len(arms) // _COLUMNS)
     columns, rows = -(-len(arms) // block), block * len(others)
     height = 0.5 * len(delays) + (0.65 if len(others) > 1 else 0.45)
     with matplotlib.rc_context(STYLE), matplotlib.rc_context({"axes.grid": False}):
         width = 1.8 + max(0.68 * len(losses) + 0.15, 1.7) * columns
-        figure = Figure(figsize=(width, max(0.7 + max(height, 1.3) * rows, LEAST_HEIGHT)), layout="constrained")
+        figure = Figure(figsize=(width, max(0.7 + max(height, 1.3) * rows, _MIN_HEIGHT)), layout="constrained")
         panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
         for at, panel in enumerate(panels.flat):
             row, column = divmod(at, columns)
@@ -167,7 +167,7 @@ def _draw(axis: Axes, values: np.ndarray, colors: str, norm: Normalize) -> None:
     digits = 1 if max(abs(norm.vmin or 0.0), abs(norm.vmax or 0.0)) >= 1.0 else 2
     for (i, j), value in np.ndenumerate(values):
         if np.isfinite(value):
-            dark = np.array(matplotlib.colormaps[colors](norm(value))[:3]) @ LUMINANCE < DARK
+            dark = np.array(matplotlib.colormaps[colors](norm(value))[:3]) @ _LUMINANCE < _DARK
             text = f"{value:.{digits}f}".replace("-", "\N{MINUS SIGN}") if value else "0"
             axis.text(j, i, text, ha="center", va="center", fontsize=9, color="white" if dark else "#222222")
 
@@ -182,8 +182,8 @@ def _name_axes(axis: Axes, losses: list[float], delays: list[int], left: bool, l
 
 
 def _title(arm: str, other: tuple[float | None, float], several: bool) -> str:
-    rounding, burst = other
+    quantization, burst = other
     if not several:
         return arm
     losses = f"bursts of {burst:g}" if burst else "independent losses"
-    return f"{arm}\n{'' if rounding is None else f'rounding {rounding:g}, '}{losses}"
+    return f"{arm}\n{'' if quantization is None else f'quantization {quantization:g}, '}{losses}"

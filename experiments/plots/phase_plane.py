@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import matplotlib
@@ -12,25 +11,23 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.plots.arm_style import style_of
-from experiments.plots.ellipsoid_projection import shadow_of_box, shadow_of_ellipsoid
+from experiments.plots.ellipsoid_projection import projected_box, projected_ellipsoid
 from experiments.plots.figure_style import STYLE, label, legend_below, with_unit
-from experiments.runs.training_run import UnitResult
+from experiments.runs.arms import ResultsByArm
 from ncs_gym import LinearPlant
 from shields import Certificate
 
-# Panels side by side at most.
-COLUMNS = 4
-# Seen is the shadow of box and safe set, this much enlarged; of states far away only that they are is of interest.
-VIEW = 1.75
-INK = "#222222"
-
-Arms = dict[str, Sequence[UnitResult]]
+# Largest number of panels side by side.
+_COLUMNS = 4
+# The view is the projection of box and safe set, enlarged by this factor; states farther away are left out.
+_VIEW = 1.75
+_INK = "#222222"
 
 
-def phase_figure(plant: LinearPlant, certificate: Certificate, arms: Arms) -> Figure:
+def phase_figure(plant: LinearPlant, certificate: Certificate, arms: ResultsByArm) -> Figure:
     """Returns two states of the first evaluation episode of each run, a panel per arm, with safe box and safe set."""
     plane = plane_of(certificate, arms)
-    rows = -(-len(arms) // COLUMNS)
+    rows = -(-len(arms) // _COLUMNS)
     columns = -(-len(arms) // rows)
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(min(11.0, 1.4 + 3.2 * columns), 0.9 + 2.9 * rows), layout="constrained")
@@ -50,16 +47,16 @@ def phase_figure(plant: LinearPlant, certificate: Certificate, arms: Arms) -> Fi
         return figure
 
 
-def phase_caption(plant: LinearPlant, certificate: Certificate, arms: Arms) -> str:
-    """Returns what is seen, and what is not."""
+def phase_caption(plant: LinearPlant, certificate: Certificate, arms: ResultsByArm) -> str:
+    """Returns the caption: what is shown, and what is left out."""
     plane = plane_of(certificate, arms)
     text = "Phase plane: true states of the first evaluation episode of each run, for every arm."
     if plant.n > 2:
         first, second = (plant.state_names[i] for i in plane)
         text += (
-            f" Of the {plant.n} states the two that go furthest in the safe set, {first} and {second}; the curves are"
-            " the shadows of safe set and safe box on their plane, and a state within a shadow may lie outside of"
-            " the set."
+            f" Of the {plant.n} states the two that come closest to the boundary of the safe set, {first} and {second};"
+            " the curves are the projections of safe set and safe box on their plane, and a state within a projection"
+            " may lie outside of the set."
         )
     reach = _reach(plant, certificate, plane)
     if any((np.abs(r.trajectory.states[:, plane]) > reach).any() for results in arms.values() for r in results):
@@ -67,8 +64,8 @@ def phase_caption(plant: LinearPlant, certificate: Certificate, arms: Arms) -> s
     return text
 
 
-def plane_of(certificate: Certificate, arms: Arms) -> tuple[int, int]:
-    """Returns the two states that go furthest, in units of the safe set's extent, in ascending order."""
+def plane_of(certificate: Certificate, arms: ResultsByArm) -> tuple[int, int]:
+    """Returns the two states that are largest in units of the safe set's extent, in ascending order."""
     states = np.concatenate([result.trajectory.states for results in arms.values() for result in results])
     furthest = (np.abs(states) / np.sqrt(np.diag(certificate.L))).max(axis=0)
     first, second = sorted(np.argsort(-furthest, kind="stable")[:2].tolist())
@@ -81,38 +78,38 @@ def _draw_path(
     """Draws one trajectory, its start and its violating states."""
     x, y = states[:, plane].T
     axis.plot(x, y, color=color, lw=0.9, alpha=alpha)
-    (start,) = axis.plot(x[:1], y[:1], "o", ls="none", ms=5, mfc="white", mec=INK, mew=1.0)
+    (start,) = axis.plot(x[:1], y[:1], "o", ls="none", ms=5, mfc="white", mec=_INK, mew=1.0)
     handles: dict[str, Artist] = {"start": start}
     outside = plant.constraint_values(states.T).max(axis=0) > 0.0
     if outside.any():
-        (cross,) = axis.plot(x[outside], y[outside], "x", color=INK, ms=4.5, mew=1.0)
+        (cross,) = axis.plot(x[outside], y[outside], "x", color=_INK, ms=4.5, mew=1.0)
         handles["violation of the true state"] = cross
     return handles
 
 
 def _draw_sets(axis: Axes, plant: LinearPlant, certificate: Certificate, plane: tuple[int, int]) -> dict[str, Artist]:
-    """Draws safe set and safe box, or their shadows."""
-    prefix = "" if plant.n == 2 else "shadow of the "
-    (outline,) = axis.plot(*shadow_of_ellipsoid(certificate.L, plane).T, color=INK, lw=1.3)
+    """Draws safe set and safe box, or their projections."""
+    prefix = "" if plant.n == 2 else "projection of the "
+    (outline,) = axis.plot(*projected_ellipsoid(certificate.L, plane).T, color=_INK, lw=1.3)
     handles: dict[str, Artist] = {f"{prefix}safe set S": outline}
-    box = shadow_of_box(plant.C, plane)
+    box = projected_box(plant.C, plane)
     if box is not None:
-        (outline,) = axis.plot(*box.T, color=INK, lw=1.0, ls="--")
+        (outline,) = axis.plot(*box.T, color=_INK, lw=1.0, ls="--")
         handles[f"{prefix}safe box"] = outline
     return handles
 
 
 def _reach(plant: LinearPlant, certificate: Certificate, plane: tuple[int, int]) -> np.ndarray:
-    """Returns half-widths of what may be seen, shape (2,) [units of the states]."""
-    outlines = [shadow_of_ellipsoid(certificate.L, plane), shadow_of_box(plant.C, plane)]
-    return VIEW * np.max([np.abs(outline).max(axis=0) for outline in outlines if outline is not None], axis=0)
+    """Returns the largest half-widths of the view, shape (2,) [units of the states]."""
+    outlines = [projected_ellipsoid(certificate.L, plane), projected_box(plant.C, plane)]
+    return _VIEW * np.max([np.abs(outline).max(axis=0) for outline in outlines if outline is not None], axis=0)
 
 
-def _view(axis: Axes, plant: LinearPlant, certificate: Certificate, arms: Arms, plane: tuple[int, int]) -> None:
-    """Shows all of the sets, and of the trajectories what is not too far."""
+def _view(axis: Axes, plant: LinearPlant, certificate: Certificate, arms: ResultsByArm, plane: tuple[int, int]) -> None:
+    """Limits the view to the sets and the trajectories near them."""
     reach = _reach(plant, certificate, plane)
     states = np.concatenate([result.trajectory.states for results in arms.values() for result in results])
-    half = np.clip(1.05 * np.abs(states[:, plane]).max(axis=0), 1.08 * reach / VIEW, reach)
+    half = np.clip(1.05 * np.abs(states[:, plane]).max(axis=0), 1.08 * reach / _VIEW, reach)
     axis.set_xlim(-half[0], half[0])
     axis.set_ylim(-half[1], half[1])
 

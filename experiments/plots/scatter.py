@@ -1,4 +1,4 @@
-"""Cost against return: what safety costs each arm."""
+"""Safety cost against return of each arm."""
 
 from __future__ import annotations
 
@@ -14,25 +14,24 @@ from matplotlib.ticker import MaxNLocator
 
 from experiments.plots.arm_style import ArmStyle, style_of
 from experiments.plots.figure_style import STYLE, label, legend_below, thousands
-from experiments.runs.training_run import UnitResult
+from experiments.runs.arms import ResultsByArm
+from experiments.runs.training_run import RunResult
 
-# Markers of the first arm and of the last [points]: where arms coincide, those below show.
-SIZES = (12.0, 7.5)
-
-Arms = dict[str, Sequence[UnitResult]]
+# Marker sizes of the first and of the last arm [points]: where arms coincide, the lower ones are visible.
+_SIZES = (12.0, 7.5)
 
 
-def scatter_figure(summary: dict[str, dict[str, Any]], arms: Arms) -> Figure:
+def scatter_figure(summary: dict[str, dict[str, Any]], arms: ResultsByArm) -> Figure:
     """Returns mean return against violating steps per episode and against violating episodes.
 
     Args:
-        summary: Of each arm.
-        arms: The results of each arm.
+        summary: Summary of each arm.
+        arms: Results of each arm.
     """
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11.0, 4.4), layout="constrained")
         steps, episodes = figure.subplots(1, 2, sharey=True)
-        sizes = np.linspace(*SIZES, len(arms))
+        sizes = np.linspace(*_SIZES, len(arms))
         styles = {name: replace(style_of(name), size=float(size)) for name, size in zip(arms, sizes, strict=True)}
         for name, results in arms.items():
             arm, style = summary[name], styles[name]
@@ -49,8 +48,8 @@ def scatter_figure(summary: dict[str, dict[str, Any]], arms: Arms) -> Figure:
         return figure
 
 
-def scatter_caption(arms: Arms) -> str:
-    """Returns what points and bars are."""
+def scatter_caption(arms: ResultsByArm) -> str:
+    """Returns the caption: what points and bars are."""
     runs = max(len(results) for results in arms.values())
     text = "Cost and return in evaluation, better to the upper left."
     if runs > 1:
@@ -82,12 +81,12 @@ def _draw_arm(
     """Draws an arm's runs and mean, with the intervals that there are.
 
     Args:
-        axis: Where.
-        style: The arm's look.
-        arm: Its summary.
-        costs: Of each run.
-        cost: Of all.
-        bounds: The interval of the cost.
+        axis: Axis to draw on.
+        style: Style of the arm.
+        arm: Summary of the arm.
+        costs: Cost of each run.
+        cost: Cost of all runs together.
+        bounds: Confidence interval of the cost.
     """
     mean = arm["eval_return_mean"]
     if len(costs) > 1:
@@ -100,7 +99,7 @@ def _draw_arm(
 
 
 def _scale(axis: Axes) -> None:
-    """Lets the axis of costs begin at zero, with room for markers there."""
+    """Lets the axis of costs begin at zero, with space for markers there."""
     high = axis.dataLim.x1 if axis.dataLim.x1 > 0.0 else 1.0
     axis.set_xlim(-0.04 * high, 1.06 * high)
     axis.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
@@ -108,5 +107,5 @@ def _scale(axis: Axes) -> None:
     axis.yaxis.set_major_formatter(thousands)
 
 
-def _mean(result: UnitResult, name: str) -> float:
+def _mean(result: RunResult, name: str) -> float:
     return float(np.mean([getattr(episode, name) for episode in result.episodes]))

@@ -15,16 +15,13 @@ from matplotlib.lines import Line2D
 from agents.trajectory import Trajectory
 from experiments.plots.arm_style import style_of
 from experiments.plots.figure_style import STYLE, label, legend_below, with_unit
-from experiments.runs.arms import arm_of
-from experiments.runs.training_run import UnitResult
+from experiments.runs.arms import ResultsByArm, arm_of
 from ncs_gym import LinearPlant
 
-INK = "#222222"
-# Of the lines of the shown arms: where they coincide, the lower one shows.
-WIDTHS = (2.6, 1.2)
-LIMIT = {"color": INK, "lw": 1.0, "ls": (0, (6.0, 3.0))}
-
-Arms = dict[str, Sequence[UnitResult]]
+_INK = "#222222"
+# Line widths of the arms shown: where lines coincide, the lower one is visible.
+_WIDTHS = (2.6, 1.2)
+_LIMIT = {"color": _INK, "lw": 1.0, "ls": (0, (6.0, 3.0))}
 
 
 def shown_arms(names: Sequence[str]) -> list[str]:
@@ -32,12 +29,12 @@ def shown_arms(names: Sequence[str]) -> list[str]:
 
     Without a shielded arm, or without any other, fewer.
     """
-    shielded = [name for name in names if arm_of(name, "project").mode not in (None, "monitor")]
+    shielded = [name for name in names if arm_of(name).is_shielded]
     bare = sorted((name for name in names if name not in shielded), key=lambda name: name != "unshielded")
     return bare[:1] + shielded[:1]
 
 
-def episode_figure(plant: LinearPlant, arms: Arms) -> Figure:
+def episode_figure(plant: LinearPlant, arms: ResultsByArm) -> Figure:
     """Returns the same evaluation episode of the first runs of the shown arms.
 
     From above: the largest |c_j x| of state and estimate, a panel per input, and a row of ticks per kind of event.
@@ -59,12 +56,12 @@ def episode_figure(plant: LinearPlant, arms: Arms) -> Figure:
         return figure
 
 
-def episode_caption(arms: Arms) -> str:
-    """Returns which episode is seen, and what is marked."""
+def episode_caption(arms: ResultsByArm) -> str:
+    """Returns the caption: which episode is shown, and what is marked."""
     names = shown_arms(list(arms))
     paths = [arms[name][0].trajectory for name in names]
     text = f"Time series: the first evaluation episode of the first run, {' and '.join(names)}"
-    text += ", with the same draws of nature." if len(names) > 1 else "."
+    text += ", with common random numbers." if len(names) > 1 else "."
     text += (
         " Above, how close true state and estimate come to the limits: one beyond 1 violates a limit. Below, the"
         " applied inputs. Ticks mark packet"
@@ -80,15 +77,15 @@ def _draw_states(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant) -
     """Draws the largest |c_j x| of states and estimates, and marks the violations."""
     handles: dict[str, Artist] = {}
     crosses: list[Line2D] = []
-    for (name, path), width in zip(paths.items(), WIDTHS, strict=False):
+    for (name, path), width in zip(paths.items(), _WIDTHS, strict=False):
         color = style_of(name).color
         time = plant.dt * np.arange(len(path.states))
         true, estimated = (np.abs(x @ plant.C.T).max(axis=1) for x in (path.states, path.estimates))
         (handles[name],) = axis.plot(time, true, color=color, lw=width)
         (handles[f"{name}, estimate"],) = axis.plot(time, estimated, color=_dark(color), lw=1.1, ls=":", zorder=3)
         if (true > 1.0).any():
-            crosses = axis.plot(time[true > 1.0], true[true > 1.0], "x", color=INK, ms=4.5, mew=1.0, zorder=4)
-    handles["limit"] = axis.axhline(1.0, **LIMIT)
+            crosses = axis.plot(time[true > 1.0], true[true > 1.0], "x", color=_INK, ms=4.5, mew=1.0, zorder=4)
+    handles["limit"] = axis.axhline(1.0, **_LIMIT)
     if crosses:
         handles["violation of the true state"] = crosses[0]
     label(axis, "", "largest |c$_j$ x|", "First evaluation episode of the first run")
@@ -97,14 +94,14 @@ def _draw_states(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant) -
 
 
 def _dark(color: str) -> tuple[float, ...]:
-    """Returns a color that shows on a line of the given one."""
+    """Returns a color that is visible on a line of the given color."""
     return tuple(0.5 * part for part in to_rgb(color))
 
 
 def _draw_input(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant, i: int) -> dict[str, Artist]:
     """Draws one input of all arms, and what was proposed in its place."""
     handles: dict[str, Artist] = {}
-    for (name, path), width in zip(paths.items(), WIDTHS, strict=False):
+    for (name, path), width in zip(paths.items(), _WIDTHS, strict=False):
         style = style_of(name)
         edges = plant.dt * np.arange(len(path.inputs) + 1)
         axis.stairs(path.inputs[:, i], edges, baseline=None, color=style.color, lw=width)
@@ -114,11 +111,11 @@ def _draw_input(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant, i:
             axis.vlines(
                 middle, path.inputs[changed, i], path.proposed[changed, i], color=style.color, lw=0.7, alpha=0.6
             )
-            axis.plot(middle, path.proposed[changed, i], ".", color=INK, ms=4.0)
-            handles["proposed, but overridden"] = Line2D([], [], ls="none", marker=".", color=INK)
+            axis.plot(middle, path.proposed[changed, i], ".", color=_INK, ms=4.0)
+            handles["proposed, but overridden"] = Line2D([], [], ls="none", marker=".", color=_INK)
     limit = float(np.atleast_1d(plant.u_max)[i])
     for end in (-limit, limit):
-        axis.axhline(end, **LIMIT)
+        axis.axhline(end, **_LIMIT)
     axis.set_ylim(-1.15 * limit, 1.15 * limit)
     label(
         axis,
@@ -129,17 +126,17 @@ def _draw_input(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant, i:
 
 
 def _events(paths: dict[str, Trajectory], plant: LinearPlant) -> dict[str, tuple[np.ndarray, str]]:
-    """Returns times [s] and color by name of each kind of event, from below."""
+    """Returns times [s] and color of each kind of event by name, from below."""
     longest = max(paths, key=lambda name: len(paths[name].arrivals))
     events: dict[str, tuple[np.ndarray, str]] = {}
     for name, path in paths.items():
         count = len(path.arrivals)
-        # Same draws of nature: as a rule packets arrive alike in all arms, and once is enough.
+        # With common random numbers packets arrive alike in all arms as a rule, and are shown once.
         if name == longest or not np.array_equal(path.arrivals, paths[longest].arrivals[:count]):
             row = "packet arrivals" if name == longest else f"packet arrivals, {name}"
-            events[row] = plant.dt * (1.0 + np.flatnonzero(path.arrivals)), INK
+            events[row] = plant.dt * (1.0 + np.flatnonzero(path.arrivals)), _INK
     for name, path in paths.items():
-        mode = arm_of(name, "project").mode
+        mode = arm_of(name).mode
         if mode is not None:
             row = f"would override, {name}" if mode == "monitor" else "interventions"
             events[row] = plant.dt * (0.5 + np.flatnonzero(path.intervened)), style_of(name).color
@@ -147,7 +144,7 @@ def _events(paths: dict[str, Trajectory], plant: LinearPlant) -> dict[str, tuple
 
 
 def _draw_events(axis: Axes, events: dict[str, tuple[np.ndarray, str]]) -> None:
-    """Draws a row of ticks per kind."""
+    """Draws a row of ticks per kind of event."""
     for row, (times, color) in enumerate(events.values()):
         axis.vlines(times, row - 0.36, row + 0.36, color=color, lw=1.2)
     axis.set_yticks(range(len(events)), [f"{name} ({len(times):,})" for name, (times, _) in events.items()])

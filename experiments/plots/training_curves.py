@@ -15,24 +15,22 @@ from matplotlib.ticker import MaxNLocator
 
 from experiments.plots.arm_style import ArmStyle, style_of
 from experiments.plots.figure_style import STYLE, label, legend_below, thousands
-from experiments.runs.arms import Arm, arm_of
-from experiments.runs.training_run import UnitResult
+from experiments.runs.arms import ResultsByArm, arm_of
+from experiments.runs.training_run import RunResult
 
-# Curves of fewer points show them.
-FEW_POINTS = 5
-# Interventions of agents in many environments rise and fall with the episodes, which start together: their rate is
-# averaged over this many steps, an episode of 200 in each of 64 environments.
+# Curves of fewer points show each point.
+_FEW_POINTS = 5
+# The rate of interventions is averaged over this many steps, an episode of 200 in each of 64 environments: it rises and
+# falls with the episodes, which start together.
 RATE_WINDOW = 64 * 200
 
-Arms = dict[str, Sequence[UnitResult]]
 
-
-def training_figure(arms: Arms) -> Figure:
+def training_figure(arms: ResultsByArm) -> Figure:
     """Returns return, violating steps so far and intervention rate against training steps, bands over runs.
 
     Without an arm that watches for unsafe actions there is no third panel.
     """
-    watching = [name for name in arms if _arm(name).mode is not None]
+    watching = [name for name in arms if arm_of(name).mode is not None]
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11.0, 3.9), layout="constrained")
         axes = figure.subplots(1, 3 if watching else 2)
@@ -61,8 +59,8 @@ def training_figure(arms: Arms) -> Figure:
         return figure
 
 
-def training_caption(arms: Arms) -> str:
-    """Returns what the lines and bands are."""
+def training_caption(arms: ResultsByArm) -> str:
+    """Returns the caption: what the lines and bands are."""
     runs = max(len(results) for results in arms.values())
     band = (
         f"Lines are means over {runs} runs per arm, bands reach from the lowest to the highest run."
@@ -70,17 +68,17 @@ def training_caption(arms: Arms) -> str:
         else "One run per arm, so there is no band."
     )
     text = f"Training. {band} The return begins where every run has finished an episode."
-    if any(_arm(name).mode is not None for name in arms):
+    if any(arm_of(name).mode is not None for name in arms):
         text += f" Interventions are rates over the last {RATE_WINDOW:,} steps (over all, before there are as many)."
     if "monitor" in arms:
         text += " The monitor's are what the shield would have overridden; its agent is the unshielded one."
-    paying = [name for name in arms if _arm(name).prices_interventions or _arm(name).prices_violations]
-    if paying:
-        text += f" The return in training contains the penalties that {' and '.join(paying)} pay."
+    penalized = [name for name in arms if arm_of(name).penalizes_interventions or arm_of(name).penalizes_violations]
+    if penalized:
+        text += f" The return in training contains the penalties that {' and '.join(penalized)} get."
     return text
 
 
-def common_steps(results: Sequence[UnitResult]) -> np.ndarray:
+def common_steps(results: Sequence[RunResult]) -> np.ndarray:
     """Returns steps that all runs of an arm have reached, shape (points,): those of the run with the shortest history.
 
     Runs of one arm may note their totals at different steps; others are interpolated there.
@@ -103,11 +101,7 @@ def rates(steps: np.ndarray, totals: np.ndarray) -> np.ndarray:
     return (totals - before) / (steps - past)
 
 
-def _arm(name: str) -> Arm:
-    return arm_of(name, "project")
-
-
-def _on(steps: np.ndarray, results: Sequence[UnitResult], name: str) -> np.ndarray:
+def _on(steps: np.ndarray, results: Sequence[RunResult], name: str) -> np.ndarray:
     """Returns one quantity of the histories at some steps, shape (runs, points)."""
     rows = []
     for result in results:
@@ -121,10 +115,10 @@ def _draw(axis: Axes, steps: np.ndarray, values: np.ndarray, style: ArmStyle) ->
     """Draws the mean of the runs, shape (runs, points), and a band from the lowest to the highest."""
     if len(values) > 1:
         low, high = values.min(axis=0), values.max(axis=0)
-        if len(steps) < FEW_POINTS:
+        if len(steps) < _FEW_POINTS:
             axis.vlines(steps, low, high, color=style.color, lw=1.5, alpha=0.6)
         axis.fill_between(steps, low, high, color=style.color, alpha=0.16, lw=0.0)
-    points: dict[str, Any] = style.points if len(steps) < FEW_POINTS else {}
+    points: dict[str, Any] = style.points if len(steps) < _FEW_POINTS else {}
     axis.plot(steps, values.mean(axis=0), lw=1.9, **style.line, **points)
 
 
@@ -143,8 +137,8 @@ def _scale(axis: Axes, last: float, from_zero: bool) -> None:
         side.set_major_formatter(thousands)
 
 
-def _handles(arms: Arms) -> dict[str, Artist]:
-    points = any(len(common_steps(results)) < FEW_POINTS for results in arms.values())
+def _handles(arms: ResultsByArm) -> dict[str, Artist]:
+    points = any(len(common_steps(results)) < _FEW_POINTS for results in arms.values())
     handles: dict[str, Artist] = {name: style_of(name).handle(points=points) for name in arms}
     if any(len(results) > 1 for results in arms.values()):
         handles["lowest to highest run"] = Patch(color="#555555", alpha=0.2, lw=0.0)

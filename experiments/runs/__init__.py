@@ -1,1 +1,21 @@
-"""The unit of work: one training run, the setup it takes place in, and its stored result."""
+"""The unit of work: a training run, the setup it takes place in, and the store of finished results."""
+
+from experiments.runs.arms import Arm, arm_of, by_arm
+from experiments.runs.experiment_setup import ExperimentSetup, experiment_setup
+from experiments.runs.provenance import versions
+from experiments.runs.run_store import RunStore, prepare_output
+from experiments.runs.training_run import RunResult, TrainingRun, execute_run
+
+__all__ = [
+    "Arm",
+    "ExperimentSetup",
+    "RunResult",
+    "RunStore",
+    "TrainingRun",
+    "arm_of",
+    "by_arm",
+    "execute_run",
+    "experiment_setup",
+    "prepare_output",
+    "versions",
+]

@@ -2,41 +2,62 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-MODES = ("project", "switch", "boundary")
-PENALTY = "+penalty"
-NAMES = "unshielded, monitor, penalized, shielded, shielded:MODE, each shielded one also with +penalty"
+from experiments.runs.training_run import RunResult
+
+SHIELD_MODES = ("project", "switch", "boundary")
+PENALTY_SUFFIX = "+penalty"
+_KNOWN_ARMS = "unshielded, monitor, penalized, shielded, shielded:MODE, each shielded one also with +penalty"
+
+# Results of the training runs of each arm, in the order of their indices.
+ResultsByArm = dict[str, Sequence[RunResult]]
 
 
 @dataclass(frozen=True)
 class Arm:
-    """How agents of an arm are trained and evaluated.
+    """How the agents of an arm are trained and evaluated.
 
     Attributes:
-        name: As the user writes it.
-        mode: Of the shield; None for none.
-        prices_interventions: Whether the reward is less by a penalty per intervention.
-        prices_violations: Whether it is less by a penalty per violating step.
+        name: Name of the arm on the command line.
+        mode: Mode of the shield; None for no shield.
+        penalizes_interventions: Whether the training reward is reduced per intervention.
+        penalizes_violations: Whether the training reward is reduced per violating step.
     """
 
     name: str
     mode: str | None
-    prices_interventions: bool = False
-    prices_violations: bool = False
+    penalizes_interventions: bool = False
+    penalizes_violations: bool = False
+
+    @property
+    def is_shielded(self) -> bool:
+        """Whether a shield acts; a monitor only watches."""
+        return self.mode not in (None, "monitor")
 
 
-def arm_of(name: str, mode: str) -> Arm:
-    """Returns the arm of a name; "shielded" without a mode of its own takes `mode`.
+def arm_of(name: str, mode: str = "project") -> Arm:
+    """Returns the arm of a name.
+
+    Args:
+        name: Name of the arm on the command line.
+        mode: Mode of the shield of arms that name none.
 
     Raises:
         ValueError: If the name is unknown.
     """
     if name in ("unshielded", "penalized"):
-        return Arm(name, None, prices_violations=name == "penalized")
+        return Arm(name, None, penalizes_violations=name == "penalized")
     if name == "monitor":
         return Arm(name, "monitor")
-    kind, _, own = name.removesuffix(PENALTY).partition(":")
-    if kind != "shielded" or (":" in name and own not in MODES):
-        raise ValueError(f"unknown arm {name!r}; known are {NAMES} (modes: {', '.join(MODES)})")
-    return Arm(name, own or mode, prices_interventions=name.endswith(PENALTY))
+    kind, _, own_mode = name.removesuffix(PENALTY_SUFFIX).partition(":")
+    if kind != "shielded" or (":" in name and own_mode not in SHIELD_MODES):
+        raise ValueError(f"unknown arm {name!r}; known are {_KNOWN_ARMS} (modes: {', '.join(SHIELD_MODES)})")
+    return Arm(name, own_mode or mode, penalizes_interventions=name.endswith(PENALTY_SUFFIX))
+
+
+def by_arm(results: Sequence[RunResult]) -> ResultsByArm:
+    """Returns the results of each arm in the order of their runs."""
+    names = dict.fromkeys(result.arm for result in results)
+    return {name: sorted((r for r in results if r.arm == name), key=lambda r: r.index) for name in names}

@@ -1,4 +1,4 @@
-"""Policies that need no training, and trained ones from a file."""
+"""Policies by name: some that need no training, and trained agents from a folder."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from ncs_gym import NCSEnv, SetpointTracking, SpeedTracking
 
-UNTRAINED = ("greedy", "zero", "random")
+UNTRAINED_POLICIES = ("greedy", "zero", "random")
 
 # Maps an observation, shape (entries,), and its info to an action, shape (m,).
 Policy = Callable[[np.ndarray, dict], np.ndarray]
@@ -20,9 +20,9 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
 
     Args:
         name: "greedy", "zero", "random", or the folder of a trained agent.
-        env_id: The environment's id.
+        env_id: Id of the environment.
         env: The environment.
-        seed: Of the random policy.
+        seed: Seed of the random policy.
 
     Raises:
         AgentError: If there is no agent for this environment.
@@ -35,7 +35,7 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
         return lambda observation, info: rng.uniform(-1.0, 1.0, size).astype(np.float32)
     if name == "greedy":
         return lambda observation, info: greedy_action(env, observation, info["estimate"])
-    from agents.agent import Agent, AgentError  # takes torch
+    from agents.agent import Agent, AgentError  # imports torch
 
     agent = Agent.load(Path(name))
     if agent.env != env_id:
@@ -44,16 +44,16 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
 
 
 def greedy_action(env: NCSEnv, observation: np.ndarray, estimate: np.ndarray) -> np.ndarray:
-    """Returns the action, shape (m,), whose next step brings the task's goal closest, blind to the safe box.
+    """Returns the action, shape (m,), that comes closest to the task's goal in one step and ignores the safe box.
 
-    For `SpeedTracking` the speed's error, for `SetpointTracking` the output's, is removed with all the input there is,
-    and with just enough where less will do. Elsewhere |C x+| becomes as small as the unlimited least squares, clipped,
-    make it.
+    For `SpeedTracking` it removes the tracking error of the speed, for `SetpointTracking` that of the output, with as
+    little input as possible or with the largest input. For other tasks it is the clipped least-squares solution of
+    C x+ = 0.
 
     Args:
-        env: Gives plant and task.
-        observation: Whose last entry is the task's.
-        estimate: x_hat, shape (n,).
+        env: Environment with the plant and the task.
+        observation: Observation, whose last entry belongs to the task.
+        estimate: Estimate x_hat, shape (n,).
     """
     plant, task = env.plant, env.task
     if isinstance(task, SpeedTracking):
@@ -64,6 +64,6 @@ def greedy_action(env: NCSEnv, observation: np.ndarray, estimate: np.ndarray) ->
     else:
         u = np.linalg.lstsq(plant.C @ plant.B, -plant.C @ plant.A @ estimate)[0]
         return np.clip(u / plant.u_max, -1.0, 1.0).astype(np.float32)
-    most = float(np.abs(effect) @ plant.u_max)
-    share = min(1.0, abs(missing) / most) if most > 0.0 else 0.0
-    return (share * np.sign(missing * effect)).astype(np.float32)
+    largest = float(np.abs(effect) @ plant.u_max)
+    fraction = min(1.0, abs(missing) / largest) if largest > 0.0 else 0.0
+    return (fraction * np.sign(missing * effect)).astype(np.float32)

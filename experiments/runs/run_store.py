@@ -1,10 +1,10 @@
-"""Finished units in a folder, so that an interrupted experiment goes on where it was."""
+"""Results of finished training runs in a folder, so that an interrupted experiment continues where it stopped."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +14,35 @@ from agents.evaluation import Episode
 from agents.history import TrainingPoint
 from agents.trajectory import Trajectory
 from experiments.errors import ResultsError
-from experiments.runs.training_run import Unit, UnitResult
+from experiments.runs.provenance import json_digest
+from experiments.runs.training_run import RunResult, TrainingRun
 from shields.atomic_write import write_atomically
 
-FORMAT = "ncs-gym unit 1"
+_FORMAT = "ncs-gym unit 1"
 
 
-class UnitStore:
-    """Results of units: `units/NAME.json`, and the trained agents beside them in `models/NAME/`.
-
-    Args:
-        folder: Of the experiment; made if it is missing.
+def prepare_output(folder: Path) -> None:
+    """Creates an output folder and removes an earlier summary, tables, figures and report, which belong together.
 
     Raises:
-        OSError: If it cannot be written.
+        OSError: If the folder cannot be written.
+    """
+    (folder / "figures").mkdir(parents=True, exist_ok=True)
+    write_atomically(folder / ".writable", "")
+    (folder / ".writable").unlink()
+    stale = (folder / "summary.json", folder / "report.html", *folder.glob("*.parquet"), *folder.glob("figures/*.png"))
+    for file in stale:
+        file.unlink(missing_ok=True)
+
+
+class RunStore:
+    """Results of training runs in `units/NAME.json`, and the trained agents beside them in `models/NAME/`.
+
+    Args:
+        folder: Folder of the experiment; created if it is missing.
+
+    Raises:
+        OSError: If the folder cannot be written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -35,100 +50,81 @@ class UnitStore:
         for name in ("units", "models"):
             (folder / name).mkdir(parents=True, exist_ok=True)
 
-    def save(self, unit: Unit, result: UnitResult) -> None:
-        """Writes a result, its agent first, so that a stored result is complete.
+    def save(self, run: TrainingRun, result: RunResult) -> None:
+        """Writes the result of a run, its agent first, so that a stored result is complete.
 
         Raises:
             OSError: If a file cannot be written.
         """
-        self._path(unit).unlink(missing_ok=True)  # an older result must not point to the newer agent
-        models = self._folder / "models" / unit.name
+        self._path(run).unlink(missing_ok=True)  # an older result must not point to the newer agent
+        models = self._folder / "models" / run.name
         if result.files:
             models.mkdir(exist_ok=True)
         for name, content in result.files.items():
             write_atomically(models / name, content)
-        content = _content(result)
-        document = {"format": FORMAT, "key": unit.key, "sha256": _digest(content), "result": content}
-        write_atomically(self._path(unit), json.dumps(document) + "\n")
+        content = _to_json(result)
+        document = {"format": _FORMAT, "key": run.key, "sha256": json_digest(content), "result": content}
+        write_atomically(self._path(run), json.dumps(document) + "\n")
 
-    def load(self, unit: Unit) -> UnitResult | None:
-        """Returns the stored result of a unit; None if there is none or it is that of other settings.
+    def load(self, run: TrainingRun) -> RunResult | None:
+        """Returns the stored result of a run; None if there is none or if it belongs to other settings.
 
         Raises:
             ResultsError: If a file is damaged.
         """
-        path = self._path(unit)
+        path = self._path(run)
         try:
-            text = path.read_bytes()
+            document = json.loads(path.read_bytes())
+            if document["format"] != _FORMAT:
+                return None
+            content = document["result"]
+            if document["sha256"] != json_digest(content):
+                raise ResultsError(f"{path} was altered: its checksum does not match; delete it to repeat the run")
+            return _from_json(content, self._files(run, content["files"])) if document["key"] == run.key else None
         except FileNotFoundError:
             return None
-        try:
-            document = json.loads(text)
-            if document["format"] != FORMAT:
-                return None
-            if document["sha256"] != _digest(document["result"]):
-                raise ResultsError(f"{path} was altered: its checksum does not match; delete it to run the unit again")
-            return _result(document["result"], self._files(unit, document)) if document["key"] == unit.key else None
         except ResultsError:
             raise
         except (KeyError, TypeError, ValueError, RecursionError) as error:
-            raise ResultsError(f"{path} is damaged; delete it to run the unit again") from error
+            raise ResultsError(f"{path} is damaged; delete it to repeat the run") from error
 
-    def _files(self, unit: Unit, document: dict[str, Any]) -> dict[str, bytes]:
-        """Returns the agent's files.
-
-        Raises:
-            ResultsError: If one is missing or not the one that was stored.
-        """
+    def _files(self, run: TrainingRun, digests: dict[str, str]) -> dict[str, bytes]:
+        """Returns the contents of the agent's files; ResultsError if one is missing or is not the one stored."""
         files = {}
-        for name, digest in document["result"]["files"].items():
-            path = self._folder / "models" / unit.name / name
+        for name, digest in digests.items():
+            path = self._folder / "models" / run.name / name
             content = path.read_bytes() if path.is_file() else b""
             if hashlib.sha256(content).hexdigest() != digest:
-                raise ResultsError(f"{path} is missing or was altered; delete {self._path(unit)} to run the unit again")
+                raise ResultsError(f"{path} is missing or was altered; delete {self._path(run)} to repeat the run")
             files[name] = content
         return files
 
-    def _path(self, unit: Unit) -> Path:
-        return self._folder / "units" / f"{unit.name}.json"
+    def _path(self, run: TrainingRun) -> Path:
+        return self._folder / "units" / f"{run.name}.json"
 
 
-def _content(result: UnitResult) -> dict[str, Any]:
-    """Returns a result as JSON values; files by their checksums."""
-    trajectory = {entry.name: getattr(result.trajectory, entry.name).tolist() for entry in fields(Trajectory)}
-    return {
-        "arm": result.arm,
-        "index": result.index,
-        "train_steps": result.train_steps,
-        "train_violation_steps": result.train_violation_steps,
-        "train_interventions": result.train_interventions,
-        "history": [_without_nan(asdict(point)) for point in result.history],
-        "episodes": [_without_nan(asdict(episode)) for episode in result.episodes],
-        "trajectory": trajectory,
-        "files": {name: hashlib.sha256(content).hexdigest() for name, content in result.files.items()},
-    }
+def _to_json(result: RunResult) -> dict[str, Any]:
+    """Returns a result as JSON values: NaN is null, and files are represented by their checksums."""
+    content = asdict(result)
+    for name in ("history", "episodes"):
+        content[name] = [{key: None if x != x else x for key, x in entry.items()} for entry in content[name]]
+    content["trajectory"] = {name: array.tolist() for name, array in content["trajectory"].items()}
+    content["files"] = {name: hashlib.sha256(file).hexdigest() for name, file in result.files.items()}
+    return content
 
 
-def _result(content: dict[str, Any], files: dict[str, bytes]) -> UnitResult:
-    """Returns the result that `_content` made."""
+def _from_json(content: dict[str, Any], files: dict[str, bytes]) -> RunResult:
+    """Returns the result that `_to_json` was given."""
+
+    def restored(entry: dict[str, Any]) -> dict[str, Any]:
+        return {key: float("nan") if x is None else x for key, x in entry.items()}
+
     flags = ("intervened", "arrivals")
-    arrays = {name: np.array(v, np.bool_ if name in flags else float) for name, v in content["trajectory"].items()}
+    arrays = {name: np.array(x, np.bool_ if name in flags else float) for name, x in content["trajectory"].items()}
     values = content | {
-        "history": [TrainingPoint(**_with_nan(point)) for point in content["history"]],
-        "episodes": [Episode(**_with_nan(episode)) for episode in content["episodes"]],
+        "history": [TrainingPoint(**restored(point)) for point in content["history"]],
+        "episodes": [Episode(**restored(episode)) for episode in content["episodes"]],
         "trajectory": Trajectory(**arrays),
         "files": files,
     }
-    return UnitResult(**values)
-
-
-def _without_nan(values: dict[str, Any]) -> dict[str, Any]:
-    return {name: None if value != value else value for name, value in values.items()}
-
-
-def _with_nan(values: dict[str, Any]) -> dict[str, Any]:
-    return {name: float("nan") if value is None else value for name, value in values.items()}
-
-
-def _digest(content: Any) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    return RunResult(**values)

@@ -1,23 +1,22 @@
-"""The unit of work: one policy trained and evaluated; a pure function of its settings."""
+"""The unit of work: one policy, trained and evaluated; its result is a pure function of its settings."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import gymnasium as gym
 import numpy as np
 
 from agents.control_loop import ControlLoop, Shielding
 from agents.evaluation import Episode, Policy, evaluate
 from agents.history import TrainingPoint
-from agents.settings import AgentSettings
+from agents.settings import AgentSettings, OffPolicySettings
 from agents.trajectory import Trajectory
-from experiments.runs.provenance import versions
+from experiments.runs.provenance import json_digest, versions
 from ncs_gym import Channel
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate
@@ -25,33 +24,34 @@ from shields import Certificate
 if TYPE_CHECKING:
     from agents.training import TrainingResult
 
-Learner = Literal["agent", "untrained", "gain", "zero"]
+PolicyKind = Literal["trained", "untrained", "certified gain", "zero"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Unit:
-    """Settings of one unit.
+class TrainingRun:
+    """Settings of one training run.
 
     Attributes:
-        arm: Name of the arm it belongs to.
-        learner: "agent" is trained; "untrained" has its initial weights, "gain" is u = K x_hat, "zero" does nothing.
-        env: A registered id.
-        channel: In place of the environment's own.
-        seed: Of the experiment.
+        arm: Name of the arm that the run belongs to.
+        policy_kind: "trained" is a trained agent; "untrained" an agent with its initial weights; "certified gain"
+            applies u = K x_hat; "zero" applies no input.
+        env: Id of a registered environment.
+        channel: Channel that replaces the environment's own; None keeps it.
+        seed: Seed of the experiment.
         index: Number of the run within its arm; runs with equal index are paired across arms.
         steps: Training steps.
         episodes: Evaluation episodes.
-        certificate: For the shield and for x'Mx.
-        mode: The shield's; None for no shield.
+        certificate: Certificate of the shield, which also defines x'Mx.
+        mode: Mode of the shield; None for no shield.
         intervention_penalty: Subtracted from the training reward per intervention.
         violation_penalty: Subtracted from the training reward per violating step.
-        algorithm: A name in `agents.algorithms`.
-        settings: Of the algorithm.
-        place: Where in a sweep it belongs; for its name only.
+        algorithm: Name of the learning algorithm, a key of `agents.algorithms`.
+        settings: Settings of the learning algorithm.
+        grid_point: Name of the point of a sweep's grid; part of the run's name only.
     """
 
     arm: str
-    learner: Learner
+    policy_kind: PolicyKind
     env: str
     channel: Channel | None = None
     seed: int
@@ -64,16 +64,16 @@ class Unit:
     violation_penalty: float = 0.0
     algorithm: str
     settings: AgentSettings
-    place: str = ""
+    grid_point: str = ""
 
     @property
     def name(self) -> str:
-        """For files and progress lines."""
-        return "-".join(filter(None, (self.place, self.arm, str(self.index)))).replace(" ", "-").replace(":", "-")
+        """Name of the run in file names and progress lines."""
+        return "-".join(filter(None, (self.grid_point, self.arm, str(self.index)))).replace(" ", "-").replace(":", "-")
 
     @property
     def loop(self) -> ControlLoop:
-        """What the policy is trained and evaluated in."""
+        """Control loop that the policy is trained and evaluated in."""
         shielding = None
         if self.mode is not None:
             shielding = Shielding(self.certificate, self.mode, self.intervention_penalty)
@@ -83,42 +83,51 @@ class Unit:
 
     @property
     def training_seed(self) -> int:
-        """Seed of training environments and network; alike in all arms."""
+        """Seed of the training environments and of the networks; the same in all arms."""
         return self._seeds()[0]
 
     @property
     def evaluation_seed(self) -> int:
-        """Seed of the evaluation episodes; alike in all arms."""
+        """Seed of the evaluation episodes; the same in all arms."""
         return self._seeds()[1]
 
     @property
     def key(self) -> str:
         """SHA-256 of everything the result depends on: all settings, this project's source and versions of packages."""
-        content = {
-            name: getattr(self, name) for name in self.__dataclass_fields__ if name not in ("certificate", "place")
-        }
+        names = set(self.__dataclass_fields__) - {"certificate", "grid_point"}
+        content = {name: getattr(self, name) for name in names}
         content |= {"certificate": self.certificate.checksum, "channel": self.channel and asdict(self.channel)}
-        content |= {"settings": asdict(self.settings), "versions": versions()}
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+        return json_digest(content | {"settings": asdict(self.settings), "versions": versions()})
+
+    @property
+    def total_steps(self) -> int:
+        """Training steps, in whole rollouts, and evaluation steps."""
+        evaluation = self.episodes * (gym.spec(self.env).max_episode_steps or 1)
+        if self.policy_kind != "trained":
+            return evaluation
+        steps_per_env = 1 if isinstance(self.settings, OffPolicySettings) else self.settings.rollout
+        rollout = self.settings.envs * steps_per_env
+        return -(-self.steps // rollout) * rollout + evaluation
 
     def _seeds(self) -> list[int]:
-        """Returns two 31-bit numbers that depend on the experiment's seed and the run, not on the arm."""
+        """Returns two 31-bit numbers that depend on the experiment's seed and the run's index, not on the arm."""
         return [int(word >> 1) for word in np.random.SeedSequence([self.seed, self.index]).generate_state(2)]
 
 
 @dataclass(frozen=True)
-class UnitResult:
-    """What a unit leaves.
+class RunResult:
+    """Result of a training run.
 
     Attributes:
-        arm, index: The unit's.
-        train_steps: Steps of training (0 if nothing was trained).
-        train_violation_steps: Of these, steps whose true state violated the safe box.
-        train_interventions: Of these, steps in which the shield intervened.
-        history: Totals along the way.
-        episodes: Evaluation.
-        trajectory: The first evaluation episode.
-        files: The trained agent's files, contents by name; empty if nothing was trained.
+        arm: Name of the run's arm.
+        index: Number of the run within its arm.
+        train_steps: Number of training steps; 0 if nothing was trained.
+        train_violation_steps: Number of training steps whose true state violated the safe box.
+        train_interventions: Number of training steps in which the shield intervened.
+        history: Running totals during the training.
+        episodes: Evaluation episodes.
+        trajectory: Trajectory of the first evaluation episode.
+        files: Contents of the trained agent's files by name; empty if nothing was trained.
     """
 
     arm: str
@@ -132,34 +141,34 @@ class UnitResult:
     files: dict[str, bytes]
 
 
-def run_unit(unit: Unit, on_progress: Callable[[int], None], log_folder: Path | None = None) -> UnitResult:
-    """Returns the result of a unit; nothing is written but TensorBoard's events.
+def execute_run(run: TrainingRun, on_progress: Callable[[int], None], log_folder: Path | None = None) -> RunResult:
+    """Returns the result of a training run; only TensorBoard's events are written.
 
     Args:
-        unit: The settings.
+        run: Settings of the run.
         on_progress: Called with the number of training and evaluation steps taken since its last call.
-        log_folder: Where TensorBoard's events go; earlier ones there are removed.
+        log_folder: Folder of TensorBoard's events; earlier events in it are removed.
     """
     trained = None
-    if unit.learner == "agent":
-        from agents.training import train  # torch, which the process that only collects results does without
+    if run.policy_kind == "trained":
+        from agents.training import train  # imports torch, which the process that only collects results does without
 
         if log_folder is not None:
             shutil.rmtree(log_folder, ignore_errors=True)
         trained = train(
-            unit.loop,
-            unit.steps,
-            unit.training_seed,
-            unit.algorithm,
-            unit.settings,
+            run.loop,
+            run.steps,
+            run.training_seed,
+            run.algorithm,
+            run.settings,
             log_folder=log_folder,
             on_progress=on_progress,
         )
-    policy = _policy(unit, trained)
-    evaluation = evaluate(unit.loop, policy, unit.episodes, unit.evaluation_seed, unit.certificate.M, on_progress)
-    return UnitResult(
-        arm=unit.arm,
-        index=unit.index,
+    policy = _policy(run, trained)
+    evaluation = evaluate(run.loop, policy, run.episodes, run.evaluation_seed, run.certificate.M, on_progress)
+    return RunResult(
+        arm=run.arm,
+        index=run.index,
         train_steps=trained.steps if trained else 0,
         train_violation_steps=trained.violation_steps if trained else 0,
         train_interventions=trained.interventions if trained else 0,
@@ -170,17 +179,17 @@ def run_unit(unit: Unit, on_progress: Callable[[int], None], log_folder: Path | 
     )
 
 
-def _policy(unit: Unit, trained: TrainingResult | None) -> Policy:
+def _policy(run: TrainingRun, trained: TrainingResult | None) -> Policy:
     """Returns the policy to evaluate."""
     if trained is not None:
         return lambda observations, infos: trained.agent.act(observations)
-    plant = ncs_env(unit.loop.single()).plant
-    if unit.learner == "untrained":
+    plant = ncs_env(run.loop.single()).plant
+    if run.policy_kind == "untrained":
         from agents.training import untrained
 
-        agent = untrained(unit.loop, unit.training_seed, unit.algorithm, unit.settings)
+        agent = untrained(run.loop, run.training_seed, run.algorithm, run.settings)
         return lambda observations, infos: agent.act(observations)
-    if unit.learner == "gain":
-        gain = unit.certificate.K / plant.u_max[:, None]
+    if run.policy_kind == "certified gain":
+        gain = run.certificate.K / plant.u_max[:, None]
         return lambda observations, infos: np.clip(infos["estimate"] @ gain.T, -1.0, 1.0)
     return lambda observations, infos: np.zeros((len(observations), plant.m), np.float32)

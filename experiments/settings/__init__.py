@@ -1,6 +1,6 @@
 """What each command can be told: frozen dataclasses that the parser turns into flags, and the file that keeps them."""
 
-from experiments.settings.backend import EngineSettings
+from experiments.settings.backend import BackendSettings
 from experiments.settings.certificates import (
     AuditSettings,
     CertifySettings,
@@ -17,13 +17,14 @@ from experiments.settings.learning import (
     SweepSettings,
     TrainSettings,
 )
+from experiments.settings.settings_file import load_settings, save_settings, settings_json, split_config
 
 __all__ = [
     "AuditSettings",
+    "BackendSettings",
     "CertifySettings",
     "ChannelSettings",
     "CompareSettings",
-    "EngineSettings",
     "EvaluateSettings",
     "LearningSettings",
     "RenderSettings",
@@ -32,4 +33,8 @@ __all__ = [
     "SynthesizeSettings",
     "TrainSettings",
     "VerifySettings",
+    "load_settings",
+    "save_settings",
+    "settings_json",
+    "split_config",
 ]

@@ -1,4 +1,4 @@
-"""Where the runs of an experiment are worked on; importing this is cheap."""
+"""Settings of the backend that executes the training runs of an experiment."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import re
 from dataclasses import dataclass, fields
 from typing import Literal
 
-# An address that starts a Ray of its own.
-OWN_RAY = "local"
-ADDRESS = re.compile(r"local|auto|[\w.-]+:\d{1,5}|\[[0-9a-fA-F:]+\]:\d{1,5}")
+# Address that starts a Ray cluster of its own on this machine.
+OWN_CLUSTER = "local"
+_ADDRESS = re.compile(r"local|auto|[\w.-]+:\d{1,5}|\[[0-9a-fA-F:]+\]:\d{1,5}")
 
 
 @dataclass(frozen=True, kw_only=True)
-class EngineSettings:
-    """Where runs are worked on; their results do not depend on it.
+class BackendSettings:
+    """Where training runs are executed; their results do not depend on it.
 
     Attributes:
         engine: "local" uses processes of this machine, "ray" a Ray cluster (docs/scaling.md).
-        jobs: Worker processes of the engine "local".
+        jobs: Number of worker processes of the engine "local".
         ray_address: "local" starts a Ray on this machine for as long as it is needed, "auto" joins the one that runs
             here, HOST:PORT joins the cluster whose head that is; this machine has to be one of its nodes.
         ray_wait: Seconds to wait for a node that is large enough for a run: for clusters that grow on demand.
@@ -27,7 +27,7 @@ class EngineSettings:
 
     engine: Literal["local", "ray"] = "local"
     jobs: int = 2
-    ray_address: str = OWN_RAY
+    ray_address: str = OWN_CLUSTER
     ray_wait: float = 0.0
     cpus_per_run: float = 1.0
     gpus_per_run: float = 0.0
@@ -36,7 +36,7 @@ class EngineSettings:
         """Raises ValueError if a value is out of range or belongs to another engine."""
         if self.jobs < 1:
             raise ValueError(f"--jobs must be at least 1, got {self.jobs}")
-        if not ADDRESS.fullmatch(self.ray_address):
+        if not _ADDRESS.fullmatch(self.ray_address):
             raise ValueError(f"--ray-address must be local, auto or HOST:PORT, got {self.ray_address!r}")
         if not 0.0 <= self.ray_wait < float("inf"):
             raise ValueError(f"--ray-wait must be >= 0, got {self.ray_wait}")
@@ -46,13 +46,6 @@ class EngineSettings:
         if not 0.0 <= self.gpus_per_run < float("inf") or not whole:
             raise ValueError(f"--gpus-per-run must be in [0, 1] or a whole number, got {self.gpus_per_run}")
         if self.engine == "local":
-            self._refuse_settings_of_ray()
-
-    def _refuse_settings_of_ray(self) -> None:
-        for field in fields(EngineSettings)[2:]:
-            if getattr(self, field.name) != field.default:
-                raise ValueError(f"--{field.name.replace('_', '-')} is a setting of --engine ray")
-
-
-# Names of the settings that results do not depend on.
-NAMES = tuple(field.name for field in fields(EngineSettings))
+            for field in fields(BackendSettings)[2:]:
+                if getattr(self, field.name) != field.default:
+                    raise ValueError(f"--{field.name.replace('_', '-')} is a setting of --engine ray")

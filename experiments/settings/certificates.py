@@ -1,4 +1,4 @@
-"""What the commands that train nothing can be told; importing this is cheap."""
+"""Settings of the commands about certificates and the paper: they train nothing."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class SynthesizeSettings:
 
     Attributes:
         env: Id of one of the four environments with a plant of their own.
-        method: The certified method, or the published one as printed.
+        method: Synthesis method: ours, whose result is verified exactly, or the published one as printed.
         out: File for the certificate (JSON).
-        max_age: Channel contract to rest on, in steps; by default the environment's own, if it needs one.
+        max_age: Largest measurement age of the channel contract [steps]; by default the environment's contract.
         seed: Accepted by every command; the synthesis is deterministic and does not use it.
     """
 
@@ -33,7 +33,7 @@ class VerifySettings:
     """Verifies a certificate in exact rational arithmetic against the plant it was made for.
 
     Attributes:
-        file: The certificate (JSON).
+        file: File of the certificate (JSON).
         env: Id of one of the four environments with a plant of their own; without it, the one whose plant has the
             certificate's fingerprint.
         out: File for the verdicts (JSON).
@@ -48,20 +48,21 @@ class VerifySettings:
 
 @dataclass(frozen=True, kw_only=True)
 class CertifySettings:
-    """Attacks shielded loops within the assumptions, and counts what leaves the safe set.
+    """Attacks shielded control loops within the assumptions, and counts the states that leave the safe set.
 
-    Registered environments and random plants, behind every kind of channel; disturbances that push the next state
-    farthest out, starts and first errors on the boundaries of their sets, sensor noise of full size in random
-    directions; random and hostile agents.
+    The plants are those of the registered environments and random ones, behind every kind of channel. Disturbances push
+    the next state farthest out, initial states and first estimation errors lie on the boundaries of their sets, sensor
+    noise has full size in random directions, and agents are random or hostile.
 
     Attributes:
-        steps: In all, at least; whole blocks of `envs` episodes are run, at least one per case and mode of the shield.
-        out: Folder; an interrupted campaign goes on where it was, and one with more steps adds to it.
-        random_plants: How many random plants, each behind four kinds of channels.
-        envs: Episodes of a block, run side by side.
-        jobs: Worker processes.
-        unshielded: Let the shield only watch: what happens without it.
-        seed: Of the campaign, >= 0.
+        steps: Smallest number of steps in all; whole batches of `envs` episodes are run, at least one per attack case
+            and mode of the shield.
+        out: Output folder; an interrupted campaign continues where it stopped, and one with more steps adds to it.
+        random_plants: Number of random plants, each behind four kinds of channels.
+        envs: Number of episodes in a batch, simulated side by side.
+        jobs: Number of worker processes.
+        unshielded: Let the shield only watch, to see what happens without it.
+        seed: Seed of the campaign, >= 0.
     """
 
     steps: float = 1e8
@@ -101,13 +102,14 @@ class AuditSettings:
 class ReproduceSettings:
     """Simulates Section 5 of Liu et al.: printed (K, M), certified (K, M), and OP's at the nearest feasible bounds.
 
-    Random starts in each safe set, all four impairments; prints a table and leaves figures and summary.json.
+    Simulates random initial states in each safe set with all four network impairments; prints a table and leaves
+    figures and summary.json.
 
     Attributes:
         out: Output folder.
-        starts: Random initial states per design.
+        starts: Number of random initial states per design.
         steps: Steps of each simulation.
-        seed: Of starts, disturbances and channel, alike for all designs.
+        seed: Seed of initial states, disturbances and channel, the same for all designs.
     """
 
     out: Path = Path("runs/reproduce")

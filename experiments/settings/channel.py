@@ -1,4 +1,4 @@
-"""Channels from the command line."""
+"""Settings of the channel: changes of an environment's own channel."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from ncs_gym import Channel, GilbertElliott
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelSettings:
-    """What to change of the environment's own channel.
+    """Changes of the environment's own channel; None keeps a value.
 
     Attributes:
         loss: Probability that a packet is lost.
         burst_length: Mean number of packets lost in a row (Gilbert-Elliott); losses are independent without it
             (a mean of 1 / (1 - loss)).
-        delay: Steps that every packet is late.
-        jitter: Largest extra random delay, in steps.
-        send_period: A sample is sent every so many steps.
-        quantization_step: Measurements are rounded to multiples of it.
-        max_consecutive_losses: Never lose more packets in a row.
+        delay: Delay of every packet [steps].
+        jitter: Largest extra random delay [steps].
+        send_period: Transmission period [steps].
+        quantization_step: Measurements are quantized to multiples of this step.
+        max_consecutive_losses: Longest run of lost packets that the channel allows.
     """
 
     loss: float | None = None
@@ -72,6 +72,6 @@ def bursts(loss: float, length: float, send_period: int = 1) -> GilbertElliott:
     if not usable or entered > 1.0 or (eigenvalue < 0.0 and send_period > 1):
         raise ValueError(f"no losses of probability {loss} come in bursts of mean length {length}: try a longer one")
     if send_period > 1:
-        share = (1.0 - eigenvalue ** (1.0 / send_period)) / (left + entered)
-        left, entered = share * left, share * entered
+        factor = (1.0 - eigenvalue ** (1.0 / send_period)) / (left + entered)
+        left, entered = factor * left, factor * entered
     return GilbertElliott(p_good_to_bad=entered, p_bad_to_good=left)

@@ -1,4 +1,4 @@
-"""What each command can be told; importing this is cheap."""
+"""Settings of the commands that train agents, evaluate them or draw their episodes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from agents.settings import A2CSettings, AgentSettings, OffPolicySettings, PPOSettings
-from experiments.settings.backend import EngineSettings
+from experiments.settings.backend import BackendSettings
 from experiments.settings.channel import ChannelSettings
 
 Algorithm = Literal["PPO", "A2C", "SAC", "TD3", "TRPO", "TQC", "CrossQ"]
@@ -18,21 +18,21 @@ Mode = Literal["project", "switch", "boundary"]
 
 @dataclass(frozen=True, kw_only=True)
 class LearningSettings:
-    """What the commands that train share.
+    """Settings that the commands that train share.
 
     Attributes:
-        config: A settings.json of an earlier run; its settings hold where none are given here.
+        config: Settings file (settings.json) of an earlier run; its settings hold where none are given here.
         env: Id of one of the four environments with a plant of their own.
-        seed: Of the experiment, >= 0; all runs derive theirs from it.
+        seed: Seed of the experiment, >= 0; all runs derive their seeds from it.
         steps: Training steps per run, rounded up to whole rollouts.
         episodes: Evaluation episodes per run.
         algo: Learning algorithm; TRPO, TQC and CrossQ need sb3-contrib.
-        mode: What the shield does with an unsafe action: the closest safe input ("project"), or the certified K x_hat
-            ("switch"; "boundary" applies it unless every action would be safe).
+        mode: What the shield applies in place of an unsafe action: the closest safe input ("project"), or the certified
+            K x_hat ("switch"; "boundary" applies it unless every action would be safe).
         intervention_penalty: Subtracted from the training reward per intervention, in arms with "+penalty".
         violation_penalty: Subtracted from the training reward per violating step, in the arm "penalized".
-        certificate: File to use instead of synthesizing one.
-        channel: What to change of the environment's channel.
+        certificate: Certificate file to use instead of synthesizing one.
+        channel: Changes of the environment's channel.
         ppo: Settings of PPO and TRPO.
         a2c: Settings of A2C.
         off_policy: Settings of SAC, TD3, TQC and CrossQ.
@@ -55,7 +55,7 @@ class LearningSettings:
 
     @property
     def agent(self) -> AgentSettings:
-        """Settings of the chosen algorithm."""
+        """Settings of the chosen learning algorithm."""
         return {"PPO": self.ppo, "TRPO": self.ppo, "A2C": self.a2c}.get(self.algo, self.off_policy)
 
     def __post_init__(self) -> None:
@@ -71,20 +71,20 @@ class LearningSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareSettings(EngineSettings, LearningSettings):
+class CompareSettings(BackendSettings, LearningSettings):
     """Trains agents with and without the shield and compares violations, return and interventions.
 
     Synthesizes and exactly verifies a certificate, trains paired runs (equal seeds), evaluates each on the same
-    episodes (equal draws of nature), prints a table and leaves summary.json, settings.json, episodes.parquet,
+    episodes (common random numbers), prints a table and leaves summary.json, settings.json, episodes.parquet,
     training.parquet, report.html, figures, models, TensorBoard events and the certificate in the output folder. Started
     again with the same folder, finished runs are kept.
 
     Attributes:
         out: Output folder; created if it does not exist.
-        seeds: Paired training runs per arm.
-        arms: unshielded, monitor (unshielded, counts what the shield would have done), penalized (unshielded, pays for
-            violations), shielded, shielded:MODE, and each shielded one with +penalty (pays for interventions).
-        smoke: Shrink the run, whatever else is asked for, to see that everything works.
+        seeds: Number of paired training runs per arm.
+        arms: unshielded, monitor (unshielded, counts what the shield would have done), penalized (unshielded, with a
+            penalty per violation), shielded, shielded:MODE, and each shielded one with +penalty (per intervention).
+        smoke: Run a short version, whatever else is asked for, to see that everything works.
     """
 
     out: Path = Path("runs/compare")
@@ -95,7 +95,7 @@ class CompareSettings(EngineSettings, LearningSettings):
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
         LearningSettings.__post_init__(self)
-        EngineSettings.__post_init__(self)
+        BackendSettings.__post_init__(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +104,7 @@ class TrainSettings(LearningSettings):
 
     Attributes:
         out: Output folder; created if it does not exist.
-        arm: How it is trained; see the arms of `ncs compare`.
+        arm: Arm that the agent is trained in; see the arms of `ncs compare`.
     """
 
     out: Path = Path("runs/train")
@@ -118,10 +118,10 @@ class EvaluateSettings:
     Attributes:
         model: Folder of a trained agent, such as models/shielded-0 in the output of `ncs compare` or `ncs train`.
         shield: Mode of the shield; "monitor" changes nothing and counts what it would have done.
-        episodes: How many.
-        seed: Of the episodes.
-        certificate: File to use instead of synthesizing one.
-        channel: What to change of the channel it was trained with.
+        episodes: Number of evaluation episodes.
+        seed: Seed of the episodes.
+        certificate: Certificate file to use instead of synthesizing one.
+        channel: Changes of the channel that the agent was trained with.
         out: File for the summary (JSON).
     """
 
@@ -142,8 +142,8 @@ class EvaluateSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepSettings(EngineSettings, LearningSettings):
-    """Compares arms over a grid of channels: how violations, return and interventions depend on its quality.
+class SweepSettings(BackendSettings, LearningSettings):
+    """Compares arms over a grid of channels: how safety, return and interventions depend on the channel.
 
     Every point of the grid is a comparison of its own with the same seeds. Leaves sweep.parquet, summary.json,
     settings.json, report.html with heatmaps, and the models. Started again with the same folder, finished runs are
@@ -151,14 +151,14 @@ class SweepSettings(EngineSettings, LearningSettings):
 
     Attributes:
         out: Output folder; created if it does not exist.
-        seeds: Paired training runs per arm and channel.
+        seeds: Number of paired training runs per arm and channel.
         steps: Training steps per run, rounded up to whole rollouts.
         episodes: Evaluation episodes per run.
-        arms: See `ncs compare`.
-        losses: Probabilities that a packet is lost.
-        delays: Steps that every packet is late.
-        quantization_steps: Measurements are rounded to multiples of these; the environment's own if none is given.
-        burst_lengths: Mean numbers of packets lost in a row; 0 loses independently.
+        arms: Arms of the comparison; see `ncs compare`.
+        losses: Loss probabilities of the grid.
+        delays: Delays of the grid [steps].
+        quantization_steps: Quantization steps of the grid; the environment's own if none is given.
+        burst_lengths: Mean numbers of packets lost in a row; 0 stands for independent losses.
     """
 
     out: Path = Path("runs/sweep")
@@ -174,25 +174,25 @@ class SweepSettings(EngineSettings, LearningSettings):
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
         LearningSettings.__post_init__(self)
-        EngineSettings.__post_init__(self)
+        BackendSettings.__post_init__(self)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings:
-    """Plays an episode with a policy and draws it, as an animation or its last picture (docs/rendering.md).
+    """Draws an episode of a policy, as an animation or its last frame (docs/rendering.md).
 
     Attributes:
         env: Id of one of the four environments with a plant of their own.
-        out: File to write: .gif, .mp4, or .png for the last picture alone.
+        out: File to write: .gif, .mp4, or .png for the last frame alone.
         policy: "greedy" (toward the task's goal as hard as it can), "zero", "random", or the folder of a
             trained agent.
-        shield: What the shield does with an unsafe action; "none" for no shield.
+        shield: Mode of the shield; "none" for no shield.
         side_by_side: Draw the same episode without a shield at the left, with it at the right.
-        certificate: File to use instead of synthesizing one.
-        seed: Of the episode (both, side by side) and of the random policy.
-        steps: Most steps to play.
-        fps: Pictures per second; one per step.
-        width: Of the animation [pixels]; by default as drawn.
+        certificate: Certificate file to use instead of synthesizing one.
+        seed: Seed of the episode (of both, side by side) and of the random policy.
+        steps: Largest number of steps.
+        fps: Frames per second; one frame per step.
+        width: Width of the animation [pixels]; by default as drawn.
     """
 
     env: str = "ncs_gym/TruckTrailerCruise-v0"

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
+import argparse
 import json
-from collections.abc import Callable
-from dataclasses import asdict
+import types
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from experiments.errors import SettingsError
 from ncs_gym.validation import LONGEST_QUOTE
 from shields.atomic_write import write_atomically
 
 FORMAT = "ncs-gym settings 1"
-FLAG = "--config"
 
 
 def settings_json(command: str, settings: Any) -> dict[str, Any]:
@@ -33,62 +31,35 @@ def save_settings(path: Path, command: str, settings: Any) -> None:
     write_atomically(path, json.dumps(settings_json(command, settings), indent=1) + "\n")
 
 
-def with_config(arguments: list[str], parse: Callable[[list[str]], Any] | None = None) -> list[str]:
-    """Returns the command line with `--config FILE` replaced by the flags in the file, before the user's own flags.
+def split_config(arguments: list[str]) -> tuple[Path | None, list[str]]:
+    """Returns the file given by `--config`, or None, and the other arguments.
+
+    Raises:
+        SettingsError: If the flag is given more than once or without a file.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--config", action="append", nargs="?", const="", default=[])
+    found, others = parser.parse_known_args(arguments)
+    if not found.config:
+        return None, arguments
+    if len(found.config) > 1:
+        raise SettingsError(f"--config is given {len(found.config)} times")
+    if not found.config[0]:
+        raise SettingsError("--config needs a file")
+    return Path(found.config[0]), others
+
+
+def load_settings(path: Path, command: str, kind: type) -> Any:
+    """Returns the settings in a file; fields that it does not give have their defaults.
 
     Args:
-        arguments: The command line.
-        parse: Returns the settings that a command line stands for, or exits; None does not look at the values.
+        path: The file.
+        command: Command that the settings are for.
+        kind: Dataclass of the command's settings.
 
     Raises:
-        SettingsError: If the file is missing, damaged or another command's, or holds what `parse` does not take.
+        SettingsError: If the file is missing, damaged or another command's, or holds a wrong value.
     """
-    given = [i for i, argument in enumerate(arguments) if argument == FLAG or argument.startswith(f"{FLAG}=")]
-    if not given or not arguments[0:1] or arguments[0].startswith("-"):
-        return arguments
-    if len(given) > 1:
-        raise SettingsError(f"{FLAG} is given {len(given)} times")
-    at = given[0]
-    value = arguments[at].partition("=")[2] or "".join(arguments[at + 1 : at + 2])
-    if not value or value.startswith("--"):
-        raise SettingsError(f"{FLAG} needs a file")
-    rest = arguments[1:at] + arguments[at + (1 if "=" in arguments[at] else 2) :]
-    command, values = arguments[0], _read(Path(value), arguments[0])
-    if parse is not None:
-        _require_meaning(Path(value), command, values, parse)
-    return [command, *_flags(values), *rest]
-
-
-def _require_meaning(path: Path, command: str, values: dict[str, Any], parse: Callable[[list[str]], Any]) -> None:
-    """Raises unless every value in a file is what the command makes of its flag.
-
-    Raises:
-        SettingsError: Naming the first that is not.
-    """
-    for name, value in values.items():
-        flags, unheard = _flags({name: value}), io.StringIO()
-        try:
-            with contextlib.redirect_stdout(unheard), contextlib.redirect_stderr(unheard):
-                read = settings_json(command, parse([command, *flags]))["settings"]
-        except (SystemExit, ValueError):
-            read = {}
-        if name not in read or not _is_same(value, read[name]):
-            text = " ".join(f"{name} = {json.dumps(value)}".split())
-            raise SettingsError(f"settings {path} hold what ncs {command} does not take: {text[:LONGEST_QUOTE]}")
-
-
-def _is_same(given: Any, read: Any) -> bool:
-    """Returns whether a value in a file means what was read; what is not given in it is not compared."""
-    if isinstance(given, dict) and isinstance(read, dict):
-        return all(key in read and _is_same(value, read[key]) for key, value in given.items())
-    if isinstance(given, list) and isinstance(read, list):
-        return len(given) == len(read) and all(map(_is_same, given, read))
-    if isinstance(given, str) and isinstance(read, str):
-        return given == read or str(Path(given)) == read
-    return isinstance(given, bool) == isinstance(read, bool) and given == read
-
-
-def _read(path: Path, command: str) -> dict[str, Any]:
     try:
         document = json.loads(path.read_bytes())
     except OSError as error:
@@ -99,23 +70,41 @@ def _read(path: Path, command: str) -> dict[str, Any]:
         raise SettingsError(f"{path} is not of format {FORMAT!r}")
     if document.get("command") != command or not isinstance(document.get("settings"), dict):
         raise SettingsError(f"{path} holds settings of ncs {document.get('command')}, not of ncs {command}")
-    return document["settings"]
+    try:
+        return _from_json(document["settings"], kind)
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:LONGEST_QUOTE]
+        raise SettingsError(f"settings {path} hold what ncs {command} does not take: {reason}") from error
 
 
-def _flags(values: dict[str, Any], prefix: str = "--") -> list[str]:
-    """Returns settings as command-line flags; the parser checks them like a user's."""
-    flags: list[str] = []
-    for name, value in values.items():
-        texts = [each for each in (value if isinstance(value, list) else [value]) if isinstance(each, str)]
-        if any(text.startswith("-") for text in [name, *texts]):
-            raise SettingsError(f"the settings hold a value that is none: {name} = {value!r}")
-        flag = prefix + name.replace("_", "-")
-        if isinstance(value, dict):
-            flags += _flags(value, flag + ".")
-        elif isinstance(value, bool):
-            flags.append(flag if value else f"{prefix}no-{name.replace('_', '-')}")
-        elif isinstance(value, list):
-            flags += [flag, *map(str, value)]
-        else:
-            flags += [flag, repr(value) if isinstance(value, float) else str(value)]
-    return flags
+def _from_json(value: Any, kind: Any, name: str = "") -> Any:
+    """Returns a JSON value as a value of a type.
+
+    Args:
+        value: The JSON value.
+        kind: Type that it has to have: a dataclass, or the type of one of its fields.
+        name: Dotted name of the field.
+
+    Raises:
+        TypeError: If the value is none of the type; the message names the field.
+        ValueError: If the value is out of range.
+    """
+    if is_dataclass(kind) and isinstance(value, dict):
+        fields = {field: hint for field, hint in get_type_hints(kind).items() if field != "config"}
+        prefix = f"{name}." if name else ""
+        return kind(**{key: _from_json(each, fields.get(key), prefix + key) for key, each in value.items()})  # type: ignore[operator]
+    origin, parameters = get_origin(kind), get_args(kind)
+    if origin in (Union, types.UnionType):
+        chosen = types.NoneType if value is None else next(each for each in parameters if each is not types.NoneType)
+        return _from_json(value, chosen, name)
+    if origin is tuple and isinstance(value, list):
+        return tuple(_from_json(each, parameters[0], name) for each in value)
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    if (origin is Literal and value in parameters) or (
+        kind in (bool, int, str, types.NoneType) and type(value) is kind
+    ):
+        return value
+    if kind is float and type(value) in (int, float) and float(value) == value:  # not NaN, not rounded
+        return float(value)
+    raise TypeError(f"{name} = {json.dumps(value)}")

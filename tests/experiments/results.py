@@ -11,7 +11,7 @@ from agents.history import TrainingPoint
 from agents.trajectory import Trajectory
 from experiments.analysis.summary import paired_differences, summarize_arm
 from experiments.runs.arms import arm_of
-from experiments.runs.training_run import UnitResult
+from experiments.runs.training_run import RunResult
 
 ALL_ARMS = [
     "unshielded",
@@ -38,7 +38,7 @@ def history(*steps: int, scale: float = 1.0) -> list[TrainingPoint]:
     ]
 
 
-def run(arm: str, index: int = 0, violations=(0, 0), returns=(-1.0, -3.0), **change: Any) -> UnitResult:
+def run(arm: str, index: int = 0, violations=(0, 0), returns=(-1.0, -3.0), **change: Any) -> RunResult:
     """A run of an arm with an episode of 10 steps for each number of violating steps."""
     episodes = [
         Episode(i, 10, total - index, count, count, 1, True, 0.9)
@@ -53,10 +53,10 @@ def run(arm: str, index: int = 0, violations=(0, 0), returns=(-1.0, -3.0), **cha
         "trajectory": trajectory(np.zeros((11, 2))),
         "files": {},
     }
-    return UnitResult(arm=arm, index=index, **(content | change))
+    return RunResult(arm=arm, index=index, **(content | change))
 
 
-def summary_of(results: dict[str, list[UnitResult]], **settings: Any) -> dict[str, Any]:
+def summary_of(results: dict[str, list[RunResult]], **settings: Any) -> dict[str, Any]:
     """The summary of a comparison without reference policies."""
 
     def arm(name: str) -> dict[str, Any]:

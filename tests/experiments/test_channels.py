@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from experiments.commands.sweep import cells_of
+from experiments.commands.sweep import grid_points
 from experiments.settings.channel import ChannelSettings, bursts, channel_of
 from experiments.settings.learning import SweepSettings
 from ncs_gym import Channel, GilbertElliott
@@ -57,9 +57,9 @@ def test_bursts_need_a_loss_probability():
 
 def test_grid_is_the_product_of_its_sides():
     settings = SweepSettings(losses=(0.0, 0.5), delays=(1,), quantization_steps=(0.1, 0.2), burst_lengths=(0.0, 3.0))
-    cells = cells_of(settings)
-    assert len(cells) == len({cell.name for cell in cells}) == 8
-    lossless, *_, last = cells
+    points = grid_points(settings)
+    assert len(points) == len({point.name for point in points}) == 8
+    lossless, *_, last = points
     assert lossless.channel(ChannelSettings(jitter=1)) == ChannelSettings(
         loss=0.0, delay=1, quantization_step=0.1, jitter=1
     )
@@ -71,9 +71,9 @@ def test_grid_is_the_product_of_its_sides():
 @pytest.mark.parametrize("change", [{"losses": ()}, {"delays": (1, 1)}, {"arms": ("shielded", "shielded")}])
 def test_empty_and_repeated_sides_are_refused(change):
     with pytest.raises(ValueError, match=f"--{next(iter(change))} must be different"):
-        cells_of(SweepSettings(**change))
+        grid_points(SweepSettings(**change))
 
 
-def test_cells_that_print_alike_have_names_of_their_own():
-    cells = cells_of(SweepSettings(losses=(0.9, 0.90000001), delays=(0,)))
-    assert len({cell.name for cell in cells}) == 2
+def test_points_that_print_alike_have_names_of_their_own():
+    points = grid_points(SweepSettings(losses=(0.9, 0.90000001), delays=(0,)))
+    assert len({point.name for point in points}) == 2

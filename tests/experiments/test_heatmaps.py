@@ -3,7 +3,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from experiments.plots.heatmaps import QUANTITIES, heatmap_caption, heatmap_figure, heatmaps_of
+from experiments.plots.heatmaps import QUANTITIES, heatmap_caption, heatmap_figure, sweep_figures
 
 
 def cells(arms, losses=(0.0, 0.3, 0.6), delays=(0, 4), roundings=(None,), bursts=(1.0,), rate=None):
@@ -78,13 +78,13 @@ def test_small_rates_have_another_digit():
     assert numbers(axis) == ["0", "0.04"]
 
 
-def test_roundings_and_bursts_have_panels_of_their_own():
+def test_quantization_steps_and_bursts_have_panels_of_their_own():
     grid = cells(["unshielded", "shielded"], roundings=(0.05, 0.1), bursts=(0.0, 3.0))
     shown = panels(heatmap_figure(grid, ["unshielded", "shielded"], QUANTITIES["return"]))
     titles = [axis.get_title() for axis in shown]
     assert len(titles) == len(set(titles)) == 8
-    assert "shielded\nrounding 0.1, bursts of 3" in titles
-    assert "shielded\nrounding 0.1, independent losses" in titles
+    assert "shielded\nquantization 0.1, bursts of 3" in titles
+    assert "shielded\nquantization 0.1, independent losses" in titles
 
 
 def test_one_channel_is_a_map_of_one_field():
@@ -95,10 +95,10 @@ def test_one_channel_is_a_map_of_one_field():
 
 def test_interventions_are_those_of_arms_with_a_shield_only():
     arms = ["unshielded", "penalized", "monitor", "shielded"]
-    figures = heatmaps_of({"cells": cells(arms, losses=(0.0,))}, arms)
+    figures = sweep_figures({"cells": cells(arms, losses=(0.0,))}, arms)
     assert set(figures) == {"violations", "return", "interventions"}
     assert all(png.startswith(b"\x89PNG") for _, png in figures.values())
-    assert set(heatmaps_of({"cells": cells(arms, losses=(0.0,))}, ["unshielded"])) == {"violations", "return"}
+    assert set(sweep_figures({"cells": cells(arms, losses=(0.0,))}, ["unshielded"])) == {"violations", "return"}
 
 
 def test_captions_say_over_how_many_runs_and_what_a_monitor_counts():

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiments.settings.learning import CompareSettings, SweepSettings
+from experiments.settings import CompareSettings, SweepSettings
 from experiments.settings.settings_file import FORMAT, settings_json
 from tests.command import assert_one_sentence, ncs
 from tests.fuzz import examples

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, NCSVectorEnv
-from ncs_gym.estimation import gain_table
 from ncs_gym.envs.env import NCSEnv
+from ncs_gym.estimation import gain_table
 from ncs_gym.estimation.estimator import Belief, Estimator
 from ncs_gym.network.channel import Packet
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from experiments.plots.figure_style import as_png
@@ -10,21 +9,21 @@ from experiments.plots.phase_plane import phase_caption, phase_figure
 from experiments.plots.scatter import scatter_caption, scatter_figure
 from experiments.plots.time_series import episode_caption, episode_figure
 from experiments.plots.training_curves import training_caption, training_figure
-from experiments.runs.training_run import UnitResult
+from experiments.runs.arms import ResultsByArm
 from ncs_gym import LinearPlant
 from shields import Certificate
 
 
-def figures_of(
-    plant: LinearPlant, certificate: Certificate, summary: dict[str, Any], results: dict[str, Sequence[UnitResult]]
+def comparison_figures(
+    plant: LinearPlant, certificate: Certificate, summary: dict[str, Any], results: ResultsByArm
 ) -> dict[str, tuple[str, bytes]]:
-    """Returns caption and PNG of every figure by name.
+    """Returns caption and PNG file of every figure by name.
 
     Args:
-        plant: Limits, names and units.
-        certificate: Of the safe set.
-        summary: The content of summary.json; its arms are shown, in its order.
-        results: Of every arm's runs.
+        plant: Plant of the environment.
+        certificate: Certificate of the safe set.
+        summary: Content of summary.json; its arms are shown in its order.
+        results: Results of the runs of every arm.
     """
     arms = {name: results[name] for name in summary["arms"]}
     return {

@@ -8,17 +8,17 @@ from queue import Queue
 import pytest
 
 from agents.settings import PPOSettings
-from experiments.backends.processes import _work, run_all
+from experiments.backends.processes import _execute, execute_all
 from experiments.errors import RunStopped
-from experiments.runs.training_run import Unit
+from experiments.runs.training_run import TrainingRun
 
 
 @pytest.fixture(scope="module")
 def endless(certificate):
-    """A unit that would run for hours."""
-    return Unit(
+    """A run that would run for hours."""
+    return TrainingRun(
         arm="zero input",
-        learner="zero",
+        policy_kind="zero",
         env="ncs_gym/TruckTrailerCruise-v0",
         seed=0,
         index=0,
@@ -31,19 +31,19 @@ def endless(certificate):
     )
 
 
-def test_a_unit_told_to_stop_gives_up_at_its_next_report(endless):
-    news, stop = Queue(), threading.Event()
+def test_a_run_told_to_stop_gives_up_at_its_next_report(endless):
+    reports, stop = Queue(), threading.Event()
     stop.set()
     with pytest.raises(RunStopped, match="zero-input-0"):
-        _work(endless, None, news, stop)
-    assert news.empty()
+        _execute(endless, None, reports, stop)
+    assert reports.empty()
 
 
 def test_the_first_failure_stops_the_others_and_is_the_one_reported(endless):
     broken = replace(endless, arm="broken", env="ncs_gym/Nowhere-v0")
     begin, kept = time.monotonic(), []
     with pytest.raises(Exception, match="Nowhere") as caught:
-        run_all([endless, broken], 2, 1000, lambda unit, result: kept.append(unit))
+        execute_all([endless, broken], 2, lambda run, result: kept.append(run), lambda steps: None)
     assert not isinstance(caught.value, RunStopped)
     assert kept == []
     assert time.monotonic() - begin < 300.0

@@ -15,19 +15,20 @@ import pytest
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'ncs-gym[ray]'")
 
-from experiments.backends import ray_backend as ray_engine  # noqa: E402
-from experiments.backends import ray_cluster as cluster  # noqa: E402
-from experiments.backends.ray_cluster import Need, require_answer  # noqa: E402
+from experiments.backends import ray_backend, ray_cluster  # noqa: E402
+from experiments.backends.ray_cluster import portable_task, require_answer  # noqa: E402
 from experiments.errors import ClusterError, RunError  # noqa: E402
-from experiments.runs.provenance import versions  # noqa: E402
+from experiments.runs import versions  # noqa: E402
+from experiments.settings import BackendSettings  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 GRID = ["--losses", "0.5", "--delays", "1", "--burst-lengths", "0", "3", "--seeds", "2", "--episodes", "3"]
 GRID += ["--steps", "2048", "--ppo.envs", "4"]
-UNITS = 8
-PATIENCE = 300.0
+RUNS = 8
+TIMEOUT = 300.0
+ONE_CORE, HALF_A_CORE = (BackendSettings(engine="ray", cpus_per_run=cpus) for cpus in (1.0, 0.5))
 
 
 def command(*arguments):
@@ -40,7 +41,7 @@ def environment(**change):
 
 def ncs(*arguments, cwd=None, **change):
     run = subprocess.run(
-        command(*arguments), cwd=cwd, env=environment(**change), capture_output=True, text=True, timeout=PATIENCE
+        command(*arguments), cwd=cwd, env=environment(**change), capture_output=True, text=True, timeout=TIMEOUT
     )
     assert "Traceback" not in run.stderr
     return run
@@ -89,7 +90,7 @@ def is_alive(pid):
 
 
 def until(condition, what):
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + TIMEOUT
     while not (found := condition()):
         assert time.monotonic() < deadline, what
         time.sleep(0.05)
@@ -108,8 +109,8 @@ def until_stored(out, count, run):
     until(enough, "nothing was stored")
 
 
-def lines_of_units(text):
-    """Names of the units whose lines are in what was written to stderr."""
+def lines_of_runs(text):
+    """Names of the runs whose lines are in what was written to stderr."""
     return [line.partition(": ")[0] for line in text.replace("\r", "\n").splitlines() if " episodes violating," in line]
 
 
@@ -118,7 +119,7 @@ def assert_same(out, other):
     for name in ("summary.json", "sweep.parquet"):
         assert (out / name).read_bytes() == (other / name).read_bytes()
     models = sorted(path.relative_to(out) for path in out.glob("models/*/model.zip"))
-    assert len(models) == UNITS
+    assert len(models) == RUNS
     for model in models:
         mine, others = zipfile.ZipFile(out / model), zipfile.ZipFile(other / model)
         assert mine.read("policy.pth") == others.read("policy.pth")
@@ -136,7 +137,7 @@ def local(tmp_path_factory):
 def own_ray():
     """A Ray of the tests' own process."""
     handler = signal.getsignal(signal.SIGTERM)
-    with ray_engine._connected("local"):
+    with ray_backend._connected("local"):
         assert signal.getsignal(signal.SIGTERM) is handler
         yield
 
@@ -147,12 +148,12 @@ def test_rows_are_those_of_the_local_engine_bit_for_bit(local, tmp_path):
     (folder / "agents" / "__init__.py").write_text("raise RuntimeError('hidden')")
     entry = "import sys; sys.path.pop(0); from experiments.__main__ import main; main()"
     arguments = [sys.executable, "-c", entry, "sweep", *GRID, "--engine", "ray", "--out", "../out"]
-    run = subprocess.run(arguments, cwd=folder, env=environment(), capture_output=True, text=True, timeout=PATIENCE)
+    run = subprocess.run(arguments, cwd=folder, env=environment(), capture_output=True, text=True, timeout=TIMEOUT)
     assert run.returncode == 0, run.stderr
     assert_same(out, local)
-    assert len(lines_of_units(run.stderr)) == len(set(lines_of_units(run.stderr))) == UNITS
+    assert len(lines_of_runs(run.stderr)) == len(set(lines_of_runs(run.stderr))) == RUNS
     noise = [line for line in run.stderr.replace("\r", "\n").splitlines() if line.strip() and "step/s]" not in line]
-    assert len(noise) == UNITS, run.stderr
+    assert len(noise) == RUNS, run.stderr
 
 
 def test_killed_worker_costs_nothing(local, tmp_path):
@@ -161,10 +162,10 @@ def test_killed_worker_costs_nothing(local, tmp_path):
     for count in (1, 3):
         until_stored(out, count, run)
         os.kill(until(lambda: working(run.pid), "nobody works")[0], signal.SIGKILL)
-        assert stored(out) < UNITS
-    _, errors = run.communicate(timeout=PATIENCE)
+        assert stored(out) < RUNS
+    _, errors = run.communicate(timeout=TIMEOUT)
     assert run.returncode == 0, errors
-    assert sorted(lines_of_units(errors)) == sorted(path.stem for path in (local / "units").glob("*.json"))
+    assert sorted(lines_of_runs(errors)) == sorted(path.stem for path in (local / "units").glob("*.json"))
     assert_same(out, local)
 
 
@@ -179,11 +180,11 @@ def test_killed_driver_leaves_no_process_and_goes_on_where_it_was(local, tmp_pat
     until(lambda: not any(map(is_alive, processes)), f"processes outlive their driver: {processes}")
     assert not (out / "summary.json").exists()
     finished = stored(out)
-    assert 2 <= finished < UNITS
+    assert 2 <= finished < RUNS
     again = ncs("sweep", *GRID, "--engine", "ray", "--out", out)
     assert again.returncode == 0, again.stderr
-    assert f"{finished} of {UNITS} units were finished before" in again.stderr
-    assert len(set(lines_of_units(again.stderr))) == len(lines_of_units(again.stderr)) == UNITS - finished
+    assert f"{finished} of {RUNS} runs were finished before" in again.stderr
+    assert len(set(lines_of_runs(again.stderr))) == len(lines_of_runs(again.stderr)) == RUNS - finished
     assert_same(out, local)
 
 
@@ -203,7 +204,7 @@ def test_interrupted_driver_stops_everything_and_keeps_what_is_finished(tmp_path
     assert errors.strip().splitlines()[-1] == "ncs: interrupted"
     assert "Traceback" not in errors
     until(lambda: not any(map(is_alive, processes)), f"processes outlive their driver: {processes}")
-    assert 1 <= stored(out) < UNITS
+    assert 1 <= stored(out) < RUNS
 
 
 def test_sweep_begun_locally_is_finished_on_ray(local, tmp_path):
@@ -214,8 +215,8 @@ def test_sweep_begun_locally_is_finished_on_ray(local, tmp_path):
         path.unlink()
     run = ncs("sweep", *GRID, "--engine", "ray", "--out", tmp_path / "out")
     assert run.returncode == 0, run.stderr
-    assert f"{UNITS - 3} of {UNITS} units were finished before" in run.stderr
-    assert len(lines_of_units(run.stderr)) == 3
+    assert f"{RUNS - 3} of {RUNS} runs were finished before" in run.stderr
+    assert len(lines_of_runs(run.stderr)) == 3
     assert_same(tmp_path / "out", local)
 
 
@@ -253,9 +254,9 @@ def test_error_of_a_run_is_not_retried(own_ray, tmp_path):
             file.write("call\n")
         raise KeyError("mine")
 
-    reference = ray_engine._task(fail, Need(1.0, 0.0)).remote()
+    reference = ray_backend._remote(fail, ONE_CORE).remote()
     with pytest.raises(RunError, match=r"run its-name: KeyError: 'mine' \(NCS_DEBUG=1") as error:
-        ray_engine._result(NAMED, reference)
+        ray_backend._result(NAMED, reference)
     assert "mine" in str(error.value.__cause__)
     assert Path(calls).read_text() == "call\n"
 
@@ -268,22 +269,22 @@ def test_worker_that_always_dies_is_given_up_and_named(own_ray, tmp_path):
             file.write("call\n")
         os._exit(1)
 
-    reference = ray_engine._task(die, Need(1.0, 0.0)).remote()
+    reference = ray_backend._remote(die, ONE_CORE).remote()
     with pytest.raises(RunError, match="run its-name: its worker died, 3 retries included"):
-        ray_engine._result(NAMED, reference)
-    assert Path(calls).read_text() == "call\n" * (1 + ray_engine.RETRIES)
+        ray_backend._result(NAMED, reference)
+    assert Path(calls).read_text() == "call\n" * (1 + ray_backend.RETRIES)
 
 
 def test_node_with_another_source_is_refused_in_one_sentence(own_ray):
-    task = ray_engine._task(cluster.carried_work(), Need(1.0, 0.0))
+    task = ray_backend._remote(portable_task(), ONE_CORE)
     with pytest.raises(ClusterError, match="another source of ncs-gym than the driver"):
-        ray_engine._result(NAMED, task.remote(versions() | {"source": "other"}, b""))
+        ray_backend._result(NAMED, task.remote(versions() | {"source": "other"}, b""))
 
 
 def test_node_without_this_package_is_named_in_one_sentence(own_ray, tmp_path):
     (tmp_path / "experiments").mkdir()
     (tmp_path / "experiments" / "__init__.py").write_text("raise ModuleNotFoundError('no such package')")
-    work = cluster.carried_work()
+    work = portable_task()
 
     def bare(path):
         import sys
@@ -296,9 +297,9 @@ def test_node_without_this_package_is_named_in_one_sentence(own_ray, tmp_path):
         finally:
             sys.path.remove(path)
 
-    reference = ray_engine._task(bare, Need(1.0, 0.0)).remote(str(tmp_path))
+    reference = ray_backend._remote(bare, ONE_CORE).remote(str(tmp_path))
     with pytest.raises(RunError, match=r"run its-name: node .* cannot import ncs-gym .*: install the same on every"):
-        ray_engine._result(NAMED, reference)
+        ray_backend._result(NAMED, reference)
 
 
 def test_workers_compute_with_as_many_threads_as_local_ones(own_ray):
@@ -311,23 +312,23 @@ def test_workers_compute_with_as_many_threads_as_local_ones(own_ray):
 
     import torch
 
-    found = ray.get(ray_engine._task(threads, Need(0.5, 0.0)).remote())
+    found = ray.get(ray_backend._remote(threads, HALF_A_CORE).remote())
     assert found == (os.environ.get("OMP_NUM_THREADS", str(os.cpu_count())), torch.get_num_threads())
 
 
 def test_everything_finished_is_noticed_at_once(own_ray):
     references = [ray.put(number) for number in range(5)]
-    assert set(ray_engine.finished(references)) == set(references)
-    endless = ray_engine._task(lambda: time.sleep(1000), Need(0.5, 0.0)).remote()
-    assert ray_engine.finished([endless]) == []
-    assert ray_engine.finished([endless, references[0]]) == [references[0]]
-    ray_engine._cancel([endless])
+    assert set(ray_backend._finished(references)) == set(references)
+    endless = ray_backend._remote(lambda: time.sleep(1000), HALF_A_CORE).remote()
+    assert ray_backend._finished([endless]) == []
+    assert ray_backend._finished([endless, references[0]]) == [references[0]]
+    ray_backend._cancel([endless])
     with pytest.raises(ray.exceptions.RayError):
         ray.get(endless, timeout=60)
 
 
 def test_listener_that_is_no_ray_is_one_sentence_in_bounded_time(monkeypatch):
-    monkeypatch.setattr(cluster, "PATIENCE", 4.0)
+    monkeypatch.setattr(ray_cluster, "JOIN_TIMEOUT", 4.0)
     start = time.monotonic()
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"127.0.0.1:{server.getsockname()[1]}"
@@ -394,7 +395,7 @@ def test_cluster_that_asks_for_a_token_is_one_sentence_in_bounded_time(head, tmp
     other = own | {"HOME": str(tmp_path), "RAY_AUTH_MODE": "disabled"}
     run = ncs("sweep", *GRID, "--engine", "ray", "--ray-address", address, "--out", tmp_path / "out", **other)
     assert "it asks for a token (RAY_AUTH_MODE=token" in one_sentence(run)
-    assert time.monotonic() - start < 2 * cluster.PATIENCE
+    assert time.monotonic() - start < 2 * ray_cluster.JOIN_TIMEOUT
 
 
 def test_cluster_that_ends_is_one_sentence_and_costs_nothing_that_is_stored(tmp_path_factory, local, tmp_path):
@@ -403,12 +404,12 @@ def test_cluster_that_ends_is_one_sentence_and_costs_nothing_that_is_stored(tmp_
         run = started("sweep", *GRID, "--engine", "ray", "--ray-address", address, "--out", out, **own)
         until_stored(out, 1, run)
         process.terminate()
-        _, errors = run.communicate(timeout=PATIENCE)
+        _, errors = run.communicate(timeout=TIMEOUT)
     assert run.returncode == 2
     assert errors.strip().splitlines()[-1].startswith("ncs: Ray has ended on this machine")
     assert "Traceback" not in errors
     finished = stored(out)
-    assert 1 <= finished < UNITS
+    assert 1 <= finished < RUNS
     again = ncs("sweep", *GRID, "--jobs", "2", "--out", out)
-    assert f"{finished} of {UNITS} units were finished before" in again.stderr
+    assert f"{finished} of {RUNS} runs were finished before" in again.stderr
     assert_same(out, local)

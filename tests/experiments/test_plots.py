@@ -8,10 +8,10 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex, to_rgb
 from scipy.optimize import linprog
 
-from experiments.plots.arm_style import LOOKS, style_of
-from experiments.plots.ellipsoid_projection import shadow_of_box, shadow_of_ellipsoid
+from experiments.plots.arm_style import ARM_COLORS_AND_MARKERS, style_of
+from experiments.plots.comparison_figures import comparison_figures
+from experiments.plots.ellipsoid_projection import projected_box, projected_ellipsoid
 from experiments.plots.figure_style import thousands
-from experiments.plots.figures import figures_of
 from experiments.plots.phase_plane import phase_caption, phase_figure, plane_of
 from experiments.plots.scatter import scatter_caption, scatter_figure
 from experiments.plots.time_series import episode_caption, episode_figure, shown_arms
@@ -64,7 +64,7 @@ def test_all_arms_look_different_and_a_penalty_keeps_the_color():
 
 @pytest.mark.parametrize("seen", [np.eye(3), DEUTERANOPIA, PROTANOPIA])
 def test_color_blind_readers_can_tell_the_colors_apart(seen):
-    linear = {arm: np.power(to_rgb(color), 2.2) for arm, (color, _) in LOOKS.items()}
+    linear = {arm: np.power(to_rgb(color), 2.2) for arm, (color, _) in ARM_COLORS_AND_MARKERS.items()}
     shown = {arm: np.power(np.clip(seen @ color, 0.0, 1.0), 1 / 2.2) for arm, color in linear.items()}
     for one, other in combinations(shown, 2):
         assert np.linalg.norm(shown[one] - shown[other]) > 0.1, (one, other)
@@ -163,7 +163,7 @@ def test_intervention_rate_is_that_of_the_last_steps_only():
 
 def test_caption_names_the_arms_whose_return_contains_penalties_and_what_a_monitor_counts():
     caption = training_caption(arms("penalized", "shielded+penalty", "shielded", "monitor"))
-    assert "penalties that penalized and shielded+penalty pay" in caption
+    assert "penalties that penalized and shielded+penalty get" in caption
     assert "would have" in caption
     assert "penalties" not in training_caption(arms("unshielded", "shielded"))
 
@@ -194,22 +194,22 @@ def test_view_holds_the_sets_and_leaves_out_what_is_far_away(plant):
     assert "leave the view" in phase_caption(plant, SimpleNamespace(L=np.eye(2)), arms("unshielded", trajectory=far))
 
 
-def test_of_many_states_those_are_shown_that_go_furthest_and_the_caption_speaks_of_shadows():
+def test_of_many_states_the_largest_are_shown_and_the_caption_speaks_of_projections():
     plant = random_plant(0, 4, 1)
     states = np.array([[0.0, 0.1, 0.0, 0.1], [0.1, 0.9, 0.2, 0.3]])
     shown, certificate = arms("shielded", trajectory=trajectory(states)), SimpleNamespace(L=np.diag([1.0, 1, 1, 0.1]))
     assert plane_of(certificate, shown) == (1, 3)
     caption = phase_caption(plant, certificate, shown)
     assert "x2 and x4" in caption
-    assert "shadow" in caption
-    assert any("shadow of the safe set" in text for text in texts(phase_figure(plant, certificate, shown)))
+    assert "projection" in caption
+    assert any("projection of the safe set" in text for text in texts(phase_figure(plant, certificate, shown)))
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_shadows_reach_as_far_as_the_sets_in_every_direction(seed):
+def test_projections_reach_as_far_as_the_sets_in_every_direction(seed):
     rng = np.random.default_rng(seed)
     factor, rows = rng.standard_normal((4, 4)), rng.standard_normal((5, 4))
-    ellipse, box = shadow_of_ellipsoid(factor @ factor.T, (0, 2), 20_001), shadow_of_box(rows, (0, 2))
+    ellipse, box = projected_ellipsoid(factor @ factor.T, (0, 2), 20_001), projected_box(rows, (0, 2))
     for angle in np.linspace(0.0, np.pi, 7):
         direction = np.array([np.cos(angle), 0.0, np.sin(angle), 0.0])
         reach = linprog(-direction, np.vstack([rows, -rows]), np.ones(10), bounds=(None, None))
@@ -220,8 +220,8 @@ def test_shadows_reach_as_far_as_the_sets_in_every_direction(seed):
 
 def test_box_without_limits_in_the_plane_has_no_outline_and_elsewhere_does_not_matter():
     rows = np.array([[0.5, 0.0, 0.0], [0.0, 0.25, 0.0]])
-    assert shadow_of_box(rows, (0, 2)) is None
-    outline = shadow_of_box(rows, (0, 1))
+    assert projected_box(rows, (0, 2)) is None
+    outline = projected_box(rows, (0, 1))
     np.testing.assert_allclose(np.abs(outline).max(axis=0), [2.0, 4.0])
     assert len(outline) == 5
 
@@ -347,7 +347,7 @@ def test_scatter_caption_warns_of_episodes_that_end_early():
 
 def test_every_figure_is_a_png_with_a_caption_of_its_own(plant):
     shown = arms(*ALL_ARMS[:5])
-    figures = figures_of(plant, SimpleNamespace(L=np.eye(2)), summary_of(shown), shown)
+    figures = comparison_figures(plant, SimpleNamespace(L=np.eye(2)), summary_of(shown), shown)
     assert set(figures) == {"training", "scatter", "phase", "episode"}
     assert all(png.startswith(b"\x89PNG") for _, png in figures.values())
     assert len({caption for caption, _ in figures.values()}) == 4

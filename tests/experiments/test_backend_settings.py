@@ -3,9 +3,9 @@ import sys
 import pytest
 
 from experiments.__main__ import COMMANDS, _run
-from experiments.commands.compare import INCIDENTAL
-from experiments.runs.training_run import Unit
-from experiments.settings.backend import EngineSettings
+from experiments.runs.experiment_setup import INCIDENTAL_SETTINGS
+from experiments.runs.training_run import TrainingRun
+from experiments.settings import BackendSettings
 from experiments.settings.learning import CompareSettings, SweepSettings
 
 
@@ -29,7 +29,7 @@ from experiments.settings.learning import CompareSettings, SweepSettings
         ({"ray_wait": 1.0}, "--ray-wait is a setting of --engine ray"),
     ],
 )
-@pytest.mark.parametrize("kind", [EngineSettings, CompareSettings, SweepSettings])
+@pytest.mark.parametrize("kind", [BackendSettings, CompareSettings, SweepSettings])
 def test_impossible_settings_are_refused(kind, change, words):
     with pytest.raises(ValueError, match=words):
         kind(**change)
@@ -37,7 +37,7 @@ def test_impossible_settings_are_refused(kind, change, words):
 
 @pytest.mark.parametrize("address", ["local", "auto", "head:6379", "my-head.example:6379", "[::1]:1"])
 def test_addresses_of_clusters_are_taken(address):
-    assert EngineSettings(engine="ray", ray_address=address, gpus_per_run=0.25, cpus_per_run=0.5).jobs == 2
+    assert BackendSettings(engine="ray", ray_address=address, gpus_per_run=0.25, cpus_per_run=0.5).jobs == 2
 
 
 @pytest.mark.parametrize("kind", [CompareSettings, SweepSettings])
@@ -56,12 +56,12 @@ def test_ray_missing_is_one_sentence_that_says_what_to_install(kind, monkeypatch
 
 def test_results_of_every_engine_have_the_same_key_and_provenance():
     # A unit does not know its engine, and a summary leaves it out: a sweep begun with one can be finished with another.
-    names = set(EngineSettings.__dataclass_fields__)
+    names = set(BackendSettings.__dataclass_fields__)
     assert names
-    assert not names & set(Unit.__dataclass_fields__)
-    assert names < set(INCIDENTAL)
+    assert not names & set(TrainingRun.__dataclass_fields__)
+    assert names < set(INCIDENTAL_SETTINGS)
 
 
 def test_engines_are_offered_by_the_commands_with_many_runs():
     kinds = {"compare": CompareSettings, "sweep": SweepSettings}
-    assert {name for name in COMMANDS if issubclass(kinds.get(name, object), EngineSettings)} == {"compare", "sweep"}
+    assert {name for name in COMMANDS if issubclass(kinds.get(name, object), BackendSettings)} == {"compare", "sweep"}
