@@ -56,9 +56,8 @@ def _parse(arguments: list[str]) -> object:
     kinds = {name: getattr(settings, kind) for name, (kind, _, _) in COMMANDS.items()}
     command, rest = "".join(arguments[:1]), arguments[1:]
     if hasattr(kinds.get(command), "config"):
-        path, others = settings.split_config(rest)
-        if path is not None:
-            defaults = settings.load_settings(path, command, kinds[command])
+        defaults, others = settings.config_defaults(rest, command, kinds[command])
+        if defaults is not None:
             return tyro.cli(kinds[command], prog=f"ncs {command}", args=others, default=defaults)
     return tyro.extras.subcommand_cli_from_dict(
         kinds, prog="ncs", description="Safe learning control over imperfect networks.", args=arguments

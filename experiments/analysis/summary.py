@@ -95,7 +95,7 @@ def covered_fraction(summary: dict[str, Any]) -> float | None:
     return (here - start) / (goal - start) if goal != start else None
 
 
-def summary_rows(arms: dict[str, dict[str, Any]]) -> list[list[str]]:
+def _rows(arms: dict[str, dict[str, Any]]) -> list[list[str]]:
     """Returns two header rows, then one row of text per summary of an arm."""
     rows = [
         ["", "training:", "", "evaluation, exact 95 % CI:", "violating steps", "", ""],
@@ -128,7 +128,7 @@ def summary_rows(arms: dict[str, dict[str, Any]]) -> list[list[str]]:
 
 def summary_text(arms: dict[str, dict[str, Any]], references: dict[str, dict[str, Any]]) -> str:
     """Returns the table for a terminal; references stand below a rule."""
-    return text_table(summary_rows(arms | references), rules=(2, 2 + len(arms)))
+    return text_table(_rows(arms | references), rules=(2, 2 + len(arms)))
 
 
 def _overridden(arm: dict[str, Any], key: str) -> str:

@@ -99,7 +99,7 @@ def execute_submitted(
 
 
 def portable_task() -> Callable[[dict[str, str], bytes], RunResult]:
-    """Returns `execute_on_node` in a function that Ray sends as code: it can say that a node lacks this package."""
+    """Returns `_execute_on_node` in a function that Ray sends as code: it can say that a node lacks this package."""
 
     def work(expected: dict[str, str], content: bytes) -> RunResult:
         import platform
@@ -109,12 +109,12 @@ def portable_task() -> Callable[[dict[str, str], bytes], RunResult]:
         except ImportError as error:
             node = f"node {platform.node()} cannot import ncs-gym with the extra [train] ({error})"
             raise ImportError(f"{node}: install the same on every node") from None
-        return ray_cluster.execute_on_node(expected, content)
+        return ray_cluster._execute_on_node(expected, content)
 
     return work
 
 
-def execute_on_node(expected: dict[str, str], content: bytes) -> RunResult:
+def _execute_on_node(expected: dict[str, str], content: bytes) -> RunResult:
     """Returns the result of a pickled run, which is unpickled only if this node has the driver's classes.
 
     Args:

@@ -24,10 +24,10 @@ def audit(settings: AuditSettings) -> None:
     document = json.dumps([asdict(claim) for claim in claims], indent=1)
     if settings.out is not None:
         write_atomically(settings.out, document + "\n")
-    print(document if settings.json else audit_text(claims))
+    print(document if settings.json else _text(claims))
 
 
-def audit_text(claims: list[Claim]) -> str:
+def _text(claims: list[Claim]) -> str:
     """Returns the table for a terminal."""
     blocks = []
     for number, claim in enumerate(claims, 1):

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections import deque
 from dataclasses import asdict
+from pathlib import Path
+
+from tqdm import tqdm
 
 from experiments.analysis.text_table import text_table
-from experiments.attack import SafetyCounts
-from experiments.attack.attack_cases import attack_cases
-from experiments.attack.campaign_execution import certificate_files, execute_batches, split_into_batches
+from experiments.attack import AttackCase, MonteCarloBatch, SafetyCounts, attack_cases
+from experiments.attack.campaign_execution import execute_batches
 from experiments.attack.counts_store import CountsStore
 from experiments.attack.monte_carlo_batch import SETTLING_STEPS, SHIELD_MODES, Campaign
 from experiments.errors import SafetyBroken
@@ -40,11 +43,11 @@ def certify(settings: CertifySettings) -> None:
         shielded=not settings.unshielded,
     )
     cases = attack_cases(campaign.seed, campaign.random_plants)
-    certificates = certificate_files(cases, settings.out / "certificates")
+    certificates = _certificate_files(cases, settings.out / "certificates")
     keys = {case: f"{campaign.key} {Certificate.load(file).checksum}" for case, file in certificates.items()}
     store = CountsStore(settings.out / "tallies.jsonl", keys)
     least = len(SHIELD_MODES) if campaign.shielded else 1
-    batches = split_into_batches(list(cases), settings.steps / campaign.batch_steps, least)
+    batches = _batches(list(cases), settings.steps / campaign.batch_steps, least)
     missing = {case: deque(each for each in some if each not in store.counts) for case, some in batches.items()}
     start, steps = time.perf_counter(), campaign.batch_steps * sum(map(len, missing.values()))
     execute_batches(campaign, missing, certificates, store, settings.jobs)
@@ -61,6 +64,33 @@ def certify(settings: CertifySettings) -> None:
         raise SafetyBroken(
             f"{total.exits:,} steps outside S, {total.violations:,} outside the box, {total.unproved:,} without a proof"
         )
+
+
+def _certificate_files(cases: dict[str, AttackCase], folder: Path) -> dict[str, Path]:
+    """Returns a file with the certificate of each case; certificates that are missing are synthesized."""
+    folder.mkdir(parents=True, exist_ok=True)
+    files = {}
+    for name, case in tqdm(cases.items(), desc="certificates", leave=False, disable=None):
+        contract = "" if case.contract is None else f"-{case.contract.max_age}-{case.contract.quantization_step:g}"
+        files[name] = folder / f"{case.plant.fingerprint[:16]}{contract}.json"
+        if not files[name].exists():
+            case.certificate.save(files[name])
+    return files
+
+
+def _batches(cases: list[str], count: float, least: int) -> dict[str, list[MonteCarloBatch]]:
+    """Returns the batches of each case, as evenly as possible, earlier cases first.
+
+    Args:
+        cases: Names of the cases.
+        count: Smallest number of batches in all.
+        least: Smallest number of batches of each case.
+    """
+    each, extra = divmod(max(math.ceil(count), least * len(cases)), len(cases))
+    return {
+        name: [MonteCarloBatch(name, index) for index in range(each + (number < extra))]
+        for number, name in enumerate(cases)
+    }
 
 
 def _table(counts: dict[str, SafetyCounts], total: SafetyCounts) -> str:

@@ -14,12 +14,11 @@ from experiments.backends.execution import results_of
 from experiments.plots.comparison_figures import comparison_figures
 from experiments.report.comparison import comparison_report
 from experiments.runs import (
+    Arm,
     ExperimentSetup,
     RunResult,
     TrainingRun,
-    arm_of,
     by_arm,
-    experiment_setup,
     prepare_output,
 )
 from experiments.runs.training_run import PolicyKind
@@ -44,14 +43,14 @@ def compare(settings: CompareSettings) -> None:
     """
     if settings.smoke:
         settings = replace(settings, **_SMOKE)
-    arms = [arm_of(name, settings.mode) for name in settings.arms]
+    arms = [Arm.of(name, settings.mode) for name in settings.arms]
     if len({arm.name for arm in arms}) != len(arms) or not arms:
         raise ValueError(f"--arms must be different ones, at least one, got {' '.join(settings.arms) or 'none'}")
-    setup = experiment_setup(settings.env, settings.channel, settings.certificate)
+    setup = ExperimentSetup.of(settings.env, settings.channel, settings.certificate)
     prepare_output(settings.out)
     save_settings(settings.out / "settings.json", "compare", settings)
     print(setup.title, flush=True)
-    runs = training_runs(settings, setup)
+    runs = _training_runs(settings, setup)
     results = results_of(runs, settings.out, settings)
     summary = _summary(settings, setup, runs, results)
     findings = _findings(summary)
@@ -61,7 +60,7 @@ def compare(settings: CompareSettings) -> None:
     print(summary_text(summary["arms"], summary["references"]), *findings, f"files: {settings.out}", sep="\n")
 
 
-def training_runs(settings: CompareSettings, setup: ExperimentSetup) -> list[TrainingRun]:
+def _training_runs(settings: CompareSettings, setup: ExperimentSetup) -> list[TrainingRun]:
     """Returns the runs of every arm and of the reference policies, those that train first because they take longer."""
     runs = []
     for index in range(settings.seeds):

@@ -8,9 +8,8 @@ from dataclasses import asdict
 from agents import evaluation
 from agents.control_loop import ControlLoop, Shielding
 from experiments.analysis.summary import arm_summary, summary_text
-from experiments.runs import RunResult, experiment_setup, versions
+from experiments.runs import ExperimentSetup, RunResult, versions
 from experiments.settings import EvaluateSettings
-from experiments.settings.channel import channel_of
 from ncs_gym.envs.env import ncs_env
 from shields.atomic_write import write_atomically
 
@@ -29,8 +28,8 @@ def evaluate(settings: EvaluateSettings) -> None:
 
     agent = Agent.load(settings.model)
     own = ncs_env(ControlLoop(env=agent.env, channel=agent.channel).single()).channel
-    channel = channel_of(settings.channel, own) or agent.channel
-    setup = experiment_setup(agent.env, channel, settings.certificate)
+    channel = settings.channel.applied_to(own) or agent.channel
+    setup = ExperimentSetup.of(agent.env, channel, settings.certificate)
     mode = None if settings.shield == "none" else settings.shield
     shielding = None if mode is None else Shielding(setup.certificate, mode)
     evaluated = evaluation.evaluate(

@@ -11,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments.commands import require_extra
-from experiments.plots.animation import FORMATS, save_animation, scaled
+from experiments.plots.animation import FORMATS, save_animation
 from experiments.runs.experiment_setup import registered_env
 from experiments.runs.policies import UNTRAINED_POLICIES, policy_by_name
 from experiments.settings import RenderSettings
@@ -40,8 +40,8 @@ def render(settings: RenderSettings) -> None:
         require_extra("render", "moviepy")
     modes = ("none", settings.shield) if settings.side_by_side else (settings.shield,)
     renderers = [_EpisodeRenderer(settings, mode) for mode in modes]
-    frames = (scaled(_side_by_side(row), settings.width) for row in _frames(renderers, settings.steps))
-    size = save_animation(frames, settings.out, settings.fps)
+    frames = map(_side_by_side, _frames(renderers, settings.steps))
+    size = save_animation(frames, settings.out, settings.fps, settings.width)
     for renderer in renderers:
         print(renderer)
     print(f"saved to {settings.out} ({size / 1e6:.2f} MB)")

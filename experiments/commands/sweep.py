@@ -15,13 +15,13 @@ from experiments.analysis.text_table import text_table
 from experiments.backends.execution import results_of
 from experiments.plots.heatmaps import sweep_figures
 from experiments.report.sweep import sweep_report
-from experiments.runs import ExperimentSetup, RunResult, arm_of, by_arm, experiment_setup, prepare_output
+from experiments.runs import Arm, ExperimentSetup, RunResult, by_arm, prepare_output
 from experiments.settings import ChannelSettings, SweepSettings, save_settings
 from shields.atomic_write import write_atomically
 
 
 @dataclass(frozen=True)
-class GridPoint:
+class _GridPoint:
     """One channel of the grid.
 
     Attributes:
@@ -60,13 +60,13 @@ def sweep(settings: SweepSettings) -> None:
         RunError: If a run fails.
         ClusterError: If a cluster cannot execute the runs.
     """
-    points = grid_points(settings)
+    points = _grid_points(settings)
     for name in ("loss", "delay", "burst_length"):
         if getattr(settings.channel, name) is not None:
             raise ValueError(f"--channel.{name.replace('_', '-')} is a side of the grid: give its values there")
     for name in settings.arms:
-        arm_of(name, settings.mode)
-    setups = [experiment_setup(settings.env, each.channel(settings.channel), settings.certificate) for each in points]
+        Arm.of(name, settings.mode)
+    setups = [ExperimentSetup.of(settings.env, each.channel(settings.channel), settings.certificate) for each in points]
     prepare_output(settings.out)
     save_settings(settings.out / "settings.json", "sweep", settings)
     runs = [
@@ -89,7 +89,7 @@ def sweep(settings: SweepSettings) -> None:
     print(f"{settings.env}: {count} per arm and channel\n", _text(summary), f"files: {settings.out}", sep="\n")
 
 
-def grid_points(settings: SweepSettings) -> list[GridPoint]:
+def _grid_points(settings: SweepSettings) -> list[_GridPoint]:
     """Returns the points of the grid.
 
     Raises:
@@ -106,7 +106,7 @@ def grid_points(settings: SweepSettings) -> list[GridPoint]:
         if not side or len(set(side)) != len(side):
             raise ValueError(f"--{name.replace('_', '-')} must be different values, at least one")
     del sides["arms"]
-    return [GridPoint(*point) for point in product(*sides.values())]
+    return [_GridPoint(*point) for point in product(*sides.values())]
 
 
 def _write(settings: SweepSettings, summary: dict[str, Any], rows: list[dict], setup: ExperimentSetup) -> None:
@@ -136,7 +136,7 @@ def _text(summary: dict[str, Any]) -> str:
             outcome = [
                 f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,}",
                 f"{arm['train_violation_steps']:,} of {arm['train_steps']:,}",
-                "-" if arm_of(name).mode is None else f"{100 * arm['intervention_rate']:.1f} %",
+                "-" if Arm.of(name).mode is None else f"{100 * arm['intervention_rate']:.1f} %",
                 f"{arm['eval_return_mean']:.1f}",
             ]
             rows.append([*channel, name, *outcome])
@@ -147,7 +147,7 @@ def _arms(results: Sequence[RunResult]) -> dict[str, Any]:
     return {name: summarize_arm(runs, fixed_policy=False) for name, runs in by_arm(results).items()}
 
 
-def _rows(point: GridPoint, results: Sequence[RunResult]) -> list[dict[str, Any]]:
+def _rows(point: _GridPoint, results: Sequence[RunResult]) -> list[dict[str, Any]]:
     """Returns one row per training run."""
     rows = []
     for result in results:

@@ -6,7 +6,7 @@ import json
 
 from experiments.analysis.summary import arm_summary, summary_text
 from experiments.backends.execution import results_of
-from experiments.runs import arm_of, experiment_setup, prepare_output
+from experiments.runs import Arm, ExperimentSetup, prepare_output
 from experiments.settings import BackendSettings, TrainSettings, save_settings
 from shields.atomic_write import write_atomically
 
@@ -21,8 +21,8 @@ def train(settings: TrainSettings) -> None:
         Infeasible: If no certificate is found.
         RunError: If the run fails.
     """
-    arm_of(settings.arm, settings.mode)
-    setup = experiment_setup(settings.env, settings.channel, settings.certificate)
+    Arm.of(settings.arm, settings.mode)
+    setup = ExperimentSetup.of(settings.env, settings.channel, settings.certificate)
     prepare_output(settings.out)
     save_settings(settings.out / "settings.json", "train", settings)
     run = setup.training_run(settings, settings.arm, 0)

@@ -7,10 +7,9 @@ from collections.abc import Callable, Sequence
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from experiments.paper.reproduction import Simulation
-from experiments.plots.figure_style import STYLE, as_png
+from experiments.plots.figure_style import STYLE, CaptionedFigure
 
 _COLOR = "#1f6f8b"
 # The transient is over after these steps; the other inputs are near zero.
@@ -20,15 +19,15 @@ _SHOWN_STEPS = 40
 def reproduction_figures(simulations: Sequence[Simulation]) -> dict[str, bytes]:
     """Returns the PNG files of the states and of the inputs, by name."""
     return {
-        "states": as_png(_panels(simulations, _draw_states)),
-        "inputs": as_png(_panels(simulations, _draw_inputs)),
+        "states": _panels(simulations, _draw_states).png,
+        "inputs": _panels(simulations, _draw_inputs).png,
     }
 
 
-def _panels(simulations: Sequence[Simulation], draw: Callable[[Axes, Simulation], None]) -> Figure:
+def _panels(simulations: Sequence[Simulation], draw: Callable[[Axes, Simulation], None]) -> CaptionedFigure:
     """Returns one panel per design, with one legend below."""
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(12, 4.6), layout="constrained")
+        figure = CaptionedFigure((12, 4.6))
         axes = figure.subplots(1, len(simulations), sharey=True)
         for axis, simulation in zip(axes, simulations, strict=True):
             draw(axis, simulation)

@@ -21,22 +21,14 @@ _LAST_FRAME_TIME = 2000
 _EDGE_FRACTIONS = (0.35, 0.7)
 
 
-def scaled(picture: np.ndarray, width: int | None) -> Image.Image:
-    """Returns an image, shape (height, width, 3), scaled to a width; both sides even, as video coders want them."""
-    image = Image.fromarray(picture)
-    if width is None or width == image.width:
-        return image
-    height = round(image.height * width / image.width)
-    return image.resize((width - width % 2, height - height % 2), Image.Resampling.LANCZOS)
-
-
-def save_animation(frames: Iterable[Image.Image], file: Path, fps: int) -> int:
+def save_animation(frames: Iterable[np.ndarray], file: Path, fps: int, width: int | None = None) -> int:
     """Writes frames in the format of the file's name.
 
     Args:
-        frames: Frames of the same size, at least one.
+        frames: Frames of the same size, at least one, shape (height, width, 3), uint8.
         file: File whose name ends in one of FORMATS.
         fps: Frames per second.
+        width: Width of the animation [pixels]; None for that of the frames.
 
     Returns:
         Size of the file [bytes].
@@ -45,9 +37,18 @@ def save_animation(frames: Iterable[Image.Image], file: Path, fps: int) -> int:
         OSError: If it cannot be written.
     """
     encode = {".gif": _gif, ".mp4": _mp4, ".png": _png}[file.suffix]
-    data = encode(frames, fps)
+    data = encode((_scaled(frame, width) for frame in frames), fps)
     write_atomically(file, data)
     return len(data)
+
+
+def _scaled(frame: np.ndarray, width: int | None) -> Image.Image:
+    """Returns a frame scaled to a width; both sides are even, as video encoders need them."""
+    image = Image.fromarray(frame)
+    if width is None or width == image.width:
+        return image
+    height = round(image.height * width / image.width)
+    return image.resize((width - width % 2, height - height % 2), Image.Resampling.LANCZOS)
 
 
 def _gif(frames: Iterable[Image.Image], fps: int) -> bytes:

@@ -41,6 +41,21 @@ class ArmStyle:
     hollow: bool
     size: float
 
+    @classmethod
+    def of(cls, arm: str) -> ArmStyle:
+        """Returns the style of an arm: the color stands for the shield, dashed lines and hollow markers for a penalty.
+
+        The monitor's agent is the unshielded one, so its curves lie on those of the unshielded arm and are dotted.
+
+        Raises:
+            KeyError: If the arm is unknown.
+        """
+        color, marker = ARM_COLORS_AND_MARKERS[arm.removesuffix(PENALTY_SUFFIX)]
+        if arm == "monitor":
+            return cls(color, _DOTTED, marker, hollow=True, size=11.0)
+        penalized = arm.endswith(PENALTY_SUFFIX)
+        return cls(color, _DASHED if penalized else _SOLID, marker, hollow=penalized, size=10.0 if penalized else 7.0)
+
     @property
     def line(self) -> dict[str, Any]:
         """Keyword arguments of matplotlib for lines."""
@@ -61,18 +76,3 @@ class ArmStyle:
         """Returns the arm's entry in a legend."""
         shape = self.line | {"lw": 2.0} if line else {"ls": "none"}
         return Line2D([], [], **shape, **(self.points if points else {}))
-
-
-def style_of(arm: str) -> ArmStyle:
-    """Returns the style of an arm: the color stands for the shield, dashed lines and hollow markers for a penalty.
-
-    The monitor's agent is the unshielded one, so its curves lie on those of the unshielded arm and are dotted.
-
-    Raises:
-        KeyError: If the arm is unknown.
-    """
-    color, marker = ARM_COLORS_AND_MARKERS[arm.removesuffix(PENALTY_SUFFIX)]
-    if arm == "monitor":
-        return ArmStyle(color, _DOTTED, marker, hollow=True, size=11.0)
-    penalized = arm.endswith(PENALTY_SUFFIX)
-    return ArmStyle(color, _DASHED if penalized else _SOLID, marker, hollow=penalized, size=10.0 if penalized else 7.0)

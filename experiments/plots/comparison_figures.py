@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from experiments.plots.figure_style import as_png
-from experiments.plots.phase_plane import phase_caption, phase_figure
-from experiments.plots.scatter import scatter_caption, scatter_figure
-from experiments.plots.time_series import episode_caption, episode_figure
-from experiments.plots.training_curves import training_caption, training_figure
+from experiments.plots.phase_plane import phase_figure
+from experiments.plots.scatter import scatter_figure
+from experiments.plots.time_series import episode_figure
+from experiments.plots.training_curves import training_figure
 from experiments.runs.arms import ResultsByArm
 from ncs_gym import LinearPlant
 from shields import Certificate
@@ -26,9 +25,10 @@ def comparison_figures(
         results: Results of the runs of every arm.
     """
     arms = {name: results[name] for name in summary["arms"]}
-    return {
-        "training": (training_caption(arms), as_png(training_figure(arms))),
-        "scatter": (scatter_caption(arms), as_png(scatter_figure(summary["arms"], arms))),
-        "phase": (phase_caption(plant, certificate, arms), as_png(phase_figure(plant, certificate, arms))),
-        "episode": (episode_caption(arms), as_png(episode_figure(plant, arms))),
+    figures = {
+        "training": training_figure(arms),
+        "scatter": scatter_figure(summary["arms"], arms),
+        "phase": phase_figure(plant, certificate, arms),
+        "episode": episode_figure(plant, arms),
     }
+    return {name: (figure.caption, figure.png) for name, figure in figures.items()}

@@ -1,4 +1,4 @@
-"""Style of all figures: settings of matplotlib, labels, legends and the PNG file."""
+"""What all figures share: a caption, the PNG file, settings of matplotlib, labels and legends."""
 
 from __future__ import annotations
 
@@ -29,13 +29,29 @@ _LETTER, _HANDLE = 0.085, 0.6
 _SQUARED = "\N{SUPERSCRIPT TWO}"
 
 
-def as_png(figure: Figure) -> bytes:
-    """Returns a figure as a PNG file's bytes."""
-    buffer = io.BytesIO()
-    # Some settings are read only when a figure is drawn.
-    with matplotlib.rc_context(STYLE):
-        figure.savefig(buffer, format="png", metadata={"Software": ""})
-    return buffer.getvalue()
+class CaptionedFigure(Figure):
+    """A figure of matplotlib with a caption.
+
+    Args:
+        size: Width and height [inches].
+        caption: Text below the figure.
+
+    Attributes:
+        caption: Text below the figure.
+    """
+
+    def __init__(self, size: tuple[float, float], caption: str = "") -> None:
+        super().__init__(figsize=size, layout="constrained")
+        self.caption = caption
+
+    @property
+    def png(self) -> bytes:
+        """Content of the PNG file."""
+        buffer = io.BytesIO()
+        # Some settings are read only when a figure is drawn.
+        with matplotlib.rc_context(STYLE):
+            self.savefig(buffer, format="png", metadata={"Software": ""})
+        return buffer.getvalue()
 
 
 def with_unit(name: str, unit: str) -> str:

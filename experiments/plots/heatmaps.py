@@ -11,10 +11,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 
-from experiments.plots.figure_style import STYLE, as_png, label, thousands, with_unit
-from experiments.runs.arms import arm_of
+from experiments.plots.figure_style import STYLE, CaptionedFigure, label, thousands, with_unit
+from experiments.runs.arms import Arm
 
 # Largest number of panels side by side.
 _COLUMNS = 4
@@ -26,8 +25,8 @@ _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 @dataclass(frozen=True)
-class Quantity:
-    """Quantity that a heatmap shows.
+class _Quantity:
+    """_Quantity that a heatmap shows.
 
     Attributes:
         key: Key of the quantity in an arm's summary.
@@ -52,8 +51,8 @@ class Quantity:
     of_shields: bool = False
 
 
-QUANTITIES = {
-    "violations": Quantity(
+_QUANTITIES = {
+    "violations": _Quantity(
         "eval_violation_rate",
         100.0,
         "violating evaluation episodes",
@@ -63,7 +62,7 @@ QUANTITIES = {
         10.0,
         "Violations: fraction of evaluation episodes in which the true state violates, over all runs of an arm.",
     ),
-    "return": Quantity(
+    "return": _Quantity(
         "eval_return_mean",
         1.0,
         "mean return",
@@ -73,7 +72,7 @@ QUANTITIES = {
         None,
         "Return: mean of the evaluation episodes, without penalties; one color scale for all arms.",
     ),
-    "interventions": Quantity(
+    "interventions": _Quantity(
         "intervention_rate",
         100.0,
         "actions overridden",
@@ -88,17 +87,17 @@ QUANTITIES = {
 
 
 def sweep_figures(summary: dict[str, Any], arms: Sequence[str]) -> dict[str, tuple[str, bytes]]:
-    """Returns caption and PNG of every figure by name; without an arm that has a shield, none of interventions."""
+    """Returns caption and PNG file of every figure by name; without an arm that has a shield, none of interventions."""
     figures = {}
-    for name, quantity in QUANTITIES.items():
-        shown = [arm for arm in arms if not quantity.of_shields or arm_of(arm).mode is not None]
+    for name, quantity in _QUANTITIES.items():
+        shown = [arm for arm in arms if not quantity.of_shields or Arm.of(arm).mode is not None]
         if shown:
-            figure = heatmap_figure(summary["cells"], shown, quantity)
-            figures[name] = (heatmap_caption(quantity, summary["cells"], shown), as_png(figure))
+            figure = _heatmap(summary["cells"], shown, quantity)
+            figures[name] = (figure.caption, figure.png)
     return figures
 
 
-def heatmap_caption(quantity: Quantity, cells: Sequence[dict[str, Any]], arms: Sequence[str]) -> str:
+def _caption(quantity: _Quantity, cells: Sequence[dict[str, Any]], arms: Sequence[str]) -> str:
     """Returns the caption."""
     runs = max(cell["arms"][arm]["runs"] for cell in cells for arm in arms)
     text = f"{quantity.caption} {runs} {'run' if runs == 1 else 'runs'} per field."
@@ -107,7 +106,7 @@ def heatmap_caption(quantity: Quantity, cells: Sequence[dict[str, Any]], arms: S
     return text
 
 
-def heatmap_figure(cells: Sequence[dict[str, Any]], arms: Sequence[str], quantity: Quantity) -> Figure:
+def _heatmap(cells: Sequence[dict[str, Any]], arms: Sequence[str], quantity: _Quantity) -> CaptionedFigure:
     """Returns one quantity: a panel per arm, a block of them per combination of quantization step and burst length."""
     losses, delays = (sorted({cell[side] for cell in cells}) for side in ("loss", "delay"))
     others = list(dict.fromkeys((cell["quantization_step"], cell["burst_length"]) for cell in cells))
@@ -118,7 +117,8 @@ def heatmap_figure(cells: Sequence[dict[str, Any]], arms: Sequence[str], quantit
     height = 0.5 * len(delays) + (0.65 if len(others) > 1 else 0.45)
     with matplotlib.rc_context(STYLE), matplotlib.rc_context({"axes.grid": False}):
         width = 1.8 + max(0.68 * len(losses) + 0.15, 1.7) * columns
-        figure = Figure(figsize=(width, max(0.7 + max(height, 1.3) * rows, _MIN_HEIGHT)), layout="constrained")
+        size = (width, max(0.7 + max(height, 1.3) * rows, _MIN_HEIGHT))
+        figure = CaptionedFigure(size, _caption(quantity, cells, arms))
         panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
         for at, panel in enumerate(panels.flat):
             row, column = divmod(at, columns)
@@ -140,7 +140,7 @@ def _field(
     cells: Sequence[dict[str, Any]],
     arm: str,
     other: tuple[float | None, float],
-    quantity: Quantity,
+    quantity: _Quantity,
     losses: list[float],
     delays: list[int],
 ) -> np.ndarray:
@@ -153,7 +153,7 @@ def _field(
     return values
 
 
-def _norm(fields: Sequence[np.ndarray], quantity: Quantity) -> Normalize:
+def _norm(fields: Sequence[np.ndarray], quantity: _Quantity) -> Normalize:
     """Returns one color scale for all panels."""
     low = np.nanmin(fields) if quantity.low is None else quantity.low
     high = np.nanmax(fields) if quantity.high is None else max(quantity.high, np.nanmax(fields))

@@ -8,11 +8,10 @@ import matplotlib
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from experiments.plots.arm_style import style_of
+from experiments.plots.arm_style import ArmStyle
 from experiments.plots.ellipsoid_projection import projected_box, projected_ellipsoid
-from experiments.plots.figure_style import STYLE, label, legend_below, with_unit
+from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below, with_unit
 from experiments.runs.arms import ResultsByArm
 from ncs_gym import LinearPlant
 from shields import Certificate
@@ -24,18 +23,18 @@ _VIEW = 1.75
 _INK = "#222222"
 
 
-def phase_figure(plant: LinearPlant, certificate: Certificate, arms: ResultsByArm) -> Figure:
+def phase_figure(plant: LinearPlant, certificate: Certificate, arms: ResultsByArm) -> CaptionedFigure:
     """Returns two states of the first evaluation episode of each run, a panel per arm, with safe box and safe set."""
-    plane = plane_of(certificate, arms)
+    plane = _plane(certificate, arms)
     rows = -(-len(arms) // _COLUMNS)
     columns = -(-len(arms) // rows)
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(min(11.0, 1.4 + 3.2 * columns), 0.9 + 2.9 * rows), layout="constrained")
+        figure = CaptionedFigure((min(11.0, 1.4 + 3.2 * columns), 0.9 + 2.9 * rows), _caption(plant, certificate, arms))
         panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         handles: dict[str, Artist] = {}
         for panel, (name, results) in zip(panels.flat, arms.items(), strict=False):
             handles |= _draw_sets(panel, plant, certificate, plane)
-            color, alpha = style_of(name).color, max(0.8 - 0.05 * len(results), 0.3)  # many paths stay apart
+            color, alpha = ArmStyle.of(name).color, max(0.8 - 0.05 * len(results), 0.3)  # many paths stay apart
             for result in results:
                 handles |= _draw_path(panel, plant, result.trajectory.states, plane, color, alpha)
             panel.set_title(name)
@@ -47,9 +46,9 @@ def phase_figure(plant: LinearPlant, certificate: Certificate, arms: ResultsByAr
         return figure
 
 
-def phase_caption(plant: LinearPlant, certificate: Certificate, arms: ResultsByArm) -> str:
+def _caption(plant: LinearPlant, certificate: Certificate, arms: ResultsByArm) -> str:
     """Returns the caption: what is shown, and what is left out."""
-    plane = plane_of(certificate, arms)
+    plane = _plane(certificate, arms)
     text = "Phase plane: true states of the first evaluation episode of each run, for every arm."
     if plant.n > 2:
         first, second = (plant.state_names[i] for i in plane)
@@ -64,7 +63,7 @@ def phase_caption(plant: LinearPlant, certificate: Certificate, arms: ResultsByA
     return text
 
 
-def plane_of(certificate: Certificate, arms: ResultsByArm) -> tuple[int, int]:
+def _plane(certificate: Certificate, arms: ResultsByArm) -> tuple[int, int]:
     """Returns the two states that are largest in units of the safe set's extent, in ascending order."""
     states = np.concatenate([result.trajectory.states for results in arms.values() for result in results])
     furthest = (np.abs(states) / np.sqrt(np.diag(certificate.L))).max(axis=0)

@@ -9,11 +9,10 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from experiments.plots.arm_style import ArmStyle, style_of
-from experiments.plots.figure_style import STYLE, label, legend_below, thousands
+from experiments.plots.arm_style import ArmStyle
+from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below, thousands
 from experiments.runs.arms import ResultsByArm
 from experiments.runs.training_run import RunResult
 
@@ -21,7 +20,7 @@ from experiments.runs.training_run import RunResult
 _SIZES = (12.0, 7.5)
 
 
-def scatter_figure(summary: dict[str, dict[str, Any]], arms: ResultsByArm) -> Figure:
+def scatter_figure(summary: dict[str, dict[str, Any]], arms: ResultsByArm) -> CaptionedFigure:
     """Returns mean return against violating steps per episode and against violating episodes.
 
     Args:
@@ -29,10 +28,10 @@ def scatter_figure(summary: dict[str, dict[str, Any]], arms: ResultsByArm) -> Fi
         arms: Results of each arm.
     """
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(11.0, 4.4), layout="constrained")
+        figure = CaptionedFigure((11.0, 4.4), _caption(arms))
         steps, episodes = figure.subplots(1, 2, sharey=True)
         sizes = np.linspace(*_SIZES, len(arms))
-        styles = {name: replace(style_of(name), size=float(size)) for name, size in zip(arms, sizes, strict=True)}
+        styles = {name: replace(ArmStyle.of(name), size=float(size)) for name, size in zip(arms, sizes, strict=True)}
         for name, results in arms.items():
             arm, style = summary[name], styles[name]
             per_episode = [_mean(result, "violation_steps") for result in results]
@@ -48,7 +47,7 @@ def scatter_figure(summary: dict[str, dict[str, Any]], arms: ResultsByArm) -> Fi
         return figure
 
 
-def scatter_caption(arms: ResultsByArm) -> str:
+def _caption(arms: ResultsByArm) -> str:
     """Returns the caption: what points and bars are."""
     runs = max(len(results) for results in arms.values())
     text = "Cost and return in evaluation, better to the upper left."

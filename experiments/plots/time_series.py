@@ -9,13 +9,12 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from agents.trajectory import Trajectory
-from experiments.plots.arm_style import style_of
-from experiments.plots.figure_style import STYLE, label, legend_below, with_unit
-from experiments.runs.arms import ResultsByArm, arm_of
+from experiments.plots.arm_style import ArmStyle
+from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below, with_unit
+from experiments.runs.arms import Arm, ResultsByArm
 from ncs_gym import LinearPlant
 
 _INK = "#222222"
@@ -24,26 +23,26 @@ _WIDTHS = (2.6, 1.2)
 _LIMIT = {"color": _INK, "lw": 1.0, "ls": (0, (6.0, 3.0))}
 
 
-def shown_arms(names: Sequence[str]) -> list[str]:
+def _shown_arms(names: Sequence[str]) -> list[str]:
     """Returns the pair to show: the unshielded arm, or else another one without a shield, and the first shielded one.
 
     Without a shielded arm, or without any other, fewer.
     """
-    shielded = [name for name in names if arm_of(name).is_shielded]
+    shielded = [name for name in names if Arm.of(name).is_shielded]
     bare = sorted((name for name in names if name not in shielded), key=lambda name: name != "unshielded")
     return bare[:1] + shielded[:1]
 
 
-def episode_figure(plant: LinearPlant, arms: ResultsByArm) -> Figure:
+def episode_figure(plant: LinearPlant, arms: ResultsByArm) -> CaptionedFigure:
     """Returns the same evaluation episode of the first runs of the shown arms.
 
     From above: the largest |c_j x| of state and estimate, a panel per input, and a row of ticks per kind of event.
     """
-    paths = {name: arms[name][0].trajectory for name in shown_arms(list(arms))}
+    paths = {name: arms[name][0].trajectory for name in _shown_arms(list(arms))}
     events = _events(paths, plant)
     heights = [1.5, *[1.0] * plant.m, 0.16 + 0.17 * len(events)]
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(11.0, 1.2 + 1.45 * sum(heights)), layout="constrained")
+        figure = CaptionedFigure((11.0, 1.2 + 1.45 * sum(heights)), _caption(arms))
         axes = figure.subplots(2 + plant.m, 1, sharex=True, height_ratios=heights)
         handles = _draw_states(axes[0], paths, plant)
         for i in range(plant.m):
@@ -56,9 +55,9 @@ def episode_figure(plant: LinearPlant, arms: ResultsByArm) -> Figure:
         return figure
 
 
-def episode_caption(arms: ResultsByArm) -> str:
+def _caption(arms: ResultsByArm) -> str:
     """Returns the caption: which episode is shown, and what is marked."""
-    names = shown_arms(list(arms))
+    names = _shown_arms(list(arms))
     paths = [arms[name][0].trajectory for name in names]
     text = f"Time series: the first evaluation episode of the first run, {' and '.join(names)}"
     text += ", with common random numbers." if len(names) > 1 else "."
@@ -78,7 +77,7 @@ def _draw_states(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant) -
     handles: dict[str, Artist] = {}
     crosses: list[Line2D] = []
     for (name, path), width in zip(paths.items(), _WIDTHS, strict=False):
-        color = style_of(name).color
+        color = ArmStyle.of(name).color
         time = plant.dt * np.arange(len(path.states))
         true, estimated = (np.abs(x @ plant.C.T).max(axis=1) for x in (path.states, path.estimates))
         (handles[name],) = axis.plot(time, true, color=color, lw=width)
@@ -102,7 +101,7 @@ def _draw_input(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant, i:
     """Draws one input of all arms, and what was proposed in its place."""
     handles: dict[str, Artist] = {}
     for (name, path), width in zip(paths.items(), _WIDTHS, strict=False):
-        style = style_of(name)
+        style = ArmStyle.of(name)
         edges = plant.dt * np.arange(len(path.inputs) + 1)
         axis.stairs(path.inputs[:, i], edges, baseline=None, color=style.color, lw=width)
         changed = (path.inputs != path.proposed).any(axis=1)
@@ -136,10 +135,10 @@ def _events(paths: dict[str, Trajectory], plant: LinearPlant) -> dict[str, tuple
             row = "packet arrivals" if name == longest else f"packet arrivals, {name}"
             events[row] = plant.dt * (1.0 + np.flatnonzero(path.arrivals)), _INK
     for name, path in paths.items():
-        mode = arm_of(name).mode
+        mode = Arm.of(name).mode
         if mode is not None:
             row = f"would override, {name}" if mode == "monitor" else "interventions"
-            events[row] = plant.dt * (0.5 + np.flatnonzero(path.intervened)), style_of(name).color
+            events[row] = plant.dt * (0.5 + np.flatnonzero(path.intervened)), ArmStyle.of(name).color
     return events
 
 

@@ -9,40 +9,39 @@ import matplotlib
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from experiments.plots.arm_style import ArmStyle, style_of
-from experiments.plots.figure_style import STYLE, label, legend_below, thousands
-from experiments.runs.arms import ResultsByArm, arm_of
+from experiments.plots.arm_style import ArmStyle
+from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below, thousands
+from experiments.runs.arms import Arm, ResultsByArm
 from experiments.runs.training_run import RunResult
 
 # Curves of fewer points show each point.
 _FEW_POINTS = 5
 # The rate of interventions is averaged over this many steps, an episode of 200 in each of 64 environments: it rises and
 # falls with the episodes, which start together.
-RATE_WINDOW = 64 * 200
+_RATE_WINDOW = 64 * 200
 
 
-def training_figure(arms: ResultsByArm) -> Figure:
+def training_figure(arms: ResultsByArm) -> CaptionedFigure:
     """Returns return, violating steps so far and intervention rate against training steps, bands over runs.
 
     Without an arm that watches for unsafe actions there is no third panel.
     """
-    watching = [name for name in arms if arm_of(name).mode is not None]
+    watching = [name for name in arms if Arm.of(name).mode is not None]
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(11.0, 3.9), layout="constrained")
+        figure = CaptionedFigure((11.0, 3.9), _caption(arms))
         axes = figure.subplots(1, 3 if watching else 2)
         for name, results in arms.items():
-            steps = common_steps(results)
-            style = style_of(name)
+            steps = _common_steps(results)
+            style = ArmStyle.of(name)
             _draw(axes[0], steps, _on(steps, results, "episode_return"), style)
             violations = _on(steps, results, "violation_steps")
             # Before the first step nothing has happened: true, and a curve even where the history is one point.
             _draw(axes[1], np.array([0, *steps]), np.pad(violations, ((0, 0), (1, 0))), style)
             if name in watching:
-                _draw(axes[2], steps, 100.0 * rates(steps, _on(steps, results, "interventions")), style)
+                _draw(axes[2], steps, 100.0 * _rates(steps, _on(steps, results, "interventions")), style)
         label(axes[0], "training steps", "mean return of recent episodes", "Return")
         label(axes[1], "training steps", "violating steps so far", "Violations of the true state")
         if watching:
@@ -59,7 +58,7 @@ def training_figure(arms: ResultsByArm) -> Figure:
         return figure
 
 
-def training_caption(arms: ResultsByArm) -> str:
+def _caption(arms: ResultsByArm) -> str:
     """Returns the caption: what the lines and bands are."""
     runs = max(len(results) for results in arms.values())
     band = (
@@ -68,17 +67,17 @@ def training_caption(arms: ResultsByArm) -> str:
         else "One run per arm, so there is no band."
     )
     text = f"Training. {band} The return begins where every run has finished an episode."
-    if any(arm_of(name).mode is not None for name in arms):
-        text += f" Interventions are rates over the last {RATE_WINDOW:,} steps (over all, before there are as many)."
+    if any(Arm.of(name).mode is not None for name in arms):
+        text += f" Interventions are rates over the last {_RATE_WINDOW:,} steps (over all, before there are as many)."
     if "monitor" in arms:
         text += " The monitor's are what the shield would have overridden; its agent is the unshielded one."
-    penalized = [name for name in arms if arm_of(name).penalizes_interventions or arm_of(name).penalizes_violations]
+    penalized = [name for name in arms if Arm.of(name).penalizes_interventions or Arm.of(name).penalizes_violations]
     if penalized:
         text += f" The return in training contains the penalties that {' and '.join(penalized)} get."
     return text
 
 
-def common_steps(results: Sequence[RunResult]) -> np.ndarray:
+def _common_steps(results: Sequence[RunResult]) -> np.ndarray:
     """Returns steps that all runs of an arm have reached, shape (points,): those of the run with the shortest history.
 
     Runs of one arm may note their totals at different steps; others are interpolated there.
@@ -89,14 +88,14 @@ def common_steps(results: Sequence[RunResult]) -> np.ndarray:
     return shortest[shortest <= last]
 
 
-def rates(steps: np.ndarray, totals: np.ndarray) -> np.ndarray:
-    """Returns events per step over the last `RATE_WINDOW` steps, shape (runs, points).
+def _rates(steps: np.ndarray, totals: np.ndarray) -> np.ndarray:
+    """Returns events per step over the last `_RATE_WINDOW` steps, shape (runs, points).
 
     Args:
         steps: Shape (points,).
         totals: Events so far, shape (runs, points).
     """
-    past = np.maximum(steps - RATE_WINDOW, 0.0)
+    past = np.maximum(steps - _RATE_WINDOW, 0.0)
     before = np.array([np.interp(past, [0.0, *steps], [0.0, *row]) for row in totals])
     return (totals - before) / (steps - past)
 
@@ -138,8 +137,8 @@ def _scale(axis: Axes, last: float, from_zero: bool) -> None:
 
 
 def _handles(arms: ResultsByArm) -> dict[str, Artist]:
-    points = any(len(common_steps(results)) < _FEW_POINTS for results in arms.values())
-    handles: dict[str, Artist] = {name: style_of(name).handle(points=points) for name in arms}
+    points = any(len(_common_steps(results)) < _FEW_POINTS for results in arms.values())
+    handles: dict[str, Artist] = {name: ArmStyle.of(name).handle(points=points) for name in arms}
     if any(len(results) > 1 for results in arms.values()):
         handles["lowest to highest run"] = Patch(color="#555555", alpha=0.2, lw=0.0)
     return handles

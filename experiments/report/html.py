@@ -8,8 +8,8 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from experiments.analysis.statistics import CONFIDENCE, RESAMPLES
-from experiments.plots.arm_style import ARM_COLORS_AND_MARKERS, style_of
-from experiments.runs.arms import PENALTY_SUFFIX, arm_of
+from experiments.plots.arm_style import ARM_COLORS_AND_MARKERS, ArmStyle
+from experiments.runs.arms import PENALTY_SUFFIX, Arm
 from shields import Report
 
 # Pixels of a figure per pixel of the page: the widest figures then fill it, and letters have the same size in all.
@@ -71,8 +71,8 @@ def _environment() -> Environment:
     )
     environment.tests["arm"] = lambda name: name.removesuffix(PENALTY_SUFFIX) in ARM_COLORS_AND_MARKERS
     environment.filters |= {
-        "arm_of": arm_of,
-        "arm_color": lambda name: style_of(name).color,
+        "arm_of": Arm.of,
+        "arm_color": lambda name: ArmStyle.of(name).color,
         "combined": lambda first, second: first | second,
         "decimal": _decimal,
         "interval": _interval,

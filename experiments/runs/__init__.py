@@ -1,7 +1,7 @@
 """The unit of work: a training run, the setup it takes place in, and the store of finished results."""
 
-from experiments.runs.arms import Arm, arm_of, by_arm
-from experiments.runs.experiment_setup import ExperimentSetup, experiment_setup
+from experiments.runs.arms import Arm, by_arm
+from experiments.runs.experiment_setup import ExperimentSetup
 from experiments.runs.provenance import versions
 from experiments.runs.run_store import RunStore, prepare_output
 from experiments.runs.training_run import RunResult, TrainingRun, execute_run
@@ -12,10 +12,8 @@ __all__ = [
     "RunResult",
     "RunStore",
     "TrainingRun",
-    "arm_of",
     "by_arm",
     "execute_run",
-    "experiment_setup",
     "prepare_output",
     "versions",
 ]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from experiments.runs.training_run import RunResult
 
-SHIELD_MODES = ("project", "switch", "boundary")
+_SHIELD_MODES = ("project", "switch", "boundary")
 PENALTY_SUFFIX = "+penalty"
 _KNOWN_ARMS = "unshielded, monitor, penalized, shielded, shielded:MODE, each shielded one also with +penalty"
 
@@ -31,30 +31,30 @@ class Arm:
     penalizes_interventions: bool = False
     penalizes_violations: bool = False
 
+    @classmethod
+    def of(cls, name: str, mode: str = "project") -> Arm:
+        """Returns the arm of a name.
+
+        Args:
+            name: Name of the arm on the command line.
+            mode: Mode of the shield of arms that name none.
+
+        Raises:
+            ValueError: If the name is unknown.
+        """
+        if name in ("unshielded", "penalized"):
+            return cls(name, None, penalizes_violations=name == "penalized")
+        if name == "monitor":
+            return cls(name, "monitor")
+        kind, _, own_mode = name.removesuffix(PENALTY_SUFFIX).partition(":")
+        if kind != "shielded" or (":" in name and own_mode not in _SHIELD_MODES):
+            raise ValueError(f"unknown arm {name!r}; known are {_KNOWN_ARMS} (modes: {', '.join(_SHIELD_MODES)})")
+        return cls(name, own_mode or mode, penalizes_interventions=name.endswith(PENALTY_SUFFIX))
+
     @property
     def is_shielded(self) -> bool:
         """Whether a shield acts; a monitor only watches."""
         return self.mode not in (None, "monitor")
-
-
-def arm_of(name: str, mode: str = "project") -> Arm:
-    """Returns the arm of a name.
-
-    Args:
-        name: Name of the arm on the command line.
-        mode: Mode of the shield of arms that name none.
-
-    Raises:
-        ValueError: If the name is unknown.
-    """
-    if name in ("unshielded", "penalized"):
-        return Arm(name, None, penalizes_violations=name == "penalized")
-    if name == "monitor":
-        return Arm(name, "monitor")
-    kind, _, own_mode = name.removesuffix(PENALTY_SUFFIX).partition(":")
-    if kind != "shielded" or (":" in name and own_mode not in SHIELD_MODES):
-        raise ValueError(f"unknown arm {name!r}; known are {_KNOWN_ARMS} (modes: {', '.join(SHIELD_MODES)})")
-    return Arm(name, own_mode or mode, penalizes_interventions=name.endswith(PENALTY_SUFFIX))
 
 
 def by_arm(results: Sequence[RunResult]) -> ResultsByArm:

@@ -8,11 +8,10 @@ from typing import Any
 
 import gymnasium as gym
 
-from experiments.runs.arms import arm_of
+from experiments.runs.arms import Arm
 from experiments.runs.provenance import versions
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings, ChannelSettings, LearningSettings, settings_json
-from experiments.settings.channel import channel_of
 from ncs_gym import Channel, LinearPlant, NCSEnv, registration
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.registration import ENTRY_POINTS
@@ -42,6 +41,28 @@ class ExperimentSetup:
     certificate: Certificate
     verification: Report
 
+    @classmethod
+    def of(
+        cls, env_id: str, channel: ChannelSettings | Channel | None, certificate_file: Path | None = None
+    ) -> ExperimentSetup:
+        """Returns the setup of a registered environment, with another channel or with changes of its own channel.
+
+        Raises:
+            ValueError: If the environment is unknown or has no plant of its own, or it cannot have the channel.
+            CertificateError: If a given certificate is damaged or does not verify for the plant.
+            Infeasible: If no certificate is found.
+        """
+        own = registered_env(env_id)
+        if isinstance(channel, ChannelSettings):
+            channel = channel.applied_to(own.channel)
+        env = own if channel is None else ncs_env(gym.make(env_id, channel=channel))
+        if certificate_file is None:
+            certificate = certificate_for(env.plant, env.contract)
+        else:
+            certificate = Certificate.load(certificate_file)
+            require_valid(certificate, env.plant)
+        return cls(env_id, channel, env.plant, certificate, verify(certificate, env.plant))
+
     @property
     def title(self) -> str:
         """One line about the certificate."""
@@ -55,7 +76,7 @@ class ExperimentSetup:
         Raises:
             ValueError: If the arm is unknown.
         """
-        arm = arm_of(arm_name, settings.mode)
+        arm = Arm.of(arm_name, settings.mode)
         return TrainingRun(
             arm=arm_name,
             policy_kind="trained",
@@ -84,28 +105,6 @@ class ExperimentSetup:
             "certificate_file": self.certificate.document,
             "versions": versions(),
         }
-
-
-def experiment_setup(
-    env_id: str, channel: ChannelSettings | Channel | None, certificate_file: Path | None = None
-) -> ExperimentSetup:
-    """Returns the setup of a registered environment, with another channel or with changes of its own channel.
-
-    Raises:
-        ValueError: If the id is not one of ours with a plant of its own, or the environment cannot have the channel.
-        CertificateError: If a given certificate is damaged or does not verify for the plant.
-        Infeasible: If no certificate is found.
-    """
-    own = registered_env(env_id)
-    if isinstance(channel, ChannelSettings):
-        channel = channel_of(channel, own.channel)
-    env = own if channel is None else ncs_env(gym.make(env_id, channel=channel))
-    if certificate_file is None:
-        certificate = certificate_for(env.plant, env.contract)
-    else:
-        certificate = Certificate.load(certificate_file)
-        require_valid(certificate, env.plant)
-    return ExperimentSetup(env_id, channel, env.plant, certificate, verify(certificate, env.plant))
 
 
 def registered_env(env_id: str) -> NCSEnv:

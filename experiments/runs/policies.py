@@ -34,7 +34,7 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
         rng = np.random.default_rng(seed)
         return lambda observation, info: rng.uniform(-1.0, 1.0, size).astype(np.float32)
     if name == "greedy":
-        return lambda observation, info: greedy_action(env, observation, info["estimate"])
+        return lambda observation, info: _greedy_action(env, observation, info["estimate"])
     from agents.agent import Agent, AgentError  # imports torch
 
     agent = Agent.load(Path(name))
@@ -43,7 +43,7 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
     return lambda observation, info: agent.act(observation[None])[0]
 
 
-def greedy_action(env: NCSEnv, observation: np.ndarray, estimate: np.ndarray) -> np.ndarray:
+def _greedy_action(env: NCSEnv, observation: np.ndarray, estimate: np.ndarray) -> np.ndarray:
     """Returns the action, shape (m,), that comes closest to the task's goal in one step and ignores the safe box.
 
     For `SpeedTracking` it removes the tracking error of the speed, for `SetpointTracking` that of the output, with as

@@ -17,7 +17,7 @@ from experiments.settings.learning import (
     SweepSettings,
     TrainSettings,
 )
-from experiments.settings.settings_file import load_settings, save_settings, settings_json, split_config
+from experiments.settings.settings_file import config_defaults, save_settings, settings_json
 
 __all__ = [
     "AuditSettings",
@@ -33,8 +33,7 @@ __all__ = [
     "SynthesizeSettings",
     "TrainSettings",
     "VerifySettings",
-    "load_settings",
+    "config_defaults",
     "save_settings",
     "settings_json",
-    "split_config",
 ]

@@ -30,27 +30,28 @@ class ChannelSettings:
     quantization_step: float | None = None
     max_consecutive_losses: int | None = None
 
+    def applied_to(self, own: Channel) -> Channel | None:
+        """Returns the environment's own channel with the changes; None for no changes.
 
-def channel_of(settings: ChannelSettings, own: Channel) -> Channel | None:
-    """Returns the environment's `own` channel with the changes asked for; None for no changes.
+        Raises:
+            ValueError: If a value is out of range, or bursts are asked for without a loss probability.
+        """
+        names = ("delay", "jitter", "send_period", "quantization_step", "max_consecutive_losses")
+        changes = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        loss = own.loss if self.loss is None else self.loss
+        if self.burst_length is not None:
+            if isinstance(loss, GilbertElliott):
+                raise ValueError(
+                    "--channel.burst-length needs --channel.loss: the environment's own losses come in bursts"
+                )
+            period = own.send_period if self.send_period is None else self.send_period
+            loss = _bursts(loss, self.burst_length, period)
+        if loss != own.loss:
+            changes["loss"] = loss
+        return replace(own, **changes) if changes else None
 
-    Raises:
-        ValueError: If a value is out of range, or bursts are asked for without a loss probability.
-    """
-    names = ("delay", "jitter", "send_period", "quantization_step", "max_consecutive_losses")
-    changes = {name: getattr(settings, name) for name in names if getattr(settings, name) is not None}
-    loss = own.loss if settings.loss is None else settings.loss
-    if settings.burst_length is not None:
-        if isinstance(loss, GilbertElliott):
-            raise ValueError("--channel.burst-length needs --channel.loss: the environment's own losses come in bursts")
-        period = own.send_period if settings.send_period is None else settings.send_period
-        loss = bursts(loss, settings.burst_length, period)
-    if loss != own.loss:
-        changes["loss"] = loss
-    return replace(own, **changes) if changes else None
 
-
-def bursts(loss: float, length: float, send_period: int = 1) -> GilbertElliott:
+def _bursts(loss: float, length: float, send_period: int = 1) -> GilbertElliott:
     """Returns losses of a given probability that come in bursts of a given mean length.
 
     In the bad state everything is lost. From one packet to the next, M = send_period steps later, it is to be left with

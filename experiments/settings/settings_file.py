@@ -31,11 +31,17 @@ def save_settings(path: Path, command: str, settings: Any) -> None:
     write_atomically(path, json.dumps(settings_json(command, settings), indent=1) + "\n")
 
 
-def split_config(arguments: list[str]) -> tuple[Path | None, list[str]]:
-    """Returns the file given by `--config`, or None, and the other arguments.
+def config_defaults(arguments: list[str], command: str, kind: type) -> tuple[Any, list[str]]:
+    """Returns the settings in the file given by `--config`, or None, and the other arguments.
+
+    Args:
+        arguments: Arguments of the command.
+        command: Name of the command.
+        kind: Dataclass of the command's settings; fields that the file does not give have their defaults.
 
     Raises:
-        SettingsError: If the flag is given more than once or without a file.
+        SettingsError: If the flag is given more than once or without a file, or the file is missing, damaged or another
+            command's, or holds a wrong value.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--config", action="append", nargs="?", const="", default=[])
@@ -46,20 +52,11 @@ def split_config(arguments: list[str]) -> tuple[Path | None, list[str]]:
         raise SettingsError(f"--config is given {len(found.config)} times")
     if not found.config[0]:
         raise SettingsError("--config needs a file")
-    return Path(found.config[0]), others
+    return _load(Path(found.config[0]), command, kind), others
 
 
-def load_settings(path: Path, command: str, kind: type) -> Any:
-    """Returns the settings in a file; fields that it does not give have their defaults.
-
-    Args:
-        path: The file.
-        command: Command that the settings are for.
-        kind: Dataclass of the command's settings.
-
-    Raises:
-        SettingsError: If the file is missing, damaged or another command's, or holds a wrong value.
-    """
+def _load(path: Path, command: str, kind: type) -> Any:
+    """Returns the settings in a file; raises SettingsError as `config_defaults` says."""
     try:
         document = json.loads(path.read_bytes())
     except OSError as error:

@@ -10,7 +10,7 @@ from agents.evaluation import Episode
 from agents.history import TrainingPoint
 from agents.trajectory import Trajectory
 from experiments.analysis.summary import paired_differences, summarize_arm
-from experiments.runs.arms import arm_of
+from experiments.runs.arms import Arm
 from experiments.runs.training_run import RunResult
 
 ALL_ARMS = [
@@ -60,7 +60,7 @@ def summary_of(results: dict[str, list[RunResult]], **settings: Any) -> dict[str
     """The summary of a comparison without reference policies."""
 
     def arm(name: str) -> dict[str, Any]:
-        mode = arm_of(name, "project").mode
+        mode = Arm.of(name, "project").mode
         return {"mode": mode, "shielded": mode not in (None, "monitor")} | summarize_arm(
             results[name], fixed_policy=False
         )

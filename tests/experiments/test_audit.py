@@ -8,7 +8,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from experiments.commands.audit import audit_text
+from experiments.commands.audit import _text
 from experiments.paper.audit import FAILS, HOLDS, ROUNDED, audited_claims
 from experiments.paper.counterexample import worst_step
 from experiments.paper.paper_example import PaperExample
@@ -95,7 +95,7 @@ def test_worst_step_beats_random_search():
 
 
 def test_text_is_readable_and_complete(claims):
-    text = audit_text(claims)
+    text = _text(claims)
     assert all(len(line) <= 100 for line in text.splitlines())
     assert text.endswith("4 of 11 claims hold.")
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from experiments.attack.attack_cases import AttackCase, attack_cases
-from experiments.attack.campaign_execution import certificate_files
 from experiments.attack.counts_store import CountsStore
 from experiments.attack.monte_carlo_batch import Campaign, MonteCarloBatch, run_batch
 from experiments.attack.safety_counts import SafetyCounts
@@ -31,7 +30,7 @@ def files(tmp_path_factory):
     chosen = {
         name: case for name, case in attack_cases(0, 1).items() if name.startswith(("TruckTrailerCruise", "CartPole"))
     }
-    return certificate_files(chosen, folder)
+    return command._certificate_files(chosen, folder)
 
 
 def test_every_kind_of_plant_and_channel_is_attacked():
@@ -154,9 +153,7 @@ def test_a_shield_that_fails_ends_with_an_error(tmp_path, small, monkeypatch, ca
             MonteCarloBatch(CRUISE, 0), SafetyCounts(steps=3200, episodes=16, exits=2, broken_episodes=1, level=1.1)
         ),
     )
-    monkeypatch.setattr(
-        command, "split_into_batches", lambda names, count, least: {CRUISE: [MonteCarloBatch(CRUISE, 0)]}
-    )
+    monkeypatch.setattr(command, "_batches", lambda names, count, least: {CRUISE: [MonteCarloBatch(CRUISE, 0)]})
     with pytest.raises(SafetyBroken, match="2 steps outside S, 0 outside the box, 0 without a proof"):
         certify(settings(tmp_path))
     assert "-1.0e-01" in capsys.readouterr().out

@@ -5,9 +5,9 @@ import pytest
 
 from agents.evaluation import Episode
 from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
-from experiments.analysis.summary import covered_fraction, paired_differences, summarize_arm, summary_rows
-from experiments.commands.compare import training_runs
-from experiments.runs.arms import arm_of, by_arm
+from experiments.analysis.summary import _rows, covered_fraction, paired_differences, summarize_arm
+from experiments.commands.compare import _training_runs
+from experiments.runs.arms import Arm, by_arm
 from experiments.runs.experiment_setup import ExperimentSetup
 from experiments.runs.run_store import prepare_output
 from experiments.runs.training_run import RunResult
@@ -23,7 +23,7 @@ def setup(certificate, loaded):
 
 
 def runs_of(setup, **change):
-    return training_runs(CompareSettings(**change), setup)
+    return _training_runs(CompareSettings(**change), setup)
 
 
 def test_runs_with_equal_numbers_are_paired_across_arms_and_differ_from_each_other(setup):
@@ -70,7 +70,7 @@ def test_each_arm_has_its_shield_and_its_penalties(setup):
 @pytest.mark.parametrize("name", ["", "shield", "shielded:", "shielded:hope", "monitor+penalty", "shielded:monitor"])
 def test_unknown_arms_are_refused(name):
     with pytest.raises(ValueError, match="unknown arm"):
-        arm_of(name, "project")
+        Arm.of(name, "project")
 
 
 @pytest.mark.parametrize(
@@ -149,7 +149,7 @@ def test_paired_differences_are_those_of_runs_with_equal_index():
 
 def test_no_violation_is_printed_with_its_upper_bound():
     summary = summarize_arm([result([1.0] * 10, [0] * 10)], fixed_policy=True) | {"mode": "monitor"}
-    row = summary_rows({"monitor": summary})[2]
+    row = _rows({"monitor": summary})[2]
     assert row[3] == "0 of 10 [0.0, 30.8 %]"
     assert row[2] == "(20.0 %)"
 

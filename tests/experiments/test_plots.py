@@ -8,14 +8,14 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex, to_rgb
 from scipy.optimize import linprog
 
-from experiments.plots.arm_style import ARM_COLORS_AND_MARKERS, style_of
+from experiments.plots.arm_style import ARM_COLORS_AND_MARKERS, ArmStyle
 from experiments.plots.comparison_figures import comparison_figures
 from experiments.plots.ellipsoid_projection import projected_box, projected_ellipsoid
 from experiments.plots.figure_style import thousands
-from experiments.plots.phase_plane import phase_caption, phase_figure, plane_of
-from experiments.plots.scatter import scatter_caption, scatter_figure
-from experiments.plots.time_series import episode_caption, episode_figure, shown_arms
-from experiments.plots.training_curves import RATE_WINDOW, common_steps, rates, training_caption, training_figure
+from experiments.plots.phase_plane import _plane, phase_figure
+from experiments.plots.scatter import scatter_figure
+from experiments.plots.time_series import _shown_arms, episode_figure
+from experiments.plots.training_curves import _RATE_WINDOW, _common_steps, _rates, training_figure
 from ncs_gym import Ellipsoid
 from tests.experiments.results import ALL_ARMS, history, run, summary_of, trajectory
 from tests.plants import random_plant
@@ -54,12 +54,12 @@ def by_color(axis):
 
 
 def test_all_arms_look_different_and_a_penalty_keeps_the_color():
-    looks = [style_of(arm) for arm in ALL_ARMS]
+    looks = [ArmStyle.of(arm) for arm in ALL_ARMS]
     assert len({(look.color, str(look.dashes)) for look in looks}) == len(ALL_ARMS)
     assert len({(look.marker, look.hollow) for look in looks}) == len(ALL_ARMS)
-    assert style_of("shielded:switch+penalty").color == style_of("shielded:switch").color
+    assert ArmStyle.of("shielded:switch+penalty").color == ArmStyle.of("shielded:switch").color
     with pytest.raises(KeyError):
-        style_of("hoped")
+        ArmStyle.of("hoped")
 
 
 @pytest.mark.parametrize("seen", [np.eye(3), DEUTERANOPIA, PROTANOPIA])
@@ -75,11 +75,11 @@ def test_arms_have_the_same_color_in_every_figure(plant):
     training = training_figure(shown).axes[0]
     scatter = scatter_figure(summary_of(shown)["arms"], shown).axes[0]
     phase = phase_figure(plant, SimpleNamespace(L=np.eye(2)), shown)
-    wanted = {style_of(name).color.lower() for name in shown}
+    wanted = {ArmStyle.of(name).color.lower() for name in shown}
     assert set(by_color(training)) == wanted
     assert {to_hex(line.get_markeredgecolor()).lower() for line in scatter.get_lines()} >= wanted
     for name, axis in zip(shown, phase.axes, strict=True):
-        assert style_of(name).color.lower() in by_color(axis)
+        assert ArmStyle.of(name).color.lower() in by_color(axis)
 
 
 def test_legend_takes_rows_until_it_fits_the_figure(plant):
@@ -102,12 +102,12 @@ def test_training_has_a_line_and_a_band_per_arm_and_interventions_only_of_watchi
     axes = training_figure(arms("unshielded", "monitor", "shielded", runs=3)).axes
     assert [len(lines(axis)) for axis in axes] == [3, 3, 2]
     assert [len(bands(axis)) for axis in axes] == [3, 3, 2]
-    assert set(by_color(axes[2])) == {style_of(name).color.lower() for name in ("monitor", "shielded")}
+    assert set(by_color(axes[2])) == {ArmStyle.of(name).color.lower() for name in ("monitor", "shielded")}
 
 
 def test_without_a_watching_arm_there_is_no_panel_of_interventions():
     assert len(training_figure(arms("unshielded", "penalized")).axes) == 2
-    assert "Interventions" not in training_caption(arms("unshielded"))
+    assert "Interventions" not in training_figure(arms("unshielded")).caption
 
 
 def test_band_reaches_from_the_lowest_to_the_highest_run_around_the_mean():
@@ -117,13 +117,13 @@ def test_band_reaches_from_the_lowest_to_the_highest_run_around_the_mean():
     np.testing.assert_allclose(line.get_ydata(), [0, 20, 40, 200])
     heights = band.get_paths()[0].vertices
     assert sorted({y for x, y in heights if x == 100}) == [100, 300]
-    assert "lowest to the highest run" in training_caption(arms("shielded", runs=3))
+    assert "lowest to the highest run" in training_figure(arms("shielded", runs=3)).caption
 
 
 def test_one_run_has_no_band_and_the_caption_says_so():
     figure = training_figure(arms("unshielded", "shielded", runs=1))
     assert [bands(axis) for axis in figure.axes] == [[], [], []]
-    assert "no band" in training_caption(arms("unshielded", runs=1))
+    assert "no band" in training_figure(arms("unshielded", runs=1)).caption
     assert not any("run" in text for text in texts(figure))
 
 
@@ -148,7 +148,7 @@ def test_runs_with_histories_of_different_lengths_meet_at_common_steps():
         run("shielded", 0, history=history(10, 20, 30, 40)),
         run("shielded", 1, history=history(16, 32)),
     ]
-    np.testing.assert_array_equal(common_steps(runs), [16, 32])
+    np.testing.assert_array_equal(_common_steps(runs), [16, 32])
     line = lines(training_figure({"shielded": runs}).axes[1])[0]
     np.testing.assert_allclose(line.get_ydata(), [0, 16, 32])
     figure = training_figure({"shielded": runs, "unshielded": [run("unshielded", history=history(*range(5, 1005, 5)))]})
@@ -156,16 +156,16 @@ def test_runs_with_histories_of_different_lengths_meet_at_common_steps():
 
 
 def test_intervention_rate_is_that_of_the_last_steps_only():
-    steps = np.array([RATE_WINDOW, 2 * RATE_WINDOW, 3 * RATE_WINDOW], float)
-    totals = np.array([[0.0, 0.5 * RATE_WINDOW, 0.5 * RATE_WINDOW]])
-    np.testing.assert_allclose(rates(steps, totals), [[0.0, 0.5, 0.0]])
+    steps = np.array([_RATE_WINDOW, 2 * _RATE_WINDOW, 3 * _RATE_WINDOW], float)
+    totals = np.array([[0.0, 0.5 * _RATE_WINDOW, 0.5 * _RATE_WINDOW]])
+    np.testing.assert_allclose(_rates(steps, totals), [[0.0, 0.5, 0.0]])
 
 
 def test_caption_names_the_arms_whose_return_contains_penalties_and_what_a_monitor_counts():
-    caption = training_caption(arms("penalized", "shielded+penalty", "shielded", "monitor"))
+    caption = training_figure(arms("penalized", "shielded+penalty", "shielded", "monitor")).caption
     assert "penalties that penalized and shielded+penalty get" in caption
     assert "would have" in caption
-    assert "penalties" not in training_caption(arms("unshielded", "shielded"))
+    assert "penalties" not in training_figure(arms("unshielded", "shielded")).caption
 
 
 # Phase plane
@@ -177,7 +177,7 @@ def test_phase_plane_has_a_panel_per_arm_a_path_per_run_and_marks_violations(pla
     figure = phase_figure(plant, SimpleNamespace(L=np.eye(2)), shown)
     assert len(figure.axes) == 2
     for axis, name in zip(figure.axes, shown, strict=True):
-        own = [line for line in lines(axis) if to_hex(line.get_color()).lower() == style_of(name).color.lower()]
+        own = [line for line in lines(axis) if to_hex(line.get_color()).lower() == ArmStyle.of(name).color.lower()]
         assert len(own) == 3
         crosses = [line for line in axis.get_lines() if line.get_marker() == "x"]
         assert [line.get_xdata().tolist() for line in crosses] == [[2.5]] * 3
@@ -191,15 +191,15 @@ def test_view_holds_the_sets_and_leaves_out_what_is_far_away(plant):
     low, high = figure.axes[0].get_xlim()
     assert 2.0 < high < 10.0
     assert low == -high
-    assert "leave the view" in phase_caption(plant, SimpleNamespace(L=np.eye(2)), arms("unshielded", trajectory=far))
+    assert "leave the view" in figure.caption
 
 
 def test_of_many_states_the_largest_are_shown_and_the_caption_speaks_of_projections():
     plant = random_plant(0, 4, 1)
     states = np.array([[0.0, 0.1, 0.0, 0.1], [0.1, 0.9, 0.2, 0.3]])
     shown, certificate = arms("shielded", trajectory=trajectory(states)), SimpleNamespace(L=np.diag([1.0, 1, 1, 0.1]))
-    assert plane_of(certificate, shown) == (1, 3)
-    caption = phase_caption(plant, certificate, shown)
+    assert _plane(certificate, shown) == (1, 3)
+    caption = phase_figure(plant, certificate, shown).caption
     assert "x2 and x4" in caption
     assert "projection" in caption
     assert any("projection of the safe set" in text for text in texts(phase_figure(plant, certificate, shown)))
@@ -239,7 +239,7 @@ def test_box_without_limits_in_the_plane_has_no_outline_and_elsewhere_does_not_m
     ],
 )
 def test_time_series_show_the_shielded_arm_and_an_unshielded_one(names, pair):
-    assert shown_arms(names) == pair
+    assert _shown_arms(names) == pair
 
 
 @pytest.mark.parametrize(("n", "m"), [(2, 1), (4, 1), (4, 2)])
@@ -276,7 +276,7 @@ def test_an_episode_that_ended_early_stands_beside_a_longer_one():
     figure = episode_figure(plant, shown)
     assert figure.axes[-1].get_xlim() == (0.0, 1.0)
     assert [t for t in texts(figure) if "packet" in t] == ["packet arrivals (3)"]
-    assert "ended at its first violation" in episode_caption(shown)
+    assert "ended at its first violation" in episode_figure(plant, shown).caption
 
 
 def test_packets_of_both_arms_are_shown_where_they_differ():
@@ -293,7 +293,7 @@ def test_a_monitor_only_would_override():
     plant = random_plant(1, 2, 1)
     shown = arms("monitor", runs=1, trajectory=trajectory(np.zeros((11, 2)), intervened=(1,)))
     assert "would override, monitor (1)" in texts(episode_figure(plant, shown))
-    assert "would have" in episode_caption(shown)
+    assert "would have" in episode_figure(plant, shown).caption
 
 
 # Cost and return
@@ -334,15 +334,16 @@ def test_one_run_has_no_interval_of_the_return_and_all_zero_costs_have_a_plain_a
     axis = scatter_figure(summary_of(shown)["arms"], shown).axes[0]
     assert not [line for line in axis.get_lines() if line.get_marker() == "_"]
     assert axis.get_xlim()[1] > 0.5
-    assert "no interval" in scatter_caption(shown)
+    assert "no interval" in scatter_figure(summary_of(shown)["arms"], shown).caption
 
 
 def test_scatter_caption_warns_of_episodes_that_end_early():
     shown = arms("shielded", "unshielded")
-    assert "shorter" not in scatter_caption(shown)
+    assert "shorter" not in scatter_figure(summary_of(shown)["arms"], shown).caption
     first = shown["unshielded"][0]
     short = replace(first, episodes=[replace(first.episodes[0], steps=4)])
-    assert "shorter" in scatter_caption({"unshielded": [short], "shielded": shown["shielded"]})
+    shown["unshielded"][0] = short
+    assert "shorter" in scatter_figure(summary_of(shown)["arms"], shown).caption
 
 
 def test_every_figure_is_a_png_with_a_caption_of_its_own(plant):

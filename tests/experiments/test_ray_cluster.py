@@ -12,7 +12,7 @@ import pytest
 from agents.settings import PPOSettings
 from experiments.backends import ray_cluster
 from experiments.backends.execution import results_of
-from experiments.backends.ray_cluster import execute_on_node, execute_submitted, portable_task, require_answer
+from experiments.backends.ray_cluster import _execute_on_node, execute_submitted, portable_task, require_answer
 from experiments.errors import ClusterError, RunError
 from experiments.runs import TrainingRun, execute_run, versions
 from experiments.settings import BackendSettings
@@ -126,7 +126,7 @@ def test_waiting_for_nothing_goes_on_waiting():
 
 
 def test_worker_returns_what_the_run_returns_here(run):
-    result, expected = execute_on_node(versions(), pickle.dumps(run)), execute_run(run, lambda steps: None)
+    result, expected = _execute_on_node(versions(), pickle.dumps(run)), execute_run(run, lambda steps: None)
     assert result.episodes == expected.episodes
     assert (result.trajectory.states == expected.trajectory.states).all()
 
@@ -142,14 +142,14 @@ def test_worker_returns_what_the_run_returns_here(run):
 )
 def test_worker_with_other_versions_refuses_before_it_reads_the_run(change, words):
     with pytest.raises(ClusterError, match=words):
-        execute_on_node(versions() | change, b"no run")
+        _execute_on_node(versions() | change, b"no run")
 
 
 def test_worker_with_a_package_that_the_driver_lacks_refuses():
     expected = versions()
     del expected["torch"]
     with pytest.raises(ClusterError, match="where the driver has none"):
-        execute_on_node(expected, b"no run")
+        _execute_on_node(expected, b"no run")
 
 
 def test_node_without_this_package_says_so(monkeypatch):

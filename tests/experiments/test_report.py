@@ -7,7 +7,7 @@ import pytest
 from jinja2 import UndefinedError
 
 from experiments.report import comparison_report, sweep_report
-from experiments.runs.arms import arm_of
+from experiments.runs.arms import Arm
 from shields import Report
 from shields.verification.conditions import flag
 from tests.experiments.results import ALL_ARMS, provenance, run, summary_of
@@ -265,6 +265,6 @@ def test_sweep_has_a_row_per_channel_and_arm():
 
 @pytest.mark.parametrize("mode", ["project", "switch", "boundary"])
 def test_the_shield_is_explained_as_its_mode_acts(mode):
-    assert arm_of("shielded", mode).mode == mode
+    assert Arm.of("shielded", mode).mode == mode
     assert ("closest input" in comparison("shielded", mode=mode)) == (mode == "project")
     assert ("where not every input" in swept("shielded", mode=mode)) == (mode == "boundary")

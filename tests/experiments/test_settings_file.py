@@ -6,7 +6,7 @@ import pytest
 from agents.settings import PPOSettings
 from experiments.__main__ import _parse
 from experiments.errors import SettingsError
-from experiments.settings import ChannelSettings, CompareSettings, SweepSettings, save_settings, split_config
+from experiments.settings import ChannelSettings, CompareSettings, SweepSettings, config_defaults, save_settings
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,7 @@ def test_flags_of_the_user_win(tmp_path):
 
 def test_without_config_nothing_changes():
     for arguments in ([], ["--help"], ["--steps", "9"]):
-        assert split_config(arguments) == (None, arguments)
+        assert config_defaults(arguments, "compare", CompareSettings) == (None, arguments)
     assert _parse(["compare", "--steps", "9"]) == CompareSettings(steps=9)
 
 
