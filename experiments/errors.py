@@ -4,11 +4,11 @@ from __future__ import annotations
 
 
 class SettingsError(ValueError):
-    """A file holds no settings of the command."""
+    """A settings file is missing or damaged, or holds settings that the command does not take."""
 
 
 class ResultsError(ValueError):
-    """A results file is missing, damaged or of another experiment."""
+    """A stored result is missing, damaged or altered."""
 
 
 class RunError(RuntimeError):

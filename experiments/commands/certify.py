@@ -12,7 +12,8 @@ from pathlib import Path
 from tqdm import tqdm
 
 from experiments.analysis.text_table import text_table
-from experiments.attack import AttackCase, MonteCarloBatch, SafetyCounts, attack_cases
+from experiments.attack import MonteCarloBatch, SafetyCounts
+from experiments.attack.attack_cases import AttackCase, attack_cases
 from experiments.attack.campaign_execution import execute_batches
 from experiments.attack.counts_store import CountsStore
 from experiments.attack.monte_carlo_batch import SETTLING_STEPS, SHIELD_MODES, Campaign

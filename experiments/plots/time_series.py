@@ -26,7 +26,7 @@ _LIMIT = {"color": _INK, "lw": 1.0, "ls": (0, (6.0, 3.0))}
 def _shown_arms(names: Sequence[str]) -> list[str]:
     """Returns the pair to show: the unshielded arm, or else another one without a shield, and the first shielded one.
 
-    Without a shielded arm, or without any other, fewer.
+    There are fewer where no arm is shielded or all are.
     """
     shielded = [name for name in names if Arm.of(name).is_shielded]
     bare = sorted((name for name in names if name not in shielded), key=lambda name: name != "unshielded")
@@ -63,8 +63,7 @@ def _caption(arms: ResultsByArm) -> str:
     text += ", with common random numbers." if len(names) > 1 else "."
     text += (
         " Above, how close true state and estimate come to the limits: one beyond 1 violates a limit. Below, the"
-        " applied inputs. Ticks mark packet"
-        " arrivals and interventions"
+        " applied inputs. Ticks mark packet arrivals and interventions"
     )
     text += "; the monitor's are what the shield would have done." if "monitor" in names else "."
     if len({len(path.inputs) for path in paths}) > 1:
