@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from shields.verification.verify import require_valid
+from shields.verification import require_valid
 
 from experiments.runs.arms import Arm
 from experiments.runs.provenance import versions

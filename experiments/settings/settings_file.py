@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from experiments.errors import SettingsError
-from ncs_gym.validation import LONGEST_QUOTE
+from ncs_gym.validation import MAX_QUOTED_LENGTH
 from shields.atomic_write import write_atomically
 
 FORMAT = "ncs-gym settings 1"
@@ -70,7 +70,7 @@ def _load(path: Path, command: str, kind: type) -> Any:
     try:
         return _from_json(document["settings"], kind)
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
-        reason = " ".join(str(error).split())[:LONGEST_QUOTE]
+        reason = " ".join(str(error).split())[:MAX_QUOTED_LENGTH]
         raise SettingsError(f"settings {path} hold what ncs {command} does not take: {reason}") from error
 
 
