@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from shields.verification import require_valid
 
 from experiments.runs.arms import Arm
 from experiments.runs.provenance import versions
@@ -18,6 +17,7 @@ from ncs_gym.envs.env import ncs_env
 from ncs_gym.registration import ENTRY_POINTS
 from shields import Certificate, Report, verify
 from shields.runtime.wrapper import certificate_for
+from shields.verification import require_valid
 
 # Settings that results do not depend on.
 INCIDENTAL_SETTINGS = ("out", *BackendSettings.__dataclass_fields__)

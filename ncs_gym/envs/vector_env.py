@@ -162,7 +162,7 @@ class NCSVectorEnv(VectorEnv):
         if sends.any():
             samples = self.channel.quantize(self._process.measure(rng, self._state))
             if not np.isfinite(samples.sum()):  # no sensor within the assumptions sends this
-                damaged = ~np.isfinite(samples).all(axis=0)
+                damaged = np.asarray(~np.isfinite(samples).all(axis=0))
                 self._channel_state.discard(damaged)
                 estimator.alarm |= sends & damaged
                 samples[:, damaged] = 0.0  # times a gain of zero it is to be nothing

@@ -1,4 +1,4 @@
-"""Errors, disturbances, noise and traffic that do an estimator the most harm its assumptions allow, for many at once."""
+"""Errors, disturbances, noise and traffic that do an estimator the most harm that its assumptions allow, in batches."""
 
 from __future__ import annotations
 
