@@ -1,12 +1,8 @@
 """Under attack errors stay in their running ellipsoid, and that in the certified set of its age."""
 
-from dataclasses import replace
-
-import numpy as np
 import pytest
 
-from ncs_gym import Channel, ChannelContract, Ellipsoid, Estimator, Packet, batch_reactor, cart_pole, truck_trailer
-from ncs_gym.estimation.arrival_patterns import patterns_of
+from ncs_gym import Channel, ChannelContract, batch_reactor, cart_pole, truck_trailer
 from shields.verification.rational_matrix import is_positive_semidefinite, rational, subtract
 from tests.ncs_gym.adversary import Attack
 from tests.plants import random_plant
