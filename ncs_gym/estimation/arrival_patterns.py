@@ -20,11 +20,13 @@ from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
 
-# Patterns beyond this number, and beyond this number of ages in all of them together, are forgotten but for those in
-# use (an age takes about 40 bytes).
-MAX_PATTERNS, MAX_AGES = 1 << 17, 1 << 21
+# Patterns are forgotten but for those in use when there are this many, or when they and their statistics take about
+# this much memory, in numbers of 8 bytes.
+MAX_PATTERNS, MAX_NUMBERS = 1 << 17, 1 << 25
 # A graph takes at least this many times the patterns it began with, or it would be forgotten at every step.
 SMALLEST_GROWTH = 4
+# Of more plants and channels than this, graphs are kept only as long as an estimator uses them.
+MAX_GRAPHS = 32
 # Number of what is not worked out yet; a pattern without a history to replay.
 UNKNOWN = NO_REPLAY = -1
 # Number of the statistics that stand for "no sample is used here": their gain is zero.
@@ -104,6 +106,8 @@ class ArrivalPatterns:
         self._lock = threading.RLock()
         self._successor: ArrivalPatterns | None = None
         self._adopted_count = 0
+        # What a pattern and what statistics take, in numbers of 8 bytes.
+        self._sizes = 80 + 5 * (self.buffer + 1), 150 + 6 * plant.n**2 + 4 * plant.n * plant.p
         ages_held = self.buffer + 1
         first = self._number_of_statistics(recursion.first)
         self.root = self._number_of_pattern(Pattern(first, (UNKNOWN,) * ages_held, (False,) * ages_held, NO_REPLAY))
@@ -124,8 +128,10 @@ class ArrivalPatterns:
     @property
     def is_full(self) -> bool:
         """Whether it is time to forget patterns that are not in use (`keeping`)."""
-        most = min(MAX_PATTERNS, MAX_AGES // (self.buffer + 1))
-        return len(self._patterns) >= max(most, SMALLEST_GROWTH * self._adopted_count)
+        count = len(self._patterns)
+        numbers = self._sizes[0] * count + self._sizes[1] * len(self.statistics)
+        is_large = count >= MAX_PATTERNS or numbers >= MAX_NUMBERS
+        return is_large and count >= SMALLEST_GROWTH * self._adopted_count
 
     def error_statistics(self, pattern: int) -> ErrorStatistics:
         """Returns the statistics of the present estimate."""
@@ -189,7 +195,7 @@ class ArrivalPatterns:
             if successor is None or successor.is_full:
                 successor = self._successor = ArrivalPatterns(self.recursion, self.channel)
                 successor._lock = self._lock  # the recursion, which belongs to both, has a filter that moves
-            for key, shared in _shared.items():
+            for key, shared in list(_shared.items()):
                 if shared is self:
                     _shared[key] = successor
             numbers = successor._adopted(self, np.unique(patterns).tolist())
@@ -290,9 +296,13 @@ def arrival_patterns(plant: LinearPlant, channel: Channel, contract: ChannelCont
     # Only delays and quantization matter to it, not how packets are lost or when they are sent.
     kept = Channel(quantization_step=channel.quantization_step, delay=channel.delay, jitter=channel.jitter)
     key = plant.fingerprint, kept, contract
-    if key not in _shared:
-        _shared[key] = patterns_of(plant, kept, certified_error_set(plant, contract))
-    return _shared[key]
+    patterns = _shared.pop(key, None)
+    if patterns is None:
+        patterns = patterns_of(plant, kept, certified_error_set(plant, contract))
+    _shared[key] = patterns
+    if len(_shared) > MAX_GRAPHS:  # the one that was asked for the longest ago
+        _shared.pop(next(iter(_shared)), None)
+    return patterns
 
 
 def patterns_of(plant: LinearPlant, channel: Channel, error_set: ErrorSet, **precision: Any) -> ArrivalPatterns:
