@@ -20,11 +20,13 @@ from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
 
-# Patterns beyond this number, and beyond this number of ages in all of them together, are forgotten but for those in
-# use (an age takes about 40 bytes).
-MAX_PATTERNS, MAX_AGES = 1 << 17, 1 << 21
+# Patterns are forgotten but for those in use when there are this many, or when they and their statistics take about
+# this much memory, in numbers of 8 bytes.
+MAX_PATTERNS, MAX_NUMBERS = 1 << 17, 1 << 25
 # A graph takes at least this many times the patterns it began with, or it would be forgotten at every step.
 SMALLEST_GROWTH = 4
+# Of more plants and channels than this, graphs are kept only as long as an estimator uses them.
+MAX_GRAPHS = 32
 # A pattern without a history to replay.
 NO_REPLAY = UNKNOWN
 
@@ -77,6 +79,7 @@ class ArrivalPatterns:
         root: Number of the pattern at the start of an episode.
         table: The distinct error statistics met so far.
         arrays: What vectorized environments look up by pattern.
+        is_full: Whether it is time to forget patterns that are not in use (`keeping`).
     """
 
     def __init__(self, recursion: ErrorRecursion, channel: Channel) -> None:
@@ -92,7 +95,10 @@ class ArrivalPatterns:
         self._replays: dict[int, Replay] = {}
         self._lock = threading.RLock()
         self._successor: ArrivalPatterns | None = None
-        self._adopted_count = 0
+        self._adopted_count, self.is_full = 0, False
+        # What a pattern and what statistics take, in numbers of 8 bytes.
+        n, p = recursion.plant.n, recursion.plant.p
+        self._sizes = 80 + 5 * (self.buffer + 1), 150 + 6 * n**2 + 4 * n * p
         ages_held = self.buffer + 1
         first = self.table.number_of(recursion.first)
         self.root = self._number_of_pattern(Pattern(first, (UNKNOWN,) * ages_held, (False,) * ages_held, NO_REPLAY))
@@ -109,12 +115,6 @@ class ArrivalPatterns:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state | {"_lock": threading.RLock()})
-
-    @property
-    def is_full(self) -> bool:
-        """Whether it is time to forget patterns that are not in use (`keeping`)."""
-        most = min(MAX_PATTERNS, MAX_AGES // (self.buffer + 1))
-        return len(self._patterns) >= max(most, SMALLEST_GROWTH * self._adopted_count)
 
     def error_statistics(self, pattern: int) -> ErrorStatistics:
         """Returns the statistics of the present estimate."""
@@ -172,7 +172,7 @@ class ArrivalPatterns:
             if successor is None or successor.is_full:
                 successor = self._successor = ArrivalPatterns(self.recursion, self.channel)
                 successor._lock = self._lock  # the recursion, which belongs to both, has a filter that moves
-            for key, shared in _shared.items():
+            for key, shared in list(_shared.items()):
                 if shared is self:
                     _shared[key] = successor
             numbers = successor._adopted(self, np.unique(patterns).tolist())
@@ -189,7 +189,7 @@ class ArrivalPatterns:
             present, priors, held, replay_from = other._patterns[each]
             adopted = Pattern(same(present), tuple(map(same, priors)), held, replay_from)
             numbers[each] = self._number_of_pattern(adopted)
-        self._adopted_count = max(self._adopted_count, len(patterns))
+        self._adopted_count, self.is_full = max(self._adopted_count, len(patterns)), False
         return numbers
 
     def _number_of_pattern(self, pattern: Pattern) -> int:
@@ -199,6 +199,10 @@ class ArrivalPatterns:
             self._pattern_numbers[pattern] = len(self._patterns)
             self._patterns.append(pattern)
             self._next.append(UNKNOWN)
+            count = len(self._patterns)
+            numbers = self._sizes[0] * count + self._sizes[1] * len(self.table.statistics)
+            is_large = count >= MAX_PATTERNS or numbers >= MAX_NUMBERS
+            self.is_full = is_large and count >= SMALLEST_GROWTH * self._adopted_count
         return self._pattern_numbers[pattern]
 
     def _replayed(self, pattern: Pattern) -> Replay:
@@ -234,9 +238,13 @@ def arrival_patterns(plant: LinearPlant, channel: Channel, contract: ChannelCont
     # Only delays and quantization matter to it, not how packets are lost or when they are sent.
     kept = Channel(quantization_step=channel.quantization_step, delay=channel.delay, jitter=channel.jitter)
     key = plant.fingerprint, kept, contract
-    if key not in _shared:
-        _shared[key] = patterns_of(plant, kept, certified_error_set(plant, contract))
-    return _shared[key]
+    patterns = _shared.pop(key, None)
+    if patterns is None:
+        patterns = patterns_of(plant, kept, certified_error_set(plant, contract))
+    _shared[key] = patterns
+    if len(_shared) > MAX_GRAPHS:  # the one that was asked for the longest ago
+        _shared.pop(next(iter(_shared)), None)
+    return patterns
 
 
 def patterns_of(plant: LinearPlant, channel: Channel, error_set: ErrorSet, **precision: Any) -> ArrivalPatterns:

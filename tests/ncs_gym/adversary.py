@@ -1,4 +1,4 @@
-"""Errors, disturbances, noise and traffic that do an estimator the most harm that its assumptions allow, in batches."""
+"""Errors, disturbances, noise and traffic that do many estimators the most harm their assumptions allow."""
 
 from __future__ import annotations
 
