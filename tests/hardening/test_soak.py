@@ -7,7 +7,8 @@ import pytest
 
 from ncs_gym import Channel, NCSVectorEnv
 from ncs_gym.envs.env import NCSEnv
-from ncs_gym.estimation import gain_table
+from ncs_gym.estimation import arrival_patterns
+from ncs_gym.estimation.arrival_patterns import ArrivalPatterns, patterns_of
 from ncs_gym.estimation.estimator import Belief, Estimator
 from ncs_gym.network.channel import Packet
 
@@ -37,22 +38,22 @@ class Diary:
 
     def write(self, info):
         """Reads the channel of each watched environment after a step."""
-        env, fleet = self.env, self.env._fleet
-        slot = env.ticks % (CHANNEL.longest_delay + 1)
+        env = self.env
+        delays, samples = env._channel_state._delays[0], env._estimator._samples[0]
         for e in WATCHED:
             if env.episodes[e] != self.episodes[e]:
                 self.told[e], self.first[e], self.in_flight[e] = [], info["estimate"][e].copy(), {}
                 continue
-            step, due = int(fleet.steps[e]), int(fleet.due[slot, e])
-            if step % CHANNEL.send_period == 0 and due >= 0:
-                sample = Packet(step, fleet.samples[slot, :, e].copy())
-                self.in_flight[e].setdefault(step + due, []).append(sample)
+            step, delay = int(env.steps[e]), int(delays[e])
+            if delay >= 0:
+                self.in_flight[e].setdefault(step + delay, []).append(Packet(step, samples[:, e].copy()))
             self.told[e].append((info["input"][e].copy(), self.in_flight[e].pop(step, [])))
         self.episodes = env.episodes.copy()
 
     def compare(self, info):
         """Computes the present episodes again; returns how many packets came in them."""
-        table, nodes = self.env.patterns
+        estimator = self.env._estimator
+        known, numbers = estimator.patterns.statistics, estimator.statistics
         packets = 0
         for e in WATCHED:
             fresh = Estimator(self.env.plant, CHANNEL, self.env.error_set)
@@ -60,9 +61,8 @@ class Diary:
             for u, arrived in self.told[e]:
                 fresh.advance(u, sorted(arrived, key=lambda packet: packet.stamp))
                 packets += len(arrived)
-            spread = table._spreads[table._nodes[nodes[e]].belief]
             np.testing.assert_array_equal(info["error_shape"][e], fresh.belief.shape)
-            np.testing.assert_array_equal(spread.covariance, fresh.belief.covariance)
+            np.testing.assert_array_equal(known[numbers[e]].covariance, fresh.belief.covariance)
             np.testing.assert_allclose(info["estimate"][e], fresh.belief.mean, rtol=0.0, atol=1e-12)
             assert info["measurement_age"][e] == fresh.age
             assert info["assumption_violated"][e] == fresh.alarm
@@ -116,15 +116,16 @@ def soak_one(plant, steps, warm_up):
     assert sum(len(packets) for _, packets in told) > 50
     for name in Belief._fields:
         np.testing.assert_array_equal(getattr(fresh.belief, name), getattr(env.estimator.belief, name), err_msg=name)
-    assert len(env.estimator._priors) <= CHANNEL.longest_delay + 1
     return gained
 
 
 def restored(env):
-    """A fresh estimator in the state of an environment's, which holds no more than its buffer."""
-    old, new = env.estimator, Estimator(env.plant, env.channel, env.error_set)
-    new.step, new.alarm, new.belief = old.step, old.alarm, old.belief
-    new._priors, new._inputs, new._samples = dict(old._priors), dict(old._inputs), dict(old._samples)
+    """A fresh estimator in the state of an environment's, with a graph of patterns of its own."""
+    old, patterns = env.estimator, patterns_of(env.plant, env.channel, env.error_set)
+    new = Estimator(env.plant, env.channel, patterns=patterns)
+    new.step, new.age, new.alarm, new.mean = old.step, old.age, old.alarm, old.mean
+    new._pattern = patterns._adopted(old._patterns, [old._pattern])[old._pattern]
+    new._priors, new._inputs, new._samples = old._priors.copy(), old._inputs.copy(), old._samples.copy()
     return new
 
 
@@ -133,17 +134,17 @@ def test_a_long_run_neither_grows_nor_drifts(loaded):
     assert soak_one(loaded, 3000, 1000) < MOST_GROWTH
 
 
-def test_a_table_that_forgets_patterns_does_not_drift(loaded, monkeypatch):
-    monkeypatch.setattr(gain_table, "MOST_NODES", 300)
-    tables, keeping = set(), gain_table.GainTable.keeping
+def test_a_graph_that_forgets_patterns_does_not_drift(loaded, monkeypatch):
+    monkeypatch.setattr(arrival_patterns, "MAX_PATTERNS", 300)
+    forgetful, keeping = set(), ArrivalPatterns.keeping
 
-    def counted(table, live):
-        tables.add(id(table))
-        return keeping(table, live)
+    def counted(patterns, live):
+        forgetful.add(id(patterns))
+        return keeping(patterns, live)
 
-    monkeypatch.setattr(gain_table.GainTable, "keeping", counted)
+    monkeypatch.setattr(ArrivalPatterns, "keeping", counted)
     soak_many(loaded, 16, 1000, 900)
-    assert tables
+    assert forgetful
 
 
 @pytest.mark.slow
