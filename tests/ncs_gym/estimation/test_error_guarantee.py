@@ -4,7 +4,7 @@ import pytest
 
 from ncs_gym import Channel, ChannelContract, batch_reactor, cart_pole, truck_trailer
 from shields.verification.rational_matrix import is_positive_semidefinite, rational, subtract
-from tests.ncs_gym.adversary import Attack
+from tests.ncs_gym.estimation.adversary import Attack
 from tests.plants import random_plant
 
 CASES = {

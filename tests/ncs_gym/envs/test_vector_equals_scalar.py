@@ -23,7 +23,7 @@ from ncs_gym import (
     truck_trailer,
 )
 from ncs_gym.estimation import arrival_patterns
-from tests.ncs_gym.same_draws import compare
+from tests.ncs_gym.envs.same_draws import compare
 from tests.plants import random_plant
 
 IDS = ("TruckTrailer", "TruckTrailerCruise", "CartPole", "BatchReactor")

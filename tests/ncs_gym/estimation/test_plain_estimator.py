@@ -27,7 +27,7 @@ from ncs_gym.estimation.error_statistics import ErrorRecursion
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.channel_state import ChannelState
 from tests.fuzz import channels, examples, plants
-from tests.plain_estimator import PlainEstimator
+from tests.ncs_gym.estimation.plain_estimator import PlainEstimator
 from tests.plants import random_plant
 
 BURSTS = GilbertElliott(p_good_to_bad=0.15, p_bad_to_good=0.3, loss_good=0.05, loss_bad=0.9)

@@ -7,7 +7,7 @@ import numpy as np
 from ncs_gym import Channel, ChannelContract, LinearPlant, certified_error_set
 from ncs_gym.estimation.arrival_patterns import patterns_of
 from ncs_gym.estimation.vector_estimator import VectorEstimator
-from tests.ncs_gym.same_draws import holding_gain
+from tests.ncs_gym.envs.same_draws import holding_gain
 
 # Points on a boundary are pulled in by more than their rounding.
 PULL = 1.0 - 1e-10
