@@ -21,24 +21,24 @@ class Oscillation(Task):
     period: int = 40
 
     def begin(self, rng, plant):
-        """Returns the memory: the phase [rad]."""
+        """Returns the state of the task: the phase [rad]."""
         return rng.uniform(0.0, 2.0 * np.pi)
 
-    def advance(self, rng, plant, memory, u):
+    def advance(self, rng, plant, task_state, u):
         """Returns the phase one step on."""
-        return (memory + 2.0 * np.pi / self.period) % (2.0 * np.pi)
+        return (task_state + 2.0 * np.pi / self.period) % (2.0 * np.pi)
 
-    def observe(self, memory):
+    def observe(self, task_state):
         """Returns what the agent sees besides the estimate."""
-        return np.array([np.sin(memory), np.cos(memory)])
+        return np.array([np.sin(task_state), np.cos(task_state)])
 
     def observation_bound(self, plant, horizon):
         """Returns how large these entries can become."""
         return np.ones(2)
 
-    def reward(self, plant, memory, state, u):
+    def reward(self, plant, task_state, state, u):
         """Returns how near the state is."""
-        return -float((state[0] - self.amplitude * np.sin(memory)) ** 2)
+        return -float((state[0] - self.amplitude * np.sin(task_state)) ** 2)
 
 
 env = gym.make("ncs_gym:ncs_gym/TruckTrailer-v0", task=Oscillation())
