@@ -45,7 +45,7 @@ benchmark: $(INSTALLED) $(RAY_INSTALLED)
 	$(BIN)/python benchmarks/contracts.py
 	$(BIN)/python benchmarks/numerical_trust.py
 	$(BIN)/python benchmarks/vector_env.py
-	$(BIN)/python benchmarks/codesign_grid.py
+	$(BIN)/python benchmarks/optimization_problem_grid.py
 	$(BIN)/python benchmarks/rendering.py
 	$(BIN)/python benchmarks/ppo_settings.py
 	$(BIN)/python benchmarks/ray_overhead.py

@@ -1,16 +1,58 @@
-"""Training and evaluation of stable-baselines3 agents; needs the `train` extra."""
+"""Training and evaluation of stable-baselines3 agents in control loops of plant, network and shield.
+
+A `ControlLoop` says which environment, channel and shield an agent works in; `train` returns a trained `Agent` and what
+happened on the way, `evaluate` plays episodes and counts violations of the true state. `SB3VecEnv` and `SafetyCallback`
+also serve training code of your own. What needs stable-baselines3 or torch (the extra `train`) is imported when it is
+first asked for.
+"""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from agents.agent import Agent, AgentError
+    from agents.callbacks import SafetyCallback
+    from agents.control_loop import ControlLoop, ShieldSettings
+    from agents.evaluation import evaluate
+    from agents.results import Episode, Evaluation, TrainingPoint, Trajectory
     from agents.sb3_vec_env import SB3VecEnv
+    from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
+    from agents.training import TrainingResult, train
 
-__all__ = ["SB3VecEnv"]
+__all__ = [
+    "A2CSettings",
+    "Agent",
+    "AgentError",
+    "ControlLoop",
+    "Episode",
+    "Evaluation",
+    "OffPolicySettings",
+    "PPOSettings",
+    "SB3VecEnv",
+    "SafetyCallback",
+    "ShieldSettings",
+    "TrainingPoint",
+    "TrainingResult",
+    "Trajectory",
+    "evaluate",
+    "train",
+]
+
+_MODULES = {
+    "agent": ("Agent", "AgentError"),
+    "callbacks": ("SafetyCallback",),
+    "control_loop": ("ControlLoop", "ShieldSettings"),
+    "evaluation": ("evaluate",),
+    "results": ("Episode", "Evaluation", "TrainingPoint", "Trajectory"),
+    "sb3_vec_env": ("SB3VecEnv",),
+    "settings": ("A2CSettings", "OffPolicySettings", "PPOSettings"),
+    "training": ("TrainingResult", "train"),
+}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    """Imports stable-baselines3 only when it is asked for."""
-    if name == "SB3VecEnv":
-        return import_module("agents.sb3_vec_env").SB3VecEnv
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    """Imports the module of a public name when the name is first asked for."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)

@@ -1,4 +1,4 @@
-"""A trained policy, and its files: weights and numbers, no pickled code."""
+"""A trained policy, and its files, which hold weights and numbers but no pickled code."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.algorithms import ALGORITHMS, build
+from agents.algorithms import ALGORITHMS, build_model
 from agents.control_loop import ControlLoop
 from agents.sb3_vec_env import SB3VecEnv
 from agents.settings import AgentSettings
 from ncs_gym import Channel, GilbertElliott
 from shields.atomic_write import write_atomically
 
-FORMAT = "ncs-gym agent 1"
+_FORMAT = "ncs-gym agent 1"
 
 
 class AgentError(ValueError):
-    """A file is no agent, damaged, or of another environment."""
+    """A folder holds no agent, a damaged or altered one, or one of another environment."""
 
 
 @dataclass(frozen=True, eq=False)
 class Normalization:
-    """What observations are normalized by: clip((o - mean) / sqrt(variance + epsilon), +-clip).
+    """Normalizes observations: clip((o - mean) / sqrt(variance + epsilon), -clip, clip).
 
     Attributes:
-        mean, variance: Shape (entries,).
+        mean, variance: Statistics of the observations in training, shape (entries,).
         epsilon: Keeps the root away from 0.
-        clip: Largest absolute value.
+        clip: Largest absolute value of a normalized entry.
     """
 
     mean: np.ndarray
@@ -65,15 +65,15 @@ class Normalization:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Agent:
-    """A policy with everything that is needed to act and to be built again.
+    """A policy with everything needed to act, to be saved and to be loaded.
 
     Attributes:
-        algorithm: Its name in `agents.algorithms`.
-        settings: It was trained with.
-        env: Id of the environment it was trained in.
-        channel: Of that environment, None for the id's own.
-        model: The stable-baselines3 object.
-        normalization: Of its observations.
+        algorithm: Name of the algorithm in `agents.algorithms.ALGORITHMS`.
+        settings: Settings the agent was trained with.
+        env: Id of the environment the agent was trained in.
+        channel: Channel the agent was trained with; None for that of the id.
+        model: The stable-baselines3 model.
+        normalization: Normalization of the model's observations.
     """
 
     algorithm: str
@@ -96,7 +96,7 @@ class Agent:
         return digest.hexdigest()
 
     def files(self) -> dict[str, bytes]:
-        """Returns the contents of `model.zip` (stable-baselines3's) and `agent.json` (what else `load` needs)."""
+        """Returns the contents of `model.zip`, in stable-baselines3's format, and of `agent.json`, with the rest."""
         buffer = io.BytesIO()
         self.model.save(buffer)
         content = {
@@ -104,7 +104,7 @@ class Agent:
             "settings": asdict(self.settings),
             "env": self.env,
             "channel": None if self.channel is None else asdict(self.channel),
-            "plant": plant_fingerprint(self.env),
+            "plant": _plant_fingerprint(self.env),
             "normalization": {
                 "mean": self.normalization.mean.tolist(),
                 "variance": self.normalization.variance.tolist(),
@@ -113,7 +113,7 @@ class Agent:
             },
             "sha256_of_model": hashlib.sha256(buffer.getvalue()).hexdigest(),
         }
-        document = {"format": FORMAT, "sha256": _digest(content), "agent": content}
+        document = {"format": _FORMAT, "sha256": _digest(content), "agent": content}
         return {"model.zip": buffer.getvalue(), "agent.json": (json.dumps(document, indent=1) + "\n").encode()}
 
     def save(self, folder: Path) -> None:
@@ -127,7 +127,7 @@ class Agent:
 
     @classmethod
     def load(cls, folder: str | Path) -> Agent:
-        """Returns the agent in a folder; nothing pickled is read, so that a foreign file cannot run code.
+        """Returns the agent saved in a folder; nothing is unpickled, so that an untrusted file cannot run code.
 
         Raises:
             AgentError: If the files are missing, damaged, of another format or of an environment that has changed.
@@ -144,8 +144,8 @@ class Agent:
             ) from error
         except (ValueError, RecursionError) as error:
             raise AgentError(f"{folder / 'agent.json'} is damaged: it is not valid JSON") from error
-        if not isinstance(document, dict) or document.get("format") != FORMAT:
-            raise AgentError(f"{folder / 'agent.json'} is not of format {FORMAT!r}")
+        if not isinstance(document, dict) or document.get("format") != _FORMAT:
+            raise AgentError(f"{folder / 'agent.json'} is not of format {_FORMAT!r}")
         content = document.get("agent")
         if not isinstance(content, dict) or document.get("sha256") != _digest(content):
             raise AgentError(f"{folder / 'agent.json'} was altered: its checksum does not match")
@@ -160,14 +160,14 @@ class Agent:
             raise AgentError(f"the agent in {folder} is damaged: {reason}") from error
 
 
-def plant_fingerprint(env_id: str) -> str | None:
+def _plant_fingerprint(env_id: str) -> str | None:
     """Returns the fingerprint of an environment's plant, None for an environment without one."""
     plant = getattr(gym.make(env_id).unwrapped, "plant", None)
     return None if plant is None else plant.fingerprint
 
 
-def channel_from_json(content: dict[str, Any] | None) -> Channel | None:
-    """Returns the channel that `dataclasses.asdict` turned into `content`."""
+def _channel_from_json(content: dict[str, Any] | None) -> Channel | None:
+    """Returns the channel whose `dataclasses.asdict` is `content`."""
     if content is None:
         return None
     loss = content["loss"]
@@ -176,17 +176,17 @@ def channel_from_json(content: dict[str, Any] | None) -> Channel | None:
 
 
 def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
-    """Returns an agent from checked contents."""
+    """Returns the agent of an `agent.json` and a `model.zip` whose checksums are right."""
     env_id, algorithm = content["env"], content["algorithm"]
     if env_id not in gym.registry:
         raise AgentError(f"the agent was trained in {env_id}, which is not registered here")
-    if content["plant"] != plant_fingerprint(env_id):
+    if content["plant"] != _plant_fingerprint(env_id):
         raise AgentError(f"the agent was trained on another plant than that of {env_id}: their fingerprints differ")
     if algorithm not in ALGORITHMS:
         raise AgentError(f"the agent is of an unknown algorithm, {algorithm!r}")
     settings = ALGORITHMS[algorithm][1](**content["settings"])
-    channel = channel_from_json(content["channel"])
-    model = build(algorithm, SB3VecEnv(ControlLoop(env=env_id, channel=channel).vector(1)), settings, seed=0)
+    channel = _channel_from_json(content["channel"])
+    model = build_model(algorithm, SB3VecEnv(ControlLoop(env=env_id, channel=channel).vector(1)), settings, seed=0)
     _, parameters, _ = load_from_zip_file(io.BytesIO(weights), load_data=False, device="cpu")
     model.set_parameters(parameters, exact_match=True, device="cpu")
     numbers = content["normalization"]

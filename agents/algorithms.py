@@ -1,4 +1,4 @@
-"""The learning algorithms by name."""
+"""The learning algorithms of stable-baselines3 and sb3-contrib, by name."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents.settings import A2CSettings, AgentSettings, OffPolicySettings, PPOSettings
 
-# Where each algorithm comes from and which settings it takes.
+# The package of each algorithm and the class of its settings.
 ALGORITHMS: dict[str, tuple[str, type[AgentSettings]]] = {
     "PPO": ("stable_baselines3", PPOSettings),
     "A2C": ("stable_baselines3", A2CSettings),
@@ -28,46 +28,43 @@ ALGORITHMS: dict[str, tuple[str, type[AgentSettings]]] = {
 }
 
 
-def algorithm_class(name: str) -> type[BaseAlgorithm]:
-    """Returns the class of an algorithm.
+def checked_settings(name: str, settings: AgentSettings | None) -> AgentSettings:
+    """Returns the settings of an algorithm: the given ones, or its defaults for None.
 
     Raises:
-        ValueError: If the name is unknown.
-        ModuleNotFoundError: If its package is not installed.
+        ValueError: If the name is unknown, or the settings are those of another algorithm.
+        ModuleNotFoundError: If the algorithm's package is not installed.
     """
     if name not in ALGORITHMS:
         raise ValueError(f"unknown algorithm {name!r}; known are {', '.join(ALGORITHMS)}")
-    package = ALGORITHMS[name][0]
+    package, kind = ALGORITHMS[name]
     if importlib.util.find_spec(package) is None:
         distribution = package.replace("_", "-")
         raise ModuleNotFoundError(f"{name} needs {distribution}: pip install {distribution}")
-    return getattr(importlib.import_module(package), name)
+    if settings is not None and not isinstance(settings, kind):
+        raise ValueError(f"{name} takes {kind.__name__}, got {type(settings).__name__}")
+    return settings or kind()
 
 
-def build(name: str, env: VecEnv, settings: AgentSettings, seed: int, steps: int = 0) -> BaseAlgorithm:
-    """Returns an untrained agent.
+def build_model(name: str, env: VecEnv, settings: AgentSettings, seed: int, steps: int = 0) -> BaseAlgorithm:
+    """Returns an untrained model.
 
     Args:
-        name: In `ALGORITHMS`.
-        env: What it will be trained in.
-        settings: Of the algorithm.
-        seed: Of network and sampling.
-        steps: It will be trained for; stretches the fall of the learning rate.
+        name: A name in `ALGORITHMS`.
+        env: The environment it will be trained in.
+        settings: Settings of the algorithm.
+        seed: Seed of the network's weights and of sampling.
+        steps: Number of steps it will be trained for, over which the learning rate falls to zero.
 
     Raises:
-        ValueError: If the name is unknown, or the settings are another algorithm's.
+        ValueError: If the name is unknown, or the settings are those of another algorithm.
         ModuleNotFoundError: If the algorithm's package is not installed.
     """
-    cls = algorithm_class(name)
-    if not isinstance(settings, ALGORITHMS[name][1]):
-        raise ValueError(f"{name} takes {ALGORITHMS[name][1].__name__}, got {type(settings).__name__}")
+    settings = checked_settings(name, settings)
+    cls = getattr(importlib.import_module(ALGORITHMS[name][0]), name)
     torch.set_num_threads(1)  # more threads only pay off at batches of 16384 and make results depend on their number
-    # The rate of an update is that of the start of its rollout: the library looks at the end, where the last is zero.
-    rollout = env.num_envs * (1 if isinstance(settings, OffPolicySettings) else settings.rollout)
-    share = min(rollout / steps, 1.0) if steps else 0.0
-    rate = settings.learning_rate
     common: dict[str, Any] = {
-        "learning_rate": LinearSchedule(rate * (1.0 + share), rate * share, 1.0),
+        "learning_rate": _learning_rate(env, settings, steps),
         "gamma": settings.discount,
         "seed": seed,
         "device": "cpu",
@@ -83,8 +80,19 @@ def build(name: str, env: VecEnv, settings: AgentSettings, seed: int, steps: int
     return cls("MlpPolicy", env, **common)
 
 
+def _learning_rate(env: VecEnv, settings: AgentSettings, steps: int) -> LinearSchedule:
+    """Returns a learning rate that falls linearly; the last update still has the rate at the start of its rollout.
+
+    The library evaluates the schedule at the end of each rollout, where that of the last one would be zero.
+    """
+    rollout = env.num_envs * (1 if isinstance(settings, OffPolicySettings) else settings.rollout)
+    fraction = min(rollout / steps, 1.0) if steps else 0.0
+    rate = settings.learning_rate
+    return LinearSchedule(rate * (1.0 + fraction), rate * fraction, 1.0)
+
+
 def _replay(name: str, settings: OffPolicySettings, inputs: int) -> dict[str, Any]:
-    """Returns what algorithms with a replay buffer take besides."""
+    """Returns the further arguments of algorithms with a replay buffer."""
     noise = NormalActionNoise(np.zeros(inputs), settings.noise * np.ones(inputs)) if name == "TD3" else None
     return {
         "batch_size": settings.batch_size,

@@ -1,4 +1,4 @@
-"""Counts what happens during training, step by step."""
+"""Counts violations and interventions during training, step by step."""
 
 from __future__ import annotations
 
@@ -8,25 +8,26 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from agents.history import TrainingPoint
+from agents.results import TrainingPoint
 from agents.sb3_vec_env import SB3VecEnv
 
-# Where every step of all environments is a rollout, the history has this many points.
-POINTS = 200
+# The history has about this many points where every step of all environments is a rollout.
+_MAX_POINTS = 200
 
 
 class SafetyCallback(BaseCallback):
     """Counts violations of the true state and interventions in every training step, and logs their rates.
 
-    The counts come from each step's info; `Monitor` alone would see the last step of each episode only. Works with any
-    stable-baselines3 algorithm, on `SB3VecEnv` and on single environments. TensorBoard gets `safety/violation_rate`,
-    `safety/intervention_rate` (per step since the last log) and `safety/violation_steps` (total).
+    The counts come from the info of every step, whereas `Monitor` only sees the last step of each episode. The callback
+    works with any stable-baselines3 algorithm, on `SB3VecEnv` and on single environments. TensorBoard gets
+    `safety/violation_rate` and `safety/intervention_rate` (per step since the last log) and `safety/violation_steps`
+    (total).
 
     Args:
         on_progress: Called with the number of steps taken since its last call.
 
     Attributes:
-        history: Totals after every rollout; where rollouts are single steps, `POINTS` of them.
+        history: Totals after every rollout; where rollouts are single steps, after every 200th part of the training.
         violation_steps: Steps so far whose true state violated the safe box.
         interventions: Steps so far in which the shield intervened.
     """
@@ -38,7 +39,7 @@ class SafetyCallback(BaseCallback):
         self.violation_steps = self.interventions = 0
 
     def _on_training_start(self) -> None:
-        self._every = self.locals["total_timesteps"] // POINTS
+        self._interval = self.locals["total_timesteps"] // _MAX_POINTS
 
     def _on_step(self) -> bool:
         batch = _batch_info(self.training_env)
@@ -50,15 +51,15 @@ class SafetyCallback(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        if self.num_timesteps - (self.history[-1].steps if self.history else 0) >= self._every:
-            self._note()
+        if self.num_timesteps - (self.history[-1].steps if self.history else 0) >= self._interval:
+            self._add_point()
 
     def _on_training_end(self) -> None:
         if not self.history or self.history[-1].steps < self.num_timesteps:
-            self._note()
+            self._add_point()
 
-    def _note(self) -> None:
-        """Adds a point to the history and to TensorBoard's next event."""
+    def _add_point(self) -> None:
+        """Adds the present totals to the history and to TensorBoard's next event."""
         last = self.history[-1] if self.history else TrainingPoint(0, float("nan"), 0, 0)
         taken = max(self.num_timesteps - last.steps, 1)
         self.logger.record("safety/violation_rate", (self.violation_steps - last.violation_steps) / taken)
@@ -72,7 +73,7 @@ class SafetyCallback(BaseCallback):
 
 
 def _batch_info(env: VecEnv) -> dict[str, np.ndarray] | None:
-    """Returns the infos of the last step as arrays, None where there are only dicts."""
+    """Returns the infos of the last step as arrays; None if the environment has one dict per environment only."""
     while isinstance(env, VecEnvWrapper):
         env = env.venv
     return env.batch_info if isinstance(env, SB3VecEnv) else None

@@ -1,4 +1,4 @@
-"""The loop an agent learns in: an environment with its channel, its shield and the price of a violation."""
+"""The control loop an agent works in: an environment with its channel, its shield and the penalty of a violation."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from shields import Certificate, SafetyShield, VectorSafetyShield
 
 
 @dataclass(frozen=True)
-class Shielding:
-    """How an environment is shielded.
+class ShieldSettings:
+    """Settings of the shield around an environment.
 
     Attributes:
-        certificate: Verified when the shield is built.
-        mode: Of `SafetyShield`.
-        penalty: Subtracted from the reward per intervention.
+        certificate: Certificate of the safe set; it is verified when the shield is built.
+        mode: Mode of `SafetyShield`: "project", "switch", "boundary" or "monitor".
+        penalty: Subtracted from the reward for every intervention.
     """
 
     certificate: Certificate
@@ -31,64 +31,65 @@ class Shielding:
 
 @dataclass(frozen=True, kw_only=True)
 class ControlLoop:
-    """An environment with what lies between it and the agent.
+    """An environment together with everything between it and the agent.
 
     Attributes:
-        env: A registered id.
-        channel: In place of the id's own.
-        shielding: None leaves the agent's actions alone.
-        violation_penalty: Subtracted from the reward of every step whose true state violates the safe box.
+        env: A registered environment id.
+        channel: Replaces the channel of the id; None keeps it.
+        shield: Settings of the shield; None applies the agent's actions as they are.
+        violation_penalty: Subtracted from the reward of every step whose true state violates the safe box, in vector
+            environments, which agents are trained in.
     """
 
     env: str
     channel: Channel | None = None
-    shielding: Shielding | None = None
+    shield: ShieldSettings | None = None
     violation_penalty: float = 0.0
 
     @property
-    def unpriced(self) -> ControlLoop:
+    def without_penalties(self) -> ControlLoop:
         """The same loop with the environment's own rewards."""
-        shielding = self.shielding and replace(self.shielding, penalty=0.0)
-        return replace(self, shielding=shielding, violation_penalty=0.0)
+        shield = self.shield and replace(self.shield, penalty=0.0)
+        return replace(self, shield=shield, violation_penalty=0.0)
 
     def single(self, **settings: Any) -> gym.Env:
-        """Returns one environment; `settings` go to `gym.make`. A violation is not priced."""
-        env, shielding = gym.make(self.env, **self._settings(settings)), self.shielding
-        if shielding is None:
+        """Returns one environment, without the penalty of a violation; `settings` are passed to `gym.make`."""
+        env, shield = gym.make(self.env, **self._settings(settings)), self.shield
+        if shield is None:
             return env
-        return SafetyShield(env, shielding.certificate, mode=shielding.mode, penalty=shielding.penalty)
+        return SafetyShield(env, shield.certificate, mode=shield.mode, penalty=shield.penalty)
 
     def vector(self, count: int, **settings: Any) -> VectorEnv:
-        """Returns `count` environments: the id's vector environment, else gymnasium's of single ones."""
+        """Returns `count` environments: the id's own vector environment, or gymnasium's of single environments."""
         if gym.spec(self.env).vector_entry_point is None:
             envs: Any = SyncVectorEnv([lambda: self.single(**settings)] * count)
         else:
             envs = gym.make_vec(self.env, num_envs=count, **self._settings(settings))
-            if self.shielding is not None:
-                mode, penalty = self.shielding.mode, self.shielding.penalty
-                envs = VectorSafetyShield(envs, self.shielding.certificate, mode=mode, penalty=penalty)
-        return PricedViolations(envs, self.violation_penalty) if self.violation_penalty else envs
+            if self.shield is not None:
+                mode, penalty = self.shield.mode, self.shield.penalty
+                envs = VectorSafetyShield(envs, self.shield.certificate, mode=mode, penalty=penalty)
+        return CostPenalty(envs, self.violation_penalty) if self.violation_penalty else envs
 
     def _settings(self, settings: dict[str, Any]) -> dict[str, Any]:
         return settings if self.channel is None else {"channel": self.channel} | settings
 
 
-class PricedViolations(VectorWrapper):
-    """Subtracts a price from the reward of every step after which the true state violates the safe box.
+class CostPenalty(VectorWrapper):
+    """Subtracts a penalty from the reward of every step after which the true state violates the safe box.
 
     Args:
-        env: With `cost` in its infos.
-        price: Per violating step.
+        env: A vector environment with `cost` in its infos.
+        penalty: Subtracted per violating step.
     """
 
-    def __init__(self, env: VectorEnv, price: float) -> None:
+    def __init__(self, env: VectorEnv, penalty: float) -> None:
         super().__init__(env)
-        self.price = price
+        self.penalty = penalty
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Steps; the last step of an episode is priced by its own infos."""
+        """Steps the environments; the cost of an episode's last step is read from its final info."""
         observation, rewards, terminated, truncated, info = self.env.step(actions)
         cost, done = info["cost"], terminated | truncated
         if "final_info" in info:
             cost = np.where(done, info["final_info"]["cost"], cost)
-        return observation, rewards - self.price * cost, terminated, truncated, info
+        return observation, rewards - self.penalty * cost, terminated, truncated, info

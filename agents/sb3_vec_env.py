@@ -14,36 +14,41 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from ncs_gym import NCSVectorEnv
 
-# Vector environments whose reset takes options={"reset_mask": ...} and starts the episodes of these alone.
-WITH_RESET_MASK = (NCSVectorEnv, SyncVectorEnv, AsyncVectorEnv)
-# What `Monitor(info_keywords=...)` would keep of an episode's last step, where the environment reports it.
-EPISODE_KEYS = ("episode_violations", "is_success")
+# Vector environments whose reset takes options={"reset_mask": ...} and resets only the environments in the mask.
+_WITH_RESET_MASK = (NCSVectorEnv, SyncVectorEnv, AsyncVectorEnv)
+# Infos of an episode's last step that become part of info["episode"], as with `Monitor(info_keywords=...)`.
+_EPISODE_KEYS = ("episode_violations", "is_success")
+# Attributes that change with the episodes of an `NCSVectorEnv`, but never in its scalar prototype.
+_STATEFUL_ATTRIBUTES = ("steps", "episodes", "np_random", "starts", "spec", "num_envs", "metadata")
 
 
 class SB3VecEnv(VecEnv):
     """A gymnasium `VectorEnv` as a stable-baselines3 `VecEnv`.
 
-    stable-baselines3 wants the first observation of the next episode in the step that ends one, and the last one in
-    `info["terminal_observation"]`. That is exact for SAME_STEP autoreset, and for NEXT_STEP and DISABLED where resets
-    of single environments are possible (`NCSVectorEnv`, gymnasium's sync and async). Other NEXT_STEP environments take
-    a step to reset: with `allow_reset_transitions=True` the learner sees that step as a transition of reward 0 from the
-    last observation of an episode to the first of the next, once per episode.
+    stable-baselines3 expects the step that ends an episode to return the first observation of the next episode, and
+    the last observation in `info["terminal_observation"]`. This class provides that exactly for SAME_STEP autoreset,
+    and for NEXT_STEP and DISABLED where single environments can be reset (`NCSVectorEnv`, gymnasium's sync and async).
+    Other NEXT_STEP environments take a step to reset: with `allow_reset_transitions=True` the learner sees that step,
+    once per episode, as a transition of reward 0 from the last observation of an episode to the first of the next.
 
     Like `Monitor` it adds `info["episode"]` (`r`, `l`, `t`) to the last step of an episode, with `episode_violations`
-    and `is_success` where there are such infos. A dict per environment and step is slow: by default they hold what the
-    library needs; `batch_info` has all values of the last step as arrays, and `info_keys` says what to copy.
+    and `is_success` where there are such infos. Filling a dict per environment and step is slow. Therefore the dicts
+    hold by default only what the library needs: `batch_info` has all values of the last step as arrays, and `info_keys`
+    names values to be copied into the dicts.
 
     Args:
-        vector_env: The environment.
-        allow_reset_transitions: See above.
-        info_keys: Infos that every step's dicts hold; the last step of an episode has all of them.
+        vector_env: The vector environment.
+        allow_reset_transitions: Whether to accept environments that take a step to reset.
+        info_keys: Infos that the dicts of every step hold; those of an episode's last step hold all infos.
 
     Attributes:
-        vector_env: The environment.
-        batch_info: Infos of the last step, arrays with the environment as first axis; where an episode ended its own.
+        vector_env: The vector environment.
+        batch_info: Infos of the last step, arrays with the environment as first axis; for an environment whose episode
+            ended they are those of the episode's last step.
 
     Raises:
-        ValueError: If episodes cannot be restarted in time and that is not allowed, or observations are no arrays.
+        ValueError: If episodes cannot be restarted in the step that ends them and that is not allowed, or if
+            observations are not arrays.
     """
 
     def __init__(
@@ -55,7 +60,7 @@ class SB3VecEnv(VecEnv):
             raise ValueError(f"observations must be arrays, got {vector_env.single_observation_space}")
         self.vector_env, self._info_keys = vector_env, tuple(info_keys)
         self._mode = vector_env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
-        self._masks = isinstance(vector_env.unwrapped, WITH_RESET_MASK)
+        self._masks = isinstance(vector_env.unwrapped, _WITH_RESET_MASK)
         if self._mode is not AutoresetMode.SAME_STEP and not self._masks and not allow_reset_transitions:
             raise ValueError(
                 f"{type(vector_env.unwrapped).__name__} takes a step of its own to reset: make it with SAME_STEP "
@@ -68,12 +73,12 @@ class SB3VecEnv(VecEnv):
         super().__init__(vector_env.num_envs, vector_env.single_observation_space, vector_env.single_action_space)
 
     def reset(self) -> np.ndarray:
-        """Starts episodes, with the seeds and options given before."""
+        """Starts all episodes, with the seeds and options given by `seed` and `set_options`."""
         options = self._options[0]
         if not all(_same(option, options) for option in self._options):
             raise ValueError("a vector environment takes the same options for all environments")
         seeds: Any = None if self._seeds[0] is None else self._seeds
-        if seeds is not None and not isinstance(self.vector_env.unwrapped, WITH_RESET_MASK[1:]):
+        if seeds is not None and not isinstance(self.vector_env.unwrapped, _WITH_RESET_MASK[1:]):
             seeds = seeds[0]
         observation, info = self.vector_env.reset(seed=seeds, options=options or None)
         self._reset_seeds()
@@ -88,7 +93,7 @@ class SB3VecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Steps; returns observations, rewards (float32), dones and a dict per environment."""
+        """Steps all environments; returns observations, rewards (float32), dones and a dict per environment."""
         observation, rewards, terminated, truncated, info = self.vector_env.step(self._actions)
         done = terminated | truncated
         self._returns += rewards
@@ -119,11 +124,11 @@ class SB3VecEnv(VecEnv):
         return observation, rewards.astype(np.float32), done, infos
 
     def _last_info(self, e: int, dense: dict[str, np.ndarray], observation: np.ndarray, cut: bool) -> dict[str, Any]:
-        """Returns the dict of environment e whose episode ends now."""
+        """Returns the info of environment e, whose episode ends in this step."""
         info = {key: value[e] for key, value in dense.items()}
         elapsed = round(time.time() - self._started, 6)
         info["episode"] = {"r": float(self._returns[e]), "l": int(self._lengths[e]), "t": elapsed}
-        info["episode"] |= {key: float(info[key]) for key in EPISODE_KEYS if key in info}
+        info["episode"] |= {key: float(info[key]) for key in _EPISODE_KEYS if key in info}
         info["terminal_observation"] = np.array(observation)
         info["TimeLimit.truncated"] = cut
         return info
@@ -136,16 +141,16 @@ class SB3VecEnv(VecEnv):
         """Returns an attribute of each environment; of a vector environment that is one object, the same for all.
 
         Raises:
-            AttributeError: If there is no such attribute, or an array of the vector environment that may be anything.
+            AttributeError: If there is no such attribute, or it is an array, which may hold anything.
         """
         chosen = self._get_indices(indices)
         inner = self.vector_env.unwrapped
         if attr_name == "render_mode":
             return [self.vector_env.render_mode for _ in chosen]
-        if isinstance(inner, WITH_RESET_MASK[1:]):
+        if isinstance(inner, _WITH_RESET_MASK[1:]):
             values = inner.get_attr(attr_name)
             return [values[e] for e in chosen]
-        source = inner.single if isinstance(inner, NCSVectorEnv) and attr_name not in STATEFUL else inner
+        source = inner.single if isinstance(inner, NCSVectorEnv) and attr_name not in _STATEFUL_ATTRIBUTES else inner
         value = getattr(source, attr_name)
         if isinstance(value, np.ndarray):
             raise AttributeError(f"{attr_name} is an array of {type(inner).__name__}: read it from vector_env")
@@ -155,10 +160,10 @@ class SB3VecEnv(VecEnv):
         """Sets an attribute of environments of gymnasium's sync and async vector environments, all at once.
 
         Raises:
-            AttributeError: Of any other vector environment, whose environments are not objects.
+            AttributeError: For any other vector environment, whose environments are not objects of their own.
         """
         inner, chosen = self.vector_env.unwrapped, list(self._get_indices(indices))
-        if not isinstance(inner, WITH_RESET_MASK[1:]):
+        if not isinstance(inner, _WITH_RESET_MASK[1:]):
             raise AttributeError(f"the environments of {type(inner).__name__} have no attributes of their own to set")
         values = list(inner.get_attr(attr_name)) if len(chosen) < self.num_envs else [None] * self.num_envs
         for e in chosen:
@@ -171,10 +176,10 @@ class SB3VecEnv(VecEnv):
         """Calls a method of each environment of gymnasium's sync and async vector environments.
 
         Raises:
-            AttributeError: Of any other vector environment.
+            AttributeError: For any other vector environment.
         """
         inner = self.vector_env.unwrapped
-        if not isinstance(inner, WITH_RESET_MASK[1:]):
+        if not isinstance(inner, _WITH_RESET_MASK[1:]):
             raise AttributeError(f"the environments of {type(inner).__name__} have no methods of their own to call")
         results = inner.call(method_name, *method_args, **method_kwargs)
         return [results[e] for e in self._get_indices(indices)]
@@ -182,7 +187,7 @@ class SB3VecEnv(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper], indices: int | Iterable[int] | None = None
     ) -> list[bool]:
-        """Returns True for `Monitor`, whose infos this class gives; else whether a wrapper of that class is around."""
+        """Returns whether a wrapper of that class is around; True for `Monitor`, whose infos this class provides."""
         wrapped, layer = wrapper_class is Monitor, self.vector_env
         while isinstance(layer, gym.vector.VectorWrapper):
             wrapped |= isinstance(layer, wrapper_class)
@@ -197,19 +202,15 @@ class SB3VecEnv(VecEnv):
         return [frame if isinstance(frame, np.ndarray) else None for frame in frames]
 
 
-# Attributes of `NCSVectorEnv` that its scalar prototype has too, but never changes.
-STATEFUL = ("steps", "episodes", "np_random", "starts", "spec", "num_envs", "metadata")
-
-
 def _dense(info: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Returns the infos that are arrays with an entry per environment."""
+    """Returns those infos that are arrays with an entry per environment."""
     return {
         key: value for key, value in info.items() if not key.startswith(("_", "final_")) and not isinstance(value, dict)
     }
 
 
 def _with_final(info: dict[str, Any], done: np.ndarray) -> dict[str, Any]:
-    """Returns infos with those of the last step where episodes ended."""
+    """Returns the infos, with those of the last step for environments whose episode ended."""
     final = _dense(info.get("final_info", {}))
     merged = dict(info) | {key: value for key, value in final.items() if key not in info}
     for key in final.keys() & _dense(info).keys():

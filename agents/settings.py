@@ -1,4 +1,4 @@
-"""What a training run is made of."""
+"""Settings of the learning algorithms."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 class _Settings:
-    """Checks ranges by the names that algorithms share."""
+    """Checks the ranges of settings, which have the same names in all algorithms."""
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
@@ -24,15 +24,15 @@ class PPOSettings(_Settings):
     magnitude faster at no loss of return on these small tasks (`python benchmarks/ppo_settings.py`).
 
     Attributes:
-        envs: Environments stepped side by side.
-        rollout: Steps per environment between updates.
-        batch_size: Samples per gradient step; rollout * envs should be a multiple.
+        envs: Number of environments stepped side by side.
+        rollout: Steps of each environment between updates.
+        batch_size: Samples per gradient step; rollout * envs should be a multiple of it.
         epochs: Passes over each rollout.
-        learning_rate: Of Adam, falling linearly to zero.
-        discount: Per step.
-        gae_lambda: Of generalized advantage estimation.
+        learning_rate: Initial learning rate of Adam, which falls linearly to zero.
+        discount: Discount factor per step.
+        gae_lambda: Parameter lambda of generalized advantage estimation.
         log_std: Initial log standard deviation of the actions.
-        width: Units in each of two hidden layers, for policy and value.
+        width: Units in each of the two hidden layers of the policy and of the value function.
     """
 
     envs: int = 64
@@ -57,13 +57,13 @@ class A2CSettings(_Settings):
     """Settings of A2C.
 
     Attributes:
-        envs: Environments stepped side by side.
-        rollout: Steps per environment between updates.
-        learning_rate: Of RMSprop, falling linearly to zero.
-        discount: Per step.
-        gae_lambda: Of generalized advantage estimation.
+        envs: Number of environments stepped side by side.
+        rollout: Steps of each environment between updates.
+        learning_rate: Initial learning rate of RMSprop, which falls linearly to zero.
+        discount: Discount factor per step.
+        gae_lambda: Parameter lambda of generalized advantage estimation.
         log_std: Initial log standard deviation of the actions.
-        width: Units in each of two hidden layers, for policy and value.
+        width: Units in each of the two hidden layers of the policy and of the value function.
     """
 
     envs: int = 64
@@ -80,15 +80,15 @@ class OffPolicySettings(_Settings):
     """Settings of SAC, TD3, TQC and CrossQ.
 
     Attributes:
-        envs: Environments stepped side by side.
-        gradient_steps: Updates per step of all environments.
-        batch_size: Samples per update.
-        buffer_size: Transitions kept.
-        learning_starts: Steps with random actions before the first update.
-        learning_rate: Of Adam, falling linearly to zero.
-        discount: Per step.
-        noise: Standard deviation of TD3's exploration, in units of the input limits.
-        width: Units in each of two hidden layers, for policy and values.
+        envs: Number of environments stepped side by side.
+        gradient_steps: Updates after each step of all environments.
+        batch_size: Transitions per update.
+        buffer_size: Number of transitions in the replay buffer.
+        learning_starts: Environment steps with random actions before the first update.
+        learning_rate: Initial learning rate of Adam, which falls linearly to zero.
+        discount: Discount factor per step.
+        noise: Standard deviation of TD3's exploration noise, in units of the input limits.
+        width: Units in each of the two hidden layers of the policy and of the value functions.
     """
 
     envs: int = 64
@@ -106,7 +106,7 @@ AgentSettings = PPOSettings | A2CSettings | OffPolicySettings
 
 
 def _check(name: str, value: Any) -> None:
-    """Raises ValueError if a setting is out of the range its name stands for."""
+    """Raises ValueError if a setting is out of the range that belongs to its name."""
     if name in ("discount", "gae_lambda"):
         if not 0.0 <= value <= 1.0:
             raise ValueError(f"{name} must be in [0, 1], got {value!r}")

@@ -1,4 +1,4 @@
-"""How much intervention a sharper one-step test saves: share of actions overridden by each of three tests.
+"""How much intervention a sharper one-step test saves: fraction of actions overridden by each of three tests.
 
     python benchmarks/containment.py [--episodes 15]
 
@@ -51,7 +51,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--episodes", type=int, default=15)
     options = parser.parse_args()
-    print("share of actions overridden by each test")
+    print("fraction of actions overridden by each test")
     print(f"{'environment':26s}{'policy':30s}{'norm':>8s}{'shield':>8s}{'exact':>8s}{'exact [us]':>12s}", flush=True)
     for env_id in ("ncs_gym/TruckTrailer-v0", "ncs_gym/TruckTrailerCruise-v0"):
         plant = gym.make(env_id).unwrapped.plant
@@ -63,15 +63,18 @@ def main() -> None:
                 for step in range(STEPS):
                     action = act(step, episode).astype(np.float32)
                     case = info["estimate"], info["error_shape"], plant.u_max * action.astype(np.float64)
-                    room, margin = env.filter.test.at(*case[:2]).judge(case[2].tolist())
+                    sets = env.filter.test.reachable(case[0][:, None], env.filter.errors_of(case[1]).batch())
+                    slack, margin = (each.item() for each in sets.slack(case[2][:, None]))
                     start = time.perf_counter()
                     contained = exact(env.filter, *case)
                     seconds += time.perf_counter() - start
-                    turned_down += margin < MARGIN, room < MARGIN, not contained
+                    turned_down += margin < MARGIN, slack < MARGIN, not contained
                     *_, info = env.step(action)
             count = options.episodes * STEPS
-            shares = "".join(f"{share:8.1%}" for share in turned_down / count)
-            print(f"{env_id.removeprefix('ncs_gym/'):26s}{name:30s}{shares}{1e6 * seconds / count:12.0f}", flush=True)
+            fractions = "".join(f"{fraction:8.1%}" for fraction in turned_down / count)
+            print(
+                f"{env_id.removeprefix('ncs_gym/'):26s}{name:30s}{fractions}{1e6 * seconds / count:12.0f}", flush=True
+            )
 
 
 if __name__ == "__main__":

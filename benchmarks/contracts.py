@@ -1,10 +1,10 @@
-"""The largest disturbance for which the synthesis finds a start, against the contract's age, per unstable plant.
+"""The largest disturbance with an initial design, against the age a contract allows, per unstable plant.
 
     python benchmarks/contracts.py [--ages 1 4 8 16] [--out contracts.png]
 
-Disturbance radii are in percent of the half-widths of the safe box; sensor noise and first error are a hundredth of
-that. By bisection to 1 %; a start is what the synthesis needs, the rest of it enlarges the set. Seconds are those of a
-whole synthesis, with exact verification, at two thirds of that radius.
+Disturbance radii are in percent of the half-widths of the safe box; sensor noise and initial error are a hundredth of
+that. They are found by bisection to 1 %: once there is an initial design, the rest of the synthesis enlarges its set.
+Seconds are those of a whole synthesis, with exact verification, at two thirds of that radius.
 """
 
 from __future__ import annotations
@@ -20,9 +20,8 @@ from ncs_gym import ChannelContract, LinearPlant, batch_reactor, cart_pole
 from ncs_gym.uncertainty.truncated_gaussian import chi2_quantile
 from shields import Infeasible, synthesize
 from shields.synthesis.design_problem import design_problem
-from shields.synthesis.initial_designs import best_start
-from shields.synthesis.semidefinite_programs import InvariantSetProgram
-from shields.synthesis.synthesize import SLACKS
+from shields.synthesis.initial_designs import initial_design
+from shields.synthesis.invariant_set_program import InvariantSetProgram
 
 PLANTS = {
     "cart-pole, full state": cart_pole(),
@@ -30,10 +29,12 @@ PLANTS = {
     "batch reactor, two outputs": batch_reactor(),
 }
 PRECISION = 1.01
+# Relative tightening of the semidefinite program, the smallest one that the synthesis tries.
+SLACK = 1e-6
 
 
 def with_radius(plant: LinearPlant, radius: float) -> LinearPlant:
-    """The plant with a disturbance of a share of the box, and a hundredth of that for sensors and first estimate."""
+    """The plant with a disturbance of that fraction of the box, and a hundredth of it elsewhere."""
     half_widths, n = plant.half_widths, plant.n
     outputs = np.abs(plant.H) @ half_widths
     return replace(
@@ -44,19 +45,19 @@ def with_radius(plant: LinearPlant, radius: float) -> LinearPlant:
     )
 
 
-def has_start(plant: LinearPlant, contract: ChannelContract) -> bool:
+def has_initial_design(plant: LinearPlant, contract: ChannelContract) -> bool:
     try:
         problem, _ = design_problem(plant, contract)
     except Infeasible:
         return False
-    return best_start(problem, InvariantSetProgram(problem, SLACKS[0]), lambda line: None) is not None
+    return initial_design(problem, InvariantSetProgram(problem, SLACK), lambda line: None) is not None
 
 
 def largest_radius(plant: LinearPlant, contract: ChannelContract) -> float:
     low, high = 1e-5, 0.1
     while high / low > PRECISION:
         middle = (low * high) ** 0.5
-        low, high = (middle, high) if has_start(with_radius(plant, middle), contract) else (low, middle)
+        low, high = (middle, high) if has_initial_design(with_radius(plant, middle), contract) else (low, middle)
     return low
 
 

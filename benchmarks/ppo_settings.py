@@ -1,10 +1,10 @@
-"""PPO's default settings here against stable-baselines3's: frames per second and return, in one run.
+"""Compares PPO's default settings here with those of stable-baselines3: frames per second and return.
 
     python benchmarks/ppo_settings.py [--steps 150000] [--seeds 2]
 
-All learn `ncs_gym/TruckTrailerCruise-v0` unshielded with the same number of steps and normalization: with our settings
-from the vector environment, with stable-baselines3's from its DummyVecEnv of 8 scalar ones. Frames per second are whole
-training, environment included; ratios are to the first line.
+All agents learn `ncs_gym/TruckTrailerCruise-v0` unshielded, with the same number of steps and the same normalization:
+with our settings in the vector environment, with those of stable-baselines3 in a DummyVecEnv of 8 scalar environments.
+Frames per second are those of the whole training, environment included; ratios are to the first line.
 """
 
 from __future__ import annotations
@@ -18,15 +18,12 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
-from agents import SB3VecEnv
+from agents import ControlLoop, PPOSettings, SB3VecEnv, evaluate
 from agents.agent import Normalization
-from agents.algorithms import build
-from agents.control_loop import ControlLoop
-from agents.evaluation import evaluate
-from agents.settings import PPOSettings
+from agents.algorithms import build_model
 
 CRUISE = ControlLoop(env="ncs_gym/TruckTrailerCruise-v0")
-# Scalar environments and settings; None stands for stable-baselines3's own defaults.
+# Whether the environments of an arm are scalar, and its settings; None stands for the defaults of stable-baselines3.
 ARMS = {
     "stable-baselines3, scalar": (True, None),
     "the same, rollout 256": (True, {"n_steps": 256}),
@@ -44,19 +41,17 @@ def environments(scalar: bool, count: int) -> VecEnv:
 
 def trained(scalar: bool, settings: PPOSettings | dict | None, steps: int, seed: int) -> tuple[PPO, VecNormalize]:
     ours = isinstance(settings, PPOSettings)
-    env = VecNormalize(
-        environments(scalar, settings.envs if ours else SB3_ENVS), gamma=settings.discount if ours else 0.99
-    )
-    model = (
-        build("PPO", env, settings, seed) if ours else PPO("MlpPolicy", env, seed=seed, device="cpu", **settings or {})
-    )
-    return model.learn(steps), env
+    count, discount = (settings.envs, settings.discount) if ours else (SB3_ENVS, 0.99)
+    env = VecNormalize(environments(scalar, count), gamma=discount)
+    if ours:
+        return build_model("PPO", env, settings, seed).learn(steps), env
+    return PPO("MlpPolicy", env, seed=seed, device="cpu", **settings or {}).learn(steps), env
 
 
 def mean_return(model: PPO, env: VecNormalize) -> float:
     normalize = Normalization.of(env)
-    played = evaluate(CRUISE, lambda o, infos: model.predict(normalize(o), deterministic=True)[0], 100, 10**7)
-    return float(np.mean([episode.episode_return for episode in played.episodes]))
+    result = evaluate(CRUISE, lambda o, infos: model.predict(normalize(o), deterministic=True)[0], 100, 10**7)
+    return float(np.mean([episode.episode_return for episode in result.episodes]))
 
 
 def main() -> None:
@@ -65,7 +60,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=2)
     options = parser.parse_args()
     print(f"{'settings':32s}{'frames/s':>10s}{'ratio':>8s}{'return':>10s}   by seed", flush=True)
-    trained(False, PPOSettings(), 1, 0)  # compiles
+    trained(False, PPOSettings(), 1, 0)  # What only the first training of a process takes time for is not measured.
     base = None
     for name, (scalar, settings) in ARMS.items():
         rates, returns = [], []

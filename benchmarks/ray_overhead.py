@@ -1,9 +1,9 @@
-"""What Ray and the driver cost per unit, without the unit's own work; docs/scaling.md reckons with these figures.
+"""What Ray and the driver cost per training run, without the run's own work; docs/scaling.md uses these figures.
 
-    python benchmarks/ray_overhead.py [--units 1000]
+    python benchmarks/ray_overhead.py [--runs 1000]
 
-Starts a Ray on this machine. The empty units return nothing; the others return the result of a small trained agent,
-which is computed once, so that its way back is paid and its work is not.
+Starts a Ray on this machine. The empty runs return nothing; the others return the result of a small trained agent,
+which is computed once, so that its way back is measured and its work is not.
 """
 
 from __future__ import annotations
@@ -14,51 +14,48 @@ import tempfile
 import time
 import tracemalloc
 import warnings
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
 
 from agents.settings import PPOSettings
-from experiments import ray_engine
-from experiments.cluster import AHEAD, FEWEST, Need, collect, stream
-from experiments.settings import SweepSettings
-from experiments.unit import Unit, run_unit
-from experiments.unit_store import UnitStore
-from experiments.versions import versions
+from experiments.backends import ray_backend, ray_cluster
+from experiments.runs import RunStore, TrainingRun, execute_run, versions
+from experiments.settings import BackendSettings, SweepSettings
 from ncs_gym.envs.env import ncs_env
 from shields import synthesize
 
 ENV = "ncs_gym/TruckTrailerCruise-v0"
-NEED = Need(1.0, 0.0)
 
 
-def through_ray(function, units: list[Unit], room: int, store: UnitStore | None = None) -> tuple[float, float]:
-    """Milliseconds per unit: until all are collected, and of the driver's processor."""
-    task, expected = ray_engine._task(function, NEED), versions()
+def through_ray(function, runs: list[TrainingRun], store: RunStore | None = None) -> tuple[float, float]:
+    """Milliseconds per run: until all are collected, and of the driver's processor."""
+    task, expected = ray_backend._remote(function, BackendSettings(engine="ray")), versions()
 
-    def submit(unit: Unit):
-        return task.remote(expected, pickle.dumps(unit))
-
-    def run(some: list[Unit]) -> int:
+    def execute(some: list[TrainingRun]) -> int:
         collected = set()
 
-        def keep(unit: Unit, result) -> None:
-            collected.add(unit.index)
+        def keep(run: TrainingRun, result) -> None:
+            collected.add(run.index)
             if store is not None:
-                store.save(unit, result)
+                store.save(run, result)
 
-        batches = stream(some, submit, ray_engine.finished, ray_engine._cancel, lambda: room)
-        with closing(batches):
-            collect(batches, ray_engine._result, keep)
+        ray_cluster.execute_submitted(
+            some,
+            lambda run: task.remote(expected, pickle.dumps(run)),
+            ray_backend._finished,
+            ray_backend._result,
+            ray_backend._cancel,
+            keep,
+        )
         return len(collected)
 
-    run(units[:50])  # starts the workers
+    execute(runs[:50])  # starts the workers
     start, busy = time.perf_counter(), time.process_time()
-    assert run(units) == len(units)
+    assert execute(runs) == len(runs)
     took, used = time.perf_counter() - start, time.process_time() - busy
-    return 1e3 * took / len(units), 1e3 * used / len(units)
+    return 1e3 * took / len(runs), 1e3 * used / len(runs)
 
 
 def per_call(function, items) -> float:
@@ -69,13 +66,13 @@ def per_call(function, items) -> float:
     return 1e3 * (time.perf_counter() - start) / len(items)
 
 
-def example(episodes: int) -> Unit:
-    """A small unit that trains."""
+def example(episodes: int) -> TrainingRun:
+    """A small run that trains."""
     certificate = synthesize(ncs_env(gym.make(ENV)).plant)
     settings = PPOSettings(envs=4)
-    return Unit(
+    return TrainingRun(
         arm="shielded",
-        learner="agent",
+        policy_kind="trained",
         env=ENV,
         seed=0,
         index=0,
@@ -91,12 +88,12 @@ def example(episodes: int) -> Unit:
 def memory(item, count: int) -> float:
     """Kilobytes that each of many takes in memory."""
     content = pickle.dumps(item)
-    shared = {"certificate": item.certificate, "settings": item.settings} if isinstance(item, Unit) else {}
+    shared = {"certificate": item.certificate, "settings": item.settings} if isinstance(item, TrainingRun) else {}
     tracemalloc.start()
     kept = []
     for _ in range(count):
         one = pickle.loads(content)
-        kept.append(replace(one, **shared))  # units share what they are made with
+        kept.append(replace(one, **shared))  # runs share what they are made with
     taken = tracemalloc.get_traced_memory()[0] / len(kept) / 1e3
     tracemalloc.stop()
     return taken
@@ -104,12 +101,12 @@ def memory(item, count: int) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--units", type=int, default=1000)
-    count = parser.parse_args().units
+    parser.add_argument("--runs", type=int, default=1000)
+    count = parser.parse_args().runs
     warnings.simplefilter("ignore")
-    unit = example(episodes=100)
-    result = run_unit(unit, lambda steps: None)
-    units = [replace(unit, index=index) for index in range(count)]
+    run = example(episodes=100)
+    result = execute_run(run, lambda steps: None)
+    runs = [replace(run, index=index) for index in range(count)]
 
     def empty(expected, content):
         return None
@@ -117,32 +114,29 @@ def main() -> None:
     def full(expected, content):
         return result
 
-    with ray_engine._connected("local"):
+    with ray_backend._connected("local"):
         for name, function in (("empty", empty), ("with a result", full)):
-            for room in (FEWEST, AHEAD * 1000):
-                took, used = through_ray(function, units, room)
-                print(
-                    f"{count} units, {name}, {room} under way: {took:.2f} ms per unit, driver {used:.2f} ms", flush=True
-                )
+            took, used = through_ray(function, runs)
+            print(f"{count} runs, {name}: {took:.2f} ms per run, driver {used:.2f} ms", flush=True)
         with tempfile.TemporaryDirectory() as folder:
-            took, used = through_ray(full, units, FEWEST, UnitStore(Path(folder)))
+            took, used = through_ray(full, runs, RunStore(Path(folder)))
             print(
-                f"{count} units, with a result that is stored: {took:.2f} ms per unit, driver {used:.2f} ms", flush=True
+                f"{count} runs, with a result that is stored: {took:.2f} ms per run, driver {used:.2f} ms", flush=True
             )
     with tempfile.TemporaryDirectory() as folder:
-        store = UnitStore(Path(folder))
-        few = units[:200]
+        store = RunStore(Path(folder))
+        few = runs[:200]
         print(f"key: {per_call(lambda one: one.key, few):.2f} ms")
         print(f"storing: {per_call(lambda one: store.save(one, replace(result, index=one.index)), few):.2f} ms")
         print(f"loading: {per_call(store.load, few):.2f} ms")
         disk = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file()) / len(few)
     light = replace(result, files={})
-    print(f"a result of {unit.episodes} episodes: {disk / 1e3:.0f} kB stored in 3 files, ", end="")
+    print(f"a result of {run.episodes} episodes: {disk / 1e3:.0f} kB stored in 3 files, ", end="")
     print(f"{memory(light, 100):.0f} kB in memory, {memory(result, 100):.0f} kB with the agent's files")
-    print(f"a unit: {len(pickle.dumps(unit)) / 1e3:.1f} kB pickled, {memory(unit, 1000):.1f} kB in memory")
+    print(f"settings of a run: {len(pickle.dumps(run)) / 1e3:.1f} kB pickled, {memory(run, 1000):.1f} kB in memory")
     start = time.perf_counter()
     defaults = SweepSettings()
-    run_unit(replace(unit, steps=defaults.steps, settings=defaults.ppo), lambda steps: None)
+    execute_run(replace(run, steps=defaults.steps, settings=defaults.ppo), lambda steps: None)
     print(f"a run of ncs sweep with its default budget: {time.perf_counter() - start:.1f} s on one core")
 
 

@@ -1,4 +1,7 @@
-"""Pictures per second of render mode "rgb_array", steps included (`python benchmarks/rendering.py`)."""
+"""Measures how many pictures per second render mode "rgb_array" draws, steps included.
+
+python benchmarks/rendering.py
+"""
 
 import time
 
@@ -22,7 +25,7 @@ def main() -> None:
 
 
 def measured(env: gym.Env) -> tuple[float, float]:
-    """Mean seconds of a step and of a picture in an episode of small random actions."""
+    """Returns the mean times of a step and of a picture in an episode of small random actions [s]."""
     env.reset(seed=0)
     env.render()
     rng, step, picture = np.random.default_rng(0), 0.0, 0.0

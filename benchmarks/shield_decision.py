@@ -1,4 +1,4 @@
-"""What one decision of the shield costs, against the same filter as a parameterized cvxpy problem, in one run.
+"""What the shield costs: one decision against the same filter in cvxpy, and a step against other environments' steps.
 
     python benchmarks/shield_decision.py [--steps 400]
 
@@ -22,11 +22,13 @@ import numpy as np
 
 from ncs_gym import Channel, LinearPlant, NCSEnv
 from ncs_gym.uncertainty.ellipsoid import outer_sum
-from shields import SafetyFilter, SafetyShield, synthesize
+from shields import SafetyFilter, SafetyShield, VectorSafetyShield, synthesize
 from shields.runtime.filter import MARGIN
 
 CHANNEL = Channel(loss=0.3, quantization_step=0.01, send_period=2, delay=2)
 REPEATS = 20
+# Steps are timed in many short blocks: the fastest is one that nothing else interrupted.
+BLOCKS = 60
 REASONS = ("safe", "projected", "fallback")
 
 
@@ -114,6 +116,65 @@ def compare(name: str, env: NCSEnv, steps: int) -> None:
     )
 
 
+def seconds_per_call(call, repeats: int) -> float:
+    """Of the fastest block of calls."""
+    blocks = []
+    for _ in range(BLOCKS):
+        start = time.perf_counter()
+        for _ in range(repeats):
+            call()
+        blocks.append((time.perf_counter() - start) / repeats)
+    return min(blocks)
+
+
+class Stopwatch:
+    """What is inside the shield, with the time that its steps take."""
+
+    def __init__(self, env) -> None:
+        self.step_inside, self.seconds = env.step, 0.0
+        env.step = self.step
+
+    def step(self, actions):
+        start = time.perf_counter()
+        result = self.step_inside(actions)
+        self.seconds += time.perf_counter() - start
+        return result
+
+
+def added_by(shield, shape: tuple[int, ...], repeats: int) -> float:
+    """Seconds that a shield adds to a step, in the fastest block of steps."""
+    rng, watch, blocks = np.random.default_rng(0), Stopwatch(shield.env), []
+    actions = rng.uniform(-1, 1, (100, *shape)).astype(np.float32)
+    shield.reset(seed=0)
+    for _ in range(BLOCKS):
+        watch.seconds = spent = 0.0
+        for step in range(repeats):
+            start = time.perf_counter()
+            truncated = shield.step(actions[step % 100])[3]
+            spent += time.perf_counter() - start
+            if truncated is True:
+                shield.reset()
+        blocks.append((spent - watch.seconds) / repeats)
+    return min(blocks)
+
+
+def compare_steps() -> None:
+    """Prints what the scalar and the vector shield add to a step."""
+    pendulum = gym.make("Pendulum-v1", max_episode_steps=10**9)
+    pendulum.reset(seed=0)
+    single = seconds_per_call(lambda: pendulum.step(np.zeros(1, np.float32)), 200)
+    added = added_by(SafetyShield(gym.make("ncs_gym/TruckTrailerCruise-v0")), (1,), 200)
+    print(f"one environment:  {1e6 * added:6.0f} us, {added / single:.2f} steps of Pendulum-v1")
+    for count in (64, 1024):
+        poles = gym.make_vec("CartPole-v1", num_envs=count, vectorization_mode="vector_entry_point")
+        poles.reset(seed=0)
+        actions = poles.action_space.sample()
+        many = seconds_per_call(lambda poles=poles, actions=actions: poles.step(actions), 20)
+        shield = VectorSafetyShield(gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=count))
+        added = added_by(shield, (count, 1), 20)
+        print(f"{count:4d} environments:{1e6 * added:6.0f} us, {added / many:.2f} steps of the vector CartPole-v1")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=400)
@@ -129,6 +190,8 @@ def main() -> None:
     compare("TruckTrailerCruise-v0", cruise, options.steps)
     for n, m in ((4, 1), (4, 2), (4, 3), (8, 3)):
         compare(f"random, n = {n}, m = {m}", NCSEnv(random_plant(n, n, m), CHANNEL), options.steps)
+    print("what the shield adds to a step")
+    compare_steps()
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The same plant, policy and seed behind better and worse networks."""
+"""Shows how to choose the network: the estimation error of the same plant, input and seed behind six channels."""
 
 import gymnasium as gym
 import numpy as np
@@ -13,6 +13,7 @@ CHANNELS = {
     "rounded to 0.2": Channel(quantization_step=0.2),
     "blackout": Channel(loss=1.0),
 }
+# The input is zero in every step; the estimate differs from the state by sensor noise and by what the channel does.
 for name, channel in CHANNELS.items():
     env = gym.make("ncs_gym:ncs_gym/TruckTrailer-v0", channel=channel)
     env.reset(seed=0)

@@ -1,4 +1,4 @@
-"""A plant of your own: certificate, shield and training."""
+"""Shows all steps for a plant of your own: its model, a certificate, a shield, and training behind the shield."""
 
 import argparse
 
@@ -13,14 +13,15 @@ parser = argparse.ArgumentParser()
 parser.add_argument("--steps", type=int, default=50_000)
 options = parser.parse_args()
 
-# A damped pendulum in discrete time: x = (angle [rad], rate [rad/s]), u a torque, |angle| <= 0.5, |rate| <= 2.
+# The plant is a damped pendulum in discrete time, with the state (angle [rad], rate [rad/s]) and a torque as input.
+# Each row of C is one limit, |C x| <= 1: the angle stays within 0.5 rad and the rate within 2 rad/s.
 plant = ncs_gym.LinearPlant(
     A=[[0.98, 0.095], [-0.38, 0.90]],
     B=[[0.005], [0.095]],
     C=[[1 / 0.5, 0.0], [0.0, 1 / 2.0]],
     u_max=3.0,
     dt=0.1,
-    gamma=1e-5,  # |d|^2 <= gamma
+    gamma=1e-5,  # The disturbance d satisfies |d|^2 <= gamma.
     measurement_noise_cov=[[1e-5, 0.0], [0.0, 1e-4]],
     state_names=("angle", "rate"),
     state_units=("rad", "rad/s"),

@@ -1,4 +1,4 @@
-"""The shield without Gymnasium: plain functions in a control loop of your own."""
+"""Shows estimator and shield without Gymnasium, as plain functions in a control loop of your own."""
 
 import numpy as np
 
@@ -10,18 +10,18 @@ shield = SafetyFilter(synthesize(plant), plant, mode="project")
 estimator = Estimator(plant, channel)
 
 rng = np.random.default_rng(0)
-x = np.zeros(2)  # the real plant would be here
+x = np.zeros(2)  # This simulation takes the place of the real plant.
 estimator.reset(x + plant.initial_noise.sample(rng))
-under_way, overridden, worst = [], 0, 0.0
+in_flight, overridden, worst = [], 0, 0.0
 for step in range(1000):
-    wanted = np.array([2.2 if step % 50 < 25 else -2.2])  # your controller
-    decision = shield.decide(estimator.belief.mean, estimator.belief.shape, wanted)
+    proposed = np.array([2.2 if step % 50 < 25 else -2.2])  # Your controller goes here.
+    decision = shield.decide(estimator.belief.mean, estimator.belief.shape, proposed)
     overridden += decision.intervened
     x = plant.A @ x + plant.B @ decision.input + plant.process_noise.sample(rng)
-    arrived = under_way  # sent a step ago
+    arrived = in_flight  # What was sent one step ago arrives now, because the delay is one step.
     y = plant.H @ x + plant.sensor_noise.sample(rng)
     y = channel.quantization_step * np.round(y / channel.quantization_step)
-    under_way = [] if rng.random() < channel.loss else [Packet(stamp=step + 1, measurement=y)]
+    in_flight = [] if rng.random() < channel.loss else [Packet(stamp=step + 1, measurement=y)]
     estimator.advance(decision.input, arrived)
     worst = max(worst, float(np.abs(plant.C @ x).max()))
 print(f"overridden: {overridden} of 1000; closest to the limit: {worst:.3f} (violated above 1)")

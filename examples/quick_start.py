@@ -1,10 +1,11 @@
-"""A random policy behind a shield: it may do what it likes, the coupling never overstretches."""
+"""Shows the smallest shielded episode: the policy is random, and still the coupling never exceeds its limits."""
 
 import gymnasium as gym
 
 from shields import SafetyShield
 
-env = SafetyShield(gym.make("ncs_gym:ncs_gym/TruckTrailerCruise-v0"))  # synthesizes and verifies a certificate
+# Without a certificate of its own, the shield synthesizes one and verifies it.
+env = SafetyShield(gym.make("ncs_gym:ncs_gym/TruckTrailerCruise-v0"))
 env.action_space.seed(0)
 observation, info = env.reset(seed=0)
 done = False

@@ -1,4 +1,7 @@
-"""sb3-contrib's RecurrentPPO: an agent with a memory, for what an estimate alone does not say (how old it is)."""
+"""Shows sb3-contrib's RecurrentPPO, a policy with a memory, behind a channel with long outages.
+
+The observation does not say how old the estimate is, which a recurrent policy can find out from earlier observations.
+"""
 
 import argparse
 
@@ -14,13 +17,13 @@ parser.add_argument("--steps", type=int, default=20_000)
 options = parser.parse_args()
 
 
-def bursty() -> gym.Env:
-    """Returns the shielded cruise behind a channel whose outages last ten steps on average."""
+def make_env() -> gym.Env:
+    """Returns the shielded cruise environment behind a channel whose outages last ten steps on average."""
     channel = Channel(loss=GilbertElliott(p_good_to_bad=0.05, p_bad_to_good=0.1), delay=1, quantization_step=0.05)
     return SafetyShield(gym.make("ncs_gym:ncs_gym/TruckTrailerCruise-v0", channel=channel))
 
 
-envs = make_vec_env(bursty, n_envs=4, seed=0, monitor_kwargs={"info_keywords": ("episode_violations",)})
+envs = make_vec_env(make_env, n_envs=4, seed=0, monitor_kwargs={"info_keywords": ("episode_violations",)})
 model = RecurrentPPO("MlpLstmPolicy", envs, n_steps=128, batch_size=128, n_epochs=4, seed=0, device="cpu")
 model.learn(options.steps)
 

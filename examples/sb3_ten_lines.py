@@ -1,4 +1,4 @@
-"""stable-baselines3's PPO, SAC and TD3 as they are: no adapter, and the shield is one more wrapper."""
+"""Shows stable-baselines3's PPO, SAC and TD3 without any adapter: the shield is a wrapper like any other."""
 
 import argparse
 
@@ -12,6 +12,7 @@ parser = argparse.ArgumentParser()
 parser.add_argument("--steps", type=int, default=10_000)
 options = parser.parse_args()
 
+# Monitor adds these infos of the last step to each episode; the last step has the totals of the episode.
 keys = ("episode_violations", "episode_interventions")
 for algorithm in ("PPO", "SAC", "TD3"):
     env = Monitor(SafetyShield(gym.make("ncs_gym:ncs_gym/TruckTrailerCruise-v0")), info_keywords=keys)

@@ -1,4 +1,7 @@
-"""PPO in one file with nothing but torch and gymnasium: `python examples/single_file_ppo.py --shield none`."""
+"""Shows PPO in one file, written with torch and gymnasium alone, with or without a shield.
+
+Compare `python examples/single_file_ppo.py` with `python examples/single_file_ppo.py --shield none`.
+"""
 
 from collections import deque
 from dataclasses import dataclass
@@ -18,40 +21,40 @@ from shields import SafetyShield
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of a run."""
+    """Settings of a training run."""
 
     env_id: str = "ncs_gym:ncs_gym/TruckTrailerCruise-v0"
-    """Any id with a Box of actions."""
+    """Id of any environment with a Box of actions."""
     shield: Literal["none", "project", "switch", "boundary", "monitor"] = "project"
-    """Mode of the shield."""
+    """Mode of the shield; "none" trains without one."""
     penalty: float = 0.0
-    """What an intervention of the shield costs."""
+    """Subtracted from the reward for every intervention of the shield."""
     total_timesteps: int = 100_000
     """Environment steps, rounded down to whole rollouts; at least one."""
     num_envs: int = 8
-    """Environments stepped together."""
+    """Number of environments stepped together."""
     rollout: int = 256
     """Steps of each environment between updates."""
     epochs: int = 10
-    """Passes over a rollout."""
+    """Number of passes over each rollout."""
     batch_size: int = 256
     """Transitions per gradient step."""
     learning_rate: float = 1e-3
-    """Of Adam; falls to zero linearly."""
+    """Initial learning rate of Adam, which falls to zero linearly."""
     discount: float = 0.98
-    """gamma."""
+    """Discount factor gamma per step."""
     gae_lambda: float = 0.95
-    """Of generalized advantage estimation."""
+    """Parameter lambda of generalized advantage estimation."""
     clip: float = 0.2
-    """How far the ratio of probabilities may move."""
+    """Largest change of the probability ratio that is still rewarded."""
     max_grad_norm: float = 0.5
     """Gradients are clipped to this norm."""
     seed: int = 0
-    """Of environments, network and sampling."""
+    """Seed of environments, network and sampling."""
 
 
 def make_env(settings: Settings) -> gym.Env:
-    """Returns an environment; the shield is next to it, what changes rewards or observations is outside."""
+    """Returns an environment; wrappers that change observations or rewards are outside the shield."""
     env = gym.make(settings.env_id)
     if settings.shield != "none":
         env = SafetyShield(env, mode=settings.shield, penalty=settings.penalty)
@@ -64,7 +67,7 @@ def network(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class Policy(nn.Module):
-    """A Gaussian over actions and a value."""
+    """A Gaussian distribution over actions, and a value function."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -116,7 +119,7 @@ for update in range(updates):
             episodes += len(ended)
             violations += final["episode_violations"][ended].sum()
             interventions += int(final["episode_interventions"][ended].sum()) if settings.shield != "none" else 0
-            for e in np.flatnonzero(truncated & ~terminated):  # the time limit is not the end of the world
+            for e in np.flatnonzero(truncated & ~terminated):  # A truncated episode would have gone on.
                 with torch.no_grad():
                     reward[e] += settings.discount * policy.value(tensor(info["final_obs"][e]))
         steps.append((observation, action, distribution.log_prob(action).sum(-1), value, reward, tensor(done)))

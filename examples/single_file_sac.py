@@ -1,4 +1,7 @@
-"""SAC in one file with nothing but torch and gymnasium: `python examples/single_file_sac.py --shield none`."""
+"""Shows SAC in one file, written with torch and gymnasium alone, with or without a shield.
+
+Compare `python examples/single_file_sac.py` with `python examples/single_file_sac.py --shield none`.
+"""
 
 from collections import deque
 from copy import deepcopy
@@ -18,28 +21,28 @@ from shields import SafetyShield
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of a run."""
+    """Settings of a training run."""
 
     env_id: str = "ncs_gym:ncs_gym/TruckTrailerCruise-v0"
-    """Any id with a Box of actions between -1 and 1."""
+    """Id of any environment whose actions are a Box between -1 and 1."""
     shield: Literal["none", "project", "switch", "boundary", "monitor"] = "project"
-    """Mode of the shield."""
+    """Mode of the shield; "none" trains without one."""
     penalty: float = 0.0
-    """What an intervention of the shield costs."""
+    """Subtracted from the reward for every intervention of the shield."""
     total_timesteps: int = 20_000
-    """Environment steps."""
+    """Number of environment steps."""
     learning_starts: int = 1000
     """Steps of random actions before the first update."""
     batch_size: int = 128
     """Transitions per gradient step."""
     learning_rate: float = 1e-3
-    """Of all three Adams."""
+    """Learning rate of the three Adam optimizers."""
     discount: float = 0.98
-    """gamma."""
+    """Discount factor gamma per step."""
     averaging: float = 0.01
-    """How fast the target networks follow."""
+    """Fraction by which the target networks move towards the critics after each update."""
     seed: int = 0
-    """Of environment, networks and sampling."""
+    """Seed of environment, networks and sampling."""
 
 
 def network(inputs: int, outputs: int) -> nn.Sequential:
@@ -48,7 +51,7 @@ def network(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class Actor(nn.Module):
-    """A Gaussian squashed into the box of actions."""
+    """A Gaussian distribution, mapped into the box of actions by tanh."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -59,19 +62,19 @@ class Actor(nn.Module):
         mean, log_std = self.body(observation).chunk(2, dim=-1)
         gaussian = Normal(mean, log_std.clamp(-5.0, 2.0).exp())
         raw = gaussian.rsample()
-        slope = 2.0 * (np.log(2.0) - raw - nn.functional.softplus(-2.0 * raw))  # log(1 - tanh(raw)^2)
+        slope = 2.0 * (np.log(2.0) - raw - nn.functional.softplus(-2.0 * raw))  # This is log(1 - tanh(raw)^2).
         return raw.tanh(), (gaussian.log_prob(raw) - slope).sum(-1)
 
 
 class Critic(nn.Module):
-    """Two estimates of the return."""
+    """Two estimates of the return from an observation and an action."""
 
     def __init__(self, inputs: int) -> None:
         super().__init__()
         self.both = nn.ModuleList([network(inputs, 1), network(inputs, 1)])
 
     def forward(self, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """Returns both, shape (2, N)."""
+        """Returns both estimates, shape (2, N)."""
         together = torch.cat([observation, action], dim=-1)
         return torch.stack([each(together).squeeze(-1) for each in self.both])
 
@@ -94,7 +97,7 @@ actor_step, critic_step, temperature_step = (
     torch.optim.Adam(parameters, settings.learning_rate)
     for parameters in (actor.parameters(), critic.parameters(), [log_temperature])
 )
-# A row per transition: observation, action, reward, next observation, and whether that was the end of the world.
+# Each row is a transition: observation, action, reward, next observation, and whether the episode terminated there.
 buffer = torch.zeros(settings.total_timesteps, 2 * entries + inputs + 2)
 returns, episodes, violations, interventions = deque(maxlen=20), 0, 0.0, 0
 

@@ -1,4 +1,4 @@
-"""A task of your own: the coupling is to oscillate, and the agent is told the phase."""
+"""Shows how to write a task: the coupling is to follow a sine, and the observation contains the phase of the sine."""
 
 from dataclasses import dataclass
 
@@ -10,34 +10,34 @@ from ncs_gym import Task
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Oscillation(Task):
-    """Follow a sine with the first state; the phase is drawn anew in each episode.
+    """The first state is to follow a sine, which starts with a random phase in each episode.
 
     Attributes:
-        amplitude: Of the sine, in the units of the state.
-        period: [steps].
+        amplitude: Amplitude of the sine, in the units of the state.
+        period: Period of the sine [steps].
     """
 
     amplitude: float = 1.0
     period: int = 40
 
     def begin(self, rng, plant):
-        """Returns the state of the task: the phase [rad]."""
+        """Returns the state of the task, which is the phase [rad]."""
         return rng.uniform(0.0, 2.0 * np.pi)
 
     def advance(self, rng, plant, task_state, u):
-        """Returns the phase one step on."""
+        """Returns the phase after one more step."""
         return (task_state + 2.0 * np.pi / self.period) % (2.0 * np.pi)
 
     def observe(self, task_state):
-        """Returns what the agent sees besides the estimate."""
+        """Returns the entries of the observation that follow the estimate."""
         return np.array([np.sin(task_state), np.cos(task_state)])
 
     def observation_bound(self, plant, horizon):
-        """Returns how large these entries can become."""
+        """Returns the largest absolute values of these entries."""
         return np.ones(2)
 
     def reward(self, plant, task_state, state, u):
-        """Returns how near the state is."""
+        """Returns minus the squared distance of the state from the sine."""
         return -float((state[0] - self.amplitude * np.sin(task_state)) ** 2)
 
 

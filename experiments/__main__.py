@@ -9,8 +9,22 @@ import signal
 import sys
 from pathlib import Path
 
-ERROR = 2
-INTERRUPTED = 130
+_ERROR = 2
+_INTERRUPTED = 130
+_TRAINING = {"train": ("stable_baselines3", "torch", "tensorboard", "pyarrow", "jinja2")}
+# The settings and the function of each command, and the packages that it needs of each extra.
+COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
+    "compare": ("CompareSettings", "experiments.commands.compare:compare", _TRAINING),
+    "train": ("TrainSettings", "experiments.commands.train:train", _TRAINING),
+    "evaluate": ("EvaluateSettings", "experiments.commands.evaluate:evaluate", _TRAINING),
+    "sweep": ("SweepSettings", "experiments.commands.sweep:sweep", _TRAINING),
+    "render": ("RenderSettings", "experiments.commands.render:render", {"render": ("pygame",)}),
+    "synthesize": ("SynthesizeSettings", "experiments.commands.synthesize:synthesize", {}),
+    "verify": ("VerifySettings", "experiments.commands.verify:verify", {}),
+    "certify": ("CertifySettings", "experiments.commands.certify:certify", {}),
+    "audit": ("AuditSettings", "experiments.commands.audit:audit", {}),
+    "reproduce": ("ReproduceSettings", "experiments.commands.reproduce:reproduce", {}),
+}
 
 
 def main() -> None:
@@ -23,61 +37,43 @@ def main() -> None:
         settings = _parse(sys.argv[1:])
         _run(settings)
     except KeyboardInterrupt:
-        sys.exit(_complain("interrupted", INTERRUPTED))
+        sys.exit(_complain("interrupted", _INTERRUPTED))
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(ERROR)
+        sys.exit(_ERROR)
     except Exception as error:
         if os.environ.get("NCS_DEBUG"):
             raise
-        sys.exit(_complain(_sentence(error), ERROR))
-
-
-TRAINING = {"train": ("stable_baselines3", "torch", "tensorboard", "pyarrow")}
-# What each command runs, and the packages of extras it needs.
-COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
-    "compare": ("CompareSettings", "experiments.compare:compare", TRAINING),
-    "train": ("TrainSettings", "experiments.single:train_agent", TRAINING),
-    "evaluate": ("EvaluateSettings", "experiments.single:evaluate_agent", TRAINING),
-    "sweep": ("SweepSettings", "experiments.sweep:sweep", TRAINING),
-    "render": ("RenderSettings", "experiments.render:render", {"render": ("pygame",)}),
-    "synthesize": ("SynthesizeSettings", "experiments.certificates:synthesize_file", {}),
-    "verify": ("VerifySettings", "experiments.certificates:verify_file", {}),
-    "certify": ("CertifySettings", "experiments.certify:certify", {}),
-    "audit": ("AuditSettings", "experiments.audit:audit", {}),
-    "reproduce": ("ReproduceSettings", "experiments.reproduce:reproduce", {}),
-}
+        sys.exit(_complain(_sentence(error), _ERROR))
 
 
 def _parse(arguments: list[str]) -> object:
+    """Returns the settings of the chosen command; those of a file given by `--config` replace the defaults."""
     import tyro
 
-    from experiments import proof_settings, settings
-    from experiments.settings_file import with_config
+    from experiments import settings
 
-    kinds = vars(settings) | vars(proof_settings)
-
-    def parsed(given: list[str]) -> object:
-        return tyro.extras.subcommand_cli_from_dict(
-            {name: kinds[kind] for name, (kind, _, _) in COMMANDS.items()},
-            prog="ncs",
-            description="Safe learning control over imperfect networks.",
-            args=given,
-        )
-
-    return parsed(with_config(arguments, parsed))
+    kinds = {name: getattr(settings, kind) for name, (kind, _, _) in COMMANDS.items()}
+    command, rest = "".join(arguments[:1]), arguments[1:]
+    if hasattr(kinds.get(command), "config"):
+        defaults, others = settings.config_defaults(rest, command, kinds[command])
+        if defaults is not None:
+            return tyro.cli(kinds[command], prog=f"ncs {command}", args=others, default=defaults)
+    return tyro.extras.subcommand_cli_from_dict(
+        kinds, prog="ncs", description="Safe learning control over imperfect networks.", args=arguments
+    )
 
 
-def _run(chosen: object) -> None:
-    from experiments.extras import require_extra
+def _run(settings: object) -> None:
+    from experiments.commands import require_extra
 
-    _, target, extras = next(entry for entry in COMMANDS.values() if entry[0] == type(chosen).__name__)
+    _, target, extras = next(entry for entry in COMMANDS.values() if entry[0] == type(settings).__name__)
     for extra, packages in extras.items():
         require_extra(extra, *packages)
-    if getattr(chosen, "engine", "local") == "ray":
+    if getattr(settings, "engine", "local") == "ray":
         require_extra("ray", "ray")
     module, _, function = target.partition(":")
-    getattr(importlib.import_module(module), function)(chosen)
+    getattr(importlib.import_module(module), function)(settings)
 
 
 def _interrupt(number: int, frame: object) -> None:
@@ -97,7 +93,7 @@ def _require_own_agents() -> None:
 
 
 def _sentence(error: Exception) -> str:
-    """Returns an error as one line; only the unexpected ones show their type."""
+    """Returns an error as one line; only unexpected errors show their type."""
     ours = type(error).__module__.partition(".")[0] == "experiments"
     expected = ours or isinstance(error, (ValueError, OSError, ImportError))
     if isinstance(error, OSError) and error.strerror:

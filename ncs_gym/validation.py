@@ -7,16 +7,16 @@ from typing import Any, Self
 import numpy as np
 
 # Entries beyond this would overflow when squared twice; what is divided by is no smaller than its inverse.
-LARGEST, SMALLEST = 1e75, 1e-75
+LARGEST_NUMBER, SMALLEST_NUMBER = 1e75, 1e-75
 # Steps and environments are counted in 32 bits.
-MOST = 2**31 - 1
+LARGEST_COUNT = 2**31 - 1
 # Messages quote no more of a value than this many letters.
-LONGEST_QUOTE = 200
+MAX_QUOTED_LENGTH = 200
 # Default of a field that `__post_init__` puts a value in place of: None, but never seen as that from outside.
-FILLED_IN: Any = None
+FILLED_IN_LATER: Any = None
 
 
-class FrozenArrays:
+class ReadOnlyArrays:
     """Mixin that keeps the array fields of a frozen dataclass read-only.
 
     `dataclass(frozen=True)` stops assignment to a field but not writing into an array. `gym.make`
@@ -24,7 +24,7 @@ class FrozenArrays:
     again; so a copy is the object itself, and unpickling freezes anew.
     """
 
-    def _freeze_arrays(self) -> None:
+    def _make_arrays_read_only(self) -> None:
         """Replaces every array attribute by a read-only copy of its own."""
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray):
@@ -32,7 +32,7 @@ class FrozenArrays:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._freeze_arrays()
+        self._make_arrays_read_only()
 
     def __copy__(self) -> Self:
         return self
@@ -68,7 +68,7 @@ def shown(value: Any) -> str:
         text = " ".join(repr(value).split())
     except Exception:
         text = f"a {type(value).__name__}"
-    return text if len(text) <= LONGEST_QUOTE else f"{text[:LONGEST_QUOTE]}..."
+    return text if len(text) <= MAX_QUOTED_LENGTH else f"{text[:MAX_QUOTED_LENGTH]}..."
 
 
 def as_setting(value: Any) -> np.ndarray | None:
@@ -97,8 +97,8 @@ def as_matrix(value: Any, shape: tuple[int | None, int | None], name: str) -> np
     )
     if not fits:
         raise ValueError(f"{name} must have shape {expected}, got {matrix.shape}")
-    if not (np.abs(matrix) < LARGEST).all():
-        raise ValueError(f"{name} must be finite and below {LARGEST:g} in size, got {shown(matrix.tolist())}")
+    if not (np.abs(matrix) < LARGEST_NUMBER).all():
+        raise ValueError(f"{name} must be finite and below {LARGEST_NUMBER:g} in size, got {shown(matrix.tolist())}")
     return matrix
 
 
@@ -113,8 +113,8 @@ def as_vector(value: Any, size: int | None, name: str) -> np.ndarray:
         raise ValueError(f"{name} must be a vector of numbers, got {shown(value)}")
     if vector.ndim != 1 or vector.size == 0 or size not in (None, vector.size):
         raise ValueError(f"{name} must have shape ({'any' if size is None else size},), got {vector.shape}")
-    if not (np.abs(vector) < LARGEST).all():
-        raise ValueError(f"{name} must be finite and below {LARGEST:g} in size, got {shown(vector.tolist())}")
+    if not (np.abs(vector) < LARGEST_NUMBER).all():
+        raise ValueError(f"{name} must be finite and below {LARGEST_NUMBER:g} in size, got {shown(vector.tolist())}")
     return vector
 
 
@@ -173,8 +173,8 @@ def as_number(
     if not (np.isfinite(number) and above and below):
         raise ValueError(f"{name} must be a number {wanted}, got {shown(value)}")
     bounded = np.isfinite(low) and np.isfinite(high)
-    if not (bounded or number == 0.0 or SMALLEST <= abs(number) < LARGEST):
-        raise ValueError(f"{name} must be between {SMALLEST:g} and {LARGEST:g} in size, got {number!r}")
+    if not (bounded or number == 0.0 or SMALLEST_NUMBER <= abs(number) < LARGEST_NUMBER):
+        raise ValueError(f"{name} must be between {SMALLEST_NUMBER:g} and {LARGEST_NUMBER:g} in size, got {number!r}")
     return number
 
 
@@ -202,7 +202,7 @@ def as_flag(value: Any, name: str) -> bool:
     return bool(value)
 
 
-def as_count(value: Any, name: str, *, low: int, high: int = MOST) -> int:
+def as_count(value: Any, name: str, *, low: int, high: int = LARGEST_COUNT) -> int:
     """Returns `value` as an int of at least `low` and at most `high`.
 
     Raises:

@@ -1,18 +1,21 @@
-"""Robust safety invariant sets, their exact verification, and shields made of them."""
+"""Safety shields for networked control: synthesis, exact verification and run-time use of robust invariant sets.
+
+`synthesize` finds a robust control invariant ellipsoid with its gain for a plant, `verify` checks the resulting
+`Certificate` in exact arithmetic, and `SafetyShield`, `VectorSafetyShield` and `SafetyFilter` use it to keep any agent
+inside the safe set.
+"""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from shields.certificate import Certificate, CertificateError, Multipliers
-from shields.errors import Infeasible
-from shields.runtime.filter import Decision, SafetyFilter
-from shields.runtime.wrapper import SafetyShield
-from shields.verification.conditions import Condition
-from shields.verification.verify import Report, verify
+from shields.certificate import Certificate
+from shields.errors import CertificateError, Infeasible
+from shields.proof import Multipliers
+from shields.runtime import Decision, SafetyFilter, SafetyShield, VectorSafetyShield
+from shields.verification import Condition, Report, verify
 
 if TYPE_CHECKING:
-    from shields.runtime.vector_wrapper import VectorSafetyShield
-    from shields.synthesis.synthesize import certify, synthesize
+    from shields.synthesis import certify, synthesize
 
 __all__ = [
     "Certificate",
@@ -31,16 +34,12 @@ __all__ = [
 ]
 
 
-# Imported when they are asked for: what needs the solver, and what needs the compiler.
-LATER = {
-    "certify": "synthesis.synthesize",
-    "synthesize": "synthesis.synthesize",
-    "VectorSafetyShield": "runtime.vector_wrapper",
-}
+# Imported at first use: these need the solver.
+_LAZY = {"certify": "synthesis", "synthesize": "synthesis"}
 
 
 def __getattr__(name: str) -> Any:
-    """Imports what takes long only when it is asked for."""
-    if name in LATER:
-        return getattr(import_module(f"shields.{LATER[name]}"), name)
+    """Returns a public name whose import takes long."""
+    if name in _LAZY:
+        return getattr(import_module(f"shields.{_LAZY[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

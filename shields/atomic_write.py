@@ -1,4 +1,4 @@
-"""Files that a reader never sees half-written."""
+"""File writes that a reader sees either completely or not at all."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pathlib import Path
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Writes a file under a temporary name beside its place, then renames it there.
+    """Writes a temporary file in the same directory, then renames it to `path`.
 
     Args:
-        path: Where it goes; an existing file is replaced.
-        content: Text is written as UTF-8.
+        path: Destination; an existing file is replaced.
+        content: Text is encoded as UTF-8.
 
     Raises:
-        OSError: If it cannot be written; nothing is left behind.
+        OSError: If the file cannot be written; the temporary file is removed.
     """
     data = content.encode() if isinstance(content, str) else content
     if path.is_dir():
@@ -38,6 +38,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 def _umask() -> int:
+    """Returns the process's file mode mask, which can only be read by setting it."""
     mask = os.umask(0)
     os.umask(mask)
     return mask

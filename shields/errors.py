@@ -1,23 +1,29 @@
-"""Why there is no certificate."""
+"""Why there is no certificate, or why one is refused."""
 
 from __future__ import annotations
+
+
+class CertificateError(ValueError):
+    """A certificate is damaged, belongs to another plant, or does not verify."""
 
 
 class Infeasible(ValueError):
     """No certificate was found.
 
     Attributes:
-        binding: What stands in the way: "E1" (no error bound), "S" (the box is unbounded), "U" (input limits) or
-            "I" (invariance); where only exact verification failed, the name of its condition.
-            Of OP: "C2", "C1", "C5" (input limit), or "grid" where only the search's steps are too coarse.
-        shortfall: By how much: for "E1" the excess of the spectral radius over 1; for "I" and "U" the share by
-            which the uncertainty (disturbance and error radii) is too large, in (0, 1]; for "S" the number of
-            directions without a limit; where only exact verification failed, its margin; for "C2"
-            1 - lambda_min(L)/alpha.
-        details: Further figures by name. "certified": `share_of_radii` for which a design is found; under a contract
-            also the largest `max_age`, and the `largest_gamma` at the age asked for. "paper": the best ratio
-            lambda_min(L)/alpha, its kappa and rho, the largest gamma and the largest scales of the uncertainty for
-            which OP is feasible.
+        binding: Name of the condition that cannot be met: "E1" (there is no error bound), "S" (the safe box is
+            unbounded), "U" (the input limits) or "I" (invariance); where a candidate failed in exact verification only,
+            the condition it failed. For method "paper": "C2", "C1", "C5" (the input limit), or "grid" if OP is feasible
+            but not at a point of the search grid.
+        shortfall: By how much the condition fails: for "E1" the excess of the spectral radius over 1; for "I" and "U"
+            the fraction, in (0, 1], by which the radii of disturbance and estimation error must shrink; for "S" the
+            number of unbounded directions; for "C2" 1 - lambda_min(L)/alpha; where only exact verification failed, the
+            violation of that condition.
+        details: Further figures by name. Method "certified": `share_of_radii`, the fraction of the given radii for
+            which a design is found; under a channel contract also `max_age`, the largest age that is feasible, and
+            `largest_gamma`, the largest feasible gamma at the given age. Method "paper": `ratio`, the largest
+            lambda_min(L)/alpha with its `kappa` and `rho`, and `largest_gamma`, `largest_noise_scale` and
+            `largest_scale`, the largest uncertainty for which OP is feasible.
     """
 
     def __init__(self, message: str, binding: str, shortfall: float, details: dict[str, float] | None = None) -> None:

@@ -77,7 +77,7 @@ def _exit_code() -> int:
 
 @contextlib.contextmanager
 def _captured(name: str, descriptor: int, file: Path) -> Iterator[Path]:
-    """Sends a stream to a file, also what compiled code and worker processes write to its descriptor."""
+    """Sends a stream to a file, also what native code and worker processes write to its descriptor."""
     getattr(sys, name).flush()
     before = os.dup(descriptor)
     try:

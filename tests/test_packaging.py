@@ -36,7 +36,8 @@ def test_packages_import_only_from_those_to_their_left(package):
 
 def test_only_synthesis_and_paper_import_a_solver():
     users = {path.name for package in ORDER for path in (ROOT / package).rglob("*.py") if imports(path) & SOLVERS}
-    assert users == {"semidefinite_programs.py", "optimization_problem.py", "cone_program.py"}
+    synthesis = {"semidefinite_programs.py", "invariant_set_program.py"}
+    assert users == synthesis | {"optimization_problem.py", "cone_program.py"}
 
 
 def test_environment_and_shields_do_not_import_the_learners():
@@ -49,8 +50,8 @@ def test_environment_and_shields_do_not_import_the_learners():
     ("module", "later"),
     [
         ("shields", {"cvxpy", "numba", "torch", "matplotlib"}),
-        ("experiments.compare", {"torch", "stable_baselines3"}),
-        ("experiments.parent", {"numpy", "gymnasium"}),
+        ("experiments.commands.compare", {"torch", "stable_baselines3"}),
+        ("experiments.backends.worker_init", {"numpy", "gymnasium"}),
         ("experiments.__main__", {"numpy", "tyro"}),
     ],
 )
@@ -93,6 +94,9 @@ def test_wheel_holds_the_four_packages_and_nothing_else(tmp_path):
     build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
     subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
     (wheel,) = tmp_path.glob("*.whl")
-    names = {name.split("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
+    files = set(zipfile.ZipFile(wheel).namelist())
+    names = {name.split("/")[0] for name in files}
     assert {name for name in names if not name.endswith(".dist-info")} == set(ORDER)
-    assert all(f"{package}/py.typed" in zipfile.ZipFile(wheel).namelist() for package in ORDER)
+    sources = {path for package in ORDER for path in (ROOT / package).rglob("*") if path.is_file()}
+    assert files >= {path.relative_to(ROOT).as_posix() for path in sources if "__pycache__" not in path.parts}
+    assert {f"{package}/py.typed" for package in ORDER} | {"experiments/report/templates/page.html.j2"} <= files

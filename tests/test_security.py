@@ -9,8 +9,7 @@ import pytest
 from agents.agent import Agent, AgentError, _digest
 from agents.control_loop import ControlLoop
 from agents.training import untrained
-from experiments.settings import CompareSettings
-from experiments.settings_file import settings_json
+from experiments.settings import CompareSettings, settings_json
 from shields import Certificate, CertificateError
 from tests.command import assert_one_sentence, ncs
 
@@ -28,8 +27,8 @@ NETWORK = {"socket", "ssl", "urllib", "urllib3", "http", "ftplib", "smtplib", "r
 
 # What goes from a driver to its own workers, over Ray, which unpickles what it is sent itself (SECURITY.md).
 BETWEEN_DRIVER_AND_WORKERS = {
-    "experiments/cluster.py": ["pickle", "socket"],
-    "experiments/ray_engine.py": ["pickle"],
+    "experiments/backends/ray_cluster.py": ["pickle", "socket"],
+    "experiments/backends/ray_backend.py": ["pickle"],
 }
 
 

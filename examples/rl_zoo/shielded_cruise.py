@@ -1,9 +1,12 @@
-"""Importing this registers `ShieldedCruise-v0`: an id whose shield is a part of it, for code that takes only an id."""
+"""Shows how to make the shield a part of an environment id, for code that takes only an id.
+
+Importing this module registers `ShieldedCruise-v0`.
+"""
 
 import gymnasium as gym
 from gymnasium.envs.registration import WrapperSpec
 
-import ncs_gym  # noqa: F401  (registers the cruise)
+import ncs_gym  # noqa: F401  (registers the environment below)
 
 cruise = gym.spec("ncs_gym/TruckTrailerCruise-v0")
 gym.register(

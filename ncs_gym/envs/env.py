@@ -19,9 +19,8 @@ from ncs_gym.network.channel_state import ChannelState
 from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.process import LinearProcess
-from ncs_gym.rendering import Annotation, Film, Scene, scene_of
+from ncs_gym.rendering import Annotation, Renderer
 from ncs_gym.tasks.regulation import Regulation
-from ncs_gym.tasks.speed_tracking import SpeedTracking
 from ncs_gym.tasks.task import Task
 from ncs_gym.uncertainty.disturbance_settings import as_disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
@@ -144,7 +143,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         if render_mode is not None and not (isinstance(render_mode, str) and render_mode in RENDER_MODES):
             raise RenderModeError(f"render_mode must be None or one of {RENDER_MODES}, got {shown(render_mode)}")
         self.render_mode = render_mode
-        self._film = None if render_mode is None else Film(plant, "ncs-gym", RENDER_FPS)
+        self._renderer = None if render_mode is None else Renderer(plant, self.task, render_mode, RENDER_FPS)
         self.contract = _contract(plant, self.channel, contract)
         patterns = arrival_patterns(plant, self.channel, self.contract)
         self.error_set = patterns.recursion.error_set
@@ -187,9 +186,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._violations = 0.0
         self._consistent = True
         info = self._info(np.zeros(self.plant.m), arrived=False)
-        if self._film is not None:
-            self._film.history.begin(self._state)
-            self._show()
+        if self._renderer is not None:
+            self._renderer.begin(info, self._task_state)
         return self._observation(), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -215,10 +213,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         info = self._info(u, arrived=bool(packets))
         terminated = self.terminate_on_violation and info["cost"] > 0.0
         self._consistent = True
-        if self._film is not None:
-            speed = self._task_state[0] if isinstance(self.task, SpeedTracking) else 0.0
-            self._film.history.add(self._state, u, self._channel_state, packets, self.plant.dt * speed)
-            self._show()
+        if self._renderer is not None:
+            self._renderer.record(info, self._task_state, self._channel_state, packets)
         return self._observation(), reward, terminated, False, info
 
     def render(self) -> np.ndarray | None:
@@ -228,31 +224,22 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             gymnasium.error.DependencyNotInstalled: If pygame is missing.
             gymnasium.error.ResetNeeded: If there was no reset.
         """
-        if self._film is None:
+        if self._renderer is None:
             gym.logger.warn('render() draws nothing without a render mode: gym.make(..., render_mode="rgb_array")')
             return None
         if not self._consistent:
             raise gym.error.ResetNeeded("call reset before render")
-        if self.render_mode == "human":
-            return self._show()
-        return self._film.pixels(self._scene(self._film))
+        return self._renderer.render()
 
     def annotate(self, annotation: Annotation) -> None:
         """Shows what a shield knows in the picture of the next step or reset; nothing where nothing is drawn."""
-        if self._film is not None:
-            self._film.history.annotate(annotation)
+        if self._renderer is not None:
+            self._renderer.annotate(annotation)
 
     def close(self) -> None:
         """Closes the window."""
-        if self._film is not None:
-            self._film.close()
-
-    def _show(self) -> None:
-        if self._film is not None and self.render_mode == "human":
-            self._film.show(self._scene(self._film))
-
-    def _scene(self, film: Film) -> Scene:
-        return scene_of(self.plant, self.task, self._task_state, self.estimator, film.history, int(self._violations))
+        if self._renderer is not None:
+            self._renderer.close()
 
     def _observation(self) -> np.ndarray:
         entries = np.concatenate([self.estimator.mean, self.task.observe(self._task_state)])

@@ -32,7 +32,9 @@ def loop_info(
         constraints: Constraint values, shape (k,) or (k, N), the cost, and the sum of costs in the episode.
     """
     values, cost, violations = constraints
-    age, many = estimator.age, state.ndim > 1
+    age: Any = estimator.age
+    alarm: Any = estimator.alarm
+    many = state.ndim > 1
     broken = age > contract.max_age if contract is not None else np.zeros(age.shape, np.bool_) if many else False
     return {
         "state": state.copy().T,
@@ -44,7 +46,7 @@ def loop_info(
         "cost": cost,
         "measurement_age": age.copy() if many else age,
         "packet_arrived": arrived,
-        "assumption_violated": estimator.alarm.copy() if many else estimator.alarm,
+        "assumption_violated": alarm.copy() if many else alarm,
         "episode_violations": violations,
         "is_success": (violations == 0.0) * 1.0,
         "contract_broken": broken,

@@ -67,7 +67,7 @@ def applied_input(plant: LinearPlant, action: Any) -> np.ndarray:
     if numbers is not None and numbers.shape == (plant.m,):
         values = numbers.tolist()
         if all(map(isfinite, values)):
-            return plant.u_max * [1.0 if value > 1.0 else -1.0 if value < -1.0 else value for value in values]
+            return plant.u_max * np.array([min(max(value, -1.0), 1.0) for value in values])
     raise ValueError(f"the action must be finite with shape ({plant.m},), got {shown(action)}")
 
 

@@ -10,16 +10,16 @@ import numpy as np
 from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov
 from scipy.optimize import minimize_scalar
 
-from ncs_gym.estimation.error_bounds_by_age import AgeSets, age_sets
+from ncs_gym.estimation.error_bounds_by_age import ErrorSetsByAge, error_sets_by_age
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.validation import FrozenArrays
+from ncs_gym.validation import ReadOnlyArrays
 
 # Growth c of the optimal set: gives (E1) slack that an exact check can see, and updates room (theory.md section 3).
 GROWTH = 1.1
 # Beyond this many roundings of its largest entry a checked inequality is taken to hold.
 ROUNDINGS = 100.0
-# Flat disturbances are thickened by this share of their mean extent, so that (E1) has slack in every direction.
+# Flat disturbances are thickened by this fraction of their mean extent, so that (E1) has slack in every direction.
 THICKENING = 1e-9
 # No set is thinner than this, in half-widths of the safe box (a perfectly known plant has no error at all).
 THINNEST = 1e-6
@@ -34,7 +34,7 @@ class ErrorSetError(ValueError):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ErrorSet(FrozenArrays):
+class ErrorSet(ReadOnlyArrays):
     """What the estimation error never leaves: one set for every age, or one per age under a contract.
 
     Without a contract, E(Sigma) with (E0) Sigma >= r0^2 I and (E1) Sigma >= A Sigma A'/rate + D/(1 - rate).
@@ -47,10 +47,10 @@ class ErrorSet(FrozenArrays):
 
     Sigma: np.ndarray
     rate: float
-    ages: AgeSets | None = None
+    ages: ErrorSetsByAge | None = None
 
     def __post_init__(self) -> None:
-        self._freeze_arrays()
+        self._make_arrays_read_only()
 
     @overload
     def shape_at(self, age: Literal[0]) -> np.ndarray: ...
@@ -88,8 +88,8 @@ _by_contract: dict[tuple[str, ChannelContract], ErrorSet] = {}
 
 
 def _conditional_set(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
-    """Returns the error sets by age under a contract; see `age_sets`."""
-    sets = age_sets(plant, contract)
+    """Returns the error sets by age under a contract; see `error_sets_by_age`."""
+    sets = error_sets_by_age(plant, contract)
     if sets is None:
         raise ErrorSetError(
             f"no error set was found under a contract of max_age = {contract.max_age}: promise less age"
@@ -98,7 +98,7 @@ def _conditional_set(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
     return ErrorSet(Sigma=sets.shapes[contract.max_age], rate=float(sets.rates[-1]), ages=sets)
 
 
-def _check_ages(sets: AgeSets, plant: LinearPlant) -> None:
+def _check_ages(sets: ErrorSetsByAge, plant: LinearPlant) -> None:
     """Raises unless (C0), (C1) and (C2) hold by more than rounding.
 
     Raises:

@@ -9,17 +9,17 @@ import numpy as np
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.lqr import regulator_gain
-from ncs_gym.uncertainty.ellipsoid import SMALLEST_SHARE, is_inside, joined, outer_sum
-from ncs_gym.validation import FrozenArrays
+from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER, is_inside, joined, outer_sum
+from ncs_gym.validation import ReadOnlyArrays
 
 # The sets are made for noise this much larger than allowed, so that at run time good gains nearly always fit in.
-NOISE_GROWTH = 1.2
+NOISE_MARGIN = 1.2
 # Strict inequalities at the end.
 SLACK = 1.0 + 1e-7
-# Growth per iteration; it doubles now and then, which ends cycles between shares that are equally good.
+# Growth per iteration; it doubles now and then, which ends cycles between multipliers that are equally good.
 SMALLEST_GROWTH, DOUBLING = 1e-6, 50.0
-# Shares mu that gains are chosen from: fine sensors want it close to 1.
-SHARES = np.concatenate([np.linspace(0.01, 0.99, 99), 1.0 - np.logspace(-2.1, -4.0, 20)])
+# Multipliers mu that gains are chosen from: fine sensors want it close to 1.
+MULTIPLIERS = np.concatenate([np.linspace(0.01, 0.99, 99), 1.0 - np.logspace(-2.1, -4.0, 20)])
 ITERATIONS = 1000
 # The regulator whose answer to an error counts, in units of the box and of the input limits, and how much it counts:
 # of a few tried, the one that leaves the unstable plants of benchmarks/contracts.py the largest disturbances.
@@ -31,7 +31,7 @@ LARGEST = 1e6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class AgeSets(FrozenArrays):
+class ErrorSetsByAge(ReadOnlyArrays):
     """E(Sigma_0) .. E(Sigma_{h+1}), h the contract's largest age (docs/theory.md section 6).
 
         (C0) Sigma_0 >= r0^2 I
@@ -43,7 +43,7 @@ class AgeSets(FrozenArrays):
         shapes: Sigma_j, shape (h+2, n, n).
         rates: lam_j, shape (h+1,).
         gains: T_1 .. T_{h+1}, shape (h+1, n, p).
-        shares: mu_1 .. mu_{h+1}, shape (h+1,).
+        multipliers: mu_1 .. mu_{h+1}, shape (h+1,).
         noise: N of the contract's quantizer, shape (p, p).
     """
 
@@ -51,11 +51,11 @@ class AgeSets(FrozenArrays):
     shapes: np.ndarray
     rates: np.ndarray
     gains: np.ndarray
-    shares: np.ndarray
+    multipliers: np.ndarray
     noise: np.ndarray
 
     def __post_init__(self) -> None:
-        self._freeze_arrays()
+        self._make_arrays_read_only()
 
     def needs(self, plant: LinearPlant) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
         """Returns, per condition, pairs (outer, inner) of shapes of which each outer must hold the inner one."""
@@ -66,8 +66,8 @@ class AgeSets(FrozenArrays):
             for shape, rate in zip(self.shapes, self.rates, strict=False)
         ]
         updated = [
-            (kept := identity - gain @ plant.H) @ shape @ kept.T / share + gain @ self.noise @ gain.T / (1.0 - share)
-            for shape, gain, share in zip(self.shapes[1:], self.gains, self.shares, strict=True)
+            (kept := identity - gain @ plant.H) @ shape @ kept.T / mu + gain @ self.noise @ gain.T / (1.0 - mu)
+            for shape, gain, mu in zip(self.shapes[1:], self.gains, self.multipliers, strict=True)
         ]
         return {
             "(C0)": [(self.shapes[0], first)],
@@ -76,16 +76,16 @@ class AgeSets(FrozenArrays):
         }
 
 
-def age_sets(plant: LinearPlant, contract: ChannelContract) -> AgeSets | None:
+def error_sets_by_age(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsByAge | None:
     """Returns error sets by age, without a solver; None if the iteration finds none, or none that float64 can hold."""
     with np.errstate(all="ignore"):
         try:
-            return _age_sets(plant, contract)
+            return _iterated_sets(plant, contract)
         except np.linalg.LinAlgError:
             return None
 
 
-def _age_sets(plant: LinearPlant, contract: ChannelContract) -> AgeSets | None:
+def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsByAge | None:
     """Returns error sets by age; None if the iteration finds none.
 
     From Sigma_0 = r0^2 I: carry it through the longest gap, update after every possible gap with the set-membership
@@ -104,7 +104,7 @@ def _age_sets(plant: LinearPlant, contract: ChannelContract) -> AgeSets | None:
     D = D + 1e-9 * float(np.trace(D)) / plant.n * np.eye(plant.n)
     first = inverse @ plant.initial_error.shape @ inverse.T + 1e-12 * np.eye(plant.n)
     exact = plant.sensor_error_with(contract.quantization_step).shape
-    noise = NOISE_GROWTH * exact + 1e-12 * np.diag(np.diag(H @ H.T)) * float(np.trace(D)) / plant.n
+    noise = NOISE_MARGIN * exact + 1e-12 * np.diag(np.diag(H @ H.T)) * float(np.trace(D)) / plant.n
     start, steps = first, contract.max_age + 1
     for turn in range(ITERATIONS):
         shapes = _carried(start, A, D, steps)
@@ -122,13 +122,13 @@ def _age_sets(plant: LinearPlant, contract: ChannelContract) -> AgeSets | None:
     else:
         return None
     shapes = _carried(start, A, D, steps)
-    gains, shares, _ = zip(*(_update(shape, H, noise) for shape in shapes[1:]), strict=True)
-    return AgeSets(
+    gains, multipliers, _ = zip(*(_update(shape, H, noise) for shape in shapes[1:]), strict=True)
+    return ErrorSetsByAge(
         contract=contract,
         shapes=np.stack([_symmetric(T @ shape @ T.T) for shape in shapes]),
         rates=np.array([_rate(shape, A, D) for shape in shapes[:-1]]),
         gains=np.stack([T @ gain for gain in gains]),
-        shares=np.array(shares),
+        multipliers=np.array(multipliers),
         noise=exact,
     )
 
@@ -158,19 +158,19 @@ def _carried(start: np.ndarray, A: np.ndarray, D: np.ndarray, steps: int) -> lis
 def _rate(shape: np.ndarray, A: np.ndarray, D: np.ndarray) -> float:
     """Returns the lam of `_carried`."""
     a, b = np.sqrt(np.trace(A @ shape @ A.T)), np.sqrt(np.trace(D))
-    return float(np.clip(a / (a + b), SMALLEST_SHARE, 1.0 - SMALLEST_SHARE))
+    return float(np.clip(a / (a + b), SMALLEST_MULTIPLIER, 1.0 - SMALLEST_MULTIPLIER))
 
 
 def _update(shape: np.ndarray, H: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
-    """Returns the set-membership gain T, its share mu and the updated shape, for the trace-smallest of SHARES."""
+    """Returns the set-membership gain T, its multiplier mu and the updated shape, of the smallest trace."""
     values, vectors = np.linalg.eigh(shape)
     factor = vectors * np.sqrt(np.maximum(values, 0.0))
     seen = H @ factor
     gains, basis = np.linalg.eigh(seen.T @ np.linalg.solve(noise, seen))
     axes, gains = factor @ basis, np.maximum(gains, 0.0)
     sizes = (axes * axes).sum(axis=0)
-    traces = (sizes / (SHARES[:, None] + (1.0 - SHARES[:, None]) * gains)).sum(axis=1)
-    mu = float(SHARES[int(np.argmin(traces))])
+    traces = (sizes / (MULTIPLIERS[:, None] + (1.0 - MULTIPLIERS[:, None]) * gains)).sum(axis=1)
+    mu = float(MULTIPLIERS[int(np.argmin(traces))])
     updated = (axes / (mu + (1.0 - mu) * gains)) @ axes.T
     spread = shape @ H.T / mu
     gain = np.linalg.solve(H @ spread + noise / (1.0 - mu), spread.T).T

@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ncs_gym.estimation.arrival_patterns import NO_SAMPLE, UNKNOWN, ArrivalPatterns, arrival_patterns, patterns_of
+from ncs_gym.estimation.arrival_patterns import ArrivalPatterns, arrival_patterns, patterns_of
 from ncs_gym.estimation.error_bound import ErrorSet
+from ncs_gym.estimation.statistics_table import NO_SAMPLE, UNKNOWN
 from ncs_gym.network.channel import Channel, Packet
 from ncs_gym.plants.linear_plant import LinearPlant
 
@@ -63,8 +64,9 @@ class Estimator:
     ) -> None:
         self.plant, self.channel, self.buffer = plant, channel, channel.longest_delay
         if patterns is None:
-            patterns = arrival_patterns(plant, channel, None) if error_set is None else None
-        self._patterns = patterns_of(plant, channel, error_set) if patterns is None else patterns
+            shared = error_set is None
+            patterns = arrival_patterns(plant, channel, None) if shared else patterns_of(plant, channel, error_set)
+        self._patterns = patterns
         self.error_set = self._patterns.recursion.error_set
         ages = self.error_set.ages
         if ages is not None and not ages.contract.is_fine_enough_for(channel):
@@ -128,6 +130,7 @@ class Estimator:
         self._samples[age] = packet.measurement
         return after
 
+    @np.errstate(invalid="ignore", over="ignore")  # an infinite weight of a residual of zero, a huge residual
     def _replayed(self, pattern: int) -> int:
         """Replays from the oldest new sample on, keeps whichever history is better, and returns the pattern then."""
         replay, H = self._patterns.replay(pattern), self.plant.H
@@ -137,8 +140,10 @@ class Estimator:
             statistics, sample = replay.used[age], self._samples[age]
             if statistics != NO_SAMPLE and sample is not None:
                 residual = sample - H.dot(mean)
-                self._monitor(residual, statistics)
-                mean = mean + self._patterns.gain(statistics).dot(residual)
+                _, gain, quick_test = self._patterns.update(statistics)
+                if not residual.dot(quick_test.dot(residual)) <= 1.0:
+                    self._test_exactly(residual, statistics)
+                mean = mean + gain.dot(residual)
             if age > 0:
                 mean = self._predicted(mean, self._inputs[age - 1])
         if replay.accepted:
@@ -154,14 +159,11 @@ class Estimator:
         mean = self.plant.A.dot(mean) + self.plant.B.dot(u)
         return mean if self._limit is None else np.minimum(np.maximum(mean, -self._limit), self._limit)
 
-    def _monitor(self, residual: np.ndarray, statistics: int) -> None:
+    def _test_exactly(self, residual: np.ndarray, statistics: int) -> None:
         """Latches the alarm if a residual y - H x_hat lies outside E(H Sigma H') + E(N).
 
-        The ellipsoid of shape H Sigma H' + N lies inside that sum, so passing it settles the matter.
+        The ellipsoid of shape H Sigma H' + N, which the quick test is about, lies inside that sum.
         """
-        with np.errstate(invalid="ignore", over="ignore"):  # an infinite weight of a residual of zero, a huge residual
-            quick = residual.dot(self._patterns.quick_test(statistics).dot(residual))
-        if not quick <= 1.0:
-            test = self._patterns.test
-            spread = test.spread(self._patterns.statistics[statistics].shape)
-            self.alarm |= bool(test.are_impossible(residual[None], spread)[0])
+        table = self._patterns.table
+        test, spread = table.test, table.test.spread(table.statistics[statistics].shape)
+        self.alarm |= bool(test.are_impossible(residual[None], spread)[0])

@@ -10,7 +10,7 @@ from ncs_gym.uncertainty.minkowski_sum import common_axes, outside_sum
 # An innovation this far beyond its exact bound counts as rounding, not as an alarm.
 ALARM_TOLERANCE = 1e-9
 # Up to this condition number an inverse says which residuals are possible to within 1e-3.
-LARGEST_CONDITION = 1e7
+MAX_CONDITION_NUMBER = 1e7
 
 
 class InnovationTest:
@@ -36,7 +36,7 @@ class InnovationTest:
         """
         bound = spread + self._noise
         extent = np.sqrt(bound.diagonal())
-        if not _condition(bound / np.outer(extent, extent)) <= LARGEST_CONDITION:  # in units of its own; NaN fails
+        if not _condition(bound / np.outer(extent, extent)) <= MAX_CONDITION_NUMBER:  # in units of its own; NaN fails
             return np.diag(np.full(len(bound), np.inf))
         return solved(bound, np.eye(len(bound)))
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ncs_gym.validation import MOST, as_count, as_number
+from ncs_gym.validation import as_count, as_number
 
 # Packets in flight are kept in memory, for every environment [steps].
 LONGEST_DELAY = 1000
@@ -82,8 +82,9 @@ class Channel:
             object.__setattr__(self, "loss", as_number(self.loss, "loss", low=0.0, high=1.0))
         step = as_number(self.quantization_step, "quantization_step", low=0.0)
         object.__setattr__(self, "quantization_step", step)
-        for name, low, high in (("send_period", 1, MOST), ("delay", 0, LONGEST_DELAY), ("jitter", 0, LONGEST_DELAY)):
-            object.__setattr__(self, name, as_count(getattr(self, name), name, low=low, high=high))
+        object.__setattr__(self, "send_period", as_count(self.send_period, "send_period", low=1))
+        for name in ("delay", "jitter"):
+            object.__setattr__(self, name, as_count(getattr(self, name), name, low=0, high=LONGEST_DELAY))
         if self.max_consecutive_losses is not None:
             most = as_count(self.max_consecutive_losses, "max_consecutive_losses", low=0)
             object.__setattr__(self, "max_consecutive_losses", most)

@@ -50,8 +50,9 @@ def transmit(channel: Channel, rng: np.random.Generator, state: LossState, sends
     if isinstance(loss, GilbertElliott):
         bad = bad != (rng.random(size) < loss.p_good_to_bad + (loss.p_bad_to_good - loss.p_good_to_bad) * bad)
         loss = loss.loss_good + (loss.loss_bad - loss.loss_good) * bad
+        state = LossState(bad, consecutive)
     if not (sends if size is None else sends.any()):
-        return LossState(bad, consecutive), -1 if size is None else np.full(size, -1)
+        return state, -1 if size is None else np.full(size, -1)
     most = channel.max_consecutive_losses
     lost = sends * (rng.random(size) < loss) * (consecutive < (UNLIMITED if most is None else most))
     arrives = sends * (1 - lost)

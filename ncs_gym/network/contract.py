@@ -8,7 +8,7 @@ from ncs_gym.network.channel import Channel
 from ncs_gym.validation import as_count, as_number
 
 # There is an error set for every age.
-LONGEST_AGE = 1000
+MAX_AGE = 1000
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class ChannelContract:
     quantization_step: float = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "max_age", as_count(self.max_age, "max_age", low=0, high=LONGEST_AGE))
+        object.__setattr__(self, "max_age", as_count(self.max_age, "max_age", low=0, high=MAX_AGE))
         step = as_number(self.quantization_step, "quantization_step", low=0.0)
         object.__setattr__(self, "quantization_step", step)
 
@@ -56,4 +56,4 @@ def contract_of(channel: Channel) -> ChannelContract | None:
     if losses is None:
         return None
     age = (losses + 1) * channel.send_period + channel.longest_delay - 1
-    return ChannelContract(age, channel.quantization_step) if age <= LONGEST_AGE else None
+    return ChannelContract(age, channel.quantization_step) if age <= MAX_AGE else None

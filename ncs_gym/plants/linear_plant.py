@@ -13,10 +13,10 @@ import numpy as np
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, outer_sum
 from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_KEPT, TruncatedGaussian, chi2_quantile
 from ncs_gym.validation import (
-    FILLED_IN,
-    LARGEST,
-    SMALLEST,
-    FrozenArrays,
+    FILLED_IN_LATER,
+    LARGEST_NUMBER,
+    SMALLEST_NUMBER,
+    ReadOnlyArrays,
     as_covariance,
     as_matrix,
     as_names,
@@ -44,7 +44,7 @@ SMALLEST_DELTA = 1e-12
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LinearPlant(FrozenArrays):
+class LinearPlant(ReadOnlyArrays):
     """x+ = A x + B u + d, y = H x + v, with limits and bounds (theory.md section 1).
 
     Attributes:
@@ -74,10 +74,10 @@ class LinearPlant(FrozenArrays):
     u_max: np.ndarray
     dt: float
     gamma: float
-    H: np.ndarray = FILLED_IN
-    process_noise_cov: np.ndarray = FILLED_IN
-    measurement_noise_cov: np.ndarray = FILLED_IN
-    initial_cov: np.ndarray = FILLED_IN
+    H: np.ndarray = FILLED_IN_LATER
+    process_noise_cov: np.ndarray = FILLED_IN_LATER
+    measurement_noise_cov: np.ndarray = FILLED_IN_LATER
+    initial_cov: np.ndarray = FILLED_IN_LATER
     delta: float = 0.05
     error_gain: np.ndarray | None = None
     state_names: Sequence[str] = field(default=())
@@ -119,7 +119,7 @@ class LinearPlant(FrozenArrays):
         self._set("B", B)
         self._set("C", as_matrix(self.C, (None, n), "C"))
         for name, matrix, does in (("C", self.C, "limit"), ("H", H, "measure")):
-            if (np.abs(matrix).max(axis=1) < SMALLEST).any():
+            if (np.abs(matrix).max(axis=1) < SMALLEST_NUMBER).any():
                 raise ValueError(f"every row of {name} must {does} something, got {shown(matrix.tolist())}")
         self._set("H", H)
         self._set("u_max", _as_limits(self.u_max, m))
@@ -135,7 +135,7 @@ class LinearPlant(FrozenArrays):
             names = tuple(f"{letter}{i + 1}" for i in range(size))
             for field_name, default in ((f"{name}_names", names), (f"{name}_units", ("",) * size)):
                 self._set(field_name, as_names(getattr(self, field_name), default, field_name))
-        self._freeze_arrays()
+        self._make_arrays_read_only()
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
@@ -265,13 +265,17 @@ class LinearPlant(FrozenArrays):
 
     def constraint_values(self, state: np.ndarray) -> np.ndarray:
         """Returns |c_j x| - 1 for each row of the safe box, shape (k,) or (k, N); positive is violated."""
-        return np.abs(self.C.dot(state)) - 1.0
+        return abs(self.C.dot(state)) - 1.0
 
 
 def _as_limits(value: Any, size: int) -> np.ndarray:
     """Returns input limits as a positive finite array of shape (size,)."""
     limits = as_setting(value)
-    if limits is None or limits.shape not in ((), (size,)) or not ((limits >= SMALLEST) & (limits < LARGEST)).all():
+    if (
+        limits is None
+        or limits.shape not in ((), (size,))
+        or not ((limits >= SMALLEST_NUMBER) & (limits < LARGEST_NUMBER)).all()
+    ):
         raise ValueError(f"u_max must be a positive number or shape ({size},), got {shown(value)}")
     return np.broadcast_to(limits, (size,)).copy()
 

@@ -21,8 +21,8 @@ def zero_order_hold(A: np.ndarray, B: np.ndarray, dt: float) -> tuple[np.ndarray
     from scipy.signal import cont2discrete  # takes long to import
 
     n, m = B.shape
-    sampled_A, sampled_B, *_ = cont2discrete((A, B, np.eye(n), np.zeros((n, m))), dt, method="zoh")
-    return sampled_A, sampled_B
+    sampled: Any = cont2discrete((A, B, np.eye(n), np.zeros((n, m))), dt, method="zoh")
+    return sampled[0], sampled[1]
 
 
 def sampled_plant(

@@ -1,8 +1,10 @@
-"""The picture of an environment; pygame is imported when the first frame is drawn, not before."""
+"""Pictures of an environment: the plant, the packets in the network, the phase plane and what the shield does.
 
-from ncs_gym.rendering.annotation import Annotation
-from ncs_gym.rendering.film import Film
-from ncs_gym.rendering.picture import Picture
-from ncs_gym.rendering.scene import Scene, scene_of
+An environment with a render mode records every step with a `Renderer` and asks it for frames; a shield adds what it
+knows with an `Annotation`. pygame is imported when the first frame is drawn, not before.
+"""
 
-__all__ = ["Annotation", "Film", "Picture", "Scene", "scene_of"]
+from ncs_gym.rendering.episode_record import Annotation, FrameRecord, PacketRecord
+from ncs_gym.rendering.renderer import Renderer
+
+__all__ = ["Annotation", "FrameRecord", "PacketRecord", "Renderer"]

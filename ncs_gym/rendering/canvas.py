@@ -1,4 +1,4 @@
-"""A drawing surface: pygame at twice the size, smoothly scaled down."""
+"""What pygame does for the pictures: a drawing surface, and the window of render mode "human"."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ import numpy as np
 
 from ncs_gym.rendering.theme import PAPER, SMALL, Color, Rect
 
-# Everything is drawn this many times larger than shown: edges come out smooth.
-OVERSAMPLING = 2
-# Rendered pieces of text that are kept.
-MOST_TEXTS = 600
+# Everything is drawn this many times larger than shown and then scaled down, so that edges come out smooth.
+_OVERSAMPLING = 2
+# Rendered pieces of text that are kept for the next frames.
+_MAX_CACHED_TEXTS = 600
 
-Point = Sequence[float] | np.ndarray
+_Point = Sequence[float] | np.ndarray
 
 
-def require_pygame() -> Any:
+def _require_pygame() -> Any:
     """Returns the module pygame.
 
     Raises:
@@ -35,68 +35,70 @@ def require_pygame() -> Any:
 
 
 class Canvas:
-    """Shapes and text in pixels of the finished frame; needs no display.
+    """A surface on which shapes and text are drawn in pixels of the finished frame; it needs no display.
 
     Args:
-        width, height: Size of the frame [pixels].
+        width, height: Size of the finished frame [pixels].
 
     Raises:
         gymnasium.error.DependencyNotInstalled: If pygame is missing.
     """
 
     def __init__(self, width: int, height: int) -> None:
-        self._pygame = require_pygame()
+        self._pygame = _require_pygame()
         self._pygame.font.init()
-        self.size = width, height
-        self.surface = self._pygame.Surface((width * OVERSAMPLING, height * OVERSAMPLING), depth=32)
+        self._size = width, height
+        self._surface = self._pygame.Surface((width * _OVERSAMPLING, height * _OVERSAMPLING), depth=32)
         self._frame = self._pygame.Surface((width, height), depth=32)
         self._fonts: dict[tuple[int, bool], Any] = {}
         self._texts: dict[tuple[str, int, bool, Color, bool], Any] = {}
 
     def clear(self) -> None:
         """Paints everything white."""
-        self.surface.set_clip(None)
-        self.surface.fill(PAPER)
+        self._surface.set_clip(None)
+        self._surface.fill(PAPER)
 
     def snapshot(self) -> Any:
-        """Returns a copy of what is drawn, for `restore`."""
-        return self.surface.copy()
+        """Returns a copy of everything drawn so far, for `restore`."""
+        return self._surface.copy()
 
     def restore(self, snapshot: Any) -> None:
-        """Draws a snapshot over everything."""
-        self.surface.set_clip(None)
-        self.surface.blit(snapshot, (0, 0))
+        """Replaces everything drawn so far by a snapshot."""
+        self._surface.set_clip(None)
+        self._surface.blit(snapshot, (0, 0))
 
     def frame(self) -> Any:
-        """Returns the finished picture as a pygame surface, which the next call overwrites."""
-        return self._pygame.transform.smoothscale(self.surface, self.size, self._frame)
+        """Returns the finished frame as a pygame surface, which the next call overwrites."""
+        return self._pygame.transform.smoothscale(self._surface, self._size, self._frame)
 
     def pixels(self) -> np.ndarray:
-        """Returns the finished picture, shape (height, width, 3), uint8."""
-        width, height = self.size
+        """Returns the finished frame, shape (height, width, 3), uint8."""
+        width, height = self._size
         data = self._pygame.image.tobytes(self.frame(), "RGB")
         return np.frombuffer(data, np.uint8).reshape(height, width, 3).copy()
 
     def clip(self, rect: Rect | None) -> None:
-        """Keeps what follows inside a rectangle; None lifts that."""
-        self.surface.set_clip(None if rect is None else [round(OVERSAMPLING * value) for value in rect])
+        """Restricts all following shapes to a rectangle; None lifts the restriction."""
+        self._surface.set_clip(None if rect is None else [round(_OVERSAMPLING * value) for value in rect])
 
     def rect(self, rect: Rect, color: Color, *, radius: float = 0.0, width: float = 0.0) -> None:
-        """Draws a rectangle, filled unless a line width is given."""
-        box = [round(OVERSAMPLING * value) for value in rect]
-        corner = round(OVERSAMPLING * radius)
-        self._pygame.draw.rect(self.surface, color, box, round(OVERSAMPLING * width), border_radius=corner)
+        """Draws a rectangle, filled unless a line width is given, with corners rounded by a radius."""
+        box = [round(_OVERSAMPLING * value) for value in rect]
+        corner = round(_OVERSAMPLING * radius)
+        self._pygame.draw.rect(self._surface, color, box, round(_OVERSAMPLING * width), border_radius=corner)
 
-    def line(self, points: Sequence[Point] | np.ndarray, color: Color, width: float = 1.0) -> None:
+    def line(self, points: Sequence[_Point] | np.ndarray, color: Color, width: float = 1.0) -> None:
         """Draws a line through points with round joints."""
-        places = [(OVERSAMPLING * x, OVERSAMPLING * y) for x, y in points]
-        thick = max(1, round(OVERSAMPLING * width))
-        self._pygame.draw.lines(self.surface, color, False, places, thick)
+        places = [(_OVERSAMPLING * x, _OVERSAMPLING * y) for x, y in points]
+        thick = max(1, round(_OVERSAMPLING * width))
+        self._pygame.draw.lines(self._surface, color, False, places, thick)
         if thick > 3:
             for place in places:
-                self._pygame.draw.circle(self.surface, color, place, thick / 2)
+                self._pygame.draw.circle(self._surface, color, place, thick / 2)
 
-    def dashed(self, points: Sequence[Point] | np.ndarray, color: Color, width: float = 1.0, dash: float = 5.0) -> None:
+    def dashed(
+        self, points: Sequence[_Point] | np.ndarray, color: Color, width: float = 1.0, dash: float = 5.0
+    ) -> None:
         """Draws dashes along a line through points; dashes and gaps are equally long."""
         corners = np.asarray(points, dtype=np.float64)
         lengths = np.concatenate([[0.0], np.hypot(*np.diff(corners, axis=0).T).cumsum()])
@@ -106,16 +108,16 @@ class Canvas:
             x, y = np.interp(ends, lengths, corners[:, 0]), np.interp(ends, lengths, corners[:, 1])
             self.line([(x[0], y[0]), *inner, (x[1], y[1])], color, width)
 
-    def polygon(self, points: Sequence[Point] | np.ndarray, color: Color) -> None:
+    def polygon(self, points: Sequence[_Point] | np.ndarray, color: Color) -> None:
         """Fills a polygon."""
-        self._pygame.draw.polygon(self.surface, color, [(OVERSAMPLING * x, OVERSAMPLING * y) for x, y in points])
+        self._pygame.draw.polygon(self._surface, color, [(_OVERSAMPLING * x, _OVERSAMPLING * y) for x, y in points])
 
-    def circle(self, center: Point, radius: float, color: Color, *, width: float = 0.0) -> None:
+    def circle(self, center: _Point, radius: float, color: Color, *, width: float = 0.0) -> None:
         """Draws a circle, filled unless a line width is given."""
-        place = OVERSAMPLING * center[0], OVERSAMPLING * center[1]
-        self._pygame.draw.circle(self.surface, color, place, OVERSAMPLING * radius, round(OVERSAMPLING * width))
+        place = _OVERSAMPLING * center[0], _OVERSAMPLING * center[1]
+        self._pygame.draw.circle(self._surface, color, place, _OVERSAMPLING * radius, round(_OVERSAMPLING * width))
 
-    def cross(self, center: Point, radius: float, color: Color, width: float = 2.0) -> None:
+    def cross(self, center: _Point, radius: float, color: Color, width: float = 2.0) -> None:
         """Draws a diagonal cross."""
         x, y = center
         for sign in (-1.0, 1.0):
@@ -124,47 +126,47 @@ class Canvas:
     def text(
         self,
         text: str,
-        place: Point,
+        place: _Point,
         color: Color,
         size: int = SMALL,
         *,
         align: float = 0.0,
         bold: bool = False,
         upright: bool = False,
-        most: float | None = None,
+        max_width: float | None = None,
     ) -> float:
-        """Writes text whose vertical middle is at `place`.
+        """Writes one line of text whose vertical middle is at `place`.
 
         Args:
-            text: One line.
-            place: Left end, or wherever `align` says.
-            color: Of the letters.
-            size: Of the font [pixels].
+            text: The line.
+            place: The left end of the line, or what `align` says.
+            color: Color of the letters.
+            size: Size of the font [pixels].
             align: 0 puts the left end at `place`, 0.5 the middle, 1 the right end.
             bold: Whether to use the bold font.
-            upright: Turns it by 90 degrees; `place` is its middle then.
-            most: Cuts it to this length [pixels].
+            upright: Whether to turn the line by 90 degrees; `place` is its middle then.
+            max_width: Longer lines are cut to this width [pixels].
 
         Returns:
-            Its width [pixels].
+            Width of the line [pixels].
         """
-        while most is not None and len(text) > 1 and self.text_width(text, size, bold=bold) > most:
+        while max_width is not None and len(text) > 1 and self.text_width(text, size, bold=bold) > max_width:
             text = text[:-2] + "\N{HORIZONTAL ELLIPSIS}"
         image = self._text(text, size, bold, color, upright)
         width, height = image.get_size()
-        share = 0.5 if upright else align
-        corner = OVERSAMPLING * place[0] - share * width, OVERSAMPLING * place[1] - 0.5 * height
-        self.surface.blit(image, (round(corner[0]), round(corner[1])))
-        return width / OVERSAMPLING
+        anchor = 0.5 if upright else align
+        corner = _OVERSAMPLING * place[0] - anchor * width, _OVERSAMPLING * place[1] - 0.5 * height
+        self._surface.blit(image, (round(corner[0]), round(corner[1])))
+        return width / _OVERSAMPLING
 
     def text_width(self, text: str, size: int = SMALL, *, bold: bool = False) -> float:
-        """Returns how wide a text will be [pixels]."""
-        return self._font(size, bold).size(text)[0] / OVERSAMPLING
+        """Returns the width of a line of text [pixels]."""
+        return self._font(size, bold).size(text)[0] / _OVERSAMPLING
 
     def _text(self, text: str, size: int, bold: bool, color: Color, upright: bool) -> Any:
         key = text, size, bold, color, upright
         if key not in self._texts:
-            if len(self._texts) >= MOST_TEXTS:
+            if len(self._texts) >= _MAX_CACHED_TEXTS:
                 self._texts.clear()
             image = self._font(size, bold).render(text, True, color)
             self._texts[key] = self._pygame.transform.rotate(image, 90) if upright else image
@@ -172,12 +174,44 @@ class Canvas:
 
     def _font(self, size: int, bold: bool) -> Any:
         if (size, bold) not in self._fonts:
-            self._fonts[size, bold] = self._pygame.font.Font(_font_file(bold), OVERSAMPLING * size)
+            self._fonts[size, bold] = self._pygame.font.Font(_font_file(bold), _OVERSAMPLING * size)
         return self._fonts[size, bold]
 
 
+class Window:
+    """A window that shows frames at a steady rate; the first frame opens it.
+
+    Args:
+        title: Title of the window.
+        fps: Frames shown per second.
+    """
+
+    def __init__(self, title: str, fps: int) -> None:
+        self._title, self._fps = title, fps
+        self._screen: Any = None
+
+    def show(self, frame: Any) -> None:
+        """Shows a pygame surface, and waits until the previous one was shown long enough."""
+        pygame = _require_pygame()
+        if self._screen is None:
+            pygame.display.init()
+            pygame.display.set_caption(self._title)
+            self._screen = pygame.display.set_mode(frame.get_size())
+            self._clock = pygame.time.Clock()
+        pygame.event.pump()
+        self._screen.blit(frame, (0, 0))
+        pygame.display.flip()
+        self._clock.tick(self._fps)
+
+    def close(self) -> None:
+        """Closes the window if it is open."""
+        if self._screen is not None:
+            _require_pygame().display.quit()
+            self._screen = None
+
+
 def _font_file(bold: bool) -> str | None:
-    """Returns matplotlib's DejaVu Sans, which filterpy brings and which looks alike everywhere; None without it."""
+    """Returns the file of matplotlib's DejaVu Sans, which looks alike on every machine; None without matplotlib."""
     found = importlib.util.find_spec("matplotlib")
     if found is None or found.origin is None:
         return None

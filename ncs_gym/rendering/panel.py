@@ -1,33 +1,46 @@
-"""The panel beside the phase plane: inputs, goal, recent packets and legend."""
+"""The texts and bars of a frame: the header on top, and the panel with inputs, tracked output, packets and legend."""
 
 from __future__ import annotations
+
+from math import ceil, log10
 
 import numpy as np
 
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
-from ncs_gym.rendering.history import RECENT
-from ncs_gym.rendering.limits import reading, unit_text
-from ncs_gym.rendering.scene import Scene
+from ncs_gym.rendering.episode_record import RECENT_STEPS, FrameRecord
 
-# Inputs drawn.
-MOST_INPUTS = 3
-TRACK = 12.0
+# The largest number of inputs that are drawn.
+_MAX_INPUTS = 3
+# Height of a bar, and space between the ends of a label in the header and its text [pixels].
+_BAR_HEIGHT, _PADDING = 12.0, 11.0
 
 
-def draw_panel(canvas: Canvas, scene: Scene) -> None:
-    """Draws the rows that move."""
-    rect = theme.PANEL
-    rows = min(scene.plant.m, MOST_INPUTS) + (scene.goal is not None) + 1
-    spacing = min(52.0, 172.0 / rows)
-    y = rect.y
-    for i in range(min(scene.plant.m, MOST_INPUTS)):
-        _draw_input(canvas, scene, i, y)
+def draw_header(canvas: Canvas, frame: FrameRecord) -> None:
+    """Draws step and time at the left, and the shield and the violations at the right."""
+    y = theme.HEADER.h / 2
+    decimals = min(max(1, ceil(-log10(frame.plant.dt))), 6)
+    canvas.text(f"step {frame.step}", (16, y), theme.INK, theme.BODY, bold=True)
+    canvas.text(f"{frame.step * frame.plant.dt:.{decimals}f} s", (148, y), theme.MUTED, theme.BODY, align=1.0)
+    count = frame.violations
+    text = "no violation" if count == 0 else f"{count} violation{'s' if count > 1 else ''}"
+    color, fill = (theme.DANGER, theme.DANGER_FILL) if count else (theme.SAFE, theme.SAFE_FILL)
+    left = _draw_label(canvas, theme.WIDTH - 16, text, color, fill, filled=frame.violated)
+    _draw_shield(canvas, frame, left - 10)
+
+
+def draw_panel(canvas: Canvas, frame: FrameRecord) -> None:
+    """Draws the rows of the panel that change from step to step."""
+    inputs = min(frame.plant.m, _MAX_INPUTS)
+    spacing = min(52.0, 172.0 / (inputs + (frame.tracked is not None) + 1))
+    y = theme.PANEL.y
+    for i in range(inputs):
+        _draw_input(canvas, frame, i, y)
         y += spacing
-    if scene.goal is not None:
-        _draw_goal(canvas, scene, y)
+    if frame.tracked is not None:
+        _draw_tracked_output(canvas, frame, y)
         y += spacing
-    _draw_packets(canvas, scene, y)
+    _draw_packets(canvas, frame, y)
 
 
 def draw_legend(canvas: Canvas, *, shielded: bool) -> None:
@@ -54,37 +67,67 @@ def draw_legend(canvas: Canvas, *, shielded: bool) -> None:
             canvas.text(name, (x + 14, top + 20 * i), theme.INK)
 
 
+def _draw_shield(canvas: Canvas, frame: FrameRecord, right: float) -> None:
+    """Writes into the header whether there is a shield and what it does."""
+    annotation = frame.annotation
+    if annotation is None:
+        _draw_label(canvas, right, "no shield", theme.INK, theme.GRID, filled=False)
+        return
+    count = f"{annotation.interventions}\N{MULTIPLICATION SIGN}"
+    if not annotation.protects:
+        text = f"shield only watches: would act {count}"
+    elif annotation.intervened:
+        text = f"SHIELD ACTS {count}"
+    else:
+        text = f"shield ({annotation.label}): acted {count}"
+    _draw_label(canvas, right, text, theme.SHIELD, theme.SHIELD_FILL, filled=frame.intervened)
+
+
+def _draw_label(
+    canvas: Canvas, right: float, text: str, color: theme.Color, fill: theme.Color, *, filled: bool
+) -> float:
+    """Draws a label of the header that ends at `right`; returns where it begins."""
+    width = canvas.text_width(text, theme.BODY, bold=True) + 2 * _PADDING
+    label = theme.Rect(right - width, 7, width, theme.HEADER.h - 14)
+    canvas.rect(label, color if filled else fill, radius=13)
+    place = label.x + _PADDING, theme.HEADER.h / 2
+    canvas.text(text, place, theme.PAPER if filled else color, theme.BODY, bold=True)
+    return label.x
+
+
 def _draw_disc(canvas: Canvas, center: tuple[float, float], fill: theme.Color, edge: theme.Color) -> None:
     canvas.circle(center, 6.5, fill)
     canvas.circle(center, 6.5, edge, width=1.5)
 
 
-def _draw_title(canvas: Canvas, y: float, name: str, value: str, color: theme.Color) -> None:
+def _draw_row(canvas: Canvas, y: float, name: str, value: str, color: theme.Color) -> theme.Rect:
+    """Draws the name and the value of a row of the panel and its empty bar; returns where the bar is."""
     width = canvas.text(value, (theme.PANEL.right, y + 6), color, align=1.0, bold=True)
-    canvas.text(name, (theme.PANEL.x, y + 6), theme.INK, most=theme.PANEL.w - width - 8)
+    canvas.text(name, (theme.PANEL.x, y + 6), theme.INK, max_width=theme.PANEL.w - width - 8)
+    bar = theme.Rect(theme.PANEL.x, y + 18, theme.PANEL.w, _BAR_HEIGHT)
+    canvas.rect(bar, theme.MIST, radius=4)
+    return bar
 
 
-def _draw_input(canvas: Canvas, scene: Scene, index: int, y: float) -> None:
-    """Draws an input between its limits; where the shield acts, the way from what was proposed."""
-    plant = scene.plant
+def _draw_input(canvas: Canvas, frame: FrameRecord, index: int, y: float) -> None:
+    """Draws an input between its limits; where the shield acts, also an arrow from the proposed input."""
+    plant = frame.plant
     limit = float(plant.u_max[index])
-    value = 0.0 if scene.input is None else float(scene.input[index])
-    unit = unit_text(plant.input_units[index])
-    color = theme.SHIELD if scene.intervened else theme.STEEL
-    _draw_title(canvas, y, plant.input_names[index], f"{reading(value, limit)} {unit}".strip(), color)
-    track = theme.Rect(theme.PANEL.x, y + 18, theme.PANEL.w, TRACK)
-    middle = track.x + track.w / 2
+    value = 0.0 if frame.input is None else float(frame.input[index])
+    color = theme.SHIELD if frame.intervened else theme.STEEL
+    text = theme.value_label(value, limit, plant.input_units[index])
+    bar = _draw_row(canvas, y, plant.input_names[index], text, color)
+    middle = bar.x + bar.w / 2
 
     def x_of(u: float) -> float:
-        return middle + (track.w / 2 - 6) * float(np.clip(u / limit, -1.0, 1.0))
+        return middle + (bar.w / 2 - 6) * float(np.clip(u / limit, -1.0, 1.0))
 
-    canvas.rect(track, theme.MIST, radius=4)
     x = x_of(value)
-    canvas.rect(theme.Rect(min(x, middle), track.y + 2, abs(x - middle), TRACK - 4), color)
-    canvas.line([(middle, track.y - 2), (middle, track.bottom + 2)], theme.MUTED, 1.0)
-    note = scene.annotation
-    if note is not None and note.intervened and note.proposed is not None:
-        _draw_correction(canvas, x_of(float(note.proposed[index])), x, track.y + TRACK / 2)
+    canvas.rect(theme.Rect(min(x, middle), bar.y + 2, abs(x - middle), bar.h - 4), color)
+    canvas.line([(middle, bar.y - 2), (middle, bar.bottom + 2)], theme.MUTED, 1.0)
+    annotation = frame.annotation
+    if annotation is not None and annotation.intervened and annotation.proposed is not None:
+        _draw_correction(canvas, x_of(float(annotation.proposed[index])), x, bar.y + bar.h / 2)
 
 
 def _draw_correction(canvas: Canvas, start: float, end: float, y: float) -> None:
@@ -97,46 +140,41 @@ def _draw_correction(canvas: Canvas, start: float, end: float, y: float) -> None
         canvas.polygon([(end, y), (end - 10 * side, y - 6), (end - 10 * side, y + 6)], theme.SHIELD)
 
 
-def _draw_goal(canvas: Canvas, scene: Scene, y: float) -> None:
-    """Draws a quantity and its target."""
-    goal = scene.goal
-    assert goal is not None
-    span = max(abs(goal.low), abs(goal.high))
-    unit = unit_text(goal.unit)
-    signed = goal.low < 0.0
-    numbers = [reading(value, span) if signed else f"{value:.1f}" for value in (goal.value, goal.target)]
-    text = f"{numbers[0]} \N{RIGHTWARDS ARROW} {numbers[1]} {unit}".strip()
-    _draw_title(canvas, y, f"{goal.name}, target", text, theme.SAFE)
-    track = theme.Rect(theme.PANEL.x, y + 18, theme.PANEL.w, TRACK)
-    canvas.rect(track, theme.MIST, radius=4)
+def _draw_tracked_output(canvas: Canvas, frame: FrameRecord, y: float) -> None:
+    """Draws the quantity that the task tracks, and its reference."""
+    tracked = frame.tracked
+    assert tracked is not None
+    low, high = tracked.low, tracked.high
+    limit = max(abs(low), abs(high))
+    numbers = [
+        theme.value_label(value, limit) if low < 0.0 else f"{value:.1f}" for value in (tracked.value, tracked.target)
+    ]
+    text = f"{numbers[0]} \N{RIGHTWARDS ARROW} {numbers[1]} {theme.unit_label(tracked.unit)}".strip()
+    bar = _draw_row(canvas, y, f"{tracked.name}, target", text, theme.SAFE)
 
     def x_of(value: float) -> float:
-        share = (value - goal.low) / (goal.high - goal.low)
-        return track.x + 6 + (track.w - 12) * float(np.clip(share, 0.0, 1.0))
+        return bar.x + 6 + (bar.w - 12) * float(np.clip((value - low) / (high - low), 0.0, 1.0))
 
-    base = x_of(max(goal.low, 0.0))
-    x, target = x_of(goal.value), x_of(goal.target)
-    canvas.rect(theme.Rect(min(x, base), track.y + 2, abs(x - base), TRACK - 4), theme.STEEL)
-    canvas.line([(target, track.y - 2), (target, track.bottom + 2)], theme.SAFE, 3.0)
-    canvas.polygon([(target, track.y + 4), (target - 5, track.y - 3), (target + 5, track.y - 3)], theme.SAFE)
+    zero, x, target = x_of(max(low, 0.0)), x_of(tracked.value), x_of(tracked.target)
+    canvas.rect(theme.Rect(min(x, zero), bar.y + 2, abs(x - zero), bar.h - 4), theme.STEEL)
+    canvas.line([(target, bar.y - 2), (target, bar.bottom + 2)], theme.SAFE, 3.0)
+    canvas.polygon([(target, bar.y + 4), (target - 5, bar.y - 3), (target + 5, bar.y - 3)], theme.SAFE)
 
 
-def _draw_packets(canvas: Canvas, scene: Scene, y: float) -> None:
-    """Draws the fate of the packets sent in the last steps, the newest at the right."""
-    old = scene.age
-    text = "newest used: now" if old == 0 else f"newest used: {old} step{'s' if old > 1 else ''} old"
-    _draw_title(canvas, y, "packets sent", text, theme.LATE_TEXT if old else theme.ESTIMATE)
-    track = theme.Rect(theme.PANEL.x, y + 18, theme.PANEL.w, TRACK)
-    canvas.rect(track, theme.MIST, radius=4)
-    spacing = (track.w - 14) / (RECENT - 1)
-    for flight in scene.flights:
-        back = scene.step - flight.stamp
-        if back >= RECENT:
+def _draw_packets(canvas: Canvas, frame: FrameRecord, y: float) -> None:
+    """Draws what became of the packets sent in the recent steps, the newest at the right."""
+    age = frame.measurement_age
+    text = "newest used: now" if age == 0 else f"newest used: {age} step{'s' if age > 1 else ''} old"
+    bar = _draw_row(canvas, y, "packets sent", text, theme.LATE_TEXT if age else theme.ESTIMATE)
+    spacing = (bar.w - 14) / (RECENT_STEPS - 1)
+    for packet in frame.packets:
+        back = frame.step - packet.stamp
+        if back >= RECENT_STEPS:
             continue
-        place = track.right - 7 - spacing * back, track.y + TRACK / 2
-        if flight.arrival is None:
+        place = bar.right - 7 - spacing * back, bar.y + bar.h / 2
+        if packet.arrival is None:
             canvas.cross(place, 3.5, theme.DANGER, 2.0)
-        elif flight.arrival > scene.step:
+        elif packet.arrival > frame.step:
             canvas.circle(place, 3.5, theme.LATE, width=1.5)
         else:
-            canvas.circle(place, 3.5, theme.ESTIMATE if flight.arrival == flight.stamp else theme.LATE)
+            canvas.circle(place, 3.5, theme.ESTIMATE if packet.arrival == packet.stamp else theme.LATE)

@@ -1,18 +1,20 @@
-"""Colors, sizes and the frame's layout, in pixels.
+"""How a frame looks: its layout in pixels, its colors, and how numbers and units are written.
 
-The colors stay apart for color-blind readers (hues of Okabe and Ito), and nothing is told by hue alone: the lost packet
-is a cross, the estimate dashed or hollow, the safe box dashed, a violation says so.
+The colors stay apart for color-blind readers (hues of Okabe and Ito), and no meaning rests on hue alone: the lost
+packet is a cross, the estimate is dashed or hollow, the safe box is dashed, and a violation is also written in words.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 Color = tuple[int, int, int]
 
 
 class Rect(NamedTuple):
-    """A rectangle with its top left corner at (x, y)."""
+    """A rectangle with its top left corner at (x, y) [pixels]."""
 
     x: float
     y: float
@@ -21,22 +23,22 @@ class Rect(NamedTuple):
 
     @property
     def right(self) -> float:
-        """Right edge."""
+        """The x coordinate of the right edge."""
         return self.x + self.w
 
     @property
     def bottom(self) -> float:
-        """Lower edge."""
+        """The y coordinate of the lower edge."""
         return self.y + self.h
 
 
 WIDTH, HEIGHT = 640, 480
 HEADER = Rect(0, 0, WIDTH, 40)
-STAGE = Rect(0, 40, WIDTH, 176)
+PLANT_VIEW = Rect(0, 40, WIDTH, 176)
 PLANE = Rect(64, 228, 236, 196)
 PANEL = Rect(330, 228, 294, 244)
-# Where the packets' lane is, for which every stage leaves room.
-LANE = STAGE.y + 32
+# Height of the line on which packets travel; every drawing of a plant leaves it free.
+PACKET_LINE = PLANT_VIEW.y + 32
 
 PAPER: Color = (255, 255, 255)
 MIST: Color = (244, 246, 249)
@@ -56,20 +58,41 @@ SHIELD: Color = (116, 44, 186)
 SHIELD_FILL: Color = (236, 224, 248)
 STEEL: Color = (88, 110, 134)
 BODYWORK: Color = (10, 80, 132)
-LOAD: Color = (180, 190, 200)
+CARGO: Color = (180, 190, 200)
 CRATE: Color = (138, 153, 170)
 GLASS: Color = (204, 225, 240)
 
+# Font sizes.
 SMALL, BODY, LARGE = 13, 14, 17
 
 
-def blend(first: Color, second: Color, share: float) -> Color:
-    """Returns a mixture: the first color at share 0, the second at 1."""
-    share = min(max(share, 0.0), 1.0)
-    red, green, blue = (round(a + (b - a) * share) for a, b in zip(first, second, strict=True))
+def blend(first: Color, second: Color, fraction: float) -> Color:
+    """Returns a mixture of two colors: the first at fraction 0, the second at fraction 1."""
+    fraction = min(max(fraction, 0.0), 1.0)
+    red, green, blue = (round(a + (b - a) * fraction) for a, b in zip(first, second, strict=True))
     return red, green, blue
 
 
-def strain(share: float) -> Color:
-    """Returns the color of something that uses a share of its limit: steel, turning red from 60 % on."""
-    return blend(STEEL, DANGER, (abs(share) - 0.6) / 0.35)
+def load_color(fraction: float) -> Color:
+    """Returns the color of something that uses a fraction of its limit: steel, turning red from 60 % on."""
+    return blend(STEEL, DANGER, (abs(fraction) - 0.6) / 0.35)
+
+
+def tick_label(value: float) -> str:
+    """Returns a number for an axis: three digits and a true minus sign."""
+    text = f"{value:.3g}" if abs(value) >= 1e-12 else "0"
+    return text.replace("-", "\N{MINUS SIGN}")
+
+
+def value_label(value: float, limit: float, unit: str = "") -> str:
+    """Returns a changing value and its unit; the number of decimals depends on the limit alone."""
+    decimals = 2 if not 0.0 < limit < 1e300 else int(np.clip(2 - np.floor(np.log10(limit)), 0, 6))
+    value = round(value, decimals) + 0.0  # no minus zero
+    number = f"{value:+.{decimals}f}" if abs(value) < 1e6 else f"{value:+.1e}"
+    number = number.replace("-", "\N{MINUS SIGN}")
+    return f"{number} {unit_label(unit)}".strip()
+
+
+def unit_label(unit: str) -> str:
+    """Returns a unit with its powers as superscripts."""
+    return unit.replace("^2", "\N{SUPERSCRIPT TWO}").replace("^3", "\N{SUPERSCRIPT THREE}")

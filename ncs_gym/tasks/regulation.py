@@ -34,7 +34,7 @@ class Regulation(Task):
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, as_covariance(value, None, name))
-        self._freeze_arrays()
+        self._make_arrays_read_only()
 
     def reward(self, plant, task_state, state, u):  # noqa: D102
         Q, R = _costs(self, plant)

@@ -41,7 +41,7 @@ class SetpointTracking(Task):
             object.__setattr__(self, name, as_number(getattr(self, name), name, low=0.0, low_open=True))
         probability = as_number(self.change_probability, "change_probability", low=0.0, high=1.0)
         object.__setattr__(self, "change_probability", probability)
-        self._freeze_arrays()
+        self._make_arrays_read_only()
 
     def begin(self, rng, plant, size=None):  # noqa: D102
         return self.reach * (2.0 * rng.random(size) - 1.0)
@@ -57,7 +57,7 @@ class SetpointTracking(Task):
         return np.array([self.reach])
 
     def reward(self, plant, task_state, state, u):  # noqa: D102
-        return 1.0 - np.minimum(np.abs(self.output @ state - task_state) / self.width, 1.0)
+        return 1.0 - np.minimum(abs(self.output.dot(state) - task_state) / self.width, 1.0)
 
     def check(self, plant):  # noqa: D102
         if self.output.shape != (plant.n,):

@@ -55,8 +55,9 @@ class SpeedTracking(Task):
     def advance(self, rng, plant, task_state, u):  # noqa: D102
         speed, target = task_state
         # One draw decides whether the target changes, and where to: below p, chance / p is uniform.
-        chance, p = rng.random(task_state.shape[1:]), self.change_probability
-        target = np.where(chance < p, chance * (self.fastest / p if p > 0.0 else 0.0), target)
+        chance, p = rng.random(task_state.shape[1:] or None), self.change_probability
+        drawn = chance * (self.fastest / p if p > 0.0 else 0.0)
+        target = target + (chance < p) * (drawn - target)
         return np.array([speed + plant.dt * u[self.input_index], target])
 
     def observe(self, task_state):  # noqa: D102
@@ -67,7 +68,7 @@ class SpeedTracking(Task):
 
     def reward(self, plant, task_state, state, u):  # noqa: D102
         speed, target = task_state
-        error, effort = np.abs(target - speed), u[self.input_index]
+        error, effort = abs(target - speed), u[self.input_index]
         return -self.error_weight * np.minimum(error / 5.0, 5.0) - self.input_weight * effort * effort
 
     def check(self, plant):  # noqa: D102

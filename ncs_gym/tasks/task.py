@@ -8,10 +8,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.validation import FrozenArrays
+from ncs_gym.validation import ReadOnlyArrays
 
 
-class Task(FrozenArrays, ABC):
+class Task(ReadOnlyArrays, ABC):
     """A reward, and perfectly known extra entries of the observation.
 
     `begin` draws the task's state for an episode, `advance` moves it one step; neither stores anything in the settings,

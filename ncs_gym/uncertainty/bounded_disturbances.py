@@ -51,7 +51,7 @@ class BoxDisturbance(Disturbance):
         if (widths < 0.0).any():
             raise ValueError(f"half_widths must be >= 0, got {widths.tolist()}")
         object.__setattr__(self, "half_widths", widths)
-        self._freeze_arrays()
+        self._make_arrays_read_only()
 
     def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
         return (rng.uniform(-1.0, 1.0, nominal_next.shape).T * self.widths(plant)).T

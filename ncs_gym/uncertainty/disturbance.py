@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.validation import LARGEST, FrozenArrays, as_setting, as_vector, shown
+from ncs_gym.validation import LARGEST_NUMBER, ReadOnlyArrays, as_setting, as_vector, shown
 
 # Extreme points are pulled in, and points out by rounding pushed in, by this much.
 ROUNDING = 1e-12
@@ -18,7 +18,7 @@ ROUNDING = 1e-12
 TOLERANCE = 1e-9
 
 
-class Disturbance(FrozenArrays, ABC):
+class Disturbance(ReadOnlyArrays, ABC):
     """A disturbance in {d : d'd <= gamma}; truncated process noise is added to it.
 
     `begin` draws what stays fixed for an episode, `draw` the disturbance of one step; neither stores anything in the
@@ -129,7 +129,7 @@ def checked_many(plant: LinearPlant, d: Any, count: int, *, allow_assumption_vio
         ValueError: If one is not finite, wrongly shaped, or further outside than TOLERANCE and that is not allowed.
     """
     given, d = d, as_setting(d)
-    if d is None or d.shape != (plant.n, count) or not (np.abs(d) < LARGEST).all():
+    if d is None or d.shape != (plant.n, count) or not (np.abs(d) < LARGEST_NUMBER).all():
         raise ValueError(f"the disturbances must be finite with shape ({plant.n}, {count}), got {shown(given)}")
     if allow_assumption_violation:
         return d

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from ncs_gym.validation import FrozenArrays, as_covariance, read_only
+from ncs_gym.validation import ReadOnlyArrays, as_covariance, read_only
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-# Directions whose variance is below this share of the largest count as flat: about 100 float64 roundings.
+# Directions whose variance is below this fraction of the largest count as flat: about 100 float64 roundings.
 FLAT = 2e-14
 # A point this far off a flat ellipsoid, relative to its extent, still counts as rounding.
 OFF_FLAT = 1e-12
-# The share of a term in an outer sum stays this far from 0 and 1, so that no division overflows.
-SMALLEST_SHARE = 1e-9
+# The multiplier of a term in an outer sum stays this far from 0 and 1, so that no division overflows.
+SMALLEST_MULTIPLIER = 1e-9
 # Newton's method for farthest points converges in about five steps, near the hard case in at most 25 of those tried;
 # a step below this fraction of nu is rounding.
 NEWTON_STEPS, NEWTON_PRECISION = 40, 1e-15
@@ -28,7 +28,7 @@ HARD_CASE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Ellipsoid(FrozenArrays):
+class Ellipsoid(ReadOnlyArrays):
     """The centered ellipsoid {z : a'z <= sqrt(a'Pa) for all a} with shape P.
 
     For an invertible shape this is {z : z' P^-1 z <= 1}; a singular shape is a flat ellipsoid
@@ -45,7 +45,7 @@ class Ellipsoid(FrozenArrays):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "shape", as_covariance(self.shape, None, "shape"))
-        self._freeze_arrays()
+        self._make_arrays_read_only()
 
     @property
     def dim(self) -> int:
@@ -199,7 +199,7 @@ def is_inside(inner: np.ndarray, outer: np.ndarray) -> bool:
 def outer_sum(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Returns P1/nu + P2/(1-nu), an ellipsoid around E(P1) + E(P2), with the smallest tr(W P).
 
-    Source: theory.md section 1 (Cauchy-Schwarz on the supports); the best share is
+    Source: theory.md section 1 (Cauchy-Schwarz on the supports); the best multiplier is
     nu = sqrt(tr W P1) / (sqrt(tr W P1) + sqrt(tr W P2)).
 
     Args:
@@ -211,8 +211,8 @@ def outer_sum(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.n
     b = np.sqrt(max(float(np.vdot(weight, second)), 0.0))
     if b == 0.0:
         return first + second
-    share = min(max(a / (a + b), SMALLEST_SHARE), 1.0 - SMALLEST_SHARE)
-    return first / share + second / (1.0 - share)
+    nu = min(max(a / (a + b), SMALLEST_MULTIPLIER), 1.0 - SMALLEST_MULTIPLIER)
+    return first / nu + second / (1.0 - nu)
 
 
 def joined(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -242,8 +242,8 @@ def sum_gauge(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> float
         second: P2, shape (n, n), positive semidefinite.
     """
 
-    def gauge(share: float) -> float:
-        shape = first / share + second / (1.0 - share)
+    def gauge(nu: float) -> float:
+        shape = first / nu + second / (1.0 - nu)
         return Ellipsoid(0.5 * (shape + shape.T)).gauge(point)
 
     # In units in which neither overflows: the gauge does not change.
@@ -254,9 +254,9 @@ def sum_gauge(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> float
         return Ellipsoid(first).gauge(point)
     if not np.any(first):
         return Ellipsoid(second).gauge(point)
-    best = minimize_scalar(
-        lambda share: -gauge(share),
-        bounds=(SMALLEST_SHARE, 1.0 - SMALLEST_SHARE),
+    best: Any = minimize_scalar(
+        lambda nu: -gauge(nu),
+        bounds=(SMALLEST_MULTIPLIER, 1.0 - SMALLEST_MULTIPLIER),
         method="bounded",
         options={"xatol": 1e-9},
     )

@@ -42,7 +42,7 @@ class AdversarialDisturbance(Disturbance):
     def __post_init__(self) -> None:
         if self.M is not None:
             object.__setattr__(self, "M", as_covariance(self.M, None, "M"))
-        self._freeze_arrays()
+        self._make_arrays_read_only()
 
     def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
         bound = plant.nominal_disturbance

@@ -9,14 +9,14 @@ import numpy as np
 from scipy.stats import chi2
 
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import FrozenArrays
+from ncs_gym.validation import ReadOnlyArrays
 
 # A truncation that keeps less than this probability would make rejection sampling crawl.
 SMALLEST_KEPT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class TruncatedGaussian(FrozenArrays):
+class TruncatedGaussian(ReadOnlyArrays):
     """w ~ N(0, covariance) conditioned on w' covariance^-1 w <= energy.
 
     Attributes:
@@ -28,7 +28,7 @@ class TruncatedGaussian(FrozenArrays):
     energy: float
 
     def __post_init__(self) -> None:
-        self._freeze_arrays()
+        self._make_arrays_read_only()
 
     @cached_property
     def bound(self) -> Ellipsoid:

@@ -1,4 +1,4 @@
-"""The published error bounds, exactly as printed by Liu et al. (docs/paper.md says what holds of them)."""
+"""The error bounds of Liu et al., exactly as printed (docs/paper.md says what holds of them)."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from ncs_gym import LinearPlant
 from ncs_gym.plants.linear_plant import SMALLEST_DELTA
 from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_KEPT, chi2_quantile
 from ncs_gym.validation import as_covariance, as_matrix, as_number
+
+# Where kappa rho is nearer to 1 than this, the error bound is infinite for practical purposes.
+SMALLEST_GAP = 1e-9
 
 
 def covariance_bound(k: int, p0: float, g2: float, q_bar: float) -> float:
@@ -52,8 +55,8 @@ def uplink_error_bound(
 ) -> float:
     """Returns eps_up = (p0 g2 + q_bar / (1 - g2)) chi2_{n,1-delta} (Liu et al. Theorem 5).
 
-    A quantile per step: the error's square stays below it with probability 1 - delta at each single step, if it is
-    Gaussian; "for all k" does not follow. Theorem 5's p0 g2 is kept as printed, though p0 g2^k is p0 at k = 0.
+    It is a quantile per step: if the error is Gaussian, its square stays below the bound with probability 1 - delta at
+    each single step; "for all k" does not follow. The term p0 g2 is kept as printed, although p0 g2^k is p0 at k = 0.
 
     Args:
         gamma: Squared radius of the disturbance, >= 0.
@@ -95,19 +98,19 @@ def safety_margin(gamma: float, epsilon: float, kappa: float) -> float:
     """
     gamma, epsilon = as_number(gamma, "gamma", low=0.0), as_number(epsilon, "epsilon", low=0.0)
     kappa = as_number(kappa, "kappa", low=0.0, high=1.0, low_open=True)
-    return _margin(gamma, epsilon, kappa)
+    return _alpha(gamma, epsilon, kappa)
 
 
 @dataclass(frozen=True)
 class PaperBounds:
-    """The constants of OP at one (kappa, rho).
+    """The constants of OP at one point (kappa, rho).
 
     Attributes:
         kappa: Contraction factor, in (0, 1].
         rho: Bound on the condition number of L, in [1, 1 / kappa).
-        epsilon_up: Theorem 5 at g_bar^2 = kappa rho.
-        epsilon: Theorem 7.
-        alpha: Of (C2).
+        epsilon_up: Bound of Theorem 5 on the squared uplink error, at g_bar^2 = kappa rho.
+        epsilon: Bound of Theorem 7 on the squared state error.
+        alpha: Lower bound on lambda_min(L) that (C2) demands.
     """
 
     kappa: float
@@ -118,11 +121,11 @@ class PaperBounds:
 
 
 class PaperModel:
-    """The bounds of one plant, ready for any (kappa, rho).
+    """The constants of OP for one plant, as a function of (kappa, rho).
 
     Args:
-        plant: Validated already, so that a point costs a few multiplications.
-        charitable: Reads q_bar as lambda_max(Q) and leaves the chi-square factor out.
+        plant: The plant with its bounds.
+        charitable: Reads q_bar as lambda_max(Q) and omits the chi-square factor, which makes all constants smaller.
     """
 
     def __init__(self, plant: LinearPlant, *, charitable: bool = False) -> None:
@@ -140,23 +143,26 @@ class PaperModel:
         rest = float(1 - Fraction(kappa) * Fraction(rho))
         epsilon_up = _uplink(self._p0, self._q_bar, self._quantile, g2, rest)
         epsilon = _state(self._norm, g2, epsilon_up)
-        return PaperBounds(kappa, rho, epsilon_up, epsilon, _margin(self._gamma, epsilon, kappa))
+        return PaperBounds(kappa, rho, epsilon_up, epsilon, _alpha(self._gamma, epsilon, kappa))
 
 
 def _largest(covariance: np.ndarray) -> float:
+    """Returns the largest eigenvalue of a covariance."""
     return max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0)
 
 
 def _uplink(p0: float, q_bar: float, quantile: float, g2: float, rest: float) -> float:
-    """Returns Theorem 5 from g2 and rest = 1 - g2, which loses its digits if computed from a rounded g2."""
+    """Returns the bound of Theorem 5 from g2 and rest = 1 - g2, whose digits are lost if g2 is rounded first."""
     return (p0 * g2 + q_bar / rest) * quantile
 
 
 def _state(norm: float, g2: float, epsilon_up: float) -> float:
+    """Returns the bound of Theorem 7 for the norm |A|_2."""
     return (g2**0.5 + norm) ** 2 * epsilon_up
 
 
-def _margin(gamma: float, epsilon: float, kappa: float) -> float:
+def _alpha(gamma: float, epsilon: float, kappa: float) -> float:
+    """Returns alpha of Definition 2."""
     if kappa == 1.0:
         return 0.0
     # 1 - sqrt(kappa) = (1 - kappa) / (1 + sqrt(kappa)) keeps its digits near kappa = 1.

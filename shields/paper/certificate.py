@@ -9,21 +9,22 @@ import numpy as np
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
 from shields.errors import Infeasible
+from shields.paper.algorithm import search_grid
 from shields.paper.conditions import paper_conditions
 from shields.paper.feasibility import FeasibilityScan, largest_gamma, largest_noise_scale, largest_scale
-from shields.paper.optimization_problem import PaperDesign, codesign
+from shields.paper.optimization_problem import OPSolution
 
 
 def paper_certificate(plant: LinearPlant, *, dkappa: float, drho: float, search: str) -> Certificate:
     """Returns the certificate of OP and Algorithm 1 (Liu et al. Definition 2), as printed.
 
-    It carries the guarantee of the paper's own definitions, which assumes e'e <= eps; no error set, so a shield made of
-    it is never guaranteed.
+    It carries the guarantee of the paper's own definitions, which assumes e'e <= eps. It has no error set, so a shield
+    with this certificate is never guaranteed.
 
     Args:
         plant: The plant with its bounds.
-        dkappa: Step of kappa, > 0.
-        drho: Step of rho, > 0.
+        dkappa: Grid step of kappa, > 0.
+        drho: Grid step of rho, > 0.
         search: "first" or "largest".
 
     Raises:
@@ -34,42 +35,40 @@ def paper_certificate(plant: LinearPlant, *, dkappa: float, drho: float, search:
     if free:
         raise Infeasible(f"the safe box leaves {free} of {plant.n} directions unbounded: add rows to C", "S", free)
     provenance = {"search": search, "dkappa": dkappa, "drho": drho}
-    found: list[Certificate] = []
 
-    def accept(design: PaperDesign) -> bool:
-        certificate = _certificate(plant, design, provenance)
-        if all(condition.holds for condition in paper_conditions(certificate, plant)):
-            found.append(certificate)
-        return bool(found)
+    def meets_constraints(solution: OPSolution) -> bool:
+        conditions = paper_conditions(_certificate(plant, solution, provenance), plant)
+        return all(condition.holds for condition in conditions)
 
     try:
-        codesign(plant, dkappa=dkappa, drho=drho, search=search, accept=accept)
+        solution = search_grid(plant, dkappa=dkappa, drho=drho, search=search, accept=meets_constraints)
     except LookupError:
-        raise paper_diagnosis(plant) from None
-    return found[0]
+        raise _diagnosis(plant) from None
+    return _certificate(plant, solution, provenance)
 
 
-def _certificate(plant: LinearPlant, design: PaperDesign, provenance: dict[str, Any]) -> Certificate:
+def _certificate(plant: LinearPlant, solution: OPSolution, provenance: dict[str, Any]) -> Certificate:
+    """Returns the certificate of a solution of OP, not yet verified."""
     return Certificate(
-        L=design.L,
-        K=design.K,
+        L=solution.L,
+        K=solution.K,
         method="paper",
         fingerprint=plant.fingerprint,
-        kappa=design.bounds.kappa,
-        rho=design.bounds.rho,
-        epsilon=design.bounds.epsilon,
-        epsilon_up=design.bounds.epsilon_up,
+        kappa=solution.bounds.kappa,
+        rho=solution.bounds.rho,
+        epsilon=solution.bounds.epsilon,
+        epsilon_up=solution.bounds.epsilon_up,
         provenance={
             "source": "Liu et al. Definition 2 and Algorithm 1",
             **provenance,
-            "alpha": design.bounds.alpha,
+            "alpha": solution.bounds.alpha,
             "guarantee": "the paper's own: invariance if e'e <= epsilon at every step",
         },
     )
 
 
-def paper_diagnosis(plant: LinearPlant) -> Infeasible:
-    """Returns the exception that says which constraint binds, how far off it is and what would be feasible."""
+def _diagnosis(plant: LinearPlant) -> Infeasible:
+    """Returns the exception that says which constraint binds, by how much, and what would be feasible."""
     scan = FeasibilityScan(plant)
     try:
         best = scan.best(plant)
@@ -109,6 +108,7 @@ def paper_diagnosis(plant: LinearPlant) -> Infeasible:
 
 
 def _tolerated(gamma: float, noise: float) -> str:
+    """Returns which gamma, and which scale of Q, are each feasible alone."""
     by_gamma = f"gamma up to {gamma:.3g}" if gamma > 0.0 else "no gamma"
     by_noise = f"Q scaled by up to {noise:.3g}" if noise > 0.0 else "no scale of Q"
     return f"{by_gamma} alone, {by_noise} alone"

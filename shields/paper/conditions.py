@@ -9,18 +9,17 @@ import numpy as np
 
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
-from shields.paper.bounds import PaperModel
-from shields.verification.conditions import Condition, flag, matrix_condition, scalar
+from shields.paper.bounds import SMALLEST_GAP, PaperModel
+from shields.verification.conditions import Condition, flag, matrix_condition, scalar_condition
 from shields.verification.rational_matrix import Matrix, add, multiply, quadratic, rational, scale, subtract, transpose
 
-# alpha and eps_up are square roots and quantiles; they are rounded by this, always against the certificate.
-ROUNDING = Fraction(1, 10**12)
-# kappa rho nearer to 1 than this makes the error bound infinite for practical purposes.
-SMALLEST_GAP = 1e-9
+# alpha and eps_up are square roots and quantiles in float64; their rounding counts as this much against the
+# certificate.
+_ROUNDING = Fraction(1, 10**12)
 
 
 def paper_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
-    """Yields (C1)-(C7) for a certificate of method "paper".
+    """Yields (C1)-(C7) for a certificate of method "paper" whose shapes fit the plant.
 
     U and tau are eliminated: (C4)-(C6) can be met for input i exactly if
     u_max^2 / 2 - K_i L K_i' - |K_i L|^2 eps_up / alpha^2 >= 0.
@@ -37,33 +36,33 @@ def paper_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[C
     yield flag("eps_up and eps are those of Theorems 5 and 7", bool(agree))
     L, K = rational(certificate.L), rational(certificate.K)
     identity = rational(np.eye(plant.n))
-    closed = multiply(add(rational(plant.A), multiply(rational(plant.B), K)), L)
+    closed_loop = multiply(add(rational(plant.A), multiply(rational(plant.B), K)), L)
     yield matrix_condition("L > 0", L, strict=True)
-    yield matrix_condition("(C1) [kappa L, *; (A+BK) L, L] >= 0", _blocks(scale(kappa, L), closed, L))
+    yield matrix_condition("(C1) [kappa L, *; (A+BK) L, L] >= 0", _blocks(scale(kappa, L), closed_loop, L))
     alpha = Fraction(bounds.alpha)
-    yield matrix_condition("(C2) L >= alpha I", subtract(L, scale(alpha * (1 + ROUNDING), identity)))
+    yield matrix_condition("(C2) L >= alpha I", subtract(L, scale(alpha * (1 + _ROUNDING), identity)))
     for j, row in enumerate(plant.C):
-        yield scalar(f"(C3) c_{j + 1} L c_{j + 1}' <= 1", 1 - quadratic(rational(row), L))
+        yield scalar_condition(f"(C3) c_{j + 1} L c_{j + 1}' <= 1", 1 - quadratic(rational(row), L))
     for i, limit in enumerate(plant.u_max):
         F = multiply([K[i]], L)
         used = quadratic([K[i]], L)
         if bounds.epsilon_up > 0.0:
-            error = Fraction(bounds.epsilon_up) * (1 + ROUNDING) / (alpha * (1 - ROUNDING)) ** 2
+            error = Fraction(bounds.epsilon_up) * (1 + _ROUNDING) / (alpha * (1 - _ROUNDING)) ** 2
             used += error * multiply(F, transpose(F))[0][0]
-        yield scalar(f"(C4)-(C6) input {i + 1}", Fraction(float(limit)) ** 2 / 2 - used)
+        yield scalar_condition(f"(C4)-(C6) input {i + 1}", Fraction(float(limit)) ** 2 / 2 - used)
     beta = _smallest_eigenvalue(certificate.L)
     yield matrix_condition("(C7) L >= beta I", subtract(L, scale(beta, identity)))
     yield matrix_condition("(C7) L <= rho beta I", subtract(scale(rho * beta, identity), L))
 
 
 def _smallest_eigenvalue(L: np.ndarray) -> Fraction:
-    """Returns a rational just below lambda_min(L), exactly it for a multiple of the identity."""
+    """Returns a rational just below lambda_min(L); exactly lambda_min(L) for a multiple of the identity."""
     if np.array_equal(L, L[0, 0] * np.eye(len(L))):
         return Fraction(float(L[0, 0]))
-    return Fraction(float(np.linalg.eigvalsh(L)[0])) * (1 - ROUNDING)
+    return Fraction(float(np.linalg.eigvalsh(L)[0])) * (1 - _ROUNDING)
 
 
 def _blocks(top: Matrix, corner: Matrix, bottom: Matrix) -> Matrix:
-    """Returns [top, corner'; corner, bottom]."""
+    """Returns the matrix [top, corner'; corner, bottom]."""
     upper = [left + right for left, right in zip(top, transpose(corner), strict=True)]
     return upper + [left + right for left, right in zip(corner, bottom, strict=True)]

@@ -1,59 +1,86 @@
-"""A parametrized convex program whose numbers are updated inside the solver."""
+"""Small cone programs for the solver Clarabel, written with affine expressions.
+
+An affine expression of N numbers is an array whose first axis has length N + 1: the coefficients of every number, then
+the constant term. numpy's operations on the remaining axes build larger expressions from smaller ones.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import clarabel
-import cvxpy as cp
 import numpy as np
 import scipy.sparse as sp
-from cvxpy.reductions.solvers.conic_solvers.clarabel_conif import dims_to_solver_cones
 
 # A compiled module without type stubs.
 _clarabel: Any = clarabel
-SOLVED, ALMOST = _clarabel.SolverStatus.Solved, _clarabel.SolverStatus.AlmostSolved
 
 
-class ConeProgram:
-    """max c'x subject to A(p) x + s = b(p), s in a cone, with A and b affine in a few parameters p.
+def affine_variables(*sizes: int) -> list[np.ndarray]:
+    """Returns the expressions of independent vectors of numbers, one per size, and that of the constant 1."""
+    coefficients = np.eye(sum(sizes) + 1)
+    return np.split(coefficients, np.cumsum(sizes), axis=1)
 
-    cvxpy canonicalizes once; afterwards a solve costs a small linear combination and Clarabel's own time.
+
+def lower_triangular(entries: np.ndarray, n: int) -> np.ndarray:
+    """Returns a lower triangular matrix expression, shape (N+1, n, n), with entries of shape (N+1, n (n+1) / 2)."""
+    matrix = np.zeros((len(entries), n, n))
+    matrix[:, *np.tril_indices(n)] = entries
+    return matrix
+
+
+def symmetric(entries: np.ndarray, n: int) -> np.ndarray:
+    """Returns a symmetric matrix expression, shape (N+1, n, n), with entries of shape (N+1, n (n+1) / 2)."""
+    lower = lower_triangular(entries, n)
+    return lower + transposed(np.tril(lower, -1))
+
+
+def transposed(expression: np.ndarray) -> np.ndarray:
+    """Returns the transpose of a matrix expression."""
+    return expression.swapaxes(1, 2)
+
+
+def maximum(
+    objective: np.ndarray,
+    *,
+    nonnegative: np.ndarray,
+    semidefinite: Sequence[np.ndarray],
+    exponential: Sequence[np.ndarray] = (),
+    inaccurate: bool = False,
+) -> float:
+    """Returns the maximum of an expression under constraints; minus infinity if the solver finds none.
 
     Args:
-        problem: A maximization that follows cvxpy's rules for parametrized programs.
-        parameters: Its scalar parameters, in the order `maximum` takes their values.
-        almost: Take values of reduced accuracy too: good enough to rank by, not to decide by.
+        objective: The expression to maximize, shape (N+1,); its constant term is left out.
+        nonnegative: Expressions that are at least 0, shape (N+1, k).
+        semidefinite: Symmetric matrix expressions that are positive semidefinite, each of shape (N+1, r, r).
+        exponential: Triples (x, y, z) with y exp(x / y) <= z and y > 0, each of shape (N+1, 3).
+        inaccurate: Whether a value of reduced accuracy counts: it is good enough to rank by, not to decide by.
     """
+    rows = np.concatenate([nonnegative, *map(_triangle, semidefinite), *exponential], axis=1)
+    cones = [_clarabel.NonnegativeConeT(nonnegative.shape[1])]
+    cones += [_clarabel.PSDTriangleConeT(matrix.shape[1]) for matrix in semidefinite]
+    cones += [_clarabel.ExponentialConeT() for _ in exponential]
+    settings = _clarabel.DefaultSettings()
+    settings.verbose = False
+    # Clarabel minimizes q'x subject to A x + s = b with s in the cones, so s = b - A x are the rows.
+    size = len(objective) - 1
+    A, b, q = sp.csc_array(-rows[:-1].T), rows[-1], -objective[:-1]
+    solution = _clarabel.DefaultSolver(sp.csc_array((size, size)), q, A, b, cones, settings).solve()
+    accepted = [_clarabel.SolverStatus.Solved] + [_clarabel.SolverStatus.AlmostSolved] * inaccurate
+    return -float(solution.obj_val) if solution.status in accepted else -np.inf
 
-    def __init__(self, problem: cp.Problem, parameters: Sequence[cp.Parameter], *, almost: bool = False) -> None:
-        self._accepted = (SOLVED, ALMOST) if almost else (SOLVED,)
-        base = self._data(problem, parameters, np.full(len(parameters), 1.0))
-        steps = [self._data(problem, parameters, 1.0 + np.eye(len(parameters))[i]) for i in range(len(parameters))]
-        self._base = base
-        self._steps = [(A.data - base[0].data, b - base[1]) for A, b, _, _ in steps]
-        A, b, c, cones = base
-        settings = _clarabel.DefaultSettings()
-        settings.verbose = False
-        settings.presolve_enable = False
-        settings.chordal_decomposition_enable = False
-        self._solver = _clarabel.DefaultSolver(sp.csc_array((len(c), len(c))), c, A, b, cones, settings)
 
-    @staticmethod
-    def _data(problem: cp.Problem, parameters: Sequence[cp.Parameter], values: np.ndarray) -> tuple:
-        """Returns (A, b, c, cones) at parameter values, with one sparsity pattern for all."""
-        for parameter, value in zip(parameters, values, strict=True):
-            parameter.value = float(value)
-        data, _, _ = problem.get_problem_data(cp.CLARABEL)
-        return sp.csc_matrix(data["A"]), data["b"], data["c"], dims_to_solver_cones(data["dims"])
+def _triangle(matrix: np.ndarray) -> np.ndarray:
+    """Returns the upper triangle of a symmetric expression column by column, off-diagonal entries times sqrt(2)."""
+    i, j, weights = _triangle_indices(matrix.shape[1])
+    return matrix[:, i, j] * weights
 
-    def maximum(self, values: Sequence[float]) -> float:
-        """Returns the optimal value; minus infinity if there is no solution."""
-        A, b = self._base[0].data.copy(), self._base[1].copy()
-        for value, (dA, db) in zip(values, self._steps, strict=True):
-            A += (value - 1.0) * dA
-            b += (value - 1.0) * db
-        self._solver.update(A=A, b=b)
-        solution = self._solver.solve()
-        return -float(solution.obj_val) if solution.status in self._accepted else -np.inf
+
+@cache
+def _triangle_indices(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns rows and columns of the upper triangle column by column, and 1 or sqrt(2) for each entry."""
+    j, i = np.tril_indices(n)
+    return i, j, np.where(i == j, 1.0, np.sqrt(2.0))

@@ -1,4 +1,4 @@
-"""How far OP is from a solution, and how small the uncertainty would have to be."""
+"""How far OP is from feasible over all (kappa, rho), and how large an uncertainty would be feasible."""
 
 from __future__ import annotations
 
@@ -8,65 +8,66 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ncs_gym import LinearPlant
-from shields.paper.bounds import PaperBounds, PaperModel
-from shields.paper.conditions import SMALLEST_GAP
-from shields.paper.optimization_problem import MarginProgram
+from shields.paper.bounds import SMALLEST_GAP, PaperBounds, PaperModel
+from shields.paper.reduced_problem import ReducedProblem
 
-# The domain {0 < kappa < 1, 1 <= rho < 1 / kappa} is scanned with this many points each way, denser near rho = 1.
-KAPPAS = np.linspace(0.01, 0.995, 120)
-RHO_SHARES = np.linspace(0.0, 1.0, 40) ** 2
-# Halvings of the interval in which a largest tolerated bound is sought.
-BISECTIONS = 50
-# What is reported as feasible was confirmed after shrinking by this, at most this often.
-SHRINK, ATTEMPTS = 0.99, 20
+# The domain {0 < kappa < 1, 1 <= rho < 1 / kappa} is scanned at these kappa and these fractions of the way from 1 to
+# 1 / kappa, which are denser near rho = 1.
+_KAPPAS = np.linspace(0.01, 0.995, 120)
+_RHO_FRACTIONS = np.linspace(0.0, 1.0, 40) ** 2
+# Halvings of the interval in which a largest feasible bound is sought.
+_BISECTIONS = 50
+# A bound found is reduced by this factor, at most this often, until all of OP is confirmed to be feasible.
+_REDUCTION, _ATTEMPTS = 0.99, 20
 # Points of the scan that are tried with the communication error in the input limit.
-CONFIRMED_POINTS = 100
+_CONFIRMED_POINTS = 100
 
 
 @dataclass(frozen=True)
 class Feasibility:
-    """What the scan of the domain found.
+    """The feasibility of OP at one point (kappa, rho), without the communication error in the input limit.
 
     Attributes:
-        ratio: Largest lambda_min(L) / alpha over the domain, L meeting (C1), (C3), (C7) and K_i L K_i' <= u_max^2 / 2;
-            OP needs at least 1.
-        kappa, rho: Where.
-        margin: lambda_min(L) there.
-        alpha: alpha there.
+        ratio: Largest lambda_min(L) / alpha; OP needs at least 1.
+        kappa: Contraction factor.
+        rho: Bound on the condition number of L.
+        eigenvalue: Largest lambda_min(L) under (C1), (C3), (C7) and K_i L K_i' <= u_max^2 / 2.
+        alpha: Lower bound on lambda_min(L) that (C2) demands.
     """
 
     ratio: float
     kappa: float
     rho: float
-    margin: float
+    eigenvalue: float
     alpha: float
 
 
 class FeasibilityScan:
-    """The margins of a plant over the domain, which depend on A, B, C and u_max only: one scan serves all bounds.
+    """The largest lambda_min(L) over the domain, which depends on A, B, C and u_max only: one scan serves all bounds.
 
     Args:
-        plant: The plant; its bounds are not used.
+        plant: The plant; its uncertainty is not used.
     """
 
     def __init__(self, plant: LinearPlant) -> None:
-        program = MarginProgram(plant, with_error=False)
+        problem = ReducedProblem(plant)
         self._points: list[tuple[float, float, float]] = []
-        for kappa in KAPPAS:
-            for share in RHO_SHARES:
-                rho = 1.0 + (1.0 / kappa - 1.0) * share
+        for kappa in _KAPPAS.tolist():
+            for fraction in _RHO_FRACTIONS.tolist():
+                rho = 1.0 + (1.0 / kappa - 1.0) * fraction
                 if kappa * rho > 1.0 - SMALLEST_GAP:
                     continue
-                margin = program.largest(PaperBounds(float(kappa), float(rho), np.nan, np.nan, np.nan))
-                if margin > 0.0:
-                    self._points.append((float(kappa), float(rho), margin))
+                bounds = PaperBounds(kappa, rho, np.nan, np.nan, np.nan)
+                eigenvalue = problem.largest_eigenvalue(bounds, with_error=False)
+                if eigenvalue > 0.0:
+                    self._points.append((kappa, rho, eigenvalue))
 
     def best(self, plant: LinearPlant, model: PaperModel | None = None) -> Feasibility:
-        """Returns the best point for a plant with the scanned dynamics and bounds of its own.
+        """Returns the point of largest ratio for a plant with the scanned dynamics and bounds of its own.
 
         Args:
-            plant: Its bounds count.
-            model: Of the bounds; that of the plant by default.
+            plant: The plant whose uncertainty counts.
+            model: Constants of OP; those of the plant by default.
 
         Raises:
             LookupError: If no gain contracts any ellipsoid at any point: (C1) alone has no solution.
@@ -75,52 +76,52 @@ class FeasibilityScan:
 
     def full_ratio(self, plant: LinearPlant) -> float:
         """Returns the largest lambda_min(L)/alpha on all of OP over the most promising points; at least 1: feasible."""
-        program, model, best = MarginProgram(plant), PaperModel(plant), 0.0
-        for point in self._ranked(plant)[:CONFIRMED_POINTS]:
+        problem, model, best = ReducedProblem(plant), PaperModel(plant), 0.0
+        for point in self._ranked(plant)[:_CONFIRMED_POINTS]:
             bounds = model.at(point.kappa, point.rho)
-            best = max(best, program.largest(bounds) / bounds.alpha if bounds.alpha > 0.0 else np.inf)
+            best = max(best, problem.largest_eigenvalue(bounds) / bounds.alpha if bounds.alpha > 0.0 else np.inf)
             if best >= 1.0:
                 break
         return best
 
     def _ranked(self, plant: LinearPlant, model: PaperModel | None = None) -> list[Feasibility]:
-        """Returns all points of the scan, the best first."""
-        found, model = [], model or PaperModel(plant)
-        for kappa, rho, margin in self._points:
+        """Returns all points of the scan in order of falling ratio."""
+        points, model = [], model or PaperModel(plant)
+        for kappa, rho, eigenvalue in self._points:
             alpha = model.at(kappa, rho).alpha
-            ratio = margin / alpha if alpha > 0.0 else np.inf
-            found.append(Feasibility(ratio, kappa, rho, margin, alpha))
-        if not found:
+            ratio = eigenvalue / alpha if alpha > 0.0 else np.inf
+            points.append(Feasibility(ratio, kappa, rho, eigenvalue, alpha))
+        if not points:
             raise LookupError("(C1) has no solution at any (kappa, rho)")
-        return sorted(found, key=lambda point: -point.ratio)
+        return sorted(points, key=lambda point: -point.ratio)
 
     def largest(self, plant_at: Callable[[float], LinearPlant], high: float) -> float:
         """Returns the largest t in [0, high] with OP feasible for plant_at(t), confirmed on all of OP; 0.0 if none is.
 
         Args:
-            plant_at: Returns the plant whose bounds grow with t.
-            high: Where OP is not feasible.
+            plant_at: Returns the plant whose uncertainty grows with t.
+            high: A value of t for which OP is infeasible.
         """
         low = 0.0
         if self.best(plant_at(0.0)).ratio < 1.0:
             return 0.0
-        for _ in range(BISECTIONS):
+        for _ in range(_BISECTIONS):
             middle = 0.5 * (low + high)
             low, high = (middle, high) if self.best(plant_at(middle)).ratio >= 1.0 else (low, middle)
-        for _ in range(ATTEMPTS):
+        for _ in range(_ATTEMPTS):
             if self.full_ratio(plant_at(low)) >= 1.0:
                 return low
-            low *= SHRINK
+            low *= _REDUCTION
         return 0.0
 
 
 def largest_gamma(scan: FeasibilityScan, plant: LinearPlant) -> float:
-    """Returns the largest gamma, everything else as it is, for which OP is feasible; 0.0 if it is at none."""
+    """Returns the largest gamma for which OP is feasible, all else being as it is; 0.0 if there is none."""
     return scan.largest(lambda gamma: replace(plant, gamma=gamma), max(plant.gamma, 1e-12))
 
 
 def largest_scale(scan: FeasibilityScan, plant: LinearPlant) -> float:
-    """Returns the largest common factor on gamma, Q and P0 for which OP is feasible."""
+    """Returns the largest common factor on gamma, Q and P0 for which OP is feasible; 0.0 if there is none."""
 
     def scaled(factor: float) -> LinearPlant:
         return replace(
@@ -134,5 +135,5 @@ def largest_scale(scan: FeasibilityScan, plant: LinearPlant) -> float:
 
 
 def largest_noise_scale(scan: FeasibilityScan, plant: LinearPlant) -> float:
-    """Returns the largest factor on Q, gamma as it is, for which OP is feasible; 0.0 if it is at none."""
+    """Returns the largest factor on Q for which OP is feasible, gamma being as it is; 0.0 if there is none."""
     return scan.largest(lambda factor: replace(plant, process_noise_cov=factor * plant.process_noise_cov), 1.0)

@@ -1,17 +1,17 @@
-"""Tracks whether the proof of safety holds, step by step."""
+"""Follows, step by step, whether the proof of safety holds; for one control loop or for many at once."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ncs_gym import Ellipsoid
 from ncs_gym.plants.linear_plant import SIMULATED_REACH
-from ncs_gym.uncertainty.ellipsoid import is_inside
-from ncs_gym.validation import as_numbers
 from shields.certificate import Certificate
-from shields.runtime.filter import Decision, SafetyFilter
+from shields.runtime.filter import MARGIN, Decision, SafetyFilter
+from shields.runtime.one_step_test import FARTHEST
+from shields.runtime.predicted_errors import PredictedErrors
 from shields.verification.rational_matrix import is_positive_semidefinite, rational, subtract
 
 ALARM = "a measurement contradicts the assumed bounds"
@@ -22,79 +22,117 @@ FAR_OUT = "the estimate is so far out of the safe box that rounding counts"
 UNUSABLE = "the environment reports no usable estimate or error shape"
 NO_ERROR_SET = "a certificate of the published method carries no error set"
 NOT_KNOWN_INSIDE = "the state is not known to be in the safe set"
+# Codes of `GuaranteeMonitor.reasons`; 0 while the proof holds.
+EXPLANATIONS = (
+    "", ALARM, OTHER_INPUT, OTHER_STEPS, LARGE_ERROR, FAR_OUT, UNUSABLE, NO_ERROR_SET, NOT_KNOWN_INSIDE,
+)  # fmt: skip
+CODES = {explanation: code for code, explanation in enumerate(EXPLANATIONS)}
 
 
-class ProofTracker:
+class MonitorState(NamedTuple):
+    """What a monitor knows about one control loop; about N of them, arrays of shape (N,).
+
+    Attributes:
+        broken: Code of what broke the proof for the rest of the episode; 0 for nothing.
+        inside: Whether x in S is proved, up to what broke.
+        certified: Whether the error ellipsoid lies inside a certified one.
+    """
+
+    broken: Any
+    inside: Any
+    certified: Any
+
+
+class Report(NamedTuple):
+    """What is observed of one control loop after a step; of N of them, arrays whose last axis is the loop.
+
+    Attributes:
+        estimate: x_hat, shape (n,) or (n, N); NaN if it is unusable.
+        errors: What is known of the error shapes, in the same order.
+        alarm: Whether the innovation monitor raised an alarm.
+    """
+
+    estimate: np.ndarray
+    errors: PredictedErrors
+    alarm: Any
+
+
+class GuaranteeMonitor:
     """Whether x in S is proved now, and why not (docs/shield.md, "How you see that an assumption broke").
 
     An alarm of the innovation monitor, an input other than the decided one, a step that is not one step and an estimate
     so far out that rounding counts break the error bound for the rest of the episode. The others are recoverable: a
     passed test proves the next state in S without x in S, and a running ellipsoid outside E(Sigma) is still a bound,
     only K x_hat is not proved safe with it.
+
+    Methods are functions of a state and of what happened, truth values for one loop and arrays (N,) for many.
     """
 
     def __init__(self, safety_filter: SafetyFilter) -> None:
-        self._filter = safety_filter
+        self._test = safety_filter.test
         self._reach = SIMULATED_REACH * safety_filter.plant.half_widths
-        self._broken = ""
-        self._error_certified = False
-        self._inside = False
+        self._has_error_set = safety_filter.certificate.Sigma is not None
 
-    @property
-    def reason(self) -> str:
-        """Why the proof does not hold now; empty while it does."""
-        if self._broken:
-            return self._broken
-        if self._filter.certificate.Sigma is None:
-            return NO_ERROR_SET
-        if not self._inside:
-            return NOT_KNOWN_INSIDE
-        return "" if self._error_certified else LARGE_ERROR
-
-    def start(self, known_inside: bool, at_start: bool, info: dict[str, Any]) -> None:
-        """Begins an episode.
+    def start(self, known_inside: Any, unmoved: Any, report: Report) -> MonitorState:
+        """Returns the state at the start of an episode.
 
         Args:
             known_inside: Whether every possible start lies in S (`starts_inside`).
-            at_start: Whether the environment has not moved since.
-            info: The environment's, from reset.
+            unmoved: Whether the environment has not moved since.
+            report: What is observed.
         """
-        self._broken = "" if at_start else OTHER_STEPS
-        self._inside = known_inside
-        self._observe(info)
+        return self._observe(_first(unmoved * 0, unmoved == False, OTHER_STEPS), known_inside, report)  # noqa: E712
 
-    def step(self, decision: Decision, one_step: bool, info: dict[str, Any]) -> None:
-        """Moves one step on.
+    def advance(
+        self, state: MonitorState, decision: Decision, moved_once: Any, same_input: Any, report: Report
+    ) -> MonitorState:
+        """Returns the state one step later.
 
         Args:
-            decision: What was decided before the step.
-            one_step: Whether the environment moved exactly one step since the last call.
-            info: The environment's, from step.
+            state: Before the step.
+            decision: What was decided then.
+            moved_once: Whether the environment moved exactly one step.
+            same_input: Whether the input applied is the one decided.
+            report: What is observed after the step.
         """
-        carried = self._inside and self._error_certified and decision.fallback
-        self._inside = decision.passed or carried
-        if not one_step:
-            self._broken = self._broken or OTHER_STEPS
-        elif not np.array_equal(info["input"], decision.input):
-            self._broken = self._broken or OTHER_INPUT
-        self._observe(info)
+        carried = state.inside & state.certified & decision.fallback
+        broken = _first(state.broken, moved_once == False, OTHER_STEPS)  # noqa: E712
+        broken = _first(broken, same_input == False, OTHER_INPUT)  # noqa: E712
+        return self._observe(broken, decision.passed | carried, report)
 
-    def _observe(self, info: dict[str, Any]) -> None:
+    def reasons(self, state: MonitorState) -> Any:
+        """Returns why the proof does not hold now, as indices of `EXPLANATIONS`: 0 while it does."""
+        reason = state.broken
+        if not self._has_error_set:
+            reason = _first(reason, True, NO_ERROR_SET)
+        reason = _first(reason, state.inside == False, NOT_KNOWN_INSIDE)  # noqa: E712
+        return _first(reason, state.certified == False, LARGE_ERROR)  # noqa: E712
+
+    def _observe(self, broken: Any, inside: Any, report: Report) -> MonitorState:
         """Takes in the alarm, the running ellipsoid, and what the estimate alone proves."""
-        if info["assumption_violated"] not in (False,):
-            self._broken = self._broken or ALARM
-        estimate, error_shape = as_numbers(info["estimate"]), as_numbers(info["error_shape"])
-        if estimate is None or error_shape is None or self._filter.test.at(estimate, error_shape) is None:
-            self._error_certified = False
-            self._broken = self._broken or UNUSABLE
-            return
-        if not (np.abs(estimate) + np.sqrt(np.abs(np.diag(error_shape))) <= self._reach).all():
-            self._broken = self._broken or FAR_OUT
-        # K x_hat is proved safe with any of the certified sets; that of another age serves as well.
-        shapes = self._filter.certificate.error_shapes
-        self._error_certified = any(is_inside(error_shape, Sigma) for Sigma in shapes)
-        if not self._inside:
-            self._inside = self._filter.knows_inside(estimate, error_shape)
+        estimate, errors, alarm = report
+        size = np.abs(estimate)
+        reach = self._reach if estimate.ndim == 1 else self._reach[:, None]
+        near = (size + errors.half_widths <= reach).all(axis=0)  # never without a usable estimate and error shape
+        broken = _first(broken, alarm, ALARM)
+        if not _all(near):
+            usable = (self._test.columns.dot(size) < FARTHEST) & (errors.radius == errors.radius)
+            broken = _first(_first(broken, usable == False, UNUSABLE), near == False, FAR_OUT)  # noqa: E712
+        if not _all(inside):
+            inside = inside | self._test.knows_inside(estimate, errors, MARGIN)
+        return MonitorState(broken, inside, errors.certified)
+
+
+def _all(conditions: Any) -> bool:
+    """Returns whether one truth value, or every one of an array, holds."""
+    return conditions is True or np.count_nonzero(conditions) == np.size(conditions)
+
+
+def _first(broken: Any, condition: Any, explanation: str) -> Any:
+    """Returns the code of what broke first: that of the explanation where nothing had and the condition holds."""
+    if condition is False or not np.count_nonzero(condition):  # the usual case
+        return broken
+    return broken + (broken == 0) * condition * CODES[explanation]
 
 
 def starts_inside(certificate: Certificate, initial: Ellipsoid | np.ndarray) -> bool:

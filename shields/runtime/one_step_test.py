@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from itertools import product
-from math import isfinite, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.linalg.lapack import dpotrf, dsyev  # pyright: ignore[reportAttributeAccessIssue]  # f2py makes them
 
 from ncs_gym import LinearPlant
-from ncs_gym.uncertainty.ellipsoid import SMALLEST_SHARE
 from ncs_gym.validation import read_only
-from shields.certificate import CertificateError
-from shields.runtime.plane import FARTHEST, INDEFINITE, SMALLEST_RADIUS, PlaneOutlook, outlook_in_plane
-from shields.runtime.projection import closest_admissible, closest_on_line
+from shields.certificate import Certificate, CertificateError
+from shields.runtime.predicted_errors import SMALLEST_RADIUS, PredictedErrors
+from shields.runtime.projection import closest_admissible, closest_on_lines
+from shields.verification import ACTION_ROUNDING
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
 
 # The test of all inputs looks at the 2^m vertices of the input box.
 MOST_INPUTS_WITH_VERTICES = 12
+# As many pairs of vertex and environment are looked at in one array.
+LARGEST_BLOCK = 100_000
 # Growths of the root that are tried until it provably does not understate the norm of S.
 ROOT_GROWTHS = (1e-13, 1e-12, 1e-11, 1e-10, 1e-9)
+# An estimate this far out, in units of S, is not worth a test (and its square overflows at 1e154).
+FARTHEST = 1e100
 
 
 class OneStepTest:
@@ -40,6 +42,14 @@ class OneStepTest:
         L: Shape of S, (n, n), positive definite.
         plant: Gives A, B, D and the limits.
 
+    Attributes:
+        root: G with |z|_M <= |G z|, shape (n, n).
+        moved, effect: G A and G B, shapes (n, n) and (n, m).
+        D: G D G' with the rounding of computing it, shape (n, n).
+        rounding: Bound on the rounding of a product with G, relative to the product of absolute values.
+        columns, own_columns: Norms of the columns of |G| |A| and of |G|, shape (n,).
+        pushed: Largest norm of |G| |B| |u| within the limits.
+
     Raises:
         CertificateError: If S is so thin that no norm computed in float64 provably describes it.
     """
@@ -49,88 +59,132 @@ class OneStepTest:
         self.root = read_only(certified_root(L))
         self.moved = read_only(self.root @ plant.A)
         self.effect = read_only(self.root @ plant.B)
-        # Products with |G| bound what rounding does to products with G, in units of `rounding`.
         self.rounding = 8.0 * (plant.n + plant.m) * float(np.finfo(float).eps)
         size = np.abs(self.root)
-        self.columns = np.linalg.norm(size @ np.abs(plant.A), axis=0)
-        self.own_columns = np.linalg.norm(size, axis=0)
+        self.columns = read_only(np.linalg.norm(size @ np.abs(plant.A), axis=0))
+        self.own_columns = read_only(np.linalg.norm(size, axis=0))
         self.pushed = float(np.linalg.norm(size @ np.abs(plant.B), axis=0) @ plant.u_max)
         bound = plant.disturbance.shape
         extent = float(self.own_columns @ np.sqrt(np.diag(bound)))
         D = self.root @ bound @ self.root.T + self.rounding * extent**2 * np.eye(plant.n)
         self.D = read_only(0.5 * (D + D.T))
-        # The trace-optimal share of the ellipsoid around E(Sigma_k moved) + E(D) needs the traces of both.
-        self._gram = self.moved.T @ self.moved
-        self._second = float(np.trace(self.D)) ** 0.5
-        # Two states and one input, the commonest small plant, go ten times faster in plain floats.
-        self._plane = None
-        if (plant.n, plant.m) == (2, 1):
-            moved, effect, D = self.moved.tolist(), self.effect[:, 0].tolist(), self.D.tolist()
-            self._plane = (moved, effect, D, self.columns.tolist(), self.pushed, self.rounding, plant.u_max.item())
 
-    @cached_property
-    def vertices(self) -> np.ndarray:
-        """Corners of the input box, shape (2^m, m)."""
-        return read_only(np.array(list(product(*((-limit, limit) for limit in self.plant.u_max.tolist())))))
-
-    def at(self, estimate: np.ndarray, error_shape: np.ndarray) -> Outlook | PlaneOutlook | None:
-        """Returns the test at an estimate and its error ellipsoid; None if it cannot be computed from them.
+    def reachable(self, estimates: np.ndarray, errors: PredictedErrors) -> ReachableSets:
+        """Returns the sets of next states that N estimates allow.
 
         Args:
-            estimate: x_hat, shape (n,), float64.
-            error_shape: Sigma_k, shape (n, n), float64.
+            estimates: x_hat, shape (n, N).
+            errors: What is known of the Sigma_k of each.
         """
-        n = self.plant.n
-        if estimate.shape != (n,) or error_shape.shape != (n, n):
-            return None
-        if self._plane is not None:
-            return outlook_in_plane(*self._plane, estimate.tolist(), error_shape.tolist())
-        return self._in_space(estimate, error_shape)
+        reach = self.columns @ np.abs(estimates)
+        radius = errors.radius - self.rounding * reach
+        near, small = reach < FARTHEST, radius < SMALLEST_RADIUS
+        if np.count_nonzero(near) < len(near):  # what is too far out or not finite has no radius
+            radius[~near] = np.nan
+        if np.count_nonzero(small):  # too small for the weights: nothing passes
+            radius[small] = np.minimum(radius[small], 0.0)
+        return ReachableSets(self, self.moved @ estimates, errors.turn, radius)
 
-    @np.errstate(all="ignore")  # what overflows is seen below, what underflows does not count
-    def _in_space(self, estimate: np.ndarray, error_shape: np.ndarray) -> Outlook | None:
-        """Returns the test for any number of states and inputs."""
-        # The trace of G A Sigma_k A' G'; not finite if any entry of Sigma_k is not.
-        first = float(np.vdot(self._gram, error_shape))
-        if not (isfinite(first) and _is_shape(error_shape)):
-            return None
-        spread = float(self.columns.dot(np.sqrt(np.abs(error_shape.diagonal()))))
-        reach = float(self.columns.dot(np.abs(estimate)))
-        first = max(abs(first) ** 0.5, SMALLEST_SHARE * self._second)
-        predicted = self.moved.dot(0.5 * (error_shape + error_shape.T)).dot(self.moved.T)
-        predicted.flat[:: len(predicted) + 1] += self.rounding * spread * spread
-        predicted = predicted * (1.0 + self._second / first) + self.D * (1.0 + first / self._second)
-        values, axes, failed = dsyev(predicted)  # numpy's eigh, without its three times longer preparation
-        loss = self.rounding * (reach + spread + self.pushed)
-        if failed or not (reach < FARTHEST and isfinite(float(values[0]) + loss) and 0.0 < values[-1] < np.inf):
-            return None
-        return Outlook(self, self.moved.dot(estimate), values, axes, loss)
+    def reachable_alone(self, estimate: np.ndarray, errors: PredictedErrors) -> ReachableSet | None:
+        """Returns what `reachable` does for one estimate, shape (n,), and one error shape; None if nothing passes."""
+        radius = errors.radius - self.rounding * float(self.columns.dot(np.abs(estimate)))
+        return ReachableSet(self, self.moved.dot(estimate), errors.turn, radius) if radius >= SMALLEST_RADIUS else None
 
     @np.errstate(all="ignore")
-    def shape_view(self, error_shape: np.ndarray) -> tuple[np.ndarray, float, float] | None:
-        """Returns what the test knows without an estimate: W of |z|^2 = z'Wz, 1 - h, and what rounding grows with.
+    def knows_inside(self, estimates: np.ndarray, errors: PredictedErrors, margin: float) -> np.ndarray:
+        """Returns whether |x_hat|_M + sqrt(lambda_max(M Sigma_k)) <= 1 - margin, which proves that x is in S.
 
-        W holds for radii of at least SMALLEST_RADIUS. None if the shape, (n, n), is unusable.
+        Args:
+            estimates: x_hat, shape (n, N) or (n,).
+            errors: What is known of the Sigma_k of each.
+            margin: In units of S.
         """
-        seen = self._in_space(np.zeros(self.plant.n), error_shape)
-        if seen is None:
-            return None
-        spread = float(self.columns.dot(np.sqrt(np.abs(error_shape.diagonal()))))
-        return seen.weight, 1.0 - seen.h, spread
+        level = norms(self.root.dot(estimates)) + errors.largest
+        return level <= 1.0 - margin - self.rounding * self.own_columns.dot(np.abs(estimates))
 
-    def largest_error(self, error_shape: np.ndarray) -> float:
-        """Returns a bound of sqrt(lambda_max(M Sigma_k)), with its rounding."""
-        spread = float(self.own_columns @ np.sqrt(np.abs(np.diag(error_shape))))
-        shape = self.root @ (0.5 * (error_shape + error_shape.T)) @ self.root.T
-        return max(float(np.linalg.eigvalsh(shape)[-1]) + self.rounding * spread**2, 0.0) ** 0.5
 
-    def knows_inside(self, estimate: np.ndarray, error_shape: np.ndarray, margin: float) -> bool:
-        """Returns whether |x_hat|_M + sqrt(lambda_max(M Sigma_k)) <= 1 - margin, which proves that x is in S."""
-        if self.at(estimate, error_shape) is None:
-            return False
-        reach = float(self.own_columns @ np.abs(estimate))
-        level = float(np.linalg.norm(self.root @ estimate)) + self.largest_error(error_shape)
-        return level <= 1.0 - margin - self.rounding * reach
+class ReachableSets(NamedTuple):
+    """Where next states lie: in {A x_hat + B u} + E(Sigma_pred), for each of N environments.
+
+    Attributes:
+        test: What holds for all of them.
+        offset: G A x_hat, shape (n, N).
+        turn: T of `PredictedErrors`, shape (n, n, N).
+        radius: 1 - h less rounding, shape (N,); no input passes if it is not positive. NaN if nothing is known.
+    """
+
+    test: OneStepTest
+    offset: np.ndarray
+    turn: np.ndarray
+    radius: np.ndarray
+
+    def some(self, chosen: np.ndarray) -> ReachableSets:
+        """Returns the sets of some environments, given by their indices."""
+        offset, turn, radius = (array.take(chosen, axis=-1) for array in self[1:])
+        return ReachableSets(self.test, offset, turn, radius)
+
+    def slack(self, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns slack and margin of inputs u, shape (m, N); each has shape (N,), NaN where nothing is known.
+
+        The slack is radius - |T G (A x_hat + B u)|: x+ is in S unless it is negative. The margin is
+        1 - h - |A x_hat + B u|_M less rounding, which is at most the slack.
+        """
+        center = self.offset + self.test.effect @ inputs
+        return self.radius - norms((self.turn * center).sum(axis=1)), self.radius - norms(center)
+
+    def smallest_slack(self) -> np.ndarray:
+        """Returns the slack of the worst input within the limits, shape (N,): a vertex, since the norm is convex."""
+        vertices = np.array(list(product(*((-limit, limit) for limit in self.test.plant.u_max.tolist())))).T
+        pieces = max(1, vertices.shape[1] * len(self.radius) // LARGEST_BLOCK)
+        worst = self.radius
+        for some in np.array_split(vertices, pieces, axis=1):
+            centers = self.offset[:, None] + (self.test.effect @ some)[:, :, None]
+            farthest = norms((self.turn[:, :, None] * centers).sum(axis=1)).max(axis=0)
+            worst = np.minimum(worst, self.radius - farthest)
+        return worst
+
+    def closest(self, inputs: np.ndarray, reserve: float) -> np.ndarray:
+        """Returns the inputs within the limits, shape (m, N), closest to given ones with a slack of `reserve`.
+
+        NaN where there is none.
+        """
+        effect = (self.turn[:, :, None] * self.test.effect[:, :, None]).sum(axis=1)
+        offset = (self.turn * self.offset).sum(axis=1)
+        return closest_admissible(inputs, offset, effect, self.radius - reserve, self.test.plant.u_max)
+
+
+class ReachableSet(NamedTuple):
+    """`ReachableSets` of a single environment: the same formulas without its axis, in a fifth of the time.
+
+    Attributes:
+        test: What holds for all environments.
+        offset: G A x_hat, shape (n,).
+        turn: T of `PredictedErrors`, shape (n, n).
+        radius: 1 - h less rounding, at least SMALLEST_RADIUS.
+    """
+
+    test: OneStepTest
+    offset: np.ndarray
+    turn: np.ndarray
+    radius: float
+
+    def slack(self, u: np.ndarray) -> tuple[float, float]:
+        """Returns slack and margin of an input u, shape (m,)."""
+        center = self.offset + self.test.effect.dot(u)
+        turned = self.turn.dot(center)
+        return self.radius - float(turned.dot(turned)) ** 0.5, self.radius - float(center.dot(center)) ** 0.5
+
+    @np.errstate(all="ignore")
+    def closest(self, u: np.ndarray, reserve: float) -> np.ndarray:
+        """Returns what `ReachableSets.closest` does for plants with a single input, shape (1,)."""
+        effect, offset = self.turn.dot(self.test.effect[:, 0]), self.turn.dot(self.offset)
+        form = effect.dot(effect), effect.dot(offset), offset.dot(offset)
+        return closest_on_lines(u, *form, self.radius - reserve, self.test.plant.u_max)
+
+
+def norms(vectors: np.ndarray) -> np.ndarray:
+    """Returns the Euclidean norms of the columns of an array (n, N), shape (N,)."""
+    return np.sqrt((vectors * vectors).sum(axis=0))
 
 
 def certified_root(L: np.ndarray) -> np.ndarray:
@@ -151,73 +205,17 @@ def certified_root(L: np.ndarray) -> np.ndarray:
     raise CertificateError("the safe set is too thin to decide in float64 what lies in it")
 
 
-def _is_shape(matrix: np.ndarray) -> bool:
-    """Returns whether a matrix (n, n) is positive semidefinite up to rounding, in whatever units."""
-    padded = matrix.copy()
-    padded.flat[:: len(matrix) + 1] *= 1.0 + INDEFINITE
-    padded.flat[:: len(matrix) + 1] += 1e-300  # a state known perfectly
-    return dpotrf(0.5 * (padded + padded.T))[1] == 0
+def require_computable(certificate: Certificate, plant: LinearPlant) -> None:
+    """Raises unless float64 computes K x_hat on S more accurately than (I) and (U) make room for.
 
+    D_u allows a shift by 2^-24 u_max, twice what rounding an action to float32 does; the other half is for this.
 
-class Outlook:
-    """The test at one estimate: an input u keeps x+ in S if |offset + effect u| <= radius in the norm of the test.
-
-    Args:
-        test: What holds at every estimate.
-        offset: G A x_hat, shape (n,), where |z|_M = |G z|.
-        values: Eigenvalues of G Sigma_pred G', shape (n,), ascending.
-        axes: Its eigenvectors, shape (n, n).
-        loss: What rounding may do.
-
-    Attributes:
-        h: Of the test.
-        radius: 1 - h less rounding; no input passes if it is negative.
+    Raises:
+        CertificateError: If it does not.
     """
-
-    def __init__(
-        self, test: OneStepTest, offset: np.ndarray, values: np.ndarray, axes: np.ndarray, loss: float
-    ) -> None:
-        self.h = h = sqrt(values[-1])
-        self.radius = 1.0 - h - loss
-        self._test, self._reached = test, offset
-        turn = axes
-        if self.radius >= SMALLEST_RADIUS:
-            turn = axes * np.sqrt(h * (1.0 - h) / (h - values))
-        else:
-            self.radius = min(self.radius, 0.0)
-        self._turn = turn
-        self._offset, self._effect = offset.dot(turn), test.effect.T.dot(turn)
-
-    @property
-    def weight(self) -> np.ndarray:
-        """W with |z|^2 = z'Wz in the norm of the test, shape (n, n)."""
-        return self._turn.dot(self._turn.T)
-
-    @np.errstate(all="ignore")
-    def judge(self, u: list[float]) -> tuple[float, float]:
-        """Returns room and margin of an input u, m numbers.
-
-        The room is radius - |offset + effect u|: x+ is in S unless it is negative. The margin is
-        1 - h - |A x_hat + B u|_M, less rounding, which is at most the room.
-        """
-        moved = self._offset + np.dot(u, self._effect)
-        reached = self._reached + np.dot(u, self._test.effect.T)
-        return self.radius - float(moved.dot(moved)) ** 0.5, self.radius - float(reached.dot(reached)) ** 0.5
-
-    @np.errstate(all="ignore")
-    def smallest_room(self) -> float:
-        """Returns the room of the worst input within the limits: a vertex, since the norm is convex."""
-        moved = self._offset + self._test.vertices @ self._effect
-        return self.radius - float((moved * moved).sum(axis=1).max()) ** 0.5
-
-    @np.errstate(all="ignore")
-    def closest(self, u: list[float], reserve: float) -> list[float] | None:
-        """Returns the input within the limits, m numbers, closest to u with a room of `reserve`; None if none has."""
-        target = self.radius - reserve
-        if len(u) > 1:
-            found = closest_admissible(np.array(u), self._offset, self._effect.T, target, self._test.plant.u_max)
-            return None if found is None else found.tolist()
-        effect, offset = self._effect[0], self._offset
-        a, b, c = float(effect @ effect), float(effect @ offset), float(offset @ offset)
-        found = closest_on_line(u[0], a, b, c, target, self._test.plant.u_max.item())
-        return None if found is None else [found]
+    extent = np.sqrt(np.diag(certificate.L))
+    if len(certificate.error_shapes):
+        extent = extent + np.sqrt(np.diagonal(certificate.error_shapes, axis1=1, axis2=2)).max(axis=0)
+    error = (plant.n + 2) * np.finfo(float).eps * (np.abs(certificate.K) @ extent)
+    if (error > 0.25 * float(ACTION_ROUNDING) * plant.u_max).any():
+        raise CertificateError("the gain is too large against the input limits to compute K x_hat in float64")

@@ -1,114 +1,155 @@
-"""The closest admissible input: projection onto the intersection of a box and an ellipsoid test."""
+"""The closest admissible inputs: projection onto the intersection of a box and an ellipsoid, for many at once."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-# A gain below this share of the largest counts as a direction that does not move the state.
+# A gain below this fraction of the largest counts as a direction that does not move the state.
 FLAT = 1e-13
 # Newton steps on the multiplier; from the left on a concave function they rise monotonically and converge fast.
 NEWTON_STEPS = 60
 RELATIVE_TOLERANCE = 1e-12
 
 
-def closest_on_line(wanted: float, a: float, b: float, c: float, radius: float, limit: float) -> float | None:
-    """Returns argmin |u - wanted| over c + 2 b u + a u^2 <= radius^2, |u| <= limit, or None; |wanted| <= limit."""
-    square = b * b - a * (c - radius * radius)
-    if radius < 0.0 or square < 0.0:
-        return None
-    if a <= 0.0:
-        return wanted if c <= radius * radius else None
-    half = square**0.5
-    low, high = (-b - half) / a, (-b + half) / a
-    if low > limit or high < -limit:
-        return None
-    return low if wanted < low else high if wanted > high else wanted
-
-
 def closest_admissible(
-    wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, radius: float, limit: np.ndarray
-) -> np.ndarray | None:
-    """Returns argmin |u - wanted| over |offset + effect u| <= radius, |u_i| <= limit_i; None if there is none.
+    wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, radius: np.ndarray, limit: np.ndarray
+) -> np.ndarray:
+    """Returns argmin |u - wanted| over |offset + effect u| <= radius, |u_i| <= limit_i; NaN where there is none.
 
-    By branching on input limits: if the solution without the limits breaks some of them, then at the true solution
-    at least one of those is attained (otherwise a small move towards the former would stay feasible and be closer).
+    One input is an interval. Otherwise by branching on input limits: if the solution without the limits breaks some of
+    them, then at the true solution at least one of those is attained (otherwise a small move towards the former would
+    stay feasible and be closer). The candidates of all problems, each a problem and the limits it holds, are solved
+    together; one that is farther away than a solution found is not branched on.
 
     Args:
-        wanted: Shape (m,).
-        offset: Shape (n,).
-        effect: Shape (n, m).
-        radius: Of the ball; none is admissible if it is negative.
+        wanted: Shape (m, N), within the limits.
+        offset: Shape (n, N).
+        effect: Shape (n, m, N).
+        radius: Of the ball, shape (N,); nothing is admissible if it is negative or NaN.
         limit: Shape (m,), > 0.
+
+    Returns:
+        Shape (m, N).
     """
-    if radius < 0.0:
-        return None
-    best: tuple[float, np.ndarray | None] = (np.inf, None)
-    pending: list[dict[int, float]] = [{}]
-    seen: set[frozenset[tuple[int, float]]] = set()
-    while pending:
-        fixed = pending.pop()
-        candidate = _with_fixed(wanted, offset, effect, radius, fixed)
-        if candidate is None:
-            continue
-        distance = float(np.linalg.norm(candidate - wanted))
-        if distance >= best[0]:
-            continue
-        broken = [i for i in range(len(wanted)) if i not in fixed and abs(candidate[i]) > limit[i]]
-        if not broken:
-            best = (distance, candidate)
-        for i in broken:
-            branch = {**fixed, i: float(np.copysign(limit[i], candidate[i]))}
-            if (key := frozenset(branch.items())) not in seen:
-                seen.add(key)
-                pending.append(branch)
-    return best[1]
+    if len(wanted) == 1:
+        effect = effect[:, 0]
+        form = (effect * effect).sum(axis=0), (effect * offset).sum(axis=0), (offset * offset).sum(axis=0)
+        return closest_on_lines(wanted, *form, radius, limit[0])
+    closest, distance = np.full(wanted.shape, np.nan), np.full(len(radius), np.inf)
+    problem = np.flatnonzero(radius >= 0.0)
+    held = np.zeros((len(wanted), len(problem)))  # the sign of the limit at which an input is held, 0 if it is free
+    while problem.size:  # every turn holds one limit more
+        start = np.where(held == 0.0, wanted[:, problem], held * limit[:, None])
+        u = _onto_balls(start, offset[:, problem], effect[:, :, problem], radius[problem], held == 0.0)
+        away = np.sqrt(((u - wanted[:, problem]) ** 2).sum(axis=0))
+        beyond = (np.abs(u) > limit[:, None]) & (held == 0.0)
+        solved = np.flatnonzero((away < distance[problem]) & ~beyond.any(axis=0))
+        np.minimum.at(distance, problem[solved], away[solved])
+        best = solved[away[solved] == distance[problem[solved]]]
+        closest[:, problem[best]] = u[:, best]
+        problem, held = _branched(problem, held, np.sign(u), beyond & (away < distance[problem]))
+    return closest
 
 
-def _with_fixed(
-    wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, radius: float, fixed: dict[int, float]
-) -> np.ndarray | None:
-    """Returns the closest input in the ball test alone, with some entries held; None if the test cannot be met."""
-    solution = wanted.copy()
-    for i, value in fixed.items():
-        solution[i] = value
-    free = [i for i in range(len(wanted)) if i not in fixed]
-    held = list(fixed)
-    moved = offset + effect[:, held] @ solution[held]
-    if np.linalg.norm(moved + effect[:, free] @ solution[free]) <= radius:
-        return solution
-    if not free:
-        return None
-    closest = _onto_ball(solution[free], moved, effect[:, free], radius)
-    if closest is None:
-        return None
-    solution[free] = closest
-    return solution
+def _branched(
+    problem: np.ndarray, held: np.ndarray, signs: np.ndarray, broken: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the candidates, each once, that hold one more of the limits broken, at the sign it is broken with."""
+    which, parent = np.nonzero(broken)
+    if not parent.size:
+        return parent, held[:, parent]
+    branches = held[:, parent]
+    branches[which, np.arange(len(parent))] = signs[which, parent]
+    candidates = np.unique(np.vstack([problem[parent], branches]), axis=1)
+    return candidates[0].astype(np.int64), candidates[1:]
 
 
-def _onto_ball(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, radius: float) -> np.ndarray | None:
-    """Returns argmin |u - wanted| on |offset + effect u| = radius, for a `wanted` outside; None if out of reach.
+def closest_on_lines(wanted: Any, a: Any, b: Any, c: Any, radius: Any, limit: Any) -> Any:
+    """Returns argmin |u - wanted| over a u^2 + 2 b u + c <= radius^2, |u| <= limit; NaN where there is none.
+
+    Numbers or arrays of them; |wanted| <= limit.
+    """
+    excess = c - radius * radius
+    half = np.sqrt(b * b - a * excess)
+    low, high = (-b - half) / a, (-b + half) / a
+    closest = np.minimum(np.maximum(wanted, low), high)
+    found = (radius >= 0.0) & (low <= limit) & (high >= -limit)
+    if not np.all(a):  # an input that moves nothing
+        found = np.where(a > 0.0, found, (radius >= 0.0) & (excess <= 0.0))
+        closest = np.where(a > 0.0, closest, wanted)
+    return np.where(found, closest, np.nan)
+
+
+def _onto_balls(
+    start: np.ndarray, offset: np.ndarray, effect: np.ndarray, radius: np.ndarray, free: np.ndarray
+) -> np.ndarray:
+    """Returns argmin |u - start| over |offset + effect u| <= radius, moving free inputs only; NaN where there is none.
 
     With effect = U diag(r) V' and s = r^2 the minimizer for multiplier t is c_i + (w_i - c_i) / (1 + t s_i) in the axes
     V, c the center of the test; 1 / sqrt(excess) is concave and increasing in t (as in trust-region methods).
+
+    Args:
+        start: Shape (m, F).
+        offset: Shape (n, F).
+        effect: Shape (n, m, F).
+        radius: Shape (F,).
+        free: Shape (m, F).
+
+    Returns:
+        Shape (m, F).
     """
-    images, gains, axes = np.linalg.svd(effect, full_matrices=False)
-    moves = gains > FLAT * max(float(gains[0]), 0.0)
-    images, gains, axes = images[:, moves], gains[moves], axes[moves].T
-    seen = images.T @ offset
-    center = -seen / gains
-    away = axes.T @ wanted - center
-    residual = offset - images @ seen
-    reach = radius**2 - float(residual @ residual)
-    s = gains**2
-    if reach < 0.0 or not moves.any():
-        return None
-    multiplier = 0.0
+    reached = offset + (effect * start).sum(axis=1)
+    images, axes = _orthogonal_images(effect * free)
+    s = (images * images).sum(axis=0)
+    s = np.where(s > FLAT**2 * s.max(axis=0), s, 0.0)
+    # From here in the axes: how far the start is from the center, and what no input can change of the distance.
+    away = np.where(s > 0.0, (images * reached[:, None]).sum(axis=0) / s, 0.0)
+    rest = reached - (images * away).sum(axis=1)
+    reach = radius * radius - (rest * rest).sum(axis=0)
+    multiplier = _multipliers(s, away, reach)
+    move = away / (1.0 + multiplier * s) - away
+    solution = np.where(free, start + (axes * move).sum(axis=1), start)
+    solution = np.where((reach >= 0.0) & (s > 0.0).any(axis=0), solution, np.nan)
+    return np.where((reached * reached).sum(axis=0) <= radius * radius, start, solution)
+
+
+def _multipliers(s: np.ndarray, away: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Returns t >= 0, shape (F,), with sum_i s_i (away_i / (1 + t s_i))^2 <= reach, by Newton's method.
+
+    Args:
+        s: Shape (k, F).
+        away: Shape (k, F).
+        reach: Shape (F,); where it is negative the result means nothing.
+    """
+    multiplier = np.zeros(len(reach))
     for _ in range(NEWTON_STEPS):
-        share = 1.0 / (1.0 + multiplier * s)
-        excess = float((s * (away * share) ** 2).sum())
-        if excess <= reach * (1.0 + RELATIVE_TOLERANCE):
+        shrunk = 1.0 / (1.0 + multiplier * s)
+        parts = s * (away * shrunk) ** 2
+        excess = parts.sum(axis=0)
+        unmet = excess > reach * (1.0 + RELATIVE_TOLERANCE)
+        if not (unmet & (reach >= 0.0)).any():
             break
-        slope = float((s**2 * away**2 * share**3).sum())
-        multiplier += excess / slope * (np.sqrt(excess / reach) - 1.0) if reach > 0.0 else 1e300
-    moved = axes @ (away / (1.0 + multiplier * s) - away)
-    return wanted + moved
+        growth = excess / (s * parts * shrunk).sum(axis=0) * (np.sqrt(excess / reach) - 1.0)
+        multiplier = np.where(unmet, multiplier + np.minimum(growth, 1e300), multiplier)
+    return multiplier
+
+
+def _orthogonal_images(effect: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns effect V with orthogonal columns, shape (n, k, F), and V with orthonormal ones, shape (m, k, F).
+
+    V leaves out only directions that move nothing. Two inputs, the commonest case, need one rotation by an angle in
+    closed form; more inputs a singular value decomposition, a hundred times slower in large batches.
+    """
+    if effect.shape[1] > 2:
+        images, gains, axes = np.linalg.svd(effect.transpose(2, 0, 1), full_matrices=False)
+        return (images * gains[:, None]).transpose(1, 2, 0), axes.transpose(2, 1, 0)
+    first, second = effect[:, 0], effect[:, 1]
+    a, b, d = (first * first).sum(axis=0), (first * second).sum(axis=0), (second * second).sum(axis=0)
+    twist = (d - a) / (2.0 * b)
+    tangent = np.where(b == 0.0, 0.0, np.copysign(1.0, twist) / (np.abs(twist) + np.sqrt(1.0 + twist * twist)))
+    cosine = 1.0 / np.sqrt(1.0 + tangent * tangent)
+    sine = tangent * cosine
+    images = np.stack([cosine * first - sine * second, sine * first + cosine * second], axis=1)
+    return images, np.array([[cosine, sine], [-sine, cosine]])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -11,10 +11,12 @@ from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, S
 
 from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv
 from ncs_gym.envs.env import applied_input, ncs_env
-from ncs_gym.validation import as_number, shown
+from ncs_gym.validation import as_number, as_numbers, shown
 from shields.certificate import Certificate
 from shields.runtime.filter import SafetyFilter
-from shields.runtime.guarantee import ProofTracker, starts_inside
+from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, Report, starts_inside
+
+T = TypeVar("T")
 
 # What changes, repeats or swallows actions between the shield and the plant.
 REFUSED = (gym.ActionWrapper, RepeatAction, StickyAction, MaxAndSkipObservation, Autoreset)
@@ -68,15 +70,16 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         penalty: float = 0.0,
     ) -> None:
         RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty)
-        plant = _plant_behind(env)
+        inner = environment_behind(env, gym.Wrapper, (*REFUSED, SafetyShield), NCSEnv)
+        if env.action_space != inner.action_space:
+            raise ValueError(f"a wrapper inside the shield changes the action space to {env.action_space}")
         gym.Wrapper.__init__(self, env)
         self.penalty = as_number(penalty, "penalty", low=0.0)
         if certificate is not None and not isinstance(certificate, Certificate):
             raise ValueError(f"certificate must be a Certificate or None, got {shown(certificate)}")
-        contract = ncs_env(env).contract
-        self.certificate = certificate_for(plant, contract) if certificate is None else certificate
-        self.filter = SafetyFilter(self.certificate, plant, mode)
-        self._proof = ProofTracker(self.filter)
+        self.certificate = certificate_for(inner.plant, inner.contract) if certificate is None else certificate
+        self.filter = SafetyFilter(self.certificate, inner.plant, mode)
+        self._monitor = GuaranteeMonitor(self.filter)
         self._clock: tuple[int, int] | None = None
         self._is_drawn = env.unwrapped.render_mode is not None
 
@@ -91,12 +94,12 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             if self._read_clock() == before:  # refused before anything moved
                 self._clock = before
             raise
-        clock = self._read_clock()
-        self._proof.start(starts_inside(self.certificate, ncs_env(self.env).start), clock[1] == 0, info)
-        self._estimate, self._error_shape = np.array(info["estimate"]), np.array(info["error_shape"])
+        clock, self._report = self._read_clock(), self._observed(info)
+        known_inside = starts_inside(self.certificate, ncs_env(self.env).start)
+        self._state = self._monitor.start(known_inside, clock[1] == 0, self._report)
         self._interventions = 0
         u = np.zeros(self.filter.plant.m)
-        margin = self.filter.margin(self._estimate, self._error_shape, u)
+        margin = self.filter.margin(self._report.estimate, info["error_shape"], u)
         self._clock = clock
         return observation, info | self._info(u, u, margin, intervened=False)
 
@@ -110,20 +113,29 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         if self._clock is None:
             raise gym.error.ResetNeeded("call reset before the first step")
         proposed = applied_input(self.filter.plant, action)
-        decision = self.filter.decide(self._estimate, self._error_shape, proposed)
+        decision = self.filter.decide_knowing(self._report.estimate, self._report.errors, proposed)
         if decision.intervened and self.filter.mode != "monitor":
             action = (decision.input / self.filter.plant.u_max).astype(np.float32)
         if self._is_drawn:
             self._annotate(proposed, self._interventions + decision.intervened, intervened=decision.intervened)
         (episode, step), self._clock = self._clock, INTERRUPTED
         observation, reward, terminated, truncated, info = self.env.step(action)
-        clock = self._read_clock()
-        self._proof.step(decision, clock == (episode, step + 1), info)
-        self._estimate, self._error_shape = np.array(info["estimate"]), np.array(info["error_shape"])
+        clock, self._report = self._read_clock(), self._observed(info)
+        applied = as_numbers(info["input"])
+        same_input = applied is not None and applied.tolist() == decision.input.tolist()
+        moved_once = clock == (episode, step + 1)
+        self._state = self._monitor.advance(self._state, decision, moved_once, same_input, self._report)
         self._interventions += decision.intervened
         self._clock = clock
         info = info | self._info(proposed, decision.input, decision.margin, intervened=decision.intervened)
         return observation, float(reward) - self.penalty * decision.intervened, terminated, truncated, info
+
+    def _observed(self, info: dict[str, Any]) -> Report:
+        """Returns what the decision and the guarantee need of an info, as copies: callers may write into theirs."""
+        estimate, n = as_numbers(info["estimate"]), self.filter.plant.n
+        fits = estimate is not None and estimate.shape == (n,)
+        estimate = np.array(estimate) if fits else np.full(n, np.nan)
+        return Report(estimate, self.filter.errors_of(info["error_shape"]), info["assumption_violated"] not in (False,))
 
     def _read_clock(self) -> tuple[int, int]:
         """Returns the number of episodes begun and of steps taken in this one."""
@@ -143,11 +155,11 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         ncs_env(self.env).annotate(note)
 
     def _info(self, proposed: np.ndarray, applied: np.ndarray, margin: float, *, intervened: bool) -> dict[str, Any]:
-        reason = self._proof.reason
+        reason = EXPLANATIONS[self._monitor.reasons(self._state)]
         return {
             "shield_intervened": intervened,
             "input_proposed": proposed.copy(),
-            "shield_correction": float(np.linalg.norm(applied - proposed)),
+            "shield_correction": float(np.linalg.norm(applied - proposed)) if intervened else 0.0,
             "shield_margin": margin,
             "shield_guaranteed": not reason,
             "shield_reason": reason,
@@ -163,26 +175,33 @@ def certificate_for(plant: LinearPlant, contract: ChannelContract | None = None)
     """
     key = plant.fingerprint, contract
     if key not in _synthesized:
-        from shields.synthesis.synthesize import (
-            synthesize,  # takes the solver, which who has a certificate does without
-        )
+        from shields.synthesis import synthesize  # the solver, which who has a certificate does without
 
         _synthesized[key] = synthesize(plant, contract=contract)
     return _synthesized[key]
 
 
-def _plant_behind(env: gym.Env) -> LinearPlant:
-    """Returns the plant of the innermost environment after looking at every wrapper around it."""
+def environment_behind(env: Any, wrappers: type, refused: tuple[type, ...], wanted: type[T], hint: str = "") -> T:
+    """Returns the innermost environment after looking at every wrapper around it.
+
+    Args:
+        env: Environment or vector environment.
+        wrappers: Base class of its wrappers.
+        refused: Wrappers that may not be inside a shield.
+        wanted: Class of the innermost environment.
+        hint: What to do about another one.
+
+    Raises:
+        ValueError: If a wrapper is refused, or the innermost environment is of another class.
+    """
     layer = env
-    while isinstance(layer, gym.Wrapper):
-        if isinstance(layer, (*REFUSED, SafetyShield)):
+    while isinstance(layer, wrappers):
+        if isinstance(layer, refused):
             raise ValueError(
                 f"the shield must be inside {type(layer).__name__}, which changes or repeats actions: wrap the shield "
                 "around the environment first"
             )
         layer = layer.env
-    if not isinstance(layer, NCSEnv):
-        raise ValueError(f"the shield needs an NCSEnv inside, got {type(layer).__name__}")
-    if env.action_space != layer.action_space:
-        raise ValueError(f"a wrapper inside the shield changes the action space to {env.action_space}")
-    return layer.plant
+    if not isinstance(layer, wanted):
+        raise ValueError(f"the shield needs an {wanted.__name__} inside, got {type(layer).__name__}{hint}")
+    return layer

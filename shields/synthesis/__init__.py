@@ -1,1 +1,11 @@
-"""Offline synthesis of a safe set and its gain by semidefinite programming."""
+"""Offline synthesis of a robust control invariant ellipsoid with its gain, by semidefinite programming.
+
+`synthesize` looks for the largest certified set: the design problem is scaled, an initial design is found for fixed
+multipliers or from a gain of largest margin, alternation between the linear matrix inequalities and the multipliers
+enlarges the set, and the result is verified exactly. `certify` proves a given set and gain. Importing this package
+imports the solver.
+"""
+
+from shields.synthesis.certification import certify, synthesize
+
+__all__ = ["certify", "synthesize"]

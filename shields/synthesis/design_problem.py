@@ -2,24 +2,114 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 
 from ncs_gym import ChannelContract, ErrorSet, ErrorSetError, LinearPlant, UnstablePlantError, certified_error_set
+from ncs_gym.uncertainty.ellipsoid import is_inside, joined
 from shields.errors import Infeasible
-from shields.synthesis.semidefinite_programs import ScaledProblem, largest_box_ellipsoid, scaled_problem
+from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
+from shields.verification import ACTION_ROUNDING
 
-# The certificate's Sigma and D are larger than the environment's by this, so that another machine's rounding (of a
-# Lyapunov solution, of a chi-square quantile) stays inside.
-GROWTH = 1.0 + 1e-9
+# The certificate's Sigma and D are larger than the environment's by this factor, so that another machine's rounding (of
+# a Lyapunov solution, of a chi-square quantile) stays inside.
+INFLATION = 1.0 + 1e-9
+# Axes of an error set are lengthened to at least this fraction of its longest one in the semidefinite programs; exact
+# verification uses the error set itself.
+_SMALLEST_AXIS_RATIO = 0.01
 
 
-def design_problem(plant: LinearPlant, contract: ChannelContract | None = None) -> tuple[ScaledProblem, ErrorSet]:
-    """Returns the scaled problem and the error set, with its shapes a little larger than the environment's.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DesignProblem:
+    """The plant in scaled coordinates z = T^-1 x and u / u_max, with T T' the largest ellipsoid in the safe box.
+
+    Attributes:
+        A: State matrix in scaled coordinates, shape (n, n).
+        B: Input matrix in scaled coordinates, shape (n, m).
+        C: Rows of the safe box in scaled coordinates, shape (k, n).
+        D_u: Shape of the disturbance set with the rounding of actions (theory.md section 3), scaled, (n, n).
+        error_shapes: Shapes of the error sets for which K x_hat must be safe, scaled, (k, n, n).
+        transform: The transformation T, shape (n, n).
+        u_max: Input limits in physical units, shape (m,).
+        rounding: Multiplier s of D_u.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D_u: np.ndarray
+    error_shapes: np.ndarray
+    transform: np.ndarray
+    u_max: np.ndarray
+    rounding: float
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return self.A.shape[0]
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return self.B.shape[1]
+
+    @property
+    def maximal_error_shapes(self) -> np.ndarray:
+        """The error sets that lie in no other one, thickened where they are nearly flat, shape (l, n, n).
+
+        The linearization of L Sigma^-1 L allows hardly any change of L if Sigma is nearly flat. A larger error set is
+        sound.
+        """
+        kept = list(self.error_shapes)
+        for Sigma in self.error_shapes:
+            others = [other for other in kept if other is not Sigma]
+            if any(is_inside(Sigma, other) for other in others):
+                kept = others
+        longest = np.linalg.eigvalsh(np.stack(kept))[:, -1]
+        return np.stack(kept) + _SMALLEST_AXIS_RATIO**2 * longest[:, None, None] * np.eye(self.n)
+
+    @property
+    def covering_error_shape(self) -> np.ndarray:
+        """The shape of an ellipsoid that contains every error set, (n, n)."""
+        return reduce(joined, self.error_shapes)
+
+    def to_physical(self, L: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns L (n, n) and K (m, n) in physical units."""
+        shape = self.transform @ L @ self.transform.T
+        return 0.5 * (shape + shape.T), np.diag(self.u_max) @ np.linalg.solve(self.transform.T, K.T).T
+
+    def to_scaled(self, L: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns L (n, n) and K (m, n) in scaled coordinates."""
+        inverse = np.linalg.inv(self.transform)
+        return inverse @ L @ inverse.T, (K @ self.transform) / self.u_max[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class CandidateDesign:
+    """A candidate for an invariant set in scaled coordinates, not yet verified.
+
+    Attributes:
+        L: Shape of the set, (n, n).
+        K: Gain, shape (m, n).
+        multipliers: Multipliers (lx, le, ld) of (I).
+        inputs: Multipliers mu_i of (U), shape (m,).
+        log_det: Logarithm of det L; 0 is the largest ellipsoid in the safe box.
+    """
+
+    L: np.ndarray
+    K: np.ndarray
+    multipliers: tuple[float, float, float]
+    inputs: np.ndarray
+    log_det: float
+
+
+def design_problem(plant: LinearPlant, contract: ChannelContract | None = None) -> tuple[DesignProblem, ErrorSet]:
+    """Returns the scaled design problem, and the error set with its shapes a little larger than the environment's.
 
     Raises:
-        Infeasible: If the plant has no error set or its box is unbounded.
+        Infeasible: If the plant has no error set or its safe box is unbounded.
     """
     free = plant.n - int(np.linalg.matrix_rank(plant.C))
     if free:
@@ -29,16 +119,39 @@ def design_problem(plant: LinearPlant, contract: ChannelContract | None = None) 
             free,
         )
     try:
-        errors = grown(certified_error_set(plant, contract))
+        errors = _inflated(certified_error_set(plant, contract))
     except UnstablePlantError as error:
         raise Infeasible(f"(E1) cannot hold: {error}", "E1", plant.spectral_radius - 1.0) from error
     except ErrorSetError as error:
         raise Infeasible(str(error), "E1", 0.0) from error
     shapes = errors.Sigma[None] if errors.ages is None else errors.ages.shapes[:-1]
-    return scaled_problem(plant, shapes, largest_box_ellipsoid(plant.C)), errors
+    return _scaled(plant, shapes, largest_box_ellipsoid(plant.C)), errors
 
 
-def grown(errors: ErrorSet) -> ErrorSet:
-    """Returns an error set with every shape larger by GROWTH; (E0) to (C2) keep holding."""
-    ages = errors.ages and replace(errors.ages, shapes=GROWTH * errors.ages.shapes)
-    return replace(errors, Sigma=GROWTH * errors.Sigma, ages=ages)
+def _inflated(errors: ErrorSet) -> ErrorSet:
+    """Returns an error set with every shape larger by INFLATION; (E0), (E1) and (C0) to (C2) keep holding."""
+    ages = errors.ages and replace(errors.ages, shapes=INFLATION * errors.ages.shapes)
+    return replace(errors, Sigma=INFLATION * errors.Sigma, ages=ages)
+
+
+def _scaled(plant: LinearPlant, error_shapes: np.ndarray, box: np.ndarray) -> DesignProblem:
+    """Returns the design problem for error sets (k, n, n) and the largest ellipsoid in the safe box (n, n)."""
+    T = np.linalg.cholesky(box)
+    D = plant.disturbance.shape
+    step = plant.B * (float(ACTION_ROUNDING) * plant.u_max)
+    rounding = plant.m * step @ step.T
+    weight = np.linalg.inv(box)
+    ratio = np.vdot(weight, rounding) / max(float(np.vdot(weight, D)), 1e-30)
+    s = float(np.sqrt(np.clip(ratio, 1e-16, 1.0)))
+    inverse = np.linalg.inv(T)
+    D_u = (1.0 + s) * D + (1.0 + 1.0 / s) * rounding
+    return DesignProblem(
+        A=inverse @ plant.A @ T,
+        B=inverse @ plant.B @ np.diag(plant.u_max),
+        C=plant.C @ T,
+        D_u=inverse @ D_u @ inverse.T,
+        error_shapes=inverse @ error_shapes @ inverse.T,
+        transform=T,
+        u_max=plant.u_max,
+        rounding=s,
+    )

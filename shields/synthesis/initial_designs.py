@@ -1,4 +1,4 @@
-"""Where the search for an invariant set begins: without a good start, alternation stalls."""
+"""Initial designs for the alternation, which stalls if it begins at a poor one (theory.md section 3)."""
 
 from __future__ import annotations
 
@@ -7,75 +7,82 @@ from itertools import product
 
 import numpy as np
 
-from shields.synthesis.max_margin_gain import RoomyGain, roomiest_gain
-from shields.synthesis.multipliers import best_input_shares
-from shields.synthesis.semidefinite_programs import Design, InvariantSetProgram, ScaledProblem
+from shields.synthesis.design_problem import CandidateDesign, DesignProblem
+from shields.synthesis.invariant_set_program import InvariantSetProgram
+from shields.synthesis.max_margin_gain import MaxMarginGain, max_margin_gain
+from shields.synthesis.multipliers import best_input_multipliers
 
-# (lx, le / (1 - lx)) to start from; without good starts the alternation stalls (theory.md section 3).
-STARTS = ((0.85, 0.3), (0.85, 0.1), (0.92, 0.3), (0.92, 0.1), (0.75, 0.3), (0.6, 0.2), (0.97, 0.2))
-START_INPUT_SHARE = 0.8
-# The invariant set of the gain that bears most is enlarged by at most this to start from.
-LARGEST_GROWTH = 100.0
-# It counts if exact verification has this much room.
-ENOUGH = 1.0 + 1e-5
-# Within this of the box ellipsoid's log det nothing is left to gain.
-CLOSE_ENOUGH = 2e-4
+# The multiplier lx and the fraction le / (1 - lx) of the initial designs.
+_INITIAL_MULTIPLIERS = ((0.85, 0.3), (0.85, 0.1), (0.92, 0.3), (0.92, 0.1), (0.75, 0.3), (0.6, 0.2), (0.97, 0.2))
+_INITIAL_INPUT_MULTIPLIER = 0.8
+# The invariant set of the max-margin gain is enlarged by at most this factor before X is linearized there.
+_LARGEST_ENLARGEMENT = 100.0
+# Exact verification needs a margin a little above 1.
+SUFFICIENT_MARGIN = 1.0 + 1e-5
+# A design whose log det is within this of the box ellipsoid's cannot be improved noticeably.
+VOLUME_TOLERANCE = 2e-4
 
 Progress = Callable[[str], None]
 
 
-def best_start(problem: ScaledProblem, program: InvariantSetProgram, progress: Progress) -> Design | None:
-    """Returns the design of the cheapest kind of start that finds one; None if there is none."""
-    design = plain_start(problem, program, progress) if len(problem.Sigmas) == 1 else None
-    return design or roomy_start(problem, program, progress)
+def initial_design(problem: DesignProblem, program: InvariantSetProgram, progress: Progress) -> CandidateDesign | None:
+    """Returns a feasible design, from fixed multipliers if possible and else from a gain; None if none is found."""
+    design = _from_fixed_multipliers(problem, program, progress) if len(problem.error_shapes) == 1 else None
+    return design or _from_max_margin_gain(problem, program, progress)
 
 
-def plain_start(problem: ScaledProblem, program: InvariantSetProgram, progress: Progress) -> Design | None:
-    """Returns the best design over a handful of shares and two linearizations."""
-    last = problem.Sigmas[-1]
-    near = last / float(np.linalg.eigvalsh(last)[-1])
-    inputs = np.full(problem.m, START_INPUT_SHARE)
+def multiplier_triple(lx: float, error_fraction: float) -> tuple[float, float, float]:
+    """Returns (lx, le, ld) with sum 1, given lx and the fraction le / (1 - lx)."""
+    return float(lx), float((1.0 - lx) * error_fraction), float((1.0 - lx) * (1.0 - error_fraction))
+
+
+def volume_text(design: CandidateDesign | None) -> str:
+    """Returns the volume of a design's set for a line of progress."""
+    return "none found yet" if design is None else f"{np.exp(0.5 * design.log_det):.4f} of the box ellipsoid's volume"
+
+
+def _from_fixed_multipliers(
+    problem: DesignProblem, program: InvariantSetProgram, progress: Progress
+) -> CandidateDesign | None:
+    """Returns the best design over a few multipliers and two linearizations."""
+    Sigma = problem.error_shapes[-1]
+    normalized = Sigma / float(np.linalg.eigvalsh(Sigma)[-1])
+    inputs = np.full(problem.m, _INITIAL_INPUT_MULTIPLIER)
     best = None
-    starts = list(product(STARTS, (np.eye(problem.n), near)))
-    for turn, ((state, part), linearize_at) in enumerate(starts):
-        design = program.solve(as_shares(state, part), inputs, linearize_at)
+    trials = list(product(_INITIAL_MULTIPLIERS, (np.eye(problem.n), normalized)))
+    for trial, ((lx, error_fraction), linearize_at) in enumerate(trials):
+        design = program.solve(multiplier_triple(lx, error_fraction), inputs, linearize_at)
         if design is not None and (best is None or design.log_det > best.log_det):
             best = design
-        progress(f"start {turn + 1} of {len(starts)}: {volume_of(best)}")
-        if best is not None and -best.log_det < CLOSE_ENOUGH:
+        progress(f"initial design {trial + 1} of {len(trials)}: {volume_text(best)}")
+        if best is not None and -best.log_det < VOLUME_TOLERANCE:
             break
     return best
 
 
-def roomy_start(problem: ScaledProblem, program: InvariantSetProgram, progress: Progress) -> Design | None:
-    """Returns a design near the gain that bears the largest radii; None if they are smaller than those given."""
-    for Sigma in (problem.Sigmas[-1], problem.covering) if len(problem.Sigmas) > 1 else problem.Sigmas:
-        gain = roomiest_gain(problem, Sigma)
-        reach = 0.0 if gain is None else gain.reach
-        progress(f"start at the gain that bears most: {reach:.3f} of the radii given")
-        if gain is None or reach < ENOUGH:
+def _from_max_margin_gain(
+    problem: DesignProblem, program: InvariantSetProgram, progress: Progress
+) -> CandidateDesign | None:
+    """Returns a design near the gain of largest margin; None if that margin is below 1."""
+    several = len(problem.error_shapes) > 1
+    gain = None
+    for Sigma in (problem.error_shapes[-1], problem.covering_error_shape) if several else problem.error_shapes:
+        gain = max_margin_gain(problem, Sigma)
+        progress(f"max-margin gain: it tolerates {0.0 if gain is None else gain.margin:.3f} of the given radii")
+        if gain is None or gain.margin < SUFFICIENT_MARGIN:
             continue
-        L = min(reach**2, LARGEST_GROWTH) * gain.L
-        design = program.solve(gain.shares, best_input_shares(Sigma[None], L, gain.K), L)
+        L = min(gain.margin**2, _LARGEST_ENLARGEMENT) * gain.L
+        design = program.solve(gain.multipliers, best_input_multipliers(Sigma[None], L, gain.K), L)
         if design is not None:
             return design
-    # Thickened error sets by age may leave the program nothing where the sets themselves leave something.
-    several = len(problem.Sigmas) > 1
-    return _as_design(gain, problem.covering) if several and gain is not None and reach >= ENOUGH else None
+    # The program thickens error sets by age and may be infeasible for that reason alone; the gain's own set is not.
+    if several and gain is not None and gain.margin >= SUFFICIENT_MARGIN:
+        return _as_design(gain, problem.covering_error_shape)
+    return None
 
 
-def _as_design(gain: RoomyGain, Sigma: np.ndarray) -> Design:
-    """Returns the gain's own set, with half the room it has left on either side, as a design."""
-    L = gain.reach * gain.L
-    inputs = best_input_shares(Sigma[None], L, gain.K)
-    return Design(L, gain.K, gain.shares, inputs, float(np.linalg.slogdet(L)[1]))
-
-
-def as_shares(state: float, part: float) -> tuple[float, float, float]:
-    """Returns (lx, le, ld) from lx and le / (1 - lx)."""
-    return float(state), float((1.0 - state) * part), float((1.0 - state) * (1.0 - part))
-
-
-def volume_of(design: Design | None) -> str:
-    """Returns how large a design's set is, for people."""
-    return "none found yet" if design is None else f"{np.exp(0.5 * design.log_det):.4f} of the box ellipsoid's volume"
+def _as_design(gain: MaxMarginGain, Sigma: np.ndarray) -> CandidateDesign:
+    """Returns the gain's invariant set as a design, enlarged so that (I) and the limits have equal slack."""
+    L = gain.margin * gain.L
+    inputs = best_input_multipliers(Sigma[None], L, gain.K)
+    return CandidateDesign(L, gain.K, gain.multipliers, inputs, float(np.linalg.slogdet(L)[1]))

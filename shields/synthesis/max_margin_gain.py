@@ -1,4 +1,4 @@
-"""The gain that bears the largest radii: a smooth search over gains, without a semidefinite program."""
+"""The gain that tolerates the largest radii: a smooth search over gains, without a semidefinite program."""
 
 from __future__ import annotations
 
@@ -9,61 +9,63 @@ from scipy.linalg import lu_factor, lu_solve
 from scipy.optimize import minimize
 
 from ncs_gym.plants.lqr import regulator_gain
-from shields.synthesis.semidefinite_programs import ScaledProblem
+from shields.synthesis.design_problem import DesignProblem
 
-# Regulators the search starts from: weight of the inputs, and the rate lx their loops are made to decay with.
-EFFORTS = (0.1, 1.0, 10.0, 100.0)
-DECAYS = (0.75, 0.9, 0.96, 0.985)
-# The most promising ones are pursued.
-PURSUED = 3
-ITERATIONS = 300
-# The logarithm of the need of a gain that does not stabilize, and what keeps logarithms and roots of 0 away.
-HOPELESS, TINY = 50.0, 1e-16
+# Weights of the inputs, and decay rates of the closed loop, of the linear-quadratic regulators the search begins with.
+_INPUT_WEIGHTS = (0.1, 1.0, 10.0, 100.0)
+_DECAY_RATES = (0.75, 0.9, 0.96, 0.985)
+# The search is continued from this many of them, those of largest margin.
+_LOCAL_SEARCHES = 3
+_ITERATIONS = 300
+# Logarithm of the use of every limit that is assigned to a gain that does not stabilize.
+_UNSTABLE_USE = 50.0
+# Keeps logarithms and square roots away from 0.
+_TINY = 1e-16
 
 
 @dataclass(frozen=True, eq=False)
-class RoomyGain:
-    """A gain with the smallest set that is invariant with it.
+class MaxMarginGain:
+    """A gain with the smallest set that is invariant under it.
 
     Attributes:
-        K: Shape (m, n).
-        L: Shape (n, n), invariant for the radii given; it satisfies the limits if `reach` is 1 or more.
-        shares: lx, le, ld.
-        reach: What all radii may grow by before a limit is met.
+        K: Gain in scaled coordinates, shape (m, n).
+        L: Shape of the smallest invariant set for the given radii, (n, n); it respects the limits if `margin` >= 1.
+        multipliers: Multipliers (lx, le, ld) with which (I) holds.
+        margin: Factor by which all radii of disturbance and error sets may grow before a limit is violated.
     """
 
     K: np.ndarray
     L: np.ndarray
-    shares: tuple[float, float, float]
-    reach: float
+    multipliers: tuple[float, float, float]
+    margin: float
 
 
-def roomiest_gain(problem: ScaledProblem, Sigma: np.ndarray, *, limited: bool = True) -> RoomyGain | None:
-    """Returns the gain that bears the largest radii of disturbance and error sets; None if none is stabilizing.
+def max_margin_gain(problem: DesignProblem, Sigma: np.ndarray, *, input_limits: bool = True) -> MaxMarginGain | None:
+    """Returns the gain that tolerates the largest radii; None if no stabilizing gain is found.
 
-    For a gain and shares, (I) has a smallest solution L, a Lyapunov series, which grows with the square of the radii;
-    so the share of the radii that fits is the smallest ratio of a limit to what L needs of it, and has derivatives.
-    The search is local and starts from regulators.
+    For a gain and multipliers, (I) has a smallest solution L, a Lyapunov series, which grows with the square of the
+    radii. So the tolerated radii are those at which L just uses up the first limit, a function with derivatives. The
+    search is local and begins at linear-quadratic regulators (theory.md section 6).
 
     Args:
         problem: The scaled design problem.
-        Sigma: The error set, shape (n, n).
-        limited: False drops (U), to find out what binds.
+        Sigma: Shape of the error set, scaled, (n, n).
+        input_limits: False drops (U), which tells whether the input limits are what binds.
     """
-    search = _Search(problem, Sigma, limited)
+    search = _GainSearch(problem, Sigma, input_limits)
     with np.errstate(all="ignore"):
-        starts = sorted(_starts(problem), key=search.most_needed)[:PURSUED]
-        found = [search.improved(start) for start in starts]
-    best = min(found, key=lambda one: search.most_needed(one), default=None)
-    return None if best is None else search.result(best)
+        initial = sorted(_initial_points(problem), key=search.largest_use)[:_LOCAL_SEARCHES]
+        improved = [search.improved(point) for point in initial]
+    best = min(improved, key=search.largest_use, default=None)
+    return None if best is None else search.gain_at(best)
 
 
-def _starts(problem: ScaledProblem) -> list[np.ndarray]:
-    """Returns points (K, logit of lx, logit of le / (1 - lx)) to start from, each of shape (m n + 2,)."""
+def _initial_points(problem: DesignProblem) -> list[np.ndarray]:
+    """Returns points (K, logit of lx, logit of le / (1 - lx)) with stabilizing K, each of shape (m n + 2,)."""
     gains = [np.zeros((problem.m, problem.n))]
-    for effort in EFFORTS:
-        for decay in DECAYS:
-            gain = regulator_gain(problem.A, problem.B, effort, decay)
+    for input_weight in _INPUT_WEIGHTS:
+        for decay_rate in _DECAY_RATES:
+            gain = regulator_gain(problem.A, problem.B, input_weight, decay_rate)
             gains += [] if gain is None else [gain]
     points = []
     for gain in gains:
@@ -74,86 +76,86 @@ def _starts(problem: ScaledProblem) -> list[np.ndarray]:
     return points
 
 
-class _Search:
-    """What a gain needs of the limits, as a function of (K, logit of lx, logit of le / (1 - lx))."""
+class _GainSearch:
+    """How much of each limit a gain uses, as a function of the point (K, logit of lx, logit of le / (1 - lx))."""
 
-    def __init__(self, problem: ScaledProblem, Sigma: np.ndarray, limited: bool) -> None:
-        self._problem, self._Sigma, self._limited = problem, Sigma, limited
+    def __init__(self, problem: DesignProblem, Sigma: np.ndarray, input_limits: bool) -> None:
+        self._problem, self._Sigma, self._input_limits = problem, Sigma, input_limits
 
-    def most_needed(self, point: np.ndarray) -> float:
-        """Returns the logarithm of the largest square need, shape (); at most 0 if every limit is met."""
-        return float(self._needs(point)[0].max())
+    def largest_use(self, point: np.ndarray) -> float:
+        """Returns the logarithm of the squared use of the most used limit; at most 0 if every limit is respected."""
+        return float(self._uses(point)[0].max())
 
-    def improved(self, start: np.ndarray) -> np.ndarray:
-        """Returns a point near `start` that needs less, by sequential quadratic programming on t >= needs."""
-        slope = np.append(np.zeros(len(start)), 1.0)
+    def improved(self, initial: np.ndarray) -> np.ndarray:
+        """Returns a point with a smaller largest use, by sequential quadratic programming: minimize t >= uses."""
+        objective_slope = np.append(np.zeros(len(initial)), 1.0)
 
         def jacobian(point: np.ndarray) -> np.ndarray:
-            slopes = self._needs(point[:-1])[1]
+            slopes = self._uses(point[:-1])[1]
             return np.column_stack([-slopes, np.ones(len(slopes))])
 
-        found = minimize(
+        local = minimize(
             lambda point: point[-1],
-            np.append(start, self.most_needed(start)),
-            jac=lambda point: slope,
-            constraints={"type": "ineq", "fun": lambda point: point[-1] - self._needs(point[:-1])[0], "jac": jacobian},
+            np.append(initial, self.largest_use(initial)),
+            jac=lambda point: objective_slope,
+            constraints={"type": "ineq", "fun": lambda point: point[-1] - self._uses(point[:-1])[0], "jac": jacobian},
             method="SLSQP",
-            options={"maxiter": ITERATIONS, "ftol": 1e-7},
+            options={"maxiter": _ITERATIONS, "ftol": 1e-7},
         ).x[:-1]
-        return min((found, start), key=self.most_needed)
+        return min((local, initial), key=self.largest_use)
 
-    def result(self, point: np.ndarray) -> RoomyGain:
-        """Returns the gain of a point with its set."""
-        K, lx, part = self._unpacked(point)
-        L, _, _ = self._smallest_set(K, lx, part)
-        shares = lx, (1.0 - lx) * part, (1.0 - lx) * (1.0 - part)
-        return RoomyGain(K=K, L=L, shares=shares, reach=float(np.exp(-0.5 * self.most_needed(point))))
+    def gain_at(self, point: np.ndarray) -> MaxMarginGain:
+        """Returns the gain of a point with its invariant set."""
+        K, lx, fraction = self._unpacked(point)
+        L, _, _ = self._smallest_set(K, lx, fraction)
+        multipliers = lx, (1.0 - lx) * fraction, (1.0 - lx) * (1.0 - fraction)
+        return MaxMarginGain(K=K, L=L, multipliers=multipliers, margin=float(np.exp(-0.5 * self.largest_use(point))))
 
     def _unpacked(self, point: np.ndarray) -> tuple[np.ndarray, float, float]:
-        """Returns K, lx and le / (1 - lx)."""
-        lx, part = 1.0 / (1.0 + np.exp(-np.clip(point[-2:], -30.0, 30.0)))
-        return point[:-2].reshape(self._problem.m, self._problem.n), float(lx), float(part)
+        """Returns K, lx and the fraction le / (1 - lx)."""
+        lx, fraction = 1.0 / (1.0 + np.exp(-np.clip(point[-2:], -30.0, 30.0)))
+        return point[:-2].reshape(self._problem.m, self._problem.n), float(lx), float(fraction)
 
-    def _smallest_set(self, K: np.ndarray, lx: float, part: float) -> tuple[np.ndarray, np.ndarray, tuple]:
+    def _smallest_set(self, K: np.ndarray, lx: float, fraction: float) -> tuple[np.ndarray, np.ndarray, tuple]:
         """Returns L = F L F' + S of (I), F = (A + BK) / sqrt(lx), and the factors of its linear equations."""
         problem, n = self._problem, self._problem.n
-        moved = problem.B @ K
-        source = moved @ self._Sigma @ moved.T / ((1.0 - lx) * part) + problem.D / ((1.0 - lx) * (1.0 - part))
-        F = (problem.A + moved) / np.sqrt(lx)
+        BK = problem.B @ K
+        source = BK @ self._Sigma @ BK.T / ((1.0 - lx) * fraction) + problem.D_u / ((1.0 - lx) * (1.0 - fraction))
+        F = (problem.A + BK) / np.sqrt(lx)
         factors = lu_factor(np.eye(n * n) - np.kron(F, F), check_finite=False)
         L = lu_solve(factors, source.ravel(), check_finite=False).reshape(n, n)
         return 0.5 * (L + L.T), F, factors
 
-    def _needs(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _uses(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the logarithms of c_i L c_i' and of (|K_i|_L + |K_i|_Sigma)^2, and their derivatives.
 
         A functional tr(Z L) changes by tr(Y dS) + 2 tr(Y dF L F') with the adjoint Y = F'YF + Z.
         """
-        problem, (K, lx, part) = self._problem, self._unpacked(point)
-        C, rows = problem.C, K if self._limited else K[:0]
-        unstable = np.full(len(C) + len(rows), HOPELESS), np.zeros((len(C) + len(rows), len(point)))
+        problem, (K, lx, fraction) = self._problem, self._unpacked(point)
+        C, rows = problem.C, K if self._input_limits else K[:0]
+        unstable = np.full(len(C) + len(rows), _UNSTABLE_USE), np.zeros((len(C) + len(rows), len(point)))
         if not (np.isfinite(K).all() and np.abs(np.linalg.eigvals(problem.A + problem.B @ K)).max() ** 2 < lx):
             return unstable
-        L, F, factors = self._smallest_set(K, lx, part)
+        L, F, factors = self._smallest_set(K, lx, fraction)
         functionals = np.concatenate([C, rows])
-        squares = np.einsum("ij,jk,ik->i", functionals, L, functionals) + TINY
-        slopes = self._slopes(functionals, K, lx, part, L, F, factors)
-        needs, derivatives = np.log(squares), slopes / squares[:, None]
+        squares = np.einsum("ij,jk,ik->i", functionals, L, functionals) + _TINY
+        slopes = self._slopes(functionals, K, lx, fraction, L, F, factors)
+        uses, derivatives = np.log(squares), slopes / squares[:, None]
         for i, row in enumerate(rows, start=len(C)):
             slopes[i, :-2].reshape(K.shape)[i - len(C)] += 2.0 * L @ row
             error = np.zeros_like(slopes[i])
             error[:-2].reshape(K.shape)[i - len(C)] = 2.0 * self._Sigma @ row
-            a, b = np.sqrt(squares[i]), np.sqrt(row @ self._Sigma @ row + TINY)
-            needs[i], derivatives[i] = 2.0 * np.log(a + b), (slopes[i] / a + error / b) / (a + b)
-        usable = np.isfinite(needs).all() and np.isfinite(derivatives).all()
-        return (needs, derivatives) if usable else unstable
+            a, b = np.sqrt(squares[i]), np.sqrt(row @ self._Sigma @ row + _TINY)
+            uses[i], derivatives[i] = 2.0 * np.log(a + b), (slopes[i] / a + error / b) / (a + b)
+        usable = np.isfinite(uses).all() and np.isfinite(derivatives).all()
+        return (uses, derivatives) if usable else unstable
 
     def _slopes(
         self,
         functionals: np.ndarray,
         K: np.ndarray,
         lx: float,
-        part: float,
+        fraction: float,
         L: np.ndarray,
         F: np.ndarray,
         factors: tuple,
@@ -163,12 +165,12 @@ class _Search:
         sources = np.einsum("ij,ik->jki", functionals, functionals).reshape(n * n, -1)
         adjoints = lu_solve(factors, sources, trans=1, check_finite=False).T.reshape(-1, n, n)
         adjoints = 0.5 * (adjoints + adjoints.transpose(0, 2, 1))
-        le, ld = (1.0 - lx) * part, (1.0 - lx) * (1.0 - part)
-        moved = problem.B @ K
-        by_gain = 2.0 * problem.B.T @ adjoints @ (moved @ self._Sigma / le + F @ L / np.sqrt(lx))
-        by_le = -np.einsum("kij,ij->k", adjoints, moved @ self._Sigma @ moved.T) / le**2
-        by_ld = -np.einsum("kij,ij->k", adjoints, problem.D) / ld**2
-        by_lx = -np.einsum("kij,ij->k", adjoints, F @ L @ F.T) / lx - part * by_le - (1.0 - part) * by_ld
-        by_part = (1.0 - lx) * (by_le - by_ld)
-        scalars = np.stack([lx * (1.0 - lx) * by_lx, part * (1.0 - part) * by_part], axis=1)
+        le, ld = (1.0 - lx) * fraction, (1.0 - lx) * (1.0 - fraction)
+        BK = problem.B @ K
+        by_gain = 2.0 * problem.B.T @ adjoints @ (BK @ self._Sigma / le + F @ L / np.sqrt(lx))
+        by_le = -np.einsum("kij,ij->k", adjoints, BK @ self._Sigma @ BK.T) / le**2
+        by_ld = -np.einsum("kij,ij->k", adjoints, problem.D_u) / ld**2
+        by_lx = -np.einsum("kij,ij->k", adjoints, F @ L @ F.T) / lx - fraction * by_le - (1.0 - fraction) * by_ld
+        by_fraction = (1.0 - lx) * (by_le - by_ld)
+        scalars = np.stack([lx * (1.0 - lx) * by_lx, fraction * (1.0 - fraction) * by_fraction], axis=1)
         return np.concatenate([by_gain.reshape(len(functionals), -1), scalars], axis=1)

@@ -1,1 +1,12 @@
-"""Exact verification of certificates in rational arithmetic: no solver, no tolerance."""
+"""Exact verification of certificates: every condition is decided in rational arithmetic, without a solver.
+
+`verify` reports all conditions of a certificate with their margins; `require_valid` raises at the first that fails.
+Every float is a dyadic rational, so `rational_matrix` evaluates a condition without rounding; `certified_conditions`
+states the conditions of theory.md section 3.
+"""
+
+from shields.verification.certified_conditions import ACTION_ROUNDING
+from shields.verification.conditions import Condition
+from shields.verification.report import Report, require_valid, verify
+
+__all__ = ["ACTION_ROUNDING", "Condition", "Report", "require_valid", "verify"]

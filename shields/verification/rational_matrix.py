@@ -1,4 +1,4 @@
-"""Rational matrices: every float is a dyadic rational, so what is computed here is exact."""
+"""Matrices of rational numbers: every float is a dyadic rational, so their arithmetic has no rounding."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ def quadratic(row: Matrix, matrix: Matrix) -> Fraction:
 def is_positive_semidefinite(matrix: Matrix, *, strict: bool = False) -> bool:
     """Returns whether a symmetric rational matrix is positive semidefinite (definite if `strict`).
 
-    By the exact LDL' factorization: it is semidefinite exactly if no pivot is negative and every zero pivot has a
-    zero column below it.
+    The matrix is factorized exactly into LDL'; it is semidefinite exactly if no pivot is negative and every zero pivot
+    has a zero column below it. An asymmetric matrix is not semidefinite.
     """
     rest = [row[:] for row in matrix]
     size = len(rest)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from agents.control_loop import ControlLoop, PricedViolations, Shielding
+from agents.control_loop import ControlLoop, CostPenalty, ShieldSettings
 from ncs_gym import Channel
 from shields import SafetyShield, VectorSafetyShield
 
@@ -9,7 +9,7 @@ CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 
 
 def test_it_shields_only_if_asked(certificate):
-    bare, shielded = ControlLoop(env=CRUISE), ControlLoop(env=CRUISE, shielding=Shielding(certificate, "switch", 0.5))
+    bare, shielded = ControlLoop(env=CRUISE), ControlLoop(env=CRUISE, shield=ShieldSettings(certificate, "switch", 0.5))
     assert not isinstance(bare.single(), SafetyShield)
     assert not isinstance(bare.vector(2), VectorSafetyShield)
     assert (shielded.single().penalty, shielded.single().filter.mode) == (0.5, "switch")
@@ -22,9 +22,9 @@ def test_channel_reaches_both_kinds_of_environment():
 
 
 @pytest.mark.parametrize("autoreset", ["NextStep", "SameStep"])
-def test_every_violating_step_has_its_price(autoreset):
-    def played(price):
-        envs = ControlLoop(env=CRUISE, violation_penalty=price).vector(3, autoreset_mode=autoreset)
+def test_every_violating_step_has_its_penalty(autoreset):
+    def played(penalty):
+        envs = ControlLoop(env=CRUISE, violation_penalty=penalty).vector(3, autoreset_mode=autoreset)
         envs.reset(seed=0)
         steps = [envs.step(np.ones((3, 1), np.float32)) for _ in range(201)]
         if autoreset == "NextStep":
@@ -34,13 +34,13 @@ def test_every_violating_step_has_its_price(autoreset):
             costs = [np.where(cut, info.get("final_info", none)["cost"], info["cost"]) for *_, cut, info in steps]
         return np.array([step[1] for step in steps]), np.array(costs)
 
-    (free, costs), (priced, _) = played(0.0), played(2.0)
+    (free, costs), (penalized, _) = played(0.0), played(2.0)
     assert costs.sum() > 0
-    np.testing.assert_allclose(free - priced, 2.0 * costs)
+    np.testing.assert_allclose(free - penalized, 2.0 * costs)
 
 
-def test_unpriced_loop_has_the_environments_own_rewards(certificate):
-    loop = ControlLoop(env=CRUISE, shielding=Shielding(certificate, penalty=1.0), violation_penalty=2.0)
-    assert isinstance(loop.vector(1), PricedViolations)
-    assert not isinstance(loop.unpriced.vector(1), PricedViolations)
-    assert loop.unpriced.shielding.penalty == 0.0
+def test_loop_without_penalties_has_the_environments_own_rewards(certificate):
+    loop = ControlLoop(env=CRUISE, shield=ShieldSettings(certificate, penalty=1.0), violation_penalty=2.0)
+    assert isinstance(loop.vector(1), CostPenalty)
+    assert not isinstance(loop.without_penalties.vector(1), CostPenalty)
+    assert loop.without_penalties.shield.penalty == 0.0

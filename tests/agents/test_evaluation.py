@@ -4,8 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.control_loop import ControlLoop, Shielding
-from agents.evaluation import STREAM, evaluate
+from agents.control_loop import ControlLoop, ShieldSettings
+from agents.evaluation import _SEED_STREAM, evaluate
 from shields.runtime.wrapper import certificate_for
 
 CRUISE = ControlLoop(env="ncs_gym/TruckTrailerCruise-v0")
@@ -20,8 +20,8 @@ def throttle(observations, infos):
 
 
 @pytest.fixture
-def shielding(certificate):
-    return Shielding(certificate)
+def shield(certificate):
+    return ShieldSettings(certificate)
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def scalar(monkeypatch):
 
 
 def test_it_counts_what_a_plain_loop_counts(certificate):
-    word = int(np.random.SeedSequence([100, 0, STREAM]).generate_state(1)[0] >> 1)
+    word = int(np.random.SeedSequence([100, 0, _SEED_STREAM]).generate_state(1)[0] >> 1)
     played = evaluate(CRUISE, throttle, 8, 100, level_matrix=certificate.M)
     envs = gym.make_vec(CRUISE.env, num_envs=8)
     plant = envs.unwrapped.plant
@@ -58,21 +58,23 @@ def test_it_counts_what_a_plain_loop_counts(certificate):
     assert not played.trajectory.arrivals.all()
 
 
-def test_environments_without_a_vector_one_are_played_alike(scalar, shielding):
-    for loop in (scalar, ControlLoop(env=scalar.env, shielding=shielding)):
-        played = evaluate(loop, throttle, 4, 0, shielding.certificate.M)
-        shielded = loop.shielding is not None
+def test_environments_without_a_vector_one_are_played_alike(scalar, shield):
+    for loop in (scalar, ControlLoop(env=scalar.env, shield=shield)):
+        played = evaluate(loop, throttle, 4, 0, shield.certificate.M)
+        shielded = loop.shield is not None
         assert [record.steps for record in played.episodes] == [200] * 4
         assert all((record.violation_steps == 0) == shielded for record in played.episodes)
         assert all(record.guaranteed == shielded for record in played.episodes)
         assert len(played.trajectory.states) == 201
 
 
-def test_it_is_guaranteed_behind_a_shield_and_leaves_penalties_out(shielding):
-    free = evaluate(ControlLoop(env=CRUISE.env, shielding=shielding), throttle, 3, 0)
-    priced = ControlLoop(env=CRUISE.env, shielding=Shielding(shielding.certificate, penalty=1.0), violation_penalty=1.0)
-    assert free.episodes == evaluate(priced, throttle, 3, 0).episodes or np.isnan(free.episodes[0].largest_level)
-    for one, other in zip(free.episodes, evaluate(priced, throttle, 3, 0).episodes, strict=True):
+def test_it_is_guaranteed_behind_a_shield_and_leaves_penalties_out(shield):
+    free = evaluate(ControlLoop(env=CRUISE.env, shield=shield), throttle, 3, 0)
+    penalized = ControlLoop(
+        env=CRUISE.env, shield=ShieldSettings(shield.certificate, penalty=1.0), violation_penalty=1.0
+    )
+    assert free.episodes == evaluate(penalized, throttle, 3, 0).episodes or np.isnan(free.episodes[0].largest_level)
+    for one, other in zip(free.episodes, evaluate(penalized, throttle, 3, 0).episodes, strict=True):
         assert one.guaranteed
         assert one.violation_steps == 0
         assert one.interventions == other.interventions > 0
@@ -81,9 +83,9 @@ def test_it_is_guaranteed_behind_a_shield_and_leaves_penalties_out(shielding):
     assert (free.trajectory.inputs != free.trajectory.proposed).any()
 
 
-def test_arms_meet_the_same_draws_of_nature(shielding):
+def test_arms_have_common_random_numbers(shield):
     bare = evaluate(CRUISE, zero, 5, 7).episodes
-    shielded = evaluate(ControlLoop(env=CRUISE.env, shielding=shielding), zero, 5, 7).episodes
+    shielded = evaluate(ControlLoop(env=CRUISE.env, shield=shield), zero, 5, 7).episodes
     assert [record.episode_return for record in bare] == [record.episode_return for record in shielded]
     others = evaluate(CRUISE, zero, 5, 8).episodes
     assert not {record.episode_return for record in bare} & {record.episode_return for record in others}
@@ -91,7 +93,7 @@ def test_arms_meet_the_same_draws_of_nature(shielding):
 
 def test_episode_that_ends_early_changes_nothing_for_the_others():
     env = "ncs_gym/CartPole-v0"
-    loop = ControlLoop(env=env, shielding=Shielding(certificate_for(*_of(env)), "project"))
+    loop = ControlLoop(env=env, shield=ShieldSettings(certificate_for(*_of(env)), "project"))
 
     def push_the_first(observations, infos):
         actions = np.zeros((len(observations), 1), np.float32)
@@ -107,16 +109,16 @@ def test_episode_that_ends_early_changes_nothing_for_the_others():
 
 
 def test_many_episodes_are_played_in_parts(monkeypatch):
-    monkeypatch.setattr("agents.evaluation.SIDE_BY_SIDE", 3)
+    monkeypatch.setattr("agents.evaluation._MAX_PARALLEL_EPISODES", 3)
     played = evaluate(CRUISE, zero, 8, 0)
     assert [record.index for record in played.episodes] == list(range(8))
     assert len({record.episode_return for record in played.episodes}) == 8
 
 
-def test_progress_is_told_in_steps():
-    told = []
-    evaluate(CRUISE, zero, 5, 0, on_progress=told.append)
-    assert sum(told) == 5 * 200
+def test_progress_is_reported_in_steps():
+    reported = []
+    evaluate(CRUISE, zero, 5, 0, on_progress=reported.append)
+    assert sum(reported) == 5 * 200
 
 
 def _of(env_id):

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from gymnasium.vector import VectorWrapper
 
-from agents.control_loop import ControlLoop, Shielding
-from agents.sb3_vec_env import EPISODE_KEYS
+from agents.control_loop import ControlLoop, ShieldSettings
+from agents.sb3_vec_env import _EPISODE_KEYS
 from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
 from agents.training import train, untrained
 
@@ -18,7 +18,7 @@ TINY_REPLAY = OffPolicySettings(envs=4, gradient_steps=1, batch_size=32, buffer_
 
 @pytest.fixture(scope="module")
 def shielded(certificate):
-    return ControlLoop(env=CRUISE.env, shielding=Shielding(certificate))
+    return ControlLoop(env=CRUISE.env, shield=ShieldSettings(certificate))
 
 
 def test_same_seed_trains_the_same_agent():
@@ -55,7 +55,7 @@ def test_single_environments_are_counted_alike(certificate, monkeypatch):
     spec = copy.deepcopy(gym.spec(CRUISE.env))
     spec.id, spec.vector_entry_point = "Scalar-v0", None
     monkeypatch.setitem(gym.registry, "Scalar-v0", spec)
-    result = train(ControlLoop(env="Scalar-v0", shielding=Shielding(certificate)), 1024, 0, settings=TINY)
+    result = train(ControlLoop(env="Scalar-v0", shield=ShieldSettings(certificate)), 1024, 0, settings=TINY)
     assert result.violation_steps == 0
     assert result.interventions > 20
     assert train(ControlLoop(env="Scalar-v0"), 1024, 0, settings=TINY).violation_steps > 0
@@ -68,7 +68,7 @@ def test_shielded_training_has_no_violation_and_counts_interventions(shielded):
 
 
 def test_monitored_training_is_the_unshielded_one_and_counts_what_the_shield_would_do(certificate):
-    monitored = ControlLoop(env=CRUISE.env, shielding=Shielding(certificate, "monitor"))
+    monitored = ControlLoop(env=CRUISE.env, shield=ShieldSettings(certificate, "monitor"))
     one, other = train(monitored, 2048, 0, settings=TINY), train(CRUISE, 2048, 0, settings=TINY)
     observations = np.random.default_rng(0).standard_normal((20, 3))
     np.testing.assert_array_equal(one.agent.act(observations), other.agent.act(observations))
@@ -76,9 +76,9 @@ def test_monitored_training_is_the_unshielded_one_and_counts_what_the_shield_wou
     assert one.interventions > 0
 
 
-def test_price_of_violations_changes_what_is_learned():
-    priced = ControlLoop(env=CRUISE.env, violation_penalty=5.0)
-    one, other = train(priced, 2048, 0, settings=TINY), train(CRUISE, 2048, 0, settings=TINY)
+def test_violation_penalty_changes_what_is_learned():
+    penalized = ControlLoop(env=CRUISE.env, violation_penalty=5.0)
+    one, other = train(penalized, 2048, 0, settings=TINY), train(CRUISE, 2048, 0, settings=TINY)
     observations = np.random.default_rng(0).standard_normal((20, 3))
     assert (one.agent.act(observations) != other.agent.act(observations)).any()
 
@@ -107,7 +107,7 @@ def test_a_single_rollout_is_learned_from():
 def test_rate_falls_from_its_full_value_to_that_of_the_last_rollout():
     schedule = train(CRUISE, 4 * 256, 0, settings=TINY).agent.model.lr_schedule
     assert [schedule(remaining) for remaining in (0.75, 0.5, 0.25, 0.0)] == pytest.approx(
-        [TINY.learning_rate * share for share in (1.0, 0.75, 0.5, 0.25)]
+        [TINY.learning_rate * fraction for fraction in (1.0, 0.75, 0.5, 0.25)]
     )
 
 
@@ -147,7 +147,7 @@ def test_rates_reach_tensorboard(algorithm, settings, shielded, tmp_path):
 
 
 def test_monitor_keeps_the_episodes_totals():
-    assert set(EPISODE_KEYS) <= set(CRUISE.single().reset(seed=0)[1])
+    assert set(_EPISODE_KEYS) <= set(CRUISE.single().reset(seed=0)[1])
     result = train(CRUISE, 4 * 256, 0, settings=TINY)
     episodes = list(result.agent.model.ep_info_buffer)
     assert len(episodes) == 4
@@ -184,17 +184,17 @@ def test_eval_callback_reports_success_on_both_kinds_of_environment(certificate,
         model.learn(128, callback=EvalCallback(env, n_eval_episodes=4, eval_freq=64, log_path=str(log), verbose=0))
         return np.load(log / "evaluations.npz")["successes"]
 
-    shielding = Shielding(certificate)
-    vector = SB3VecEnv(ControlLoop(env=CRUISE.env, shielding=shielding).vector(2))
-    scalar = make_vec_env(lambda: ControlLoop(env=CRUISE.env, shielding=shielding).single(), n_envs=2, seed=0)
+    shield = ShieldSettings(certificate)
+    vector = SB3VecEnv(ControlLoop(env=CRUISE.env, shield=shield).vector(2))
+    scalar = make_vec_env(lambda: ControlLoop(env=CRUISE.env, shield=shield).single(), n_envs=2, seed=0)
     for env in (vector, scalar):
         assert successes(env).all()
 
 
 def test_progress_adds_up_to_the_steps():
-    told = []
-    result = train(CRUISE, 1024, 0, settings=TINY, on_progress=told.append)
-    assert sum(told) == result.steps
+    reported = []
+    result = train(CRUISE, 1024, 0, settings=TINY, on_progress=reported.append)
+    assert sum(reported) == result.steps
 
 
 def test_untrained_agent_is_reproducible():

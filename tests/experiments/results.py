@@ -6,12 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from agents.evaluation import Episode
-from agents.history import TrainingPoint
-from agents.trajectory import Trajectory
-from experiments.arms import arm_of
-from experiments.summary import paired_differences, summarize_arm
-from experiments.unit import UnitResult
+from agents.results import Episode, TrainingPoint, Trajectory
+from experiments.analysis.summary import paired_differences, summarize_arm
+from experiments.runs.arms import Arm
+from experiments.runs.training_run import RunResult
 
 ALL_ARMS = [
     "unshielded",
@@ -38,7 +36,7 @@ def history(*steps: int, scale: float = 1.0) -> list[TrainingPoint]:
     ]
 
 
-def run(arm: str, index: int = 0, violations=(0, 0), returns=(-1.0, -3.0), **change: Any) -> UnitResult:
+def run(arm: str, index: int = 0, violations=(0, 0), returns=(-1.0, -3.0), **change: Any) -> RunResult:
     """A run of an arm with an episode of 10 steps for each number of violating steps."""
     episodes = [
         Episode(i, 10, total - index, count, count, 1, True, 0.9)
@@ -53,14 +51,14 @@ def run(arm: str, index: int = 0, violations=(0, 0), returns=(-1.0, -3.0), **cha
         "trajectory": trajectory(np.zeros((11, 2))),
         "files": {},
     }
-    return UnitResult(arm=arm, index=index, **(content | change))
+    return RunResult(arm=arm, index=index, **(content | change))
 
 
-def summary_of(results: dict[str, list[UnitResult]], **settings: Any) -> dict[str, Any]:
+def summary_of(results: dict[str, list[RunResult]], **settings: Any) -> dict[str, Any]:
     """The summary of a comparison without reference policies."""
 
     def arm(name: str) -> dict[str, Any]:
-        mode = arm_of(name, "project").mode
+        mode = Arm.of(name, "project").mode
         return {"mode": mode, "shielded": mode not in (None, "monitor")} | summarize_arm(
             results[name], fixed_policy=False
         )

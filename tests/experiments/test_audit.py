@@ -8,15 +8,16 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from experiments.audit import FAILS, HOLDS, ROUNDED, audit_rows, audit_text
-from experiments.counterexample import worst_step
-from experiments.printed_case import PrintedCase
+from experiments.commands.audit import _text
+from experiments.paper.audit import FAILS, HOLDS, ROUNDED, audited_claims
+from experiments.paper.counterexample import worst_step
+from experiments.paper.paper_example import PaperExample
 from tests.command import ncs
 
 
 @pytest.fixture(scope="module")
-def rows():
-    return list(audit_rows(PrintedCase()))
+def claims():
+    return list(audited_claims(PaperExample()))
 
 
 EXPECTED = [
@@ -35,38 +36,38 @@ EXPECTED = [
 
 
 @pytest.mark.parametrize("index", range(len(EXPECTED)))
-def test_every_claim_has_its_verdict_and_figures(rows, index):
-    claim, verdict, figures = EXPECTED[index]
-    row = rows[index]
-    assert row.claim.startswith(claim)
-    assert row.verdict == verdict
+def test_every_claim_has_its_verdict_and_figures(claims, index):
+    start, verdict, figures = EXPECTED[index]
+    claim = claims[index]
+    assert claim.claim.startswith(start)
+    assert claim.verdict == verdict
     for figure in figures:
-        assert figure in row.computed + row.charitable
+        assert figure in claim.computed + claim.charitable
 
 
-def test_no_claim_is_left_out(rows):
-    assert len(rows) == len(EXPECTED)
+def test_no_claim_is_left_out(claims):
+    assert len(claims) == len(EXPECTED)
 
 
 def test_verdicts_follow_the_numbers():
     # With a smaller printed epsilon and gain other claims would hold: nothing is a constant.
-    other = replace(PrintedCase(), K=0.5 * PrintedCase().K, epsilon=0.2)
-    verdicts = {row.claim.split(" ")[0]: row.verdict for row in audit_rows(other)}
+    other = replace(PaperExample(), K=0.5 * PaperExample().K, epsilon=0.2)
+    verdicts = {claim.claim.split(" ")[0]: claim.verdict for claim in audited_claims(other)}
     assert verdicts["(C1)"] == FAILS
     assert verdicts["(C5)"] == HOLDS
     assert verdicts["epsilon"] == HOLDS
 
 
 def test_counterexample_is_one_in_exact_arithmetic():
-    case = PrintedCase()
-    step = worst_step(case.closed, case.M, 5e-4, case.epsilon)
+    case = PaperExample()
+    step = worst_step(case.closed_loop, case.M, 5e-4, case.epsilon)
 
     def exact(vector):
         return [Fraction(float(v)) for v in vector]
 
     x, d, e = exact(step.state), exact(step.disturbance), exact(step.error)
-    M = [exact(row) for row in case.M]
-    closed = [exact(row) for row in case.closed]
+    M = [exact(claim) for claim in case.M]
+    closed = [exact(claim) for claim in case.closed_loop]
 
     def level(v):
         return sum(v[i] * M[i][j] * v[j] for i in range(2) for j in range(2))
@@ -80,30 +81,30 @@ def test_counterexample_is_one_in_exact_arithmetic():
 
 
 def test_worst_step_beats_random_search():
-    case = PrintedCase()
-    found = worst_step(case.closed, case.M, 5e-4, case.epsilon)
+    case = PaperExample()
+    found = worst_step(case.closed_loop, case.M, 5e-4, case.epsilon)
     rng = np.random.default_rng(1)
     root = np.linalg.inv(np.linalg.cholesky(case.M).T)
     best = 0.0
     for _ in range(20_000):
         x, d, e = (v / np.linalg.norm(v) for v in rng.standard_normal((3, 2)))
-        end = case.closed @ root @ x + 5e-4**0.5 * d + case.epsilon**0.5 * e
+        end = case.closed_loop @ root @ x + 5e-4**0.5 * d + case.epsilon**0.5 * e
         best = max(best, end @ case.M @ end)
     assert best <= found.level
     assert best > 0.98 * found.level
 
 
-def test_text_is_readable_and_complete(rows):
-    text = audit_text(rows)
+def test_text_is_readable_and_complete(claims):
+    text = _text(claims)
     assert all(len(line) <= 100 for line in text.splitlines())
     assert text.endswith("4 of 11 claims hold.")
 
 
-def test_command_prints_json_and_writes_it(rows, tmp_path):
+def test_command_prints_json_and_writes_it(claims, tmp_path):
     run = ncs("audit", "--json", "--out", tmp_path / "audit.json")
     assert run.returncode == 0, run.stderr
     assert json.loads(run.stdout) == json.loads((tmp_path / "audit.json").read_text())
-    assert [row["verdict"] for row in json.loads(run.stdout)] == [row.verdict for row in rows]
+    assert [claim["verdict"] for claim in json.loads(run.stdout)] == [claim.verdict for claim in claims]
 
 
 def test_printed_numbers_are_nowhere_else_in_the_code():
@@ -113,5 +114,5 @@ def test_printed_numbers_are_nowhere_else_in_the_code():
     printed = re.compile(r"0\.9029|0\.0094|0\.0017|2\.0927|0\.3514|9\.8426")
     for package in ("ncs_gym", "shields", "agents", "experiments"):
         for path in (root / package).rglob("*.py"):
-            if path.name != "printed_case.py":
+            if path.name != "paper_example.py":
                 assert not printed.search(path.read_text()), path

@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments import certify as command
-from experiments.block import Block, Campaign, run_block
-from experiments.cases import Case, cases
-from experiments.certify import certify
+from experiments.attack.attack_cases import AttackCase, attack_cases
+from experiments.attack.counts_store import CountsStore
+from experiments.attack.monte_carlo_batch import Campaign, MonteCarloBatch, run_batch
+from experiments.attack.safety_counts import SafetyCounts
+from experiments.commands import certify as command
+from experiments.commands.certify import certify
 from experiments.errors import ResultsError, SafetyBroken
-from experiments.proof_settings import CertifySettings
-from experiments.tally import Tally
-from experiments.tally_store import TallyStore
+from experiments.settings.certificates import CertifySettings
 from ncs_gym import truck_trailer
 from ncs_gym.network.contract import contract_of
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
@@ -27,21 +27,26 @@ CRUISE = "TruckTrailerCruise-v0, overtaking"
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("certificates")
-    chosen = {name: case for name, case in cases(0, 1).items() if name.startswith(("TruckTrailerCruise", "CartPole"))}
-    return command._certificates(chosen, folder)
+    chosen = {
+        name: case for name, case in attack_cases(0, 1).items() if name.startswith(("TruckTrailerCruise", "CartPole"))
+    }
+    return command._certificate_files(chosen, folder)
 
 
 def test_every_kind_of_plant_and_channel_is_attacked():
-    found = cases(3, 5)
+    found = attack_cases(3, 5)
     assert len(found) == 2 * 1 + 2 * 3 + (2 + 5) * 4
     assert {case.contract is None for case in found.values()} == {True, False}
-    assert cases(3, 5)["random plant 4, perfect"].plant.fingerprint == found["random plant 4, bursts"].plant.fingerprint
-    others = cases(4, 5)["random plant 4, perfect"].plant.fingerprint
+    assert (
+        attack_cases(3, 5)["random plant 4, perfect"].plant.fingerprint
+        == found["random plant 4, bursts"].plant.fingerprint
+    )
+    others = attack_cases(4, 5)["random plant 4, perfect"].plant.fingerprint
     assert others != found["random plant 4, perfect"].plant.fingerprint
 
 
 def test_contracts_are_used_up():
-    found = cases(0, 0)
+    found = attack_cases(0, 0)
     for name in ("CartPole-v0", "BatchReactor-v0"):
         for kind in ("late", "rare"):
             case = found[f"{name}, {kind}"]
@@ -49,12 +54,12 @@ def test_contracts_are_used_up():
 
 
 def test_a_block_is_the_same_after_any_other(files):
-    blocks = [Block(CRUISE, 0), Block(CRUISE, 1), Block("CartPole-v0, rare", 2)]
-    first = [run_block(CAMPAIGN, block, files[block.case]) for block in blocks]
-    again = [run_block(CAMPAIGN, block, files[block.case]) for block in reversed(blocks)]
+    batches = [MonteCarloBatch(CRUISE, 0), MonteCarloBatch(CRUISE, 1), MonteCarloBatch("CartPole-v0, rare", 2)]
+    first = [run_batch(CAMPAIGN, batch, files[batch.case]) for batch in batches]
+    again = [run_batch(CAMPAIGN, batch, files[batch.case]) for batch in reversed(batches)]
     assert first == again[::-1]
     assert first[0] != first[1]
-    total = sum(first, Tally())
+    total = sum(first, SafetyCounts())
     assert (total.steps, total.episodes) == (3 * 32 * 200, 96)
     assert (total.exits, total.violations, total.broken_episodes, total.unproved) == (0, 0, 0, 0)
     assert 0 < total.interventions < total.steps
@@ -63,19 +68,19 @@ def test_a_block_is_the_same_after_any_other(files):
 
 def test_without_the_shield_the_attack_breaks_out_and_is_counted(files):
     watching = replace(CAMPAIGN, shielded=False)
-    tally = run_block(watching, Block(CRUISE, 0), files[CRUISE])
-    assert tally.exits > 1000
-    assert tally.violations > 1000
-    assert tally.broken_episodes > 16
-    assert tally.level > 1.5
-    assert tally.unproved > 0
-    assert tally.margin < 0.0
+    counts = run_batch(watching, MonteCarloBatch(CRUISE, 0), files[CRUISE])
+    assert counts.exits > 1000
+    assert counts.violations > 1000
+    assert counts.broken_episodes > 16
+    assert counts.level > 1.5
+    assert counts.unproved > 0
+    assert counts.margin < 0.0
 
 
 def test_nature_attains_every_bound(files):
-    from experiments.block import _shields
+    from experiments.attack.monte_carlo_batch import _shields
 
-    case, certificate = cases(0, 1)[CRUISE], Certificate.load(files[CRUISE])
+    case, certificate = attack_cases(0, 1)[CRUISE], Certificate.load(files[CRUISE])
     shield = _shields(CAMPAIGN, CRUISE, files[CRUISE])["project"]
     _, info = shield.reset(seed=1)
     np.testing.assert_allclose([certificate.safe_set.gauge(x) for x in info["state"]], 1.0, atol=1e-8)
@@ -85,16 +90,16 @@ def test_nature_attains_every_bound(files):
     _, _, _, _, info = shield.step(np.zeros((32, 1), np.float32))
     pushed = info["state"] - before @ case.plant.A.T - info["input"] @ case.plant.B.T
     np.testing.assert_allclose(case.plant.nominal_disturbance.gauge(pushed), 1.0, atol=1e-6)
-    shield.step(np.zeros((32, 1), np.float32))
-    noise = shield.unwrapped._fleet.noise
-    np.testing.assert_allclose([case.plant.sensor_noise.bound.gauge(v) for v in noise.T], 1.0, atol=1e-6)
+    state = info["state"].T
+    noise = shield.unwrapped._process.measure(np.random.default_rng(0), state) - case.plant.H @ state
+    np.testing.assert_allclose(case.plant.sensor_noise.bound.gauge(noise.T), 1.0, atol=1e-6)
 
 
 @pytest.fixture
 def small(monkeypatch):
     """A campaign of two cases."""
-    chosen = {name: cases(0, 1)[name] for name in (CRUISE, "TruckTrailer-v0, perfect")}
-    monkeypatch.setattr(command, "cases", lambda seed, random_plants: chosen)
+    chosen = {name: attack_cases(0, 1)[name] for name in (CRUISE, "TruckTrailer-v0, perfect")}
+    monkeypatch.setattr(command, "attack_cases", lambda seed, random_plants: chosen)
 
 
 def settings(out, **changes):
@@ -126,7 +131,7 @@ def test_results_do_not_depend_on_jobs_and_an_interrupted_campaign_goes_on(tmp_p
     assert len(log.read_bytes().splitlines()) == 7
 
 
-def test_another_certificate_makes_stored_tallies_void(tmp_path, small, capsys):
+def test_another_certificate_makes_stored_counts_void(tmp_path, small, capsys):
     certify(settings(tmp_path, jobs=1))
     first = document(tmp_path)["cases"]
     for file in (tmp_path / "certificates").iterdir():
@@ -143,42 +148,44 @@ def test_another_certificate_makes_stored_tallies_void(tmp_path, small, capsys):
 def test_a_shield_that_fails_ends_with_an_error(tmp_path, small, monkeypatch, capsys):
     monkeypatch.setattr(
         command,
-        "_run",
+        "execute_batches",
         lambda campaign, missing, certificates, store, jobs: store.add(
-            Block(CRUISE, 0), Tally(steps=3200, episodes=16, exits=2, broken_episodes=1, level=1.1)
+            MonteCarloBatch(CRUISE, 0), SafetyCounts(steps=3200, episodes=16, exits=2, broken_episodes=1, level=1.1)
         ),
     )
-    monkeypatch.setattr(command, "_blocks", lambda names, count, least: {CRUISE: [Block(CRUISE, 0)]})
+    monkeypatch.setattr(command, "_batches", lambda names, count, least: {CRUISE: [MonteCarloBatch(CRUISE, 0)]})
     with pytest.raises(SafetyBroken, match="2 steps outside S, 0 outside the box, 0 without a proof"):
         certify(settings(tmp_path))
     assert "-1.0e-01" in capsys.readouterr().out
     certify(settings(tmp_path / "watching", unshielded=True))
 
 
-def test_damaged_tallies_are_refused(tmp_path):
+def test_damaged_counts_are_refused(tmp_path):
     path = tmp_path / "tallies.jsonl"
-    store = TallyStore(path, {"case": "key"})
+    store = CountsStore(path, {"case": "key"})
     for index in range(3):
-        store.add(Block("case", index), Tally(steps=index, episodes=1))
+        store.add(MonteCarloBatch("case", index), SafetyCounts(steps=index, episodes=1))
     whole = path.read_bytes()
-    assert TallyStore(path, {"case": "key"}).tallies == store.tallies
-    assert TallyStore(path, {"case": "other", "else": "key"}).tallies == {}
+    assert CountsStore(path, {"case": "key"}).counts == store.counts
+    assert CountsStore(path, {"case": "other", "else": "key"}).counts == {}
     second = whole.splitlines(keepends=True)[1]
     start = whole.index(second)
     for position in range(start, start + len(second) - 1):
         path.write_bytes(whole[:position] + bytes([whole[position] ^ 1]) + whole[position + 1 :])
         with pytest.raises(ResultsError, match=r"line [23] of .* was altered"):
-            TallyStore(path, {"case": "key"})
+            CountsStore(path, {"case": "key"})
     path.write_bytes(whole + b'{"sha256": "torn')
-    assert TallyStore(path, {"case": "key"}).tallies == store.tallies
+    assert CountsStore(path, {"case": "key"}).counts == store.counts
     assert path.read_bytes() == whole
 
 
-def test_tallies_add_up_and_bound_the_probability():
-    tally = sum([Tally(steps=2, episodes=300, level=0.5), Tally(steps=3, episodes=300, level=0.9)], Tally())
-    assert (tally.steps, tally.episodes, tally.level) == (5, 600, 0.9)
-    assert tally.margin == pytest.approx(0.1)
-    assert tally.bound == pytest.approx(1.0 - 0.025 ** (1.0 / 600))
+def test_counts_add_up_and_bound_the_probability():
+    counts = sum(
+        [SafetyCounts(steps=2, episodes=300, level=0.5), SafetyCounts(steps=3, episodes=300, level=0.9)], SafetyCounts()
+    )
+    assert (counts.steps, counts.episodes, counts.level) == (5, 600, 0.9)
+    assert counts.margin == pytest.approx(0.1)
+    assert counts.bound == pytest.approx(1.0 - 0.025 ** (1.0 / 600))
 
 
 @pytest.mark.parametrize(
@@ -198,5 +205,5 @@ def test_wrong_settings_are_named(changes, flag, tmp_path):
 
 
 def test_the_certificate_of_a_case_fits_its_plant_and_contract():
-    case = Case(truck_trailer(), cases(0, 1)[CRUISE].channel)
+    case = AttackCase(truck_trailer(), attack_cases(0, 1)[CRUISE].channel)
     assert case.certificate.fingerprint == truck_trailer().fingerprint

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from experiments.channels import ChannelSettings, bursts, channel_of
-from experiments.settings import SweepSettings
-from experiments.sweep import cells_of
+from experiments.commands.sweep import _grid_points
+from experiments.settings.channel import ChannelSettings, _bursts
+from experiments.settings.learning import SweepSettings
 from ncs_gym import Channel, GilbertElliott
 from ncs_gym.network.channel_state import ChannelState
 
@@ -11,12 +11,12 @@ OWN = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
 
 
 def test_nothing_asked_for_changes_nothing():
-    assert channel_of(ChannelSettings(), OWN) is None
-    assert channel_of(ChannelSettings(loss=0.3), OWN) is None
+    assert ChannelSettings().applied_to(OWN) is None
+    assert ChannelSettings(loss=0.3).applied_to(OWN) is None
 
 
 def test_what_is_asked_for_replaces_the_environments_own():
-    changed = channel_of(ChannelSettings(loss=0.1, delay=0, max_consecutive_losses=4), OWN)
+    changed = ChannelSettings(loss=0.1, delay=0, max_consecutive_losses=4).applied_to(OWN)
     expected = Channel(loss=0.1, quantization_step=0.05, send_period=2, delay=0, max_consecutive_losses=4)
     assert changed == expected
 
@@ -26,7 +26,7 @@ def test_what_is_asked_for_replaces_the_environments_own():
 )
 def test_bursts_have_the_loss_rate_and_the_length_asked_for(loss, length, period):
     # What the channel itself does, packet by packet.
-    channel, rng = Channel(loss=bursts(loss, length, period), send_period=period), np.random.default_rng(0)
+    channel, rng = Channel(loss=_bursts(loss, length, period), send_period=period), np.random.default_rng(0)
     link, states = ChannelState(channel, rng), []
     for step in range(1, 200_000):
         if link.sends_at(step):
@@ -44,22 +44,22 @@ def test_bursts_have_the_loss_rate_and_the_length_asked_for(loss, length, period
 )
 def test_impossible_bursts_are_refused(loss, length):
     with pytest.raises(ValueError, match="bursts of mean length"):
-        bursts(loss, length)
+        _bursts(loss, length)
 
 
 def test_bursts_need_a_loss_probability():
     own = Channel(loss=GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.5))
     with pytest.raises(ValueError, match=r"--channel\.loss"):
-        channel_of(ChannelSettings(burst_length=3.0), own)
-    assert channel_of(ChannelSettings(burst_length=3.0, loss=0.2), own).loss == bursts(0.2, 3.0)
-    assert channel_of(ChannelSettings(burst_length=3.0), OWN).loss == bursts(0.3, 3.0, 2)
+        ChannelSettings(burst_length=3.0).applied_to(own)
+    assert ChannelSettings(burst_length=3.0, loss=0.2).applied_to(own).loss == _bursts(0.2, 3.0)
+    assert ChannelSettings(burst_length=3.0).applied_to(OWN).loss == _bursts(0.3, 3.0, 2)
 
 
 def test_grid_is_the_product_of_its_sides():
     settings = SweepSettings(losses=(0.0, 0.5), delays=(1,), quantization_steps=(0.1, 0.2), burst_lengths=(0.0, 3.0))
-    cells = cells_of(settings)
-    assert len(cells) == len({cell.name for cell in cells}) == 8
-    lossless, *_, last = cells
+    points = _grid_points(settings)
+    assert len(points) == len({point.name for point in points}) == 8
+    lossless, *_, last = points
     assert lossless.channel(ChannelSettings(jitter=1)) == ChannelSettings(
         loss=0.0, delay=1, quantization_step=0.1, jitter=1
     )
@@ -71,9 +71,9 @@ def test_grid_is_the_product_of_its_sides():
 @pytest.mark.parametrize("change", [{"losses": ()}, {"delays": (1, 1)}, {"arms": ("shielded", "shielded")}])
 def test_empty_and_repeated_sides_are_refused(change):
     with pytest.raises(ValueError, match=f"--{next(iter(change))} must be different"):
-        cells_of(SweepSettings(**change))
+        _grid_points(SweepSettings(**change))
 
 
-def test_cells_that_print_alike_have_names_of_their_own():
-    cells = cells_of(SweepSettings(losses=(0.9, 0.90000001), delays=(0,)))
-    assert len({cell.name for cell in cells}) == 2
+def test_points_that_print_alike_have_names_of_their_own():
+    points = _grid_points(SweepSettings(losses=(0.9, 0.90000001), delays=(0,)))
+    assert len({point.name for point in points}) == 2

@@ -122,7 +122,7 @@ def test_report_is_one_self_contained_page(smoke):
     assert page.count("data:image/png;base64,") >= 3
     assert "http://" not in page
     assert "https://" not in page
-    assert "(E1) Sigma - A Sigma A&#x27;/lam_e" in page
+    assert "(E1) Sigma - A Sigma A&#39;/lam_e" in page
 
 
 def test_saved_certificate_verifies(smoke, loaded):
@@ -150,20 +150,20 @@ def test_killed_run_goes_on_by_its_settings_file_and_ends_like_an_uninterrupted_
     finished = len(list(units.glob("*.json")))
     again = ncs("compare", "--config", smoke[0] / "settings.json", "--out", out, "--jobs", 1)
     assert again.returncode == 0, again.stderr
-    assert f"{finished} of 12 units were finished before" in again.stderr
+    assert f"{finished} of 12 runs were finished before" in again.stderr
     assert (out / "summary.json").read_bytes() == (smoke[0] / "summary.json").read_bytes()
 
 
 def test_finished_run_is_not_run_again_and_damage_is_one_sentence(smoke, tmp_path):
     shutil.copytree(smoke[0], tmp_path / "out")
     again = ncs("compare", "--smoke", "--out", tmp_path / "out")
-    assert "12 of 12 units were finished before" in again.stderr
+    assert "12 of 12 runs were finished before" in again.stderr
     assert again.stdout.splitlines()[:-1] == smoke[1].stdout.splitlines()[:-1]
     unit = tmp_path / "out" / "units" / "shielded-1.json"
     unit.write_text(unit.read_text()[:100])
     run = ncs("compare", "--smoke", "--out", tmp_path / "out")
     assert run.returncode == 2
-    assert "shielded-1.json is damaged; delete it to run the unit again" in run.stderr
+    assert "shielded-1.json is damaged; delete it to repeat the run" in run.stderr
     assert "Traceback" not in run.stderr
 
 
@@ -206,7 +206,7 @@ def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path):
     assert "data:image/png;base64," in (out / "report.html").read_text()
     more = ncs("sweep", "--config", out / "settings.json", "--losses", "0.4", "0.5")
     assert more.returncode == 0, more.stderr
-    assert "4 of 8 units were finished before" in more.stderr
+    assert "4 of 8 runs were finished before" in more.stderr
 
 
 def test_synthesize_then_verify(tmp_path):
@@ -234,7 +234,7 @@ def test_command_in_this_process_hides_no_warning_and_changes_nothing_outside(mo
         os.system("echo native >&2")
 
     before = os.getcwd(), sys.argv, sys.stdout, sys.stderr, signal.getsignal(signal.SIGTERM)
-    monkeypatch.setattr("experiments.audit.audit", warn)
+    monkeypatch.setattr("experiments.commands.audit.audit", warn)
     run = ncs("audit", cwd=tmp_path, SAID="this")
     assert (run.returncode, (tmp_path / "here").read_text()) == (0, "this")
     assert "UserWarning: loud" in run.stderr

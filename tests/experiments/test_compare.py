@@ -3,54 +3,54 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents.evaluation import Episode
+from agents.results import Episode
 from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
-from experiments.arms import arm_of
-from experiments.compare import _units, grouped, prepare
+from experiments.analysis.summary import _rows, covered_fraction, paired_differences, summarize_arm
+from experiments.commands.compare import _training_runs
+from experiments.runs.arms import Arm, by_arm
+from experiments.runs.experiment_setup import ExperimentSetup
+from experiments.runs.run_store import prepare_output
+from experiments.runs.training_run import RunResult
 from experiments.settings import CompareSettings
-from experiments.summary import paired_differences, summarize_arm, table_rows, way_covered
-from experiments.unit import UnitResult
-from experiments.worlds import World
 from shields import verify
 
 ALL_ARMS = ("unshielded", "monitor", "penalized", "shielded", "shielded:switch+penalty", "shielded:boundary")
 
 
 @pytest.fixture(scope="module")
-def world(certificate, loaded):
-    return World("ncs_gym/TruckTrailerCruise-v0", None, loaded, certificate, verify(certificate, loaded))
+def setup(certificate, loaded):
+    return ExperimentSetup("ncs_gym/TruckTrailerCruise-v0", None, loaded, certificate, verify(certificate, loaded))
 
 
-def units(world, **change):
-    settings = CompareSettings(**change)
-    return [unit for index in range(settings.seeds) for unit in _units(settings, world, index)]
+def runs_of(setup, **change):
+    return _training_runs(CompareSettings(**change), setup)
 
 
-def test_runs_with_equal_numbers_are_paired_across_arms_and_differ_from_each_other(world):
+def test_runs_with_equal_numbers_are_paired_across_arms_and_differ_from_each_other(setup):
     seeds: dict = {}
-    for unit in units(world, arms=ALL_ARMS):
-        seeds.setdefault(unit.index, set()).add((unit.training_seed, unit.evaluation_seed))
+    for run in runs_of(setup, arms=ALL_ARMS):
+        seeds.setdefault(run.index, set()).add((run.training_seed, run.evaluation_seed))
     assert {len(pairs) for pairs in seeds.values()} == {1}
     flat = [number for pairs in seeds.values() for pair in pairs for number in pair]
     assert len(set(flat)) == len(flat) == 6
 
 
-def test_another_seed_draws_everything_anew(world):
-    first, second = ({unit.training_seed for unit in units(world, seed=seed)} for seed in (0, 1))
+def test_another_seed_draws_everything_anew(setup):
+    first, second = ({run.training_seed for run in runs_of(setup, seed=seed)} for seed in (0, 1))
     assert not first & second
 
 
 @pytest.mark.parametrize("seed", [0, 10**9, 2**63])
-def test_any_seed_is_usable(world, seed):
-    for unit in units(world, seed=seed):
-        assert 0 <= unit.training_seed < 2**31
-        assert 0 <= unit.evaluation_seed < 2**31
+def test_any_seed_is_usable(setup, seed):
+    for run in runs_of(setup, seed=seed):
+        assert 0 <= run.training_seed < 2**31
+        assert 0 <= run.evaluation_seed < 2**31
 
 
-def test_each_arm_has_its_shield_and_its_prices(world):
-    chosen = units(world, arms=ALL_ARMS, seeds=1, mode="switch", intervention_penalty=0.3, violation_penalty=2.0)
-    loops = {unit.arm: unit.loop for unit in chosen}
-    modes = {name: loop.shielding and loop.shielding.mode for name, loop in loops.items()}
+def test_each_arm_has_its_shield_and_its_penalties(setup):
+    chosen = runs_of(setup, arms=ALL_ARMS, seeds=1, mode="switch", intervention_penalty=0.3, violation_penalty=2.0)
+    loops = {run.arm: run.loop for run in chosen}
+    modes = {name: loop.shield and loop.shield.mode for name, loop in loops.items()}
     assert modes == {
         "unshielded": None,
         "monitor": "monitor",
@@ -62,25 +62,25 @@ def test_each_arm_has_its_shield_and_its_prices(world):
         "K x_hat": None,
         "untrained": None,
     }
-    priced = {name for name, loop in loops.items() if loop.shielding and loop.shielding.penalty == 0.3}
-    assert priced == {"shielded:switch+penalty"}
+    penalized = {name for name, loop in loops.items() if loop.shield and loop.shield.penalty == 0.3}
+    assert penalized == {"shielded:switch+penalty"}
     assert {name for name, loop in loops.items() if loop.violation_penalty == 2.0} == {"penalized"}
 
 
 @pytest.mark.parametrize("name", ["", "shield", "shielded:", "shielded:hope", "monitor+penalty", "shielded:monitor"])
 def test_unknown_arms_are_refused(name):
     with pytest.raises(ValueError, match="unknown arm"):
-        arm_of(name, "project")
+        Arm.of(name, "project")
 
 
 @pytest.mark.parametrize(
     ("algo", "settings"),
     [("PPO", PPOSettings), ("TRPO", PPOSettings), ("A2C", A2CSettings), ("SAC", OffPolicySettings)],
 )
-def test_settings_reach_every_run(world, algo, settings):
+def test_settings_reach_every_run(setup, algo, settings):
     given = {"ppo": PPOSettings(envs=3), "a2c": A2CSettings(envs=3), "off_policy": OffPolicySettings(envs=3)}
-    for unit in units(world, steps=7, episodes=9, algo=algo, **given):
-        assert (unit.steps, unit.episodes, unit.algorithm, unit.settings) == (7, 9, algo, settings(envs=3))
+    for run in runs_of(setup, steps=7, episodes=9, algo=algo, **given):
+        assert (run.steps, run.episodes, run.algorithm, run.settings) == (7, 9, algo, settings(envs=3))
 
 
 def result(returns, violations, interventions=0, index=0):
@@ -88,7 +88,7 @@ def result(returns, violations, interventions=0, index=0):
         Episode(i, 10, r, v, 2 * v, interventions, True, 0.5)
         for i, (r, v) in enumerate(zip(returns, violations, strict=True))
     ]
-    return UnitResult("arm", index, 100, 4, 20, [], episodes, None, {})
+    return RunResult("arm", index, 100, 4, 20, [], episodes, None, {})
 
 
 def test_summary_of_an_arm_adds_up():
@@ -114,16 +114,16 @@ def test_interval_of_a_fixed_policy_is_over_episodes():
 def covered(shielded, shielded_steps=200):
     means = {"unshielded": (-5.0, 200), "shielded": (shielded, shielded_steps), "zero input": (-65.0, 200)}
     named = {name: {"eval_return_mean": mean, "eval_steps": steps} for name, (mean, steps) in means.items()}
-    return way_covered({"arms": named, "references": named})
+    return covered_fraction({"arms": named, "references": named})
 
 
-def test_way_covered_is_zero_at_the_zero_input_and_one_at_the_unshielded_agent():
+def test_covered_fraction_is_zero_at_the_zero_input_and_one_at_the_unshielded_agent():
     assert [covered(value) for value in (-65.0, -5.0, -20.0)] == [0.0, 1.0, 0.75]
 
 
-def test_returns_of_episodes_that_end_early_are_no_way_covered():
+def test_returns_of_episodes_that_end_early_are_no_covered_fraction():
     assert covered(-20.0, shielded_steps=150) is None
-    assert way_covered({"arms": {}, "references": {}}) is None
+    assert covered_fraction({"arms": {}, "references": {}}) is None
 
 
 def test_interquartile_mean_leaves_the_extreme_runs_out():
@@ -149,14 +149,14 @@ def test_paired_differences_are_those_of_runs_with_equal_index():
 
 def test_no_violation_is_printed_with_its_upper_bound():
     summary = summarize_arm([result([1.0] * 10, [0] * 10)], fixed_policy=True) | {"mode": "monitor"}
-    row = table_rows({"monitor": summary})[2]
+    row = _rows({"monitor": summary})[2]
     assert row[3] == "0 of 10 [0.0, 30.8 %]"
     assert row[2] == "(20.0 %)"
 
 
 def test_results_are_grouped_by_arm_in_the_order_of_runs():
     results = [replace(result([0.0], [0], index=i), arm=arm) for arm in ("b", "a") for i in (1, 0)]
-    groups = grouped(results)
+    groups = by_arm(results)
     assert list(groups) == ["b", "a"]
     assert [one.index for one in groups["a"]] == [0, 1]
 
@@ -166,7 +166,7 @@ def test_folder_is_made_and_an_earlier_summary_removed(tmp_path):
     (tmp_path / "figures").mkdir()
     for name in ("summary.json", "report.html", "episodes.parquet", "figures/old.png"):
         (tmp_path / name).write_text("{}")
-    prepare(tmp_path)
+    prepare_output(tmp_path)
     assert not any((tmp_path / "figures").iterdir())
     assert {path.name for path in tmp_path.iterdir()} == {"units", "figures"}
 

@@ -9,9 +9,9 @@ from PIL import Image
 
 from agents.control_loop import ControlLoop
 from agents.training import untrained
-from experiments.policies import greedy_action, policy_by_name
-from experiments.render import render
-from experiments.settings import RenderSettings
+from experiments.commands.render import render
+from experiments.runs.policies import _greedy_action, policy_by_name
+from experiments.settings.learning import RenderSettings
 from ncs_gym.rendering import theme
 from shields import SafetyShield
 from tests.command import assert_one_sentence, ncs
@@ -90,8 +90,8 @@ def violations_of_greedy(env_id, certificate=None, shielded=False):
         env = SafetyShield(env, certificate)
     observation, info = env.reset(seed=0)
     for _ in range(60):
-        action = greedy_action(inner, observation, info["estimate"])
-        np.testing.assert_array_equal(action, greedy_action(inner, observation, info["estimate"]))
+        action = _greedy_action(inner, observation, info["estimate"])
+        np.testing.assert_array_equal(action, _greedy_action(inner, observation, info["estimate"]))
         observation, _, terminated, _, info = env.step(action)
         if terminated:
             break
@@ -113,12 +113,12 @@ def test_greedy_policy_violates_unless_shielded_on_unstable_plants(env_id):
 def test_greedy_policy_uses_no_more_input_than_it_takes():
     env = gym.make(CRUISE).unwrapped
     for error, action in ((10.0, 1.0), (-10.0, -1.0), (1.0, 0.5), (-0.5, -0.25), (0.0, 0.0)):
-        assert greedy_action(env, np.array([0.0, 0.0, error]), np.zeros(2)) == pytest.approx([action])
+        assert _greedy_action(env, np.array([0.0, 0.0, error]), np.zeros(2)) == pytest.approx([action])
 
 
 def test_greedy_policy_regulates_where_nothing_is_tracked():
     env = gym.make("ncs_gym/TruckTrailer-v0").unwrapped
-    action = greedy_action(env, np.zeros(2), np.array([1.0, 1.0]))
+    action = _greedy_action(env, np.zeros(2), np.array([1.0, 1.0]))
     plant = env.plant
     sizes = [np.linalg.norm(plant.A @ [1.0, 1.0] + plant.B @ [4.0 * a]) for a in (action[0], 0.0, 1.0, -1.0)]
     assert sizes[0] <= min(sizes[1:])

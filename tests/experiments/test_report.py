@@ -4,9 +4,10 @@ import re
 from html.parser import HTMLParser
 
 import pytest
+from jinja2 import UndefinedError
 
-from experiments.arms import arm_of
-from experiments.report import html_report, sweep_report
+from experiments.report import comparison_report, sweep_report
+from experiments.runs.arms import Arm
 from shields import Report
 from shields.verification.conditions import flag
 from tests.experiments.results import ALL_ARMS, provenance, run, summary_of
@@ -50,7 +51,7 @@ class Reader(HTMLParser):
 
 def comparison(*names, runs=3, figures=None, findings=(), change=None, **settings):
     results = {name: [run(name, i, **(change or {})) for i in range(runs)] for name in names}
-    return html_report(summary_of(results, **settings), VERIFIED, figures or {}, list(findings))
+    return comparison_report(summary_of(results, **settings), VERIFIED, figures or {}, list(findings))
 
 
 def swept(*names, seeds=1, mode="project", change=None, **settings):
@@ -95,7 +96,7 @@ def test_captions_findings_and_conditions_are_escaped():
     summary = summary_of({"shielded": [run("shielded")]})
     summary["references"] = {ATTACK: summary["arms"]["shielded"]}
     summary["versions"] = {ATTACK: ATTACK}
-    page = html_report(summary, Report((flag(ATTACK, False),)), {f'"{ATTACK}. B': PNG}, [ATTACK])
+    page = comparison_report(summary, Report((flag(ATTACK, False),)), {f'"{ATTACK}. B': PNG}, [ATTACK])
     assert "<script" not in page
     assert Reader(page).open == []
 
@@ -132,12 +133,12 @@ def test_a_text_anywhere_in_a_summary_stays_text(text):
     summary = summary_of({name: [run(name)] for name in ("unshielded", "shielded")})
     summary["references"] = {"zero input": summary["arms"]["unshielded"] | {"train_steps": 0}}
     summary = json.loads(json.dumps(summary))
-    honest = tags_of(html_report(summary, VERIFIED, {"A. B.": PNG}, []))
+    honest = tags_of(comparison_report(summary, VERIFIED, {"A. B.": PNG}, []))
     shown = set()
     for path, change in attacked(summary, text):
         try:
-            page = html_report(change, VERIFIED, {"A. B.": PNG}, [])
-        except (AttributeError, IndexError, KeyError, TypeError, ValueError):
+            page = comparison_report(change, VERIFIED, {"A. B.": PNG}, [])
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError, UndefinedError):
             continue  # no page is as good as a harmless one
         assert tags_of(page) <= honest, path
         if text in "".join(Reader(page).text):
@@ -182,7 +183,7 @@ def test_violating_episodes_have_their_exact_interval():
 def test_violations_of_state_and_estimate_stand_apart():
     summary = summary_of({"shielded": [run("shielded")]})
     summary["arms"]["shielded"] |= {"eval_violation_steps": 1234, "eval_estimate_violation_steps": 5678}
-    assert safety(html_report(summary, VERIFIED, {}, []))["shielded"][3:5] == ["1,234", "5,678"]
+    assert safety(comparison_report(summary, VERIFIED, {}, []))["shielded"][3:5] == ["1,234", "5,678"]
 
 
 def test_interventions_of_a_monitor_are_in_brackets_and_without_a_shield_there_are_none():
@@ -223,13 +224,15 @@ def test_a_single_arm_has_no_differences():
 def test_policies_without_training_stand_below_a_rule():
     summary = summary_of({"shielded": [run("shielded")]})
     summary["references"] = {"zero input": summary["arms"]["shielded"] | {"mode": None, "train_steps": 0}}
-    page = html_report(summary, VERIFIED, {}, [])
+    page = comparison_report(summary, VERIFIED, {}, [])
     assert page.count("<tr class=rule><td>zero input</td><td>\N{EN DASH}</td>") == 1
     assert "zero input (does nothing)" in page
 
 
 def test_conditions_are_shown_and_a_broken_one_stands_out():
-    page = html_report(summary_of({"shielded": [run("shielded")]}), Report((flag("(S)", False),)), {}, ["Finding 1."])
+    page = comparison_report(
+        summary_of({"shielded": [run("shielded")]}), Report((flag("(S)", False),)), {}, ["Finding 1."]
+    )
     assert '<td>(S)</td><td>-1.00e+00</td><td><span class="broken">broken</span></td>' in page.replace("\n", "")
     assert "<li>Finding 1.</li>" in page
 
@@ -262,6 +265,6 @@ def test_sweep_has_a_row_per_channel_and_arm():
 
 @pytest.mark.parametrize("mode", ["project", "switch", "boundary"])
 def test_the_shield_is_explained_as_its_mode_acts(mode):
-    assert arm_of("shielded", mode).mode == mode
+    assert Arm.of("shielded", mode).mode == mode
     assert ("closest input" in comparison("shielded", mode=mode)) == (mode == "project")
     assert ("where not every input" in swept("shielded", mode=mode)) == (mode == "boundary")

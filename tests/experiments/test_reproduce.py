@@ -3,18 +3,18 @@ import json
 import numpy as np
 import pytest
 
-from experiments.printed_case import PrintedCase
-from experiments.reproduce import StateFeedback, _outcome
+from experiments.paper.paper_example import PaperExample
+from experiments.paper.reproduction import Simulation, StateFeedback
 from ncs_gym.registration import CASE_STUDY_BOX
 from tests.command import ncs
 
 
 def test_outcome_counts_what_left_the_set_the_box_and_the_limit():
-    case = PrintedCase()
+    case = PaperExample()
     design = StateFeedback("printed", case.plant, CASE_STUDY_BOX, 4.0 * np.eye(2), case.K, 0.01)
     states = np.array([[[0.0, 0.0], [1.9, 1.9], [2.1, 0.0]]])
     errors = np.array([[[0.1, 0.0], [0.0, 0.0]]])
-    outcome, _, _ = _outcome(design, states, np.array([[4.5, -1.0]]), errors)
+    outcome = Simulation(design, states, np.array([[4.5, -1.0]]), errors).outcome
     assert (outcome.steps, outcome.outside_set, outcome.outside_box, outcome.input_asked_beyond) == (2, 2, 1, 1)
     assert outcome.largest_level == pytest.approx(2 * 1.9**2 / 4)
     expected = np.square(case.plant.B @ case.K @ [0.1, 0.0]).sum()

@@ -1,16 +1,12 @@
 import json
+from dataclasses import replace
 
 import pytest
-import tyro
 
 from agents.settings import PPOSettings
-from experiments.channels import ChannelSettings
-from experiments.settings import CompareSettings, SweepSettings
-from experiments.settings_file import SettingsError, save_settings, with_config
-
-
-def parsed(kind, arguments):
-    return tyro.cli(kind, args=arguments)
+from experiments.__main__ import _parse
+from experiments.errors import SettingsError
+from experiments.settings import ChannelSettings, CompareSettings, SweepSettings, config_defaults, save_settings
 
 
 @pytest.mark.parametrize(
@@ -39,21 +35,20 @@ def parsed(kind, arguments):
 )
 def test_settings_come_back_exactly(command, settings, tmp_path):
     save_settings(tmp_path / "s.json", command, settings)
-    flags = with_config([command, "--config", str(tmp_path / "s.json")])
-    assert flags[0] == command
-    assert parsed(type(settings), flags[1:]) == settings
+    assert _parse([command, "--config", str(tmp_path / "s.json")]) == settings
 
 
 def test_flags_of_the_user_win(tmp_path):
     save_settings(tmp_path / "s.json", "compare", CompareSettings(steps=7, arms=("monitor",), smoke=True))
     own = ["compare", "--steps", "9", f"--config={tmp_path / 's.json'}", "--arms", "shielded", "--no-smoke"]
-    read = parsed(CompareSettings, with_config(own)[1:])
+    read = _parse(own)
     assert (read.steps, read.arms, read.smoke) == (9, ("shielded",), False)
 
 
 def test_without_config_nothing_changes():
-    for arguments in ([], ["--help"], ["compare", "--steps", "9"]):
-        assert with_config(arguments) == arguments
+    for arguments in ([], ["--help"], ["--steps", "9"]):
+        assert config_defaults(arguments, "compare", CompareSettings) == (None, arguments)
+    assert _parse(["compare", "--steps", "9"]) == CompareSettings(steps=9)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +65,7 @@ def test_damaged_and_foreign_files_are_one_sentence(content, words, tmp_path):
     if content is not None:
         (tmp_path / "s.json").write_text(content)
     with pytest.raises(SettingsError, match=words) as caught:
-        with_config(["compare", "--config", str(tmp_path / "s.json")])
+        _parse(["compare", "--config", str(tmp_path / "s.json")])
     assert "\n" not in str(caught.value)
 
 
@@ -79,12 +74,38 @@ def test_config_is_given_once_and_with_a_file(tmp_path):
     twice = ["compare", "--config", str(tmp_path / "s.json"), "--config", "other.json"]
     for arguments, words in ((twice, "2 times"), (["compare", "--config"], "needs a file")):
         with pytest.raises(SettingsError, match=words):
-            with_config(arguments)
+            _parse(arguments)
 
 
-@pytest.mark.parametrize("values", [{"arms": ["shielded", "--seed", "9"]}, {"env": "--help"}, {"-x": 1}])
+@pytest.mark.parametrize("values", [{"arms": ["shielded", "--seed", "9"]}, {"env": "--help"}])
 def test_values_in_a_file_are_no_flags(values, tmp_path):
+    path = written(tmp_path, values)
+    name, value = next(iter(values.items()))
+    read = _parse(["compare", "--config", path])
+    assert read == replace(CompareSettings(), **{name: tuple(value) if isinstance(value, list) else value})
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"-x": 1}, "-x = 1"),
+        ({"config": "other.json"}, "config = "),
+        ({"seed": True}, "seed = true"),
+        ({"steps": 10**400, "violation_penalty": 10**400}, "too large"),
+        ({"ppo": {"envs": 4.0}}, "ppo.envs = 4.0"),
+        ({"channel": {"loss": float("nan")}}, "channel.loss = NaN"),
+        ({"ppo": {"discount": 2.0}}, "discount must be in"),
+        ({"steps": 0}, "--steps must be at least 1"),
+        ({"ray_address": "auto"}, "--ray-address is a setting of --engine ray"),
+    ],
+)
+def test_wrong_values_in_a_file_are_named(values, words, tmp_path):
+    with pytest.raises(SettingsError, match=r"hold what ncs compare does not take: ") as caught:
+        _parse(["compare", "--config", written(tmp_path, values)])
+    assert words in str(caught.value)
+
+
+def written(folder, values):
     document = {"format": "ncs-gym settings 1", "command": "compare", "settings": values}
-    (tmp_path / "s.json").write_text(json.dumps(document))
-    with pytest.raises(SettingsError, match="a value that is none"):
-        with_config(["compare", "--config", str(tmp_path / "s.json")])
+    (folder / "s.json").write_text(json.dumps(document))
+    return str(folder / "s.json")

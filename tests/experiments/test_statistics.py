@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, norm
 
-from experiments.statistics import bootstrap_interval, clopper_pearson, interquartile_mean, mean_interval
+from experiments.analysis.statistics import bootstrap_interval, clopper_pearson, interquartile_mean, mean_interval
 
 
 @pytest.mark.parametrize(("events", "trials"), [(0, 600), (1, 10), (5, 10), (10, 10), (589, 600)])

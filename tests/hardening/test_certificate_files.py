@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ncs_gym import ChannelContract, LinearPlant
 from shields import Certificate, CertificateError, synthesize, verify
-from shields.certificate import _digest
+from shields.certificate_file import _digest
 from tests.fuzz import examples
 
 STEP = 7

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments.settings import CompareSettings, SweepSettings
-from experiments.settings_file import FORMAT, settings_json
+from experiments.settings.settings_file import FORMAT, settings_json
 from tests.command import assert_one_sentence, ncs
 from tests.fuzz import examples
 

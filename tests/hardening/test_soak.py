@@ -58,7 +58,7 @@ class Diary:
             for u, arrived in self.told[e]:
                 fresh.advance(u, sorted(arrived, key=lambda packet: packet.stamp))
                 packets += len(arrived)
-            statistics = estimator.patterns.statistics[estimator.statistics[e]]
+            statistics = estimator.patterns.table.statistics[estimator.statistics[e]]
             np.testing.assert_array_equal(info["error_shape"][e], fresh.belief.shape)
             np.testing.assert_array_equal(statistics.covariance, fresh.belief.covariance)
             np.testing.assert_allclose(info["estimate"][e], fresh.belief.mean, rtol=0.0, atol=1e-12)

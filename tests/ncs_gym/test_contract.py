@@ -112,10 +112,10 @@ def test_error_sets_meet_their_conditions_exactly(name):
     for j, rate in enumerate(map(Fraction, sets.rates)):
         grown = add(scale(1 / rate, congruence(A, shapes[j])), scale(1 / (1 - rate), D))
         assert is_positive_semidefinite(subtract(shapes[j + 1], grown))
-    for j, (gain, share) in enumerate(zip(sets.gains, map(Fraction, sets.shares), strict=True), start=1):
+    for j, (gain, mu) in enumerate(zip(sets.gains, map(Fraction, sets.multipliers), strict=True), start=1):
         T = rational(gain)
         kept = congruence(subtract(rational(np.eye(plant.n)), multiply(T, H)), shapes[j])
-        updated = add(scale(1 / share, kept), scale(1 / (1 - share), congruence(T, N)))
+        updated = add(scale(1 / mu, kept), scale(1 / (1 - mu), congruence(T, N)))
         assert is_positive_semidefinite(subtract(shapes[0], updated))
 
 

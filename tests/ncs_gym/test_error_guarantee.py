@@ -28,7 +28,9 @@ def attack(name, count, steps, seed):
     for number, age in attacked.seen:
         certified = error_set.shape_at(age)
         assert certified is not None, age
-        assert is_positive_semidefinite(subtract(rational(certified), rational(patterns.statistics[number].shape)))
+        assert is_positive_semidefinite(
+            subtract(rational(certified), rational(patterns.table.statistics[number].shape))
+        )
     return attacked
 
 

@@ -253,9 +253,9 @@ def test_vector_estimator_equals_the_plain_ones(name, most, monkeypatch):
 
 
 def assert_one_of_many(many, index, plain, step):
-    statistics = many.patterns.statistics[many.statistics[index]]
+    statistics = many.patterns.table.statistics[many.statistics[index]]
     np.testing.assert_array_equal(statistics.shape, plain.statistics.shape, err_msg=f"step {step}")
     np.testing.assert_array_equal(statistics.covariance, plain.statistics.covariance)
-    np.testing.assert_array_equal(many.patterns.arrays.shapes[many.statistics[index]], plain.statistics.shape)
+    np.testing.assert_array_equal(many.patterns.table.shapes[many.statistics[index]], plain.statistics.shape)
     np.testing.assert_allclose(many.mean[:, index], plain.mean, rtol=1e-10, atol=1e-10)
     assert (many.age[index], many.alarm[index]) == (plain.age, plain.alarm)

@@ -18,8 +18,9 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from ncs_gym import Annotation, Channel, Ellipsoid, LinearPlant
 from ncs_gym.registration import ENTRY_POINTS
-from ncs_gym.rendering import Picture, theme
-from ncs_gym.rendering.history import RECENT, Flight
+from ncs_gym.rendering import PacketRecord, theme
+from ncs_gym.rendering.episode_record import RECENT_STEPS
+from ncs_gym.rendering.renderer import _Picture
 from tests.plants import random_plant
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -34,25 +35,29 @@ def make(env_id=CRUISE, render_mode="rgb_array", **settings):
 
 
 @cache
-def quiet_scene():
+def resting_record():
     """The truck at rest, before its first step."""
     env = make().unwrapped
     env.reset(seed=0, options={"state": np.zeros(2)})
-    return replace(env._scene(env._film), estimate=np.zeros(2), error_shape=1e-6 * np.eye(2))
+    return replace(env._renderer.frame_record(), estimate=np.zeros(2), error_shape=1e-6 * np.eye(2))
 
 
-def scene(state=(0.0, 0.0), **changes):
-    """A scene that shows nothing but a state, and what changes it."""
+def record(state=(0.0, 0.0), **changes):
+    """A frame that shows nothing but a state, and what changes it."""
     state = np.array(state, dtype=float)
     violated = bool((np.abs(state) > 2.0).any())
     return replace(
-        quiet_scene(), **{"state": state, "estimate": state, "violated": violated, "path": state[None]} | changes
+        resting_record(), **{"state": state, "estimate": state, "violated": violated, "path": state[None]} | changes
     )
 
 
 @pytest.fixture(scope="module")
 def picture(loaded):
-    return Picture(loaded)
+    return _Picture(loaded)
+
+
+def pixels_of(picture, frame):
+    return picture.draw(frame).pixels()
 
 
 def count(pixels, color, rect, off=24):
@@ -79,7 +84,7 @@ def test_every_environment_draws_frames_that_follow_it(env_id):
         assert frame.shape == (theme.HEIGHT, theme.WIDTH, 3)
         assert frame.dtype == np.uint8
     np.testing.assert_array_equal(env.render(), frames[-1])
-    for rect in (theme.HEADER, theme.STAGE, theme.PLANE, theme.PANEL):
+    for rect in (theme.HEADER, theme.PLANT_VIEW, theme.PLANE, theme.PANEL):
         assert changed(frames[0], frames[-1], rect) > 0
     assert frames[-1].flags.writeable
 
@@ -105,15 +110,15 @@ def test_oblique_limits_are_drawn_as_they_are():
     plant = LinearPlant(C=np.array([[1.0, 1.0], [1.0, -1.0]]), **common)
     env = make("ncs_gym/LinearNCS-v0", plant=plant).unwrapped
     env.reset(seed=0)
-    frame, plane = env.render(), env._film._picture._plane
+    frame, plane = env.render(), env._renderer._picture._plane
     points = np.array([(0.85, 0.1), (-0.1, -0.85), (0.6, 0.6), (-0.6, 0.55)])  # inside, inside, outside, outside
-    colors = [tuple(frame[round(y), round(x)]) for x, y in plane.place(points)]
+    colors = [tuple(frame[round(y), round(x)]) for x, y in plane.pixels_of(points)]
     assert colors == [theme.PAPER, theme.PAPER, theme.DANGER_FILL, theme.DANGER_FILL]
 
 
 def test_coupling_turns_red_near_its_limit(picture):
     band = theme.Rect(340, 150, 60, 35)
-    red = [count(picture.pixels(scene((stretch, 0.0))), theme.DANGER, band) for stretch in (0.0, 1.0, 1.95, -1.95)]
+    red = [count(pixels_of(picture, record((stretch, 0.0))), theme.DANGER, band) for stretch in (0.0, 1.0, 1.95, -1.95)]
     mark = 20  # pixels of the limit's dashed mark at most
     assert red[0] < mark
     assert red[1] < mark
@@ -123,22 +128,22 @@ def test_coupling_turns_red_near_its_limit(picture):
 def test_coupling_stretches(picture):
     fronts = []
     for stretch in (-1.0, 0.0, 1.0):
-        row = picture.pixels(scene((stretch, 0.0)))[130, :400].astype(int)
-        fronts.append(np.flatnonzero(np.abs(row - np.array(theme.LOAD)).max(axis=-1) < 24).max())
+        row = pixels_of(picture, record((stretch, 0.0)))[130, :400].astype(int)
+        fronts.append(np.flatnonzero(np.abs(row - np.array(theme.CARGO)).max(axis=-1) < 24).max())
     assert fronts[0] - fronts[1] == pytest.approx(fronts[1] - fronts[2], abs=1)
     assert fronts[0] - fronts[1] == pytest.approx(31, abs=1)
 
 
-def test_ghost_stands_where_the_estimate_is(picture):
-    right, off = scene(), scene(estimate=np.array([1.0, 0.0]))
+def test_dashed_outline_stands_where_the_estimate_is(picture):
+    right, off = record(), record(estimate=np.array([1.0, 0.0]))
     left = theme.Rect(0, 110, 140, 70)
-    assert count(picture.pixels(right), theme.ESTIMATE, left) == 0
-    assert count(picture.pixels(off), theme.ESTIMATE, left) > 50
+    assert count(pixels_of(picture, right), theme.ESTIMATE, left) == 0
+    assert count(pixels_of(picture, off), theme.ESTIMATE, left) > 50
 
 
 def test_error_ellipse_has_the_size_of_the_bound(picture):
     areas = [
-        count(picture.pixels(scene(error_shape=size**2 * np.eye(2))), theme.ERROR_FILL, theme.PLANE, off=6)
+        count(pixels_of(picture, record(error_shape=size**2 * np.eye(2))), theme.ERROR_FILL, theme.PLANE, off=6)
         for size in (0.5, 1.0)
     ]
     pixels_per_unit = theme.PLANE.w * theme.PLANE.h / 6.0**2
@@ -146,14 +151,14 @@ def test_error_ellipse_has_the_size_of_the_bound(picture):
 
 
 def test_packets_show_whether_they_are_on_time_late_or_lost(picture):
-    lane = theme.Rect(250, theme.LANE - 26, 280, 50)
+    line = theme.Rect(250, theme.PACKET_LINE - 26, 280, 50)
     at = {"step": 4, "input": np.zeros(1)}
-    empty = picture.pixels(scene(**at))
+    empty = pixels_of(picture, record(**at))
     seen = {}
-    for name, flight in (("new", Flight(4, 4)), ("late", Flight(3, 5)), ("lost", Flight(4, None))):
-        frame = picture.pixels(scene(**at, flights=(flight,)))
-        seen[name] = [count(frame, color, lane) for color in (theme.ESTIMATE, theme.LATE, theme.DANGER)]
-        assert changed(empty, frame, lane) > 100
+    for name, packet in (("new", PacketRecord(4, 4)), ("late", PacketRecord(3, 5)), ("lost", PacketRecord(4, None))):
+        frame = pixels_of(picture, record(**at, packets=(packet,)))
+        seen[name] = [count(frame, color, line) for color in (theme.ESTIMATE, theme.LATE, theme.DANGER)]
+        assert changed(empty, frame, line) > 100
     assert seen["new"][0] > 80
     assert seen["new"][1:] == [0, 0]
     assert seen["late"][1] > 80
@@ -162,28 +167,28 @@ def test_packets_show_whether_they_are_on_time_late_or_lost(picture):
 
 
 def test_packets_travel(picture):
-    lane = theme.Rect(0, theme.LANE - 3, theme.WIDTH, 6)
+    line = theme.Rect(0, theme.PACKET_LINE - 3, theme.WIDTH, 6)
     places = []
     for step in (10, 11, 12):
-        frame = picture.pixels(scene(step=step, flights=(Flight(9, 13),)))
-        x, y, w, h = (round(value) for value in lane)
+        frame = pixels_of(picture, record(step=step, packets=(PacketRecord(9, 13),)))
+        x, y, w, h = (round(value) for value in line)
         part = frame[y : y + h, x : x + w].astype(int)
         places.append(np.nonzero(np.abs(part - np.array(theme.LATE)).max(axis=-1) < 24)[1].mean())
     assert places[0] + 20 < places[1] < places[2] - 20
 
 
-def test_fates_are_those_of_the_channel():
-    def flights(channel, steps=12):
+def test_packets_are_lost_and_late_as_the_channel_says():
+    def packets(channel, steps=12):
         env = make(channel=channel).unwrapped
         env.reset(seed=0)
         for _ in range(steps):
             env.step(np.zeros(1, np.float32))
-        return list(env._film.history.flights)
+        return list(env._renderer.frame_record().packets)
 
-    assert flights(Channel(send_period=3)) == [Flight(k, k) for k in (3, 6, 9, 12)]
-    assert flights(Channel(delay=2)) == [Flight(k, k + 2) for k in range(1, 13)]
-    assert flights(Channel(loss=1.0)) == [Flight(k, None) for k in range(1, 13)]
-    mixed = flights(Channel(loss=0.5, jitter=3))
+    assert packets(Channel(send_period=3)) == [PacketRecord(k, k) for k in (3, 6, 9, 12)]
+    assert packets(Channel(delay=2)) == [PacketRecord(k, k + 2) for k in range(1, 13)]
+    assert packets(Channel(loss=1.0)) == [PacketRecord(k, None) for k in range(1, 13)]
+    mixed = packets(Channel(loss=0.5, jitter=3))
     assert any(each.arrival is None for each in mixed)
     assert len({each.arrival - each.stamp for each in mixed if each.arrival is not None}) > 1
 
@@ -192,53 +197,53 @@ def test_arrivals_are_those_of_the_infos():
     env = make(channel=Channel(loss=0.4, delay=1, jitter=2))
     env.reset(seed=3)
     arrived = [k for k in range(1, 31) if env.step(np.zeros(1, np.float32))[4]["packet_arrived"]]
-    flights = env.unwrapped._film.history.flights
-    assert sorted({each.arrival for each in flights if each.arrival is not None and each.arrival <= 30}) == arrived
+    packets = env.unwrapped._renderer.frame_record().packets
+    assert sorted({each.arrival for each in packets if each.arrival is not None and each.arrival <= 30}) == arrived
 
 
 def test_phase_plane_shows_the_safe_set_and_its_absence(picture):
     note = Annotation(safe_set=SAFE_SET, label="project")
-    with_set, without = picture.pixels(scene(annotation=note)), picture.pixels(scene())
+    with_set, without = pixels_of(picture, record(annotation=note)), pixels_of(picture, record())
     area = np.pi * 4.0 * theme.PLANE.w * theme.PLANE.h / 36.0
     assert count(with_set, theme.SAFE_FILL, theme.PLANE, off=6) == pytest.approx(area, rel=0.15)
     assert count(without, theme.SAFE_FILL, theme.PLANE, off=6) == 0
-    smaller = picture.pixels(scene(annotation=Annotation(safe_set=Ellipsoid(np.eye(2)), label="project")))
+    smaller = pixels_of(picture, record(annotation=Annotation(safe_set=Ellipsoid(np.eye(2)), label="project")))
     assert count(smaller, theme.SAFE_FILL, theme.PLANE, off=6) == pytest.approx(area / 4.0, rel=0.2)
 
 
 def test_intervention_shows_in_the_header_and_at_the_input(picture):
     quiet = Annotation(safe_set=SAFE_SET, label="project", proposed=np.array([4.0]))
     acting = replace(quiet, intervened=True, interventions=1)
-    frames = [picture.pixels(scene(step=1, input=np.array([1.0]), annotation=note)) for note in (quiet, acting)]
+    frames = [pixels_of(picture, record(step=1, input=np.array([1.0]), annotation=note)) for note in (quiet, acting)]
     bar = theme.Rect(theme.PANEL.x, theme.PANEL.y + 16, theme.PANEL.w, 16)
     beyond = theme.Rect(bar.right - bar.w / 4, bar.y, bar.w / 4, bar.h)  # between the applied input and the proposed
     for rect in (theme.HEADER, bar):
         assert count(frames[1], theme.SHIELD, rect) > count(frames[0], theme.SHIELD, rect) + 100
     assert count(frames[0], theme.SHIELD, beyond) == 0
     assert count(frames[1], theme.SHIELD, beyond) > 60
-    assert count(frames[1], theme.SHIELD_FILL, theme.STAGE, off=4) > 10_000
-    watching = picture.pixels(scene(step=1, input=np.array([4.0]), annotation=replace(acting, protects=False)))
-    assert count(watching, theme.SHIELD_FILL, theme.STAGE, off=4) == 0
+    assert count(frames[1], theme.SHIELD_FILL, theme.PLANT_VIEW, off=4) > 10_000
+    watching = pixels_of(picture, record(step=1, input=np.array([4.0]), annotation=replace(acting, protects=False)))
+    assert count(watching, theme.SHIELD_FILL, theme.PLANT_VIEW, off=4) == 0
 
 
-def test_path_and_the_steps_the_shield_acted_on_are_drawn(picture):
+def test_path_and_interventions_are_drawn(picture):
     path = np.array([(-1.5, -1.0), (1.5, -1.0)])
-    frames = [picture.pixels(scene(path=path, acted=np.array([False, acted]))) for acted in (False, True)]
-    assert changed(picture.pixels(scene()), frames[0], theme.PLANE) > 150
+    frames = [pixels_of(picture, record(path=path, interventions=np.array([False, acted]))) for acted in (False, True)]
+    assert changed(pixels_of(picture, record()), frames[0], theme.PLANE) > 150
     assert count(frames[0], theme.SHIELD, theme.PLANE) == 0
     assert count(frames[1], theme.SHIELD, theme.PLANE) > 15
 
 
 def test_violation_shows(picture):
-    safe, over = picture.pixels(scene()), picture.pixels(scene((2.5, 0.0), violations=1))
+    safe, over = pixels_of(picture, record()), pixels_of(picture, record((2.5, 0.0), violations=1))
     assert count(safe, theme.DANGER, theme.HEADER) == 0
     assert count(over, theme.DANGER, theme.HEADER) > 1000
-    assert count(over, theme.DANGER_FILL, theme.STAGE, off=4) > 10_000
+    assert count(over, theme.DANGER_FILL, theme.PLANT_VIEW, off=4) > 10_000
 
 
 def test_states_far_outside_are_drawn_at_the_edge(picture):
     far = np.array([1e9, -1e9])
-    frame = picture.pixels(scene((1e9, -1e9), estimate=far, error_shape=1e30 * np.eye(2), path=far[None]))
+    frame = pixels_of(picture, record((1e9, -1e9), estimate=far, error_shape=1e30 * np.eye(2), path=far[None]))
     assert count(frame, theme.DANGER, theme.Rect(theme.PLANE.right - 20, theme.PLANE.bottom - 20, 20, 20)) > 20
 
 
@@ -247,24 +252,24 @@ def test_annotation_lasts_one_step():
     note = Annotation(safe_set=SAFE_SET, label="project")
     env.annotate(note)
     env.reset(seed=0)
-    assert env._film.history.annotation is note
+    assert env._renderer.frame_record().annotation is note
     env.step(np.zeros(1, np.float32))
-    assert env._film.history.annotation is None
+    assert env._renderer.frame_record().annotation is None
     env.annotate(note)
     for expected in (note, None):
         env.step(np.zeros(1, np.float32))
-        assert env._film.history.annotation is expected
+        assert env._renderer.frame_record().annotation is expected
 
 
-def test_history_forgets():
+def test_frame_shows_the_recent_steps_of_this_episode_only():
     env = make()
     env.reset(seed=0)
-    for _ in range(2 * RECENT):
+    for _ in range(2 * RECENT_STEPS):
         env.step(np.zeros(1, np.float32))
-    assert len(env.unwrapped._film.history.moments) == RECENT
+    assert len(env.unwrapped._renderer.frame_record().path) == RECENT_STEPS
     env.reset()
-    assert len(env.unwrapped._film.history.moments) == 1
-    assert not env.unwrapped._film.history.flights
+    assert len(env.unwrapped._renderer.frame_record().path) == 1
+    assert not env.unwrapped._renderer.frame_record().packets
 
 
 def test_drawing_does_not_change_the_episode():
@@ -279,6 +284,18 @@ def test_drawing_does_not_change_the_episode():
                 env.render()
         runs.append(np.concatenate([np.ravel(value) for info in infos for value in info.values()]))
     np.testing.assert_array_equal(*runs)
+
+
+def test_writing_into_an_info_does_not_change_the_picture():
+    env = make()
+    frames = []
+    for spoiled in (False, True):
+        for info in (env.reset(seed=0)[1], env.step(np.ones(1, np.float32))[4]):
+            if spoiled:
+                for key in ("state", "estimate", "error_shape", "input"):
+                    info[key][:] = 1.0
+        frames.append(env.render())
+    np.testing.assert_array_equal(*frames)
 
 
 def test_record_video_writes_a_file(tmp_path):

@@ -70,7 +70,7 @@ def test_missing_file_is_named(tmp_path):
 
 
 def test_numbers_that_are_not_finite_are_refused_even_with_a_fitting_checksum(certificate, path):
-    from shields.certificate import _digest
+    from shields.certificate_file import _digest
 
     for change in (
         {"L": [[float("nan"), 0.0], [0.0, 1.0]]},

@@ -132,7 +132,7 @@ MUTATIONS = {
     "no gain": (lambda c, s: sets(c, gains=at(s.gains, 2, 0.0)), ["(C2)"]),
     "a rate": (lambda c, s: sets(c, rates=at(s.rates, 0, 0.5)), ["(C1) Sigma_1"]),
     "a rate above one": (lambda c, s: sets(c, rates=at(s.rates, 0, 5.0)), ["0 < lam_e < 1"]),
-    "a share": (lambda c, s: sets(c, shares=at(s.shares, 0, 0.01)), ["(C2)"]),
+    "a multiplier": (lambda c, s: sets(c, multipliers=at(s.multipliers, 0, 0.01)), ["(C2)"]),
     "less noise": (lambda c, s: sets(c, noise=0.9 * s.noise), ["N:"]),
     "coarser rounding": (lambda c, s: sets(c, contract=ChannelContract(2, 5e-3)), ["N:"]),
     "idle multipliers": (
@@ -141,15 +141,15 @@ MUTATIONS = {
     ),
     "another Sigma": (lambda c, s: replace(c, Sigma=1.1 * c.Sigma), ["Sigma is the set of the largest age"]),
     "shares of (I)": (
-        lambda c, s: replace(c, ages=replace(c.ages, shares=at(c.ages.shares, (1, 1), 1e-6))),
+        lambda c, s: replace(c, ages=replace(c.ages, multipliers=at(c.ages.multipliers, (1, 1), 1e-6))),
         ["(I) L - (A+BK) L (A+BK)'/lx - BK Sigma K'B'/le - D_u/ld >= 0 at age 1"],
     ),
     "shares of (U)": (
         lambda c, s: replace(c, ages=replace(c.ages, inputs=at(c.ages.inputs, (0, 1), 1e-9))),
         ["(U) input 2 stays within u_max (1 - 2^-24) at age 0"],
     ),
-    "shares above one": (
-        lambda c, s: replace(c, ages=replace(c.ages, shares=at(c.ages.shares, (2, 0), 1.5))),
+    "multipliers above one": (
+        lambda c, s: replace(c, ages=replace(c.ages, multipliers=at(c.ages.multipliers, (2, 0), 1.5))),
         ["lx + le + ld <= 1"],
     ),
 }
@@ -178,13 +178,13 @@ def test_margins_by_age_agree_with_floating_point(promised):
         assert found == pytest.approx(smallest(s.shapes[j + 1] - grown), rel=1e-4)
     for j, found in enumerate(margins["(C2)0"]):
         kept = np.eye(plant.n) - s.gains[j] @ plant.H
-        updated = kept @ s.shapes[j + 1] @ kept.T / s.shares[j]
-        updated += s.gains[j] @ s.noise @ s.gains[j].T / (1 - s.shares[j])
+        updated = kept @ s.shapes[j + 1] @ kept.T / s.multipliers[j]
+        updated += s.gains[j] @ s.noise @ s.gains[j].T / (1 - s.multipliers[j])
         assert found == pytest.approx(smallest(s.shapes[0] - updated), rel=1e-4)
     closed, gain = plant.A + plant.B @ certificate.K, plant.B @ certificate.K
     spread = plant.m * plant.B @ np.diag((plant.u_max * 2.0**-24) ** 2) @ plant.B.T
     D_u = (1 + growth) * certificate.D + (1 + 1 / growth) * spread
-    for j, (lx, le, ld) in enumerate(ages.shares):
+    for j, (lx, le, ld) in enumerate(ages.multipliers):
         grown = closed @ certificate.L @ closed.T / lx + gain @ s.shapes[j] @ gain.T / le + D_u / ld
         assert margins[f"(I){j}"] == [pytest.approx(smallest(certificate.L - grown), rel=1e-4)]
         for k, mu, limit, found in zip(certificate.K, ages.inputs[j], plant.u_max, margins[f"(U){j}"], strict=True):

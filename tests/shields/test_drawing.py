@@ -41,7 +41,7 @@ def test_an_intervention_shows_in_its_frame_and_in_no_other(certificate):
     seen = set()
     for k in range(30):
         info = env.step(FULL_THROTTLE if k < 10 else np.zeros(1, np.float32))[4]
-        tinted = count(env.render(), theme.SHIELD_FILL, theme.STAGE) > 10_000
+        tinted = count(env.render(), theme.SHIELD_FILL, theme.PLANT_VIEW) > 10_000
         assert tinted == info["shield_intervened"]
         seen.add(tinted)
     assert seen == {True, False}
@@ -51,7 +51,7 @@ def test_a_shield_that_watches_does_not_look_as_if_it_acted(certificate):
     env = shielded(certificate, mode="monitor")
     for _ in range(6):
         info = env.step(FULL_THROTTLE)[4]
-        assert count(env.render(), theme.SHIELD_FILL, theme.STAGE) == 0
+        assert count(env.render(), theme.SHIELD_FILL, theme.PLANT_VIEW) == 0
     assert info["episode_interventions"] > 0
 
 
@@ -59,9 +59,10 @@ def test_the_picture_shows_the_inputs_and_the_count_of_the_info(certificate):
     env = shielded(certificate)
     for _ in range(5):
         info = env.step(FULL_THROTTLE)[4]
-        note, history = env.unwrapped._film.history.annotation, env.unwrapped._film.history
+        frame = env.unwrapped._renderer.frame_record()
+        note = frame.annotation
         np.testing.assert_array_equal(note.proposed, info["input_proposed"])
-        np.testing.assert_array_equal(history.input, info["input"])
+        np.testing.assert_array_equal(frame.input, info["input"])
         assert note.intervened == info["shield_intervened"]
         assert note.interventions == info["episode_interventions"]
 
@@ -80,7 +81,7 @@ def test_human_mode_shows_the_shield_in_the_very_step(certificate, monkeypatch):
         info = env.step(FULL_THROTTLE)[4]
     assert info["shield_intervened"]
     shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
-    assert count(shown, theme.SHIELD_FILL, theme.STAGE) > 10_000
+    assert count(shown, theme.SHIELD_FILL, theme.PLANT_VIEW) > 10_000
     env.close()
 
 
@@ -103,4 +104,4 @@ def test_a_shield_that_is_not_drawn_tells_nothing(certificate, monkeypatch):
     env = shielded(certificate, render_mode=None)
     monkeypatch.setattr(type(env.unwrapped), "annotate", None)
     env.step(FULL_THROTTLE)
-    assert env.unwrapped._film is None
+    assert env.unwrapped._renderer is None

@@ -1,3 +1,4 @@
+import pickle
 from dataclasses import FrozenInstanceError, replace
 from functools import cache
 from itertools import product
@@ -10,10 +11,15 @@ from hypothesis import strategies as st
 from ncs_gym import Ellipsoid, truck_trailer
 from ncs_gym.uncertainty.ellipsoid import outer_sum
 from shields import CertificateError, SafetyFilter, synthesize
-from shields.runtime.filter import MARGIN, MODES
+from shields.runtime.filter import MARGIN, MODES, REASONS
 from tests.plants import random_plant
 
 TWO_STATES = random_plant(3, 2, 1)
+
+
+def many(shield, estimates, shapes, inputs):
+    """The decisions about rows of estimates (N, n) and inputs (N, m) and as many shapes, in one batch."""
+    return shield.decide_many(estimates.T, shield.errors_of_many(shapes), inputs.T)
 
 
 def worst_next_level(certificate, plant, estimate, shape, u, rng, tries=20):
@@ -84,10 +90,10 @@ def test_projected_input_is_expressible_in_float32_and_the_closest(case):
         action = (decision.input / plant.u_max).astype(np.float32)
         np.testing.assert_array_equal(plant.u_max * action.astype(np.float64), decision.input)
         # No random admissible input is closer by more than the rounding.
-        outlook = shield.test.at(estimate, shape)
+        sets = shield.test.reachable(estimate[:, None], shield.errors_of(shape).batch())
         near = decision.input + (wanted - decision.input) * rng.uniform(0, 1, (100, 1))
         others = np.vstack([rng.uniform(-1, 1, (400, plant.m)) * plant.u_max, near])
-        admissible = np.array([outlook.judge(u.tolist())[0] >= 0.0 for u in others])
+        admissible = sets.slack(others.T)[0] >= 0.0
         distances = np.linalg.norm(others - wanted, axis=1)
         best = distances[admissible].min(initial=np.inf)
         assert np.linalg.norm(decision.input - wanted) <= best + 1e-5
@@ -217,15 +223,18 @@ def test_what_underflows_raises_nothing(states, mode):
         with np.errstate(all="raise"):
             decision = shield.decide(size * np.ones(states), 1e-4 * np.eye(states), plant.u_max)
         assert decision.intervened
-        # A state known better than perfectly, by rounding.
-        assert shield.knows_inside(np.zeros(states), -1e-310 * np.eye(states)) is (states > 2)
+        # A state known better than perfectly is none.
+        assert not shield.knows_inside(np.zeros(states), -1e-310 * np.eye(states))
 
 
 def test_wrongly_projected_input_is_not_applied(certificate, loaded, monkeypatch):
     shield = SafetyFilter(certificate, loaded)
-    monkeypatch.setattr("shields.runtime.plane.closest_on_line", lambda wanted, *rest: wanted)
-    decision = shield.decide(np.array([1.6, 0.5]), 0.1 * certificate.Sigma, np.array([4.0]))
-    assert decision.reason == "fallback"
+    case = np.array([1.6, 0.5]), 0.1 * certificate.Sigma, np.array([4.0])
+    assert shield.decide(*case).reason == "projected"
+    for module in ("one_step_test", "projection"):
+        monkeypatch.setattr(f"shields.runtime.{module}.closest_on_lines", lambda wanted, *rest: wanted)
+    assert shield.decide(*case).reason == "fallback"
+    assert many(shield, *(np.array([each]) for each in case)).reason.tolist() == [REASONS.index("fallback")]
 
 
 def test_public_helpers_refuse_what_decide_would_call_invalid(certificate, loaded):
@@ -392,8 +401,8 @@ def test_the_test_is_passed_with_a_margin_or_not_at_all(certificate, loaded):
         middle = 0.5 * (low + high)
         passed = shield.decide(np.array([1.6, 0.0]), shape, np.array([middle])).reason == "safe"
         low, high = (middle, high) if passed else (low, middle)
-    room, _ = shield.test.at(np.array([1.6, 0.0]), shape).judge([low])
-    assert MARGIN <= room <= 2 * MARGIN
+    sets = shield.test.reachable(np.array([[1.6], [0.0]]), shield.errors_of(shape).batch())
+    assert MARGIN * (1 - 1e-6) <= sets.slack(np.array([[low]]))[0].item() <= 2 * MARGIN  # but for its own rounding
     assert MARGIN >= 1e-10
 
 
@@ -407,3 +416,88 @@ def test_projection_leaves_room_for_float32():
         estimate = 0.8 * certificate.safe_set.sample(rng)
         reasons.append(shield.decide(estimate, 1e-3 * certificate.Sigma, np.array([1e4])).reason)
     assert set(reasons) == {"projected"}
+
+
+def random_cases(rng, shield, count):
+    """Estimates, error shapes and proposals; some cannot be used, some are what the fallback would do."""
+    plant, certificate = shield.plant, shield.certificate
+    estimates = certificate.safe_set.sample_boundary(rng, count) * rng.uniform(0.0, 1.3, (count, 1))
+    estimates[::3] *= 0.05
+    factor = np.linalg.cholesky(certificate.Sigma)
+    inner = rng.standard_normal((count, plant.n, plant.n)) * np.exp(rng.uniform(-4.0, 1.0, (count, 1, 1)))
+    inner[::5, :, 0] *= 1e-8  # flat ones
+    shapes = factor @ inner @ inner.swapaxes(1, 2) @ factor.T
+    inputs = rng.uniform(-1.0, 1.0, (count, plant.m)) * plant.u_max
+    inputs[::7] = plant.u_max
+    inputs[::11] = [shield.fallback_input(estimate) for estimate in estimates[::11]]
+    estimates[3], estimates[4], estimates[5, 0], estimates[6] = 1e200, np.nan, np.inf, 0.0
+    shapes[8], shapes[9], shapes[10], shapes[12, 0, 0] = 0.0, np.nan, -shapes[10], np.inf
+    inputs[13, -1], inputs[14], inputs[15, 0] = np.nan, 1.1 * plant.u_max, -np.inf
+    return estimates, shapes, inputs
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (2, 1), (2, 2), (3, 2), (4, 1), (4, 3), (5, 2), (6, 3)])
+def test_decisions_one_by_one_equal_those_of_a_batch(n, m, mode):
+    plant = replace(random_plant(n, n, m), u_max=0.3 / m)
+    shield, rng, count = SafetyFilter(certificate_of(plant), plant, mode), np.random.default_rng(n + m), 300
+    estimates, shapes, inputs = random_cases(rng, shield, count)
+    found = many(shield, estimates, shapes, inputs)
+    ones = [shield.decide(*case) for case in zip(estimates, shapes, inputs, strict=True)]
+    assert {type(value) for value in ones[0]} == {np.ndarray, bool, float, str}
+    reasons = [one.reason for one in ones]
+    assert [REASONS[code] for code in found.reason] == reasons
+    for name in ("intervened", "passed", "fallback"):
+        np.testing.assert_array_equal(getattr(found, name), [getattr(one, name) for one in ones])
+    # Where roundings of float64 differ, roundings to float32 hardly ever do.
+    applied, margins = np.array([one.input for one in ones]).T, np.array([one.margin for one in ones])
+    np.testing.assert_allclose(found.input, applied, rtol=2.0**-23)
+    same = (found.input == applied).all(axis=0)
+    assert same.mean() > 0.99
+    np.testing.assert_allclose(found.margin[same], margins[same], rtol=1e-12, atol=1e-12)
+    unusable = np.isin(np.arange(count), [3, 4, 5, 9, 10, 12, 13, 14, 15])
+    np.testing.assert_array_equal(np.array(reasons) == "invalid", unusable)
+    assert {"project": {"safe", "projected"}, "monitor": {"safe", "unsafe"}}.get(mode, {"safe", "fallback"}) <= set(
+        reasons
+    )
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("states", [2, 3])
+def test_single_decisions_take_off_as_much_for_rounding_as_batches_do(states, mode):
+    # As if float64 had five digits.
+    plant = replace(random_plant(states, states, 1), u_max=0.3)
+    shield, rng = SafetyFilter(certificate_of(plant), plant, mode), np.random.default_rng(0)
+    plain = SafetyFilter(certificate_of(plant), plant, mode)
+    shield.test.rounding = 1e-5
+    estimates, shapes, inputs = random_cases(rng, shield, 100)
+    estimates[20:] *= 10.0
+    found, others = many(shield, estimates, shapes, inputs), many(plain, estimates, shapes, inputs)
+    for e in range(100):
+        one = shield.decide(estimates[e], shapes[e], inputs[e])
+        assert REASONS[found.reason[e]] == one.reason
+        np.testing.assert_allclose(found.margin[e], one.margin, rtol=1e-6)
+    same = (found.input == others.input).all(axis=0) & np.isfinite(found.margin)
+    assert (others.margin - found.margin)[same].min() > 0.0
+    assert same.sum() > 50
+
+
+def test_remembered_error_shapes_are_forgotten_in_time(monkeypatch):
+    plant = TWO_STATES
+    shield, Sigma = SafetyFilter(certificate_of(plant), plant), certificate_of(plant).Sigma
+    monkeypatch.setattr("shields.runtime.filter.MOST_REMEMBERED", 5)
+    for _ in range(2):
+        for size in np.linspace(0.1, 1.0, 12):
+            errors = shield.errors_of(size * Sigma)
+            assert shield.errors_of((size * Sigma).copy()) is errors
+            np.testing.assert_allclose(errors.half_widths, np.sqrt(size * np.diag(Sigma)))
+            assert len(shield._remembered) <= 5
+
+
+def test_a_filter_decides_the_same_after_pickling(certificate, loaded):
+    shield = SafetyFilter(certificate, loaded)
+    case = np.array([1.6, 0.5]), 0.1 * certificate.Sigma, np.array([4.0])
+    for twin in (shield, pickle.loads(pickle.dumps(shield))):
+        first, second = twin.decide(*case), pickle.loads(pickle.dumps(twin)).decide(*case)
+        assert first[1:] == second[1:]
+        np.testing.assert_array_equal(first.input, second.input)

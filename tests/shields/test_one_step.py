@@ -7,9 +7,8 @@ from scipy.optimize import minimize_scalar
 
 from ncs_gym import Ellipsoid, truck_trailer
 from shields import SafetyFilter, synthesize
-from shields.runtime import one_step_test as one_step
 from shields.runtime.one_step_test import OneStepTest
-from shields.runtime.plane import PlaneOutlook
+from shields.runtime.predicted_errors import predicted_errors
 from tests.plants import random_plant
 
 PLANTS = {"truck": truck_trailer(mass=4000.0)} | {
@@ -32,6 +31,29 @@ def predicted(certificate, plant, shape):
     return root, P, np.sqrt(np.linalg.eigvalsh(P)[-1])
 
 
+def errors_of(test, shape):
+    """What is known of one error shape, as a batch of one."""
+    return predicted_errors(test, shape[None], np.empty((0, *shape.shape)))
+
+
+def reachable(test, estimate, shape):
+    """The next states that one estimate and error shape allow, as a batch of one."""
+    with np.errstate(all="ignore"):
+        return test.reachable(estimate[:, None], errors_of(test, shape))
+
+
+def slack_and_margin(sets, u):
+    """Of one input."""
+    return tuple(each.item() for each in sets.slack(u[:, None]))
+
+
+def nothing_is_known(test, estimate, shape):
+    sets = reachable(test, estimate, shape)
+    with np.errstate(all="ignore"):
+        unknown = np.isnan([*slack_and_margin(sets, np.zeros(test.plant.m)), *sets.smallest_slack()])
+    return bool(unknown.all())
+
+
 def cases(certificate, plant, rng, count):
     for _ in range(count):
         turn = rng.standard_normal((plant.n, plant.n))
@@ -41,18 +63,18 @@ def cases(certificate, plant, rng, count):
         yield estimate, 0.5 * (shape + shape.T), rng.uniform(-1, 1, plant.m) * plant.u_max * rng.random()
 
 
-def test_room_is_that_of_the_formula(case):
+def test_slack_is_that_of_the_formula(case):
     plant, certificate = case
     test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(0)
     for estimate, shape, u in cases(certificate, plant, rng, 100):
         root, P, h = predicted(certificate, plant, shape)
         c = root @ (plant.A @ estimate + plant.B @ u)
-        room, margin = test.at(estimate, shape).judge(u.tolist())
+        slack, margin = slack_and_margin(reachable(test, estimate, shape), u)
         if h < 1.0:
             weight = (1 - h) * h * np.linalg.inv(h * np.eye(plant.n) - P)
-            assert room == pytest.approx(1 - h - np.sqrt(c @ weight @ c), abs=1e-9)
+            assert slack == pytest.approx(1 - h - np.sqrt(c @ weight @ c), abs=1e-9)
         assert margin == pytest.approx(1 - h - np.linalg.norm(c), abs=1e-9)
-        assert room >= margin - 1e-12
+        assert slack >= margin - 1e-12
 
 
 def test_the_test_lies_between_the_sufficient_and_the_exact_one(case):
@@ -61,7 +83,7 @@ def test_the_test_lies_between_the_sufficient_and_the_exact_one(case):
     sharper = agree = exactly = 0
     for estimate, shape, u in cases(certificate, plant, rng, 400):
         root, P, h = predicted(certificate, plant, shape)
-        room, margin = test.at(estimate, shape).judge(u.tolist())
+        slack, margin = slack_and_margin(reachable(test, estimate, shape), u)
         values, axes = np.linalg.eigh(P)
         c = axes.T @ root @ (plant.A @ estimate + plant.B @ u)
         best = np.inf
@@ -75,12 +97,12 @@ def test_the_test_lies_between_the_sufficient_and_the_exact_one(case):
             best = found.fun
         exact = best <= 1.0
         if margin >= 0.0:
-            assert room >= 0.0
-        if room >= 1e-6:
+            assert slack >= 0.0
+        if slack >= 1e-6:
             assert exact
-        sharper += room > margin + 1e-6
-        exactly += exact and room < 0.0
-        agree += exact and room >= 0.0
+        sharper += slack > margin + 1e-6
+        exactly += exact and slack < 0.0
+        agree += exact and slack >= 0.0
     assert agree > 50
     assert exactly < 0.05 * agree  # little is lost against the exact test
     assert sharper > 50
@@ -92,11 +114,11 @@ def test_passing_inputs_are_the_ones_the_worst_case_allows(case):
     test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(2)
     tight = 0.0
     for estimate, shape, u in cases(certificate, plant, rng, 60):
-        outlook = test.at(estimate, shape)
-        outward = outlook.closest(u.tolist(), 0.0)
-        if outward is None:
+        with np.errstate(all="ignore"):
+            outward = reachable(test, estimate, shape).closest(u[:, None], 0.0)[:, 0]
+        if np.isnan(outward).any():
             continue
-        errors, center = Ellipsoid(shape), plant.A @ estimate + plant.B @ np.array(outward)
+        errors, center = Ellipsoid(shape), plant.A @ estimate + plant.B @ outward
         for _ in range(10):
             e, d = errors.sample_boundary(rng), plant.disturbance.sample_boundary(rng)
             for _ in range(30):
@@ -108,55 +130,39 @@ def test_passing_inputs_are_the_ones_the_worst_case_allows(case):
     assert tight > 0.9
 
 
-def test_smallest_room_is_that_of_the_worst_input(case):
+def test_smallest_slack_is_that_of_the_worst_input(case, monkeypatch):
     plant, certificate = case
     test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(3)
     for estimate, shape, _ in cases(certificate, plant, rng, 30):
-        outlook = test.at(estimate, shape)
+        sets = reachable(test, estimate, shape)
         inputs = rng.uniform(-1, 1, (500, plant.m)) * plant.u_max
         corners = np.sign(inputs) * plant.u_max
-        smallest = outlook.smallest_room()
-        assert all(outlook.judge(u.tolist())[0] >= smallest - 1e-12 for u in inputs)
-        assert min(outlook.judge(u.tolist())[0] for u in corners) == pytest.approx(smallest, abs=1e-12)
+        smallest = sets.smallest_slack().item()
+        assert (sets.slack(inputs.T)[0] >= smallest - 1e-12).all()
+        assert sets.slack(corners.T)[0].min() == pytest.approx(smallest, abs=1e-12)
+        monkeypatch.setattr("shields.runtime.one_step_test.LARGEST_BLOCK", 1)
+        assert sets.smallest_slack().item() == pytest.approx(smallest, abs=1e-12)
+        monkeypatch.undo()
 
 
-def test_plain_floats_agree_with_arrays():
-    plant = PLANTS["truck"]
-    certificate = synthesize(plant)
-    fast = OneStepTest(certificate.L, plant)
-    slow = copy(fast)
-    slow._plane = None
-    rng = np.random.default_rng(4)
-    reached = 0
-    for estimate, shape, u in cases(certificate, plant, rng, 2000):
-        a, b = fast.at(estimate, shape), slow.at(estimate, shape)
-        assert isinstance(a, PlaneOutlook)
-        assert not isinstance(b, PlaneOutlook)
-        assert a.radius == pytest.approx(b.radius, abs=1e-12)
-        np.testing.assert_allclose(a.judge(u.tolist()), b.judge(u.tolist()), atol=1e-11)
-        assert a.smallest_room() == pytest.approx(b.smallest_room(), abs=1e-11)
-        first, second = a.closest(u.tolist(), 1e-9), b.closest(u.tolist(), 1e-9)
-        assert (first is None) == (second is None)
-        if first is not None:
-            reached += 1
-            np.testing.assert_allclose(first, second, atol=1e-7)
-    assert reached > 500
-
-
-def test_plain_floats_take_off_as_much_for_rounding_as_arrays_do():
-    # As if float64 had five digits, for asymmetric shapes (which are rounding, too).
-    plant = PLANTS["truck"]
-    fast = OneStepTest(synthesize(plant).L, plant)
-    *most, _, limit = fast._plane
-    fast.rounding, fast._plane = 1e-5, (*most, 1e-5, limit)
-    slow = copy(fast)
-    slow._plane = None
-    rng = np.random.default_rng(5)
-    for estimate, shape, u in cases(synthesize(plant), plant, rng, 200):
-        shape[0, 1] *= 1.0 - 1e-4
-        a, b = (test.at(100.0 * estimate, shape) for test in (fast, slow))
-        assert a.radius == pytest.approx(b.radius, abs=1e-6)
-        np.testing.assert_allclose(a.judge(u.tolist()), b.judge(u.tolist()), rtol=1e-6)
+def test_a_batch_says_of_each_what_a_batch_of_one_does(case):
+    plant, certificate = case
+    test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(4)
+    estimates, shapes, inputs = (np.array(each) for each in zip(*cases(certificate, plant, rng, 300), strict=True))
+    estimates[7], shapes[8], shapes[9] = np.nan, np.nan, -shapes[9]
+    errors = predicted_errors(test, shapes, certificate.error_shapes)
+    chosen = rng.permutation(300)
+    with np.errstate(all="ignore"):
+        sets = test.reachable(estimates[chosen].T, errors.of(chosen))
+        found = np.array([*sets.slack(inputs[chosen].T), sets.smallest_slack()])
+        closest = sets.closest(inputs[chosen].T, 1e-9)
+        for k, e in enumerate(chosen.tolist()):
+            one = reachable(test, estimates[e], shapes[e])
+            expected = [*slack_and_margin(one, inputs[e]), one.smallest_slack().item()]
+            np.testing.assert_allclose(found[:, k], expected, rtol=1e-12, atol=1e-13)
+            np.testing.assert_allclose(closest[:, [k]], one.closest(inputs[e][:, None], 1e-9), rtol=1e-7, atol=1e-9)
+    assert np.isnan(found[:, np.isin(chosen, [7, 8, 9])]).all()
+    assert np.isfinite(closest).all(axis=0).sum() > 100
 
 
 @pytest.mark.parametrize("size", [1e-12, 1e-3, 1.0])
@@ -164,9 +170,19 @@ def test_plain_floats_take_off_as_much_for_rounding_as_arrays_do():
 def test_nothing_is_said_about_indefinite_shapes_of_any_size(key, size):
     plant = PLANTS[key]
     test, shape = OneStepTest(np.eye(plant.n), plant), 1e-3 * size * np.eye(plant.n)
-    assert test.at(np.zeros(plant.n), shape) is not None
+    assert not nothing_is_known(test, np.zeros(plant.n), shape)
     shape[0, 1] = shape[1, 0] = 1.001 * shape[0, 0]
-    assert test.at(np.zeros(plant.n), shape) is None
+    assert nothing_is_known(test, np.zeros(plant.n), shape)
+
+
+@pytest.mark.parametrize("size", [1e-12, 1e-3])
+def test_nothing_is_said_about_shapes_that_are_indefinite_only_as_a_whole(size):
+    # Each pair of states could be correlated like this; all three cannot.
+    test = OneStepTest(np.eye(3), PLANTS["3, 2"])
+    units = np.diag([1.0, 1e-3, 10.0])
+    for correlation, known in ((-0.4999, True), (-0.5 - 1e-8, False), (-0.9, False)):
+        shape = size * units @ (np.eye(3) + correlation * (1.0 - np.eye(3))) @ units
+        assert nothing_is_known(test, np.zeros(3), shape) is not known
 
 
 @pytest.mark.parametrize("key", ["truck", "3, 2"])
@@ -175,34 +191,61 @@ def test_nothing_is_said_about_what_is_not_finite(key, bad):
     plant = PLANTS[key]
     test = OneStepTest(np.eye(plant.n), plant)
     shape, estimate = 0.01 * np.eye(plant.n), np.zeros(plant.n)
-    assert test.at(estimate, shape) is not None
+    assert not nothing_is_known(test, estimate, shape)
     for i in range(plant.n):
         broken = estimate.copy()
         broken[i] = bad
-        assert test.at(broken, shape) is None
+        assert nothing_is_known(test, broken, shape)
         for j in range(plant.n):
             broken = shape.copy()
             broken[i, j] = broken[j, i] = bad
-            assert test.at(estimate, broken) is None
+            assert nothing_is_known(test, estimate, broken)
 
 
 @pytest.mark.parametrize("key", ["truck", "3, 2"])
 def test_nothing_is_said_about_wrong_shapes_or_negative_ones(key):
     plant = PLANTS[key]
-    test = OneStepTest(np.eye(plant.n), plant)
-    assert test.at(np.zeros(plant.n + 1), np.eye(plant.n)) is None
-    assert test.at(np.zeros((plant.n, 1)), np.eye(plant.n)) is None
-    assert test.at(np.zeros(plant.n), np.eye(plant.n + 1)) is None
-    assert test.at(np.zeros(plant.n), np.ones(plant.n)) is None
-    assert test.at(np.zeros(plant.n), -np.eye(plant.n)) is None
+    shield, n = SafetyFilter(synthesize(plant), plant), plant.n
+    test, u = shield.test, np.zeros(plant.m)
+    assert nothing_is_known(test, np.zeros(n), -np.eye(n))
+    assert np.isfinite(shield.margin(np.zeros(n), 1e-4 * np.eye(n), u))
+    for estimate, shape in (
+        (np.zeros(n + 1), 1e-4 * np.eye(n)),
+        (np.zeros((n, 1)), 1e-4 * np.eye(n)),
+        (np.zeros(n), 1e-4 * np.eye(n + 1)),
+        (np.zeros(n), 1e-4 * np.ones(n)),
+        (np.zeros(n), 1e-4 * np.eye(n).ravel()),
+    ):
+        assert np.isnan(shield.margin(estimate, shape, u))
+        assert shield.decide(estimate, shape, u).reason == "invalid"
 
 
 def test_decomposition_that_fails_says_nothing(monkeypatch):
     plant = PLANTS["3, 2"]
     test = OneStepTest(np.eye(3), plant)
 
-    monkeypatch.setattr(one_step, "dsyev", lambda matrix: (np.ones(3), np.eye(3), 1))
-    assert test.at(np.zeros(3), 0.01 * np.eye(3)) is None
+    def fail(matrices):
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr(np.linalg, "eigh", fail)
+    assert nothing_is_known(test, np.zeros(3), 0.01 * np.eye(3))
+
+
+def test_what_cannot_be_used_spoils_no_other_shape_of_the_batch():
+    plant = PLANTS["3, 2"]
+    certificate = synthesize(plant)
+    test, good = OneStepTest(certificate.L, plant), 0.5 * certificate.Sigma
+    swap = good + np.eye(3)[[1, 0, 2]]
+    bad = [np.full((3, 3), np.nan), np.full((3, 3), np.inf), -good, 1e308 * np.eye(3), swap]
+    errors = predicted_errors(test, np.array([good, *bad, good]), certificate.error_shapes)
+    np.testing.assert_array_equal(np.isfinite(errors.radius), [True, *[False] * 5, True])
+    np.testing.assert_array_equal(errors.certified, [True, *[False] * 5, True])
+    assert np.isnan(errors.largest[1:-1]).all()
+    assert np.isnan(errors.half_widths[:, 1:-1]).all()
+    alone = predicted_errors(test, good[None], certificate.error_shapes)
+    for array, one in zip(errors, alone, strict=True):
+        np.testing.assert_allclose(array[..., 0], one[..., 0], rtol=1e-12)
+        np.testing.assert_array_equal(array[..., 0], array[..., -1])
 
 
 def test_one_state_leaves_nothing_to_be_sharper_about():
@@ -211,10 +254,10 @@ def test_one_state_leaves_nothing_to_be_sharper_about():
     test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(0)
     for estimate, shape, u in cases(certificate, plant, rng, 50):
         *_, h = predicted(certificate, plant, shape)
-        room, margin = test.at(estimate, shape).judge(u.tolist())
+        slack, margin = slack_and_margin(reachable(test, estimate, shape), u)
         center = abs(plant.A @ estimate + plant.B @ u).item() / np.sqrt(certificate.L.item())
-        assert room == pytest.approx(margin, abs=1e-12)
-        assert room == pytest.approx(1.0 - h - center, abs=1e-9)
+        assert slack == pytest.approx(margin, abs=1e-12)
+        assert slack == pytest.approx(1.0 - h - center, abs=1e-9)
 
 
 def test_bounds_on_rounding_hold_column_by_column():
@@ -233,18 +276,44 @@ def test_bounds_on_rounding_hold_column_by_column():
     np.testing.assert_allclose(room, test.rounding * extent**2, rtol=0.2)
     # The radius is smaller by what rounding does to the estimate, its error and the input.
     estimate, shape = np.array([1.0, 2.0, -1.0]), 1e-7 * np.diag([1.0, 2.0, 3.0])
-    for state, error in (
-        (estimate, shape),
-        (1e3 * estimate, shape),
-        (0.0 * estimate, shape),
-        (0.0 * estimate, 10 * shape),
-    ):
-        found = test.at(state, error)
-        reach, spread = test.columns @ np.abs(state), test.columns @ np.sqrt(np.diag(error))
+    still, certain, test.rounding = copy(test), copy(test), 1e-9  # as if float64 had nine digits
+    still.rounding = certain.rounding = test.rounding
+    still.pushed, certain.columns = 0.0, 0.0 * test.columns
+    for state, error in ((estimate, shape), (1e3 * estimate, shape), (0.0 * estimate, 10 * shape)):
+        known, reach = errors_of(test, error).radius.item(), test.columns @ np.abs(state)
+        assert known - reachable(test, state, error).radius.item() == pytest.approx(test.rounding * reach, abs=3e-16)
         pushed = np.linalg.norm(G @ np.abs(plant.B), axis=0) @ plant.u_max
-        loss = 1.0 - found.h - found.radius
-        assert found.h < 1.0
-        assert loss == pytest.approx(test.rounding * (reach + spread + pushed), abs=3e-16)
+        assert errors_of(still, error).radius.item() - known == pytest.approx(test.rounding * pushed, rel=1e-6)
+        spread = test.rounding * test.columns @ np.sqrt(np.diag(error))  # which enlarges h a little, too
+        assert spread < errors_of(certain, error).radius.item() - known < 2.0 * spread
+
+
+def test_error_shapes_are_enlarged_by_the_rounding_of_moving_them():
+    plant = PLANTS["3, 2"]
+    test = OneStepTest(np.eye(3), plant)
+    test.D, test.pushed, test.rounding = 1e-12 * np.eye(3), 0.0, 1e-3
+    shape = np.diag([1e-2, 1e-8, 1e-8])
+    spread = test.columns @ np.sqrt(np.diag(shape))
+    h = np.sqrt(np.linalg.eigvalsh(test.moved @ shape @ test.moved.T)[-1] + test.rounding * spread**2)
+    assert errors_of(test, shape).radius.item() == pytest.approx(1.0 - h - test.rounding * spread, abs=1e-4 * h)
+
+
+@pytest.mark.parametrize("key", ["truck", "3, 2"])
+def test_nothing_passes_where_the_radius_is_too_small_for_the_weights(key):
+    plant = PLANTS[key]
+    shield = SafetyFilter(synthesize(plant), plant)
+    still, u, low, high = np.zeros((plant.n, 1)), np.zeros(plant.m), 0.0, 1e6
+    for _ in range(80):  # to an error ellipsoid whose h is 5e-6 below 1
+        middle = 0.5 * (low + high)
+        radius = shield.errors_of(middle * np.eye(plant.n)).radius
+        low, high = (middle, high) if radius > 5e-6 else (low, middle)
+    shape = low * np.eye(plant.n)
+    assert 4e-6 < shield.errors_of(shape).radius < 6e-6
+    sets = shield.test.reachable(still, shield.errors_of(shape).batch())
+    np.testing.assert_array_equal([sets.radius, *sets.slack(u[:, None])], 0.0)
+    assert shield.decide(still[:, 0], shape, u).reason == "fallback"
+    assert not shield.decide(still[:, 0], shape, u).passed
+    assert shield.decide(still[:, 0], 0.9 * shape, u).passed
 
 
 def test_perfect_estimate_and_huge_error_are_handled(case):

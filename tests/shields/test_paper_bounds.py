@@ -89,7 +89,7 @@ def test_model_of_a_plant_agrees_with_the_single_formulas():
         (lambda: state_error_bound([1.0, 2.0], 0.5, 1.0), "A must have shape"),
     ],
 )
-def test_bad_arguments_are_refused(call, word):
+def test_invalid_arguments_are_refused(call, word):
     with pytest.raises(ValueError, match=word):
         call()
 

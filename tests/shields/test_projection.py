@@ -2,9 +2,22 @@ import cvxpy as cp
 import numpy as np
 import pytest
 
-from shields.runtime.closest import closest_in_space
-from shields.runtime.closest_pair import closest_pairs
-from shields.runtime.projection import closest_admissible, closest_on_line
+from shields.runtime import projection
+
+
+def closest_admissible(wanted, offset, effect, radius, limit):
+    """The projection of one input, shape (m,), as a batch of one; None if there is none."""
+    with np.errstate(all="ignore"):
+        columns = wanted[:, None], offset[:, None], effect[:, :, None], np.array([radius])
+        found = projection.closest_admissible(*columns, limit)[:, 0]
+    return None if np.isnan(found).any() else found
+
+
+def closest_on_line(wanted, a, b, c, radius, limit):
+    """The projection of one number."""
+    with np.errstate(all="ignore"):
+        found = projection.closest_on_lines(*(np.float64(each) for each in (wanted, a, b, c, radius)), limit)
+    return None if np.isnan(found) else float(found)
 
 
 class Reference:
@@ -72,7 +85,7 @@ def test_projection_agrees_with_a_conic_solver_in_a_thousand_cases(m):
         if m == 1:
             a, b, c = (effect.T @ effect).item(), (effect.T @ offset).item(), float(offset @ offset)
             line = closest_on_line(wanted.item(), a, b, c, radius, limit.item())
-            assert line == pytest.approx(found.item(), abs=1e-7)
+            assert line == found.item()  # as the scalar shield does it
     assert compared > 300
     assert failed < 10
     assert m == 1 or bound > 20  # cases in which an input limit binds too
@@ -121,71 +134,92 @@ def test_projection_agrees_with_a_conic_solver_where_limits_bind():
     assert branched > 200
 
 
-def compiled_search(pairwise, effect, limits, weight, target, offset, wanted):
-    """What the batched shield does for two inputs, and for more."""
-    if not pairwise:
-        return closest_in_space(effect, limits, weight, target, offset, wanted)
-    closest = np.full((2, 1), np.nan)
-    columns = weight.reshape(-1, 1), offset[:, None], np.array([target]), wanted[:, None]
-    closest_pairs(effect, 0.0, limits, *columns, closest)
-    return closest[:, 0]
-
-
-@pytest.mark.parametrize("pairwise", [True, False])
-def test_compiled_searches_find_what_the_scalar_one_does_in_any_norm(pairwise):
-    rng, outcomes = np.random.default_rng(0), {"none": 0, "limits": 0, "inside": 0}
-    for trial in range(2000):
-        wanted, offset, effect, radius, limit = random_case(rng, 2)
-        if trial % 9 == 0:  # only one direction moves, or none
-            effect[:, 1] = rng.choice([0.0, -2.0]) * effect[:, 0]
-        n = len(offset)
-        root = np.eye(n) + 0.3 * rng.standard_normal((n, n))
-        if trial % 2:  # some input passes, barely
-            wanted, inside = rng.choice([-1.0, 1.0], 2) * limit, rng.choice([-1.0, -0.3, 0.3, 1.0], 2) * limit
-            radius = 1.01 * np.linalg.norm(root @ (offset + effect @ inside))
-        found = compiled_search(pairwise, effect, limit, root.T @ root, radius, offset, wanted)
-        expected = closest_admissible(wanted, root @ offset, root @ effect, radius, limit)
-        if expected is None:
+@pytest.mark.parametrize("m", [1, 2, 3, 4])
+def test_many_projections_at_once_are_those_one_by_one(m):
+    rng, count, n, limit = np.random.default_rng(m), 400, 4, np.linspace(0.5, 1.5, m)
+    wanted = rng.uniform(-1.0, 1.0, (m, count)) * limit[:, None]
+    offset, effect = 2.0 * rng.standard_normal((n, count)), rng.standard_normal((n, m, count))
+    effect[:, -1, ::9] = rng.choice([0.0, -2.0]) * effect[:, 0, ::9]  # only one direction moves, or none
+    inside = rng.choice([-1.0, -0.3, 0.3, 1.0], (m, count)) * limit[:, None]
+    radius = 1.01 * np.linalg.norm(offset + (effect * inside).sum(axis=1), axis=0)  # some input passes, barely
+    radius[::3] *= rng.uniform(0.3, 1.0, len(radius[::3]))
+    radius[1], radius[2], wanted[:, 4] = -1.0, np.nan, np.nan
+    with np.errstate(all="ignore"):
+        found = projection.closest_admissible(wanted, offset, effect, radius, limit)
+    assert found.shape == (m, count)
+    outcomes = {"none": 0, "limits": 0, "inside": 0}
+    for e in range(count):
+        one = closest_admissible(wanted[:, e], offset[:, e], effect[:, :, e], radius[e], limit)
+        u = found[:, e]
+        assert np.isnan(u).any() == (one is None)
+        if one is None:
+            assert np.isnan(u).all()
             outcomes["none"] += 1
-            assert np.isnan(found).all()
             continue
-        outcomes["limits" if (np.abs(found) == limit).any() else "inside"] += 1
-        assert (np.abs(found) <= limit).all()
-        assert np.linalg.norm(root @ (offset + effect @ found)) <= radius * (1.0 + 1e-9)
-        assert np.linalg.norm(found - wanted) == pytest.approx(np.linalg.norm(expected - wanted), rel=1e-6, abs=1e-9)
-    assert min(outcomes.values()) > 100
+        outcomes["limits" if (np.abs(u) == limit).any() else "inside"] += 1
+        assert (np.abs(u) <= limit).all()
+        assert np.linalg.norm(offset[:, e] + effect[:, :, e] @ u) <= radius[e] * (1.0 + 1e-9)
+        assert np.linalg.norm(u - wanted[:, e]) == pytest.approx(np.linalg.norm(one - wanted[:, e]), rel=1e-9, abs=1e-9)
+    assert np.isnan(found[:, [1, 2, 4]]).all()
+    if m == 1:  # what is wanted is within the limit, and so is the closest
+        del outcomes["limits"]
+    assert min(outcomes.values()) > 15
 
 
-@pytest.mark.parametrize("pairwise", [True, False])
-def test_compiled_searches_find_nothing_without_room(pairwise):
-    still = np.zeros(2)
-    found = compiled_search(pairwise, np.eye(2), np.ones(2), np.eye(2), -1e-9, still, still)
-    assert np.isnan(found).all()
-    found = compiled_search(pairwise, np.eye(2), np.ones(2), np.eye(2), 0.0, still, still)
-    np.testing.assert_array_equal(found, still)
+@pytest.mark.parametrize("m", [1, 2, 3])
+def test_nothing_is_found_without_a_radius(m):
+    still = np.zeros(m)
+    assert closest_admissible(still, still, np.eye(m), -1e-9, np.ones(m)) is None
+    np.testing.assert_array_equal(closest_admissible(still, still, np.eye(m), 0.0, np.ones(m)), still)
+    np.testing.assert_allclose(closest_admissible(still + 0.5, still, np.eye(m), 0.0, np.ones(m)), still, atol=1e-150)
 
 
-@pytest.mark.parametrize("pairwise", [True, False])
 @pytest.mark.parametrize("ratio", [1e-9, 1e-6, 1e-3, 1e3, 1e6, 1e9])
-def test_compiled_searches_do_not_depend_on_the_units_of_inputs_that_are_held(pairwise, ratio):
+def test_units_of_inputs_that_are_held_do_not_matter(ratio):
     # The second input stays where it is, at its limit: the first goes where the test is met.
     effect, limits = np.array([[1.0, 0.0], [0.0, 1.0 / ratio]]), np.array([1.0, ratio])
-    found = compiled_search(pairwise, effect, limits, np.eye(2), 1.25, np.array([1.0, -2.0]), limits)
+    found = closest_admissible(limits, np.array([1.0, -2.0]), effect, 1.25, limits)
     np.testing.assert_allclose(found / limits, [-0.25, 1.0], rtol=1e-9)
 
 
-@pytest.mark.parametrize("pairwise", [True, False])
-def test_compiled_searches_converge_where_one_input_does_far_more_than_the_other(pairwise):
+@pytest.mark.parametrize("m", [2, 3])
+def test_converges_where_one_input_does_far_more_than_the_others(m):
+    # By another route: the multiplier by bisection, in the axes of a singular value decomposition.
     rng = np.random.default_rng(0)
     for _ in range(200):
-        effect = np.array([[1.0, 0.2], [0.1, 1.0]]) * 10.0 ** rng.uniform(-4, 4, 2)
-        center = rng.standard_normal(2)
-        offset, limits = -effect @ center, np.full(2, 1e6)
+        effect = (np.eye(m) + 0.2 * rng.standard_normal((m, m))) * 10.0 ** rng.uniform(-4, 4, m)
+        center = rng.standard_normal(m)
+        offset = -effect @ center
         radius = np.linalg.norm(offset) * 10.0 ** rng.uniform(-2, 0)
-        wanted = center + 100.0 * rng.standard_normal(2)
-        found = compiled_search(pairwise, effect, limits, np.eye(2), radius, offset, wanted)
-        expected = closest_admissible(wanted, offset, effect, radius, limits)
-        assert np.linalg.norm(found - wanted) == pytest.approx(np.linalg.norm(expected - wanted), rel=1e-9)
+        wanted = center + 100.0 * rng.standard_normal(m)
+        found = closest_admissible(wanted, offset, effect, radius, np.full(m, 1e6))
+        _, gains, axes = np.linalg.svd(effect)
+        away, low, high = axes @ (wanted - center), -100.0, 100.0
+        for _ in range(200):
+            middle = 0.5 * (low + high)
+            outside = np.linalg.norm(gains * away / (1.0 + 10.0**middle * gains**2)) > radius
+            low, high = (middle, high) if outside else (low, middle)
+        expected = center + axes.T @ (away / (1.0 + 10.0**high * gains**2))
+        if np.linalg.norm(offset + effect @ wanted) <= radius:
+            expected = wanted
+        assert np.linalg.norm(found - wanted) == pytest.approx(np.linalg.norm(expected - wanted), rel=1e-8)
+
+
+@pytest.mark.filterwarnings("ignore:Solution may be inaccurate")
+def test_twelve_inputs_are_projected_too():
+    rng, reference = np.random.default_rng(0), Reference(12)
+    for _ in range(20):
+        effect, offset = rng.standard_normal((6, 12)), 3.0 * rng.standard_normal(6)
+        inside = rng.choice([-1.0, 1.0, 0.2], 12)
+        case = (
+            np.sign(rng.standard_normal(12)),
+            offset,
+            effect,
+            1.2 * np.linalg.norm(offset + effect @ inside),
+            np.ones(12),
+        )
+        found, expected = closest_admissible(*case), reference(*case)
+        assert np.linalg.norm(found - case[0]) <= np.linalg.norm(expected - case[0]) * (1 + 1e-4) + 1e-6
 
 
 @pytest.mark.parametrize("ratio", [1e3, 1e6, 1e9])

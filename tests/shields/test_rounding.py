@@ -12,6 +12,7 @@ from shields import CertificateError, Infeasible, SafetyFilter, SafetyShield, sy
 from shields.runtime.filter import require_computable
 from shields.runtime.guarantee import FAR_OUT, NOT_KNOWN_INSIDE
 from shields.runtime.one_step_test import OneStepTest, certified_root
+from shields.runtime.predicted_errors import predicted_errors
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, multiply, rational, subtract
 
 SINGULAR = np.array([[0.5, -0.3], [0.25, -0.15]])
@@ -128,12 +129,13 @@ def test_known_inside_is_true_to_the_last_bit_without_any_margin(tilt):
     # The root of this L is exact; only products with it round, by terms of size `tilt` that cancel.
     factor = np.array([[1.0, 0.0], [tilt, 1.0]])
     test, rng = OneStepTest(factor @ factor.T, slanted(10.0)), np.random.default_rng(0)
+    errors = predicted_errors(test, np.zeros((1, 2, 2)), np.zeros((0, 2, 2))).single()
     for _ in range(60):
         x = factor @ rng.standard_normal(2)
         low, high = 0.0, 1e3
         for _ in range(70):  # to the edge of what is known to be inside
             middle = 0.5 * (low + high)
-            known = test.knows_inside(middle * x, np.zeros((2, 2)), 0.0)
+            known = test.knows_inside(middle * x, errors, 0.0)
             low, high = (middle, high) if known else (low, middle)
         p, q = (Fraction(float(entry)) for entry in low * x)
         assert low > 0.0

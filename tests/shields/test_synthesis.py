@@ -11,7 +11,7 @@ from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from tests.plants import random_plant
 
 
-def area_share(certificate, plant):
+def area_fraction(certificate, plant):
     return np.sqrt(np.linalg.det(certificate.L) / np.linalg.det(largest_box_ellipsoid(plant.C)))
 
 
@@ -23,13 +23,13 @@ def test_without_process_noise_the_paper_plant_reaches_the_largest_ellipsoid_in_
 
 
 @pytest.mark.parametrize(
-    ("mass", "gamma", "share"), [(1000.0, 5e-4, 0.9999), (4000.0, 5e-4, 0.9995), (4000.0, 2e-3, 0.997)]
+    ("mass", "gamma", "fraction"), [(1000.0, 5e-4, 0.9999), (4000.0, 5e-4, 0.9995), (4000.0, 2e-3, 0.997)]
 )
-def test_truck_trailers_reach_the_measured_volumes(mass, gamma, share):
+def test_truck_trailers_reach_the_measured_volumes(mass, gamma, fraction):
     plant = truck_trailer(mass=mass, gamma=gamma)
     certificate = synthesize(plant)
     assert verify(certificate, plant).valid
-    assert area_share(certificate, plant) >= share
+    assert area_fraction(certificate, plant) >= fraction
 
 
 @pytest.mark.parametrize("m", [1, 2])
@@ -39,7 +39,7 @@ def test_random_stable_plants_get_a_certificate_that_verifies(seed, n, m):
     plant = random_plant(seed, n, m, p=max(1, n - 1))
     certificate = synthesize(plant)
     assert verify(certificate, plant).valid
-    assert 0.3 < area_share(certificate, plant) <= 1.0
+    assert 0.3 < area_fraction(certificate, plant) <= 1.0
 
 
 def test_closed_loop_stays_inside_for_the_worst_state_error_and_disturbance():
@@ -67,7 +67,7 @@ def test_box_with_more_rows_than_states_is_respected():
     certificate = synthesize(plant)
     assert verify(certificate, plant).valid
     assert max(row @ certificate.L @ row for row in plant.C) <= 1.0
-    assert area_share(certificate, plant) > 0.99
+    assert area_fraction(certificate, plant) > 0.99
 
 
 def test_units_do_not_change_what_is_found():
@@ -85,7 +85,7 @@ def test_units_do_not_change_what_is_found():
         measurement_noise_cov=1e-4 * np.eye(2),
     )
     same = truck_trailer(mass=4000.0, gamma=0.0, process_noise_cov=2e-4 * np.eye(2), initial_cov=np.zeros((2, 2)))
-    assert area_share(synthesize(plant), plant) == pytest.approx(area_share(synthesize(same), same), abs=2e-3)
+    assert area_fraction(synthesize(plant), plant) == pytest.approx(area_fraction(synthesize(same), same), abs=2e-3)
 
 
 def test_too_large_disturbance_is_infeasible_and_says_by_how_much():
@@ -152,7 +152,7 @@ def test_synthesis_is_deterministic(loaded, certificate):
     np.testing.assert_array_equal(synthesize(loaded).L, certificate.L)
 
 
-def test_progress_is_told(loaded):
+def test_progress_is_reported(loaded):
     lines = []
     synthesize(loaded, progress=lines.append)
     assert any("volume" in line for line in lines)

@@ -68,9 +68,9 @@ def attack(plant, channel, contract, mode, policy, count, steps, seed):
         assert not info["assumption_violated"].any()
         assert not info["contract_broken"].any()
         level = max(level, float(np.linalg.norm(info["state"] @ worst.T, axis=1).max()))
-        table, nodes = env.patterns
-        for node in np.unique(nodes):
-            shape, rows = table.shapes[:, node].reshape(plant.n, plant.n), nodes == node
+        table, numbers = env.error_shapes
+        for number in np.unique(numbers):
+            shape, rows = table.shapes[number], numbers == number
             squares = np.linalg.solve(shape, info["estimation_error"][rows].T) * info["estimation_error"][rows].T
             error = max(error, float(squares.sum(axis=0).max()) ** 0.5)
         overridden += float(info["shield_intervened"].sum())

@@ -1,19 +1,17 @@
+from types import SimpleNamespace
+
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import VectorActionWrapper, VectorObservationWrapper, VectorWrapper
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 
-from ncs_gym import Channel, ChannelContract, LinearPlant, NCSVectorEnv, SphereDisturbance, batch_reactor, truck_trailer
-from shields import CertificateError, SafetyFilter, SafetyShield, VectorSafetyShield
-from shields.runtime import guarantee as proof
-from shields.runtime import routine, vector_wrapper
-from shields.runtime.filter import MARGIN, MODES, Decision
-from shields.runtime.guarantee import ProofTracker, starts_inside
-from shields.runtime.tracking import Knowledge, compare_clocks, track
-from shields.runtime.vector_filter import REASONS, Decisions, VectorFilter, overridden
-from shields.runtime.vector_wrapper import WHY
-from tests.attacks import CHANNELS, RANDOM, TRUCKS, certificate_of, harmful
+from ncs_gym import Channel, ChannelContract, NCSVectorEnv, SphereDisturbance, batch_reactor, truck_trailer
+from shields import CertificateError, Decision, SafetyFilter, SafetyShield, VectorSafetyShield
+from shields.runtime.filter import MODES
+from shields.runtime.guarantee import EXPLANATIONS, OTHER_STEPS, GuaranteeMonitor, Report, starts_inside
+from shields.runtime.vector_wrapper import Clock, _moved, overridden
+from tests.attacks import CHANNELS, TRUCKS, certificate_of, harmful
 
 KEYS = {
     "shield_intervened",
@@ -26,130 +24,69 @@ KEYS = {
 }
 
 
-def random_shapes(rng, plant, count):
-    """Error shapes of all sizes, some flat, some unusable."""
-    certified = certificate_of(plant).Sigma
-    factor = np.linalg.cholesky(certified)
-    shapes = []
-    for _ in range(count):
-        inner = rng.standard_normal((plant.n, plant.n)) * np.exp(rng.uniform(-4.0, 1.0))
-        inner[:, 0] *= rng.choice([1.0, 1e-8])
-        shape = factor @ inner @ inner.T @ factor.T
-        shapes.append(0.5 * (shape + shape.T))
-    shapes[0] = np.zeros_like(certified)
-    shapes[1] = np.full_like(certified, np.nan)
-    shapes[2] = -certified
-    return np.array(shapes)
+class Watched:
+    """What a scalar shield would know of one environment, from its infos alone."""
 
+    def __init__(self, shield: SafetyFilter):
+        self.shield, self.monitor, self.row = shield, GuaranteeMonitor(shield), {}
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("plant", [*TRUCKS.values(), *RANDOM.values()], ids=[*TRUCKS, *RANDOM])
-def test_decisions_equal_those_of_the_scalar_filter(plant, mode):
-    safety_filter = SafetyFilter(certificate_of(plant), plant, mode)
-    batch, rng, count = VectorFilter(safety_filter), np.random.default_rng(0), 400
-    estimates = certificate_of(plant).safe_set.sample_boundary(rng, count) * rng.uniform(0, 1.3, (count, 1))
-    estimates[3], estimates[4], estimates[5] = 1e200, np.nan, 0.0
-    shapes = random_shapes(rng, plant, 60)[rng.integers(60, size=count)]
-    proposed = rng.uniform(-1, 1, (count, plant.m)) * plant.u_max
-    proposed[::7] = plant.u_max
-    # Some propose just what the fallback would do.
-    proposed[::11] = [
-        np.zeros(plant.m) if not np.isfinite(x).all() else safety_filter.fallback_input(x) for x in estimates[::11]
-    ]
-    numbers = np.array([batch.book.number(shape) for shape in shapes])
-    found = batch.decide(np.ascontiguousarray(estimates.T), numbers, np.ascontiguousarray(proposed.T))
-    seen = set()
-    for e in range(count):
-        one = safety_filter.decide(estimates[e], shapes[e], proposed[e])
-        seen.add(one.reason)
-        assert REASONS[found.reason[e]] == one.reason
-        np.testing.assert_allclose(found.inputs[:, e], one.input, rtol=3e-7, atol=1e-12)
-        assert (found.intervened[e], found.passed[e], found.fallback[e]) == (one.intervened, one.passed, one.fallback)
-        np.testing.assert_allclose(found.margin[e], one.margin, atol=1e-6 if one.reason == "projected" else 1e-12)
-    assert {"safe", "invalid"} <= seen
-    assert seen & {"projected", "fallback", "unsafe"}
+    def _seen(self, row):
+        self.row = row
+        return Report(row["estimate"], self.shield.errors_of(row["error_shape"]), bool(row["assumption_violated"]))
 
+    def decide(self, u):
+        return self.shield.decide(self.row["estimate"], self.row["error_shape"], u)
 
-@pytest.mark.parametrize("name", ["4000 kg", "n=4 m=3 p=2"])
-def test_the_test_is_passed_with_the_margin_of_the_scalar_filter(name):
-    plant = (TRUCKS | RANDOM)[name]
-    certificate = certificate_of(plant)
-    safety_filter = SafetyFilter(certificate, plant, "switch")
-    batch, shape = VectorFilter(safety_filter), 0.1 * certificate.Sigma
-    number, u = np.array([batch.book.number(shape)]), 0.01 * plant.u_max
-    edge = certificate.safe_set.extreme_point(np.ones(plant.n))
-    low, high = 0.0, 50.0
-    for _ in range(60):  # to the last estimate at which it passes
-        middle = 0.5 * (low + high)
-        passed = REASONS[batch.decide((middle * edge)[:, None], number, u[:, None]).reason[0]] == "safe"
-        low, high = (middle, high) if passed else (low, middle)
-    assert 0.0 < low < 49.0
-    assert MARGIN <= safety_filter.test.at(low * edge, shape).judge(u.tolist())[0] <= 1.01 * MARGIN
+    def margin(self, u):
+        return self.shield.margin(self.row["estimate"], self.row["error_shape"], u)
 
+    def start(self, known_inside, row):
+        self.state = self.monitor.start(known_inside, True, self._seen(row))
 
-def test_rounding_counts_as_in_the_scalar_filter():
-    # Estimates that A annihilates, so far out that rounding shows, and errors that nearly fill the safe set.
-    A = np.array([[0.5, -0.3], [0.25, -0.15]])
-    plant = LinearPlant(A=A, B=np.ones((2, 1)), C=np.eye(2), u_max=1.0, dt=0.1, gamma=1e-6)
-    certificate = certificate_of(plant)
-    safety_filter = SafetyFilter(certificate, plant)
-    batch, test = VectorFilter(safety_filter), safety_filter.test
-    u = np.zeros(1)
+    def step(self, decision, row):
+        same_input = np.array_equal(decision.input, row["input"])
+        self.state = self.monitor.advance(self.state, decision, True, same_input, self._seen(row))
 
-    def margins(estimate, shape):
-        found = batch.decide(estimate[:, None].copy(), np.array([batch.book.number(shape)]), u[:, None])
-        return found.margin[0], safety_filter.margin(estimate, shape, u)
-
-    for size in (1e5, 1e6, 1e7):
-        estimate = size * np.array([3.0, 5.0])
-        loss = test.rounding * float(test.columns @ np.abs(estimate))
-        assert margins(estimate, 1e-4 * certificate.Sigma) == pytest.approx(
-            (margins(0.0 * estimate, 1e-4 * certificate.Sigma)[1] - loss,) * 2, abs=0.1 * loss
-        )
-    low, high = 0.0, 1e6
-    for _ in range(60):  # to a radius too small for weights
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if 1.0 - test._in_space(np.zeros(2), middle * np.eye(2)).h > 5e-6 else (low, middle)
-    assert margins(np.zeros(2), low * np.eye(2)) == pytest.approx((0.0, 0.0), abs=1e-12)
+    @property
+    def reason(self):
+        return EXPLANATIONS[self.monitor.reasons(self.state)]
 
 
 def drive(env, steps, policy):
-    """Steps a shielded vector environment; checks every key against scalar filters and trackers."""
+    """Steps a shielded vector environment; checks every key against scalar filters and monitors."""
     shield, inner = env, env.unwrapped
     safety_filter = SafetyFilter(shield.certificate, inner.plant, shield.filter.mode)
-    trackers = [ProofTracker(safety_filter) for _ in range(env.num_envs)]
+    watched = [Watched(safety_filter) for _ in range(env.num_envs)]
     _, info = env.reset(seed=0)
     inside = starts_inside(shield.certificate, inner.single.initial_set)
     counts = np.zeros(env.num_envs, int)
-    rows = [{key: value[e] for key, value in info.items()} for e in range(env.num_envs)]
-    for tracker, row in zip(trackers, rows, strict=True):
-        tracker.start(inside, True, row)
+    for e, one in enumerate(watched):
+        one.start(inside, {key: value[e] for key, value in info.items()})
     totals = {"interventions": 0, "guaranteed": 0, "reasons": set()}
     for _ in range(steps):
         actions = policy(info)
         episodes = inner.episodes.copy()
-        decisions = [
-            safety_filter.decide(row["estimate"], row["error_shape"], u)
-            for row, u in zip(rows, inner.inputs_of(actions).T, strict=True)
-        ]
+        decisions = [one.decide(u) for one, u in zip(watched, inner.inputs_of(actions).T, strict=True)]
         *_, info = env.step(actions)
-        rows = [{key: value[e] for key, value in info.items()} for e in range(env.num_envs)]
-        for e, (tracker, row, decision) in enumerate(zip(trackers, rows, decisions, strict=True)):
+        for e, (one, decision) in enumerate(zip(watched, decisions, strict=True)):
+            row = {key: value[e] for key, value in info.items()}
             if inner.episodes[e] != episodes[e]:
-                tracker.start(inside, True, row)
+                one.start(inside, row)
                 counts[e] = 0
                 assert not row["shield_intervened"]
                 assert not row["input_proposed"].any()
-                margin = safety_filter.margin(row["estimate"], row["error_shape"], np.zeros(inner.plant.m))
-                assert row["shield_margin"] == pytest.approx(margin, abs=1e-12)
+                assert row["shield_correction"] == 0.0
+                assert row["shield_margin"] == pytest.approx(one.margin(np.zeros(inner.plant.m)), abs=1e-12)
             else:
-                tracker.step(decision, True, row)
+                np.testing.assert_allclose(row["input"], decision.input, rtol=3e-7, atol=1e-9)
+                one.step(decision._replace(input=row["input"]), row)
                 counts[e] += decision.intervened
                 assert row["shield_intervened"] == decision.intervened
-                np.testing.assert_allclose(row["input"], decision.input, rtol=3e-7, atol=1e-9)
                 assert row["shield_margin"] == pytest.approx(decision.margin, abs=1e-6)
-            assert row["shield_reason"] == tracker.reason
-            assert row["shield_guaranteed"] == (not tracker.reason)
+                correction = np.linalg.norm(row["input"] - row["input_proposed"])
+                assert row["shield_correction"] == pytest.approx(correction, abs=1e-12)
+            assert row["shield_reason"] == one.reason
+            assert row["shield_guaranteed"] == (not one.reason)
             assert row["episode_interventions"] == counts[e]
         totals["interventions"] += int(info["shield_intervened"].sum())
         totals["guaranteed"] += int(info["shield_guaranteed"].sum())
@@ -187,69 +124,33 @@ def test_reasons_of_broken_proofs_equal_those_of_scalar_shields():
     assert len(totals["reasons"]) >= 4
 
 
-def test_proofs_break_and_recover_as_scalar_trackers_do_whatever_is_reported():
-    plant, count, rng = TRUCKS["4000 kg"], 200, np.random.default_rng(0)
-    shield = VectorSafetyShield(NCSVectorEnv(count, plant=plant), certificate_of(plant))
-    safety_filter, Sigma = shield.filter, shield.certificate.Sigma
-    shapes = [0.2 * Sigma, Sigma, 1.1 * Sigma, -Sigma, 1e5 * np.eye(2)]
-    numbers = np.array([shield._batch.book.number(shape) for shape in shapes])
-    trackers = [ProofTracker(safety_filter) for _ in range(count)]
-    knowledge = Knowledge(np.zeros(count, np.int64), *np.zeros((2, count), np.bool_))
-    reason, seen, kinds = np.empty(count, np.int64), set(), [0.3, 1.0, 1.5, 1e7, np.nan]
-    for step in range(12):
-        rare = lambda share: rng.random(count) < share  # noqa: E731
-        restarted = rare(0.1) if step else np.ones(count, np.bool_)
-        once, passed, fallback, known, alarm = ~rare(0.03), rare(0.7), rare(0.7), rare(0.5), rare(0.03)
-        drawn = rng.choice(5, count, p=[0.5, 0.3, 0.14, 0.03, 0.03])
-        sizes = rng.choice(kinds, count, p=[0.3, 0.3, 0.34, 0.03, 0.03])
-        estimate = (shield.certificate.safe_set.sample_boundary(rng, count) * sizes[:, None]).T.copy()
-        decided, inputs = np.zeros((1, count)), rare(0.03)[None] * 1.0
-        wrong = track(
-            shield._ground, shield._batch.book.seen, numbers[drawn], knowledge, restarted, once,
-            decided, passed, fallback, known, inputs, estimate, alarm, reason,
-        )  # fmt: skip
-        for e, tracker in enumerate(trackers):
-            info = {"estimate": estimate[:, e], "error_shape": shapes[drawn[e]], "input": inputs[:, e]}
-            info["assumption_violated"] = bool(alarm[e])
-            if restarted[e]:
-                tracker.start(bool(known[e]), bool(once[e]), info)
-            else:
-                decision = Decision(decided[:, e], False, bool(passed[e]), bool(fallback[e]), 0.0, "")
-                tracker.step(decision, bool(once[e]), info)
-            assert WHY[reason[e]] == tracker.reason
-        assert wrong == np.count_nonzero(reason)
-        seen |= set(WHY[reason])
-    assert seen == {"", *(proof.ALARM, proof.OTHER_INPUT, proof.OTHER_STEPS, proof.LARGE_ERROR, proof.FAR_OUT),
-                    proof.UNUSABLE, proof.NOT_KNOWN_INSIDE}  # fmt: skip
-
-
 @pytest.mark.parametrize("next_tick", [True, False])
 def test_one_step_is_one_of_the_environments_own_clock(next_tick):
-    episodes_before, steps_before = np.array([1, 1, 1, 1, 1, 1]), np.array([5, 5, 5, 9, 9, 9])
-    episodes, steps = np.array([1, 1, 1, 2, 3, 2]), np.array([6, 7, 5, 0, 0, 1])
-    restarted, once = np.empty((2, 6), np.bool_)
-    assert compare_clocks(episodes, steps, episodes_before, steps_before, next_tick, restarted, once) == 3
+    before = Clock(np.array([1, 1, 1, 1, 1, 1]), np.array([5, 5, 5, 9, 9, 9]), 7)
+    now = Clock(np.array([1, 1, 1, 2, 3, 2]), np.array([6, 7, 5, 0, 0, 1]), 8 if next_tick else 9)
+    restarted, once = _moved(before, now)
     np.testing.assert_array_equal(restarted, [False, False, False, True, True, True])
     np.testing.assert_array_equal(once, np.array([True, False, False, True, False, False]) & next_tick)
 
 
-def test_steps_behind_the_shields_back_are_seen_once_every_pattern_is_known(monkeypatch):
-    plant, returned = TRUCKS["4000 kg"], []
-    env = NCSVectorEnv(4, plant=plant, disturbance=harmful(plant), max_episode_steps=200)
-    shield = VectorSafetyShield(env, certificate_of(plant))
+def test_error_shapes_that_the_environment_forgets_and_meets_again_change_nothing():
+    class Forgetful(NCSVectorEnv):
+        @property
+        def error_shapes(self):
+            table, numbers = super().error_shapes
+            present, again = np.unique(numbers, return_inverse=True)
+            return SimpleNamespace(shapes=table.shapes[present]), again
 
-    def recorded(*arguments):
-        returned.append(routine.follow(*arguments))
-        return returned[-1]
-
-    monkeypatch.setattr(vector_wrapper, "follow", recorded)
-    shield.reset(seed=0)
-    for _ in range(60):
-        assert shield.step(np.zeros((4, 1)))[4]["shield_guaranteed"].all()
-    assert returned[-1] == 0  # nothing new: the compiled routine did everything
-    env.step(np.zeros((4, 1)))
-    assert not shield.step(np.zeros((4, 1)))[4]["shield_guaranteed"].any()
-    assert returned[-1] == 4
+    runs = []
+    for kind in (NCSVectorEnv, Forgetful):
+        env = kind(6, plant=TRUCKS["4000 kg"], channel=CHANNELS["overtaking"], max_episode_steps=30)
+        shield, rng = VectorSafetyShield(env, certificate_of(env.plant)), np.random.default_rng(0)
+        infos = [shield.reset(seed=0)[1]]
+        infos += [shield.step(rng.uniform(-1, 1, (6, 1)))[4] for _ in range(60)]
+        runs.append(infos)
+    for one, other in zip(*runs, strict=True):
+        for key, value in one.items():
+            np.testing.assert_array_equal(value, other[key])
 
 
 def test_start_on_the_boundary_of_the_safe_set_is_known_in_batches_too():
@@ -260,77 +161,14 @@ def test_start_on_the_boundary_of_the_safe_set_is_known_in_batches_too():
         assert (shield.reset(options={"state": factor * edge})[1]["shield_guaranteed"] == (factor < 1.0)).all()
 
 
-def test_book_of_shapes_grows_and_knows_the_widest_of_them():
-    plant = TRUCKS["4000 kg"]
-    safety_filter, Sigma = SafetyFilter(certificate_of(plant), plant), certificate_of(plant).Sigma
-    book = VectorFilter(safety_filter).book
-    shapes = [Sigma * share for share in np.linspace(0.1, 0.9, 300)]
-    assert [book.number(shape) for shape in [*shapes, shapes[7]]] == [*range(300), 7]
-    np.testing.assert_allclose(book.widest, np.sqrt(np.diag(shapes[-1])))
-    for k in (0, 255, 256, 299):
-        fresh = VectorFilter(safety_filter).book
-        fresh.number(shapes[k])
-        np.testing.assert_array_equal(book.outlooks[:, k], fresh.outlooks[:, 0])
-        np.testing.assert_array_equal(book.seen[:, k], fresh.seen[:, 0])
-    book.number(1.1 * Sigma)
-    assert np.isinf(book.widest).all()
-
-
-def test_margins_are_those_of_no_input_even_where_it_does_not_pass():
-    plant = TRUCKS["4000 kg"]
-    safety_filter, shape = SafetyFilter(certificate_of(plant), plant), 0.1 * certificate_of(plant).Sigma
-    batch, rng = VectorFilter(safety_filter), np.random.default_rng(0)
-    estimates = 1.5 * certificate_of(plant).safe_set.sample_boundary(rng, 50)
-    found = batch.margins(np.ascontiguousarray(estimates.T), np.full(50, batch.book.number(shape)))
-    expected = [safety_filter.margin(estimate, shape, np.zeros(1)) for estimate in estimates]
-    np.testing.assert_allclose(found, expected, atol=1e-12)
-    assert min(expected) < -0.1
-
-
 @pytest.mark.parametrize(
     ("given", "kept"), [(np.float32, np.float32), (np.float64, np.float64), (np.int64, np.float64)]
 )
 def test_overridden_actions_are_numbers_of_the_callers_kind(given, kept):
-    decisions = Decisions(np.array([[1.0, 3.0]]), np.array([True, False]), *np.zeros((4, 2)))
-    actions = overridden(np.array([[1], [1]], given), decisions, np.array([4.0]))
+    decided = Decision(np.array([[1.0, 3.0]]), np.array([True, False]), *np.zeros((4, 2)))
+    actions = overridden(np.array([[1], [1]], given), decided, np.array([4.0]))
     assert actions.dtype == kept
     np.testing.assert_array_equal(actions, [[0.25], [1.0]])
-
-
-def test_shortcut_is_taken_only_where_nothing_is_in_doubt():
-    hold, move_once = (getattr(loop, "py_func", loop) for loop in (routine._hold, routine._move_once))
-    reach, widest, none = np.array([10.0, 20.0]), np.array([1.0, 2.0]), np.zeros(3, np.bool_)
-    ones, estimate = np.ones((2, 3)), np.array([[9.0, 0.0, -9.0], [18.0, 0.0, -18.0]])
-
-    def holds(broken=0, passed=True, applied=1.0, shift=0.0, alarm=False, e=2):
-        """Whether all proofs hold with something else in environment e."""
-        changed = [np.zeros(3, np.int64), ~none, ones.copy(), estimate.copy(), none.copy()]
-        changed[0][e], changed[1][e], changed[2][1, e], changed[4][e] = broken, passed, applied, alarm
-        changed[3][1, e] += shift
-        broken, passed, applied, seen, alarm = changed
-        return hold(reach, widest, broken, ones, passed, applied, seen, alarm)
-
-    assert holds()
-    for doubt in (
-        {"broken": 3},
-        {"passed": False},
-        {"applied": 0.5},
-        {"shift": -0.1},
-        {"shift": np.nan},
-        {"alarm": True},
-    ):
-        assert not holds(**doubt), doubt
-    assert not holds(shift=0.1, e=0)
-    assert holds(shift=1.0, e=1)
-    first, then = np.array([1, 1]), np.array([5, 6])
-    assert move_once(first, then + 1, first, then)
-    for episodes, steps in (
-        (first, then),
-        (first, then + first * 2),
-        (first * [1, 2], then + 1),
-        (first + 1, then + 1),
-    ):
-        assert not move_once(episodes, steps, first, then)
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
@@ -429,9 +267,10 @@ def assert_honest(shield, info):
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_a_user_who_changes_what_was_returned_changes_no_decision(mode):
     plant = TRUCKS["4000 kg"]
-    env = NCSVectorEnv(20, plant=plant, disturbance=harmful(plant), max_episode_steps=30, autoreset_mode=mode)
-    shield = VectorSafetyShield(env, certificate_of(plant))
+    settings = {"disturbance": harmful(plant), "max_episode_steps": 30, "autoreset_mode": mode}
+    shield, twin = (VectorSafetyShield(NCSVectorEnv(20, plant=plant, **settings), certificate_of(plant)) for _ in "ab")
     _, info = shield.reset(seed=0)
+    twin.reset(seed=0)
     for _ in range(60):
         actions = outwards(shield, info)
         for array in info.values():
@@ -440,6 +279,32 @@ def test_a_user_who_changes_what_was_returned_changes_no_decision(mode):
         _, _, _, _, info = shield.step(actions)
         assert_honest(shield, info)
         assert info["shield_guaranteed"].all()
+        for key, value in twin.step(actions.copy())[4].items():
+            if not key.endswith(("final_info", "final_obs")):
+                np.testing.assert_array_equal(info[key], value)
+
+
+@pytest.mark.parametrize("moved", [True, False])
+def test_interrupted_step_promises_nothing_until_a_reset(moved):
+    class Breaks(VectorWrapper):
+        broken = False
+
+        def step(self, actions):
+            result = self.env.step(actions) if moved or not self.broken else None
+            if self.broken:
+                raise KeyboardInterrupt
+            return result
+
+    inner = Breaks(gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=2))
+    env, actions = VectorSafetyShield(inner), np.ones((2, 1), np.float32)
+    env.reset(seed=0)
+    assert env.step(actions)[4]["shield_guaranteed"].all()
+    inner.broken = True
+    with pytest.raises(KeyboardInterrupt):
+        env.step(actions)
+    inner.broken = False
+    assert set(env.step(actions)[4]["shield_reason"]) == {OTHER_STEPS}
+    assert env.reset(seed=0)[1]["shield_guaranteed"].all()
 
 
 def test_last_steps_behind_the_shields_back_promise_nothing():

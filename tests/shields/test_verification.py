@@ -6,7 +6,7 @@ import pytest
 
 from ncs_gym import Ellipsoid, truck_trailer
 from shields import CertificateError, synthesize, verify
-from shields.verification.verify import require_valid
+from shields.verification import require_valid
 from tests.plants import random_plant
 
 
@@ -14,7 +14,7 @@ def broken(certificate, plant) -> list[str]:
     return [condition.name for condition in verify(certificate, plant).conditions if not condition.holds]
 
 
-def shares(certificate, **change):
+def with_multipliers(certificate, **change):
     return replace(certificate, multipliers=replace(certificate.multipliers, **change))
 
 
@@ -36,22 +36,25 @@ MUTATIONS = {
     "tiny Sigma": (lambda c: replace(c, Sigma=1e-4 * c.Sigma), ["(E0)", "(E1)"]),
     "small D": (lambda c: replace(c, D=0.9 * c.D), ["D:"]),
     "D a hair too small": (lambda c: replace(c, D=(1 - 1.1e-9) * c.D), ["D: the certificate's"]),
-    "denormal share": (lambda c: shares(c, state=1e-320), ["(I)"]),
-    "denormal rate": (lambda c: shares(c, error=1e-320), ["(E1)"]),
-    "swapped shares": (lambda c: shares(c, state=c.multipliers.disturbance, disturbance=c.multipliers.state), ["(I)"]),
-    "wrong rate": (lambda c: shares(c, error=0.999), ["(E1)"]),
-    "shares above one": (lambda c: shares(c, state=0.99, estimate=0.5), ["lx + le + ld"]),
-    "negative share": (lambda c: shares(c, estimate=-0.1), ["lx, le, ld, s > 0"]),
-    "zero share": (lambda c: shares(c, disturbance=0.0), ["lx, le, ld, s > 0"]),
-    # With a rate or share below zero the sums of (E1) and (U) have terms of the wrong sign, and hold.
-    "negative rate": (lambda c: shares(c, error=-0.5), ["0 < lam_e < 1"]),
-    "negative input share": (lambda c: shares(c, inputs=(-0.5,)), ["0 < mu_i < 1"]),
-    "rate of zero": (lambda c: shares(c, error=0.0), ["0 < lam_e < 1"]),
-    "rate of one": (lambda c: shares(c, error=1.0), ["0 < lam_e < 1"]),
-    "input share of one": (lambda c: shares(c, inputs=(1.0,)), ["0 < lam_e < 1"]),
-    "no input share": (lambda c: shares(c, inputs=()), ["shapes"]),
-    "infinite share": (lambda c: shares(c, rounding=float("inf")), ["finite"]),
-    "NaN share": (lambda c: shares(c, state=float("nan")), ["finite"]),
+    "denormal multiplier": (lambda c: with_multipliers(c, state=1e-320), ["(I)"]),
+    "denormal rate": (lambda c: with_multipliers(c, error=1e-320), ["(E1)"]),
+    "swapped multipliers": (
+        lambda c: with_multipliers(c, state=c.multipliers.disturbance, disturbance=c.multipliers.state),
+        ["(I)"],
+    ),
+    "wrong rate": (lambda c: with_multipliers(c, error=0.999), ["(E1)"]),
+    "multipliers above one": (lambda c: with_multipliers(c, state=0.99, estimate=0.5), ["lx + le + ld"]),
+    "negative multiplier": (lambda c: with_multipliers(c, estimate=-0.1), ["lx, le, ld, s > 0"]),
+    "zero multiplier": (lambda c: with_multipliers(c, disturbance=0.0), ["lx, le, ld, s > 0"]),
+    # With a rate or multiplier below zero the sums of (E1) and (U) have terms of the wrong sign, and hold.
+    "negative rate": (lambda c: with_multipliers(c, error=-0.5), ["0 < lam_e < 1"]),
+    "negative input multiplier": (lambda c: with_multipliers(c, inputs=(-0.5,)), ["0 < mu_i < 1"]),
+    "rate of zero": (lambda c: with_multipliers(c, error=0.0), ["0 < lam_e < 1"]),
+    "rate of one": (lambda c: with_multipliers(c, error=1.0), ["0 < lam_e < 1"]),
+    "input multiplier of one": (lambda c: with_multipliers(c, inputs=(1.0,)), ["0 < lam_e < 1"]),
+    "no input multiplier": (lambda c: with_multipliers(c, inputs=()), ["shapes"]),
+    "infinite multiplier": (lambda c: with_multipliers(c, rounding=float("inf")), ["finite"]),
+    "NaN multiplier": (lambda c: with_multipliers(c, state=float("nan")), ["finite"]),
     "lopsided L": (lambda c: replace(c, L=c.L + 1e-12 * np.eye(2, k=1)), ["L > 0", "(I)"]),
     "flat L": (lambda c: replace(c, L=np.diag([3.9, 0.0])), ["L > 0", "(I)"]),
     "negative L": (lambda c: replace(c, L=-c.L), ["L > 0", "(I)"]),
@@ -73,7 +76,7 @@ def test_mutation_is_rejected_for_the_right_condition(name, certificate, loaded)
         require_valid(mutate(certificate), loaded)
 
 
-def test_what_verifies_is_required_without_a_word(certificate, loaded):
+def test_a_valid_certificate_passes_as_required(certificate, loaded):
     require_valid(certificate, loaded)
 
 
@@ -83,11 +86,11 @@ def test_failed_conditions_have_a_negative_margin(certificate, loaded):
 
 
 def test_float32_rounding_of_actions_is_part_of_the_condition():
-    # Without room for it a certificate that is tight in (I) would pass; the exact D_u must reject it.
+    # Without slack for it a certificate that is tight in (I) would pass; the exact D_u must reject it.
     plant = random_plant(3, 2, 1)
     certificate = synthesize(plant)
     assert verify(certificate, plant).valid
-    assert broken(shares(certificate, rounding=1e-30), plant) != []
+    assert broken(with_multipliers(certificate, rounding=1e-30), plant) != []
 
 
 def test_plant_with_a_looser_bound_rejects_the_certificate(certificate, loaded):
@@ -101,24 +104,24 @@ def test_plant_with_a_looser_bound_rejects_the_certificate(certificate, loaded):
 @pytest.mark.parametrize("change", [{"error": "x"}, {"inputs": 0.5}, {"inputs": None}, {"state": None}])
 def test_multipliers_that_are_not_numbers_are_refused(certificate, change):
     with pytest.raises(CertificateError):
-        shares(certificate, **change)
+        with_multipliers(certificate, **change)
 
 
 def test_margins_agree_with_floating_point(certificate, loaded):
     margins = {condition.name.split()[0]: condition.margin for condition in verify(certificate, loaded).conditions}
-    c, p, shares_ = certificate, loaded, certificate.multipliers
-    grown = p.A @ c.Sigma @ p.A.T / shares_.error + c.D / (1 - shares_.error)
+    c, p, multipliers = certificate, loaded, certificate.multipliers
+    grown = p.A @ c.Sigma @ p.A.T / multipliers.error + c.D / (1 - multipliers.error)
     assert margins["(E1)"] == pytest.approx(np.linalg.eigvalsh(c.Sigma - grown)[0], rel=1e-6)
     closed, gain = p.A + p.B @ c.K, p.B @ c.K
-    grown = closed @ c.L @ closed.T / shares_.state + gain @ c.Sigma @ gain.T / shares_.estimate
-    D_u = (1 + shares_.rounding) * c.D + (1 + 1 / shares_.rounding) * p.B @ p.B.T * (4.0 * 2**-24) ** 2
-    assert margins["(I)"] == pytest.approx(np.linalg.eigvalsh(c.L - grown - D_u / shares_.disturbance)[0], rel=1e-5)
+    grown = closed @ c.L @ closed.T / multipliers.state + gain @ c.Sigma @ gain.T / multipliers.estimate
+    D_u = (1 + multipliers.rounding) * c.D + (1 + 1 / multipliers.rounding) * p.B @ p.B.T * (4.0 * 2**-24) ** 2
+    assert margins["(I)"] == pytest.approx(np.linalg.eigvalsh(c.L - grown - D_u / multipliers.disturbance)[0], rel=1e-5)
 
 
 def test_margins_of_several_inputs_agree_with_floating_point():
-    # Large limits and a small share s, so that the rounding of actions counts in (I) and in (U).
+    # Large limits and a small multiplier s, so that the rounding of actions counts in (I) and in (U).
     plant = replace(random_plant(3, 3, 2), u_max=[1e3, 2e3])
-    certificate = shares(synthesize(plant), rounding=1e-9)
+    certificate = with_multipliers(synthesize(plant), rounding=1e-9)
     c, s = certificate, certificate.multipliers
     margins = {condition.name.split(" stays")[0]: condition.margin for condition in verify(c, plant).conditions}
     closed, gain = plant.A + plant.B @ c.K, plant.B @ c.K
@@ -152,26 +155,26 @@ def replaced(plant, **values):
 # Each breaks one condition and no other: a verifier without it would accept. (certificate, plant) -> the same, broken.
 ALONE = {
     "plant": lambda c, p: (replace(c, fingerprint="0" * 64), p),
-    "shapes": lambda c, p: (shares(c, inputs=(0.5, 0.5)), p),
-    "finite": lambda c, p: (shares(c, rounding=float("inf")), p),
-    "0 < lam_e < 1": lambda c, p: (shares(c, error=1.5), p),
-    "lx, le, ld, s > 0": lambda c, p: (shares(c, estimate=-1e-9), p),
-    "lx + le + ld": lambda c, p: (shares(c, estimate=c.multipliers.estimate + 1e-9), p),
+    "shapes": lambda c, p: (with_multipliers(c, inputs=(0.5, 0.5)), p),
+    "finite": lambda c, p: (with_multipliers(c, rounding=float("inf")), p),
+    "0 < lam_e < 1": lambda c, p: (with_multipliers(c, error=1.5), p),
+    "lx, le, ld, s > 0": lambda c, p: (with_multipliers(c, estimate=-1e-9), p),
+    "lx + le + ld": lambda c, p: (with_multipliers(c, estimate=c.multipliers.estimate + 1e-9), p),
     "D: the plant's": lambda c, p: (c, replaced(p, disturbance=Ellipsoid((1 - 1e-6) * p.nominal_disturbance.shape))),
     "D: the certificate's": lambda c, p: (c, replaced(p, disturbance=Ellipsoid((1 + 2e-9) * c.D))),
     "N:": lambda c, p: (c, replaced(p, sensor_error=Ellipsoid(0.99 * p.sensor_noise.bound.shape))),
     "r0:": lambda c, p: (c, replaced(p, initial_error=Ellipsoid(0.99 * p.initial_noise.bound.shape))),
     "(E0)": lambda c, p: (c, replaced(p, initial_error=Ellipsoid(1.01 * np.diag(c.Sigma).max() * np.eye(p.n)))),
-    "(E1)": lambda c, p: (shares(c, error=min(1.0 - 1e-3, c.multipliers.error * 1.2)), p),
-    "(I)": lambda c, p: (shares(c, disturbance=1e-6), p),
+    "(E1)": lambda c, p: (with_multipliers(c, error=min(1.0 - 1e-3, c.multipliers.error * 1.2)), p),
+    "(I)": lambda c, p: (with_multipliers(c, disturbance=1e-6), p),
     "(S) c_1": lambda c, p: (c, replaced(p, C=p.C * [[1.0 + 1e-5], [1.0]])),
     "(S) c_2": lambda c, p: (c, replaced(p, C=p.C * [[1.0], [1.0 + 1e-5]])),
-    "(U) input 1": lambda c, p: (shares(c, inputs=(1e-9,)), p),
+    "(U) input 1": lambda c, p: (with_multipliers(c, inputs=(1e-9,)), p),
 }
 
 
 @pytest.mark.parametrize("name", ALONE)
-def test_each_condition_alone_turns_a_certificate_down(name, certificate, loaded):
+def test_each_condition_alone_makes_a_certificate_invalid(name, certificate, loaded):
     if name == "(U) input 1":  # a certificate that uses its inputs
         loaded = random_plant(3, 2, 1)
         certificate = synthesize(loaded)
@@ -181,7 +184,7 @@ def test_each_condition_alone_turns_a_certificate_down(name, certificate, loaded
     assert name in found[0]
 
 
-def test_only_positive_definiteness_turns_a_flat_set_down():
+def test_only_positive_definiteness_excludes_a_flat_set():
     # Without L > 0 the point set {0} would be "invariant": only a plant without any disturbance could have it.
     plant = truck_trailer(
         gamma=0.0, process_noise_cov=np.zeros((2, 2)), initial_cov=np.zeros((2, 2)), measurement_noise_cov=np.eye(2)

@@ -24,7 +24,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from ncs_gym import AdversarialDisturbance, Channel, Ellipsoid, NCSEnv
 from shields import Certificate, CertificateError, SafetyShield, synthesize
-from shields.runtime.filter import Decision, SafetyFilter
+from shields.runtime.filter import SafetyFilter
 from shields.runtime.guarantee import (
     ALARM,
     FAR_OUT,
@@ -32,8 +32,6 @@ from shields.runtime.guarantee import (
     NOT_KNOWN_INSIDE,
     OTHER_INPUT,
     OTHER_STEPS,
-    UNUSABLE,
-    ProofTracker,
 )
 from tests.plants import random_plant
 
@@ -215,8 +213,8 @@ def test_boundary_overrides_more_often_than_switch(certificate):
 
 
 def test_certificate_is_synthesized_once_per_plant(monkeypatch):
+    from shields import synthesis
     from shields.runtime import wrapper
-    from shields.synthesis import synthesize as synthesis
 
     calls = []
     monkeypatch.setattr(wrapper, "_synthesized", {})
@@ -451,9 +449,9 @@ def test_writing_into_the_infos_changes_no_decision(certificate):
 def test_forged_packet_is_noticed(certificate):
     env = shielded(certificate, channel=Channel())
     env.reset(seed=0)
-    core = env.unwrapped
-    honest = core._measure
-    core._measure = lambda: honest() + 0.6
+    process = env.unwrapped._process
+    honest = process.measure
+    process.measure = lambda rng, state: honest(rng, state) + 0.6
     assert env.step(full(None))[4]["shield_reason"] == ALARM
 
 
@@ -465,50 +463,6 @@ def test_error_ellipsoid_outside_the_certified_one_is_reported(certificate, load
     infos = play(env, full, 30, seed=0)
     assert infos[0]["shield_guaranteed"]
     assert LARGE_ERROR in {info["shield_reason"] for info in infos}
-
-
-def test_nothing_is_proved_before_an_episode(certificate, loaded):
-    assert ProofTracker(SafetyFilter(certificate, loaded)).reason == NOT_KNOWN_INSIDE
-
-
-def test_fallback_proves_nothing_while_the_error_is_not_certified(certificate):
-    tracker = ProofTracker(SafetyFilter(certificate, gym.make(CRUISE).unwrapped.plant))
-    info = {
-        "estimate": np.array([1.9, 0.0]),
-        "error_shape": certificate.Sigma,
-        "assumption_violated": False,
-        "input": np.zeros(1),
-    }
-    fallback = Decision(np.zeros(1), True, False, True, -0.1, "fallback")
-    tracker.start(True, True, info)
-    tracker.step(fallback, True, info | {"error_shape": 1.01 * certificate.Sigma})
-    assert tracker.reason == LARGE_ERROR  # the step itself still began with a certified error
-    tracker.step(fallback, True, info)
-    assert tracker.reason == NOT_KNOWN_INSIDE
-    tracker.step(fallback._replace(passed=True), True, info)
-    assert tracker.reason == ""
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"estimate": np.full(2, np.nan)}, {"estimate": None}, {"error_shape": "none"}, {"error_shape": -np.eye(2)}],
-)
-def test_unusable_report_ends_the_proof_for_the_rest_of_the_episode(certificate, loaded, change):
-    tracker = ProofTracker(SafetyFilter(certificate, loaded))
-    info = {
-        "estimate": np.zeros(2),
-        "error_shape": certificate.Sigma,
-        "assumption_violated": False,
-        "input": np.zeros(1),
-    }
-    passed = Decision(np.zeros(1), False, True, False, 0.1, "safe")
-    tracker.start(True, True, info)
-    assert tracker.reason == ""
-    tracker.step(passed, True, info | change)
-    tracker.step(passed, True, info)
-    assert tracker.reason == UNUSABLE
-    tracker.start(True, True, info)
-    assert tracker.reason == ""
 
 
 @pytest.mark.parametrize("forge", [lambda S: -S, lambda S: np.float64(0.0), lambda S: S[0], lambda S: np.nan * S])
@@ -588,12 +542,12 @@ def test_wrapper_that_changes_the_action_space_is_refused_inside(certificate):
 
 def test_alarm_is_cleared_by_a_new_episode(certificate):
     env = shielded(certificate, channel=Channel())
-    core = env.unwrapped
+    process = env.unwrapped._process
     env.reset(seed=0)
-    honest = core._measure
-    core._measure = lambda: honest() + 0.6
+    honest = process.measure
+    process.measure = lambda rng, state: honest(rng, state) + 0.6
     env.step(full(None))
-    core._measure = honest
+    process.measure = honest
     assert env.reset()[1]["shield_guaranteed"]
 
 

@@ -1,0 +1,84 @@
+"""What training and evaluation return, as data that is read without stable-baselines3."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class TrainingPoint:
+    """Totals of a training run up to some step.
+
+    Attributes:
+        steps: Environment steps taken so far.
+        episode_return: Mean return of the last finished episodes, penalties included (NaN before the first).
+        violation_steps: Steps so far whose true state violated the safe box.
+        interventions: Steps so far in which the shield intervened.
+    """
+
+    steps: int
+    episode_return: float
+    violation_steps: int
+    interventions: int
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One finished episode of an evaluation.
+
+    Attributes:
+        index: Number of the episode within the evaluation. With the same seed and number of episodes, episodes of equal
+            index have the same start, disturbances and packet losses, whatever the policy and the shield.
+        steps: Length of the episode.
+        episode_return: Sum of the environment's rewards, without penalties for interventions or violations.
+        violation_steps: Steps after which the true state violated the safe box.
+        estimate_violation_steps: Steps after which the estimate was outside the safe box.
+        interventions: Steps in which the shield intervened, or would have in mode "monitor".
+        guaranteed: Whether the shield's guarantee held at every step; False without a shield.
+        largest_level: Largest x'Mx of the true state; NaN without a certificate.
+    """
+
+    index: int
+    steps: int
+    episode_return: float
+    violation_steps: int
+    estimate_violation_steps: int
+    interventions: int
+    guaranteed: bool
+    largest_level: float
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """One episode of T steps, step by step.
+
+    Attributes:
+        states: True states, shape (T + 1, n).
+        estimates: Estimates of the states, shape (T + 1, n).
+        inputs: Applied inputs, shape (T, m).
+        proposed: Inputs that the agent proposed, shape (T, m); equal to `inputs` without a shield.
+        intervened: Whether the shield intervened, or would have in mode "monitor", shape (T,).
+        arrivals: Whether a packet arrived after each step, shape (T,).
+    """
+
+    states: np.ndarray
+    estimates: np.ndarray
+    inputs: np.ndarray
+    proposed: np.ndarray
+    intervened: np.ndarray
+    arrivals: np.ndarray
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The finished episodes of an evaluation.
+
+    Attributes:
+        episodes: All episodes, in order of their index.
+        trajectory: The first episode, step by step.
+    """
+
+    episodes: list[Episode]
+    trajectory: Trajectory

@@ -1,0 +1,64 @@
+"""Confidence intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy.stats import binomtest, bootstrap, t, trim_mean
+
+CONFIDENCE = 0.95
+RESAMPLES = 10_000
+# Resamples held in memory at once.
+_BATCH = 1_000
+
+
+def clopper_pearson(events: int, trials: int) -> tuple[float, float]:
+    """Returns the exact 95 % interval of a probability after `events` in `trials` independent trials.
+
+    Raises:
+        ValueError: Unless 0 <= events <= trials and trials >= 1.
+    """
+    if not 0 <= events <= trials or trials < 1:
+        raise ValueError(f"events must be between 0 and trials >= 1, got {events} of {trials}")
+    interval = binomtest(events, trials).proportion_ci(CONFIDENCE, "exact")
+    return float(interval.low), float(interval.high)
+
+
+def mean_interval(values: Sequence[float]) -> tuple[float, float] | None:
+    """Returns Student's 95 % interval of the mean of independent values; None for fewer than two."""
+    if len(values) < 2:
+        return None
+    half = float(t.ppf(0.5 + CONFIDENCE / 2.0, len(values) - 1)) * float(np.std(values, ddof=1)) / len(values) ** 0.5
+    mean = float(np.mean(values))
+    return mean - half, mean + half
+
+
+def interquartile_mean(values: Sequence[float], axis: int = -1) -> float:
+    """Returns the mean without the lowest and the highest quarter of the values (rounded down)."""
+    return trim_mean(values, 0.25, axis=axis)
+
+
+def bootstrap_interval(
+    values: Sequence[float], statistic: Callable[..., float] = np.mean
+) -> tuple[float, float] | None:
+    """Returns the percentile bootstrap's 95 % interval; None for fewer than two values.
+
+    With a handful of values it is too narrow: it cannot reach beyond the smallest and the largest of them.
+
+    Args:
+        values: Independent values.
+        statistic: Function of an array of resampled values and the `axis` over which it is computed.
+    """
+    if len(values) < 2:
+        return None
+    result = bootstrap(
+        (np.asarray(values),),
+        statistic,
+        n_resamples=RESAMPLES,
+        batch=_BATCH,
+        confidence_level=CONFIDENCE,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    )
+    return float(result.confidence_interval.low), float(result.confidence_interval.high)

@@ -1,0 +1,23 @@
+"""Tables for a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+
+def text_table(rows: Sequence[Sequence[str]], rules: Collection[int] = (1,), left_columns: int = 1) -> str:
+    """Returns rows of cells as aligned text.
+
+    Args:
+        rows: Rows of equal length, the header first.
+        rules: Indices of the rows above which a horizontal rule is drawn.
+        left_columns: Number of columns that are aligned to the left; the others are aligned to the right.
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    rule = "-" * (sum(widths) + 2 * (len(widths) - 1))
+    lines = []
+    for index, row in enumerate(rows):
+        cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=True)]
+        cells[:left_columns] = [cell.ljust(width) for cell, width in zip(row, widths[:left_columns], strict=False)]
+        lines += [rule] * (index in rules) + ["  ".join(cells).rstrip()]
+    return "\n".join(lines)

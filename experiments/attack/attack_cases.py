@@ -1,0 +1,96 @@
+"""The control loops that a campaign attacks: plants behind channels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import gymnasium as gym
+import numpy as np
+
+from ncs_gym import Channel, ChannelContract, GilbertElliott, LinearPlant, truck_trailer
+from ncs_gym.envs.env import ncs_env
+from ncs_gym.registration import ENTRY_POINTS, loaded_truck_trailer
+from shields import Certificate
+from shields.runtime.wrapper import certificate_for
+
+# One channel of each kind: no loss, no packet at all, losses in bursts, and packets that overtake one another.
+_CHANNELS = {
+    "perfect": Channel(),
+    "blackout": Channel(loss=1.0),
+    "bursts": Channel(loss=GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.1), send_period=2, quantization_step=0.01),
+    "overtaking": Channel(loss=0.2, quantization_step=0.01, send_period=2, delay=1, jitter=3),
+}
+# Numbers of states, inputs and measurements of the random plants, in turn.
+_SIZES = ((2, 1, 2), (2, 2, 1), (3, 2, 3), (4, 1, 4))
+
+
+@dataclass(frozen=True, eq=False)
+class AttackCase:
+    """A plant behind a channel.
+
+    Attributes:
+        plant: The plant.
+        channel: The channel between sensor and estimator.
+        contract: Channel contract that the certificate assumes; None for a stable plant.
+    """
+
+    plant: LinearPlant
+    channel: Channel
+    contract: ChannelContract | None = None
+
+    @property
+    def certificate(self) -> Certificate:
+        """A certificate for the plant under the contract, synthesized once per process."""
+        return certificate_for(self.plant, self.contract)
+
+
+@cache
+def attack_cases(seed: int, random_plants: int) -> dict[str, AttackCase]:
+    """Returns the cases by name: every registered environment, and all kinds of channels for it and for random plants.
+
+    Args:
+        seed: Seed of the random plants.
+        random_plants: Number of random plants.
+    """
+    found = {}
+    for env_id, name in ENTRY_POINTS.items():
+        if name == "LINEAR_NCS":  # has no plant of its own
+            continue
+        env, short = ncs_env(gym.make(env_id)), env_id.removeprefix("ncs_gym/")
+        found[f"{short}, its channel"] = AttackCase(env.plant, env.channel, env.contract)
+        if env.contract is not None:
+            for kind, channel in _extremes(env.contract).items():
+                found[f"{short}, {kind}"] = AttackCase(env.plant, channel, env.contract)
+    plants = {"TruckTrailer-v0": truck_trailer(), "TruckTrailerCruise-v0": loaded_truck_trailer()}
+    plants |= {f"random plant {index}": _random_plant(seed, index) for index in range(random_plants)}
+    for name, plant in plants.items():
+        found |= {f"{name}, {kind}": AttackCase(plant, channel) for kind, channel in _CHANNELS.items()}
+    return found
+
+
+def _extremes(contract: ChannelContract) -> dict[str, Channel]:
+    """Returns channels that reach the limits of a contract: the oldest sample each time, the longest gap each time."""
+    age, step = contract.max_age, contract.quantization_step
+    longest_gap = Channel(loss=1.0, max_consecutive_losses=age, quantization_step=step)
+    return {"late": Channel(delay=age, quantization_step=step), "rare": longest_gap}
+
+
+def _random_plant(seed: int, index: int) -> LinearPlant:
+    """Returns a stable plant in the unit box whose inputs are so weak that a shield lets some of them through."""
+    rng = np.random.default_rng([seed, index])
+    n, m, p = _SIZES[index % len(_SIZES)]
+    A = rng.standard_normal((n, n))
+    A *= rng.uniform(0.4, 0.9) / np.abs(np.linalg.eigvals(A)).max()
+    return LinearPlant(
+        A=A,
+        B=rng.standard_normal((n, m)),
+        C=np.eye(n),
+        u_max=rng.uniform(0.1, 0.5, m),
+        dt=0.1,
+        gamma=1e-3,
+        H=rng.standard_normal((p, n)),
+        process_noise_cov=1e-5 * np.eye(n),
+        measurement_noise_cov=1e-4 * np.eye(p),
+        initial_cov=1e-5 * np.eye(n),
+    )

@@ -1,0 +1,55 @@
+"""What a campaign counts; sums of counts do not depend on how the work was split."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+from experiments.analysis.statistics import clopper_pearson
+
+
+@dataclass(frozen=True, kw_only=True)
+class SafetyCounts:
+    """Counts of some episodes.
+
+    Attributes:
+        steps: Number of simulated steps.
+        episodes: Number of episodes.
+        exits: Number of steps whose true state lay outside S.
+        violations: Number of steps whose true state lay outside the safe box.
+        broken_episodes: Number of episodes with an exit or a violation.
+        interventions: Number of steps in which the shield intervened.
+        unproved: Number of steps at which the shield's proof did not hold.
+        level: Largest sqrt(x'Mx) of a true state after `monte_carlo_batch.SETTLING_STEPS`.
+    """
+
+    steps: int = 0
+    episodes: int = 0
+    exits: int = 0
+    violations: int = 0
+    broken_episodes: int = 0
+    interventions: int = 0
+    unproved: int = 0
+    level: float = 0.0
+
+    def __add__(self, other: SafetyCounts) -> SafetyCounts:
+        """Returns the counts of both."""
+        sums: dict[str, Any] = {
+            each.name: getattr(self, each.name) + getattr(other, each.name) for each in fields(self)
+        }
+        sums["level"] = max(self.level, other.level)
+        return SafetyCounts(**sums)
+
+    @property
+    def margin(self) -> float:
+        """Smallest 1 - sqrt(x'Mx): the distance of the states from the boundary of S, in units of S."""
+        return 1.0 - self.level
+
+    @property
+    def bound(self) -> float:
+        """Upper end of the exact 95 % interval of the probability that an episode leaves S or the box."""
+        return clopper_pearson(self.broken_episodes, self.episodes)[1]
+
+    def document(self) -> dict[str, float]:
+        """Returns counts, margin and bound as JSON values."""
+        return asdict(self) | {"margin": self.margin, "bound": self.bound}

@@ -1,0 +1,69 @@
+"""Nature and agents that do harm within the assumptions."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+
+from ncs_gym import AdversarialDisturbance, LinearPlant, NCSVectorEnv
+from ncs_gym.plants.process import BlockSampler
+from shields import Certificate
+
+# Points on a boundary are pulled in by rounding.
+INWARD = 1.0 - 1e-12
+
+
+class WorstCaseVectorEnv(NCSVectorEnv):
+    """Disturbances that push the next state farthest out of S; starts, first errors and sensor noise of full size.
+
+    Args:
+        num_envs: N.
+        certificate: Certificate of the safe set S.
+        settings: Those of `NCSEnv` without disturbance and initial set.
+    """
+
+    def __init__(self, num_envs: int, certificate: Certificate, **settings: Any) -> None:
+        push = AdversarialDisturbance(certificate.M)
+        super().__init__(num_envs, disturbance=push, initial_set=certificate.safe_set, **settings)
+        self._process.sensor_noise = BlockSampler(self._extreme_noise, num_envs)
+
+    def _extreme_noise(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Returns sensor noise on the boundary of its bound, shape (p, count)."""
+        return INWARD * self.plant.sensor_noise.bound.sample_boundary(rng, count).T
+
+    def _first(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Returns states on the boundary of S and first errors on the boundary of theirs, shape (n, count) each."""
+        states = self.single.initial_set.sample_boundary(self.np_random, count)
+        errors = self.plant.initial_noise.bound.sample_boundary(self.np_random, count)
+        return (1.0 - 1e-9) * states.T, INWARD * errors.T
+
+
+class HostileAgents:
+    """Actions for N environments, a quarter each: random, outwards, the certified gain turned round, and bang-bang.
+
+    Args:
+        num_envs: N.
+        plant: The plant.
+        certificate: Whose set and gain they turn against.
+        rng: Source of randomness.
+    """
+
+    def __init__(self, num_envs: int, plant: LinearPlant, certificate: Certificate, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self._outwards = (plant.B.T @ certificate.M @ plant.A).T
+        self._turned = -1e3 * (certificate.K / plant.u_max[:, None]).T
+        ends = [num_envs * quarter // 4 for quarter in range(5)]
+        self._random, self._out, self._back, self._bang = (slice(*pair) for pair in itertools.pairwise(ends))
+        self._actions = np.zeros((num_envs, plant.m), np.float32)
+        self._signs = rng.choice([-1.0, 1.0], self._actions[self._bang].shape)
+
+    def act(self, estimates: np.ndarray) -> np.ndarray:
+        """Returns the actions, shape (N, m), for estimates (N, n); the array is used again."""
+        actions = self._actions
+        actions[self._random] = self._rng.uniform(-1.0, 1.0, actions[self._random].shape)
+        actions[self._out] = np.sign(estimates[self._out] @ self._outwards)
+        actions[self._back] = np.clip(estimates[self._back] @ self._turned, -1.0, 1.0)
+        actions[self._bang] = self._signs
+        return actions

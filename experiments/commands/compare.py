@@ -1,0 +1,136 @@
+"""`ncs compare`: trains and compares agents with and without the shield."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from experiments.analysis.parquet_tables import write_tables
+from experiments.analysis.summary import arm_summary, covered_fraction, paired_differences, summary_text
+from experiments.backends.execution import results_of
+from experiments.plots.comparison_figures import comparison_figures
+from experiments.report.comparison import comparison_report
+from experiments.runs import (
+    Arm,
+    ExperimentSetup,
+    RunResult,
+    TrainingRun,
+    by_arm,
+    prepare_output,
+)
+from experiments.runs.training_run import PolicyKind
+from experiments.settings import CompareSettings, save_settings
+from shields.atomic_write import write_atomically
+
+# Budget of `--smoke`: enough to pass through every part.
+_SMOKE = {"steps": 4_096, "episodes": 10, "seeds": 2}
+_REFERENCES: dict[str, PolicyKind] = {"zero input": "zero", "K x_hat": "certified gain", "untrained": "untrained"}
+
+
+def compare(settings: CompareSettings) -> None:
+    """Runs `ncs compare`: prints the table and writes the files.
+
+    Raises:
+        ValueError: If a setting is out of range or a stored result is damaged.
+        OSError: If the output folder cannot be written.
+        CertificateError: If a given certificate does not verify.
+        Infeasible: If no certificate is found.
+        RunError: If a run fails.
+        ClusterError: If a cluster cannot execute the runs.
+    """
+    if settings.smoke:
+        settings = replace(settings, **_SMOKE)
+    arms = [Arm.of(name, settings.mode) for name in settings.arms]
+    if len({arm.name for arm in arms}) != len(arms) or not arms:
+        raise ValueError(f"--arms must be different ones, at least one, got {' '.join(settings.arms) or 'none'}")
+    setup = ExperimentSetup.of(settings.env, settings.channel, settings.certificate)
+    prepare_output(settings.out)
+    save_settings(settings.out / "settings.json", "compare", settings)
+    print(setup.title, flush=True)
+    runs = _training_runs(settings, setup)
+    results = results_of(runs, settings.out, settings)
+    summary = _summary(settings, setup, runs, results)
+    findings = _findings(summary)
+    _write(settings.out, summary, results, setup, findings)
+    count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
+    print(f"\n{settings.env}: {count} per arm, {settings.episodes} evaluation episodes per run\n")
+    print(summary_text(summary["arms"], summary["references"]), *findings, f"files: {settings.out}", sep="\n")
+
+
+def _training_runs(settings: CompareSettings, setup: ExperimentSetup) -> list[TrainingRun]:
+    """Returns the runs of every arm and of the reference policies, those that train first because they take longer."""
+    runs = []
+    for index in range(settings.seeds):
+        trained = [setup.training_run(settings, name, index) for name in settings.arms]
+        unshielded = replace(trained[0], mode=None, intervention_penalty=0.0, violation_penalty=0.0)
+        references = [replace(unshielded, arm=name, policy_kind=kind) for name, kind in _REFERENCES.items()]
+        runs += trained + references
+    return sorted(runs, key=lambda run: run.policy_kind != "trained")
+
+
+def _summary(
+    settings: CompareSettings, setup: ExperimentSetup, runs: Sequence[TrainingRun], results: Sequence[RunResult]
+) -> dict[str, Any]:
+    """Returns the content of summary.json."""
+    results_by_arm, modes = by_arm(results), {run.arm: run.mode for run in runs}
+
+    def arm(name: str) -> dict[str, Any]:
+        fixed = _REFERENCES.get(name) in ("zero", "certified gain")
+        return arm_summary(results_by_arm[name], modes[name], fixed_policy=fixed)
+
+    baseline = "unshielded" if "unshielded" in settings.arms else settings.arms[0]
+    return {
+        "arms": {name: arm(name) for name in settings.arms},
+        "references": {name: arm(name) for name in _REFERENCES},
+        "paired_differences": {
+            "baseline": baseline,
+            "arms": paired_differences({name: results_by_arm[name] for name in settings.arms}, baseline),
+        },
+        "units": {run.name: run.key for run in runs},
+        "seeds": {run.index: {"training": run.training_seed, "evaluation": run.evaluation_seed} for run in runs},
+    } | setup.provenance("compare", settings)
+
+
+def _findings(summary: dict[str, Any]) -> list[str]:
+    """Returns what to read from the table, in sentences computed from it."""
+    findings = []
+    for name, arm in summary["arms"].items():
+        if not arm["shielded"]:
+            continue
+        upper = 100.0 * arm["eval_violation_rate_ci95"][1]
+        findings += [
+            f"{name}: the proof held in {arm['guaranteed_episodes']:,} of {arm['eval_episodes']:,} evaluation "
+            f"episodes; the largest x'Mx was {arm['largest_level']:.3f} (the safe set ends at 1).",
+            f"{name}: {arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,} episodes violating; from these "
+            f"episodes alone at most {upper:.2f} % with 95 % confidence.",
+        ]
+    paired = summary["paired_differences"]
+    for name, difference in paired["arms"].items():
+        interval = difference["return_ci95"]
+        text = f" [{interval[0]:+.1f}, {interval[1]:+.1f}]" if interval else ""
+        findings.append(f"{name}, paired with {paired['baseline']}: return {difference['return_mean']:+.1f}{text}.")
+    if (covered := covered_fraction(summary)) is not None:
+        findings.append(
+            f"The shielded return covers {100 * covered:.0f} % of the way from the zero input to the unshielded agent."
+        )
+    if "monitor" in summary["arms"]:
+        findings.append("In brackets: what the shield would have overridden.")
+    return findings
+
+
+def _write(
+    out: Path, summary: dict[str, Any], results: Sequence[RunResult], setup: ExperimentSetup, findings: list[str]
+) -> None:
+    """Writes every file; summary.json comes last, so that it stands for a complete experiment."""
+    figures = comparison_figures(setup.plant, setup.certificate, summary, by_arm(results))
+    for name, (_, png) in figures.items():
+        write_atomically(out / "figures" / f"{name}.png", png)
+    setup.certificate.save(out / "certificate.json")
+    names = ("settings", "seeds", "plant", "certificate", "certificate_file", "versions")
+    write_tables(out, results, {name: summary[name] for name in names})
+    page = comparison_report(summary, setup.verification, dict(figures.values()), findings)
+    write_atomically(out / "report.html", page)
+    write_atomically(out / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")

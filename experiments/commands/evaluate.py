@@ -1,0 +1,57 @@
+"""`ncs evaluate`: evaluates a trained agent."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+
+from agents import evaluation
+from agents.control_loop import ControlLoop, ShieldSettings
+from experiments.analysis.summary import arm_summary, summary_text
+from experiments.runs import ExperimentSetup, RunResult, versions
+from experiments.settings import EvaluateSettings
+from ncs_gym.envs.env import ncs_env
+from shields.atomic_write import write_atomically
+
+
+def evaluate(settings: EvaluateSettings) -> None:
+    """Runs `ncs evaluate`.
+
+    Raises:
+        AgentError: If the agent's files are missing, damaged or of another environment.
+        ValueError: If a setting is out of range.
+        CertificateError: If a given certificate does not verify.
+        Infeasible: If no certificate is found.
+        OSError: If the summary cannot be written.
+    """
+    from agents.agent import Agent  # imports torch
+
+    agent = Agent.load(settings.model)
+    own = ncs_env(ControlLoop(env=agent.env, channel=agent.channel).single()).channel
+    channel = settings.channel.applied_to(own) or agent.channel
+    setup = ExperimentSetup.of(agent.env, channel, settings.certificate)
+    mode = None if settings.shield == "none" else settings.shield
+    shield = None if mode is None else ShieldSettings(setup.certificate, mode)
+    evaluated = evaluation.evaluate(
+        ControlLoop(env=agent.env, channel=channel, shield=shield),
+        lambda observations, infos: agent.act(observations),
+        settings.episodes,
+        settings.seed,
+        setup.certificate.M,
+    )
+    result = RunResult(settings.shield, 0, 0, 0, 0, [], evaluated.episodes, evaluated.trajectory, {})
+    arms = {f"shield: {settings.shield}": arm_summary([result], mode, fixed_policy=True)}
+    print(f"{agent.algorithm} of {settings.model} in {agent.env}\n\n{summary_text(arms, {})}")
+    if settings.out is not None:
+        content = {
+            "arms": arms,
+            "env": agent.env,
+            "channel": asdict(channel) if channel else None,
+            "episodes": settings.episodes,
+            "seed": settings.seed,
+            "model": {"folder": str(settings.model), "sha256": agent.checksum},
+            "plant": setup.plant.fingerprint,
+            "certificate": setup.certificate.checksum,
+            "versions": versions(),
+        }
+        write_atomically(settings.out, json.dumps(content, indent=1) + "\n")

@@ -1,0 +1,134 @@
+"""`ncs render`: draws an episode."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+
+import gymnasium as gym
+import numpy as np
+from tqdm import tqdm
+
+from experiments.commands import require_extra
+from experiments.plots.animation import FORMATS, save_animation
+from experiments.runs.experiment_setup import registered_env
+from experiments.runs.policies import UNTRAINED_POLICIES, policy_by_name
+from experiments.settings import RenderSettings
+from ncs_gym.envs.env import ncs_env
+from shields import Certificate, SafetyShield
+
+_MAX_FPS = 50
+_MIN_WIDTH = 160
+# Width and gray value of the space between two frames side by side [pixels].
+_GAP = 8
+_GRAY = 120
+
+
+def render(settings: RenderSettings) -> None:
+    """Runs `ncs render`.
+
+    Raises:
+        ValueError: If a setting is wrong.
+        OSError: If a file cannot be read or written.
+        Infeasible: If a shield is asked for and no certificate is found.
+    """
+    _check(settings)
+    if settings.policy not in UNTRAINED_POLICIES:
+        require_extra("train", "stable_baselines3", "torch")
+    if settings.out.suffix == ".mp4":
+        require_extra("render", "moviepy")
+    modes = ("none", settings.shield) if settings.side_by_side else (settings.shield,)
+    renderers = [_EpisodeRenderer(settings, mode) for mode in modes]
+    frames = map(_side_by_side, _frames(renderers, settings.steps))
+    size = save_animation(frames, settings.out, settings.fps, settings.width)
+    for renderer in renderers:
+        print(renderer)
+    print(f"saved to {settings.out} ({size / 1e6:.2f} MB)")
+
+
+class _EpisodeRenderer:
+    """Simulates one episode and draws it step by step.
+
+    Args:
+        settings: Settings of the command.
+        mode: Mode of the shield, or "none".
+
+    Attributes:
+        is_over: Whether the episode has ended.
+    """
+
+    def __init__(self, settings: RenderSettings, mode: str) -> None:
+        self._mode = mode
+        certificate = None if settings.certificate is None else Certificate.load(settings.certificate)
+        self._env: gym.Env = gym.make(settings.env, render_mode="rgb_array")
+        self._policy = policy_by_name(settings.policy, settings.env, ncs_env(self._env), settings.seed)
+        if mode != "none":
+            self._env = SafetyShield(self._env, certificate, mode=mode)
+        self._observation, self._info = self._env.reset(seed=settings.seed)
+        self.is_over, self._steps = False, 0
+
+    def frame(self) -> np.ndarray:
+        """Returns the frame of the present step, shape (height, width, 3), uint8."""
+        frame = self._env.render()
+        if not isinstance(frame, np.ndarray):
+            raise TypeError(f"expected an image, got {type(frame).__name__}")
+        return frame
+
+    def step(self) -> None:
+        """Simulates a step, unless the episode is over."""
+        if not self.is_over:
+            action = self._policy(self._observation, self._info)
+            self._observation, _, terminated, truncated, self._info = self._env.step(action)
+            self._steps += 1
+            self.is_over = terminated or truncated
+
+    def __str__(self) -> str:
+        count = int(self._info["episode_violations"])
+        line = f"{'no shield' if self._mode == 'none' else self._mode}: {self._steps} steps, {count} with a violation"
+        if self._mode == "none":
+            return line
+        acted = "would have acted" if self._mode == "monitor" else "acted"
+        return f"{line}, shield {acted} {self._info['episode_interventions']} times"
+
+
+def _frames(renderers: list[_EpisodeRenderer], steps: int) -> Iterator[list[np.ndarray]]:
+    """Yields the frames of all episodes at reset and after each step, until all episodes are over."""
+    yield [renderer.frame() for renderer in renderers]
+    with tqdm(total=steps, desc="drawing", unit="step", leave=False, disable=None) as bar:
+        for _ in range(steps):
+            if all(renderer.is_over for renderer in renderers):
+                return
+            for renderer in renderers:
+                renderer.step()
+            yield [renderer.frame() for renderer in renderers]
+            bar.update()
+
+
+def _side_by_side(frames: list[np.ndarray]) -> np.ndarray:
+    """Returns frames side by side with a line between them."""
+    gap = np.full((len(frames[0]), _GAP, 3), 255, np.uint8)
+    gap[:, _GAP // 2 - 1 : _GAP // 2 + 1] = _GRAY
+    parts = [part for frame in frames for part in (gap, frame)][1:]
+    return np.concatenate(parts, axis=1)
+
+
+def _check(settings: RenderSettings) -> None:
+    """Checks the settings.
+
+    Raises:
+        ValueError: If a setting is wrong.
+        OSError: If the folder of the file does not exist.
+    """
+    registered_env(settings.env)
+    if settings.out.suffix not in FORMATS:
+        raise ValueError(f"--out must end in one of {', '.join(FORMATS)}, got {settings.out}")
+    for name, low, high in (("seed", 0, None), ("steps", 1, None), ("fps", 1, _MAX_FPS), ("width", _MIN_WIDTH, None)):
+        value = getattr(settings, name)
+        if value is not None and (value < low or (high is not None and value > high)):
+            limits = f"at least {low}" + (f" and at most {high}" if high is not None else "")
+            raise ValueError(f"--{name} must be {limits}, got {value}")
+    if settings.side_by_side and settings.shield == "none":
+        raise ValueError('--side-by-side compares with a shield: choose a --shield other than "none"')
+    if not settings.out.resolve().parent.is_dir():
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(settings.out))

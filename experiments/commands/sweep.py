@@ -1,0 +1,157 @@
+"""`ncs sweep`: the same comparison over a grid of channels."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from experiments.analysis.parquet_tables import parquet
+from experiments.analysis.summary import summarize_arm
+from experiments.analysis.text_table import text_table
+from experiments.backends.execution import results_of
+from experiments.plots.heatmaps import sweep_figures
+from experiments.report.sweep import sweep_report
+from experiments.runs import Arm, ExperimentSetup, RunResult, by_arm, prepare_output
+from experiments.settings import ChannelSettings, SweepSettings, save_settings
+from shields.atomic_write import write_atomically
+
+
+@dataclass(frozen=True)
+class _GridPoint:
+    """One channel of the grid.
+
+    Attributes:
+        loss: Probability that a packet is lost.
+        delay: Delay of every packet [steps].
+        quantization_step: Quantization step of the measurements; None for the environment's own.
+        burst_length: Mean number of packets lost in a row; 0 for independent losses.
+    """
+
+    loss: float
+    delay: int
+    quantization_step: float | None
+    burst_length: float
+
+    @property
+    def name(self) -> str:
+        """Name of the point in file names."""
+        quantization = "" if self.quantization_step is None else f"-q{self.quantization_step}"
+        return f"loss{self.loss}-delay{self.delay}{quantization}-burst{self.burst_length}"
+
+    def channel(self, base: ChannelSettings) -> ChannelSettings:
+        """Returns the changes of the environment's channel that make this point's channel."""
+        bursts = None if self.burst_length == 0.0 or self.loss == 0.0 else self.burst_length
+        quantization = base.quantization_step if self.quantization_step is None else self.quantization_step
+        return replace(base, loss=self.loss, delay=self.delay, quantization_step=quantization, burst_length=bursts)
+
+
+def sweep(settings: SweepSettings) -> None:
+    """Runs `ncs sweep`.
+
+    Raises:
+        ValueError: If a setting is out of range, a channel impossible, or a stored result damaged.
+        OSError: If the output folder cannot be written.
+        CertificateError: If a given certificate does not verify.
+        Infeasible: If no certificate is found.
+        RunError: If a run fails.
+        ClusterError: If a cluster cannot execute the runs.
+    """
+    points = _grid_points(settings)
+    for name in ("loss", "delay", "burst_length"):
+        if getattr(settings.channel, name) is not None:
+            raise ValueError(f"--channel.{name.replace('_', '-')} is a side of the grid: give its values there")
+    for name in settings.arms:
+        Arm.of(name, settings.mode)
+    setups = [ExperimentSetup.of(settings.env, each.channel(settings.channel), settings.certificate) for each in points]
+    prepare_output(settings.out)
+    save_settings(settings.out / "settings.json", "sweep", settings)
+    runs = [
+        setup.training_run(settings, name, index, grid_point=point.name)
+        for point, setup in zip(points, setups, strict=True)
+        for index in range(settings.seeds)
+        for name in settings.arms
+    ]
+    results = results_of(runs, settings.out, settings)
+    per_point = len(runs) // len(points)
+    parts = [results[i * per_point : (i + 1) * per_point] for i in range(len(points))]
+    summary = {
+        "cells": [asdict(point) | {"arms": _arms(part)} for point, part in zip(points, parts, strict=True)],
+        "units": {run.name: run.key for run in runs},
+        "seeds": {run.index: {"training": run.training_seed, "evaluation": run.evaluation_seed} for run in runs},
+    } | setups[0].provenance("sweep", settings)
+    rows = [row for point, part in zip(points, parts, strict=True) for row in _rows(point, part)]
+    _write(settings, summary, rows, setups[0])
+    count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
+    print(f"{settings.env}: {count} per arm and channel\n", _text(summary), f"files: {settings.out}", sep="\n")
+
+
+def _grid_points(settings: SweepSettings) -> list[_GridPoint]:
+    """Returns the points of the grid.
+
+    Raises:
+        ValueError: If a side of the grid is empty or names a value twice.
+    """
+    sides = {
+        "losses": settings.losses,
+        "delays": settings.delays,
+        "quantization_steps": settings.quantization_steps or (None,),
+        "burst_lengths": settings.burst_lengths,
+        "arms": settings.arms,
+    }
+    for name, side in sides.items():
+        if not side or len(set(side)) != len(side):
+            raise ValueError(f"--{name.replace('_', '-')} must be different values, at least one")
+    del sides["arms"]
+    return [_GridPoint(*point) for point in product(*sides.values())]
+
+
+def _write(settings: SweepSettings, summary: dict[str, Any], rows: list[dict], setup: ExperimentSetup) -> None:
+    """Writes every file; summary.json comes last, so that it stands for a complete experiment."""
+    out: Path = settings.out
+    figures = sweep_figures(summary, settings.arms)
+    for name, (_, png) in figures.items():
+        write_atomically(out / "figures" / f"{name}.png", png)
+    setup.certificate.save(out / "certificate.json")
+    write_atomically(out / "sweep.parquet", parquet(rows, setup.provenance("sweep", settings)))
+    write_atomically(out / "report.html", sweep_report(summary, setup.verification, dict(figures.values())))
+    write_atomically(out / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
+
+
+def _text(summary: dict[str, Any]) -> str:
+    """Returns the table for a terminal: a row per channel and arm."""
+    head = ["loss", "delay", "quantization", "burst", "arm", "violating episodes", "training steps", "overridden"]
+    rows = [[*head, "return"]]
+    for cell in summary["cells"]:
+        channel = [
+            f"{cell['loss']:g}",
+            str(cell["delay"]),
+            "own" if cell["quantization_step"] is None else f"{cell['quantization_step']:g}",
+            f"{cell['burst_length']:g}" if cell["burst_length"] else "none",
+        ]
+        for name, arm in cell["arms"].items():
+            outcome = [
+                f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,}",
+                f"{arm['train_violation_steps']:,} of {arm['train_steps']:,}",
+                "-" if Arm.of(name).mode is None else f"{100 * arm['intervention_rate']:.1f} %",
+                f"{arm['eval_return_mean']:.1f}",
+            ]
+            rows.append([*channel, name, *outcome])
+    return text_table(rows, left_columns=0)
+
+
+def _arms(results: Sequence[RunResult]) -> dict[str, Any]:
+    return {name: summarize_arm(runs, fixed_policy=False) for name, runs in by_arm(results).items()}
+
+
+def _rows(point: _GridPoint, results: Sequence[RunResult]) -> list[dict[str, Any]]:
+    """Returns one row per training run."""
+    rows = []
+    for result in results:
+        summary = summarize_arm([result], fixed_policy=False)
+        numbers = {name: value for name, value in summary.items() if isinstance(value, (int, float))}
+        rows.append(asdict(point) | {"arm": result.arm, "run": result.index} | numbers)
+    return rows

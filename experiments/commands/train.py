@@ -1,0 +1,34 @@
+"""`ncs train`: trains and evaluates one agent."""
+
+from __future__ import annotations
+
+import json
+
+from experiments.analysis.summary import arm_summary, summary_text
+from experiments.backends.execution import results_of
+from experiments.runs import Arm, ExperimentSetup, prepare_output
+from experiments.settings import BackendSettings, TrainSettings, save_settings
+from shields.atomic_write import write_atomically
+
+
+def train(settings: TrainSettings) -> None:
+    """Runs `ncs train`.
+
+    Raises:
+        ValueError: If a setting is out of range or a stored result is damaged.
+        OSError: If the output folder cannot be written.
+        CertificateError: If a given certificate does not verify.
+        Infeasible: If no certificate is found.
+        RunError: If the run fails.
+    """
+    Arm.of(settings.arm, settings.mode)
+    setup = ExperimentSetup.of(settings.env, settings.channel, settings.certificate)
+    prepare_output(settings.out)
+    save_settings(settings.out / "settings.json", "train", settings)
+    run = setup.training_run(settings, settings.arm, 0)
+    results = results_of([run], settings.out, BackendSettings(jobs=1))
+    arms = {settings.arm: arm_summary(results, run.mode, fixed_policy=True)}
+    setup.certificate.save(settings.out / "certificate.json")
+    content = {"arms": arms} | setup.provenance("train", settings)
+    write_atomically(settings.out / "summary.json", json.dumps(content, indent=1) + "\n")
+    print(summary_text(arms, {}), f"agent: {settings.out / 'models' / run.name}", sep="\n")

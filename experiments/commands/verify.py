@@ -1,0 +1,49 @@
+"""`ncs verify`: checks a certificate in exact arithmetic."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+
+import shields
+from experiments.runs.experiment_setup import environment_ids, registered_env
+from experiments.settings import VerifySettings
+from shields import Certificate, CertificateError
+from shields.atomic_write import write_atomically
+
+
+def verify(settings: VerifySettings) -> None:
+    """Runs `ncs verify`.
+
+    Raises:
+        CertificateError: If the certificate is damaged, of an unknown plant or does not verify.
+        ValueError: If the environment is unknown.
+        OSError: If the verdicts cannot be written.
+    """
+    certificate = Certificate.load(settings.file)
+    env_id = settings.env or _matching_env(certificate)
+    report = shields.verify(certificate, registered_env(env_id).plant)
+    print(f"against the plant of {env_id}:\n{report}")
+    if certificate.ages is not None:
+        print(f"it rests on {certificate.ages.sets.contract}")
+    if settings.out is not None:
+        conditions = [asdict(condition) for condition in report.conditions]
+        document = {"env": env_id, "valid": report.valid, "conditions": conditions}
+        write_atomically(settings.out, json.dumps(document, indent=1) + "\n")
+    if not report.valid:
+        broken = sum(not condition.holds for condition in report.conditions)
+        raise CertificateError(
+            f"{settings.file} does not verify: {broken} of {len(report.conditions)} conditions broken"
+        )
+    print("valid")
+
+
+def _matching_env(certificate: Certificate) -> str:
+    """Returns the id of the registered environment whose plant the certificate was made for."""
+    for env_id in environment_ids():
+        if registered_env(env_id).plant.fingerprint == certificate.fingerprint:
+            return env_id
+    raise CertificateError(
+        "the certificate belongs to no registered environment's plant; "
+        "for one of your own call shields.verify(certificate, plant)"
+    )

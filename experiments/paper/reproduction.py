@@ -1,0 +1,151 @@
+"""Section 5 of Liu et al., simulated: printed design, certified design, and OP's at the nearest feasible bounds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gymnasium as gym
+import numpy as np
+from tqdm import tqdm
+
+from experiments.paper.paper_example import PaperExample
+from experiments.settings.certificates import ReproduceSettings
+from ncs_gym import BoxDisturbance, Ellipsoid, LinearPlant
+from ncs_gym.registration import CASE_STUDY_BOX
+from shields import synthesize
+from shields.paper.feasibility import FeasibilityScan, largest_scale
+
+_ENV = "ncs_gym/TruckTrailer-v0"
+# OP is solved at this fraction of the largest feasible scale of the bounds, on a fine grid of kappa and rho.
+_OP_SCALE = 0.9
+_OP_GRID_STEP = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class StateFeedback:
+    """A design to simulate: u = K x_hat with the safe set E(L), on a plant with bounds.
+
+    Attributes:
+        name: Name of the design in the table and the figures.
+        plant: The plant, with the bounds that are simulated.
+        box: Distribution of the disturbance.
+        L: Shape of the safe set, shape (2, 2).
+        K: Feedback gain, shape (1, 2).
+        epsilon: Claimed bound on e'e, e = B K e_up; None if the design claims none.
+    """
+
+    name: str
+    plant: LinearPlant
+    box: BoxDisturbance
+    L: np.ndarray
+    K: np.ndarray
+    epsilon: float | None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the simulation of a design showed.
+
+    Attributes:
+        steps: Number of simulated steps of all initial states.
+        outside_set: Number of steps with the true state outside the safe set.
+        outside_box: Number of steps with the true state outside the safe box.
+        input_asked_beyond: Number of steps with |K x_hat| beyond the input limit (the plant applied the limit).
+        largest_level: Largest x'Mx.
+        largest_error: Largest e'e, e = B K e_up.
+        largest_estimation_error: Largest e_up'e_up.
+        largest_input: Largest |K x_hat|.
+        epsilon: The bound on e'e that the design claims; None if it claims none.
+    """
+
+    steps: int
+    outside_set: int
+    outside_box: int
+    input_asked_beyond: int
+    largest_level: float
+    largest_error: float
+    largest_estimation_error: float
+    largest_input: float
+    epsilon: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """Simulated trajectories of a design.
+
+    Attributes:
+        design: The design.
+        states: True states, shape (starts, steps + 1, 2).
+        inputs: Inputs K x_hat before the limit, shape (starts, steps) [m/s^2].
+        errors: Estimation errors e_up, shape (starts, steps, 2).
+    """
+
+    design: StateFeedback
+    states: np.ndarray
+    inputs: np.ndarray
+    errors: np.ndarray
+
+    @property
+    def outcome(self) -> Outcome:
+        """Counts and largest values of the simulation."""
+        design = self.design
+        levels = np.einsum("ski,ij,skj->sk", self.states, np.linalg.inv(design.L), self.states)
+        boxes = np.abs(self.states @ design.plant.C.T).max(axis=2)
+        gain = design.plant.B @ design.K
+        return Outcome(
+            steps=self.inputs.size,
+            outside_set=int((levels[:, 1:] > 1.0).sum()),
+            outside_box=int((boxes[:, 1:] > 1.0).sum()),
+            input_asked_beyond=int((np.abs(self.inputs) > design.plant.u_max[0]).sum()),
+            largest_level=float(levels.max()),
+            largest_error=float(np.square(self.errors @ gain.T).sum(axis=2).max()),
+            largest_estimation_error=float(np.square(self.errors).sum(axis=2).max()),
+            largest_input=float(np.abs(self.inputs).max()),
+            epsilon=design.epsilon,
+        )
+
+
+def designs() -> list[StateFeedback]:
+    """Returns the three designs: printed, certified, and OP's."""
+    example = PaperExample()
+    plant = example.plant
+    ours = synthesize(plant)
+    scale = _OP_SCALE * largest_scale(FeasibilityScan(plant), plant)
+    scaled = replace(
+        plant,
+        gamma=scale * plant.gamma,
+        process_noise_cov=scale * plant.process_noise_cov,
+        initial_cov=scale * plant.initial_cov,
+    )
+    op = synthesize(scaled, "paper", dkappa=_OP_GRID_STEP, drho=_OP_GRID_STEP)
+    box = BoxDisturbance((1.0 - 1e-9) * scale**0.5 * np.asarray(CASE_STUDY_BOX.half_widths))
+    return [
+        StateFeedback("printed", plant, CASE_STUDY_BOX, example.L, example.K, example.epsilon),
+        StateFeedback("certified", plant, CASE_STUDY_BOX, ours.L, ours.K, None),
+        StateFeedback(f"OP at {scale:.3f} of the bounds", scaled, box, op.L, op.K, op.epsilon),
+    ]
+
+
+def simulate(design: StateFeedback, settings: ReproduceSettings, bar: tqdm) -> Simulation:
+    """Returns the simulation of a design from random initial states."""
+    env = gym.make(
+        _ENV,
+        plant=design.plant,
+        disturbance=design.box,
+        initial_set=Ellipsoid(design.L),
+        max_episode_steps=settings.steps,
+    )
+    limit = design.plant.u_max[0]
+    states = np.empty((settings.starts, settings.steps + 1, 2))
+    inputs = np.empty((settings.starts, settings.steps))
+    errors = np.empty((settings.starts, settings.steps, 2))
+    for start in range(settings.starts):
+        _, info = env.reset(seed=settings.seed * 1_000_003 + start)
+        states[start, 0] = info["state"]
+        for step in range(settings.steps):
+            u = design.K @ info["estimate"]
+            inputs[start, step], errors[start, step] = u[0], info["estimation_error"]
+            *_, info = env.step(u / limit)
+            states[start, step + 1] = info["state"]
+        bar.update()
+    return Simulation(design, states, inputs, errors)

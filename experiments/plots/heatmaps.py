@@ -1,0 +1,189 @@
+"""Heatmaps of a sweep: a panel per arm, losses against delays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+
+from experiments.plots.figure_style import STYLE, CaptionedFigure, label, thousands, with_unit
+from experiments.runs.arms import Arm
+
+# Largest number of panels side by side.
+_COLUMNS = 4
+# Height at which the longest label of a color scale fits [inches].
+_MIN_HEIGHT = 2.8
+# Fields whose relative luminance is smaller than this have light numbers; weights of red, green and blue.
+_DARK = 0.45
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+
+
+@dataclass(frozen=True)
+class _Quantity:
+    """_Quantity that a heatmap shows.
+
+    Attributes:
+        key: Key of the quantity in an arm's summary.
+        factor: Factor from the unit in the summary to the unit in the figure.
+        title: Label of the color scale.
+        unit: Unit in the figure.
+        colors: Name of a color map of matplotlib.
+        low: Start of the color scale; None for the smallest value.
+        high: End of the color scale, unless a value is larger; None for the largest value.
+        caption: First sentence of the caption.
+        of_shields: Whether only arms with a shield have the quantity.
+    """
+
+    key: str
+    factor: float
+    title: str
+    unit: str
+    colors: str
+    low: float | None
+    high: float | None
+    caption: str
+    of_shields: bool = False
+
+
+_QUANTITIES = {
+    "violations": _Quantity(
+        "eval_violation_rate",
+        100.0,
+        "violating evaluation episodes",
+        "%",
+        "OrRd",
+        0.0,
+        10.0,
+        "Violations: fraction of evaluation episodes in which the true state violates, over all runs of an arm.",
+    ),
+    "return": _Quantity(
+        "eval_return_mean",
+        1.0,
+        "mean return",
+        "",
+        "cividis",
+        None,
+        None,
+        "Return: mean of the evaluation episodes, without penalties; one color scale for all arms.",
+    ),
+    "interventions": _Quantity(
+        "intervention_rate",
+        100.0,
+        "actions overridden",
+        "%",
+        "PuBu",
+        0.0,
+        None,
+        "Interventions: fraction of the agent's actions in evaluation that the shield overrides.",
+        of_shields=True,
+    ),
+}
+
+
+def sweep_figures(summary: dict[str, Any], arms: Sequence[str]) -> dict[str, tuple[str, bytes]]:
+    """Returns caption and PNG file of every figure by name; without an arm that has a shield, none of interventions."""
+    figures = {}
+    for name, quantity in _QUANTITIES.items():
+        shown = [arm for arm in arms if not quantity.of_shields or Arm.of(arm).mode is not None]
+        if shown:
+            figure = _heatmap(summary["cells"], shown, quantity)
+            figures[name] = (figure.caption, figure.png)
+    return figures
+
+
+def _caption(quantity: _Quantity, cells: Sequence[dict[str, Any]], arms: Sequence[str]) -> str:
+    """Returns the caption."""
+    runs = max(cell["arms"][arm]["runs"] for cell in cells for arm in arms)
+    text = f"{quantity.caption} {runs} {'run' if runs == 1 else 'runs'} per field."
+    if quantity.of_shields and "monitor" in arms:
+        text += " The monitor's are what the shield would have overridden."
+    return text
+
+
+def _heatmap(cells: Sequence[dict[str, Any]], arms: Sequence[str], quantity: _Quantity) -> CaptionedFigure:
+    """Returns one quantity: a panel per arm, a block of them per combination of quantization step and burst length."""
+    losses, delays = (sorted({cell[side] for cell in cells}) for side in ("loss", "delay"))
+    others = list(dict.fromkeys((cell["quantization_step"], cell["burst_length"]) for cell in cells))
+    fields = {(arm, other): _field(cells, arm, other, quantity, losses, delays) for other in others for arm in arms}
+    norm = _norm(list(fields.values()), quantity)
+    block = -(-len(arms) // _COLUMNS)
+    columns, rows = -(-len(arms) // block), block * len(others)
+    height = 0.5 * len(delays) + (0.65 if len(others) > 1 else 0.45)
+    with matplotlib.rc_context(STYLE), matplotlib.rc_context({"axes.grid": False}):
+        width = 1.8 + max(0.68 * len(losses) + 0.15, 1.7) * columns
+        size = (width, max(0.7 + max(height, 1.3) * rows, _MIN_HEIGHT))
+        figure = CaptionedFigure(size, _caption(quantity, cells, arms))
+        panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+        for at, panel in enumerate(panels.flat):
+            row, column = divmod(at, columns)
+            arm_at = row % block * columns + column
+            panel.set_visible(arm_at < len(arms))
+            if not panel.get_visible():
+                continue
+            arm, other = arms[arm_at], others[row // block]
+            _draw(panel, fields[arm, other], quantity.colors, norm)
+            panel.set_title(_title(arm, other, len(others) > 1))
+            below = row + 1 < rows and (row % block + 1 == block or arm_at + columns < len(arms))
+            _name_axes(panel, losses, delays, left=column == 0, lowest=not below)
+        mappable = ScalarMappable(norm, quantity.colors)
+        figure.colorbar(mappable, ax=panels, label=with_unit(quantity.title, quantity.unit), format=thousands)
+        return figure
+
+
+def _field(
+    cells: Sequence[dict[str, Any]],
+    arm: str,
+    other: tuple[float | None, float],
+    quantity: _Quantity,
+    losses: list[float],
+    delays: list[int],
+) -> np.ndarray:
+    """Returns the values of a panel, shape (delays, losses)."""
+    values = np.full((len(delays), len(losses)), np.nan)
+    for cell in cells:
+        if (cell["quantization_step"], cell["burst_length"]) == other:
+            at = delays.index(cell["delay"]), losses.index(cell["loss"])
+            values[at] = quantity.factor * cell["arms"][arm][quantity.key]
+    return values
+
+
+def _norm(fields: Sequence[np.ndarray], quantity: _Quantity) -> Normalize:
+    """Returns one color scale for all panels."""
+    low = np.nanmin(fields) if quantity.low is None else quantity.low
+    high = np.nanmax(fields) if quantity.high is None else max(quantity.high, np.nanmax(fields))
+    # Where all values are alike the scale still has a length.
+    return Normalize(low, high if high > low else low + 1.0)
+
+
+def _draw(axis: Axes, values: np.ndarray, colors: str, norm: Normalize) -> None:
+    """Draws a panel and writes the numbers into its fields, light on dark."""
+    axis.imshow(values, cmap=colors, norm=norm, origin="lower", aspect="auto")
+    digits = 1 if max(abs(norm.vmin or 0.0), abs(norm.vmax or 0.0)) >= 1.0 else 2
+    for (i, j), value in np.ndenumerate(values):
+        if np.isfinite(value):
+            dark = np.array(matplotlib.colormaps[colors](norm(value))[:3]) @ _LUMINANCE < _DARK
+            text = f"{value:.{digits}f}".replace("-", "\N{MINUS SIGN}") if value else "0"
+            axis.text(j, i, text, ha="center", va="center", fontsize=9, color="white" if dark else "#222222")
+
+
+def _name_axes(axis: Axes, losses: list[float], delays: list[int], left: bool, lowest: bool) -> None:
+    """Labels the outer axes of the panels."""
+    axis.set_xticks(range(len(losses)), [f"{loss:g}" for loss in losses])
+    axis.set_yticks(range(len(delays)), [str(delay) for delay in delays])
+    axis.tick_params(length=0, labelbottom=lowest, labelleft=left)
+    axis.spines[:].set_visible(False)
+    label(axis, "loss probability" if lowest else "", "delay [steps]" if left else "", axis.get_title())
+
+
+def _title(arm: str, other: tuple[float | None, float], several: bool) -> str:
+    quantization, burst = other
+    if not several:
+        return arm
+    losses = f"bursts of {burst:g}" if burst else "independent losses"
+    return f"{arm}\n{'' if quantization is None else f'quantization {quantization:g}, '}{losses}"

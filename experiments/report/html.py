@@ -1,0 +1,119 @@
+"""Renders the templates of the reports; everything that a template inserts is escaped."""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from experiments.analysis.statistics import CONFIDENCE, RESAMPLES
+from experiments.plots.arm_style import ARM_COLORS_AND_MARKERS, ArmStyle
+from experiments.runs.arms import PENALTY_SUFFIX, Arm
+from shields import Report
+
+# Pixels of a figure per pixel of the page: the widest figures then fill it, and letters have the same size in all.
+_PIXEL_RATIO = 1.36
+# Bytes of a PNG file that hold the width of the image.
+_PNG_WIDTH = slice(16, 20)
+# Group of settings that an algorithm takes; all others take "off_policy".
+_ALGORITHM_SETTINGS = {"PPO": "ppo", "TRPO": "ppo", "A2C": "a2c"}
+
+
+def render_report(
+    template: str,
+    title: str,
+    command: str,
+    summary: dict[str, Any],
+    verification: Report,
+    figures: dict[str, bytes],
+    **context: Any,
+) -> str:
+    """Returns a report: one HTML page that contains its figures and opens offline.
+
+    Args:
+        template: Name of the template.
+        title: Title of the page.
+        command: Command of `ncs` that made the results.
+        summary: Content of summary.json.
+        verification: Exact verification of the certificate.
+        figures: PNG files by caption.
+        **context: Further variables of the template.
+    """
+    settings = summary["settings"]
+    used = _ALGORITHM_SETTINGS.get(settings["algo"], "off_policy")
+    unused = {"ppo", "a2c", "off_policy"} - {used}
+    return (
+        _environment()
+        .get_template(template)
+        .render(
+            title=title,
+            command=command,
+            summary=summary,
+            settings=settings,
+            shown_settings=_flat({name: value for name, value in settings.items() if name not in unused}),
+            verification=verification,
+            images=[_image(caption, png) for caption, png in figures.items()],
+            percent=f"{100 * CONFIDENCE:.0f}\N{NO-BREAK SPACE}%",
+            resamples=RESAMPLES,
+            **context,
+        )
+    )
+
+
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("experiments.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.tests["arm"] = lambda name: name.removesuffix(PENALTY_SUFFIX) in ARM_COLORS_AND_MARKERS
+    environment.filters |= {
+        "arm_of": Arm.of,
+        "arm_color": lambda name: ArmStyle.of(name).color,
+        "combined": lambda first, second: first | second,
+        "decimal": _decimal,
+        "interval": _interval,
+        "signed_count": lambda count: _with_minus(f"{count:+,}"),
+        "thousands": lambda count: f"{count:,}",
+    }
+    return environment
+
+
+def _image(caption: str, png: bytes) -> dict[str, Any]:
+    """Returns a figure as a template inserts it; the first sentence of its caption is its title."""
+    width = round(int.from_bytes(png[_PNG_WIDTH]) / _PIXEL_RATIO)
+    return {
+        "caption": caption,
+        "title": caption.partition(". ")[0],
+        "width": width,
+        "data": base64.b64encode(png).decode(),
+    }
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, str]:
+    """Returns nested settings as text by dotted name."""
+    flat: dict[str, str] = {}
+    for name, value in values.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{name}.")
+        elif isinstance(value, list):
+            flat[prefix + name] = " ".join(map(str, value)) or "none"
+        else:
+            flat[prefix + name] = "none" if value is None else str(value)
+    return flat
+
+
+def _decimal(value: float, sign: str = "") -> str:
+    return _with_minus(f"{value:{sign},.1f}")
+
+
+def _interval(interval: list[float] | None, sign: str = "") -> str:
+    """Returns an interval as text, or that there is none."""
+    return f"[{_decimal(interval[0], sign)}, {_decimal(interval[1], sign)}]" if interval else "none: one run"
+
+
+def _with_minus(text: str) -> str:
+    return text.replace("-", "\N{MINUS SIGN}")

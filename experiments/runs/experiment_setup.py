@@ -1,0 +1,123 @@
+"""What an experiment takes place in: an environment, its channel and a verified certificate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from experiments.runs.arms import Arm
+from experiments.runs.provenance import versions
+from experiments.runs.training_run import TrainingRun
+from experiments.settings import BackendSettings, ChannelSettings, LearningSettings, settings_json
+from ncs_gym import Channel, LinearPlant, NCSEnv, registration
+from ncs_gym.envs.env import ncs_env
+from ncs_gym.registration import ENTRY_POINTS
+from shields import Certificate, Report, verify
+from shields.runtime.wrapper import certificate_for
+from shields.verification import require_valid
+
+# Settings that results do not depend on.
+INCIDENTAL_SETTINGS = ("out", *BackendSettings.__dataclass_fields__)
+
+
+@dataclass(frozen=True, eq=False)
+class ExperimentSetup:
+    """The environment of an experiment and its certificate.
+
+    Attributes:
+        env: Id of a registered environment.
+        channel: Channel that replaces the environment's own; None keeps it.
+        plant: Plant of the environment.
+        certificate: Certificate for the plant, under the environment's channel contract.
+        verification: Exact verification of the certificate.
+    """
+
+    env: str
+    channel: Channel | None
+    plant: LinearPlant
+    certificate: Certificate
+    verification: Report
+
+    @classmethod
+    def of(
+        cls, env_id: str, channel: ChannelSettings | Channel | None, certificate_file: Path | None = None
+    ) -> ExperimentSetup:
+        """Returns the setup of a registered environment, with another channel or with changes of its own channel.
+
+        Raises:
+            ValueError: If the environment is unknown or has no plant of its own, or it cannot have the channel.
+            CertificateError: If a given certificate is damaged or does not verify for the plant.
+            Infeasible: If no certificate is found.
+        """
+        own = registered_env(env_id)
+        if isinstance(channel, ChannelSettings):
+            channel = channel.applied_to(own.channel)
+        env = own if channel is None else ncs_env(gym.make(env_id, channel=channel))
+        if certificate_file is None:
+            certificate = certificate_for(env.plant, env.contract)
+        else:
+            certificate = Certificate.load(certificate_file)
+            require_valid(certificate, env.plant)
+        return cls(env_id, channel, env.plant, certificate, verify(certificate, env.plant))
+
+    @property
+    def title(self) -> str:
+        """One line about the certificate."""
+        volume = self.certificate.provenance.get("volume_of_box_ellipsoid")
+        size = f" ({volume:.2%} of the largest ellipsoid in the safe box)" if isinstance(volume, float) else ""
+        return f"certificate: {len(self.verification.conditions)} conditions hold in exact arithmetic{size}"
+
+    def training_run(self, settings: LearningSettings, arm_name: str, index: int, grid_point: str = "") -> TrainingRun:
+        """Returns one training run of an arm.
+
+        Raises:
+            ValueError: If the arm is unknown.
+        """
+        arm = Arm.of(arm_name, settings.mode)
+        return TrainingRun(
+            arm=arm_name,
+            policy_kind="trained",
+            env=settings.env,
+            channel=self.channel,
+            seed=settings.seed,
+            index=index,
+            steps=settings.steps,
+            episodes=settings.episodes,
+            certificate=self.certificate,
+            mode=arm.mode,
+            intervention_penalty=settings.intervention_penalty if arm.penalizes_interventions else 0.0,
+            violation_penalty=settings.violation_penalty if arm.penalizes_violations else 0.0,
+            algorithm=settings.algo,
+            settings=settings.agent,
+            grid_point=grid_point,
+        )
+
+    def provenance(self, command: str, settings: LearningSettings) -> dict[str, Any]:
+        """Returns what a reader needs to know where the results of a command come from, JSON values."""
+        content = settings_json(command, settings)["settings"]
+        return {
+            "settings": {name: value for name, value in content.items() if name not in INCIDENTAL_SETTINGS},
+            "plant": {"fingerprint": self.plant.fingerprint, "spectral_radius": self.plant.spectral_radius},
+            "certificate": self.certificate.checksum,
+            "certificate_file": self.certificate.document,
+            "versions": versions(),
+        }
+
+
+def registered_env(env_id: str) -> NCSEnv:
+    """Returns a registered environment that has a plant of its own.
+
+    Raises:
+        ValueError: If the id is not one of ours that has a plant of its own.
+    """
+    if env_id not in environment_ids():
+        raise ValueError(f"unknown environment {env_id!r}; known are {', '.join(environment_ids())}")
+    return ncs_env(gym.make(env_id))
+
+
+def environment_ids() -> list[str]:
+    """Returns the ids of the registered environments that have a plant of their own."""
+    return [env_id for env_id, name in ENTRY_POINTS.items() if getattr(registration, name).plant is not None]

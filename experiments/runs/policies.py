@@ -1,0 +1,69 @@
+"""Policies by name: some that need no training, and trained agents from a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from ncs_gym import NCSEnv, SetpointTracking, SpeedTracking
+
+UNTRAINED_POLICIES = ("greedy", "zero", "random")
+
+# Maps an observation, shape (entries,), and its info to an action, shape (m,).
+Policy = Callable[[np.ndarray, dict], np.ndarray]
+
+
+def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
+    """Returns a policy for an environment.
+
+    Args:
+        name: "greedy", "zero", "random", or the folder of a trained agent.
+        env_id: Id of the environment.
+        env: The environment.
+        seed: Seed of the random policy.
+
+    Raises:
+        AgentError: If there is no agent for this environment.
+    """
+    size = env.plant.m
+    if name == "zero":
+        return lambda observation, info: np.zeros(size, np.float32)
+    if name == "random":
+        rng = np.random.default_rng(seed)
+        return lambda observation, info: rng.uniform(-1.0, 1.0, size).astype(np.float32)
+    if name == "greedy":
+        return lambda observation, info: _greedy_action(env, observation, info["estimate"])
+    from agents.agent import Agent, AgentError  # imports torch
+
+    agent = Agent.load(Path(name))
+    if agent.env != env_id:
+        raise AgentError(f"the agent in {name} was trained in {agent.env}, not in {env_id}")
+    return lambda observation, info: agent.act(observation[None])[0]
+
+
+def _greedy_action(env: NCSEnv, observation: np.ndarray, estimate: np.ndarray) -> np.ndarray:
+    """Returns the action, shape (m,), that comes closest to the task's goal in one step and ignores the safe box.
+
+    For `SpeedTracking` it removes the tracking error of the speed, for `SetpointTracking` that of the output, with as
+    little input as possible or with the largest input. For other tasks it is the clipped least-squares solution of
+    C x+ = 0.
+
+    Args:
+        env: Environment with the plant and the task.
+        observation: Observation, whose last entry belongs to the task.
+        estimate: Estimate x_hat, shape (n,).
+    """
+    plant, task = env.plant, env.task
+    if isinstance(task, SpeedTracking):
+        effect, missing = np.zeros(plant.m), float(observation[-1])
+        effect[task.input_index] = plant.dt
+    elif isinstance(task, SetpointTracking):
+        effect, missing = task.output @ plant.B, float(observation[-1] - task.output @ plant.A @ estimate)
+    else:
+        u = np.linalg.lstsq(plant.C @ plant.B, -plant.C @ plant.A @ estimate)[0]
+        return np.clip(u / plant.u_max, -1.0, 1.0).astype(np.float32)
+    largest = float(np.abs(effect) @ plant.u_max)
+    fraction = min(1.0, abs(missing) / largest) if largest > 0.0 else 0.0
+    return (fraction * np.sign(missing * effect)).astype(np.float32)

@@ -1,0 +1,192 @@
+"""The unit of work: one policy, trained and evaluated; its result is a pure function of its settings."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import gymnasium as gym
+import numpy as np
+
+from agents.control_loop import ControlLoop, ShieldSettings
+from agents.evaluation import Policy, evaluate
+from agents.results import Episode, TrainingPoint, Trajectory
+from agents.settings import AgentSettings, OffPolicySettings
+from experiments.runs.provenance import json_digest, versions
+from ncs_gym import Channel
+from ncs_gym.envs.env import ncs_env
+from shields import Certificate
+
+if TYPE_CHECKING:
+    from agents.training import TrainingResult
+
+PolicyKind = Literal["trained", "untrained", "certified gain", "zero"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingRun:
+    """Settings of one training run.
+
+    Attributes:
+        arm: Name of the arm that the run belongs to.
+        policy_kind: "trained" is a trained agent; "untrained" an agent with its initial weights; "certified gain"
+            applies u = K x_hat; "zero" applies no input.
+        env: Id of a registered environment.
+        channel: Channel that replaces the environment's own; None keeps it.
+        seed: Seed of the experiment.
+        index: Number of the run within its arm; runs with equal index are paired across arms.
+        steps: Training steps.
+        episodes: Evaluation episodes.
+        certificate: Certificate of the shield, which also defines x'Mx.
+        mode: Mode of the shield; None for no shield.
+        intervention_penalty: Subtracted from the training reward per intervention.
+        violation_penalty: Subtracted from the training reward per violating step.
+        algorithm: Name of the learning algorithm, a key of `agents.algorithms`.
+        settings: Settings of the learning algorithm.
+        grid_point: Name of the point of a sweep's grid; part of the run's name only.
+    """
+
+    arm: str
+    policy_kind: PolicyKind
+    env: str
+    channel: Channel | None = None
+    seed: int
+    index: int
+    steps: int
+    episodes: int
+    certificate: Certificate
+    mode: str | None
+    intervention_penalty: float = 0.0
+    violation_penalty: float = 0.0
+    algorithm: str
+    settings: AgentSettings
+    grid_point: str = ""
+
+    @property
+    def name(self) -> str:
+        """Name of the run in file names and progress lines."""
+        return "-".join(filter(None, (self.grid_point, self.arm, str(self.index)))).replace(" ", "-").replace(":", "-")
+
+    @property
+    def loop(self) -> ControlLoop:
+        """Control loop that the policy is trained and evaluated in."""
+        shield = None
+        if self.mode is not None:
+            shield = ShieldSettings(self.certificate, self.mode, self.intervention_penalty)
+        return ControlLoop(env=self.env, channel=self.channel, shield=shield, violation_penalty=self.violation_penalty)
+
+    @property
+    def training_seed(self) -> int:
+        """Seed of the training environments and of the networks; the same in all arms."""
+        return self._seeds()[0]
+
+    @property
+    def evaluation_seed(self) -> int:
+        """Seed of the evaluation episodes; the same in all arms."""
+        return self._seeds()[1]
+
+    @property
+    def key(self) -> str:
+        """SHA-256 of everything the result depends on: all settings, this project's source and versions of packages."""
+        names = set(self.__dataclass_fields__) - {"certificate", "grid_point"}
+        content = {name: getattr(self, name) for name in names}
+        content |= {"certificate": self.certificate.checksum, "channel": self.channel and asdict(self.channel)}
+        return json_digest(content | {"settings": asdict(self.settings), "versions": versions()})
+
+    @property
+    def total_steps(self) -> int:
+        """Training steps, in whole rollouts, and evaluation steps."""
+        evaluation = self.episodes * (gym.spec(self.env).max_episode_steps or 1)
+        if self.policy_kind != "trained":
+            return evaluation
+        steps_per_env = 1 if isinstance(self.settings, OffPolicySettings) else self.settings.rollout
+        rollout = self.settings.envs * steps_per_env
+        return -(-self.steps // rollout) * rollout + evaluation
+
+    def _seeds(self) -> list[int]:
+        """Returns two 31-bit numbers that depend on the experiment's seed and the run's index, not on the arm."""
+        return [int(word >> 1) for word in np.random.SeedSequence([self.seed, self.index]).generate_state(2)]
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """Result of a training run.
+
+    Attributes:
+        arm: Name of the run's arm.
+        index: Number of the run within its arm.
+        train_steps: Number of training steps; 0 if nothing was trained.
+        train_violation_steps: Number of training steps whose true state violated the safe box.
+        train_interventions: Number of training steps in which the shield intervened.
+        history: Running totals during the training.
+        episodes: Evaluation episodes.
+        trajectory: Trajectory of the first evaluation episode.
+        files: Contents of the trained agent's files by name; empty if nothing was trained.
+    """
+
+    arm: str
+    index: int
+    train_steps: int
+    train_violation_steps: int
+    train_interventions: int
+    history: list[TrainingPoint]
+    episodes: list[Episode]
+    trajectory: Trajectory
+    files: dict[str, bytes]
+
+
+def execute_run(run: TrainingRun, on_progress: Callable[[int], None], log_folder: Path | None = None) -> RunResult:
+    """Returns the result of a training run; only TensorBoard's events are written.
+
+    Args:
+        run: Settings of the run.
+        on_progress: Called with the number of training and evaluation steps taken since its last call.
+        log_folder: Folder of TensorBoard's events; earlier events in it are removed.
+    """
+    trained = None
+    if run.policy_kind == "trained":
+        from agents.training import train  # imports torch, which the process that only collects results does without
+
+        if log_folder is not None:
+            shutil.rmtree(log_folder, ignore_errors=True)
+        trained = train(
+            run.loop,
+            run.steps,
+            run.training_seed,
+            run.algorithm,
+            run.settings,
+            log_folder=log_folder,
+            on_progress=on_progress,
+        )
+    policy = _policy(run, trained)
+    evaluation = evaluate(run.loop, policy, run.episodes, run.evaluation_seed, run.certificate.M, on_progress)
+    return RunResult(
+        arm=run.arm,
+        index=run.index,
+        train_steps=trained.steps if trained else 0,
+        train_violation_steps=trained.violation_steps if trained else 0,
+        train_interventions=trained.interventions if trained else 0,
+        history=trained.history if trained else [],
+        episodes=evaluation.episodes,
+        trajectory=evaluation.trajectory,
+        files=trained.agent.files() if trained else {},
+    )
+
+
+def _policy(run: TrainingRun, trained: TrainingResult | None) -> Policy:
+    """Returns the policy to evaluate."""
+    if trained is not None:
+        return lambda observations, infos: trained.agent.act(observations)
+    plant = ncs_env(run.loop.single()).plant
+    if run.policy_kind == "untrained":
+        from agents.training import untrained
+
+        agent = untrained(run.loop, run.training_seed, run.algorithm, run.settings)
+        return lambda observations, infos: agent.act(observations)
+    if run.policy_kind == "certified gain":
+        gain = run.certificate.K / plant.u_max[:, None]
+        return lambda observations, infos: np.clip(infos["estimate"] @ gain.T, -1.0, 1.0)
+    return lambda observations, infos: np.zeros((len(observations), plant.m), np.float32)

@@ -1,0 +1,39 @@
+"""What each command can be told: frozen dataclasses that the parser turns into flags, and the file that keeps them."""
+
+from experiments.settings.backend import BackendSettings
+from experiments.settings.certificates import (
+    AuditSettings,
+    CertifySettings,
+    ReproduceSettings,
+    SynthesizeSettings,
+    VerifySettings,
+)
+from experiments.settings.channel import ChannelSettings
+from experiments.settings.learning import (
+    CompareSettings,
+    EvaluateSettings,
+    LearningSettings,
+    RenderSettings,
+    SweepSettings,
+    TrainSettings,
+)
+from experiments.settings.settings_file import config_defaults, save_settings, settings_json
+
+__all__ = [
+    "AuditSettings",
+    "BackendSettings",
+    "CertifySettings",
+    "ChannelSettings",
+    "CompareSettings",
+    "EvaluateSettings",
+    "LearningSettings",
+    "RenderSettings",
+    "ReproduceSettings",
+    "SweepSettings",
+    "SynthesizeSettings",
+    "TrainSettings",
+    "VerifySettings",
+    "config_defaults",
+    "save_settings",
+    "settings_json",
+]

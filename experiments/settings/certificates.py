@@ -1,0 +1,118 @@
+"""Settings of the commands about certificates and the paper: they train nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+
+@dataclass(frozen=True, kw_only=True)
+class SynthesizeSettings:
+    """Synthesizes a certificate for an environment's plant, verifies it exactly and saves it.
+
+    Attributes:
+        env: Id of one of the four environments with a plant of their own.
+        method: Synthesis method: ours, whose result is verified exactly, or the published one as printed.
+        out: File for the certificate (JSON).
+        max_age: Largest measurement age of the channel contract [steps]; by default the environment's contract.
+        seed: Accepted by every command; the synthesis is deterministic and does not use it.
+    """
+
+    env: str = "ncs_gym/TruckTrailerCruise-v0"
+    method: Literal["certified", "paper"] = "certified"
+    out: Path = Path("certificate.json")
+    max_age: int | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerifySettings:
+    """Verifies a certificate in exact rational arithmetic against the plant it was made for.
+
+    Attributes:
+        file: File of the certificate (JSON).
+        env: Id of one of the four environments with a plant of their own; without it, the one whose plant has the
+            certificate's fingerprint.
+        out: File for the verdicts (JSON).
+        seed: Accepted by every command; the verification is deterministic and does not use it.
+    """
+
+    file: tyro.conf.Positional[Path]
+    env: str | None = None
+    out: Path | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class CertifySettings:
+    """Attacks shielded control loops within the assumptions, and counts the states that leave the safe set.
+
+    The plants are those of the registered environments and random ones, behind every kind of channel. Disturbances push
+    the next state farthest out, initial states and first estimation errors lie on the boundaries of their sets, sensor
+    noise has full size in random directions, and agents are random or hostile.
+
+    Attributes:
+        steps: Smallest number of steps in all; whole batches of `envs` episodes are run, at least one per attack case
+            and mode of the shield.
+        out: Output folder; an interrupted campaign continues where it stopped, and one with more steps adds to it.
+        random_plants: Number of random plants, each behind four kinds of channels.
+        envs: Number of episodes in a batch, simulated side by side.
+        jobs: Number of worker processes.
+        unshielded: Let the shield only watch, to see what happens without it.
+        seed: Seed of the campaign, >= 0.
+    """
+
+    steps: float = 1e8
+    out: Path = Path("runs/certify")
+    random_plants: int = 4
+    envs: int = 4096
+    jobs: int = 2
+    unshielded: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        if not 1.0 <= self.steps < 1e15:
+            raise ValueError(f"--steps must be at least 1 and below 1e15, got {self.steps:g}")
+        for name, least in (("random_plants", 0), ("envs", 4), ("jobs", 1), ("seed", 0)):
+            if getattr(self, name) < least:
+                flag = name.replace("_", "-")
+                raise ValueError(f"--{flag} must be at least {least}, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AuditSettings:
+    """Checks the printed numbers of the paper (Liu et al. Section 5) claim by claim, from its own data.
+
+    Attributes:
+        json: Print JSON instead of the table.
+        out: File for the rows (JSON).
+        seed: Accepted by every command; the audit is deterministic and does not use it.
+    """
+
+    json: bool = False
+    out: Path | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReproduceSettings:
+    """Simulates Section 5 of Liu et al.: printed (K, M), certified (K, M), and OP's at the nearest feasible bounds.
+
+    Simulates random initial states in each safe set with all four network impairments; prints a table and leaves
+    figures and summary.json.
+
+    Attributes:
+        out: Output folder.
+        starts: Number of random initial states per design.
+        steps: Steps of each simulation.
+        seed: Seed of initial states, disturbances and channel, the same for all designs.
+    """
+
+    out: Path = Path("runs/reproduce")
+    starts: int = 100
+    steps: int = 200
+    seed: int = 0

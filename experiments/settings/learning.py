@@ -1,0 +1,207 @@
+"""Settings of the commands that train agents, evaluate them or draw their episodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from agents.settings import A2CSettings, AgentSettings, OffPolicySettings, PPOSettings
+from experiments.settings.backend import BackendSettings
+from experiments.settings.channel import ChannelSettings
+
+Algorithm = Literal["PPO", "A2C", "SAC", "TD3", "TRPO", "TQC", "CrossQ"]
+Mode = Literal["project", "switch", "boundary"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearningSettings:
+    """Settings that the commands that train share.
+
+    Attributes:
+        config: Settings file (settings.json) of an earlier run; its settings hold where none are given here.
+        env: Id of one of the four environments with a plant of their own.
+        seed: Seed of the experiment, >= 0; all runs derive their seeds from it.
+        steps: Training steps per run, rounded up to whole rollouts.
+        episodes: Evaluation episodes per run.
+        algo: Learning algorithm; TRPO, TQC and CrossQ need sb3-contrib.
+        mode: What the shield applies in place of an unsafe action: the closest safe input ("project"), or the certified
+            K x_hat ("switch"; "boundary" applies it unless every action would be safe).
+        intervention_penalty: Subtracted from the training reward per intervention, in arms with "+penalty".
+        violation_penalty: Subtracted from the training reward per violating step, in the arm "penalized".
+        certificate: Certificate file to use instead of synthesizing one.
+        channel: Changes of the environment's channel.
+        ppo: Settings of PPO and TRPO.
+        a2c: Settings of A2C.
+        off_policy: Settings of SAC, TD3, TQC and CrossQ.
+    """
+
+    config: Path | None = None
+    env: str = "ncs_gym/TruckTrailerCruise-v0"
+    seed: int = 0
+    steps: int = 150_000
+    episodes: int = 200
+    algo: Algorithm = "PPO"
+    mode: Mode = "project"
+    intervention_penalty: float = 0.1
+    violation_penalty: float = 1.0
+    certificate: Path | None = None
+    channel: ChannelSettings = field(default_factory=ChannelSettings)
+    ppo: PPOSettings = field(default_factory=PPOSettings)
+    a2c: A2CSettings = field(default_factory=A2CSettings)
+    off_policy: OffPolicySettings = field(default_factory=OffPolicySettings)
+
+    @property
+    def agent(self) -> AgentSettings:
+        """Settings of the chosen learning algorithm."""
+        return {"PPO": self.ppo, "TRPO": self.ppo, "A2C": self.a2c}.get(self.algo, self.off_policy)
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        for name in ("seeds", "steps", "episodes"):
+            if getattr(self, name, 1) < 1:
+                raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
+        if self.seed < 0:
+            raise ValueError(f"--seed must be >= 0, got {self.seed}")
+        for name in ("intervention_penalty", "violation_penalty"):
+            if not 0.0 <= getattr(self, name) < float("inf"):
+                raise ValueError(f"--{name.replace('_', '-')} must be >= 0, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareSettings(BackendSettings, LearningSettings):
+    """Trains agents with and without the shield and compares violations, return and interventions.
+
+    Synthesizes and exactly verifies a certificate, trains paired runs (equal seeds), evaluates each on the same
+    episodes (common random numbers), prints a table and leaves summary.json, settings.json, episodes.parquet,
+    training.parquet, report.html, figures, models, TensorBoard events and the certificate in the output folder. Started
+    again with the same folder, finished runs are kept.
+
+    Attributes:
+        out: Output folder; created if it does not exist.
+        seeds: Number of paired training runs per arm.
+        arms: unshielded, monitor (unshielded, counts what the shield would have done), penalized (unshielded, with a
+            penalty per violation), shielded, shielded:MODE, and each shielded one with +penalty (per intervention).
+        smoke: Run a short version, whatever else is asked for, to see that everything works.
+    """
+
+    out: Path = Path("runs/compare")
+    seeds: int = 3
+    arms: tuple[str, ...] = ("unshielded", "penalized", "shielded")
+    smoke: bool = False
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        LearningSettings.__post_init__(self)
+        BackendSettings.__post_init__(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainSettings(LearningSettings):
+    """Trains one agent, evaluates it, and saves it with everything needed to use it.
+
+    Attributes:
+        out: Output folder; created if it does not exist.
+        arm: Arm that the agent is trained in; see the arms of `ncs compare`.
+    """
+
+    out: Path = Path("runs/train")
+    arm: str = "shielded"
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateSettings:
+    """Evaluates a trained agent, behind a shield or not, on any channel.
+
+    Attributes:
+        model: Folder of a trained agent, such as models/shielded-0 in the output of `ncs compare` or `ncs train`.
+        shield: Mode of the shield; "monitor" changes nothing and counts what it would have done.
+        episodes: Number of evaluation episodes.
+        seed: Seed of the episodes.
+        certificate: Certificate file to use instead of synthesizing one.
+        channel: Changes of the channel that the agent was trained with.
+        out: File for the summary (JSON).
+    """
+
+    model: tyro.conf.Positional[Path]
+    shield: Literal["none", "monitor", "project", "switch", "boundary"] = "none"
+    episodes: int = 200
+    seed: int = 0
+    certificate: Path | None = None
+    channel: ChannelSettings = field(default_factory=ChannelSettings)
+    out: Path | None = None
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        if self.episodes < 1:
+            raise ValueError(f"--episodes must be at least 1, got {self.episodes}")
+        if self.seed < 0:
+            raise ValueError(f"--seed must be >= 0, got {self.seed}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepSettings(BackendSettings, LearningSettings):
+    """Compares arms over a grid of channels: how safety, return and interventions depend on the channel.
+
+    Every point of the grid is a comparison of its own with the same seeds. Leaves sweep.parquet, summary.json,
+    settings.json, report.html with heatmaps, and the models. Started again with the same folder, finished runs are
+    kept.
+
+    Attributes:
+        out: Output folder; created if it does not exist.
+        seeds: Number of paired training runs per arm and channel.
+        steps: Training steps per run, rounded up to whole rollouts.
+        episodes: Evaluation episodes per run.
+        arms: Arms of the comparison; see `ncs compare`.
+        losses: Loss probabilities of the grid.
+        delays: Delays of the grid [steps].
+        quantization_steps: Quantization steps of the grid; the environment's own if none is given.
+        burst_lengths: Mean numbers of packets lost in a row; 0 stands for independent losses.
+    """
+
+    out: Path = Path("runs/sweep")
+    seeds: int = 1
+    steps: int = 50_000
+    episodes: int = 100
+    arms: tuple[str, ...] = ("unshielded", "shielded")
+    losses: tuple[float, ...] = (0.0, 0.3, 0.6)
+    delays: tuple[int, ...] = (0, 2, 4)
+    quantization_steps: tuple[float, ...] = ()
+    burst_lengths: tuple[float, ...] = (0.0,)
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        LearningSettings.__post_init__(self)
+        BackendSettings.__post_init__(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderSettings:
+    """Draws an episode of a policy, as an animation or its last frame (docs/rendering.md).
+
+    Attributes:
+        env: Id of one of the four environments with a plant of their own.
+        out: File to write: .gif, .mp4, or .png for the last frame alone.
+        policy: "greedy" (toward the task's goal as hard as it can), "zero", "random", or the folder of a
+            trained agent.
+        shield: Mode of the shield; "none" for no shield.
+        side_by_side: Draw the same episode without a shield at the left, with it at the right.
+        certificate: Certificate file to use instead of synthesizing one.
+        seed: Seed of the episode (of both, side by side) and of the random policy.
+        steps: Largest number of steps.
+        fps: Frames per second; one frame per step.
+        width: Width of the animation [pixels]; by default as drawn.
+    """
+
+    env: str = "ncs_gym/TruckTrailerCruise-v0"
+    out: Annotated[Path, tyro.conf.arg(aliases=["--gif"])] = Path("episode.gif")
+    policy: str = "greedy"
+    shield: Literal["project", "switch", "boundary", "monitor", "none"] = "project"
+    side_by_side: bool = False
+    certificate: Path | None = None
+    seed: int = 0
+    steps: int = 200
+    fps: int = 10
+    width: int | None = None

@@ -1,0 +1,107 @@
+"""Settings of a run in a file, from which the same run can be started again."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import types
+from dataclasses import asdict, is_dataclass
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from experiments.errors import SettingsError
+from ncs_gym.validation import MAX_QUOTED_LENGTH
+from shields.atomic_write import write_atomically
+
+FORMAT = "ncs-gym settings 1"
+
+
+def settings_json(command: str, settings: Any) -> dict[str, Any]:
+    """Returns a command's settings as JSON values."""
+    values = json.loads(json.dumps(asdict(settings), default=str))
+    return {"format": FORMAT, "command": command, "settings": {k: v for k, v in values.items() if k != "config"}}
+
+
+def save_settings(path: Path, command: str, settings: Any) -> None:
+    """Writes a command's settings.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    write_atomically(path, json.dumps(settings_json(command, settings), indent=1) + "\n")
+
+
+def config_defaults(arguments: list[str], command: str, kind: type) -> tuple[Any, list[str]]:
+    """Returns the settings in the file given by `--config`, or None, and the other arguments.
+
+    Args:
+        arguments: Arguments of the command.
+        command: Name of the command.
+        kind: Dataclass of the command's settings; fields that the file does not give have their defaults.
+
+    Raises:
+        SettingsError: If the flag is given more than once or without a file, or the file is missing, damaged or another
+            command's, or holds a wrong value.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--config", action="append", nargs="?", const="", default=[])
+    found, others = parser.parse_known_args(arguments)
+    if not found.config:
+        return None, arguments
+    if len(found.config) > 1:
+        raise SettingsError(f"--config is given {len(found.config)} times")
+    if not found.config[0]:
+        raise SettingsError("--config needs a file")
+    return _load(Path(found.config[0]), command, kind), others
+
+
+def _load(path: Path, command: str, kind: type) -> Any:
+    """Returns the settings in a file; raises SettingsError as `config_defaults` says."""
+    try:
+        document = json.loads(path.read_bytes())
+    except OSError as error:
+        raise SettingsError(f"cannot read settings {path}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise SettingsError(f"settings {path} are damaged: not valid JSON") from error
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise SettingsError(f"{path} is not of format {FORMAT!r}")
+    if document.get("command") != command or not isinstance(document.get("settings"), dict):
+        raise SettingsError(f"{path} holds settings of ncs {document.get('command')}, not of ncs {command}")
+    try:
+        return _from_json(document["settings"], kind)
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:MAX_QUOTED_LENGTH]
+        raise SettingsError(f"settings {path} hold what ncs {command} does not take: {reason}") from error
+
+
+def _from_json(value: Any, kind: Any, name: str = "") -> Any:
+    """Returns a JSON value as a value of a type.
+
+    Args:
+        value: The JSON value.
+        kind: Type that it has to have: a dataclass, or the type of one of its fields.
+        name: Dotted name of the field.
+
+    Raises:
+        TypeError: If the value is none of the type; the message names the field.
+        ValueError: If the value is out of range.
+    """
+    if is_dataclass(kind) and isinstance(value, dict):
+        fields = {field: hint for field, hint in get_type_hints(kind).items() if field != "config"}
+        prefix = f"{name}." if name else ""
+        return kind(**{key: _from_json(each, fields.get(key), prefix + key) for key, each in value.items()})  # type: ignore[operator]
+    origin, parameters = get_origin(kind), get_args(kind)
+    if origin in (Union, types.UnionType):
+        chosen = types.NoneType if value is None else next(each for each in parameters if each is not types.NoneType)
+        return _from_json(value, chosen, name)
+    if origin is tuple and isinstance(value, list):
+        return tuple(_from_json(each, parameters[0], name) for each in value)
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    if (origin is Literal and value in parameters) or (
+        kind in (bool, int, str, types.NoneType) and type(value) is kind
+    ):
+        return value
+    if kind is float and type(value) in (int, float) and float(value) == value:  # not NaN, not rounded
+        return float(value)
+    raise TypeError(f"{name} = {json.dumps(value)}")

@@ -1,0 +1,112 @@
+"""The drawing of any other plant: a bar for every constraint of the safe box."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.rendering import theme
+from ncs_gym.rendering.canvas import Canvas
+from ncs_gym.rendering.episode_record import FrameRecord
+from ncs_gym.rendering.packet_animation import draw_packets
+
+# The largest number of bars, and of bars in one column.
+_MAX_BARS, _COLUMN = 8, 4
+_TOP = theme.PACKET_LINE + 27
+_SPACING = 28.0
+# The bars reach this far, in units of the limit.
+_BAR_REACH = 1.3
+# Widths of the names and numbers beside the bars, with one column and with two [pixels].
+_TEXT_WIDTH, _NARROW_TEXT_WIDTH = 150.0, 96.0
+_OUTSIDE = theme.blend(theme.DANGER_FILL, theme.DANGER, 0.15)
+
+
+class _Constraint(NamedTuple):
+    """One row of the safe box.
+
+    Attributes:
+        name: Name of the state it limits; a number for a row about several states.
+        unit: Unit of that state.
+        limit: Limit of the absolute value of that state.
+        load: Maps a state, shape (n,), to the signed fraction of the limit that it uses.
+    """
+
+    name: str
+    unit: str
+    limit: float
+    load: Callable[[np.ndarray], float]
+
+
+class ConstraintBarsDrawing:
+    """Draws c_j x against its limits for each of the first rows of the safe box.
+
+    Args:
+        plant: The plant, which names the states that the rows are about.
+
+    Attributes:
+        pair: The states in the phase plane: the first two that have a limit of their own.
+    """
+
+    def __init__(self, plant: LinearPlant) -> None:
+        self._constraints = [_constraint(plant, j) for j in range(min(len(plant.C), _MAX_BARS))]
+        limited = [int(np.flatnonzero(row)[0]) for row in plant.C if np.count_nonzero(row) == 1]
+        order = list(dict.fromkeys([*limited, *range(plant.n)]))
+        self.pair = (min(order[:2]), max(order[:2]))
+        self._text_width = _TEXT_WIDTH if len(self._constraints) <= _COLUMN else _NARROW_TEXT_WIDTH
+        self._hidden = len(plant.C) - len(self._constraints)
+
+    def draw_background(self, canvas: Canvas) -> None:
+        """Draws the names, the empty bars and the limits."""
+        for i, constraint in enumerate(self._constraints):
+            bar = self._bar(i)
+            place = bar.x - 10, bar.y + 7
+            canvas.text(constraint.name, place, theme.INK, align=1.0, max_width=self._text_width)
+            canvas.rect(bar, _OUTSIDE, radius=3)
+            inner = bar.w / _BAR_REACH
+            canvas.rect(theme.Rect(bar.x + (bar.w - inner) / 2, bar.y, inner, bar.h), theme.PAPER)
+            for sign in (-1.0, 1.0):
+                x = _x(bar, sign)
+                canvas.dashed([(x, bar.y - 3), (x, bar.bottom + 3)], theme.DANGER, 1.5, dash=3.0)
+        if self._hidden:
+            text = f"and {self._hidden} more limits"
+            canvas.text(text, (theme.WIDTH - 16, theme.PLANT_VIEW.bottom - 9), theme.MUTED, align=1.0)
+
+    def draw(self, canvas: Canvas, frame: FrameRecord) -> None:
+        """Draws the true values as bars, the estimated ones as dashed marks, and the packets."""
+        for i, constraint in enumerate(self._constraints):
+            bar, value = self._bar(i), constraint.load(frame.state)
+            color, middle = theme.load_color(value), bar.x + bar.w / 2
+            x = _x(bar, value)
+            canvas.rect(theme.Rect(min(x, middle), bar.y + 2, abs(x - middle), bar.h - 4), color)
+            canvas.line([(middle, bar.y - 1), (middle, bar.bottom + 1)], theme.MUTED, 1.0)
+            estimated = _x(bar, constraint.load(frame.estimate))
+            canvas.dashed([(estimated, bar.y - 4), (estimated, bar.bottom + 4)], theme.ESTIMATE, 2.0, dash=3.0)
+            text = theme.value_label(value * constraint.limit, constraint.limit, constraint.unit)
+            place, bold = (bar.right + 10, bar.y + 7), abs(value) > 0.8
+            canvas.text(text, place, color, bold=bold, max_width=self._text_width)
+        draw_packets(canvas, frame, 130.0, theme.WIDTH - 130.0)
+
+    def _bar(self, index: int) -> theme.Rect:
+        """Returns where a bar is."""
+        count = len(self._constraints)
+        y = _TOP + _SPACING * (index % _COLUMN) + 0.5 * _SPACING * (_COLUMN - min(count, _COLUMN))
+        if count <= _COLUMN:
+            return theme.Rect(170, y, 340, 14)
+        return theme.Rect(110 if index < _COLUMN else 420, y, 130, 14)
+
+
+def _constraint(plant: LinearPlant, index: int) -> _Constraint:
+    row = plant.C[index]
+    if np.count_nonzero(row) != 1:
+        return _Constraint(f"limit {index + 1}", "", 1.0, lambda state: float(row @ state))
+    i = int(np.flatnonzero(row)[0])
+    limit = 1.0 / abs(row[i])
+    return _Constraint(plant.state_names[i], plant.state_units[i], limit, lambda state: float(state[i]) / limit)
+
+
+def _x(bar: theme.Rect, load: float) -> float:
+    """Returns where a signed fraction of the limit is on a bar [pixels]."""
+    return bar.x + bar.w / 2 * (1.0 + float(np.clip(load / _BAR_REACH, -1.0, 1.0)))

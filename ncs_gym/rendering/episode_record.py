@@ -1,0 +1,218 @@
+"""What the pictures of an episode show, as data: the present step, the recent path and the recent packets."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ncs_gym.network.channel import Packet
+from ncs_gym.network.channel_state import ChannelState
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.tasks.setpoint_tracking import SetpointTracking
+from ncs_gym.tasks.speed_tracking import SpeedTracking
+from ncs_gym.tasks.task import Task
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
+
+# Number of steps of the path and of the packets that a frame shows.
+RECENT_STEPS = 40
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Annotation:
+    """What a shield knows about the step it is about to take, to be shown in the picture of that step.
+
+    Attributes:
+        safe_set: The safe set S = {x : x'Mx <= 1} of the shield's certificate.
+        label: The shield's mode, written in the header.
+        proposed: The input the agent proposed, shape (m,) [physical units]; None at reset.
+        intervened: Whether the shield replaces the proposed input.
+        interventions: Number of interventions in this episode, this step included.
+        protects: Whether the shield's input is applied; False for a shield that only monitors.
+    """
+
+    safe_set: Ellipsoid
+    label: str
+    proposed: np.ndarray | None = None
+    intervened: bool = False
+    interventions: int = 0
+    protects: bool = True
+
+
+class PacketRecord(NamedTuple):
+    """When a packet was sent and when it arrives.
+
+    Attributes:
+        stamp: The step at which it was sent.
+        arrival: The step at which it arrives; None if it is lost.
+    """
+
+    stamp: int
+    arrival: int | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackedOutput:
+    """The quantity that a tracking task is about, and its reference.
+
+    Attributes:
+        name: Name of the quantity.
+        unit: Unit of all four numbers.
+        value: The true value now.
+        target: The reference value now.
+        low, high: Range of the reference values.
+    """
+
+    name: str
+    unit: str
+    value: float
+    target: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameRecord:
+    """Everything that one frame shows; what draws a frame reads nothing else.
+
+    Attributes:
+        plant: The plant that is drawn.
+        step: Steps taken in this episode.
+        state: The true state x, shape (n,).
+        estimate: The estimate x_hat, shape (n,).
+        error_shape: Shape Sigma_k of the set that holds the estimation error, shape (n, n).
+        input: The input applied in the step that led here, shape (m,); None at reset.
+        violations: Number of steps of this episode with a violation.
+        violated: Whether the true state violates the safe box now.
+        measurement_age: Steps since the newest measurement used was taken.
+        path: The recent states, oldest first, shape (T, n).
+        interventions: Whether the shield replaced the input that led to each of these states, shape (T,).
+        packets: The recent packets, oldest first.
+        annotation: What the shield knows about the step that led here; None without a shield.
+        tracked: What the task tracks; None if it does not track a single quantity.
+        distance: Distance driven in this episode, if the task knows a speed [m].
+    """
+
+    plant: LinearPlant
+    step: int
+    state: np.ndarray
+    estimate: np.ndarray
+    error_shape: np.ndarray
+    input: np.ndarray | None
+    violations: int
+    violated: bool
+    measurement_age: int
+    path: np.ndarray
+    interventions: np.ndarray
+    packets: tuple[PacketRecord, ...]
+    annotation: Annotation | None
+    tracked: TrackedOutput | None
+    distance: float
+
+    @property
+    def intervened(self) -> bool:
+        """Whether a shield that protects replaced the input that led here."""
+        annotation = self.annotation
+        return annotation is not None and annotation.intervened and annotation.protects
+
+
+class EpisodeRecord:
+    """The recent past of one episode: extended at every step, turned into a `FrameRecord` only when a frame is drawn.
+
+    Args:
+        plant: The plant that is drawn.
+        task: The task, which may track a quantity.
+    """
+
+    def __init__(self, plant: LinearPlant, task: Task) -> None:
+        self._plant, self._task = plant, task
+        self._next_annotation: Annotation | None = None
+
+    def annotate(self, annotation: Annotation) -> None:
+        """Stores what is to be shown with the next step or reset."""
+        self._next_annotation = annotation
+
+    def begin(self, info: Mapping[str, Any], task_state: Any) -> None:
+        """Starts an episode, with the info of its reset."""
+        self._step, self._distance = 0, 0.0
+        self._path: deque[np.ndarray] = deque(maxlen=RECENT_STEPS)
+        self._interventions = deque([False], maxlen=RECENT_STEPS)
+        self._packets: deque[PacketRecord] = deque(maxlen=RECENT_STEPS)
+        self._input: np.ndarray | None = None
+        self._store(info, task_state)
+
+    def add(self, info: Mapping[str, Any], task_state: Any, network: ChannelState, arrived: list[Packet]) -> None:
+        """Adds a step.
+
+        Args:
+            info: The info that the environment returns for this step; its arrays are copied.
+            task_state: State of the task after this step.
+            network: State of the channel after the exchange of this step.
+            arrived: Packets that arrived at this step.
+        """
+        self._step += 1
+        if isinstance(self._task, SpeedTracking):
+            self._distance += self._plant.dt * float(task_state[0])
+        self._input = info["input"].copy()
+        self._store(info, task_state)
+        self._interventions.append(self._annotation is not None and self._annotation.intervened)
+        if network.sends_at(self._step):
+            arrival = _arrival(self._step, network.in_flight, arrived)
+            self._packets.append(PacketRecord(self._step, arrival))
+
+    def frame(self) -> FrameRecord:
+        """Returns what a frame of the present step shows."""
+        state = self._path[-1]
+        return FrameRecord(
+            plant=self._plant,
+            step=self._step,
+            state=state,
+            estimate=self._estimate,
+            error_shape=self._error_shape,
+            input=self._input,
+            violations=self._violations,
+            violated=self._violated,
+            measurement_age=self._measurement_age,
+            path=np.array(self._path),
+            interventions=np.array(self._interventions),
+            packets=tuple(self._packets),
+            annotation=self._annotation,
+            tracked=_tracked_output(self._task, self._plant, self._task_state, state),
+            distance=self._distance,
+        )
+
+    def _store(self, info: Mapping[str, Any], task_state: Any) -> None:
+        """Stores copies of what a frame shows of an info, and takes the annotation made for this step."""
+        self._annotation, self._next_annotation = self._next_annotation, None
+        self._path.append(info["state"].copy())
+        self._estimate, self._error_shape = info["estimate"].copy(), info["error_shape"].copy()
+        self._violations, self._violated = int(info["episode_violations"]), bool(info["cost"] > 0.0)
+        self._measurement_age = int(info["measurement_age"])
+        self._task_state = task_state
+
+
+def _arrival(stamp: int, in_flight: Mapping[int, list[Packet]], arrived: list[Packet]) -> int | None:
+    """Returns when the packet sent at this very step arrives; None if it was lost."""
+    if any(packet.stamp == stamp for packet in arrived):
+        return stamp
+    for step, packets in in_flight.items():
+        if any(packet.stamp == stamp for packet in packets):
+            return step
+    return None
+
+
+def _tracked_output(task: Task, plant: LinearPlant, task_state: Any, state: np.ndarray) -> TrackedOutput | None:
+    """Returns the quantity that a task tracks; None for tasks that do not track a single quantity."""
+    if isinstance(task, SpeedTracking):
+        value, target = task_state.tolist()
+        return TrackedOutput(name="speed", unit="m/s", value=value, target=target, low=0.0, high=task.fastest)
+    if isinstance(task, SetpointTracking):
+        used, name, unit = np.flatnonzero(task.output), "output", ""
+        if len(used) == 1:
+            name, unit = plant.state_names[int(used[0])], plant.state_units[int(used[0])]
+        value, target = float(task.output @ state), float(task_state)
+        return TrackedOutput(name=name, unit=unit, value=value, target=target, low=-task.reach, high=task.reach)
+    return None

@@ -1,0 +1,168 @@
+"""Certificates for a plant: synthesized with a set of largest volume, or for a given set and gain."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib.metadata import version
+
+import numpy as np
+
+from ncs_gym import ErrorSet, LinearPlant
+from ncs_gym.network.contract import ChannelContract
+from ncs_gym.validation import shown
+from shields.certificate import Certificate
+from shields.errors import Infeasible
+from shields.proof import ContractProof, Multipliers
+from shields.synthesis.alternation import largest_set, with_best_multipliers
+from shields.synthesis.design_problem import INFLATION, CandidateDesign, DesignProblem, design_problem
+from shields.synthesis.diagnosis import infeasibility, with_feasible_bounds
+from shields.synthesis.initial_designs import Progress
+from shields.synthesis.multipliers import best_input_multipliers, best_multipliers
+from shields.verification import Report, verify
+
+# Relative tightenings of the semidefinite programs, tried in turn until the result verifies exactly.
+_SLACKS = (1e-6, 1e-5, 1e-4, 1e-3)
+# Multipliers from which those of a given set and gain are sought.
+_INITIAL_MULTIPLIERS = (0.9, 0.03, 0.07)
+
+
+def synthesize(
+    plant: LinearPlant,
+    method: str = "certified",
+    *,
+    contract: ChannelContract | None = None,
+    progress: Progress | None = None,
+    dkappa: float = 0.02,
+    drho: float = 0.05,
+    search: str = "first",
+) -> Certificate:
+    """Returns a verified certificate.
+
+    Method "certified" (docs/theory.md section 3) seeks the largest ellipsoid with hard bounds. Method "paper" solves OP
+    of Liu et al. as printed with their Algorithm 1; its certificate carries no error set (docs/paper.md).
+
+    Args:
+        plant: The plant with its bounds, Schur stable for "certified" without a contract.
+        method: "certified" or "paper".
+        contract: Channel contract; with one, the error sets depend on the age of the newest sample ("certified").
+        progress: Called with a line of text per initial design and per alternation ("certified").
+        dkappa: Grid step of kappa ("paper").
+        drho: Grid step of rho ("paper").
+        search: "first" feasible grid point, as printed, or "largest" volume over the grid ("paper").
+
+    Raises:
+        Infeasible: If no certificate is found; it names the binding condition and the shortfall.
+        ValueError: If an argument is out of range.
+    """
+    if not isinstance(plant, LinearPlant):
+        raise ValueError(f"plant must be a LinearPlant, got {type(plant).__name__}")
+    if not (isinstance(method, str) and method in ("certified", "paper")):
+        raise ValueError(f"method must be 'certified' or 'paper', got {shown(method)}")
+    if method == "paper":
+        from shields.paper.certificate import paper_certificate  # nothing else here uses the paper's method
+
+        certificate = paper_certificate(plant, dkappa=dkappa, drho=drho, search=search)
+        holds = _is_certifiable(plant, certificate.L, certificate.K)
+        return replace(certificate, provenance=certificate.provenance | {"exact_conditions_hold": holds})
+    if contract is not None and not isinstance(contract, ChannelContract):
+        raise ValueError(f"contract must be a ChannelContract or None, got {shown(contract)}")
+    return _largest_certificate(plant, contract, progress or (lambda line: None))
+
+
+def certify(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> Certificate | None:
+    """Returns a verified certificate for a given set and gain; None if no multipliers that prove it are found.
+
+    Args:
+        plant: The plant with its bounds.
+        L: Shape of the safe set, (n, n).
+        K: Gain, shape (m, n) [input per state].
+
+    Raises:
+        Infeasible: If the plant has no error set or its safe box is unbounded.
+    """
+    problem, errors = design_problem(plant)
+    scaled_L, scaled_K = problem.to_scaled(L, K)
+    multipliers, _ = best_multipliers(problem, problem.error_shapes, scaled_L, scaled_K, _INITIAL_MULTIPLIERS)
+    inputs = best_input_multipliers(problem.error_shapes, scaled_L, scaled_K)
+    design = CandidateDesign(scaled_L, scaled_K, multipliers, inputs, float(np.linalg.slogdet(scaled_L)[1]))
+    certificate = replace(_certificate(plant, problem, design, errors, 0.0), L=L, K=K)
+    return certificate if verify(certificate, plant).valid else None
+
+
+def _is_certifiable(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> bool:
+    """Returns whether the certified method's conditions hold for a set and gain, as far as multipliers are found."""
+    try:
+        return certify(plant, L, K) is not None
+    except Infeasible:
+        return False
+
+
+def _largest_certificate(plant: LinearPlant, contract: ChannelContract | None, progress: Progress) -> Certificate:
+    """Returns the verified certificate of the largest set found."""
+    try:
+        problem, errors = design_problem(plant, contract)
+    except Infeasible as infeasible:
+        raise with_feasible_bounds(infeasible, plant, contract) from infeasible
+    failure = None
+    for slack in _SLACKS:
+        design = largest_set(problem, slack, progress)
+        if design is None:
+            break
+        certificate = _certificate(plant, problem, design, errors, slack)
+        report = verify(certificate, plant)
+        if report.valid:
+            return certificate
+        failure = _failed_verification(report)
+    raise failure or with_feasible_bounds(infeasibility(problem), plant, contract)
+
+
+def _failed_verification(report: Report) -> Infeasible:
+    """Returns the exception for a candidate that does not verify."""
+    failed = next(condition for condition in report.conditions if not condition.holds)
+    return Infeasible(
+        f"a candidate was found, but in exact arithmetic {failed.name} fails by {-failed.margin:.3g}",
+        failed.name.split()[0].strip("():"),
+        -failed.margin,
+    )
+
+
+def _certificate(
+    plant: LinearPlant, problem: DesignProblem, design: CandidateDesign, errors: ErrorSet, slack: float
+) -> Certificate:
+    """Returns the certificate of a design, not yet verified."""
+    L, K = problem.to_physical(design.L, design.K)
+    ages = None
+    if errors.ages is not None:
+        by_age = [with_best_multipliers(problem, design, Sigma[None]) for Sigma in problem.error_shapes]
+        multipliers = np.array([_rounded_down(each.multipliers) for each in by_age])
+        inputs = np.array([each.inputs for each in by_age])
+        ages = ContractProof(sets=errors.ages, multipliers=multipliers, inputs=inputs)
+        design = by_age[-1]
+    return Certificate(
+        L=L,
+        K=K,
+        Sigma=errors.Sigma,
+        D=INFLATION * plant.disturbance.shape,
+        multipliers=_multipliers(problem, design, errors.rate),
+        ages=ages,
+        method="certified",
+        fingerprint=plant.fingerprint,
+        provenance={
+            "source": "docs/theory.md section 3",
+            "solver": f"Clarabel {version('clarabel')} through cvxpy {version('cvxpy')}",
+            "slack": slack,
+            "volume_of_box_ellipsoid": float(np.exp(0.5 * design.log_det)),
+        },
+    )
+
+
+def _multipliers(problem: DesignProblem, design: CandidateDesign, lam_e: float) -> Multipliers:
+    """Returns a design's multipliers as a certificate has them, with those of the error set and of the rounding."""
+    lx, le, ld = _rounded_down(design.multipliers)
+    inputs = tuple(float(mu) for mu in design.inputs)
+    return Multipliers(error=lam_e, state=lx, estimate=le, disturbance=ld, inputs=inputs, rounding=problem.rounding)
+
+
+def _rounded_down(multipliers: tuple[float, float, float]) -> tuple[float, ...]:
+    """Returns multipliers so much smaller that rounding cannot lift lx + le + ld above 1."""
+    return tuple(multiplier * (1.0 - 1e-15) for multiplier in multipliers)

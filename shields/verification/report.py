@@ -1,0 +1,76 @@
+"""The exact verification of a certificate, independent of how it was synthesized."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ncs_gym import LinearPlant
+from shields.certificate import Certificate
+from shields.errors import CertificateError
+from shields.paper.conditions import paper_conditions
+from shields.verification.certified_conditions import certified_conditions, multipliers_fit
+from shields.verification.conditions import Condition, flag
+
+
+@dataclass(frozen=True)
+class Report:
+    """The outcome of a verification.
+
+    Attributes:
+        conditions: All conditions that were checked, in order; later ones are left out where earlier ones fail.
+    """
+
+    conditions: tuple[Condition, ...]
+
+    @property
+    def valid(self) -> bool:
+        """Whether every condition holds."""
+        return all(condition.holds for condition in self.conditions)
+
+    def __str__(self) -> str:
+        rows = (f"{'holds ' if c.holds else 'BROKEN'}  {c.margin:+.3e}  {c.name}" for c in self.conditions)
+        return "\n".join(rows)
+
+
+def verify(certificate: Certificate, plant: LinearPlant) -> Report:
+    """Returns whether a certificate proves what it claims for a plant, in exact rational arithmetic.
+
+    The conditions are (E0), (E1), (I), (S), (U) of theory.md section 3, and that D, N and r0^2 I contain what
+    section 1 says they contain; for a certificate of method "paper" they are the constraints of OP (docs/paper.md).
+    Neither a tolerance nor a solver nor a float decides; the margins are for people.
+
+    Args:
+        certificate: The certificate.
+        plant: The plant, with its bounds.
+
+    Raises:
+        ValueError: If an argument is of another kind.
+    """
+    if not isinstance(certificate, Certificate) or not isinstance(plant, LinearPlant):
+        kinds = f"{type(certificate).__name__} and {type(plant).__name__}"
+        raise ValueError(f"verify takes a Certificate and a LinearPlant, got {kinds}")
+    conditions = [flag("plant: the certificate belongs to it", certificate.fingerprint == plant.fingerprint)]
+    fits = certificate.L.shape == (plant.n, plant.n) and certificate.K.shape == (plant.m, plant.n)
+    if certificate.method == "paper":
+        conditions.append(flag("shapes: L (n, n), K (m, n)", fits))
+        conditions += paper_conditions(certificate, plant) if fits else []
+    else:
+        fits = fits and multipliers_fit(certificate.proof(), plant)
+        conditions.append(flag("shapes: L (n, n), K (m, n), one input multiplier per input", fits))
+        conditions += certified_conditions(certificate, plant) if fits else []
+    return Report(tuple(conditions))
+
+
+def require_valid(certificate: Certificate, plant: LinearPlant) -> None:
+    """Raises unless a certificate verifies for a plant.
+
+    Raises:
+        CertificateError: Naming the first condition that does not hold.
+    """
+    for condition in verify(certificate, plant).conditions:
+        if not condition.holds:
+            if condition.name.startswith("plant"):
+                raise CertificateError("the certificate was made for another plant: their fingerprints differ")
+            raise CertificateError(
+                f"the certificate does not verify: {condition.name} does not hold (margin {condition.margin:.3g})"
+            )

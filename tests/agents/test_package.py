@@ -1,0 +1,30 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import agents
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_every_exported_name_exists():
+    namespace = {}
+    exec("from agents import *", namespace)
+    assert set(agents.__all__) <= namespace.keys()
+    assert all(namespace[name].__name__ == name for name in agents.__all__)
+
+
+def test_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="module 'agents' has no attribute 'nothing'"):
+        _ = agents.nothing
+
+
+def test_results_and_settings_need_neither_stable_baselines3_nor_torch():
+    code = """if True:
+        import sys
+        from agents import ControlLoop, Episode, Evaluation, PPOSettings, ShieldSettings, TrainingPoint, evaluate
+        assert not {"stable_baselines3", "torch"} & sys.modules.keys()
+    """
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)

@@ -1,0 +1,359 @@
+from dataclasses import replace
+from itertools import combinations
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import to_hex, to_rgb
+from scipy.optimize import linprog
+
+from experiments.plots.arm_style import ARM_COLORS_AND_MARKERS, ArmStyle
+from experiments.plots.comparison_figures import comparison_figures
+from experiments.plots.ellipsoid_projection import projected_box, projected_ellipsoid
+from experiments.plots.figure_style import thousands
+from experiments.plots.phase_plane import _plane, phase_figure
+from experiments.plots.scatter import scatter_figure
+from experiments.plots.time_series import _shown_arms, episode_figure
+from experiments.plots.training_curves import _RATE_WINDOW, _common_steps, _rates, training_figure
+from ncs_gym import Ellipsoid
+from tests.experiments.results import ALL_ARMS, history, run, summary_of, trajectory
+from tests.plants import random_plant
+
+# Linear approximations of how the two common kinds of color blindness see (Machado, Oliveira and Fernandes 2009).
+DEUTERANOPIA = np.array(
+    [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.01182, 0.04294, 0.968881]]
+)
+PROTANOPIA = np.array(
+    [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
+)
+
+
+def arms(*names, runs=2, **change):
+    return {name: [run(name, index, **change) for index in range(runs)] for name in names}
+
+
+def lines(axis):
+    return [line for line in axis.get_lines() if len(line.get_xdata()) > 1]
+
+
+def bands(axis):
+    return [artist for artist in axis.collections if isinstance(artist, PolyCollection)]
+
+
+def texts(figure):
+    found = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    return found + [tick.get_text() for axis in figure.axes for tick in axis.get_yticklabels()]
+
+
+def by_color(axis):
+    return {to_hex(line.get_color()).lower(): line for line in lines(axis)}
+
+
+# Looks
+
+
+def test_all_arms_look_different_and_a_penalty_keeps_the_color():
+    looks = [ArmStyle.of(arm) for arm in ALL_ARMS]
+    assert len({(look.color, str(look.dashes)) for look in looks}) == len(ALL_ARMS)
+    assert len({(look.marker, look.hollow) for look in looks}) == len(ALL_ARMS)
+    assert ArmStyle.of("shielded:switch+penalty").color == ArmStyle.of("shielded:switch").color
+    with pytest.raises(KeyError):
+        ArmStyle.of("hoped")
+
+
+@pytest.mark.parametrize("seen", [np.eye(3), DEUTERANOPIA, PROTANOPIA])
+def test_color_blind_readers_can_tell_the_colors_apart(seen):
+    linear = {arm: np.power(to_rgb(color), 2.2) for arm, (color, _) in ARM_COLORS_AND_MARKERS.items()}
+    shown = {arm: np.power(np.clip(seen @ color, 0.0, 1.0), 1 / 2.2) for arm, color in linear.items()}
+    for one, other in combinations(shown, 2):
+        assert np.linalg.norm(shown[one] - shown[other]) > 0.1, (one, other)
+
+
+def test_arms_have_the_same_color_in_every_figure(plant):
+    shown = arms("unshielded", "shielded:boundary")
+    training = training_figure(shown).axes[0]
+    scatter = scatter_figure(summary_of(shown)["arms"], shown).axes[0]
+    phase = phase_figure(plant, SimpleNamespace(L=np.eye(2)), shown)
+    wanted = {ArmStyle.of(name).color.lower() for name in shown}
+    assert set(by_color(training)) == wanted
+    assert {to_hex(line.get_markeredgecolor()).lower() for line in scatter.get_lines()} >= wanted
+    for name, axis in zip(shown, phase.axes, strict=True):
+        assert ArmStyle.of(name).color.lower() in by_color(axis)
+
+
+def test_legend_takes_rows_until_it_fits_the_figure(plant):
+    figure = training_figure(arms(*ALL_ARMS))
+    figure.draw_without_rendering()
+    box = figure.legends[0].get_window_extent()
+    assert len(figure.legends[0].get_texts()) == len(ALL_ARMS) + 1
+    assert box.x0 >= 0.0
+    assert box.x1 <= figure.bbox.x1
+
+
+def test_numbers_have_thousands_separators_and_a_true_minus():
+    assert thousands(-1234567.5) == "\N{MINUS SIGN}1,234,567.5"
+
+
+# Training curves
+
+
+def test_training_has_a_line_and_a_band_per_arm_and_interventions_only_of_watching_arms():
+    axes = training_figure(arms("unshielded", "monitor", "shielded", runs=3)).axes
+    assert [len(lines(axis)) for axis in axes] == [3, 3, 2]
+    assert [len(bands(axis)) for axis in axes] == [3, 3, 2]
+    assert set(by_color(axes[2])) == {ArmStyle.of(name).color.lower() for name in ("monitor", "shielded")}
+
+
+def test_without_a_watching_arm_there_is_no_panel_of_interventions():
+    assert len(training_figure(arms("unshielded", "penalized")).axes) == 2
+    assert "Interventions" not in training_figure(arms("unshielded")).caption
+
+
+def test_band_reaches_from_the_lowest_to_the_highest_run_around_the_mean():
+    axis = training_figure(arms("shielded", runs=3)).axes[1]
+    (line,), (band,) = lines(axis), bands(axis)
+    np.testing.assert_allclose(line.get_xdata(), [0, 10, 20, 100])
+    np.testing.assert_allclose(line.get_ydata(), [0, 20, 40, 200])
+    heights = band.get_paths()[0].vertices
+    assert sorted({y for x, y in heights if x == 100}) == [100, 300]
+    assert "lowest to the highest run" in training_figure(arms("shielded", runs=3)).caption
+
+
+def test_one_run_has_no_band_and_the_caption_says_so():
+    figure = training_figure(arms("unshielded", "shielded", runs=1))
+    assert [bands(axis) for axis in figure.axes] == [[], [], []]
+    assert "no band" in training_figure(arms("unshielded", runs=1)).caption
+    assert not any("run" in text for text in texts(figure))
+
+
+def test_history_of_one_point_is_seen():
+    axes = training_figure(arms("shielded", history=history(64))).axes
+    for axis in axes:
+        (line,) = axis.get_lines()
+        assert line.get_marker() == "^"
+        assert 64 in line.get_xdata()
+        low, high = axis.get_ylim()
+        assert low < line.get_ydata()[-1] < high
+
+
+def test_without_a_finished_episode_the_panel_of_returns_says_so():
+    unfinished = [replace(point, episode_return=float("nan")) for point in history(64)]
+    axis = training_figure(arms("shielded", history=unfinished)).axes[0]
+    assert [text.get_text() for text in axis.texts] == ["no episode was finished"]
+
+
+def test_runs_with_histories_of_different_lengths_meet_at_common_steps():
+    runs = [
+        run("shielded", 0, history=history(10, 20, 30, 40)),
+        run("shielded", 1, history=history(16, 32)),
+    ]
+    np.testing.assert_array_equal(_common_steps(runs), [16, 32])
+    line = lines(training_figure({"shielded": runs}).axes[1])[0]
+    np.testing.assert_allclose(line.get_ydata(), [0, 16, 32])
+    figure = training_figure({"shielded": runs, "unshielded": [run("unshielded", history=history(*range(5, 1005, 5)))]})
+    assert sorted(len(line.get_xdata()) for line in lines(figure.axes[1])) == [3, 201]
+
+
+def test_intervention_rate_is_that_of_the_last_steps_only():
+    steps = np.array([_RATE_WINDOW, 2 * _RATE_WINDOW, 3 * _RATE_WINDOW], float)
+    totals = np.array([[0.0, 0.5 * _RATE_WINDOW, 0.5 * _RATE_WINDOW]])
+    np.testing.assert_allclose(_rates(steps, totals), [[0.0, 0.5, 0.0]])
+
+
+def test_caption_names_the_arms_whose_return_contains_penalties_and_what_a_monitor_counts():
+    caption = training_figure(arms("penalized", "shielded+penalty", "shielded", "monitor")).caption
+    assert "penalties that penalized and shielded+penalty get" in caption
+    assert "would have" in caption
+    assert "penalties" not in training_figure(arms("unshielded", "shielded")).caption
+
+
+# Phase plane
+
+
+def test_phase_plane_has_a_panel_per_arm_a_path_per_run_and_marks_violations(plant):
+    states = np.linspace(0.0, 2.5, 6)[:, None] * [1.0, 0.0]  # the box ends at 2: one state violates
+    shown = arms("unshielded", "shielded", runs=3, trajectory=trajectory(states))
+    figure = phase_figure(plant, SimpleNamespace(L=np.eye(2)), shown)
+    assert len(figure.axes) == 2
+    for axis, name in zip(figure.axes, shown, strict=True):
+        own = [line for line in lines(axis) if to_hex(line.get_color()).lower() == ArmStyle.of(name).color.lower()]
+        assert len(own) == 3
+        crosses = [line for line in axis.get_lines() if line.get_marker() == "x"]
+        assert [line.get_xdata().tolist() for line in crosses] == [[2.5]] * 3
+    assert figure.axes[0].get_xlabel() == "coupling stretch [m]"
+    assert figure.axes[0].get_ylabel() == "stretch rate [m/s]"
+
+
+def test_view_holds_the_sets_and_leaves_out_what_is_far_away(plant):
+    far = trajectory(np.array([[0.0, 0.0], [1e3, 0.0]]))
+    figure = phase_figure(plant, SimpleNamespace(L=np.eye(2)), arms("unshielded", trajectory=far))
+    low, high = figure.axes[0].get_xlim()
+    assert 2.0 < high < 10.0
+    assert low == -high
+    assert "leave the view" in figure.caption
+
+
+def test_of_many_states_the_largest_are_shown_and_the_caption_speaks_of_projections():
+    plant = random_plant(0, 4, 1)
+    states = np.array([[0.0, 0.1, 0.0, 0.1], [0.1, 0.9, 0.2, 0.3]])
+    shown, certificate = arms("shielded", trajectory=trajectory(states)), SimpleNamespace(L=np.diag([1.0, 1, 1, 0.1]))
+    assert _plane(certificate, shown) == (1, 3)
+    caption = phase_figure(plant, certificate, shown).caption
+    assert "x2 and x4" in caption
+    assert "projection" in caption
+    assert any("projection of the safe set" in text for text in texts(phase_figure(plant, certificate, shown)))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_projections_reach_as_far_as_the_sets_in_every_direction(seed):
+    rng = np.random.default_rng(seed)
+    factor, rows = rng.standard_normal((4, 4)), rng.standard_normal((5, 4))
+    ellipse, box = projected_ellipsoid(factor @ factor.T, (0, 2), 20_001), projected_box(rows, (0, 2))
+    for angle in np.linspace(0.0, np.pi, 7):
+        direction = np.array([np.cos(angle), 0.0, np.sin(angle), 0.0])
+        reach = linprog(-direction, np.vstack([rows, -rows]), np.ones(10), bounds=(None, None))
+        assert (box @ direction[[0, 2]]).max() == pytest.approx(-reach.fun)
+        wanted = Ellipsoid(factor @ factor.T).support(direction)
+        assert (ellipse @ direction[[0, 2]]).max() == pytest.approx(wanted, rel=1e-5)
+
+
+def test_box_without_limits_in_the_plane_has_no_outline_and_elsewhere_does_not_matter():
+    rows = np.array([[0.5, 0.0, 0.0], [0.0, 0.25, 0.0]])
+    assert projected_box(rows, (0, 2)) is None
+    outline = projected_box(rows, (0, 1))
+    np.testing.assert_allclose(np.abs(outline).max(axis=0), [2.0, 4.0])
+    assert len(outline) == 5
+
+
+# Time series
+
+
+@pytest.mark.parametrize(
+    ("names", "pair"),
+    [
+        (["penalized", "monitor", "unshielded", "shielded:switch", "shielded"], ["unshielded", "shielded:switch"]),
+        (["monitor", "shielded+penalty"], ["monitor", "shielded+penalty"]),
+        (["shielded"], ["shielded"]),
+        (["penalized"], ["penalized"]),
+    ],
+)
+def test_time_series_show_the_shielded_arm_and_an_unshielded_one(names, pair):
+    assert _shown_arms(names) == pair
+
+
+@pytest.mark.parametrize(("n", "m"), [(2, 1), (4, 1), (4, 2)])
+def test_time_series_have_a_panel_for_states_inputs_and_events(n, m):
+    plant = random_plant(1, n, m)
+    path = trajectory(np.zeros((11, n)), m, intervened=(2, 3), arrivals=(0, 4, 5))
+    figure = episode_figure(plant, arms("shielded", runs=1, trajectory=path))
+    assert len(figure.axes) == 2 + m
+    for axis in figure.axes[1:-1]:
+        (dots,) = [line for line in axis.get_lines() if line.get_marker() == "."]
+        np.testing.assert_allclose(dots.get_xdata(), [0.25, 0.35])
+        np.testing.assert_allclose(dots.get_ydata(), [1.5, 1.5])
+    ticks = [c for c in figure.axes[-1].collections if isinstance(c, LineCollection)]
+    assert [len(row.get_segments()) for row in ticks] == [3, 2]
+    assert {"packet arrivals (3)", "interventions (2)"} <= set(texts(figure))
+    assert figure.axes[-1].get_xlabel() == "time [s]"
+
+
+def test_violations_of_the_limit_are_marked_and_only_then_in_the_legend():
+    plant = random_plant(1, 2, 1)
+    for reach, marked in ((0.8, False), (1.5, True)):
+        path = trajectory(np.linspace(0.0, reach, 11)[:, None] * np.ones(2))
+        figure = episode_figure(plant, arms("unshielded", trajectory=path))
+        assert any(line.get_marker() == "x" for line in figure.axes[0].get_lines()) is marked
+        assert ("violation of the true state" in texts(figure)) is marked
+
+
+def test_an_episode_that_ended_early_stands_beside_a_longer_one():
+    plant = random_plant(1, 4, 1)
+    shown = {
+        "unshielded": [run("unshielded", trajectory=trajectory(np.zeros((5, 4)), arrivals=(0, 1)))],
+        "shielded": [run("shielded", trajectory=trajectory(np.zeros((11, 4)), arrivals=(0, 1, 7)))],
+    }
+    figure = episode_figure(plant, shown)
+    assert figure.axes[-1].get_xlim() == (0.0, 1.0)
+    assert [t for t in texts(figure) if "packet" in t] == ["packet arrivals (3)"]
+    assert "ended at its first violation" in episode_figure(plant, shown).caption
+
+
+def test_packets_of_both_arms_are_shown_where_they_differ():
+    plant = random_plant(1, 2, 1)
+    shown = {
+        "unshielded": [run("unshielded", trajectory=trajectory(np.zeros((11, 2)), arrivals=(3,)))],
+        "shielded": [run("shielded", trajectory=trajectory(np.zeros((11, 2)), arrivals=(0, 1)))],
+    }
+    rows = texts(episode_figure(plant, shown))
+    assert {"packet arrivals (1)", "packet arrivals, shielded (2)"} <= set(rows)
+
+
+def test_a_monitor_only_would_override():
+    plant = random_plant(1, 2, 1)
+    shown = arms("monitor", runs=1, trajectory=trajectory(np.zeros((11, 2)), intervened=(1,)))
+    assert "would override, monitor (1)" in texts(episode_figure(plant, shown))
+    assert "would have" in episode_figure(plant, shown).caption
+
+
+# Cost and return
+
+
+def test_scatter_has_a_point_per_run_and_the_mean_with_its_intervals():
+    shown = {"unshielded": [run("unshielded", i, violations=(4, 0)) for i in range(3)]}
+    summary = summary_of(shown)["arms"]
+    steps, episodes = scatter_figure(summary, shown).axes
+    for axis, cost in ((steps, 2.0), (episodes, 50.0)):
+        (dots,) = [line for line in axis.get_lines() if len(line.get_xdata()) == 3]
+        assert list(zip(dots.get_xdata(), dots.get_ydata(), strict=True)) == [(cost, -2.0), (cost, -3.0), (cost, -4.0)]
+        (mean,) = [line for line in axis.get_lines() if len(line.get_xdata()) == 1]
+        assert (mean.get_xdata()[0], mean.get_ydata()[0]) == (cost, -3.0)
+        vertical = [line for line in axis.get_lines() if line.get_marker() == "_"]
+        np.testing.assert_allclose(vertical[0].get_ydata(), summary["unshielded"]["eval_return_ci95"])
+
+
+def test_after_no_violation_the_scatter_still_shows_what_the_probability_is_at_most():
+    shown = arms("shielded")
+    summary = summary_of(shown)["arms"]
+    (bar,) = [line for line in scatter_figure(summary, shown).axes[1].get_lines() if line.get_marker() == "|"]
+    upper = 100.0 * summary["shielded"]["eval_violation_rate_ci95"][1]
+    np.testing.assert_allclose(bar.get_xdata(), [0.0, upper])
+    assert upper > 50.0
+
+
+def test_arms_that_coincide_have_markers_of_different_sizes():
+    shown = arms(*ALL_ARMS)
+    for axis in scatter_figure(summary_of(shown)["arms"], shown).axes:
+        means = [line.get_markersize() for line in axis.get_lines() if len(line.get_xdata()) == 1]
+        assert means == sorted(set(means), reverse=True)
+        assert len(means) == len(ALL_ARMS)
+
+
+def test_one_run_has_no_interval_of_the_return_and_all_zero_costs_have_a_plain_axis():
+    shown = arms("shielded", runs=1)
+    axis = scatter_figure(summary_of(shown)["arms"], shown).axes[0]
+    assert not [line for line in axis.get_lines() if line.get_marker() == "_"]
+    assert axis.get_xlim()[1] > 0.5
+    assert "no interval" in scatter_figure(summary_of(shown)["arms"], shown).caption
+
+
+def test_scatter_caption_warns_of_episodes_that_end_early():
+    shown = arms("shielded", "unshielded")
+    assert "shorter" not in scatter_figure(summary_of(shown)["arms"], shown).caption
+    first = shown["unshielded"][0]
+    short = replace(first, episodes=[replace(first.episodes[0], steps=4)])
+    shown["unshielded"][0] = short
+    assert "shorter" in scatter_figure(summary_of(shown)["arms"], shown).caption
+
+
+def test_every_figure_is_a_png_with_a_caption_of_its_own(plant):
+    shown = arms(*ALL_ARMS[:5])
+    figures = comparison_figures(plant, SimpleNamespace(L=np.eye(2)), summary_of(shown), shown)
+    assert set(figures) == {"training", "scatter", "phase", "episode"}
+    assert all(png.startswith(b"\x89PNG") for _, png in figures.values())
+    assert len({caption for caption, _ in figures.values()}) == 4
+
+
+def test_legend_below_has_at_least_the_rows_asked_for(plant):
+    figure = episode_figure(plant, arms("unshielded", "shielded"))
+    assert figure.legends[0]._ncols == -(-len(figure.legends[0].get_texts()) // 2)

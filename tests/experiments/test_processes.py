@@ -1,0 +1,49 @@
+"""Worker processes: what becomes of the others when one fails."""
+
+import threading
+import time
+from dataclasses import replace
+from queue import Queue
+
+import pytest
+
+from agents.settings import PPOSettings
+from experiments.backends.processes import _execute, execute_all
+from experiments.errors import RunStopped
+from experiments.runs.training_run import TrainingRun
+
+
+@pytest.fixture(scope="module")
+def endless(certificate):
+    """A run that would run for hours."""
+    return TrainingRun(
+        arm="zero input",
+        policy_kind="zero",
+        env="ncs_gym/TruckTrailerCruise-v0",
+        seed=0,
+        index=0,
+        steps=0,
+        episodes=10_000_000,
+        certificate=certificate,
+        mode=None,
+        algorithm="PPO",
+        settings=PPOSettings(),
+    )
+
+
+def test_a_run_told_to_stop_gives_up_at_its_next_report(endless):
+    reports, stop = Queue(), threading.Event()
+    stop.set()
+    with pytest.raises(RunStopped, match="zero-input-0"):
+        _execute(endless, None, reports, stop)
+    assert reports.empty()
+
+
+def test_the_first_failure_stops_the_others_and_is_the_one_reported(endless):
+    broken = replace(endless, arm="broken", env="ncs_gym/Nowhere-v0")
+    begin, kept = time.monotonic(), []
+    with pytest.raises(Exception, match="Nowhere") as caught:
+        execute_all([endless, broken], 2, lambda run, result: kept.append(run), lambda steps: None)
+    assert not isinstance(caught.value, RunStopped)
+    assert kept == []
+    assert time.monotonic() - begin < 300.0

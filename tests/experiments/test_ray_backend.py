@@ -1,0 +1,415 @@
+"""A real Ray on this machine: what it does when processes die, and what a user sees."""
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import zipfile
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'ncs-gym[ray]'")
+
+from experiments.backends import ray_backend, ray_cluster  # noqa: E402
+from experiments.backends.ray_cluster import portable_task, require_answer  # noqa: E402
+from experiments.errors import ClusterError, RunError  # noqa: E402
+from experiments.runs import versions  # noqa: E402
+from experiments.settings import BackendSettings  # noqa: E402
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+GRID = ["--losses", "0.5", "--delays", "1", "--burst-lengths", "0", "3", "--seeds", "2", "--episodes", "3"]
+GRID += ["--steps", "2048", "--ppo.envs", "4"]
+RUNS = 8
+TIMEOUT = 300.0
+ONE_CORE, HALF_A_CORE = (BackendSettings(engine="ray", cpus_per_run=cpus) for cpus in (1.0, 0.5))
+
+
+def command(*arguments):
+    return [sys.executable, "-m", "experiments", *map(str, arguments)]
+
+
+def environment(**change):
+    return os.environ | {"PYTHONPATH": str(ROOT)} | change
+
+
+def ncs(*arguments, cwd=None, **change):
+    run = subprocess.run(
+        command(*arguments), cwd=cwd, env=environment(**change), capture_output=True, text=True, timeout=TIMEOUT
+    )
+    assert "Traceback" not in run.stderr
+    return run
+
+
+def _take_interrupts():
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def started(*arguments, **change):
+    """A process in a group of its own, as a terminal starts it; SIGINT may be ignored where tests run."""
+    return subprocess.Popen(
+        command(*arguments),
+        env=environment(**change),
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=_take_interrupts,
+    )
+
+
+def descendants(pid):
+    """Process ids and titles of all processes below one, from /proc."""
+    parents, titles = {}, {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            parents[int(folder.name)] = int((folder / "stat").read_text().rsplit(")", 1)[1].split()[1])
+            titles[int(folder.name)] = (folder / "cmdline").read_text().replace("\0", " ").strip()
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+    found = {pid}
+    while more := {child for child, parent in parents.items() if parent in found} - found:
+        found |= more
+    return {each: titles[each] for each in found - {pid}}
+
+
+def working(pid):
+    return [each for each, title in descendants(pid).items() if title == "ray::work"]
+
+
+def is_alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def until(condition, what):
+    deadline = time.monotonic() + TIMEOUT
+    while not (found := condition()):
+        assert time.monotonic() < deadline, what
+        time.sleep(0.05)
+    return found
+
+
+def stored(out):
+    return len(list((out / "units").glob("*.json")))
+
+
+def until_stored(out, count, run):
+    def enough():
+        assert run.poll() is None, "it ended too early"
+        return stored(out) >= count
+
+    until(enough, "nothing was stored")
+
+
+def lines_of_runs(text):
+    """Names of the runs whose lines are in what was written to stderr."""
+    return [line.partition(": ")[0] for line in text.replace("\r", "\n").splitlines() if " episodes violating," in line]
+
+
+def assert_same(out, other):
+    """Rows, summary and the trained networks are the same, bit for bit."""
+    for name in ("summary.json", "sweep.parquet"):
+        assert (out / name).read_bytes() == (other / name).read_bytes()
+    models = sorted(path.relative_to(out) for path in out.glob("models/*/model.zip"))
+    assert len(models) == RUNS
+    for model in models:
+        mine, others = zipfile.ZipFile(out / model), zipfile.ZipFile(other / model)
+        assert mine.read("policy.pth") == others.read("policy.pth")
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory):
+    out = tmp_path_factory.mktemp("local") / "out"
+    run = ncs("sweep", *GRID, "--jobs", "2", "--out", out)
+    assert run.returncode == 0, run.stderr
+    return out
+
+
+@pytest.fixture(scope="module")
+def own_ray():
+    """A Ray of the tests' own process."""
+    handler = signal.getsignal(signal.SIGTERM)
+    with ray_backend._connected("local"):
+        assert signal.getsignal(signal.SIGTERM) is handler
+        yield
+
+
+def test_rows_are_those_of_the_local_engine_bit_for_bit(local, tmp_path):
+    out, folder = tmp_path / "out", tmp_path / "here"
+    (folder / "agents").mkdir(parents=True)  # must not hide the package of that name from the workers
+    (folder / "agents" / "__init__.py").write_text("raise RuntimeError('hidden')")
+    entry = "import sys; sys.path.pop(0); from experiments.__main__ import main; main()"
+    arguments = [sys.executable, "-c", entry, "sweep", *GRID, "--engine", "ray", "--out", "../out"]
+    run = subprocess.run(arguments, cwd=folder, env=environment(), capture_output=True, text=True, timeout=TIMEOUT)
+    assert run.returncode == 0, run.stderr
+    assert_same(out, local)
+    assert len(lines_of_runs(run.stderr)) == len(set(lines_of_runs(run.stderr))) == RUNS
+    noise = [line for line in run.stderr.replace("\r", "\n").splitlines() if line.strip() and "step/s]" not in line]
+    assert len(noise) == RUNS, run.stderr
+
+
+def test_killed_worker_costs_nothing(local, tmp_path):
+    out = tmp_path / "out"
+    run = started("sweep", *GRID, "--engine", "ray", "--out", out)
+    for count in (1, 3):
+        until_stored(out, count, run)
+        os.kill(until(lambda: working(run.pid), "nobody works")[0], signal.SIGKILL)
+        assert stored(out) < RUNS
+    _, errors = run.communicate(timeout=TIMEOUT)
+    assert run.returncode == 0, errors
+    assert sorted(lines_of_runs(errors)) == sorted(path.stem for path in (local / "units").glob("*.json"))
+    assert_same(out, local)
+
+
+def test_killed_driver_leaves_no_process_and_goes_on_where_it_was(local, tmp_path):
+    out = tmp_path / "out"
+    run = started("sweep", *GRID, "--engine", "ray", "--out", out)
+    until_stored(out, 2, run)
+    processes = descendants(run.pid)
+    assert any(title == "ray::work" for title in processes.values())
+    run.kill()
+    run.communicate()
+    until(lambda: not any(map(is_alive, processes)), f"processes outlive their driver: {processes}")
+    assert not (out / "summary.json").exists()
+    finished = stored(out)
+    assert 2 <= finished < RUNS
+    again = ncs("sweep", *GRID, "--engine", "ray", "--out", out)
+    assert again.returncode == 0, again.stderr
+    assert f"{finished} of {RUNS} runs were finished before" in again.stderr
+    assert len(set(lines_of_runs(again.stderr))) == len(lines_of_runs(again.stderr)) == RUNS - finished
+    assert_same(out, local)
+
+
+@pytest.mark.parametrize(
+    ("send", "number"),
+    [(os.killpg, signal.SIGINT), (os.kill, signal.SIGTERM)],  # Ctrl-C reaches the whole group
+    ids=["Ctrl-C", "SIGTERM"],
+)
+def test_interrupted_driver_stops_everything_and_keeps_what_is_finished(tmp_path, send, number):
+    out = tmp_path / "out"
+    run = started("sweep", *GRID, "--engine", "ray", "--out", out)
+    until_stored(out, 1, run)
+    processes = descendants(run.pid)
+    send(run.pid, number)
+    _, errors = run.communicate(timeout=60)
+    assert run.returncode == 130
+    assert errors.strip().splitlines()[-1] == "ncs: interrupted"
+    assert "Traceback" not in errors
+    until(lambda: not any(map(is_alive, processes)), f"processes outlive their driver: {processes}")
+    assert 1 <= stored(out) < RUNS
+
+
+def test_sweep_begun_locally_is_finished_on_ray(local, tmp_path):
+    shutil.copytree(local, tmp_path / "out")
+    for name in ("summary.json", "sweep.parquet"):
+        (tmp_path / "out" / name).unlink()
+    for path in sorted((tmp_path / "out" / "units").glob("*.json"))[:3]:
+        path.unlink()
+    run = ncs("sweep", *GRID, "--engine", "ray", "--out", tmp_path / "out")
+    assert run.returncode == 0, run.stderr
+    assert f"{RUNS - 3} of {RUNS} runs were finished before" in run.stderr
+    assert len(lines_of_runs(run.stderr)) == 3
+    assert_same(tmp_path / "out", local)
+
+
+def one_sentence(run):
+    assert run.returncode == 2, run.stderr
+    return run.stderr.strip().splitlines()[-1]
+
+
+def test_failing_run_is_named(tmp_path):
+    small = ["--algo", "SAC", "--steps", "50", "--losses", "0.5", "--delays", "1", "--arms", "unshielded"]
+    run = ncs("sweep", *small, "--engine", "ray", "--out", tmp_path / "out")
+    assert one_sentence(run).startswith("ncs: run loss0.5-delay1-burst0.0-unshielded-0: 50 steps train nothing")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--cpus-per-run", "100000"], "no node of the cluster has the 100000 cores and 0 gpus of a run"),
+        (["--gpus-per-run", "64"], "no node of the cluster has the 1 cores and 64 gpus of a run"),
+        (["--gpus-per-run", "64", "--ray-wait", "3"], "no node of the cluster has the 1 cores and 64 gpus of a run"),
+    ],
+)
+def test_more_than_any_node_has_is_one_sentence_and_does_not_wait_forever(arguments, words, tmp_path):
+    run = ncs("sweep", *GRID, "--engine", "ray", *arguments, "--out", tmp_path / "out")
+    assert words in one_sentence(run)
+    assert ("waiting up to 3 s" in run.stderr) == ("--ray-wait" in arguments)
+    assert stored(tmp_path / "out") == 0
+
+
+def test_error_of_a_run_is_not_retried(own_ray, tmp_path):
+    calls = str(tmp_path / "calls")
+
+    def fail():
+        with open(calls, "a") as file:
+            file.write("call\n")
+        raise KeyError("mine")
+
+    reference = ray_backend._remote(fail, ONE_CORE).remote()
+    with pytest.raises(RunError, match=r"run its-name: KeyError: 'mine' \(NCS_DEBUG=1") as error:
+        ray_backend._result(NAMED, reference)
+    assert "mine" in str(error.value.__cause__)
+    assert Path(calls).read_text() == "call\n"
+
+
+def test_worker_that_always_dies_is_given_up_and_named(own_ray, tmp_path):
+    calls = str(tmp_path / "calls")
+
+    def die():
+        with open(calls, "a") as file:
+            file.write("call\n")
+        os._exit(1)
+
+    reference = ray_backend._remote(die, ONE_CORE).remote()
+    with pytest.raises(RunError, match="run its-name: its worker died, 3 retries included"):
+        ray_backend._result(NAMED, reference)
+    assert Path(calls).read_text() == "call\n" * (1 + ray_backend.RETRIES)
+
+
+def test_node_with_another_source_is_refused_in_one_sentence(own_ray):
+    task = ray_backend._remote(portable_task(), ONE_CORE)
+    with pytest.raises(ClusterError, match="another source of ncs-gym than the driver"):
+        ray_backend._result(NAMED, task.remote(versions() | {"source": "other"}, b""))
+
+
+def test_node_without_this_package_is_named_in_one_sentence(own_ray, tmp_path):
+    (tmp_path / "experiments").mkdir()
+    (tmp_path / "experiments" / "__init__.py").write_text("raise ModuleNotFoundError('no such package')")
+    work = portable_task()
+
+    def bare(path):
+        import sys
+
+        sys.path.insert(0, path)
+        for name in [name for name in sys.modules if name.partition(".")[0] == "experiments"]:
+            del sys.modules[name]
+        try:
+            return work({}, b"")
+        finally:
+            sys.path.remove(path)
+
+    reference = ray_backend._remote(bare, ONE_CORE).remote(str(tmp_path))
+    with pytest.raises(RunError, match=r"run its-name: node .* cannot import ncs-gym .*: install the same on every"):
+        ray_backend._result(NAMED, reference)
+
+
+def test_workers_compute_with_as_many_threads_as_local_ones(own_ray):
+    def threads():
+        import os
+
+        import torch
+
+        return os.environ["OMP_NUM_THREADS"], torch.get_num_threads()
+
+    import torch
+
+    found = ray.get(ray_backend._remote(threads, HALF_A_CORE).remote())
+    assert found == (os.environ.get("OMP_NUM_THREADS", str(os.cpu_count())), torch.get_num_threads())
+
+
+def test_everything_finished_is_noticed_at_once(own_ray):
+    references = [ray.put(number) for number in range(5)]
+    assert set(ray_backend._finished(references)) == set(references)
+    endless = ray_backend._remote(lambda: time.sleep(1000), HALF_A_CORE).remote()
+    assert ray_backend._finished([endless]) == []
+    assert ray_backend._finished([endless, references[0]]) == [references[0]]
+    ray_backend._cancel([endless])
+    with pytest.raises(ray.exceptions.RayError):
+        ray.get(endless, timeout=60)
+
+
+def test_listener_that_is_no_ray_is_one_sentence_in_bounded_time(monkeypatch):
+    monkeypatch.setattr(ray_cluster, "JOIN_TIMEOUT", 4.0)
+    start = time.monotonic()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+        with pytest.raises(ClusterError, match=f"no Ray answers at --ray-address {address} within 4 s"):
+            require_answer(address)
+    assert time.monotonic() - start < 20.0
+
+
+class _Named:
+    name = "its-name"
+
+
+NAMED = _Named()
+
+
+@contextmanager
+def running_head(tmp_path_factory):
+    """Address, environment and process of a cluster as in docs/scaling.md, with a home and a token of its own."""
+    own = {"HOME": str(tmp_path_factory.mktemp("home")), "RAY_AUTH_MODE": "token"}
+    own |= {"RAY_TMPDIR": str(tmp_path_factory.mktemp("r")), "RAY_USAGE_STATS_ENABLED": "0"}
+    tool = [sys.executable, "-m", "ray.scripts.scripts"]
+    subprocess.run([*tool, "get-auth-token", "--generate"], env=environment(**own), check=True, capture_output=True)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    options = ["--head", "--block", f"--port={port}", "--num-cpus=2", "--include-dashboard=false"]
+    process = subprocess.Popen(
+        [*tool, "start", *options], env=environment(**own), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    until(lambda: any("raylet" in title for title in descendants(process.pid).values()), "no Ray")
+    processes = descendants(process.pid)
+    yield f"127.0.0.1:{port}", own, process
+    process.terminate()
+    process.wait(timeout=60)
+    for pid in processes:
+        if is_alive(pid):
+            os.kill(pid, signal.SIGKILL)
+
+
+@pytest.fixture(scope="module")
+def head(tmp_path_factory):
+    with running_head(tmp_path_factory) as found:
+        yield found
+
+
+def test_running_cluster_is_used_and_outlives_the_driver(head, local, tmp_path):
+    address, own, process = head
+    out = tmp_path / "out"
+    run = started("sweep", *GRID, "--engine", "ray", "--ray-address", address, "--out", out, **own)
+    until_stored(out, 1, run)
+    assert until(lambda: working(process.pid), "nobody works there")
+    run.send_signal(signal.SIGINT)
+    _, errors = run.communicate(timeout=60)
+    assert (run.returncode, errors.strip().splitlines()[-1]) == (130, "ncs: interrupted")
+    until(lambda: not working(process.pid), "its runs are not cancelled")
+    again = ncs("sweep", *GRID, "--engine", "ray", "--ray-address", address, "--out", out, **own)
+    assert again.returncode == 0, again.stderr
+    assert process.poll() is None
+    assert_same(out, local)
+
+
+def test_cluster_that_asks_for_a_token_is_one_sentence_in_bounded_time(head, tmp_path):
+    address, own, _ = head
+    start = time.monotonic()
+    other = own | {"HOME": str(tmp_path), "RAY_AUTH_MODE": "disabled"}
+    run = ncs("sweep", *GRID, "--engine", "ray", "--ray-address", address, "--out", tmp_path / "out", **other)
+    assert "it asks for a token (RAY_AUTH_MODE=token" in one_sentence(run)
+    assert time.monotonic() - start < 2 * ray_cluster.JOIN_TIMEOUT
+
+
+def test_cluster_that_ends_is_one_sentence_and_costs_nothing_that_is_stored(tmp_path_factory, local, tmp_path):
+    out = tmp_path / "out"
+    with running_head(tmp_path_factory) as (address, own, process):
+        run = started("sweep", *GRID, "--engine", "ray", "--ray-address", address, "--out", out, **own)
+        until_stored(out, 1, run)
+        process.terminate()
+        _, errors = run.communicate(timeout=TIMEOUT)
+    assert run.returncode == 2
+    assert errors.strip().splitlines()[-1].startswith("ncs: Ray has ended on this machine")
+    assert "Traceback" not in errors
+    finished = stored(out)
+    assert 1 <= finished < RUNS
+    again = ncs("sweep", *GRID, "--jobs", "2", "--out", out)
+    assert f"{finished} of {RUNS} runs were finished before" in again.stderr
+    assert_same(out, local)

@@ -1,0 +1,139 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from agents.settings import PPOSettings
+from experiments.backends.execution import results_of
+from experiments.errors import ResultsError
+from experiments.runs.run_store import RunStore
+from experiments.runs.training_run import TrainingRun, execute_run
+from experiments.settings import BackendSettings
+
+
+@pytest.fixture(scope="module")
+def run(certificate):
+    return TrainingRun(
+        arm="shielded:switch+penalty",
+        policy_kind="trained",
+        env="ncs_gym/TruckTrailerCruise-v0",
+        seed=0,
+        index=1,
+        steps=256,
+        episodes=2,
+        certificate=certificate,
+        mode="switch",
+        algorithm="PPO",
+        settings=PPOSettings(envs=2, rollout=64, batch_size=64, epochs=1, width=8),
+    )
+
+
+@pytest.fixture(scope="module")
+def result(run):
+    return execute_run(run, lambda steps: None)
+
+
+@pytest.fixture
+def store(tmp_path, run, result):
+    store = RunStore(tmp_path)
+    store.save(run, result)
+    return store
+
+
+def test_stored_result_comes_back_exactly(store, run, result):
+    again = store.load(run)
+    assert again.episodes == result.episodes
+    assert repr(again.history) == repr(result.history)  # NaN equals nothing, itself included
+    assert again.files == result.files
+    for name, array in vars(result.trajectory).items():
+        np.testing.assert_array_equal(getattr(again.trajectory, name), array)
+        assert getattr(again.trajectory, name).dtype == array.dtype
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"seed": 1}, {"steps": 257}, {"mode": "project"}, {"settings": PPOSettings()}, {"violation_penalty": 0.5}],
+)
+def test_result_of_other_settings_is_not_taken(store, run, change):
+    assert store.load(replace(run, **change)) is None
+
+
+def test_result_of_another_certificate_or_version_is_not_taken(store, run, certificate, monkeypatch):
+    other = replace(certificate, provenance=certificate.provenance | {"note": "other"})
+    assert store.load(replace(run, certificate=other)) is None
+    monkeypatch.setattr("experiments.runs.training_run.versions", lambda: {"torch": "0"})
+    assert store.load(run) is None
+
+
+def test_grid_point_is_no_part_of_the_settings(run):
+    assert replace(run, grid_point="loss0.3").key == run.key
+    assert replace(run, grid_point="loss0.3").name == "loss0.3-shielded-switch+penalty-1"
+
+
+def test_damaged_results_are_one_sentence(store, run, tmp_path):
+    path = tmp_path / "units" / f"{run.name}.json"
+    text = path.read_text()
+    for damaged in ("", "{", "[]", text[: len(text) // 2], text.replace('"index": 1', '"index": 0', 1)):
+        path.write_text(damaged)
+        with pytest.raises(ResultsError, match="delete it to repeat the run"):
+            store.load(run)
+
+
+def test_result_without_its_agent_is_refused(store, run, tmp_path):
+    (tmp_path / "models" / run.name / "model.zip").write_bytes(b"other")
+    with pytest.raises(ResultsError, match="missing or was altered"):
+        store.load(run)
+
+
+def test_half_stored_result_of_other_settings_leaves_nothing_behind(store, run, result, monkeypatch):
+    # Killed between the agent's files and the run's.
+    def killed(path, content):
+        if path.suffix == ".json" and path.parent.name == "units":
+            raise KeyboardInterrupt
+        path.write_bytes(content)
+
+    monkeypatch.setattr("experiments.runs.run_store.write_atomically", killed)
+    with pytest.raises(KeyboardInterrupt):
+        store.save(replace(run, steps=257), replace(result, files={"model.zip": b"new", "agent.json": b"new"}))
+    assert store.load(run) is None
+
+
+def test_changed_source_is_another_key(run, monkeypatch):
+    before = run.key
+    monkeypatch.setattr("experiments.runs.provenance._source_digest", lambda: "changed")
+    assert run.key != before
+
+
+def test_runs_of_one_name_are_refused(run, tmp_path):
+    with pytest.raises(ValueError, match="same name"):
+        results_of([run, run], tmp_path, BackendSettings(jobs=1))
+
+
+def test_nothing_stored_is_nothing_loaded(run, tmp_path):
+    assert RunStore(tmp_path).load(run) is None
+
+
+def test_stored_file_is_data_only(store, run, tmp_path):
+    document = json.loads((tmp_path / "units" / f"{run.name}.json").read_text())
+    assert document["key"] == run.key
+    assert set(document["result"]["files"]) == {"model.zip", "agent.json"}
+
+
+def test_finished_runs_are_not_run_again(store, run, result, tmp_path, monkeypatch, capsys):
+    ran = []
+
+    def record(runs, jobs, on_result, on_progress, log_folder):
+        for one in runs:
+            ran.append(one.name)
+            on_result(one, replace(result, index=one.index))
+
+    monkeypatch.setattr("experiments.backends.processes.execute_all", record)
+    missing = replace(run, index=2)
+    results = results_of([run, missing], tmp_path, BackendSettings(jobs=1))
+    assert ran == [missing.name]
+    assert [one.index for one in results] == [1, 2]
+    assert [one.files for one in results] == [{}, {}]  # those of many units would fill the memory
+    assert "1 of 2 runs were finished before" in capsys.readouterr().err
+    results_of([missing, run], tmp_path, BackendSettings(jobs=1))
+    assert ran == [missing.name]

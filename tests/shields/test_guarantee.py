@@ -1,0 +1,156 @@
+"""What is proved, step by step: against a plain reference, for one loop and for many."""
+
+import numpy as np
+import pytest
+
+from ncs_gym.plants.linear_plant import SIMULATED_REACH
+from ncs_gym.uncertainty.ellipsoid import is_inside
+from shields import Decision, SafetyFilter
+from shields.runtime import guarantee as proof
+from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, Report
+from tests.attacks import RANDOM, TRUCKS, certificate_of
+
+
+class Reference:
+    """The proof of one loop, told as a story: what is asked of each step in turn."""
+
+    def __init__(self, shield: SafetyFilter):
+        self.shield, self.broken, self.inside, self.certified = shield, "", False, False
+
+    @property
+    def reason(self):
+        if self.broken:
+            return self.broken
+        if self.shield.certificate.Sigma is None:
+            return proof.NO_ERROR_SET
+        if not self.inside:
+            return proof.NOT_KNOWN_INSIDE
+        return "" if self.certified else proof.LARGE_ERROR
+
+    def start(self, known_inside, unmoved, *seen):
+        self.broken = "" if unmoved else proof.OTHER_STEPS
+        self.inside = known_inside
+        self._observe(*seen)
+
+    def step(self, passed, fallback, moved_once, same_input, *seen):
+        self.inside = passed or (self.inside and self.certified and fallback)
+        if not moved_once:
+            self.broken = self.broken or proof.OTHER_STEPS
+        elif not same_input:
+            self.broken = self.broken or proof.OTHER_INPUT
+        self._observe(*seen)
+
+    def _observe(self, estimate, shape, alarm):
+        if alarm:
+            self.broken = self.broken or proof.ALARM
+        usable = np.isfinite(estimate).all() and np.isfinite(shape).all() and np.linalg.eigvalsh(shape)[0] > -1e-12
+        self.certified = False
+        if not usable or np.abs(estimate).max() > 1e90:
+            self.broken = self.broken or proof.UNUSABLE
+            return
+        plant = self.shield.plant
+        if not (np.abs(estimate) + np.sqrt(np.diag(shape)) <= SIMULATED_REACH * plant.half_widths).all():
+            self.broken = self.broken or proof.FAR_OUT
+        self.certified = any(is_inside(shape, Sigma) for Sigma in self.shield.certificate.error_shapes)
+        self.inside = self.inside or self.shield.knows_inside(estimate, shape)
+
+
+def decision(passed, fallback):
+    nothing = np.zeros(np.shape(passed))
+    return Decision(np.zeros(1), nothing, passed, fallback, nothing, "")
+
+
+@pytest.mark.parametrize("name", ["4000 kg", "n=4 m=3 p=2"])
+def test_proofs_break_and_recover_as_the_reference_says_whatever_is_reported(name):
+    plant, count, rng = (TRUCKS | RANDOM)[name], 200, np.random.default_rng(0)
+    certificate = certificate_of(plant)
+    shield, Sigma = SafetyFilter(certificate, plant), certificate.Sigma
+    monitor, references = GuaranteeMonitor(shield), [Reference(shield) for _ in range(count)]
+    shapes = np.array([0.2 * Sigma, Sigma, 1.1 * Sigma, -Sigma, 1e5 * np.eye(plant.n), np.full_like(Sigma, np.nan)])
+    known = shield.errors_of_many(shapes)
+    state, states, seen = None, [None] * count, set()
+    for step in range(14):
+        rare = lambda share: rng.random(count) < share  # noqa: E731
+        begins = rare(0.1) if step else np.ones(count, np.bool_)
+        once, same, passed, fallback, inside, alarm = (
+            ~rare(0.03),
+            ~rare(0.03),
+            rare(0.7),
+            rare(0.7),
+            rare(0.5),
+            rare(0.03),
+        )
+        drawn = rng.choice(6, count, p=[0.5, 0.3, 0.14, 0.02, 0.02, 0.02])
+        sizes = rng.choice([0.3, 1.0, 1.5, 1e7, 1e120, np.nan], count, p=[0.3, 0.3, 0.34, 0.02, 0.02, 0.02])
+        estimates = certificate.safe_set.sample_boundary(rng, count) * sizes[:, None]
+        report = Report(estimates.T, known.of(drawn), alarm)
+        started = monitor.start(inside, once, report)
+        if state is None:
+            state = started
+        else:
+            advanced = monitor.advance(state, decision(passed, fallback), once, same, report)
+            state = type(state)(*(np.where(begins, new, old) for new, old in zip(started, advanced, strict=True)))
+        reasons = [EXPLANATIONS[code] for code in monitor.reasons(state)]
+        for e, reference in enumerate(references):
+            observed = estimates[e], shapes[drawn[e]], bool(alarm[e])
+            alone = Report(estimates[e], shield.errors_of(shapes[drawn[e]]), bool(alarm[e]))
+            if begins[e]:
+                reference.start(bool(inside[e]), bool(once[e]), *observed)
+                states[e] = monitor.start(bool(inside[e]), bool(once[e]), alone)
+            else:
+                facts = bool(passed[e]), bool(fallback[e]), bool(once[e]), bool(same[e])
+                reference.step(*facts, *observed)
+                states[e] = monitor.advance(states[e], decision(*facts[:2]), *facts[2:], alone)
+            assert reasons[e] == reference.reason
+            assert EXPLANATIONS[monitor.reasons(states[e])] == reference.reason
+        seen |= set(reasons)
+    assert seen == set(EXPLANATIONS) - {proof.NO_ERROR_SET}
+
+
+def test_a_published_certificate_proves_nothing():
+    plant = TRUCKS["4000 kg"]
+    shield = SafetyFilter(certificate_of(plant), plant)
+    monitor = GuaranteeMonitor(shield)
+    monitor._has_error_set = False  # as that of a certificate without Sigma
+    report = Report(np.zeros(2), shield.errors_of(0.1 * certificate_of(plant).Sigma), False)
+    state = monitor.start(True, True, report)
+    assert EXPLANATIONS[monitor.reasons(state)] == proof.NO_ERROR_SET
+    assert EXPLANATIONS[monitor.reasons(state._replace(broken=1))] == EXPLANATIONS[1]
+
+
+@pytest.fixture
+def watched(certificate, loaded):
+    """A monitor, and reports about it with something changed."""
+    shield = SafetyFilter(certificate, loaded)
+
+    def report(estimate=(0.0, 0.0), shape=certificate.Sigma, alarm=False):
+        return Report(np.array(estimate), shield.errors_of(shape), alarm)
+
+    monitor = GuaranteeMonitor(shield)
+    return monitor, report, lambda state: EXPLANATIONS[monitor.reasons(state)]
+
+
+def test_fallback_proves_nothing_while_the_error_is_not_certified(watched, certificate):
+    monitor, report, reason = watched
+    edge, fallback = report((1.9, 0.0)), decision(False, True)
+    state = monitor.start(True, True, edge)
+    state = monitor.advance(state, fallback, True, True, report((1.9, 0.0), 1.01 * certificate.Sigma))
+    assert reason(state) == proof.LARGE_ERROR  # the step itself still began with a certified error
+    state = monitor.advance(state, fallback, True, True, edge)
+    assert reason(state) == proof.NOT_KNOWN_INSIDE
+    state = monitor.advance(state, decision(True, True), True, True, edge)
+    assert reason(state) == ""
+
+
+@pytest.mark.parametrize(
+    "change", [{"estimate": (np.nan, np.nan)}, {"shape": "none"}, {"shape": -np.eye(2)}, {"shape": np.eye(3)}]
+)
+def test_unusable_report_ends_the_proof_for_the_rest_of_the_episode(watched, change):
+    monitor, report, reason = watched
+    passed = decision(True, False)
+    state = monitor.start(True, True, report())
+    assert reason(state) == ""
+    state = monitor.advance(state, passed, True, True, report(**change))
+    state = monitor.advance(state, passed, True, True, report())
+    assert reason(state) == proof.UNUSABLE
+    assert reason(monitor.start(True, True, report())) == ""

@@ -1,0 +1,130 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ncs_gym import ChannelContract, batch_reactor, cart_pole
+from ncs_gym.plants.lqr import regulator_gain
+from ncs_gym.uncertainty.truncated_gaussian import chi2_quantile
+from shields import Infeasible, synthesize, verify
+from shields.synthesis.design_problem import design_problem
+from shields.synthesis.max_margin_gain import _GainSearch, _initial_points, max_margin_gain
+from tests.plants import random_plant
+
+CONTRACT = ChannelContract(2, 1e-4)
+PLANTS = {"cart-pole": cart_pole(), "reactor": batch_reactor()}
+
+
+@pytest.mark.parametrize("input_limits", [True, False])
+@pytest.mark.parametrize("name", PLANTS)
+def test_derivatives_are_those_of_finite_differences(name, input_limits):
+    problem, _ = design_problem(PLANTS[name], CONTRACT)
+    search = _GainSearch(problem, problem.covering_error_shape, input_limits)
+    for point in _initial_points(problem)[:4]:
+        slopes = search._uses(point)[1]
+        steps = 1e-4 * np.eye(len(point))
+        differences = [(search._uses(point + step)[0] - search._uses(point - step)[0]) / 2e-4 for step in steps]
+        np.testing.assert_allclose(slopes, np.transpose(differences), rtol=1e-3, atol=1e-4 * np.abs(slopes).max())
+
+
+def radii_scaled(plant, factor):
+    """The plant with the radii of all its uncertainty scaled."""
+    covariances = ("process_noise_cov", "measurement_noise_cov", "initial_cov")
+    return replace(plant, **{name: factor**2 * getattr(plant, name) for name in covariances})
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_its_margin_is_what_exact_verification_accepts(name):
+    plant, contract = PLANTS[name], ChannelContract(2)
+    problem, _ = design_problem(plant, contract)
+    margin = max_margin_gain(problem, problem.covering_error_shape).margin
+    tolerated = radii_scaled(plant, 0.99 * margin)
+    assert verify(synthesize(tolerated, contract=contract), tolerated).valid
+    with pytest.raises(Infeasible, match="radii shrink to") as caught:
+        synthesize(radii_scaled(plant, 2.0 * margin), contract=contract)
+    assert caught.value.details["share_of_radii"] == pytest.approx(0.5, rel=1e-2)
+
+
+def test_its_set_is_the_smallest_that_is_invariant_with_its_gain():
+    problem, _ = design_problem(cart_pole(), CONTRACT)
+    gain = max_margin_gain(problem, problem.covering_error_shape)
+    (lx, le, ld), BK, Sigma = gain.multipliers, problem.B @ gain.K, problem.covering_error_shape
+    closed_loop = problem.A + BK
+    successors = closed_loop @ gain.L @ closed_loop.T / lx + BK @ Sigma @ BK.T / le + problem.D_u / ld
+    np.testing.assert_allclose(gain.L, successors, rtol=1e-9, atol=1e-12)
+    inputs = np.sqrt([[row @ shape @ row for shape in (gain.L, Sigma)] for row in gain.K]).sum(axis=1)
+    box = np.sqrt(np.diag(problem.C @ gain.L @ problem.C.T))
+    assert 1.0 / gain.margin == pytest.approx(max(inputs.max(), box.max()), rel=1e-9)
+
+
+def test_its_margin_is_larger_than_that_of_every_initial_regulator():
+    problem, _ = design_problem(batch_reactor(), CONTRACT)
+    search = _GainSearch(problem, problem.covering_error_shape, True)
+    largest_initial_margin = np.exp(-0.5 * min(search.largest_use(point) for point in _initial_points(problem)))
+    assert max_margin_gain(problem, problem.covering_error_shape).margin > 1.2 * largest_initial_margin
+
+
+def test_the_margin_is_larger_without_input_limits():
+    problem, _ = design_problem(batch_reactor(), CONTRACT)
+    Sigma = problem.covering_error_shape
+    margin, unlimited = (max_margin_gain(problem, Sigma, input_limits=limits).margin for limits in (True, False))
+    assert unlimited > 1.1 * margin
+
+
+def test_a_plant_that_no_input_can_stabilize_has_no_gain():
+    problem, _ = design_problem(cart_pole(), CONTRACT)
+    assert max_margin_gain(replace(problem, B=np.zeros_like(problem.B)), problem.covering_error_shape) is None
+
+
+def test_a_stable_plant_needs_no_regulator():
+    problem, _ = design_problem(random_plant(0, 3, 1))
+    gain = max_margin_gain(replace(problem, B=np.zeros_like(problem.B)), problem.covering_error_shape)
+    assert gain is not None
+    assert gain.margin > 0.0
+
+
+def test_largest_gamma_and_age_are_what_synthesis_accepts():
+    plant = cart_pole(full_state=False, gamma=1e-5)
+    with pytest.raises(Infeasible, match=r"gamma = .* is the largest that works") as caught:
+        synthesize(plant, contract=ChannelContract(4, 1e-4))
+    gamma = caught.value.details["largest_gamma"]
+    assert 0.0 < gamma < 1e-5
+    assert synthesize(replace(plant, gamma=0.98 * gamma), contract=ChannelContract(4, 1e-4)) is not None
+    with pytest.raises(Infeasible):
+        synthesize(replace(plant, gamma=1.05 * gamma), contract=ChannelContract(4, 1e-4))
+    with pytest.raises(Infeasible, match=r"max_age = .* is the largest that works") as caught:
+        synthesize(batch_reactor(), contract=ChannelContract(30, 1e-3))
+    age = caught.value.details["max_age"]
+    problem, _ = design_problem(batch_reactor(), ChannelContract(age, 1e-3))
+    assert max_margin_gain(problem, problem.covering_error_shape).margin >= 1.0
+    problem, _ = design_problem(batch_reactor(), ChannelContract(age + 1, 1e-3))
+    assert max_margin_gain(problem, problem.covering_error_shape).margin < 1.0 + 1e-4
+
+
+def test_regulator_decays_as_fast_as_asked_for():
+    plant = cart_pole()
+    for decay in (0.75, 0.9, 1.0):
+        gain = regulator_gain(plant.A, plant.B, 1.0, decay)
+        assert np.abs(np.linalg.eigvals(plant.A + plant.B @ gain)).max() < np.sqrt(decay)
+    assert regulator_gain(plant.A, np.zeros_like(plant.B), 1.0, 1.0) is None
+
+
+@pytest.mark.parametrize(("full_state", "age", "radius"), [(True, 1, 6.3e-3), (True, 4, 5e-3), (False, 1, 1.9e-3)])
+def test_cart_pole_tolerates_at_least_the_measured_radii(full_state, age, radius):
+    plant = cart_pole(full_state=full_state)
+    half_widths, n = plant.half_widths, plant.n
+    plant = replace(
+        plant,
+        process_noise_cov=np.diag((radius * half_widths) ** 2) / chi2_quantile(0.95, n),
+        measurement_noise_cov=np.diag((0.01 * radius * plant.H @ half_widths) ** 2) / chi2_quantile(0.95, plant.p),
+        initial_cov=(0.01 * radius * half_widths.min()) ** 2 / chi2_quantile(0.95, n) * np.eye(n),
+    )
+    assert verify(synthesize(plant, contract=ChannelContract(age)), plant).valid
+
+
+@pytest.mark.parametrize("contract", [ChannelContract(1), ChannelContract(3, 1e-3)])
+def test_error_sets_chosen_for_the_reactors_gain_give_a_larger_margin(contract):
+    plants = batch_reactor(), batch_reactor(error_gain=None)
+    problems = [design_problem(plant, contract)[0] for plant in plants]
+    named, unnamed = (max_margin_gain(problem, problem.covering_error_shape).margin for problem in problems)
+    assert named > 1.01 * unnamed

@@ -1,0 +1,193 @@
+import pickle
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from ncs_gym import LinearPlant, truck_trailer
+from shields import Certificate, CertificateError, Infeasible, SafetyShield, certify, synthesize, verify
+from shields.paper.bounds import PaperModel
+from shields.paper.feasibility import FeasibilityScan, largest_gamma, largest_scale
+from shields.runtime.guarantee import NO_ERROR_SET
+
+SMALL = truck_trailer(gamma=1e-6, process_noise_cov=1e-6 * np.eye(2))
+
+
+@pytest.fixture(scope="module")
+def paper():
+    return synthesize(SMALL, method="paper")
+
+
+def test_certificate_carries_the_papers_constants_and_no_error_set(paper):
+    assert paper.method == "paper"
+    assert paper.Sigma is paper.error_set is paper.multipliers is None
+    bounds = PaperModel(SMALL).at(paper.kappa, paper.rho)
+    assert (paper.epsilon, paper.epsilon_up) == (bounds.epsilon, bounds.epsilon_up)
+    assert verify(paper, SMALL).valid
+
+
+@pytest.mark.parametrize("search", ["first", "largest"])
+@pytest.mark.parametrize(
+    "bounds",
+    [{"gamma": 1e-6, "process_noise_cov": 1e-6 * np.eye(2)}, {"gamma": 1e-5, "process_noise_cov": np.zeros((2, 2))}],
+)
+def test_where_op_succeeds_its_constraints_hold_exactly(bounds, search):
+    plant = truck_trailer(**bounds)
+    certificate = synthesize(plant, method="paper", search=search)
+    report = verify(certificate, plant)
+    assert report.valid, str(report)
+    assert {f"(C{i})" for i in (1, 2, 3, 7)} <= {c.name.split()[0] for c in report.conditions}
+
+
+def test_saving_and_loading_is_exact(paper, tmp_path):
+    paper.save(tmp_path / "c.json")
+    again = Certificate.load(tmp_path / "c.json")
+    np.testing.assert_array_equal(again.L, paper.L)
+    assert (again.kappa, again.rho, again.epsilon, again.epsilon_up) == (
+        paper.kappa,
+        paper.rho,
+        paper.epsilon,
+        paper.epsilon_up,
+    )
+    assert verify(again, SMALL).valid
+
+
+@pytest.mark.parametrize(
+    ("change", "mark"),
+    [
+        (lambda c: {"L": 1.001 * c.L}, "(C3)"),
+        (lambda c: {"L": 0.5 * c.L}, "(C2)"),
+        (lambda c: {"L": c.L @ np.diag([1.0, 0.97])}, "(C7)"),
+        (lambda c: {"K": np.zeros((1, 2))}, "(C1)"),
+        (lambda c: {"K": 3.0 * c.K}, "(C4)-(C6)"),
+        (lambda c: {"kappa": 0.7}, "eps_up and eps"),
+        (lambda c: {"rho": 2.0}, "0 < kappa, 1"),
+        (lambda c: {"epsilon": 0.1 * c.epsilon}, "eps_up and eps"),
+        (lambda c: {"fingerprint": "0" * 64}, "plant"),
+    ],
+)
+def test_altered_certificate_is_rejected_for_the_right_constraint(paper, change, mark):
+    found = [c.name for c in verify(replace(paper, **change(paper)), SMALL).conditions if not c.holds]
+    assert any(name.startswith(mark) for name in found), found
+
+
+def test_entries_of_the_other_method_are_refused(paper, certificate):
+    with pytest.raises(CertificateError, match="Sigma"):
+        replace(paper, Sigma=np.eye(2))
+    with pytest.raises(CertificateError, match="kappa"):
+        replace(certificate, kappa=0.9)
+    with pytest.raises(CertificateError, match="multipliers"):
+        replace(certificate, multipliers=None)
+    with pytest.raises(CertificateError, match="method must be"):
+        replace(paper, method="magic")
+
+
+def test_exact_conditions_are_checked_separately(paper):
+    assert paper.provenance["exact_conditions_hold"] is True
+    assert "e'e <= epsilon" in paper.provenance["guarantee"]
+    stronger = certify(SMALL, paper.L, paper.K)
+    assert stronger is not None
+    assert verify(stronger, SMALL).valid
+    np.testing.assert_array_equal(stronger.L, paper.L)
+    assert certify(SMALL, paper.L, 2.5 * paper.K) is None
+
+
+def test_shield_with_a_paper_certificate_works_but_is_never_guaranteed(paper):
+    env = SafetyShield(gym.make("ncs_gym/TruckTrailer-v0", plant=SMALL), paper)
+    _, info = env.reset(seed=0)
+    assert info["shield_reason"] == NO_ERROR_SET
+    for _ in range(50):
+        *_, info = env.step(np.ones(1, np.float32))
+        assert not info["shield_guaranteed"]
+        assert info["state"] @ paper.M @ info["state"] <= 1.0
+
+
+def test_printed_parameters_are_infeasible_and_the_reason_has_figures():
+    with pytest.raises(Infeasible, match=r"\(C2\) binds") as caught:
+        synthesize(truck_trailer(), method="paper")
+    error = caught.value
+    assert error.binding == "C2"
+    assert error.shortfall == pytest.approx(1.0 - 0.034, abs=5e-4)
+    assert error.details["ratio"] == pytest.approx(0.034, abs=5e-4)
+    assert error.details["largest_gamma"] == 0.0
+    copy = pickle.loads(pickle.dumps(error))
+    assert (copy.binding, copy.details) == (error.binding, error.details)
+
+
+def test_reported_scale_is_feasible_and_a_little_more_is_not():
+    plant = truck_trailer()
+    scan = FeasibilityScan(plant)
+    scale = largest_scale(scan, plant)
+
+    def scaled(factor):
+        factor *= scale
+        return truck_trailer(
+            gamma=factor * 5e-4, process_noise_cov=factor * 1e-4 * np.eye(2), initial_cov=factor * 1e-4 * np.eye(2)
+        )
+
+    assert verify(synthesize(scaled(0.97), "paper", dkappa=0.005, drho=0.01), scaled(0.97)).valid
+    with pytest.raises(Infeasible):
+        synthesize(scaled(1.05), "paper", dkappa=0.05, drho=0.05)  # proven over the whole domain, whatever the grid
+
+
+def test_without_process_noise_the_tolerated_disturbance_is_the_measured_one():
+    plant = truck_trailer(process_noise_cov=np.zeros((2, 2)))
+    assert largest_gamma(FeasibilityScan(plant), plant) == pytest.approx(1.6e-5, rel=0.02)
+
+
+def test_too_coarse_a_grid_says_so():
+    with pytest.raises(Infeasible, match="use smaller steps") as caught:
+        synthesize(SMALL, method="paper", dkappa=0.4, drho=1.0)
+    assert caught.value.binding == "grid"
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e-2, 1.0, 1e2, 1e4])
+def test_units_of_the_state_change_nothing(unit, paper):
+    scaled = replace(
+        SMALL,
+        B=SMALL.B * unit,
+        C=SMALL.C / unit,
+        gamma=SMALL.gamma * unit**2,
+        process_noise_cov=SMALL.process_noise_cov * unit**2,
+        measurement_noise_cov=SMALL.measurement_noise_cov * unit**2,
+        initial_cov=SMALL.initial_cov * unit**2,
+    )
+    certificate = synthesize(scaled, method="paper")
+    assert verify(certificate, scaled).valid
+    assert (certificate.kappa, certificate.rho) == (paper.kappa, paper.rho)
+    np.testing.assert_allclose(certificate.L / unit**2, paper.L, rtol=1e-4)
+
+
+def one_state(A, B, u_max, gamma, Q, P0):
+    return LinearPlant(
+        A=[[A]], B=[[B]], C=[[1.0]], u_max=u_max, dt=0.1, gamma=gamma, process_noise_cov=[[Q]], initial_cov=[[P0]]
+    )
+
+
+def test_a_plant_no_gain_can_contract_is_infeasible_not_falsely_certified():
+    with pytest.raises(Infeasible):
+        synthesize(one_state(0.999, 1e-6, 1.0, 1e-12, 1e-13, 1e-12), method="paper")
+
+
+def test_an_input_limit_that_binds_is_named():
+    with pytest.raises(Infeasible, match="input limit") as caught:
+        synthesize(one_state(1.5, 1.0, 0.4, 9.985e-4, 9.985e-4, 9.985e-4), method="paper")
+    assert caught.value.binding == "C5"
+    assert 0.0 < caught.value.shortfall < 1.0
+
+
+def test_no_uncertainty_at_all_is_no_division_by_zero():
+    zero = np.zeros((2, 2))
+    plant = truck_trailer(gamma=0.0, process_noise_cov=zero, initial_cov=zero)
+    assert verify(synthesize(plant, method="paper"), plant).valid
+
+
+@pytest.mark.parametrize("kappa", [float(np.nextafter(1.0, 0.0)), 1.0 - 1e-12, 0.0, -1.0, 1e70])
+def test_constants_at_the_edge_are_rejected_without_an_error(paper, kappa):
+    assert not verify(replace(paper, kappa=kappa, rho=1.0), SMALL).valid
+
+
+def test_unbounded_box_is_infeasible():
+    with pytest.raises(Infeasible, match="unbounded"):
+        synthesize(truck_trailer(C=np.array([[0.5, 0.0]])), method="paper")
