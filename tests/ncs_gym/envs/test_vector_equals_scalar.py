@@ -203,14 +203,14 @@ def test_threads_share_a_graph(most, monkeypatch):
 )
 def test_graphs_of_long_buffers_and_large_plants_hold_fewer_patterns(plant, channel, monkeypatch):
     monkeypatch.setattr(arrival_patterns, "_shared", {})
-    monkeypatch.setattr(arrival_patterns, "MAX_NUMBERS", 1 << 21)
+    monkeypatch.setattr(arrival_patterns, "MAX_NUMBERS", 1 << 20)
     env = NCSEnv(plant, channel)
     env.reset(seed=0)
     sizes, graphs, action = [], set(), np.zeros(plant.m, np.float32)
     tracemalloc.start()
     try:
         before = tracemalloc.get_traced_memory()[0]
-        for _ in range(1500):
+        for _ in range(800):
             env.step(action)
             sizes.append(tracemalloc.get_traced_memory()[0] - before)
             graphs.add(id(env.estimator._patterns))
