@@ -19,7 +19,7 @@ OTHER_INPUT = "the input applied is not the one decided"
 OTHER_STEPS = "the environment did not move exactly one step"
 LARGE_ERROR = "the error ellipsoid is not inside the certified one"
 FAR_OUT = "the estimate is so far out of the safe box that rounding counts"
-UNUSABLE = "the environment reports no usable estimate or error shape"
+UNUSABLE = "there is no usable estimate or error shape"
 NO_ERROR_SET = "a certificate of the published method carries no error set"
 NOT_KNOWN_INSIDE = "the state is not known to be in the safe set"
 # Codes of `GuaranteeMonitor.reasons`; 0 while the proof holds.

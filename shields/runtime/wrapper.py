@@ -14,7 +14,8 @@ from ncs_gym.envs.env import applied_input, ncs_env
 from ncs_gym.validation import as_number, as_numbers, shown
 from shields.certificate import Certificate
 from shields.runtime.filter import SafetyFilter
-from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, Report, starts_inside
+from shields.runtime.guarantee import Report, starts_inside
+from shields.runtime.guarded_filter import GuardedFilter
 
 T = TypeVar("T")
 
@@ -79,7 +80,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             raise ValueError(f"certificate must be a Certificate or None, got {shown(certificate)}")
         self.certificate = certificate_for(inner.plant, inner.contract) if certificate is None else certificate
         self.filter = SafetyFilter(self.certificate, inner.plant, mode)
-        self._monitor = GuaranteeMonitor(self.filter)
+        self._guarded = GuardedFilter(self.filter)
         self._clock: tuple[int, int] | None = None
         self._is_drawn = env.unwrapped.render_mode is not None
 
@@ -94,12 +95,11 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             if self._read_clock() == before:  # refused before anything moved
                 self._clock = before
             raise
-        clock, self._report = self._read_clock(), self._observed(info)
-        known_inside = starts_inside(self.certificate, ncs_env(self.env).start)
-        self._state = self._monitor.start(known_inside, clock[1] == 0, self._report)
+        clock, report = self._read_clock(), self._observed(info)
+        self._guarded.begin(report, starts_inside(self.certificate, ncs_env(self.env).start), clock[1] == 0)
         self._interventions = 0
         u = np.zeros(self.filter.plant.m)
-        margin = self.filter.margin(self._report.estimate, info["error_shape"], u)
+        margin = self.filter.margin(report.estimate, info["error_shape"], u)
         self._clock = clock
         return observation, info | self._info(u, u, margin, intervened=False)
 
@@ -113,18 +113,15 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         if self._clock is None:
             raise gym.error.ResetNeeded("call reset before the first step")
         proposed = applied_input(self.filter.plant, action)
-        decision = self.filter.decide_knowing(self._report.estimate, self._report.errors, proposed)
+        decision = self._guarded.decide(proposed)
         if decision.intervened and self.filter.mode != "monitor":
             action = (decision.input / self.filter.plant.u_max).astype(np.float32)
         if self._is_drawn:
             self._annotate(proposed, self._interventions + decision.intervened, intervened=decision.intervened)
         (episode, step), self._clock = self._clock, INTERRUPTED
         observation, reward, terminated, truncated, info = self.env.step(action)
-        clock, self._report = self._read_clock(), self._observed(info)
-        applied = as_numbers(info["input"])
-        same_input = applied is not None and applied.tolist() == decision.input.tolist()
-        moved_once = clock == (episode, step + 1)
-        self._state = self._monitor.advance(self._state, decision, moved_once, same_input, self._report)
+        clock = self._read_clock()
+        self._guarded.advance(as_numbers(info["input"]), clock == (episode, step + 1), self._observed(info))
         self._interventions += decision.intervened
         self._clock = clock
         info = info | self._info(proposed, decision.input, decision.margin, intervened=decision.intervened)
@@ -135,7 +132,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         estimate, n = as_numbers(info["estimate"]), self.filter.plant.n
         fits = estimate is not None and estimate.shape == (n,)
         estimate = np.array(estimate) if fits else np.full(n, np.nan)
-        return Report(estimate, self.filter.errors_of(info["error_shape"]), info["assumption_violated"] not in (False,))
+        return self._guarded.reported(estimate, info["error_shape"], info["assumption_violated"] not in (False,))
 
     def _read_clock(self) -> tuple[int, int]:
         """Returns the number of episodes begun and of steps taken in this one."""
@@ -155,7 +152,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         ncs_env(self.env).annotate(note)
 
     def _info(self, proposed: np.ndarray, applied: np.ndarray, margin: float, *, intervened: bool) -> dict[str, Any]:
-        reason = EXPLANATIONS[self._monitor.reasons(self._state)]
+        reason = self._guarded.reason
         return {
             "shield_intervened": intervened,
             "input_proposed": proposed.copy(),
