@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 from ncs_gym import LinearPlant, truck_trailer
-from shields import Certificate, synthesize
+from shields import Certificate
+from tests.certificates import certificate_of
 
 # Gymnasium's checker tries every render mode: no windows while tests run.
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
@@ -60,7 +61,7 @@ def loaded() -> LinearPlant:
 @pytest.fixture(scope="session")
 def certificate(loaded: LinearPlant) -> Certificate:
     """A certificate for the cruise."""
-    return synthesize(loaded)
+    return certificate_of(loaded)
 
 
 @pytest.fixture(scope="session")

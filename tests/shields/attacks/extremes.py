@@ -17,7 +17,8 @@ from ncs_gym import (
     truck_trailer,
 )
 from ncs_gym.uncertainty.ellipsoid import is_inside
-from shields import Certificate, SafetyShield, synthesize
+from shields import SafetyShield
+from tests.certificates import certificate_of
 from tests.plants import random_plant
 
 CHANNELS = {
@@ -47,15 +48,6 @@ RANDOM = {
     )
 }
 POLICIES = ("random", "constant", "outwards", "gain_turned_round", "searching")
-_certificates: dict[tuple[str, ChannelContract | None], Certificate] = {}
-
-
-def certificate_of(plant: LinearPlant, contract: ChannelContract | None = None) -> Certificate:
-    """The certificate of a plant under a contract, made once."""
-    key = plant.fingerprint, contract
-    if key not in _certificates:
-        _certificates[key] = synthesize(plant, contract=contract)
-    return _certificates[key]
 
 
 class ExtremalNoise(NCSEnv):

@@ -7,6 +7,7 @@ from scipy.optimize import differential_evolution
 
 from ncs_gym import truck_trailer
 from shields import SafetyFilter, SafetyShield
+from tests.certificates import certificate_of
 from tests.shields.attacks.extremes import (
     CHANNELS,
     POLICIES,
@@ -14,7 +15,6 @@ from tests.shields.attacks.extremes import (
     TRUCKS,
     ExtremalNoise,
     attack,
-    certificate_of,
     harmful,
 )
 

@@ -7,7 +7,8 @@ from ncs_gym import Channel, NCSVectorEnv, batch_reactor, cart_pole
 from ncs_gym.network.contract import contract_of
 from ncs_gym.plants.process import BlockSampler
 from shields import VectorSafetyShield
-from tests.shields.attacks.extremes import CHANNELS, RANDOM, TRUCKS, certificate_of, harmful
+from tests.certificates import certificate_of
+from tests.shields.attacks.extremes import CHANNELS, RANDOM, TRUCKS, harmful
 
 PLANTS = {**TRUCKS, **RANDOM}
 UNSTABLE = {
