@@ -9,7 +9,7 @@ import pytest
 from ncs_gym import Channel, ChannelContract, batch_reactor, cart_pole
 from shields import Certificate, CertificateError, SafetyShield, synthesize, verify
 from shields.runtime.guarantee import LARGE_ERROR, NOT_KNOWN_INSIDE
-from tests.attacks import attack, certificate_of, harmful
+from tests.shields.attacks.extremes import attack, certificate_of, harmful
 
 PLANTS = {
     "cart-pole": (cart_pole(), ChannelContract(4)),
