@@ -113,7 +113,7 @@ class GuaranteeMonitor:
         estimate, errors, alarm = report
         size = np.abs(estimate)
         reach = self._reach if estimate.ndim == 1 else self._reach[:, None]
-        near = (size + errors.half_widths <= reach).all(axis=0)  # never without a usable estimate and error shape
+        near = _rows_all(size + errors.half_widths <= reach)  # never without a usable estimate and error shape
         broken = _first(broken, alarm, ALARM)
         if not _all(near):
             usable = (self._test.columns.dot(size) < FARTHEST) & (errors.radius == errors.radius)
@@ -121,6 +121,11 @@ class GuaranteeMonitor:
         if not _all(inside):
             inside = inside | self._test.knows_inside(estimate, errors, MARGIN)
         return MonitorState(broken, inside, errors.certified)
+
+
+def _rows_all(conditions: np.ndarray) -> Any:
+    """Returns whether all rows hold: a truth value for shape (n,), an array (N,) for (n, N)."""
+    return np.count_nonzero(conditions) == len(conditions) if conditions.ndim == 1 else conditions.all(axis=0)
 
 
 def _all(conditions: Any) -> bool:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from math import hypot
 from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import VectorEnv
 from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, StickyAction
 
 from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv
@@ -21,6 +23,8 @@ T = TypeVar("T")
 
 # What changes, repeats or swallows actions between the shield and the plant.
 REFUSED = (gym.ActionWrapper, RepeatAction, StickyAction, MaxAndSkipObservation, Autoreset)
+
+FOR_VECTORS = ": use VectorSafetyShield for make_vec(...), or make_vec(..., wrappers=[SafetyShield])"
 
 # What the clock reads while a step is under way: if it raises, the next one does not follow from what is known.
 INTERRUPTED = (-1, -1)
@@ -71,7 +75,8 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         penalty: float = 0.0,
     ) -> None:
         RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty)
-        inner = environment_behind(env, gym.Wrapper, (*REFUSED, SafetyShield), NCSEnv)
+        hint = FOR_VECTORS if isinstance(env, VectorEnv) else ""
+        inner = environment_behind(env, gym.Wrapper, (*REFUSED, SafetyShield), NCSEnv, hint)
         if env.action_space != inner.action_space:
             raise ValueError(f"a wrapper inside the shield changes the action space to {env.action_space}")
         gym.Wrapper.__init__(self, env)
@@ -129,9 +134,8 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
 
     def _observed(self, info: dict[str, Any]) -> Report:
         """Returns what the decision and the guarantee need of an info, as copies: callers may write into theirs."""
-        estimate, n = as_numbers(info["estimate"]), self.filter.plant.n
-        fits = estimate is not None and estimate.shape == (n,)
-        estimate = np.array(estimate) if fits else np.full(n, np.nan)
+        estimate, shape = as_numbers(info["estimate"]), self.filter.test.single[0]
+        estimate = np.full(shape, np.nan) if estimate is None or estimate.shape != shape else estimate.copy()
         return self._guarded.reported(estimate, info["error_shape"], info["assumption_violated"] not in (False,))
 
     def _read_clock(self) -> tuple[int, int]:
@@ -156,7 +160,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         return {
             "shield_intervened": intervened,
             "input_proposed": proposed.copy(),
-            "shield_correction": float(np.linalg.norm(applied - proposed)) if intervened else 0.0,
+            "shield_correction": hypot(*(applied - proposed).tolist()) if intervened else 0.0,
             "shield_margin": margin,
             "shield_guaranteed": not reason,
             "shield_reason": reason,
