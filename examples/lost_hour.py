@@ -1,4 +1,4 @@
-"""Loses every packet for an hour: with a bound for any silence the proof goes on, with a contract it ends and returns."""
+"""Loses every packet for an hour: what goes on being proved with a bound for any silence, and with a contract."""
 
 import numpy as np
 
@@ -28,7 +28,8 @@ def run(contract: ChannelContract | None) -> None:
         doubts = ", ".join(f"{why} ({count} steps)" for why, count in reasons.items() if why)
         error = Ellipsoid(loop.error_shape).support(np.array([1.0, 0.0]))
         print(
-            f"{name:8s}error up to {error:.2f} m, outside: {violations}, proved: {reasons.get('', 0)} of {steps} {doubts}"
+            f"{name:8s}error up to {error:.2f} m, outside: {violations}, "
+            f"proved: {reasons.get('', 0)} of {steps} {doubts}"
         )
 
 

@@ -5,8 +5,6 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
-from tests.attacks import RANDOM, certificate_of
-from tests.ncs_gym.adversary import Traffic
 
 from ncs_gym import (
     Channel,
@@ -23,6 +21,9 @@ from shields import CertificateError, SafeLoop, SafetyShield
 from shields.runtime.filter import MODES
 from shields.runtime.guarantee import ALARM, LARGE_ERROR, NOT_KNOWN_INSIDE, OTHER_INPUT
 from shields.runtime.safe_loop import NOT_STARTED
+from tests.certificates import certificate_of
+from tests.ncs_gym.estimation.adversary import Traffic
+from tests.shields.attacks.extremes import RANDOM
 
 LATE = Channel(loss=0.3, quantization_step=0.01, delay=1, jitter=2)
 # Plant, contract, channel.
