@@ -6,7 +6,6 @@ from functools import cached_property
 
 import numpy as np
 
-from ncs_gym.plants.description import warn_of_no_noise
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, outer_sum
 from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_KEPT, TruncatedGaussian, chi2_quantile
@@ -44,8 +43,8 @@ class HardBounds(ReadOnlyArrays):
     sensor_bound: Ellipsoid | None
     initial_bound: Ellipsoid | None
 
-    def _check_declared(self) -> None:
-        """Checks what is declared of disturbances, sensor noise and the first estimate."""
+    def _check_declared(self) -> tuple[bool, bool, bool]:
+        """Checks what is declared of disturbances, sensor noise and first estimate; returns for which anything is."""
         object.__setattr__(self, "gamma", as_number(self.gamma, "gamma", low=0.0))
         object.__setattr__(self, "delta", as_number(self.delta, "delta", low=SMALLEST_DELTA, high=1.0 - SMALLEST_KEPT))
         declared = (
@@ -61,7 +60,7 @@ class HardBounds(ReadOnlyArrays):
             )
             if (value := getattr(self, bound)) is not None:
                 object.__setattr__(self, bound, as_bound(value, size, bound))
-        warn_of_no_noise((is_given[0] or self.gamma > 0.0, is_given[1], is_given[2]))
+        return is_given[0] or self.gamma > 0.0, is_given[1], is_given[2]
 
     @property
     def n(self) -> int:

@@ -133,7 +133,7 @@ class LinearPlant(HardBounds, limits.OperatingPoint):
             raise ValueError(f"every row of H must measure something, got {shown(self.H.tolist())}")
         self._set("u_max", limits.as_input_limits(self.u_max, self.m))
         self._set("dt", as_number(self.dt, "dt", low=0.0, low_open=True))
-        self._check_declared()
+        is_given = self._check_declared()
         if self.error_gain is not None:
             self._set("error_gain", as_matrix(self.error_gain, (self.m, n), "error_gain"))
         for name, size, letter in (("state", n, "x"), ("input", self.m, "u")):
@@ -143,6 +143,7 @@ class LinearPlant(HardBounds, limits.OperatingPoint):
             for field_name, default in ((f"{name}_names", names), (f"{name}_units", ("",) * size)):
                 self._set(field_name, as_names(getattr(self, field_name), default, field_name))
         self._make_arrays_read_only()
+        description.warn_of_no_noise(is_given)
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)

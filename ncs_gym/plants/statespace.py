@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 # Durations of steps that differ by less than this are the same.
 SAME_STEP = 1e-9
-# Inputs under way are states within this many times their limits, so that an input at its limit does not count as a
-# violation by rounding.
-STORED_INPUT_REACH = 1.0 + 1e-6
+# Rows of the box keep inputs under way within this many times their limits. They never leave those, so the rows only
+# bound the safe set: closer ones would forbid inputs near their limit, farther ones enlarge the set by little.
+STORED_INPUT_REACH = 4.0
 LONGEST_INPUT_DELAY = 100
 
 
@@ -166,7 +166,9 @@ def _matrices(sys: Any) -> tuple[Any, Any, Any, Any, Any]:
     if isinstance(sys, (tuple, list)) and len(sys) in (4, 5):
         A, B, C, D, *sampling = sys
         return A, B, C, D, sampling[0] if sampling else None
-    model: Any = sys.to_ss() if hasattr(sys, "to_ss") and not hasattr(sys, "A") else sys
+    model: Any = sys
+    if hasattr(model, "to_ss") and not hasattr(model, "A"):
+        model = model.to_ss()
     if not all(hasattr(model, name) for name in "ABCD"):
         raise ValueError(
             "sys must be a state-space model of python-control (control.ss(...)) or scipy.signal, or a tuple "
