@@ -206,7 +206,7 @@ class NCSVectorEnv(VectorEnv):
         """Returns states that episodes start at, and the errors of their first estimates, shape (n, count) each."""
         rng = self.np_random
         states = (1.0 - SAMPLE_ROUNDING) * self.single.initial_set.sample(rng, count)
-        return states.T, self.plant.initial_noise.sample(rng, count).T
+        return states.T, self.plant.sample_initial_error(rng, count).T
 
     def _observation(self) -> np.ndarray:
         """Returns the observations, shape (N, n + extra)."""
