@@ -24,7 +24,7 @@ coverage: $(INSTALLED)
 	$(MAKE) coverage-report
 
 coverage-report:
-	@echo 'lines and branches run by the tests [%], without worker processes; loops that numba compiles count as not run:'
+	@echo 'lines and branches run by the tests [%], without worker processes:'
 	@for package in $(PACKAGES) '*'; do \
 		printf '%-12s' "$$package"; $(BIN)/coverage report --include="$$package/*" --format=total || exit; done
 
@@ -34,6 +34,7 @@ test-slow: $(INSTALLED) $(ZOO_INSTALLED) $(RAY_INSTALLED)
 lint: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/deptry $(PACKAGES)
 
 types: $(INSTALLED)
 	$(BIN)/pyright --pythonpath $(BIN)/python
@@ -44,7 +45,7 @@ benchmark: $(INSTALLED) $(RAY_INSTALLED)
 	$(BIN)/python benchmarks/synthesis.py
 	$(BIN)/python benchmarks/contracts.py
 	$(BIN)/python benchmarks/numerical_trust.py
-	$(BIN)/python benchmarks/vector_env.py
+	$(BIN)/python benchmarks/environment_speed.py
 	$(BIN)/python benchmarks/optimization_problem_grid.py
 	$(BIN)/python benchmarks/rendering.py
 	$(BIN)/python benchmarks/ppo_settings.py

@@ -5,19 +5,45 @@ from __future__ import annotations
 import fcntl
 import os
 from collections.abc import Callable
+from dataclasses import is_dataclass
 from pathlib import Path
+from typing import Any
 
 # One thread per process, as in `ncs`: tests run side by side, and on small matrices waiting threads only burn time.
 # Read when numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import numpy as np
 import pytest
 
 from ncs_gym import LinearPlant, truck_trailer
-from shields import Certificate, synthesize
+from shields import Certificate
+from tests.certificates import certificate_of
 
 # Gymnasium's checker tries every render mode: no windows while tests run.
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+
+LONGEST_ID = 50
+
+
+def pytest_make_parametrize_id(val: Any) -> str | None:
+    """Ids say what is tried, where pytest would only count: values of lists, arrays and settings."""
+    if isinstance(val, dict | list | tuple | np.ndarray) or is_dataclass(val):
+        return _shown(val)[:LONGEST_ID]
+    return None
+
+
+def _shown(value: Any) -> str:
+    """A value in few words, the same in every process."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return ",".join(f"{_shown(key)}={_shown(each)}" for key, each in value.items()) or "none"
+    if isinstance(value, list | tuple):
+        return " ".join(map(_shown, value)) or "none"
+    if isinstance(value, str | int | float | complex | None):
+        return str(value)
+    return getattr(value, "__name__", type(value).__name__)
 
 
 @pytest.fixture(scope="session")
@@ -35,7 +61,7 @@ def loaded() -> LinearPlant:
 @pytest.fixture(scope="session")
 def certificate(loaded: LinearPlant) -> Certificate:
     """A certificate for the cruise."""
-    return synthesize(loaded)
+    return certificate_of(loaded)
 
 
 @pytest.fixture(scope="session")

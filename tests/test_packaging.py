@@ -14,42 +14,176 @@ ROOT = Path(__file__).resolve().parent.parent
 ORDER = ("ncs_gym", "shields", "agents", "experiments")
 SOLVERS = {"cvxpy", "clarabel"}
 LEARNERS = {"torch", "stable_baselines3"}
+COMPILERS = {"numba", "llvmlite", "jax", "jaxlib", "cython", "pyximport", "torch._dynamo"}
+MODULES = sorted(path for package in ORDER for path in (ROOT / package).rglob("*.py"))
+# Folders and modules of each package, from the bottom up: a row imports from itself and from rows above it.
+LAYERS = {
+    "ncs_gym": (
+        {"validation"},
+        {"uncertainty", "plants"},
+        {"network", "tasks"},
+        {"estimation", "rendering"},
+        {"envs"},
+        {"registration"},
+    ),
+    "shields": (
+        {"errors", "atomic_write"},
+        {"proof"},
+        {"certificate_file", "certificate_text"},
+        {"certificate"},
+        {"verification", "paper", "synthesis"},
+        {"runtime"},
+    ),
+    "agents": (
+        {"settings", "results", "sb3_vec_env", "control_loop"},
+        {"algorithms", "callbacks", "evaluation"},
+        {"agent"},
+        {"training"},
+    ),
+    "experiments": (
+        {"errors"},
+        {"settings"},
+        {"runs"},
+        {"backends", "analysis", "plots"},
+        {"report", "attack", "paper"},
+        {"commands"},
+        {"__main__"},
+    ),
+}
+# What the layers allow and the design does not.
+APART = [
+    ("shields.runtime", "shields.synthesis"),
+    ("shields.runtime", "shields.paper"),
+    ("shields.verification", "shields.synthesis"),
+    ("ncs_gym.network", "ncs_gym.tasks"),
+    ("ncs_gym.tasks", "ncs_gym.network"),
+    ("ncs_gym.estimation", "ncs_gym.rendering"),
+    ("ncs_gym.rendering", "ncs_gym.estimation"),
+    ("experiments.backends", "experiments.analysis"),
+    ("experiments.plots", "experiments.backends"),
+]
+MOST_MODULES, MOST_LINES_OF_FILE, MOST_LINES_OF_FUNCTION = 10, 300, 60
 
 
-def imports(path: Path) -> set[str]:
-    """Top-level names of everything a module imports."""
-    names = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+def name_of(path: Path) -> str:
+    """Dotted name of a module."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+NAMES = {name_of(path) for path in MODULES}
+
+
+def imports(path: Path, *, later: bool = True) -> set[str]:
+    """Dotted names of everything a module imports; what functions and type checkers import as well, if `later`."""
+    names, waiting = set(), [ast.parse(path.read_text())]
+    while waiting:
+        node = waiting.pop()
         if isinstance(node, ast.Import):
-            names |= {alias.name.split(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.level == 0:
-            names.add(node.module.split(".")[0])
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path} imports relatively"
+            inner = {f"{node.module}.{alias.name}" for alias in node.names}
+            names |= inner if inner <= NAMES else inner | {node.module}
+        is_later = isinstance(node, ast.FunctionDef | ast.Lambda)
+        is_later |= isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        if later or not is_later:
+            waiting += ast.iter_child_nodes(node)
     return names
+
+
+def imports_of(path: Path, names: set[str], **settings: bool) -> set[str]:
+    """Which of some packages a module imports."""
+    return names & {".".join(each.split(".")[:depth]) for each in imports(path, **settings) for depth in (1, 2)}
 
 
 @pytest.mark.parametrize("package", ORDER)
 def test_packages_import_only_from_those_to_their_left(package):
     later = set(ORDER[ORDER.index(package) + 1 :])
     for path in (ROOT / package).rglob("*.py"):
-        assert not imports(path) & later, path
+        assert not imports_of(path, later), path
+
+
+@pytest.mark.parametrize("package", ORDER)
+def test_folders_of_a_package_import_only_from_those_below(package):
+    level = {f"{package}.{name}": number for number, layer in enumerate(LAYERS[package]) for name in layer}
+    parts = {name_of(path).split(".")[1] for path in (ROOT / package).rglob("*.py") if name_of(path) != package}
+    assert {f"{package}.{part}" for part in parts} == set(level)
+    for path in (ROOT / package).rglob("*.py"):
+        own = ".".join(name_of(path).split(".")[:2])
+        used = imports_of(path, set(level), later=False)
+        assert {other for other in used if level[other] > level.get(own, len(level))} == set(), path
+
+
+@pytest.mark.parametrize(("folder", "other"), APART)
+def test_folders_that_are_apart_do_not_import_each_other(folder, other):
+    for path in ROOT.joinpath(*folder.split(".")).rglob("*.py"):
+        assert not imports_of(path, {other}, later=False), path
+
+
+def test_no_modules_import_each_other():
+    edges = {name_of(path): (imports(path, later=False) & NAMES) - {name_of(path)} for path in MODULES}
+    while leaves := {name for name, used in edges.items() if not used & edges.keys()}:
+        edges = {name: used for name, used in edges.items() if name not in leaves}
+    assert edges == {}
 
 
 def test_only_synthesis_and_paper_import_a_solver():
-    users = {path.name for package in ORDER for path in (ROOT / package).rglob("*.py") if imports(path) & SOLVERS}
-    synthesis = {"semidefinite_programs.py", "invariant_set_program.py"}
-    assert users == synthesis | {"optimization_problem.py", "cone_program.py"}
+    users = {path.parent.relative_to(ROOT).as_posix() for path in MODULES if imports_of(path, SOLVERS)}
+    assert users == {"shields/synthesis", "shields/paper"}
 
 
 def test_environment_and_shields_do_not_import_the_learners():
-    for package in ORDER[:2]:
-        for path in (ROOT / package).rglob("*.py"):
-            assert not imports(path) & LEARNERS, path
+    for path in MODULES:
+        if name_of(path).startswith(ORDER[:2]):
+            assert not imports_of(path, LEARNERS), path
+
+
+def test_nothing_is_compiled_at_first_use():
+    """Neither imported by us, nor by what we import, nor pinned."""
+    for path in MODULES:
+        assert not imports_of(path, COMPILERS), path
+    pinned = {line.partition("==")[0].lower() for line in (ROOT / "constraints.txt").read_text().splitlines()}
+    assert not pinned & COMPILERS
+    code = f"""
+import sys, gymnasium, numpy, ncs_gym, shields, shields.paper.algorithm, experiments.commands.certify
+plant = ncs_gym.LinearPlant(A=[[0.9]], B=[[1.0]], C=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-6)
+certificate = shields.synthesize(plant)
+env = shields.SafetyShield(gymnasium.make("ncs_gym/LinearNCS-v0", plant=plant), certificate)
+many = shields.VectorSafetyShield(gymnasium.make_vec("ncs_gym/LinearNCS-v0", num_envs=2, plant=plant), certificate)
+for each, shape in ((env, (1,)), (many, (2, 1))):
+    each.reset(seed=0)
+    each.step(numpy.ones(shape, numpy.float32))
+print(sorted({COMPILERS} & set(sys.modules)))
+"""
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"
+
+
+def test_no_folder_has_more_than_ten_modules():
+    for folder in {path.parent for path in MODULES}:
+        modules = {path.name for path in folder.glob("*.py")} - {"__init__.py"}
+        assert len(modules) <= MOST_MODULES, folder
+
+
+def test_every_folder_says_what_it_is_for():
+    for folder in {path.parent for path in MODULES}:
+        assert ast.get_docstring(ast.parse((folder / "__init__.py").read_text())), folder
+
+
+def test_files_and_functions_are_short():
+    for path in MODULES:
+        text = path.read_text()
+        assert len(text.splitlines()) <= MOST_LINES_OF_FILE, path
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef):
+                assert node.end_lineno - node.lineno < MOST_LINES_OF_FUNCTION, (path, node.name)
 
 
 @pytest.mark.parametrize(
     ("module", "later"),
     [
-        ("shields", {"cvxpy", "numba", "torch", "matplotlib"}),
+        ("shields", {"cvxpy", "torch", "matplotlib"}),
         ("experiments.commands.compare", {"torch", "stable_baselines3"}),
         ("experiments.backends.worker_init", {"numpy", "gymnasium"}),
         ("experiments.__main__", {"numpy", "tyro"}),

@@ -50,8 +50,7 @@ def truck_trailer(
     stiffness = as_number(stiffness, "stiffness", low=0.0, low_open=True)
     damping = as_number(damping, "damping", low=0.0)
     dt = as_number(dt, "dt", low=0.0, low_open=True)
-    A = np.array([[0.0, 1.0], [-stiffness / mass, -damping / mass]])
-    A, B = zero_order_hold(A, np.array([[0.0], [1.0]]), dt)
+    A, B = zero_order_hold(np.array([[0.0, 1.0], [-stiffness / mass, -damping / mass]]), np.array([[0.0], [1.0]]), dt)
     p = 2 if H is None else len(as_matrix(H, (None, 2), "H"))
     return LinearPlant(
         A=A,

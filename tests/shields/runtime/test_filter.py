@@ -1,6 +1,5 @@
 import pickle
 from dataclasses import FrozenInstanceError, replace
-from functools import cache
 from itertools import product
 
 import numpy as np
@@ -10,8 +9,9 @@ from hypothesis import strategies as st
 
 from ncs_gym import Ellipsoid, truck_trailer
 from ncs_gym.uncertainty.ellipsoid import outer_sum
-from shields import CertificateError, SafetyFilter, synthesize
+from shields import CertificateError, SafetyFilter
 from shields.runtime.filter import MARGIN, MODES, REASONS
+from tests.certificates import certificate_of
 from tests.plants import random_plant
 
 TWO_STATES = random_plant(3, 2, 1)
@@ -41,7 +41,7 @@ def worst_next_level(certificate, plant, estimate, shape, u, rng, tries=20):
 def case(request):
     n, m = request.param
     plant = random_plant(3, n, m)
-    return plant, synthesize(plant)
+    return plant, certificate_of(plant)
 
 
 @pytest.mark.parametrize("mode", ["project", "switch", "boundary", "monitor"])
@@ -335,7 +335,7 @@ def test_boundary_trusts_the_agent_where_no_input_can_harm(certificate, loaded):
 
 def test_boundary_refuses_too_many_inputs():
     plant = random_plant(0, 2, 13)
-    certificate = synthesize(plant)
+    certificate = certificate_of(plant)
     SafetyFilter(certificate, plant, "switch")
     with pytest.raises(ValueError, match="at most 12 inputs"):
         SafetyFilter(certificate, plant, "boundary")
@@ -351,11 +351,6 @@ def test_known_inside_is_never_claimed_wrongly(seed):
     if shield.knows_inside(estimate, shape):
         errors = Ellipsoid(shape)
         assert all(certificate.safe_set.gauge(estimate - errors.sample_boundary(rng)) <= 1.0 for _ in range(50))
-
-
-@cache
-def certificate_of(plant):
-    return synthesize(plant)
 
 
 def test_margin_is_that_of_the_contract(certificate, loaded):
@@ -409,7 +404,7 @@ def test_the_test_is_passed_with_a_margin_or_not_at_all(certificate, loaded):
 def test_projection_leaves_room_for_float32():
     # Coarse actions: a limit so large that float32 steps are visible in the test.
     plant = replace(random_plant(3, 2, 1), u_max=1e4)
-    certificate = synthesize(plant)
+    certificate = certificate_of(plant)
     shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(0)
     reasons = []
     for _ in range(300):

@@ -8,7 +8,8 @@ from ncs_gym.uncertainty.ellipsoid import is_inside
 from shields import Decision, SafetyFilter
 from shields.runtime import guarantee as proof
 from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, Report
-from tests.attacks import RANDOM, TRUCKS, certificate_of
+from tests.certificates import certificate_of
+from tests.shields.attacks.extremes import RANDOM, TRUCKS
 
 
 class Reference:

@@ -126,9 +126,11 @@ TEXTS = {
 }
 
 
-@pytest.mark.parametrize(
-    "text", [ATTACK, '"><script>1</script>', "' onerror='1", "</code></td><img src=x>", "</style>"]
-)
+# Each leaves another place of a page; one text with all of them is put everywhere, each alone where texts are shown.
+BREAKOUTS = (ATTACK, '"><script>1</script>', "' onerror='1", "</code></td><img src=x>", "</style>")
+
+
+@pytest.mark.parametrize("text", [" ".join(BREAKOUTS), *BREAKOUTS])
 def test_a_text_anywhere_in_a_summary_stays_text(text):
     summary = summary_of({name: [run(name)] for name in ("unshielded", "shielded")})
     summary["references"] = {"zero input": summary["arms"]["unshielded"] | {"train_steps": 0}}
@@ -136,6 +138,8 @@ def test_a_text_anywhere_in_a_summary_stays_text(text):
     honest = tags_of(comparison_report(summary, VERIFIED, {"A. B.": PNG}, []))
     shown = set()
     for path, change in attacked(summary, text):
+        if text in BREAKOUTS and path not in TEXTS:
+            continue
         try:
             page = comparison_report(change, VERIFIED, {"A. B.": PNG}, [])
         except (AttributeError, IndexError, KeyError, TypeError, ValueError, UndefinedError):

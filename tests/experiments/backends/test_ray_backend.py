@@ -20,10 +20,10 @@ from experiments.backends.ray_cluster import portable_task, require_answer  # no
 from experiments.errors import ClusterError, RunError  # noqa: E402
 from experiments.runs import versions  # noqa: E402
 from experiments.settings import BackendSettings  # noqa: E402
+from tests.command import ROOT  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).resolve().parent.parent.parent
 GRID = ["--losses", "0.5", "--delays", "1", "--burst-lengths", "0", "3", "--seeds", "2", "--episodes", "3"]
 GRID += ["--steps", "2048", "--ppo.envs", "4"]
 RUNS = 8

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from ncs_gym.law import SPHERE, Law
-from ncs_gym.system import packed, system_of
 
 from ncs_gym import Channel, NCSVectorEnv, batch_reactor, cart_pole
 from ncs_gym.network.contract import contract_of
+from ncs_gym.plants.process import BlockSampler
 from shields import VectorSafetyShield
-from tests.attacks import CHANNELS, RANDOM, TRUCKS, certificate_of, harmful
+from tests.certificates import certificate_of
+from tests.shields.attacks.extremes import CHANNELS, RANDOM, TRUCKS, harmful
 
 PLANTS = {**TRUCKS, **RANDOM}
 UNSTABLE = {
@@ -26,19 +26,18 @@ SLOW_ENVS, SLOW_STEPS = 680, 100
 
 
 class ExtremalVectorNoise(NCSVectorEnv):
-    """First estimates and sensor noise lie on the boundary of their bounds."""
+    """First estimates and sensor noise lie on the boundary of their bounds, pulled in by what rounding takes."""
 
     def __init__(self, *arguments, **settings):
         super().__init__(*arguments, **settings)
-        system = system_of(self.single, self.max_episode_steps)
-        edge = Law(SPHERE, (1.0 - 1e-12) * self.plant.sensor_noise.bound.factor)
-        self._counts, self._constants = packed(system._replace(sensor=edge))
+        self._process.sensor_noise = BlockSampler(self._extreme_noise, self.num_envs)
 
-    def _begin(self, mask, starts):
-        super()._begin(mask, starts)
-        chosen = np.flatnonzero(mask)
-        errors = self.plant.initial_noise.bound.sample_boundary(self.np_random, len(chosen)) * (1.0 - 1e-12)
-        self._fleet.mean[:, chosen] = self._fleet.state[:, chosen] + errors.T
+    def _extreme_noise(self, rng, count):
+        return (1.0 - 1e-12) * self.plant.sensor_noise.bound.sample_boundary(rng, count).T
+
+    def _first(self, count):
+        states, _ = super()._first(count)
+        return states, (1.0 - 1e-12) * self.plant.initial_noise.bound.sample_boundary(self.np_random, count).T
 
 
 def attack(plant, channel, contract, mode, policy, count, steps, seed):

@@ -6,9 +6,10 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from ncs_gym import Ellipsoid, truck_trailer
-from shields import SafetyFilter, synthesize
+from shields import SafetyFilter
 from shields.runtime.one_step_test import OneStepTest
 from shields.runtime.predicted_errors import predicted_errors
+from tests.certificates import certificate_of
 from tests.plants import random_plant
 
 PLANTS = {"truck": truck_trailer(mass=4000.0)} | {
@@ -19,7 +20,7 @@ PLANTS = {"truck": truck_trailer(mass=4000.0)} | {
 @pytest.fixture(scope="module", params=PLANTS)
 def case(request):
     plant = PLANTS[request.param]
-    return plant, synthesize(plant)
+    return plant, certificate_of(plant)
 
 
 def predicted(certificate, plant, shape):
@@ -205,7 +206,7 @@ def test_nothing_is_said_about_what_is_not_finite(key, bad):
 @pytest.mark.parametrize("key", ["truck", "3, 2"])
 def test_nothing_is_said_about_wrong_shapes_or_negative_ones(key):
     plant = PLANTS[key]
-    shield, n = SafetyFilter(synthesize(plant), plant), plant.n
+    shield, n = SafetyFilter(certificate_of(plant), plant), plant.n
     test, u = shield.test, np.zeros(plant.m)
     assert nothing_is_known(test, np.zeros(n), -np.eye(n))
     assert np.isfinite(shield.margin(np.zeros(n), 1e-4 * np.eye(n), u))
@@ -233,7 +234,7 @@ def test_decomposition_that_fails_says_nothing(monkeypatch):
 
 def test_what_cannot_be_used_spoils_no_other_shape_of_the_batch():
     plant = PLANTS["3, 2"]
-    certificate = synthesize(plant)
+    certificate = certificate_of(plant)
     test, good = OneStepTest(certificate.L, plant), 0.5 * certificate.Sigma
     swap = good + np.eye(3)[[1, 0, 2]]
     bad = [np.full((3, 3), np.nan), np.full((3, 3), np.inf), -good, 1e308 * np.eye(3), swap]
@@ -250,7 +251,7 @@ def test_what_cannot_be_used_spoils_no_other_shape_of_the_batch():
 
 def test_one_state_leaves_nothing_to_be_sharper_about():
     plant = random_plant(3, 1, 1)
-    certificate = synthesize(plant)
+    certificate = certificate_of(plant)
     test, rng = OneStepTest(certificate.L, plant), np.random.default_rng(0)
     for estimate, shape, u in cases(certificate, plant, rng, 50):
         *_, h = predicted(certificate, plant, shape)
@@ -301,7 +302,7 @@ def test_error_shapes_are_enlarged_by_the_rounding_of_moving_them():
 @pytest.mark.parametrize("key", ["truck", "3, 2"])
 def test_nothing_passes_where_the_radius_is_too_small_for_the_weights(key):
     plant = PLANTS[key]
-    shield = SafetyFilter(synthesize(plant), plant)
+    shield = SafetyFilter(certificate_of(plant), plant)
     still, u, low, high = np.zeros((plant.n, 1)), np.zeros(plant.m), 0.0, 1e6
     for _ in range(80):  # to an error ellipsoid whose h is 5e-6 below 1
         middle = 0.5 * (low + high)

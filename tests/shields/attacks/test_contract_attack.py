@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, ChannelContract, batch_reactor, cart_pole
-from shields import Certificate, CertificateError, SafetyShield, synthesize, verify
+from shields import Certificate, CertificateError, SafetyShield, verify
 from shields.runtime.guarantee import LARGE_ERROR, NOT_KNOWN_INSIDE
-from tests.attacks import attack, certificate_of, harmful
+from tests.certificates import certificate_of
+from tests.shields.attacks.extremes import attack, harmful
 
 PLANTS = {
     "cart-pole": (cart_pole(), ChannelContract(4)),
@@ -95,7 +96,7 @@ def test_broken_contract_ends_the_guarantee_in_time_and_newer_samples_restore_it
 @pytest.fixture(scope="module")
 def promised():
     plant, contract = batch_reactor(), ChannelContract(2, 1e-3)
-    return plant, synthesize(plant, contract=contract)
+    return plant, certificate_of(plant, contract=contract)
 
 
 def test_certificate_under_a_contract_is_valid_and_survives_its_file(promised, tmp_path):

@@ -1,4 +1,4 @@
-"""Tries to drive a shielded plant out of its safe set; see `tests/attacks.py` for what is tried."""
+"""Tries to drive a shielded plant out of its safe set; see `tests/shields/attacks/extremes.py` for what is tried."""
 
 import gymnasium as gym
 import numpy as np
@@ -7,7 +7,16 @@ from scipy.optimize import differential_evolution
 
 from ncs_gym import truck_trailer
 from shields import SafetyFilter, SafetyShield
-from tests.attacks import CHANNELS, POLICIES, RANDOM, TRUCKS, ExtremalNoise, attack, certificate_of, harmful
+from tests.certificates import certificate_of
+from tests.shields.attacks.extremes import (
+    CHANNELS,
+    POLICIES,
+    RANDOM,
+    TRUCKS,
+    ExtremalNoise,
+    attack,
+    harmful,
+)
 
 MODES = ("project", "switch", "boundary")
 RANDOM_POLICIES = ("random", "outwards", "searching")

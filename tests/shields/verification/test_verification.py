@@ -7,6 +7,7 @@ import pytest
 from ncs_gym import Ellipsoid, truck_trailer
 from shields import CertificateError, synthesize, verify
 from shields.verification import require_valid
+from tests.certificates import certificate_of
 from tests.plants import random_plant
 
 
@@ -88,7 +89,7 @@ def test_failed_conditions_have_a_negative_margin(certificate, loaded):
 def test_float32_rounding_of_actions_is_part_of_the_condition():
     # Without slack for it a certificate that is tight in (I) would pass; the exact D_u must reject it.
     plant = random_plant(3, 2, 1)
-    certificate = synthesize(plant)
+    certificate = certificate_of(plant)
     assert verify(certificate, plant).valid
     assert broken(with_multipliers(certificate, rounding=1e-30), plant) != []
 
@@ -189,7 +190,7 @@ def test_only_positive_definiteness_excludes_a_flat_set():
     plant = truck_trailer(
         gamma=0.0, process_noise_cov=np.zeros((2, 2)), initial_cov=np.zeros((2, 2)), measurement_noise_cov=np.eye(2)
     )
-    certificate = synthesize(plant)
+    certificate = certificate_of(plant)
     flat = replace(certificate, L=np.zeros((2, 2)), K=np.zeros((1, 2)))
     found = broken(flat, plant)
     assert any("L > 0" in name for name in found)

@@ -11,7 +11,8 @@ from shields import CertificateError, Decision, SafetyFilter, SafetyShield, Vect
 from shields.runtime.filter import MODES
 from shields.runtime.guarantee import EXPLANATIONS, OTHER_STEPS, GuaranteeMonitor, Report, starts_inside
 from shields.runtime.vector_wrapper import Clock, _moved, overridden
-from tests.attacks import CHANNELS, TRUCKS, certificate_of, harmful
+from tests.certificates import certificate_of
+from tests.shields.attacks.extremes import CHANNELS, TRUCKS, harmful
 
 KEYS = {
     "shield_intervened",

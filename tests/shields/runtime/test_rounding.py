@@ -14,6 +14,7 @@ from shields.runtime.guarantee import FAR_OUT, NOT_KNOWN_INSIDE
 from shields.runtime.one_step_test import OneStepTest, certified_root
 from shields.runtime.predicted_errors import predicted_errors
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, multiply, rational, subtract
+from tests.certificates import certificate_of
 
 SINGULAR = np.array([[0.5, -0.3], [0.25, -0.15]])
 
@@ -40,7 +41,7 @@ def worst_disturbance(certificate, plant, x, u):
 def test_passed_means_inside_however_far_out_the_estimate_is(size):
     # Estimates along a direction that A annihilates: products of huge numbers cancel.
     plant = LinearPlant(A=SINGULAR, B=np.ones((2, 1)), C=np.eye(2), u_max=1.0, dt=0.1, gamma=1e-6)
-    certificate = synthesize(plant)
+    certificate = certificate_of(plant)
     shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(0)
     *_, axes = np.linalg.svd(SINGULAR)
     passed, worst = 0, -1.0
@@ -81,7 +82,7 @@ def slanted(ratio):
 @pytest.mark.parametrize("ratio", [1.0, 1e2, 1e3])
 def test_passed_means_inside_for_thin_safe_sets(ratio):
     plant = slanted(ratio)
-    certificate = synthesize(plant)
+    certificate = certificate_of(plant)
     shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(0)
     passed = 0
     for _ in range(300):
