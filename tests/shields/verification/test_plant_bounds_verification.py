@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.shields.test_verification import replaced
+from tests.shields.verification.test_verification import replaced
 
 from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, truck_trailer
 from shields import synthesize, verify
