@@ -37,7 +37,7 @@ def badly_scaled_plant(seed: int, n: int, m: int, decades: float, radius: float,
     return LinearPlant(
         A=state[:, None] * A / state,
         B=state[:, None] * rng.standard_normal((n, m)) / put,
-        C=np.diag(1.0 / state),
+        box=np.diag(1.0 / state),
         u_max=put * rng.uniform(0.5, 2.0, m),
         dt=0.1,
         gamma=float(size * state.min()) ** 2,

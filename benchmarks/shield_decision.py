@@ -63,7 +63,7 @@ def random_plant(seed: int, n: int, m: int) -> LinearPlant:
     return LinearPlant(
         A=A * (0.85 / np.abs(np.linalg.eigvals(A)).max()),
         B=0.3 * rng.standard_normal((n, m)),
-        C=np.eye(n),
+        box=np.eye(n),
         u_max=1.0,
         dt=0.1,
         gamma=1e-4,

@@ -28,7 +28,7 @@ def random_plant(seed: int, n: int, m: int) -> LinearPlant:
     rng = np.random.default_rng(seed)
     A = rng.standard_normal((n, n))
     A *= rng.uniform(0.4, 0.9) / np.abs(np.linalg.eigvals(A)).max()
-    plant = LinearPlant(A=A, B=rng.standard_normal((n, m)), C=np.eye(n), u_max=1.0, dt=0.1, gamma=1e-3)
+    plant = LinearPlant(A=A, B=rng.standard_normal((n, m)), box=np.eye(n), u_max=1.0, dt=0.1, gamma=1e-3)
     radius = np.sqrt(np.diag(certified_error_set(plant).Sigma).max())
     return replace(plant, gamma=1e-3 * (ERROR_RADIUS / radius) ** 2)
 

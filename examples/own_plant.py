@@ -18,7 +18,7 @@ options = parser.parse_args()
 plant = ncs_gym.LinearPlant(
     A=[[0.98, 0.095], [-0.38, 0.90]],
     B=[[0.005], [0.095]],
-    C=[[1 / 0.5, 0.0], [0.0, 1 / 2.0]],
+    box=[[1 / 0.5, 0.0], [0.0, 1 / 2.0]],
     u_max=3.0,
     dt=0.1,
     gamma=1e-5,  # The disturbance d satisfies |d|^2 <= gamma.

@@ -8,6 +8,7 @@ from ncs_gym.network.channel import Channel, GilbertElliott, Packet
 from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
+from ncs_gym.plants.description import NoNoiseWarning
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.truck_trailer import truck_trailer
 from ncs_gym.registration import register_all
@@ -39,6 +40,7 @@ __all__ = [
     "LinearPlant",
     "NCSEnv",
     "NCSVectorEnv",
+    "NoNoiseWarning",
     "Packet",
     "Regulation",
     "SetpointTracking",

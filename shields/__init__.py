@@ -1,8 +1,8 @@
 """Safety shields for networked control: synthesis, exact verification and run-time use of robust invariant sets.
 
 `synthesize` finds a robust control invariant ellipsoid with its gain for a plant, `verify` checks the resulting
-`Certificate` in exact arithmetic, and `SafetyShield`, `VectorSafetyShield` and `SafetyFilter` use it to keep any agent
-inside the safe set.
+`Certificate` in exact arithmetic, and `SafetyShield`, `VectorSafetyShield`, `SafeLoop` and `SafetyFilter` use it to
+keep any agent inside the safe set.
 """
 
 from importlib import import_module
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from shields.certificate import Certificate
 from shields.errors import CertificateError, Infeasible
 from shields.proof import Multipliers
-from shields.runtime import Decision, SafetyFilter, SafetyShield, VectorSafetyShield
+from shields.runtime import Decision, SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.verification import Condition, Report, verify
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ __all__ = [
     "Infeasible",
     "Multipliers",
     "Report",
+    "SafeLoop",
     "SafetyFilter",
     "SafetyShield",
     "VectorSafetyShield",

@@ -12,6 +12,7 @@ import numpy as np
 from ncs_gym import Ellipsoid
 from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_number, read_only, shown
 from shields import certificate_file
+from shields.certificate_text import description_of
 from shields.errors import CertificateError
 from shields.proof import CertifiedProof, ContractProof, Multipliers, PaperConstants
 
@@ -26,7 +27,8 @@ _FIELDS = {
 class Certificate(ReadOnlyArrays):
     """A robust control invariant set S = {x : x'Mx <= 1} inside the safe box, its gain, and the numbers that prove it.
 
-    A certificate is not trusted until `shields.verify` has checked it in exact arithmetic.
+    A certificate is not trusted until `shields.verify` has checked it in exact arithmetic. Two certificates are equal
+    if their files are, every digit of them. `print(certificate)` says what it is for.
 
     Attributes:
         L: Shape of the safe set, (n, n) [squares of the states' units]; S = E(L).
@@ -138,6 +140,15 @@ class Certificate(ReadOnlyArrays):
     def document(self) -> dict[str, Any]:
         """The content of the certificate's file: the format's name, the checksum and the fields, as JSON values."""
         return certificate_file.document_of({entry.name: getattr(self, entry.name) for entry in fields(self)})
+
+    def __eq__(self, other: object) -> bool:
+        return self.checksum == other.checksum if isinstance(other, Certificate) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self.checksum)
+
+    def __str__(self) -> str:
+        return description_of(self)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a JSON file in which every float is exact; a reader never sees a partial file.

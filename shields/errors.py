@@ -2,9 +2,26 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from shields.certificate import Certificate
+
 
 class CertificateError(ValueError):
     """A certificate is damaged, belongs to another plant, or does not verify."""
+
+
+class SynthesisInterrupted(KeyboardInterrupt):
+    """The synthesis was interrupted; the message says what it had reached.
+
+    Attributes:
+        certificate: Certificate of the largest set so far, which verifies exactly; None if there is none yet.
+    """
+
+    def __init__(self, message: str, certificate: Certificate | None = None) -> None:
+        super().__init__(message)
+        self.certificate = certificate
 
 
 class Infeasible(ValueError):

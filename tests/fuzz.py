@@ -56,7 +56,7 @@ def plants(draw, most_states=6, most_inputs=3, radius=(0.0, 0.98), units=6.0, un
     return LinearPlant(
         A=scale[:, None] * A / scale,
         B=scale[:, None] * rng.standard_normal((n, m)),
-        C=C / scale,
+        box=C / scale,
         u_max=draw(st.sampled_from([1e-3, 1.0, 1e3]), label="u_max"),
         dt=draw(st.sampled_from([1e-3, 0.1, 10.0]), label="dt"),
         gamma=draw(st.sampled_from([0.0, 1e-6, 1e-3]), label="gamma") * float(scale.min()) ** 2,

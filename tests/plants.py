@@ -15,7 +15,7 @@ def random_plant(seed: int, n: int, m: int, p: int | None = None, gamma: float =
     return LinearPlant(
         A=A,
         B=rng.standard_normal((n, m)),
-        C=np.eye(n),
+        box=np.eye(n),
         u_max=rng.uniform(0.5, 2.0, m),
         dt=0.1,
         gamma=gamma,

@@ -67,7 +67,7 @@ def vector_runs(seed: int, steps: int) -> dict[str, str]:
 
 def synthesized() -> dict[str, str]:
     """Whole certificate files, without a contract and with one, and of the published method."""
-    sizes = {"B": [[0.1], [0.2]], "C": np.eye(2), "u_max": 2.0, "dt": 0.1, "gamma": 1e-6}
+    sizes = {"B": [[0.1], [0.2]], "box": np.eye(2), "u_max": 2.0, "dt": 0.1, "gamma": 1e-6}
     stable = LinearPlant(A=[[0.9, 0.1], [0.0, 0.8]], **sizes)
     unstable = LinearPlant(A=[[1.02, 0.1], [0.0, 0.8]], measurement_noise_cov=1e-6 * np.eye(2), **sizes)
     certificates = {

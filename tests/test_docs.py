@@ -1,9 +1,12 @@
-"""What the pages say exists: links, names, errors."""
+"""What the pages say exists: links, names, folders, errors; and what their programs print."""
 
 import ast
 import builtins
 import importlib
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,6 +17,12 @@ PACKAGES = ("ncs_gym", "shields", "agents", "experiments")
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 CODE = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
 REFERENCE = re.compile(r"^::: (\S+)$", re.MULTILINE)
+# A program, and what it prints if that follows.
+PROGRAM = re.compile(r"^```python\n(.*?)^```\n(?:\n```\n(.*?)^```)?", re.DOTALL | re.MULTILINE)
+QUICK_PAGES = ("README.md", "docs/index.md", "docs/ncs_gym.md", "docs/vector.md")
+# Their programs train an agent, or synthesize certificates of unstable plants.
+SLOW_PAGES = ("docs/contracts.md", "docs/agents.md", "docs/integrations.md")
+MODULE = re.compile(rf"\b(?:{'|'.join(PACKAGES)}|tests|benchmarks)/[\w/]+\.py\b")
 
 
 def nav_files(entry):
@@ -102,3 +111,42 @@ def test_examples_that_the_pages_name_exist():
     named = {path for page in PAGES for path in re.findall(r"examples/[\w/]+\.(?:py|yml|txt)", page.read_text())}
     assert "examples/single_file_ppo.py" in named
     assert [path for path in named if not (ROOT / path).exists()] == []
+
+
+def test_modules_that_the_pages_name_exist():
+    # The changelog and the figures of mutation testing name what there was.
+    pages = [page for page in PAGES if page.name not in ("CHANGELOG.md", "hardening-mutants.md")]
+    named = {path for page in pages for path in MODULE.findall(page.read_text())}
+    assert "shields/runtime/filter.py" in named
+    assert [path for path in named if not (ROOT / path).exists()] == []
+
+
+def test_architecture_describes_every_folder_and_no_other():
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    described = re.findall(rf"^\| `((?:{'|'.join(PACKAGES)})(?:/\w+)?)` \|", page, re.MULTILINE)
+    folders = {path.parent.relative_to(ROOT) for package in PACKAGES for path in (ROOT / package).rglob("*.py")}
+    assert sorted(described) == sorted(str(folder) for folder in folders)
+
+
+def test_functions_that_architecture_names_exist():
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    named = re.findall(r"`(\w+)` in `([\w/]+\.py)`", page)
+    assert ("transmit", "ncs_gym/network/channel_state.py") in named
+    for name, path in named:
+        assert re.search(rf"^\s*(?:def|class) {name}\b", (ROOT / path).read_text(), re.MULTILINE), (name, path)
+
+
+@pytest.mark.parametrize("page", [*QUICK_PAGES, *(pytest.param(page, marks=pytest.mark.slow) for page in SLOW_PAGES)])
+def test_programs_of_a_page_print_what_follows_them(page):
+    programs = PROGRAM.findall((ROOT / page).read_text())
+    if page in QUICK_PAGES:  # without what trains
+        programs = [each for each in programs if "stable_baselines3" not in each[0]]
+    assert programs
+    source = "print('---')\n".join(program for program, _ in programs)
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
+    run = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, env=environment, timeout=600)
+    assert run.returncode == 0, run.stderr
+    printed = run.stdout.split("---\n")
+    expected = [text for _, text in programs]
+    assert [text for text, wanted in zip(printed, expected, strict=True) if wanted] == list(filter(None, expected))

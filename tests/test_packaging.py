@@ -29,7 +29,7 @@ LAYERS = {
     "shields": (
         {"errors", "atomic_write"},
         {"proof"},
-        {"certificate_file"},
+        {"certificate_file", "certificate_text"},
         {"certificate"},
         {"verification", "paper", "synthesis"},
         {"runtime"},

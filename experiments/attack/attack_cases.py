@@ -85,7 +85,7 @@ def _random_plant(seed: int, index: int) -> LinearPlant:
     return LinearPlant(
         A=A,
         B=rng.standard_normal((n, m)),
-        C=np.eye(n),
+        box=np.eye(n),
         u_max=rng.uniform(0.1, 0.5, m),
         dt=0.1,
         gamma=1e-3,

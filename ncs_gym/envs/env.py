@@ -64,7 +64,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     The task's; see `Regulation` and `SpeedTracking`.
 
     ## Starting state
-    Uniform in `initial_set`, or `options={"state": x0}`. The first estimate is off by truncated Gaussian noise.
+    Uniform in `initial_set`, or `options={"state": x0}`. The first estimate is off by truncated Gaussian
+    noise and a uniform draw from the plant's `initial_bound`.
 
     ## Episode end
     Terminates on a violation of the safe box only with `terminate_on_violation`. Truncation is `TimeLimit`'s.
@@ -180,7 +181,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._task_state = self.task.begin(rng, self.plant)
         self._disturbance_memory = self._process.begin(rng)
         self._channel_state = ChannelState(self.channel, rng)
-        self.estimator.reset(self._state + self.plant.initial_noise.sample(rng))
+        self.estimator.reset(self._state + self.plant.sample_initial_error(rng))
         self.steps = 0
         self.episodes += 1
         self._violations = 0.0

@@ -14,7 +14,7 @@ from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.reset_options import vector_reset_options
 from ncs_gym.envs.spaces import applied_inputs
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
-from ncs_gym.estimation.pattern_arrays import PatternArrays
+from ncs_gym.estimation.statistics_table import StatisticsTable
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.channel_state import VectorChannelState
 from ncs_gym.plants.process import LinearProcess
@@ -80,12 +80,12 @@ class NCSVectorEnv(VectorEnv):
         self.ticks, self._consistent = 0, False
 
     @property
-    def error_shapes(self) -> tuple[PatternArrays, np.ndarray]:
+    def error_shapes(self) -> tuple[StatisticsTable, np.ndarray]:
         """A table whose `shapes` (k, n, n) are the distinct error shapes so far, and each environment's number there.
 
         The table grows; it is another object after shapes were forgotten.
         """
-        return self._estimator.patterns.arrays, self._estimator.statistics
+        return self._estimator.patterns.table, self._estimator.statistics
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
@@ -206,7 +206,7 @@ class NCSVectorEnv(VectorEnv):
         """Returns states that episodes start at, and the errors of their first estimates, shape (n, count) each."""
         rng = self.np_random
         states = (1.0 - SAMPLE_ROUNDING) * self.single.initial_set.sample(rng, count)
-        return states.T, self.plant.initial_noise.sample(rng, count).T
+        return states.T, self.plant.sample_initial_error(rng, count).T
 
     def _observation(self) -> np.ndarray:
         """Returns the observations, shape (N, n + extra)."""

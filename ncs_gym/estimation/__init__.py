@@ -1,1 +1,21 @@
-"""The delay-aware Kalman filter and the ellipsoids its error never leaves."""
+"""The delay-aware Kalman filter and the ellipsoids that its error never leaves (set-membership estimation).
+
+`error_bound` and `error_bounds_by_age` compute the certified error sets offline; `error_statistics` and
+`set_membership` move covariance and running ellipsoid through predictions and updates; `arrival_patterns` looks up
+whatever depends only on when packets arrive; `estimator` and `vector_estimator` carry the means, and `innovation_test`
+raises an alarm where a measurement contradicts the assumed bounds.
+"""
+
+from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlantError, certified_error_set
+from ncs_gym.estimation.estimator import Belief, Estimator
+from ncs_gym.estimation.vector_estimator import VectorEstimator
+
+__all__ = [
+    "Belief",
+    "ErrorSet",
+    "ErrorSetError",
+    "Estimator",
+    "UnstablePlantError",
+    "VectorEstimator",
+    "certified_error_set",
+]

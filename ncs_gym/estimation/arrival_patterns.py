@@ -14,21 +14,21 @@ import numpy as np
 
 from ncs_gym.estimation.error_bound import ErrorSet, certified_error_set
 from ncs_gym.estimation.error_statistics import ErrorRecursion, ErrorStatistics
-from ncs_gym.estimation.innovation_test import InnovationTest
 from ncs_gym.estimation.pattern_arrays import PatternArrays
+from ncs_gym.estimation.statistics_table import NO_SAMPLE, UNKNOWN, NumberedUpdate, StatisticsTable
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
 
-# Patterns beyond this number, and beyond this number of ages in all of them together, are forgotten but for those in
-# use (an age takes about 40 bytes).
-MAX_PATTERNS, MAX_AGES = 1 << 17, 1 << 21
+# Patterns are forgotten but for those in use when there are this many, or when they and their statistics take about
+# this much memory, in numbers of 8 bytes.
+MAX_PATTERNS, MAX_NUMBERS = 1 << 17, 1 << 25
 # A graph takes at least this many times the patterns it began with, or it would be forgotten at every step.
 SMALLEST_GROWTH = 4
-# Number of what is not worked out yet; a pattern without a history to replay.
-UNKNOWN = NO_REPLAY = -1
-# Number of the statistics that stand for "no sample is used here": their gain is zero.
-NO_SAMPLE = 0
+# Of more plants and channels than this, graphs are kept only as long as an estimator uses them.
+MAX_GRAPHS = 32
+# A pattern without a history to replay.
+NO_REPLAY = UNKNOWN
 
 
 class Pattern(NamedTuple):
@@ -77,35 +77,30 @@ class ArrivalPatterns:
 
     Attributes:
         root: Number of the pattern at the start of an episode.
-        statistics: The distinct statistics met so far; the first stands for NO_SAMPLE.
-        arrays: What vectorized environments look up.
+        table: The distinct error statistics met so far.
+        arrays: What vectorized environments look up by pattern.
+        is_full: Whether it is time to forget patterns that are not in use (`keeping`).
     """
 
     def __init__(self, recursion: ErrorRecursion, channel: Channel) -> None:
         self.recursion, self.channel = recursion, channel
-        plant, ages = recursion.plant, recursion.error_set.ages
-        self.test = InnovationTest(plant.H, recursion.sets.noise)
-        self.buffer = channel.longest_delay
+        self.buffer, ages = channel.longest_delay, recursion.error_set.ages
         # Ages above this make no difference: neither to a certified set nor to what the buffer holds.
-        self._oldest = max(self.buffer + 1, 0 if ages is None else len(ages.shapes))
-        self.arrays = PatternArrays(plant.n, plant.p, channel)
-        zero = np.zeros((plant.n, plant.p))
-        self.statistics: list[ErrorStatistics] = [recursion.first]
-        self._statistics_numbers: dict[tuple[bytes, bytes, int], int] = {}
-        self._predictions: list[int] = [UNKNOWN]
-        self._updates: list[tuple[int, np.ndarray, np.ndarray] | None] = [(NO_SAMPLE, zero, np.zeros((plant.p,) * 2))]
-        self.arrays.add_statistics(recursion.first.shape)
+        oldest = max(self.buffer + 1, 0 if ages is None else len(ages.shapes))
+        self.table, self.arrays = StatisticsTable(recursion, oldest), PatternArrays(channel)
         self._patterns: list[Pattern] = []
         self._pattern_numbers: dict[Pattern, int] = {}
         self._next: list[int] = []
         self._arrivals: dict[tuple[int, int], int] = {}
         self._replays: dict[int, Replay] = {}
-        self._axes: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._lock = threading.RLock()
         self._successor: ArrivalPatterns | None = None
-        self._adopted_count = 0
+        self._adopted_count, self.is_full = 0, False
+        # What a pattern and what statistics take, in numbers of 8 bytes.
+        n, p = recursion.plant.n, recursion.plant.p
+        self._sizes = 80 + 5 * (self.buffer + 1), 150 + 6 * n**2 + 4 * n * p
         ages_held = self.buffer + 1
-        first = self._number_of_statistics(recursion.first)
+        first = self.table.number_of(recursion.first)
         self.root = self._number_of_pattern(Pattern(first, (UNKNOWN,) * ages_held, (False,) * ages_held, NO_REPLAY))
 
     def __len__(self) -> int:
@@ -121,22 +116,16 @@ class ArrivalPatterns:
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state | {"_lock": threading.RLock()})
 
-    @property
-    def is_full(self) -> bool:
-        """Whether it is time to forget patterns that are not in use (`keeping`)."""
-        most = min(MAX_PATTERNS, MAX_AGES // (self.buffer + 1))
-        return len(self._patterns) >= max(most, SMALLEST_GROWTH * self._adopted_count)
-
     def error_statistics(self, pattern: int) -> ErrorStatistics:
         """Returns the statistics of the present estimate."""
-        return self.statistics[self._patterns[pattern].present]
+        return self.table.statistics[self._patterns[pattern].present]
 
     def after_step(self, pattern: int) -> int:
         """Returns the number of the pattern one step later, before anything arrives."""
         if self._next[pattern] == UNKNOWN:
             with self._lock:
                 present, priors, held, _ = self._patterns[pattern]
-                moved = self._predicted(present)
+                moved = self.table.predicted(present)
                 after = self._number_of_pattern(Pattern(moved, (moved, *priors[:-1]), (False, *held[:-1]), NO_REPLAY))
                 self.arrays.next[pattern] = self._next[pattern] = after
         return self._next[pattern]
@@ -168,23 +157,13 @@ class ArrivalPatterns:
                 self._replays[pattern] = replay
         return self._replays[pattern]
 
-    def update(self, statistics: int) -> tuple[int, np.ndarray, np.ndarray]:
-        """Returns the number of the statistics after an update, its gain (n, p), and W of the innovation test (p, p).
-
-        The gain is zero and the statistics are the same where the sample must not be used.
-        """
-        found = self._updates[statistics]
+    def update(self, statistics: int) -> NumberedUpdate:
+        """Returns what an update makes of some statistics, by their number."""
+        found = self.table.known_update(statistics)
         if found is None:
             with self._lock:
-                found = self._updates[statistics] = self._updated(statistics)
-                self.arrays.set_update(statistics, found[1], found[2])
+                found = self.table.update(statistics)
         return found
-
-    def innovation_axes(self, statistics: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the axes in which residuals before an update of some statistics are tested exactly."""
-        if statistics not in self._axes:
-            self._axes[statistics] = self.test.axes(self.test.spread(self.statistics[statistics].shape))
-        return self._axes[statistics]
 
     def keeping(self, patterns: np.ndarray) -> tuple[ArrivalPatterns, np.ndarray]:
         """Returns a graph with some patterns, shape (k,), only, and their numbers there."""
@@ -193,7 +172,7 @@ class ArrivalPatterns:
             if successor is None or successor.is_full:
                 successor = self._successor = ArrivalPatterns(self.recursion, self.channel)
                 successor._lock = self._lock  # the recursion, which belongs to both, has a filter that moves
-            for key, shared in _shared.items():
+            for key, shared in list(_shared.items()):
                 if shared is self:
                     _shared[key] = successor
             numbers = successor._adopted(self, np.unique(patterns).tolist())
@@ -203,28 +182,15 @@ class ArrivalPatterns:
         """Returns the numbers of another graph's patterns."""
 
         def same(number: int) -> int:
-            return number if number == UNKNOWN else self._number_of_statistics(other.statistics[number])
+            return number if number == UNKNOWN else self.table.number_of(other.table.statistics[number])
 
         numbers = {}
         for each in patterns:
             present, priors, held, replay_from = other._patterns[each]
             adopted = Pattern(same(present), tuple(map(same, priors)), held, replay_from)
             numbers[each] = self._number_of_pattern(adopted)
-        self._adopted_count = max(self._adopted_count, len(patterns))
+        self._adopted_count, self.is_full = max(self._adopted_count, len(patterns)), False
         return numbers
-
-    def _number_of_statistics(self, statistics: ErrorStatistics) -> int:
-        """Returns the number of statistics, a new one if they have not occurred."""
-        covariance, shape, age = statistics
-        age = min(age, self._oldest)
-        key = covariance.tobytes(), shape.tobytes(), age
-        if key not in self._statistics_numbers:
-            self._statistics_numbers[key] = len(self.statistics)
-            self.statistics.append(ErrorStatistics(covariance, shape, age))
-            self._predictions.append(UNKNOWN)
-            self._updates.append(None)
-            self.arrays.add_statistics(shape)
-        return self._statistics_numbers[key]
 
     def _number_of_pattern(self, pattern: Pattern) -> int:
         """Returns the number of a pattern, a new one if it has not occurred."""
@@ -233,23 +199,11 @@ class ArrivalPatterns:
             self._pattern_numbers[pattern] = len(self._patterns)
             self._patterns.append(pattern)
             self._next.append(UNKNOWN)
+            count = len(self._patterns)
+            numbers = self._sizes[0] * count + self._sizes[1] * len(self.table.statistics)
+            is_large = count >= MAX_PATTERNS or numbers >= MAX_NUMBERS
+            self.is_full = is_large and count >= SMALLEST_GROWTH * self._adopted_count
         return self._pattern_numbers[pattern]
-
-    def _predicted(self, number: int) -> int:
-        """Returns the number of the statistics one step later."""
-        if self._predictions[number] == UNKNOWN:
-            self._predictions[number] = self._number_of_statistics(self.recursion.predicted(self.statistics[number]))
-        return self._predictions[number]
-
-    def _updated(self, number: int) -> tuple[int, np.ndarray, np.ndarray]:
-        """Returns what `update` looks up."""
-        statistics = self.statistics[number]
-        update = self.recursion.updated(statistics)
-        quick_test = self.test.inverse_of_bound(self.test.spread(statistics.shape))
-        if update is None:
-            plant = self.recursion.plant
-            return number, np.zeros((plant.n, plant.p)), quick_test
-        return self._number_of_statistics(update.statistics), update.gain, quick_test
 
     def _replayed(self, pattern: Pattern) -> Replay:
         """Returns the history from the oldest new sample on, and whether it is kept."""
@@ -259,12 +213,12 @@ class ArrivalPatterns:
             number = replayed[age]
             if held[age]:
                 used[age] = number
-                number = self.update(number)[0]
+                number = self.table.update(number).after
             if age > 0:
-                replayed[age - 1] = self._predicted(number)
-        accepted = self.recursion.prefers(self.statistics[number], self.statistics[present])
-        age = self.statistics[number].age
-        new_age = age if accepted and age < self._oldest else UNKNOWN
+                replayed[age - 1] = self.table.predicted(number)
+        accepted = self.recursion.prefers(self.table.statistics[number], self.table.statistics[present])
+        age = self.table.statistics[number].age
+        new_age = age if accepted and self.table.age_matters(age) else UNKNOWN
         if accepted:
             present, priors = number, tuple(replayed)
         target = self._number_of_pattern(Pattern(present, priors, held, NO_REPLAY))
@@ -284,9 +238,13 @@ def arrival_patterns(plant: LinearPlant, channel: Channel, contract: ChannelCont
     # Only delays and quantization matter to it, not how packets are lost or when they are sent.
     kept = Channel(quantization_step=channel.quantization_step, delay=channel.delay, jitter=channel.jitter)
     key = plant.fingerprint, kept, contract
-    if key not in _shared:
-        _shared[key] = patterns_of(plant, kept, certified_error_set(plant, contract))
-    return _shared[key]
+    patterns = _shared.pop(key, None)
+    if patterns is None:
+        patterns = patterns_of(plant, kept, certified_error_set(plant, contract))
+    _shared[key] = patterns
+    if len(_shared) > MAX_GRAPHS:  # the one that was asked for the longest ago
+        _shared.pop(next(iter(_shared)), None)
+    return patterns
 
 
 def patterns_of(plant: LinearPlant, channel: Channel, error_set: ErrorSet, **precision: Any) -> ArrivalPatterns:

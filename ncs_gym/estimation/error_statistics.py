@@ -72,7 +72,7 @@ class ErrorRecursion:
     @property
     def first(self) -> ErrorStatistics:
         """The statistics of the first estimate, whose error lies in E(r0^2 I)."""
-        return ErrorStatistics(self.plant.initial_cov.copy(), self.plant.initial_error.shape.copy(), 0)
+        return ErrorStatistics(self.plant.kalman_covariances[2].copy(), self.plant.initial_error.shape.copy(), 0)
 
     def predicted(self, statistics: ErrorStatistics) -> ErrorStatistics:
         """Returns the statistics one step later, without a sample."""
@@ -144,12 +144,13 @@ def _rounded(covariance: np.ndarray, bits: int) -> np.ndarray:
 def _kalman_filter(plant: LinearPlant, quantization_step: float) -> Any:
     """Returns filterpy's `KalmanFilter`, which has no types, with every matrix set.
 
-    The process covariance is Q + gamma I (Liu et al. Definition 3), the sensor's R plus q^2/12 of a quantizer.
+    The covariances are the plant's own for this purpose, and that of the sensor plus q^2/12 of a quantizer.
     """
     kalman: Any = KalmanFilter(dim_x=plant.n, dim_z=plant.p)
     kalman.F, kalman.H = plant.A, plant.H
-    kalman.Q = plant.process_noise_cov + plant.gamma * np.eye(plant.n)
-    kalman.R = plant.measurement_noise_cov + quantization_step**2 / 12.0 * np.eye(plant.p)
+    process, sensor, _ = plant.kalman_covariances
+    kalman.Q = process
+    kalman.R = sensor + quantization_step**2 / 12.0 * np.eye(plant.p)
     if np.linalg.eigvalsh(kalman.R)[0] <= 0.0:  # perfect sensors: keep the innovation covariance invertible
         kalman.R = kalman.R + FLAT_INFLATION * np.diag((np.abs(plant.H) @ plant.half_widths) ** 2)
     return kalman

@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ncs_gym.estimation.arrival_patterns import NO_SAMPLE, UNKNOWN, ArrivalPatterns, arrival_patterns, patterns_of
+from ncs_gym.estimation.arrival_patterns import ArrivalPatterns, arrival_patterns, patterns_of
 from ncs_gym.estimation.error_bound import ErrorSet
+from ncs_gym.estimation.statistics_table import NO_SAMPLE, UNKNOWN
 from ncs_gym.network.channel import Channel, Packet
 from ncs_gym.plants.linear_plant import LinearPlant
 
@@ -163,6 +164,6 @@ class Estimator:
 
         The ellipsoid of shape H Sigma H' + N, which the quick test is about, lies inside that sum.
         """
-        test = self._patterns.test
-        spread = test.spread(self._patterns.statistics[statistics].shape)
+        table = self._patterns.table
+        test, spread = table.test, table.test.spread(table.statistics[statistics].shape)
         self.alarm |= bool(test.are_impossible(residual[None], spread)[0])

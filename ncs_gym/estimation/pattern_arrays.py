@@ -6,22 +6,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ncs_gym.estimation.statistics_table import UNKNOWN
 from ncs_gym.network.channel import Channel
 
 if TYPE_CHECKING:
     from ncs_gym.estimation.arrival_patterns import Replay
 
 # Entries that arrays begin with; they double when they are full.
-FIRST_CAPACITY = 256
-UNKNOWN = -1
+_FIRST_CAPACITY = 256
 
 
 class PatternArrays:
-    """What `ArrivalPatterns` knows, as arrays by pattern and by statistics; UNKNOWN until it is worked out.
+    """What `ArrivalPatterns` knows, as arrays by pattern; UNKNOWN until it is worked out.
 
     Args:
-        n: Number of states.
-        p: Number of outputs.
         channel: Gives the ages at which packets arrive.
 
     Attributes:
@@ -33,26 +31,16 @@ class PatternArrays:
         new_age: Age of the newest sample used after it, shape (patterns,); UNKNOWN where that does not change.
         used: Statistics before the update at each age, zero where no sample is used, shape (buffer + 1, patterns).
         present: Statistics of the present estimate, shape (patterns,).
-        gains: By statistics, shape (n, p, statistics).
-        quick_tests: W of the innovation test, by statistics, shape (p, p, statistics).
     """
 
-    def __init__(self, n: int, p: int, channel: Channel) -> None:
+    def __init__(self, channel: Channel) -> None:
         self._first_age, self._columns = channel.delay, channel.jitter + 1
-        self._patterns = self._statistics = 0
-        self.next, self.target, self.replay_from, self.new_age = (_unknown(FIRST_CAPACITY) for _ in range(4))
-        self.arrival = _unknown(self._columns, FIRST_CAPACITY)
-        self.accepted = np.zeros(FIRST_CAPACITY, np.bool_)
-        self.used = np.zeros((channel.longest_delay + 1, FIRST_CAPACITY), np.int64)
-        self.present = np.zeros(FIRST_CAPACITY, np.int64)
-        self._shapes = np.zeros((FIRST_CAPACITY, n, n))
-        self.gains = np.zeros((n, p, FIRST_CAPACITY))
-        self.quick_tests = np.zeros((p, p, FIRST_CAPACITY))
-
-    @property
-    def shapes(self) -> np.ndarray:
-        """The distinct error shapes Sigma_k by statistics, shape (statistics, n, n)."""
-        return self._shapes[: self._statistics]
+        self._patterns = 0
+        self.next, self.target, self.replay_from, self.new_age = (_unknown(_FIRST_CAPACITY) for _ in range(4))
+        self.arrival = _unknown(self._columns, _FIRST_CAPACITY)
+        self.accepted = np.zeros(_FIRST_CAPACITY, np.bool_)
+        self.used = np.zeros((channel.longest_delay + 1, _FIRST_CAPACITY), np.int64)
+        self.present = np.zeros(_FIRST_CAPACITY, np.int64)
 
     def row(self, table: str, index: int | None) -> np.ndarray:
         """Returns one of the arrays above, or a row of it."""
@@ -73,24 +61,10 @@ class PatternArrays:
         self.target[number] = UNKNOWN if replays else number
         self._patterns += 1
 
-    def add_statistics(self, shape: np.ndarray) -> None:
-        """Adds statistics with an error shape, (n, n)."""
-        number = self._statistics
-        if number == len(self._shapes):
-            self._shapes = np.concatenate([self._shapes, np.zeros_like(self._shapes)])
-            self.gains = np.concatenate([self.gains, np.zeros_like(self.gains)], axis=-1)
-            self.quick_tests = np.concatenate([self.quick_tests, np.zeros_like(self.quick_tests)], axis=-1)
-        self._shapes[number] = shape
-        self._statistics += 1
-
     def set_arrival(self, pattern: int, age: int, after: int) -> None:
         """Notes the pattern after a sample of some age arrived; other ages than the channel's are left out."""
         if 0 <= age - self._first_age < self._columns:
             self.arrival[age - self._first_age, pattern] = after
-
-    def set_update(self, statistics: int, gain: np.ndarray, quick_test: np.ndarray) -> None:
-        """Notes the gain, (n, p), and the quick test, (p, p), of an update of some statistics."""
-        self.gains[:, :, statistics], self.quick_tests[:, :, statistics] = gain, quick_test
 
     def set_replay(self, pattern: int, replay: Replay) -> None:
         """Notes what becomes of the new samples of a pattern."""

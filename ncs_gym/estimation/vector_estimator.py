@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym.estimation.arrival_patterns import NO_REPLAY, NO_SAMPLE, UNKNOWN, ArrivalPatterns
+from ncs_gym.estimation.arrival_patterns import NO_REPLAY, ArrivalPatterns
 from ncs_gym.estimation.innovation_test import ALARM_TOLERANCE
+from ncs_gym.estimation.statistics_table import NO_SAMPLE, UNKNOWN
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.minkowski_sum import outside_sum_in_axes
 
@@ -43,7 +44,7 @@ class VectorEstimator:
 
     @property
     def statistics(self) -> np.ndarray:
-        """Numbers of the error statistics, whose shapes are `patterns.arrays.shapes`, shape (N,)."""
+        """Numbers of the error statistics, whose shapes are `patterns.table.shapes`, shape (N,)."""
         return self.patterns.arrays.present.take(self.pattern)
 
     def begin(self, chosen: Any, mean: np.ndarray) -> None:
@@ -121,7 +122,7 @@ class VectorEstimator:
             if samples is not None and statistics.any():
                 residual = samples - H.dot(mean)
                 self._monitor(residual, statistics)
-                mean = mean + np.einsum("ijk,jk->ik", arrays.gains.take(statistics, axis=2), residual)
+                mean = mean + np.einsum("ijk,jk->ik", self.patterns.table.gains.take(statistics, axis=2), residual)
         self.mean = np.where(accepted, mean, self.mean)
         self.age = np.where(new_age == UNKNOWN, self.age, new_age)
         self.pattern = target
@@ -138,14 +139,14 @@ class VectorEstimator:
             residual: y - H x_hat, shape (p, N).
             statistics: Numbers of the statistics before the update, shape (N,); NO_SAMPLE where there is none.
         """
-        patterns = self.patterns
-        weights = patterns.arrays.quick_tests.take(statistics, axis=2)
+        table = self.patterns.table
+        weights = table.quick_tests.take(statistics, axis=2)
         with np.errstate(invalid="ignore"):  # an infinite weight of a residual of zero
             quick = np.einsum("ik,ijk,jk->k", residual, weights, residual)
         doubtful = np.flatnonzero(~(quick <= 1.0) & (statistics != NO_SAMPLE))
         if doubtful.size:
             numbers, index = np.unique(statistics[doubtful], return_inverse=True)
-            axes, values = zip(*(patterns.innovation_axes(each) for each in numbers.tolist()), strict=True)
+            axes, values = zip(*(table.innovation_axes(each) for each in numbers.tolist()), strict=True)
             with np.errstate(all="ignore"):
                 coordinates = np.einsum("kij,jk->ik", np.stack(axes)[index], residual[:, doubtful])
                 outside = outside_sum_in_axes(np.square(coordinates), np.stack(values)[index].T, ALARM_TOLERANCE)

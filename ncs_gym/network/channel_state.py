@@ -130,7 +130,7 @@ class VectorChannelState:
         self._delays = [delays, *self._delays[:-1]]
         return sends
 
-    def discard(self, chosen: np.ndarray) -> None:
+    def discard(self, chosen: Any) -> None:
         """Loses the samples that were just sent by some environments."""
         self._delays[0][chosen] = -1
 

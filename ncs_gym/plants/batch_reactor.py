@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.sampling import sampled_plant
+from ncs_gym.plants.statespace import arguments_with_noise
 
 # Bounds on disturbance and sensor noise as fractions of the half-widths of the box.
 DISTURBANCE_FRACTION = 5e-3
@@ -36,4 +36,4 @@ def batch_reactor(dt: float = 0.05, **bounds: Any) -> LinearPlant:
     B = np.array([[0.0, 0.0], [5.679, 0.0], [1.136, -3.146], [1.136, 0.0]])
     H = np.array([[1.0, 0.0, 1.0, -1.0], [0.0, 1.0, 0.0, 0.0]])
     fractions, arguments = (DISTURBANCE_FRACTION, SENSOR_FRACTION), {"error_gain": ERROR_GAIN} | bounds
-    return sampled_plant(A, B, H, np.ones(4), 2.0, dt, fractions, arguments)
+    return LinearPlant(**arguments_with_noise(A, B, H, np.ones(4), 2.0, dt, fractions, arguments))

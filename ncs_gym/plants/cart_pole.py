@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.sampling import sampled_plant
+from ncs_gym.plants.statespace import arguments_with_noise
 
 GRAVITY = 9.81
 # Bounds on disturbance and sensor noise as fractions of the half-widths of the box; no gamma, so that every state has
@@ -52,4 +52,4 @@ def cart_pole(
         "input_units": ("N",),
     }
     fractions = (DISTURBANCE_FRACTION if full_state else 0.4 * DISTURBANCE_FRACTION, SENSOR_FRACTION)
-    return sampled_plant(A, B, H, half_widths, 10.0, dt, fractions, names | bounds)
+    return LinearPlant(**arguments_with_noise(A, B, H, half_widths, 10.0, dt, fractions, names | bounds))

@@ -81,7 +81,7 @@ class LinearProcess:
 
     def _draw_sensor_noise(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Returns sensor noise, shape (p, count)."""
-        return self.plant.sensor_noise.sample(rng, count).T
+        return self.plant.sample_sensor_noise(rng, count).T
 
     def forget(self) -> None:
         """Forgets noise drawn ahead: after seeding, everything depends on the seed alone."""

@@ -19,7 +19,7 @@ TOLERANCE = 1e-9
 
 
 class Disturbance(ReadOnlyArrays, ABC):
-    """A disturbance in {d : d'd <= gamma}; truncated process noise is added to it.
+    """A disturbance in the ball d'd <= gamma plus `disturbance_bound`; truncated process noise is added to it.
 
     `begin` draws what stays fixed for an episode, `draw` the disturbance of one step; neither stores anything in the
     settings, so that one object serves any number of environments. The class attributes below are never inherited: a

@@ -29,7 +29,7 @@ class AdversarialDisturbance(Disturbance):
     """The point of E(D) that does the most harm to the next state.
 
     Attributes:
-        M: Shape (n, n): maximize (x+)' M (x+). None: maximize the largest |c_j x+|.
+        M: Shape (n, n): maximize (x+)' M (x+). None: maximize the largest |c_j x+| of those it can move.
 
     Raises:
         ValueError: If M is not symmetric positive semidefinite.
@@ -49,7 +49,9 @@ class AdversarialDisturbance(Disturbance):
         if self.M is not None:
             return (1.0 - ROUNDING) * bound.farthest_point(nominal_next.T, self.M).T
         values = plant.C @ nominal_next
-        worst = np.argmax((np.abs(values).T + bound.support(plant.C)).T, axis=0)
+        reach = np.asarray(bound.support(plant.C))
+        movable = reach > 0.0 if np.any(reach > 0.0) else np.ones(len(reach), np.bool_)
+        worst = np.argmax(np.where(movable, np.abs(values).T + reach, -1.0).T, axis=0)
         extremes = np.stack([bound.extreme_point(row) for row in plant.C], axis=1)
         signs = np.where(np.take_along_axis(values, worst[None], axis=0)[0] >= 0.0, 1.0, -1.0)
         return (1.0 - ROUNDING) * signs * extremes[:, worst]

@@ -120,6 +120,12 @@ class PaperBounds:
     alpha: float
 
 
+def unknown_bounds(plant: LinearPlant) -> list[str]:
+    """Returns the declared bounds of a plant of which the paper's theorems know nothing."""
+    declared = {name: getattr(plant, name) for name in ("disturbance_bound", "sensor_bound", "initial_bound")}
+    return [name for name, bound in declared.items() if bound is not None and np.any(bound.shape)]
+
+
 class PaperModel:
     """The constants of OP for one plant, as a function of (kappa, rho).
 

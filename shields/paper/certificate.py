@@ -10,6 +10,7 @@ from ncs_gym import LinearPlant
 from shields.certificate import Certificate
 from shields.errors import Infeasible
 from shields.paper.algorithm import search_grid
+from shields.paper.bounds import unknown_bounds
 from shields.paper.conditions import paper_conditions
 from shields.paper.feasibility import FeasibilityScan, largest_gamma, largest_noise_scale, largest_scale
 from shields.paper.optimization_problem import OPSolution
@@ -29,8 +30,12 @@ def paper_certificate(plant: LinearPlant, *, dkappa: float, drho: float, search:
 
     Raises:
         Infeasible: If OP has no solution on the grid that meets (C1)-(C7) exactly.
-        ValueError: If an argument is out of range.
+        ValueError: If an argument is out of range, or the plant has bounds that the paper's theorems do not know.
     """
+    if unknown := unknown_bounds(plant):
+        raise ValueError(
+            f"method 'paper' knows gamma and covariances alone, not {' and '.join(unknown)}: use method 'certified'"
+        )
     free = plant.n - int(np.linalg.matrix_rank(plant.C))
     if free:
         raise Infeasible(f"the safe box leaves {free} of {plant.n} directions unbounded: add rows to C", "S", free)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
-from shields.paper.bounds import SMALLEST_GAP, PaperModel
+from shields.paper.bounds import SMALLEST_GAP, PaperModel, unknown_bounds
 from shields.verification.conditions import Condition, flag, matrix_condition, scalar_condition
 from shields.verification.rational_matrix import Matrix, add, multiply, quadratic, rational, scale, subtract, transpose
 
@@ -24,6 +24,9 @@ def paper_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[C
     U and tau are eliminated: (C4)-(C6) can be met for input i exactly if
     u_max^2 / 2 - K_i L K_i' - |K_i L|^2 eps_up / alpha^2 >= 0.
     """
+    if unknown := unknown_bounds(plant):
+        yield flag(f"bounds: the paper's theorems do not know {' and '.join(unknown)}", False)
+        return
     constants = certificate.constants()
     kappa, rho = Fraction(constants.kappa), Fraction(constants.rho)
     inside = kappa > 0 and rho >= 1 and 1 - kappa * rho >= SMALLEST_GAP

@@ -109,14 +109,14 @@ class SafetyFilter(ReadOnlyArrays):
 
     def decide_knowing(self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray) -> Decision:
         """Returns what `decide` does, given `errors_of` the error shape."""
-        n, m = self.plant.n, self.plant.m
-        if estimate.shape == (n,) and proposed.shape == (m,) and self.mode != "boundary":
+        if (estimate.shape, proposed.shape) == self.test.single and self.mode != "boundary":
             try:
                 decision = self._decide_single(estimate, errors, proposed)
             except FloatingPointError:  # underflow, where numpy is told to raise
                 decision = None
             if decision is not None:
                 return decision
+        n, m = self.plant.n, self.plant.m
         decided = self.decide_many(_as_column(estimate, n), errors.batch(), _as_column(proposed, m))
         one = Decision(*(array[..., 0].tolist() for array in decided))
         return one._replace(input=np.array(one.input), reason=REASONS[one.reason])
@@ -124,7 +124,7 @@ class SafetyFilter(ReadOnlyArrays):
     def _decide_single(self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray) -> Decision | None:
         """Returns the decision in the common cases: an input that passes, and a single input that is projected."""
         alone = self.test.reachable_alone(estimate, errors)
-        pairs = zip(proposed.tolist(), self.plant.u_max.tolist(), strict=True)
+        pairs = zip(proposed.tolist(), self.test.limits, strict=True)
         if alone is None or not all([-limit <= u <= limit for u, limit in pairs]):
             return None
         slack, margin = alone.slack(proposed)

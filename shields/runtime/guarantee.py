@@ -19,7 +19,7 @@ OTHER_INPUT = "the input applied is not the one decided"
 OTHER_STEPS = "the environment did not move exactly one step"
 LARGE_ERROR = "the error ellipsoid is not inside the certified one"
 FAR_OUT = "the estimate is so far out of the safe box that rounding counts"
-UNUSABLE = "the environment reports no usable estimate or error shape"
+UNUSABLE = "there is no usable estimate or error shape"
 NO_ERROR_SET = "a certificate of the published method carries no error set"
 NOT_KNOWN_INSIDE = "the state is not known to be in the safe set"
 # Codes of `GuaranteeMonitor.reasons`; 0 while the proof holds.
@@ -113,7 +113,7 @@ class GuaranteeMonitor:
         estimate, errors, alarm = report
         size = np.abs(estimate)
         reach = self._reach if estimate.ndim == 1 else self._reach[:, None]
-        near = (size + errors.half_widths <= reach).all(axis=0)  # never without a usable estimate and error shape
+        near = _rows_all(size + errors.half_widths <= reach)  # never without a usable estimate and error shape
         broken = _first(broken, alarm, ALARM)
         if not _all(near):
             usable = (self._test.columns.dot(size) < FARTHEST) & (errors.radius == errors.radius)
@@ -121,6 +121,11 @@ class GuaranteeMonitor:
         if not _all(inside):
             inside = inside | self._test.knows_inside(estimate, errors, MARGIN)
         return MonitorState(broken, inside, errors.certified)
+
+
+def _rows_all(conditions: np.ndarray) -> Any:
+    """Returns whether all rows hold: a truth value for shape (n,), an array (N,) for (n, N)."""
+    return np.count_nonzero(conditions) == len(conditions) if conditions.ndim == 1 else conditions.all(axis=0)
 
 
 def _all(conditions: Any) -> bool:

@@ -49,6 +49,8 @@ class OneStepTest:
         rounding: Bound on the rounding of a product with G, relative to the product of absolute values.
         columns, own_columns: Norms of the columns of |G| |A| and of |G|, shape (n,).
         pushed: Largest norm of |G| |B| |u| within the limits.
+        single: Shapes of a single estimate and input, (n,) and (m,).
+        limits: Entries of u_max.
 
     Raises:
         CertificateError: If S is so thin that no norm computed in float64 provably describes it.
@@ -56,6 +58,7 @@ class OneStepTest:
 
     def __init__(self, L: np.ndarray, plant: LinearPlant) -> None:
         self.plant = plant
+        self.single, self.limits = ((plant.n,), (plant.m,)), plant.u_max.tolist()
         self.root = read_only(certified_root(L))
         self.moved = read_only(self.root @ plant.A)
         self.effect = read_only(self.root @ plant.B)
@@ -179,7 +182,7 @@ class ReachableSet(NamedTuple):
         """Returns what `ReachableSets.closest` does for plants with a single input, shape (1,)."""
         effect, offset = self.turn.dot(self.test.effect[:, 0]), self.turn.dot(self.offset)
         form = effect.dot(effect), effect.dot(offset), offset.dot(offset)
-        return closest_on_lines(u, *form, self.radius - reserve, self.test.plant.u_max)
+        return closest_on_lines(u.item(), *form, self.radius - reserve, self.test.limits[0]).reshape(1)
 
 
 def norms(vectors: np.ndarray) -> np.ndarray:

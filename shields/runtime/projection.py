@@ -76,7 +76,7 @@ def closest_on_lines(wanted: Any, a: Any, b: Any, c: Any, radius: Any, limit: An
     low, high = (-b - half) / a, (-b + half) / a
     closest = np.minimum(np.maximum(wanted, low), high)
     found = (radius >= 0.0) & (low <= limit) & (high >= -limit)
-    if not np.all(a):  # an input that moves nothing
+    if np.count_nonzero(a) < np.size(a):  # an input that moves nothing
         found = np.where(a > 0.0, found, (radius >= 0.0) & (excess <= 0.0))
         closest = np.where(a > 0.0, closest, wanted)
     return np.where(found, closest, np.nan)

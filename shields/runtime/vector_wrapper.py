@@ -26,6 +26,7 @@ from shields.runtime.one_step_test import norms
 from shields.runtime.wrapper import certificate_for, environment_behind
 
 REASONS = np.array(EXPLANATIONS, dtype=object)
+FOR_SINGLE = ": use SafetyShield for a single environment"
 FOR_OTHERS = ": for gymnasium's sync and async vector environments give make_vec(..., wrappers=[SafetyShield])"
 
 
@@ -66,7 +67,8 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
     ) -> None:
         RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty)
         refused = VectorActionWrapper, VectorSafetyShield
-        inner = self._inner = environment_behind(env, VectorWrapper, refused, NCSVectorEnv, FOR_OTHERS)
+        hint = FOR_OTHERS if isinstance(env, VectorEnv) else FOR_SINGLE
+        inner = self._inner = environment_behind(env, VectorWrapper, refused, NCSVectorEnv, hint)
         if env.single_action_space != inner.single_action_space:
             raise ValueError(f"a wrapper inside the shield changes the action space to {env.single_action_space}")
         VectorWrapper.__init__(self, env)

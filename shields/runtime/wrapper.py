@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from math import hypot
 from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import VectorEnv
 from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, StickyAction
 
 from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv
@@ -14,12 +16,15 @@ from ncs_gym.envs.env import applied_input, ncs_env
 from ncs_gym.validation import as_number, as_numbers, shown
 from shields.certificate import Certificate
 from shields.runtime.filter import SafetyFilter
-from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, Report, starts_inside
+from shields.runtime.guarantee import Report, starts_inside
+from shields.runtime.guarded_filter import GuardedFilter
 
 T = TypeVar("T")
 
 # What changes, repeats or swallows actions between the shield and the plant.
 REFUSED = (gym.ActionWrapper, RepeatAction, StickyAction, MaxAndSkipObservation, Autoreset)
+
+FOR_VECTORS = ": use VectorSafetyShield for make_vec(...), or make_vec(..., wrappers=[SafetyShield])"
 
 # What the clock reads while a step is under way: if it raises, the next one does not follow from what is known.
 INTERRUPTED = (-1, -1)
@@ -70,7 +75,8 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         penalty: float = 0.0,
     ) -> None:
         RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty)
-        inner = environment_behind(env, gym.Wrapper, (*REFUSED, SafetyShield), NCSEnv)
+        hint = FOR_VECTORS if isinstance(env, VectorEnv) else ""
+        inner = environment_behind(env, gym.Wrapper, (*REFUSED, SafetyShield), NCSEnv, hint)
         if env.action_space != inner.action_space:
             raise ValueError(f"a wrapper inside the shield changes the action space to {env.action_space}")
         gym.Wrapper.__init__(self, env)
@@ -79,7 +85,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             raise ValueError(f"certificate must be a Certificate or None, got {shown(certificate)}")
         self.certificate = certificate_for(inner.plant, inner.contract) if certificate is None else certificate
         self.filter = SafetyFilter(self.certificate, inner.plant, mode)
-        self._monitor = GuaranteeMonitor(self.filter)
+        self._guarded = GuardedFilter(self.filter)
         self._clock: tuple[int, int] | None = None
         self._is_drawn = env.unwrapped.render_mode is not None
 
@@ -94,12 +100,11 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             if self._read_clock() == before:  # refused before anything moved
                 self._clock = before
             raise
-        clock, self._report = self._read_clock(), self._observed(info)
-        known_inside = starts_inside(self.certificate, ncs_env(self.env).start)
-        self._state = self._monitor.start(known_inside, clock[1] == 0, self._report)
+        clock, report = self._read_clock(), self._observed(info)
+        self._guarded.begin(report, starts_inside(self.certificate, ncs_env(self.env).start), clock[1] == 0)
         self._interventions = 0
         u = np.zeros(self.filter.plant.m)
-        margin = self.filter.margin(self._report.estimate, info["error_shape"], u)
+        margin = self.filter.margin(report.estimate, info["error_shape"], u)
         self._clock = clock
         return observation, info | self._info(u, u, margin, intervened=False)
 
@@ -113,18 +118,15 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         if self._clock is None:
             raise gym.error.ResetNeeded("call reset before the first step")
         proposed = applied_input(self.filter.plant, action)
-        decision = self.filter.decide_knowing(self._report.estimate, self._report.errors, proposed)
+        decision = self._guarded.decide(proposed)
         if decision.intervened and self.filter.mode != "monitor":
             action = (decision.input / self.filter.plant.u_max).astype(np.float32)
         if self._is_drawn:
             self._annotate(proposed, self._interventions + decision.intervened, intervened=decision.intervened)
         (episode, step), self._clock = self._clock, INTERRUPTED
         observation, reward, terminated, truncated, info = self.env.step(action)
-        clock, self._report = self._read_clock(), self._observed(info)
-        applied = as_numbers(info["input"])
-        same_input = applied is not None and applied.tolist() == decision.input.tolist()
-        moved_once = clock == (episode, step + 1)
-        self._state = self._monitor.advance(self._state, decision, moved_once, same_input, self._report)
+        clock = self._read_clock()
+        self._guarded.advance(as_numbers(info["input"]), clock == (episode, step + 1), self._observed(info))
         self._interventions += decision.intervened
         self._clock = clock
         info = info | self._info(proposed, decision.input, decision.margin, intervened=decision.intervened)
@@ -132,10 +134,9 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
 
     def _observed(self, info: dict[str, Any]) -> Report:
         """Returns what the decision and the guarantee need of an info, as copies: callers may write into theirs."""
-        estimate, n = as_numbers(info["estimate"]), self.filter.plant.n
-        fits = estimate is not None and estimate.shape == (n,)
-        estimate = np.array(estimate) if fits else np.full(n, np.nan)
-        return Report(estimate, self.filter.errors_of(info["error_shape"]), info["assumption_violated"] not in (False,))
+        estimate, shape = as_numbers(info["estimate"]), self.filter.test.single[0]
+        estimate = np.full(shape, np.nan) if estimate is None or estimate.shape != shape else estimate.copy()
+        return self._guarded.reported(estimate, info["error_shape"], info["assumption_violated"] not in (False,))
 
     def _read_clock(self) -> tuple[int, int]:
         """Returns the number of episodes begun and of steps taken in this one."""
@@ -155,11 +156,11 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         ncs_env(self.env).annotate(note)
 
     def _info(self, proposed: np.ndarray, applied: np.ndarray, margin: float, *, intervened: bool) -> dict[str, Any]:
-        reason = EXPLANATIONS[self._monitor.reasons(self._state)]
+        reason = self._guarded.reason
         return {
             "shield_intervened": intervened,
             "input_proposed": proposed.copy(),
-            "shield_correction": float(np.linalg.norm(applied - proposed)) if intervened else 0.0,
+            "shield_correction": hypot(*(applied - proposed).tolist()) if intervened else 0.0,
             "shield_margin": margin,
             "shield_guaranteed": not reason,
             "shield_reason": reason,

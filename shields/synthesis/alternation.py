@@ -9,10 +9,9 @@ import numpy as np
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem
 from shields.synthesis.initial_designs import (
     VOLUME_TOLERANCE,
-    Progress,
+    Report,
     initial_design,
     multiplier_triple,
-    volume_text,
 )
 from shields.synthesis.invariant_set_program import InvariantSetProgram, max_slack_gain
 from shields.synthesis.multipliers import best_input_multipliers, best_multipliers
@@ -25,16 +24,16 @@ _SMALLEST_GAIN = 1e-4
 _FIRST_STEP, _SMALLEST_STEP = 0.3, 0.03
 
 
-def largest_set(problem: DesignProblem, slack: float, progress: Progress) -> CandidateDesign | None:
+def largest_set(problem: DesignProblem, slack: float, report: Report) -> CandidateDesign | None:
     """Returns the design of largest volume that alternation finds; None if no initial design is found.
 
     Args:
         problem: The scaled design problem.
         slack: Relative tightening of the conditions.
-        progress: Called with a line of text per initial design and per alternation.
+        report: Called with the stage and the best design so far, per initial design and per alternation.
     """
     program = InvariantSetProgram(problem, slack)
-    best = initial_design(problem, program, progress)
+    best = initial_design(problem, program, report)
     if best is None:
         return None
     step = _FIRST_STEP
@@ -42,13 +41,13 @@ def largest_set(problem: DesignProblem, slack: float, progress: Progress) -> Can
         if -best.log_det < VOLUME_TOLERANCE:
             break
         better = _alternate(problem, program, best, step)
-        progress(f"alternation {turn + 1} of at most {_ALTERNATIONS}: {volume_text(better)}")
+        report(f"alternation {turn + 1} of at most {_ALTERNATIONS}", better)
         if better.log_det - best.log_det < _SMALLEST_GAIN:
             step /= 3.0
             if step < _SMALLEST_STEP:
                 break
         best = better
-    return _with_best_gain(problem, best)
+    return with_best_gain(problem, best)
 
 
 def with_best_multipliers(problem: DesignProblem, design: CandidateDesign, error_shapes: np.ndarray) -> CandidateDesign:
@@ -78,7 +77,7 @@ def _alternate(
     return best
 
 
-def _with_best_gain(problem: DesignProblem, design: CandidateDesign) -> CandidateDesign:
+def with_best_gain(problem: DesignProblem, design: CandidateDesign) -> CandidateDesign:
     """Returns the design with L kept, and the gain and multipliers that leave the conditions the largest slack."""
     finished = []
     for K in (max_slack_gain(problem, design), design.K):

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import replace
 from importlib.metadata import version
+from typing import Any
 
 import numpy as np
 
@@ -11,17 +14,20 @@ from ncs_gym import ErrorSet, LinearPlant
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.validation import shown
 from shields.certificate import Certificate
-from shields.errors import Infeasible
+from shields.errors import Infeasible, SynthesisInterrupted
 from shields.proof import ContractProof, Multipliers
-from shields.synthesis.alternation import largest_set, with_best_multipliers
+from shields.synthesis.alternation import largest_set, with_best_gain, with_best_multipliers
 from shields.synthesis.design_problem import INFLATION, CandidateDesign, DesignProblem, design_problem
 from shields.synthesis.diagnosis import infeasibility, with_feasible_bounds
-from shields.synthesis.initial_designs import Progress
+from shields.synthesis.max_margin_gain import max_margin_gain
 from shields.synthesis.multipliers import best_input_multipliers, best_multipliers
+from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from shields.verification import Report, verify
 
 # Relative tightenings of the semidefinite programs, tried in turn until the result verifies exactly.
 _SLACKS = (1e-6, 1e-5, 1e-4, 1e-3)
+# Called with a line of text: the stage, and the volume reached so far.
+Progress = Callable[[str], object]
 # Multipliers from which those of a given set and gain are sought.
 _INITIAL_MULTIPLIERS = (0.9, 0.03, 0.07)
 
@@ -45,13 +51,14 @@ def synthesize(
         plant: The plant with its bounds, Schur stable for "certified" without a contract.
         method: "certified" or "paper".
         contract: Channel contract; with one, the error sets depend on the age of the newest sample ("certified").
-        progress: Called with a line of text per initial design and per alternation ("certified").
+        progress: Called with a line of text per stage: what is sought, and the volume reached so far ("certified").
         dkappa: Grid step of kappa ("paper").
         drho: Grid step of rho ("paper").
         search: "first" feasible grid point, as printed, or "largest" volume over the grid ("paper").
 
     Raises:
         Infeasible: If no certificate is found; it names the binding condition and the shortfall.
+        SynthesisInterrupted: A KeyboardInterrupt that says what was reached, with the best certificate so far.
         ValueError: If an argument is out of range.
     """
     if not isinstance(plant, LinearPlant):
@@ -63,7 +70,9 @@ def synthesize(
 
         certificate = paper_certificate(plant, dkappa=dkappa, drho=drho, search=search)
         holds = _is_certifiable(plant, certificate.L, certificate.K)
-        return replace(certificate, provenance=certificate.provenance | {"exact_conditions_hold": holds})
+        volume = np.linalg.det(np.linalg.solve(largest_box_ellipsoid(plant.C), certificate.L)) ** 0.5
+        description = _description(plant, float(volume)) | {"exact_conditions_hold": holds}
+        return replace(certificate, provenance=certificate.provenance | description)
     if contract is not None and not isinstance(contract, ChannelContract):
         raise ValueError(f"contract must be a ChannelContract or None, got {shown(contract)}")
     return _largest_certificate(plant, contract, progress or (lambda line: None))
@@ -99,21 +108,63 @@ def _is_certifiable(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> bool:
 
 def _largest_certificate(plant: LinearPlant, contract: ChannelContract | None, progress: Progress) -> Certificate:
     """Returns the verified certificate of the largest set found."""
+    progress("error set")
     try:
         problem, errors = design_problem(plant, contract)
     except Infeasible as infeasible:
+        progress("no error set: searching for bounds that have one")
         raise with_feasible_bounds(infeasible, plant, contract) from infeasible
-    failure = None
-    for slack in _SLACKS:
-        design = largest_set(problem, slack, progress)
-        if design is None:
-            break
-        certificate = _certificate(plant, problem, design, errors, slack)
-        report = verify(certificate, plant)
-        if report.valid:
-            return certificate
-        failure = _failed_verification(report)
-    raise failure or with_feasible_bounds(infeasibility(problem), plant, contract)
+    failure, slack = None, 0.0
+    reached: tuple[str, CandidateDesign | None] = "start", None
+
+    def report(stage: str, design: CandidateDesign | None) -> None:
+        nonlocal reached
+        reached = stage, design or reached[1]
+        progress(_progress_text(*reached))
+
+    try:
+        for slack in _SLACKS:
+            design = largest_set(problem, slack, report)
+            if design is None:
+                break
+            report("exact verification", design)
+            certificate = _certificate(plant, problem, design, errors, slack)
+            verification = verify(certificate, plant)
+            if verification.valid:
+                return _with_tolerated_scale(certificate, problem)
+            failure = _failed_verification(verification)
+    except KeyboardInterrupt as interrupt:
+        stage, design = reached
+        best = design and _certificate(plant, problem, with_best_gain(problem, design), errors, slack)
+        raise _interrupted(plant, stage, best) from interrupt
+    if failure is None:
+        progress("no certificate: searching for the bounds that have one")
+        failure = with_feasible_bounds(infeasibility(problem), plant, contract)
+    raise failure
+
+
+def _progress_text(stage: str, design: CandidateDesign | None) -> str:
+    """Returns a line of progress."""
+    volume = "no set yet" if design is None else f"{math.exp(0.5 * design.log_det):.4f} of the box ellipsoid's volume"
+    return f"{stage}: {volume}"
+
+
+def _interrupted(plant: LinearPlant, stage: str, best: Certificate | None) -> SynthesisInterrupted:
+    """Returns the exception for an interrupted search, with the best certificate so far if it verifies."""
+    message = f"interrupted: the synthesis was at {stage}"
+    if best is None or not verify(best, plant).valid:
+        return SynthesisInterrupted(f"{message} and had no certificate yet")
+    size = best.provenance["volume_of_box_ellipsoid"]
+    best = replace(best, provenance=best.provenance | {"interrupted_at": stage})
+    return SynthesisInterrupted(f"{message}, its best certificate has {size:.2%} of the box ellipsoid's volume", best)
+
+
+def _with_tolerated_scale(certificate: Certificate, problem: DesignProblem) -> Certificate:
+    """Returns the certificate with a record of how much larger all radii could be for some other set and gain."""
+    gain = max_margin_gain(problem, problem.covering_error_shape)
+    if gain is None or gain.margin < 1.0:  # the search for it is local, and covers the error sets of all ages by one
+        return certificate
+    return replace(certificate, provenance=certificate.provenance | {"tolerated_scale": gain.margin})
 
 
 def _failed_verification(report: Report) -> Infeasible:
@@ -151,9 +202,26 @@ def _certificate(
             "source": "docs/theory.md section 3",
             "solver": f"Clarabel {version('clarabel')} through cvxpy {version('cvxpy')}",
             "slack": slack,
-            "volume_of_box_ellipsoid": float(np.exp(0.5 * design.log_det)),
-        },
+        }
+        | _description(plant, float(np.exp(0.5 * design.log_det))),
     )
+
+
+def _description(plant: LinearPlant, volume: float) -> dict[str, Any]:
+    """Returns what a reader of the certificate wants to know about its set and its plant.
+
+    Args:
+        plant: The plant.
+        volume: Volume of the set in units of the largest ellipsoid in the safe box.
+    """
+    n = plant.n
+    description: dict[str, Any] = {"volume_of_box_ellipsoid": volume}
+    if len(plant.C) == n:  # the box is a parallelotope, which holds the unit ball as the unit cube's double does
+        description["share_of_box"] = volume * math.pi ** (n / 2) / math.gamma(n / 2 + 1) / 2.0**n
+    assumptions = getattr(plant, "assumptions", ())
+    if assumptions:
+        description["assumptions"] = [assumptions] if isinstance(assumptions, str) else list(assumptions)
+    return description
 
 
 def _multipliers(problem: DesignProblem, design: CandidateDesign, lam_e: float) -> Multipliers:

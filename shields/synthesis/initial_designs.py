@@ -22,13 +22,14 @@ SUFFICIENT_MARGIN = 1.0 + 1e-5
 # A design whose log det is within this of the box ellipsoid's cannot be improved noticeably.
 VOLUME_TOLERANCE = 2e-4
 
-Progress = Callable[[str], None]
+# Called with the stage that the search is in, and the design of the largest set so far.
+Report = Callable[[str, CandidateDesign | None], None]
 
 
-def initial_design(problem: DesignProblem, program: InvariantSetProgram, progress: Progress) -> CandidateDesign | None:
+def initial_design(problem: DesignProblem, program: InvariantSetProgram, report: Report) -> CandidateDesign | None:
     """Returns a feasible design, from fixed multipliers if possible and else from a gain; None if none is found."""
-    design = _from_fixed_multipliers(problem, program, progress) if len(problem.error_shapes) == 1 else None
-    return design or _from_max_margin_gain(problem, program, progress)
+    design = _from_fixed_multipliers(problem, program, report) if len(problem.error_shapes) == 1 else None
+    return design or _from_max_margin_gain(problem, program, report)
 
 
 def multiplier_triple(lx: float, error_fraction: float) -> tuple[float, float, float]:
@@ -36,13 +37,8 @@ def multiplier_triple(lx: float, error_fraction: float) -> tuple[float, float, f
     return float(lx), float((1.0 - lx) * error_fraction), float((1.0 - lx) * (1.0 - error_fraction))
 
 
-def volume_text(design: CandidateDesign | None) -> str:
-    """Returns the volume of a design's set for a line of progress."""
-    return "none found yet" if design is None else f"{np.exp(0.5 * design.log_det):.4f} of the box ellipsoid's volume"
-
-
 def _from_fixed_multipliers(
-    problem: DesignProblem, program: InvariantSetProgram, progress: Progress
+    problem: DesignProblem, program: InvariantSetProgram, report: Report
 ) -> CandidateDesign | None:
     """Returns the best design over a few multipliers and two linearizations."""
     Sigma = problem.error_shapes[-1]
@@ -54,21 +50,21 @@ def _from_fixed_multipliers(
         design = program.solve(multiplier_triple(lx, error_fraction), inputs, linearize_at)
         if design is not None and (best is None or design.log_det > best.log_det):
             best = design
-        progress(f"initial design {trial + 1} of {len(trials)}: {volume_text(best)}")
+        report(f"initial design {trial + 1} of {len(trials)}", best)
         if best is not None and -best.log_det < VOLUME_TOLERANCE:
             break
     return best
 
 
 def _from_max_margin_gain(
-    problem: DesignProblem, program: InvariantSetProgram, progress: Progress
+    problem: DesignProblem, program: InvariantSetProgram, report: Report
 ) -> CandidateDesign | None:
     """Returns a design near the gain of largest margin; None if that margin is below 1."""
     several = len(problem.error_shapes) > 1
     gain = None
     for Sigma in (problem.error_shapes[-1], problem.covering_error_shape) if several else problem.error_shapes:
+        report("search for the gain of largest margin", None)
         gain = max_margin_gain(problem, Sigma)
-        progress(f"max-margin gain: it tolerates {0.0 if gain is None else gain.margin:.3f} of the given radii")
         if gain is None or gain.margin < SUFFICIENT_MARGIN:
             continue
         L = min(gain.margin**2, _LARGEST_ENLARGEMENT) * gain.L

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ncs_gym import LinearPlant
+from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER
 from shields.certificate import Certificate
 from shields.proof import CertifiedProof, ContractProof
@@ -76,22 +76,43 @@ def _bound_conditions(proof: CertifiedProof, plant: LinearPlant) -> Iterator[Con
     """Checks that D, N and r0^2 I contain what theory.md section 1 says they contain."""
     ball = scale(Fraction(plant.gamma), rational(np.eye(plant.n)))
     noise = scale(Fraction(plant.process_noise.energy), rational(plant.process_noise_cov))
-    required = _sum_bound(ball, noise, rational(plant.relative_weight))
+    weight = rational(plant.relative_weight)
+    required = _with_declared(_sum_bound(ball, noise, weight), plant.disturbance_bound, weight)
     bound = rational(plant.disturbance.shape)
     yield matrix_condition("D: the plant's holds the disturbance and the process noise", subtract(bound, required))
     yield matrix_condition("D: the certificate's holds the plant's", subtract(rational(proof.D), bound))
+    identity = rational(np.eye(plant.p))
     sensor = scale(Fraction(plant.sensor_noise.energy), rational(plant.measurement_noise_cov))
+    sensor = _with_declared(sensor, plant.sensor_bound, identity)
     if proof.ages is None:
         yield matrix_condition("N: holds the sensor noise", subtract(rational(plant.sensor_error.shape), sensor))
     else:
-        step, identity = Fraction(proof.ages.sets.contract.quantization_step), rational(np.eye(plant.p))
+        step = Fraction(proof.ages.sets.contract.quantization_step)
         required = _sum_bound(scale(plant.p * step * step / 4, identity), sensor, identity)
         slack = subtract(rational(proof.ages.sets.noise), required)
         yield matrix_condition("N: holds the sensor noise and the quantization error", slack)
-    first = scale(Fraction(plant.initial_noise.energy), rational(plant.initial_cov))
+    first = _first_error(plant, weight)
     yield matrix_condition(
         "r0: holds the error of the first estimate", subtract(rational(plant.initial_error.shape), first)
     )
+
+
+def _first_error(plant: LinearPlant, weight: Matrix) -> Matrix:
+    """Returns a shape that holds the truncated first error plus the declared one.
+
+    Its multiplier is the one that is best for the ball of radius r0, with which the plant's own bound is made; any
+    multiplier proves containment.
+    """
+    noise = scale(Fraction(plant.initial_noise.energy), rational(plant.initial_cov))
+    if plant.initial_bound is None:
+        return noise
+    declared = rational(plant.initial_bound.shape)
+    occupied = np.diag((np.diag(plant.initial_cov) > 0.0).astype(np.float64))
+    ball = scale(Fraction(plant.initial_radius_squared), rational(occupied))
+    if not (any(map(any, noise)) and any(map(any, declared))):
+        return add(noise, declared)
+    nu = _smallest_trace_multiplier(ball, declared, weight)
+    return add(scale(1 / nu, noise), scale(1 / (1 - nu), declared))
 
 
 def _error_conditions(proof: CertifiedProof, plant: LinearPlant) -> Iterator[Condition]:
@@ -180,6 +201,11 @@ def _with_action_rounding(D: Matrix, B: Matrix, u_max: np.ndarray, s: Fraction) 
     for i, limit in enumerate(u_max):
         rounding[i][i] = m * (ACTION_ROUNDING * Fraction(float(limit))) ** 2
     return add(scale(1 + s, D), scale(1 + 1 / s, congruence(B, rounding)))
+
+
+def _with_declared(first: Matrix, declared: Ellipsoid | None, weight: Matrix) -> Matrix:
+    """Returns a shape around E(first) plus a declared bound, if there is one."""
+    return first if declared is None else _sum_bound(first, rational(declared.shape), weight)
 
 
 def _sum_bound(first: Matrix, second: Matrix, weight: Matrix) -> Matrix:

@@ -21,7 +21,7 @@ REPLACEMENTS = [None, True, "0.5", "", [], {}, [[1.0]], float("nan"), float("inf
 @cache
 def case(name):
     """A plant, and a certificate for it: of a stable one, or under a contract of an unstable one."""
-    sizes = {"B": [[0.1], [0.2]], "C": np.eye(2), "u_max": 2.0, "dt": 0.1, "gamma": 1e-5}
+    sizes = {"B": [[0.1], [0.2]], "box": np.eye(2), "u_max": 2.0, "dt": 0.1, "gamma": 1e-5}
     sizes |= {"process_noise_cov": 1e-6 * np.eye(2), "measurement_noise_cov": 1e-6 * np.eye(2)}
     if name == "stable":
         plant, contract = LinearPlant(A=[[0.9, 0.1], [0.0, 0.8]], initial_cov=1e-6 * np.eye(2), **sizes), None

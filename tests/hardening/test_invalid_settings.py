@@ -83,7 +83,7 @@ NOT_TASKS += [SpeedTracking(fastest=1e39), setpoint(reach=1e39), setpoint(reach=
 REFUSED = {
     noisy: {
         **dict.fromkeys(("A", "B", "H"), NOT_MATRICES),
-        "C": [*but(NOT_MATRICES, [[1, 2]]), np.zeros((1, 2)), np.ones((1, 3)), [[1e-80, 0.0]]],
+        "box": [*but(NOT_MATRICES, [[1, 2]]), np.zeros((1, 2)), np.ones((1, 3)), [[1e-80, 0.0]]],
         "u_max": [*but(WRONG, [1.0]), 0.0, 1e-300, [1.0, 1.0], [[1.0]], [np.nan]],
         "dt": [*WRONG, 0.0, 1e-80],
         "gamma": WRONG,
@@ -167,7 +167,7 @@ def test_wrong_values_of_a_setting_are_refused_in_one_sentence(make, name, wrong
 @given(data=st.data())
 @examples(120)
 def test_matrices_with_one_wrong_entry_are_refused(data):
-    name = data.draw(st.sampled_from(["A", "B", "C", "H", "process_noise_cov", "initial_cov", "u_max"]))
+    name = data.draw(st.sampled_from(["A", "B", "box", "H", "process_noise_cov", "initial_cov", "u_max"]))
     array = np.array(getattr(PLANT, name))
     entry = data.draw(st.sampled_from(range(array.size)))
     array.flat[entry] = data.draw(st.sampled_from([np.nan, np.inf, -np.inf, 1e75, -1e300]))

@@ -5,12 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, NCSVectorEnv
-from ncs_gym.envs.env import NCSEnv
+from ncs_gym import Channel, ChannelContract, Estimator, NCSEnv, NCSVectorEnv, Packet, batch_reactor
 from ncs_gym.estimation import arrival_patterns
-from ncs_gym.estimation.arrival_patterns import ArrivalPatterns, patterns_of
-from ncs_gym.estimation.estimator import Belief, Estimator
-from ncs_gym.network.channel import Packet
+from ncs_gym.estimation.arrival_patterns import ArrivalPatterns
+from ncs_gym.estimation.estimator import Belief
 
 EPISODE = 300
 # Environments of the vector whose last episodes are computed again.
@@ -45,24 +43,24 @@ class Diary:
                 self.told[e], self.first[e], self.in_flight[e] = [], info["estimate"][e].copy(), {}
                 continue
             step, delay = int(env.steps[e]), int(delays[e])
-            if delay >= 0:
-                self.in_flight[e].setdefault(step + delay, []).append(Packet(step, samples[:, e].copy()))
+            if step % env.channel.send_period == 0 and delay >= 0:
+                sample = Packet(step, samples[:, e].copy())
+                self.in_flight[e].setdefault(step + delay, []).append(sample)
             self.told[e].append((info["input"][e].copy(), self.in_flight[e].pop(step, [])))
         self.episodes = env.episodes.copy()
 
     def compare(self, info):
         """Computes the present episodes again; returns how many packets came in them."""
-        estimator = self.env._estimator
-        known, numbers = estimator.patterns.statistics, estimator.statistics
-        packets = 0
+        estimator, packets = self.env._estimator, 0
         for e in WATCHED:
-            fresh = Estimator(self.env.plant, CHANNEL, self.env.error_set)
+            fresh = Estimator(self.env.plant, self.env.channel, self.env.error_set)
             fresh.reset(self.first[e])
             for u, arrived in self.told[e]:
                 fresh.advance(u, sorted(arrived, key=lambda packet: packet.stamp))
                 packets += len(arrived)
+            statistics = estimator.patterns.table.statistics[estimator.statistics[e]]
             np.testing.assert_array_equal(info["error_shape"][e], fresh.belief.shape)
-            np.testing.assert_array_equal(known[numbers[e]].covariance, fresh.belief.covariance)
+            np.testing.assert_array_equal(statistics.covariance, fresh.belief.covariance)
             np.testing.assert_allclose(info["estimate"][e], fresh.belief.mean, rtol=0.0, atol=1e-12)
             assert info["measurement_age"][e] == fresh.age
             assert info["assumption_violated"][e] == fresh.alarm
@@ -116,15 +114,15 @@ def soak_one(plant, steps, warm_up):
     assert sum(len(packets) for _, packets in told) > 50
     for name in Belief._fields:
         np.testing.assert_array_equal(getattr(fresh.belief, name), getattr(env.estimator.belief, name), err_msg=name)
+    assert len(env.estimator._priors) <= CHANNEL.longest_delay + 1
     return gained
 
 
 def restored(env):
-    """A fresh estimator in the state of an environment's, with a graph of patterns of its own."""
-    old, patterns = env.estimator, patterns_of(env.plant, env.channel, env.error_set)
-    new = Estimator(env.plant, env.channel, patterns=patterns)
+    """A fresh estimator, with a graph of its own, in the state of an environment's."""
+    old, new = env.estimator, Estimator(env.plant, env.channel, env.error_set)
     new.step, new.age, new.alarm, new.mean = old.step, old.age, old.alarm, old.mean
-    new._pattern = patterns._adopted(old._patterns, [old._pattern])[old._pattern]
+    new._pattern = new._patterns._adopted(old._patterns, [old._pattern])[old._pattern]
     new._priors, new._inputs, new._samples = old._priors.copy(), old._inputs.copy(), old._samples.copy()
     return new
 
@@ -134,20 +132,57 @@ def test_a_long_run_neither_grows_nor_drifts(loaded):
     assert soak_one(loaded, 3000, 1000) < MOST_GROWTH
 
 
-def test_a_graph_that_forgets_patterns_does_not_drift(loaded, monkeypatch):
-    monkeypatch.setattr(arrival_patterns, "MAX_PATTERNS", 300)
-    forgetful, keeping = set(), ArrivalPatterns.keeping
+@pytest.mark.parametrize("kind", ["many", "one"])
+def test_a_graph_that_forgets_patterns_does_not_drift(loaded, monkeypatch, kind):
+    monkeypatch.setattr(arrival_patterns, "_shared", {})
+    monkeypatch.setattr(arrival_patterns, "MAX_PATTERNS", 300 if kind == "many" else 60)
+    graphs, keeping = [], ArrivalPatterns.keeping
 
-    def counted(patterns, live):
-        forgetful.add(id(patterns))
-        return keeping(patterns, live)
+    def counted(graph, patterns):
+        graphs.append(graph)
+        return keeping(graph, patterns)
 
     monkeypatch.setattr(ArrivalPatterns, "keeping", counted)
-    soak_many(loaded, 16, 1000, 900)
-    assert forgetful
+    if kind == "many":
+        soak_many(loaded, 16, 1000, 900)
+    else:
+        soak_one(loaded, 3000, 1000)
+    assert len(graphs) > 1
+    assert max(map(len, graphs)) < 600
 
 
 @pytest.mark.slow
 def test_ten_million_steps_neither_grow_nor_drift(loaded):
     assert soak_many(loaded, 1024, 9800, 2000) < MOST_GROWTH
     assert soak_one(loaded, 100_000, 10_000) < MOST_GROWTH
+
+
+@pytest.mark.slow
+def test_a_million_steps_of_one_environment_neither_grow_nor_drift(loaded):
+    assert soak_one(loaded, 1_000_000, 20_000) < MOST_GROWTH
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [1, 256])
+def test_a_million_steps_with_forgetting_do_not_grow(size, monkeypatch):
+    """Patterns of long outages and of partial measurements hardly recur: the graph is full again and again."""
+    monkeypatch.setattr(arrival_patterns, "_shared", {})
+    monkeypatch.setattr(arrival_patterns, "MAX_PATTERNS", 4000)
+    settings = {
+        "plant": batch_reactor(),
+        "channel": Channel(0.5, jitter=4, max_consecutive_losses=3),
+        "contract": ChannelContract(3),
+    }
+    env = NCSEnv(**settings) if size == 1 else NCSVectorEnv(size, max_episode_steps=EPISODE, **settings)
+    env.reset(seed=0)
+    rng, forgotten, sizes = np.random.default_rng(0), set(), []
+    actions = 0.01 * rng.uniform(-1.0, 1.0, (64, *env.action_space.shape)).astype(np.float32)
+    for k in range(1_000_000 // size):
+        env.step(actions[k % 64])
+        if size == 1 and k % EPISODE == 0:
+            env.reset()
+        if k % (50_000 // size) == 0:
+            sizes.append(resident())
+            forgotten.add(id(env.estimator._patterns if size == 1 else env._estimator.patterns))
+    assert len(forgotten) > 3
+    assert max(sizes[8:]) - max(sizes[4:8]) < MOST_GROWTH

@@ -373,7 +373,7 @@ def test_too_large_disturbance_raises_or_is_allowed_and_noticed():
         ({"disturbance": "storm"}, "disturbance must be one of"),
         ({"disturbance": BoxDisturbance([1.0, 1.0])}, "squared length"),
         ({"task": Regulation(state_cost=np.eye(3))}, "state_cost must have shape"),
-        ({"plant": LinearPlant(A=[[1.1]], B=[[1.0]], C=[[1.0]], u_max=1.0, dt=0.1, gamma=0.0)}, "spectral radius"),
+        ({"plant": LinearPlant(A=[[1.1]], B=[[1.0]], box=[[1.0]], u_max=1.0, dt=0.1, gamma=0.0)}, "spectral radius"),
     ],
 )
 def test_bad_settings_are_refused_in_one_sentence(kwargs, words):

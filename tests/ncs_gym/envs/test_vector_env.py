@@ -272,7 +272,7 @@ def test_gymnasiums_sync_vector_env_of_scalar_ones_is_still_available():
 
 
 def test_own_plant_by_id():
-    plant = LinearPlant(A=[[0.5]], B=[[1.0]], C=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-4)
+    plant = LinearPlant(A=[[0.5]], B=[[1.0]], box=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-4)
     env = make("LinearNCS", 3, plant=plant)
     env.reset(seed=0)
     assert env.step(np.zeros((3, 1), np.float32))[4]["error_shape"].shape == (3, 1, 1)

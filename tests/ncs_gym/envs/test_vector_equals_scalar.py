@@ -4,6 +4,7 @@ import copy
 import pickle
 import sys
 import threading
+import tracemalloc
 
 import gymnasium as gym
 import numpy as np
@@ -193,16 +194,41 @@ def test_threads_share_a_graph(most, monkeypatch):
         sys.setswitchinterval(interval)
 
 
-def test_a_long_buffer_holds_few_patterns():
-    # Every pattern of a buffer of 600 steps takes 20 kB.
-    env = NCSEnv(truck_trailer(), Channel(loss=0.3, delay=100, jitter=500))
-    limit = arrival_patterns.MAX_AGES // 601
+@pytest.mark.parametrize(
+    ("plant", "channel"),
+    [
+        (truck_trailer(), Channel(loss=0.3, delay=100, jitter=500)),  # a pattern takes 20 kB
+        (random_plant(5, 12, 1, p=1), Channel(loss=0.3, jitter=5)),  # statistics take 7 kB and hardly recur
+    ],
+)
+def test_graphs_of_long_buffers_and_large_plants_hold_fewer_patterns(plant, channel, monkeypatch):
+    monkeypatch.setattr(arrival_patterns, "_shared", {})
+    monkeypatch.setattr(arrival_patterns, "MAX_NUMBERS", 1 << 20)
+    env = NCSEnv(plant, channel)
     env.reset(seed=0)
-    sizes = set()
-    for _ in range(2500):
-        env.step(np.zeros(1, np.float32))
-        sizes.add(len(env.estimator._patterns))
-    assert 0.9 * limit < max(sizes) < 1.1 * limit
+    sizes, graphs, action = [], set(), np.zeros(plant.m, np.float32)
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        for _ in range(800):
+            env.step(action)
+            sizes.append(tracemalloc.get_traced_memory()[0] - before)
+            graphs.add(id(env.estimator._patterns))
+    finally:
+        tracemalloc.stop()
+    assert len(graphs) > 1
+    assert 0.4 < max(sizes) / (8 * arrival_patterns.MAX_NUMBERS) < 1.6
+
+
+def test_graphs_of_many_plants_are_not_kept_for_ever(monkeypatch):
+    shared = {}
+    monkeypatch.setattr(arrival_patterns, "_shared", shared)
+    monkeypatch.setattr(arrival_patterns, "MAX_GRAPHS", 3)
+    plants = [truck_trailer(mass=mass) for mass in (1000.0, 1100.0, 1200.0, 1300.0)]
+    graphs = [arrival_patterns.arrival_patterns(plant, Channel(loss=0.1), None) for plant in plants]
+    assert list(shared.values()) == graphs[1:]
+    assert arrival_patterns.arrival_patterns(plants[1], Channel(loss=0.9), None) is graphs[1]
+    assert list(shared.values()) == [*graphs[2:], graphs[1]]
 
 
 def test_a_graph_has_room_for_many_environments(monkeypatch):

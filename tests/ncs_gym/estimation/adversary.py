@@ -1,4 +1,4 @@
-"""Errors, disturbances, noise and traffic that do an estimator the most harm that its assumptions allow, in batches."""
+"""Errors, disturbances, noise and traffic that do many estimators the most harm their assumptions allow."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ class Attack:
         plant, many = self.plant, self.many
         if self.step % AIM == 0:
             self.axes = self._axes()
-        shapes = many.patterns.arrays.shapes.take(many.statistics, axis=0)
+        shapes = many.patterns.table.shapes.take(many.statistics, axis=0)
         u = self.gain @ many.mean + 0.05 * self.rng.uniform(-1.0, 1.0, (plant.m, self.count)) * plant.u_max[:, None]
         # A third of the environments aims at a direction some steps ahead, the others push the error outwards.
         aims = np.arange(self.count) % 3 == 0
@@ -120,7 +120,7 @@ class Attack:
 
     def _check(self) -> None:
         many = self.many
-        shapes = many.patterns.arrays.shapes.take(many.statistics, axis=0)
+        shapes = many.patterns.table.shapes.take(many.statistics, axis=0)
         inward = np.linalg.solve(shapes, self.error.T[:, :, None])[:, :, 0].T
         self.largest = max(self.largest, float(np.sqrt((self.error * inward).sum(axis=0)).max()))
         assert self.largest <= 1.0

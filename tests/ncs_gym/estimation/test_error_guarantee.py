@@ -11,7 +11,7 @@ CASES = {
     "case study": (truck_trailer(), Channel(quantization_step=0.05, jitter=4), None),
     "cruise": (truck_trailer(mass=4000.0), Channel(jitter=6), None),
     "position only": (truck_trailer(mass=4000.0, H=[[1.0, 0.0]]), Channel(quantization_step=0.02, jitter=5), None),
-    "three states, one output": (random_plant(5, 3, 2, p=1), Channel(jitter=5), None),
+    "three states, one output": (random_plant(5, 3, 2, p=1), Channel(jitter=2), None),
     "stable with a contract": (truck_trailer(), Channel(quantization_step=0.05, jitter=5), ChannelContract(5, 0.05)),
     "cart-pole": (cart_pole(), Channel(jitter=6), ChannelContract(4)),
     "position and angle": (cart_pole(full_state=False), Channel(jitter=3), ChannelContract(3)),
@@ -28,7 +28,9 @@ def attack(name, count, steps, seed):
     for number, age in attacked.seen:
         certified = error_set.shape_at(age)
         assert certified is not None, age
-        assert is_positive_semidefinite(subtract(rational(certified), rational(patterns.statistics[number].shape)))
+        assert is_positive_semidefinite(
+            subtract(rational(certified), rational(patterns.table.statistics[number].shape))
+        )
     return attacked
 
 

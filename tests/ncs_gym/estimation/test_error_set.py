@@ -75,7 +75,7 @@ def test_units_do_not_change_the_set():
     base = truck_trailer()
     inverse = np.linalg.inv(units)
     scaled = LinearPlant(
-        A=units @ base.A @ inverse, B=units @ base.B, C=base.C @ inverse, u_max=4.0, dt=0.5, gamma=0.0,
+        A=units @ base.A @ inverse, B=units @ base.B, box=base.C @ inverse, u_max=4.0, dt=0.5, gamma=0.0,
         process_noise_cov=units @ (1e-4 * np.eye(2)) @ units, measurement_noise_cov=np.eye(2),
     )  # fmt: skip
     same = truck_trailer(gamma=0.0, initial_cov=np.zeros((2, 2)))
@@ -95,7 +95,7 @@ def test_strongly_coupled_plants_get_a_true_set_or_an_error(seed, radius, n):
     rng = np.random.default_rng(seed)
     basis = np.linalg.qr(rng.standard_normal((n, n)))[0]
     A = basis @ np.triu(3.0 * rng.standard_normal((n, n)), 1) @ basis.T + radius * np.eye(n)
-    plant = LinearPlant(A=A, B=np.ones((n, 1)), C=np.eye(n), u_max=1.0, dt=0.1, gamma=1e-6)
+    plant = LinearPlant(A=A, B=np.ones((n, 1)), box=np.eye(n), u_max=1.0, dt=0.1, gamma=1e-6)
     try:
         errors = certified_error_set(plant)
     except (ErrorSetError, UnstablePlantError):
@@ -107,7 +107,7 @@ def test_strongly_coupled_plants_get_a_true_set_or_an_error(seed, radius, n):
 
 
 def test_unstable_plant_is_refused_with_its_spectral_radius():
-    plant = LinearPlant(A=[[1.02]], B=[[1.0]], C=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-3)
+    plant = LinearPlant(A=[[1.02]], B=[[1.0]], box=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-3)
     with pytest.raises(UnstablePlantError, match=r"spectral radius of A is 1\.02"):
         certified_error_set(plant)
 

@@ -278,7 +278,7 @@ def test_computed_shapes_hold_the_exact_ones():
 def ill_conditioned_sets(n):
     """Its certified set has a triangular factor whose inverse has entries of 2^(n - 2)."""
     factor = np.eye(n) - np.tril(np.ones((n, n)), -1)
-    plant = LinearPlant(A=0.5 * np.eye(n), B=np.ones((n, 1)), C=np.eye(n), u_max=1.0, dt=0.1, gamma=1e-6)
+    plant = LinearPlant(A=0.5 * np.eye(n), B=np.ones((n, 1)), box=np.eye(n), u_max=1.0, dt=0.1, gamma=1e-6)
     return SetMembership(plant, 0.0, ErrorSet(Sigma=factor @ factor.T, rate=0.5))
 
 

@@ -166,6 +166,31 @@ def test_forgetting_in_the_middle_of_an_episode_changes_nothing(name, monkeypatc
 
 
 @pytest.mark.parametrize("name", CASES)
+def test_duplicates_and_packets_from_nowhere_change_nothing(name):
+    plant, channel, contract = CASES[name]
+    patterns, rng = patterns_of(plant, channel, certified_error_set(plant, contract)), np.random.default_rng(4)
+    one, other = (Estimator(plant, channel, patterns=patterns) for _ in range(2))
+    link, arrived, copies = ChannelState(channel, rng), [], 0
+    for step in range(1, 400):
+        sample = 1e-3 * rng.standard_normal(plant.p) if link.sends_at(step) else None
+        packets = link.exchange(rng, step, sample)
+        arrived += packets
+        again = [packet for packet in arrived[-12:] if rng.random() < 0.3]
+        # What was measured does not matter in a packet that is discarded, unless it comes before the true one.
+        again = [packet._replace(measurement=packet.measurement + 9.0) for packet in again]
+        strangers = [
+            Packet(stamp, np.full(plant.p, 7.0)) for stamp in (-3, 0, step + 1, step - channel.longest_delay - 1)
+        ]
+        one.advance(np.zeros(plant.m), packets)
+        other.advance(np.zeros(plant.m), [*packets, *again, *strangers])
+        copies += len(again)
+        for value, wanted in zip(other.belief, one.belief, strict=True):
+            np.testing.assert_array_equal(value, wanted)
+        assert (other.age, other.alarm) == (one.age, one.alarm)
+    assert copies > 500
+
+
+@pytest.mark.parametrize("name", CASES)
 def test_a_copy_goes_on_like_the_original(name):
     plant, channel, contract = CASES[name]
     error_set, rng = certified_error_set(plant, contract), np.random.default_rng(2)
@@ -228,9 +253,9 @@ def test_vector_estimator_equals_the_plain_ones(name, most, monkeypatch):
 
 
 def assert_one_of_many(many, index, plain, step):
-    statistics = many.patterns.statistics[many.statistics[index]]
+    statistics = many.patterns.table.statistics[many.statistics[index]]
     np.testing.assert_array_equal(statistics.shape, plain.statistics.shape, err_msg=f"step {step}")
     np.testing.assert_array_equal(statistics.covariance, plain.statistics.covariance)
-    np.testing.assert_array_equal(many.patterns.arrays.shapes[many.statistics[index]], plain.statistics.shape)
+    np.testing.assert_array_equal(many.patterns.table.shapes[many.statistics[index]], plain.statistics.shape)
     np.testing.assert_allclose(many.mean[:, index], plain.mean, rtol=1e-10, atol=1e-10)
     assert (many.age[index], many.alarm[index]) == (plain.age, plain.alarm)

@@ -45,7 +45,7 @@ PLANTS = {
     "cart-pole, position and angle": (cart_pole(full_state=False), ChannelContract(3)),
     "batch reactor": (batch_reactor(), ChannelContract(3, 1e-3)),
     "truck-trailer": (truck_trailer(), ChannelContract(5, 0.05)),
-    "scalar": (LinearPlant(A=[[1.2]], B=[[1.0]], C=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-4), ChannelContract(0)),
+    "scalar": (LinearPlant(A=[[1.2]], B=[[1.0]], box=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-4), ChannelContract(0)),
 }
 CHANNELS = [
     Channel(loss=0.5, max_consecutive_losses=2),
@@ -244,7 +244,7 @@ def test_long_outages_end_no_episode_with_an_exception(outage):
     twice = LinearPlant(
         A=[[1.2]],
         B=[[1.0]],
-        C=[[1.0]],
+        box=[[1.0]],
         H=[[1.0], [1.0]],
         u_max=1.0,
         dt=0.1,
@@ -272,7 +272,7 @@ def test_observation_box_holds_estimates_of_every_age_and_is_finite():
     plant = LinearPlant(
         A=np.diag([1.05, 0.01]),
         B=np.ones((2, 1)),
-        C=np.eye(2),
+        box=np.eye(2),
         u_max=1.0,
         dt=0.1,
         gamma=1e-6,
@@ -282,7 +282,7 @@ def test_observation_box_holds_estimates_of_every_age_and_is_finite():
     for seed in range(100):
         observation, info = env.reset(seed=seed)
         np.testing.assert_array_equal(observation, info["estimate"].astype(np.float32))
-    fast = NCSEnv(LinearPlant(A=[[2.0]], B=[[1.0]], C=[[1.0]], u_max=3.0, dt=0.1, gamma=1e-6), Channel())
+    fast = NCSEnv(LinearPlant(A=[[2.0]], B=[[1.0]], box=[[1.0]], u_max=3.0, dt=0.1, gamma=1e-6), Channel())
     assert np.isfinite(fast.observation_space.high).all()
 
 

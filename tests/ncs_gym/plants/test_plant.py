@@ -86,7 +86,7 @@ def test_fingerprint_changes_with_every_number():
 
 
 def good() -> dict:
-    return {"A": np.eye(2) * 0.5, "B": np.ones((2, 1)), "C": np.eye(2), "u_max": 1.0, "dt": 0.1, "gamma": 0.0}
+    return {"A": np.eye(2) * 0.5, "B": np.ones((2, 1)), "box": np.eye(2), "u_max": 1.0, "dt": 0.1, "gamma": 0.0}
 
 
 @pytest.mark.parametrize(
@@ -95,10 +95,16 @@ def good() -> dict:
         ({"A": np.ones((2, 3))}, r"A must have shape \(2, 2\), got \(2, 3\)"),
         ({"A": [[np.nan, 0], [0, 0]]}, "A must be finite"),
         ({"A": "no"}, "A must be a matrix"),
-        ({"C": [[1e150, 0.0], [0.0, 1.0]]}, "C must be finite and below 1e"),
+        ({"box": [[1e150, 0.0], [0.0, 1.0]]}, "box must be finite and below 1e"),
         ({"gamma": "0"}, "gamma"),
         ({"B": np.ones((3, 1))}, "B must have shape"),
-        ({"C": np.ones((1, 3))}, "C must have shape"),
+        ({"box": np.ones((1, 3))}, "box must have shape"),
+        ({"box": [[0.0, 0.0], [1.0, 0.0]]}, "every row of box must limit something"),
+        ({"box": [1.0, -2.0]}, r"box must be positive half-widths of shape \(2,\)"),
+        ({"box": [1.0, 2.0, 3.0]}, r"box must be positive half-widths of shape \(2,\)"),
+        ({"box": [np.inf, np.inf]}, "box must be positive half-widths"),
+        ({"box": [1.0, np.nan]}, "box must be positive half-widths"),
+        ({"box": "wide"}, r"box must be half-widths of shape \(2,\) or rows of shape \(any, 2\)"),
         ({"H": np.ones((1, 3))}, "H must have shape"),
         ({"u_max": -1.0}, "u_max must be a positive number"),
         ({"u_max": [1.0, 2.0]}, "u_max must be a positive number"),

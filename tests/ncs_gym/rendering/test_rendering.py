@@ -107,7 +107,7 @@ def test_plants_of_any_size_are_drawn(n, m):
 
 def test_oblique_limits_are_drawn_as_they_are():
     common = {"A": 0.5 * np.eye(2), "B": np.ones((2, 1)), "u_max": 1.0, "dt": 0.1, "gamma": 1e-4}
-    plant = LinearPlant(C=np.array([[1.0, 1.0], [1.0, -1.0]]), **common)
+    plant = LinearPlant(box=np.array([[1.0, 1.0], [1.0, -1.0]]), **common)
     env = make("ncs_gym/LinearNCS-v0", plant=plant).unwrapped
     env.reset(seed=0)
     frame, plane = env.render(), env._renderer._picture._plane

@@ -142,7 +142,7 @@ def test_units_of_the_state_change_nothing(unit, paper):
     scaled = replace(
         SMALL,
         B=SMALL.B * unit,
-        C=SMALL.C / unit,
+        box=SMALL.C / unit,
         gamma=SMALL.gamma * unit**2,
         process_noise_cov=SMALL.process_noise_cov * unit**2,
         measurement_noise_cov=SMALL.measurement_noise_cov * unit**2,
@@ -156,7 +156,7 @@ def test_units_of_the_state_change_nothing(unit, paper):
 
 def one_state(A, B, u_max, gamma, Q, P0):
     return LinearPlant(
-        A=[[A]], B=[[B]], C=[[1.0]], u_max=u_max, dt=0.1, gamma=gamma, process_noise_cov=[[Q]], initial_cov=[[P0]]
+        A=[[A]], B=[[B]], box=[[1.0]], u_max=u_max, dt=0.1, gamma=gamma, process_noise_cov=[[Q]], initial_cov=[[P0]]
     )
 
 
@@ -185,4 +185,4 @@ def test_constants_at_the_edge_are_rejected_without_an_error(paper, kappa):
 
 def test_unbounded_box_is_infeasible():
     with pytest.raises(Infeasible, match="unbounded"):
-        synthesize(truck_trailer(C=np.array([[0.5, 0.0]])), method="paper")
+        synthesize(truck_trailer(box=np.array([[0.5, 0.0]])), method="paper")

@@ -32,7 +32,7 @@ def test_a_point_is_solved_the_same_whatever_was_solved_before():
 
 def test_log_det_and_eigenvalue_of_a_known_solution():
     # One state without dynamics: L <= 1 by the box, whatever K is, in units in which the box is 2 wide to each side.
-    plant = LinearPlant(A=[[0.0]], B=[[1.0]], C=[[0.5]], u_max=1.0, dt=0.1, gamma=1e-9, process_noise_cov=[[1e-9]])
+    plant = LinearPlant(A=[[0.0]], B=[[1.0]], box=[[0.5]], u_max=1.0, dt=0.1, gamma=1e-9, process_noise_cov=[[1e-9]])
     bounds = PaperModel(plant).at(0.5, 1.5)
     assert ReducedProblem(plant).largest_eigenvalue(bounds) == pytest.approx(4.0, rel=1e-6)
     assert ReducedProblem(plant).largest_log_det(bounds) == pytest.approx(np.log(4.0), abs=1e-6)
@@ -53,7 +53,7 @@ def test_solution_meets_the_printed_constraints():
 
 def test_several_inputs_share_one_auxiliary_matrix():
     plant = LinearPlant(
-        A=[[0.6, 0.2], [-0.1, 0.7]], B=np.eye(2), C=np.eye(2), u_max=[1.0, 2.0], dt=0.1, gamma=1e-6,
+        A=[[0.6, 0.2], [-0.1, 0.7]], B=np.eye(2), box=np.eye(2), u_max=[1.0, 2.0], dt=0.1, gamma=1e-6,
         process_noise_cov=1e-7 * np.eye(2), measurement_noise_cov=1e-6 * np.eye(2), initial_cov=1e-7 * np.eye(2),
     )  # fmt: skip
     bounds = PaperModel(plant).at(0.7, 1.2)

@@ -40,7 +40,7 @@ def worst_disturbance(certificate, plant, x, u):
 @pytest.mark.parametrize("size", [1.0, 1e4, 1e7, 1e10, 1e13])
 def test_passed_means_inside_however_far_out_the_estimate_is(size):
     # Estimates along a direction that A annihilates: products of huge numbers cancel.
-    plant = LinearPlant(A=SINGULAR, B=np.ones((2, 1)), C=np.eye(2), u_max=1.0, dt=0.1, gamma=1e-6)
+    plant = LinearPlant(A=SINGULAR, B=np.ones((2, 1)), box=np.eye(2), u_max=1.0, dt=0.1, gamma=1e-6)
     certificate = certificate_of(plant)
     shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(0)
     *_, axes = np.linalg.svd(SINGULAR)
@@ -70,7 +70,7 @@ def slanted(ratio):
     return LinearPlant(
         A=T @ np.array([[0.6, 0.2], [-0.1, 0.5]]) @ C,
         B=T @ np.array([[1.5], [1.2]]),
-        C=C,
+        box=C,
         u_max=1.0,
         dt=0.1,
         gamma=size,
@@ -174,7 +174,7 @@ def test_gain_may_be_as_large_as_float64_computes_it_accurately(certificate, loa
 @pytest.mark.parametrize("name", ["singular", "slanted"])
 def test_error_lies_in_its_ellipsoid_exactly_when_rounding_is_all_there_is(name, first_error):
     # No noise but a disturbance of the user's that asks for all of E(D), from up to 60 half-widths out.
-    base = LinearPlant(A=SINGULAR, B=np.ones((2, 1)), C=np.eye(2), u_max=1.0, dt=0.1, gamma=0.0)
+    base = LinearPlant(A=SINGULAR, B=np.ones((2, 1)), box=np.eye(2), u_max=1.0, dt=0.1, gamma=0.0)
     plant = replace(base if name == "singular" else slanted(30.0), gamma=0.0, measurement_noise_cov=None)
     plant = replace(plant, initial_cov=first_error**2 * np.eye(2))
     sign = [1.0]

@@ -63,7 +63,7 @@ def test_closed_loop_stays_inside_for_the_worst_state_error_and_disturbance():
 
 def test_box_with_more_rows_than_states_is_respected():
     angle = np.linspace(0.0, np.pi, 7)[:-1]
-    plant = truck_trailer(C=np.stack([np.cos(angle), np.sin(angle)], axis=1) / 2.0)
+    plant = truck_trailer(box=np.stack([np.cos(angle), np.sin(angle)], axis=1) / 2.0)
     certificate = synthesize(plant)
     assert verify(certificate, plant).valid
     assert max(row @ certificate.L @ row for row in plant.C) <= 1.0
@@ -77,7 +77,7 @@ def test_units_do_not_change_what_is_found():
     plant = LinearPlant(
         A=units @ base.A @ inverse,
         B=units @ base.B,
-        C=base.C @ inverse,
+        box=base.C @ inverse,
         u_max=4.0,
         dt=0.5,
         gamma=0.0,
@@ -102,7 +102,7 @@ def test_too_large_disturbance_is_infeasible_and_says_by_how_much():
 
 
 def test_unstable_plant_is_infeasible_for_want_of_an_error_bound():
-    plant = LinearPlant(A=[[1.1]], B=[[1.0]], C=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-4)
+    plant = LinearPlant(A=[[1.1]], B=[[1.0]], box=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-4)
     with pytest.raises(Infeasible, match="spectral radius") as caught:
         synthesize(plant)
     assert caught.value.binding == "E1"
@@ -111,14 +111,14 @@ def test_unstable_plant_is_infeasible_for_want_of_an_error_bound():
 
 def test_unbounded_box_is_infeasible():
     with pytest.raises(Infeasible, match="unbounded") as caught:
-        synthesize(truck_trailer(C=np.array([[0.5, 0.0]])))
+        synthesize(truck_trailer(box=np.array([[0.5, 0.0]])))
     assert caught.value.binding == "S"
 
 
 def test_weak_input_is_what_binds():
     # An unstable plant that a strong input can hold in the box, and a weak one cannot.
     def with_limit(u_max):
-        return LinearPlant(A=[[1.1]], B=[[1.0]], C=[[1.0]], u_max=u_max, dt=0.1, gamma=4e-4)
+        return LinearPlant(A=[[1.1]], B=[[1.0]], box=[[1.0]], u_max=u_max, dt=0.1, gamma=4e-4)
 
     contract = ChannelContract(1)
     certificate = synthesize(with_limit(1.0), contract=contract)
@@ -180,7 +180,7 @@ def test_solver_that_fails_gives_no_certificate_and_no_shield(monkeypatch, answe
     with pytest.raises(Infeasible):
         SafetyShield(gym.make("ncs_gym/LinearNCS-v0", plant=plant))
     with pytest.raises(Infeasible, match="largest ellipsoid"):
-        synthesize(truck_trailer(C=np.array([[0.5, 0.0], [0.0, 0.5], [0.4, 0.4]])))
+        synthesize(truck_trailer(box=np.array([[0.5, 0.0], [0.0, 0.5], [0.4, 0.4]])))
 
 
 def test_solver_whose_answers_are_a_little_wrong_gives_no_false_certificate(monkeypatch):

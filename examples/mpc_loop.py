@@ -1,0 +1,55 @@
+"""Runs a model predictive controller in a loop without Gymnasium, alone and behind a SafeLoop, under packet loss."""
+
+import cvxpy as cp
+import numpy as np
+
+from ncs_gym import Channel, Packet, truck_trailer
+from shields import SafeLoop, synthesize
+
+plant, channel = truck_trailer(mass=4000.0), Channel(quantization_step=0.05, delay=1)
+certificate = synthesize(plant)
+
+# The controller: ten steps ahead on the model without disturbances, limits softened so that a solution always exists.
+HORIZON = 10
+x = cp.Variable((plant.n, HORIZON + 1))
+u = cp.Variable((plant.m, HORIZON))
+slack = cp.Variable(HORIZON, nonneg=True)
+start, target = cp.Parameter(plant.n), cp.Parameter()
+constraints = [x[:, 0] == start, x[:, 1:] == plant.A @ x[:, :-1] + plant.B @ u, cp.abs(u) <= plant.u_max[0]]
+constraints += [cp.abs(plant.C[i] @ x[:, 1:]) <= 1.0 + slack for i in range(len(plant.C))]
+cost = cp.sum_squares(x[0, 1:] - target) + 1e-3 * cp.sum_squares(u) + 100.0 * cp.sum(slack)
+problem = cp.Problem(cp.Minimize(cost), constraints)
+
+
+def controller(estimate: np.ndarray, step: int) -> np.ndarray | None:
+    """Pulls the coupling from one limit to the other; None where the solver fails, which is for the loop to handle."""
+    start.value, target.value = estimate, 2.0 if step % 40 < 20 else -2.0
+    try:
+        problem.solve(solver=cp.CLARABEL)
+    except cp.SolverError:
+        return None
+    return None if u.value is None else u.value[:, 0]
+
+
+def run(mode: str, steps: int = 300) -> None:
+    """Simulates the plant, which takes the place of the real one, and its network, which loses 40 % of the samples."""
+    rng, state = np.random.default_rng(0), np.zeros(plant.n)
+    loop = SafeLoop(certificate, plant, channel, mode)
+    loop.start(state + plant.initial_noise.sample(rng))
+    in_flight, overridden, violations, proved = [], 0, 0, 0
+    for step in range(steps):
+        estimate = loop.receive(in_flight)  # What was sent one step ago arrives now, because the delay is one step.
+        decision = loop.decide(controller(estimate, step))
+        overridden, proved = overridden + decision.intervened, proved + loop.guaranteed
+        in_flight = []
+        if rng.random() > 0.4:
+            y = plant.H @ state + plant.sensor_noise.sample(rng)
+            in_flight = [Packet(loop.steps, channel.quantize(y))]
+        disturbance = plant.nominal_disturbance.sample_boundary(rng)
+        state = plant.A @ state + plant.B @ decision.input + disturbance
+        violations += bool((plant.constraint_values(state) > 0.0).any())
+    print(f"{mode:8s} overridden or counted: {overridden}, outside the box: {violations}, proved: {proved} of {steps}")
+
+
+run("monitor")  # applies what the controller proposes and says what it would have done
+run("project")

@@ -1,0 +1,227 @@
+"""The hard bounds on everything uncertain about a plant, derived from what is declared of it."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from ncs_gym.uncertainty.declared_bound import as_bound
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid, outer_sum
+from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_KEPT, TruncatedGaussian, chi2_quantile
+from ncs_gym.validation import ReadOnlyArrays, as_covariance, as_number, read_only
+
+# Relative growth of every hard bound, so that rounding in sampling and quantizing stays inside (theory.md section 1).
+INFLATION = 1.0 + 1e-9
+# The same for directions in which a bound is flat: growth of its diagonal alone.
+FLAT_INFLATION = 1e-12
+# No disturbance set is thinner than this, in squared half-widths of the safe box.
+THINNEST = 1e-19
+# Smaller truncation levels have no finite quantile in float64.
+SMALLEST_DELTA = 1e-12
+# Simulating a step in float64 rounds; the disturbance bound has room for that up to this many half-widths out.
+SIMULATED_REACH = 100.0
+
+
+class HardBounds(ReadOnlyArrays):
+    """Mixin of `LinearPlant`: the sets that hold disturbance, sensor noise and first error.
+
+    What is declared adds up: gamma, the covariances truncated at 1 - delta, and the bounds in plain terms.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    H: np.ndarray
+    u_max: np.ndarray
+    gamma: float
+    delta: float
+    process_noise_cov: np.ndarray
+    measurement_noise_cov: np.ndarray
+    initial_cov: np.ndarray
+    disturbance_bound: Ellipsoid | None
+    sensor_bound: Ellipsoid | None
+    initial_bound: Ellipsoid | None
+
+    def _check_declared(self) -> tuple[bool, bool, bool]:
+        """Checks what is declared of disturbances, sensor noise and first estimate; returns for which anything is."""
+        object.__setattr__(self, "gamma", as_number(self.gamma, "gamma", low=0.0))
+        object.__setattr__(self, "delta", as_number(self.delta, "delta", low=SMALLEST_DELTA, high=1.0 - SMALLEST_KEPT))
+        declared = (
+            ("process_noise_cov", "disturbance_bound", self.n),
+            ("measurement_noise_cov", "sensor_bound", self.p),
+            ("initial_cov", "initial_bound", self.n),
+        )
+        is_given = [any(getattr(self, name) is not None for name in names) for *names, _ in declared]
+        for covariance, bound, size in declared:
+            value = getattr(self, covariance)
+            object.__setattr__(
+                self, covariance, np.zeros((size, size)) if value is None else as_covariance(value, size, covariance)
+            )
+            if (value := getattr(self, bound)) is not None:
+                object.__setattr__(self, bound, as_bound(value, size, bound))
+        return is_given[0] or self.gamma > 0.0, is_given[1], is_given[2]
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return self.A.shape[0]
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return self.B.shape[1]
+
+    @property
+    def p(self) -> int:
+        """Number of outputs."""
+        return self.H.shape[0]
+
+    @cached_property
+    def weight(self) -> np.ndarray:
+        """Positive definite W, shape (n, n), that measures ellipsoids in units of the safe box: C'C, regularized."""
+        gram = self.C.T @ self.C
+        return read_only(gram + 1e-6 * np.diag(np.diag(gram) + np.trace(gram) / self.n * (np.diag(gram) == 0.0)))
+
+    @cached_property
+    def relative_weight(self) -> np.ndarray:
+        """W in units of its largest entry, shape (n, n): the identity exactly if the box is a cube."""
+        return read_only(self.weight / self.weight.max())
+
+    @cached_property
+    def half_widths(self) -> np.ndarray:
+        """Half-widths of the ellipsoid {x : x'Wx <= 1} around the safe box' center, shape (n,)."""
+        return read_only(np.sqrt(np.diag(np.linalg.inv(self.weight))))
+
+    @cached_property
+    def process_noise(self) -> TruncatedGaussian:
+        """w ~ N(0, Q) truncated at chi2_{n,1-delta}."""
+        return TruncatedGaussian(self.process_noise_cov, chi2_quantile(1.0 - self.delta, self.n))
+
+    @cached_property
+    def sensor_noise(self) -> TruncatedGaussian:
+        """v ~ N(0, R) truncated at chi2_{p,1-delta}; what lies in `sensor_bound` is added to it."""
+        return TruncatedGaussian(self.measurement_noise_cov, chi2_quantile(1.0 - self.delta, self.p))
+
+    @cached_property
+    def initial_noise(self) -> TruncatedGaussian:
+        """e_0 ~ N(0, P0) truncated at chi2_{n,1-delta}; what lies in `initial_bound` is added to it."""
+        return TruncatedGaussian(self.initial_cov, chi2_quantile(1.0 - self.delta, self.n))
+
+    @cached_property
+    def disturbance(self) -> Ellipsoid:
+        """D, shape (n, n): holds every declared disturbance, the truncated process noise and a simulation's rounding.
+
+        It is larger than `allowed_disturbance` by what holds that plus E(F), F = n diag(r^2), with r the rounding of
+        A x + B u + d for x up to SIMULATED_REACH half-widths out: (1+s/4) allowed + (1+4/s) F, s the inflation.
+        """
+        return Ellipsoid(_inflated(self.nominal_disturbance.shape) + self._rounding_room)
+
+    @cached_property
+    def allowed_disturbance(self) -> Ellipsoid:
+        """What a disturbance may use of D: the rest is for the rounding of a simulation, shape (n, n)."""
+        inflated = 0.5 * (self.nominal_disturbance.shape + _inflated(self.nominal_disturbance.shape))
+        return Ellipsoid(inflated + 0.5 * self._rounding_room)
+
+    @cached_property
+    def _rounding_room(self) -> np.ndarray:
+        """What D gains for rounding, shape (n, n)."""
+        reach = SIMULATED_REACH * self.half_widths
+        rounding = np.abs(self.A) @ reach + np.abs(self.B) @ self.u_max + reach
+        rounding *= (self.n + self.m + 2) * np.finfo(float).eps
+        box = np.linalg.inv(self.weight)
+        return THINNEST * 0.5 * (box + box.T) + 10.0 * self.n / (INFLATION - 1.0) * np.diag(rounding**2)
+
+    @cached_property
+    def nominal_disturbance(self) -> Ellipsoid:
+        """D before inflation: where extremal disturbances are drawn, so that their rounding stays inside E(D)."""
+        ball = Ellipsoid(self.gamma * np.eye(self.n))
+        noisy = _sum_or_other(ball, self.process_noise.bound, self.relative_weight)
+        return _with_declared(noisy, self.disturbance_bound, self.relative_weight)
+
+    @cached_property
+    def nominal_sensor_error(self) -> Ellipsoid:
+        """Holds the sensor noise v before inflation, shape (p, p): the truncated noise plus `sensor_bound`."""
+        return _with_declared(self.sensor_noise.bound, self.sensor_bound, np.eye(self.p))
+
+    @cached_property
+    def sensor_error(self) -> Ellipsoid:
+        """Holds the sensor noise v, shape (p, p), without the channel's quantizer (see `sensor_error_with`)."""
+        return Ellipsoid(_inflated(self.nominal_sensor_error.shape))
+
+    def sensor_error_with(self, quantization_step: float) -> Ellipsoid:
+        """Returns N, shape (p, p): sensor noise plus the ball of squared radius p q^2/4 around a quantizer's box."""
+        ball = Ellipsoid(self.p * quantization_step**2 / 4.0 * np.eye(self.p))
+        return Ellipsoid(_inflated(_sum_or_other(ball, self.nominal_sensor_error, np.eye(self.p)).shape))
+
+    @cached_property
+    def initial_radius_squared(self) -> float:
+        """r0^2 = lambda_max(P0) chi2_{n,1-delta}: the truncated first error is no longer than r0."""
+        return max(float(np.linalg.eigvalsh(self.initial_noise.bound.shape)[-1]), 0.0)
+
+    @cached_property
+    def initial_error(self) -> Ellipsoid:
+        """Holds the error of the first estimate, shape (n, n), with room for rounding.
+
+        The ball of radius r0 in the directions of which P0 is not zero, plus `initial_bound`.
+        """
+        ball = Ellipsoid(self.initial_radius_squared * np.diag((np.diag(self.initial_cov) > 0.0).astype(np.float64)))
+        nominal = _with_declared(ball, self.initial_bound, self.relative_weight)
+        return Ellipsoid(INFLATION * nominal.shape + self.estimate_rounding)
+
+    @cached_property
+    def estimate_rounding(self) -> np.ndarray:
+        """Room for the rounding of x_hat up to SIMULATED_REACH half-widths out, shape (n, n), next to an inflation."""
+        rounding = 4.0 * np.finfo(float).eps * SIMULATED_REACH * self.half_widths
+        return read_only(2.0 * self.n / (INFLATION - 1.0) * np.diag(rounding**2))
+
+    @cached_property
+    def kalman_covariances(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Covariances (Q, R, P0) from which a Kalman filter picks its gains, shapes (n, n), (p, p), (n, n).
+
+        Q + gamma I (Liu et al. Definition 3), where a declared disturbance counts as the ball of gamma does; sensor
+        noise and first errors that are bounded count with the covariance of a uniform draw, P / (dim + 2).
+        """
+        Q = self.process_noise_cov + self.gamma * np.eye(self.n)
+        R, P0 = self.measurement_noise_cov, self.initial_cov
+        if self.disturbance_bound is not None:
+            Q = Q + self.disturbance_bound.shape
+        if self.sensor_bound is not None:
+            R = R + self.sensor_bound.shape / (self.p + 2)
+        if self.initial_bound is not None:
+            P0 = P0 + self.initial_bound.shape / (self.n + 2)
+        return read_only(Q), read_only(R), read_only(P0)
+
+    def sample_sensor_noise(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
+        """Returns v, shape (p,) or (count, p): truncated noise plus a uniform point of `sensor_bound`."""
+        return _plus_uniform(self.sensor_noise.sample(rng, count), self.sensor_bound, rng, count)
+
+    def sample_initial_error(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
+        """Returns x_hat_0 - x_0, shape (n,) or (count, n): truncated noise plus a uniform point of `initial_bound`."""
+        return _plus_uniform(self.initial_noise.sample(rng, count), self.initial_bound, rng, count)
+
+
+def _plus_uniform(
+    samples: np.ndarray, bound: Ellipsoid | None, rng: np.random.Generator, count: int | None
+) -> np.ndarray:
+    """Returns samples, shape (n,) or (count, n), plus uniform points of a bound; none are drawn of a point."""
+    return samples if bound is None or not np.any(bound.shape) else samples + bound.sample(rng, count)
+
+
+def _inflated(shape: np.ndarray) -> np.ndarray:
+    """Returns a bound with room for the rounding of sampling it."""
+    return INFLATION * shape + FLAT_INFLATION * np.diag(np.diag(shape))
+
+
+def _with_declared(first: Ellipsoid, declared: Ellipsoid | None, weight: np.ndarray) -> Ellipsoid:
+    """Returns an ellipsoid around the sum of a bound and a declared one, if there is one."""
+    return first if declared is None else _sum_or_other(first, declared, weight)
+
+
+def _sum_or_other(first: Ellipsoid, second: Ellipsoid, weight: np.ndarray) -> Ellipsoid:
+    """Returns an ellipsoid around the sum, of the smallest tr(W P); where one of them is a point, the other alone."""
+    if not np.any(first.shape):
+        return second
+    if not np.any(second.shape):
+        return first
+    return Ellipsoid(outer_sum(first.shape, second.shape, weight))

@@ -1,0 +1,245 @@
+"""The limits of a plant: rows of its safe box, its inputs, and limits around an operating point."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Self, TypeVar
+
+import numpy as np
+
+from ncs_gym.validation import LARGEST_NUMBER, SMALLEST_NUMBER, as_matrix, as_setting, as_vector, shown
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+# The constant of x+ = A x + B u + c may differ by this from what an equilibrium needs, relative to its terms.
+EQUILIBRIUM_PRECISION = 1e-12
+
+Kind = TypeVar("Kind")
+
+
+def refuses_output_matrix(kind: Kind) -> Kind:
+    """Makes a constructor explain what to give in the place of C=, which means two things to two people."""
+    constructor: Any = kind
+    construct: Callable[..., None] = constructor.__init__
+
+    @functools.wraps(construct)
+    def __init__(self: Any, **settings: Any) -> None:
+        if "C" in settings:
+            raise ValueError(
+                "C= is not an argument: pass box=... for the limits |c_j x| <= 1 (rows, or half-widths of the states), "
+                "H=... for the output matrix of a state-space model"
+            )
+        construct(self, **settings)
+
+    constructor.__init__ = __init__
+    return kind
+
+
+class OperatingPoint:
+    """Mixin of `LinearPlant`: the operating point that deviations are counted from."""
+
+    H: np.ndarray
+    operating_state: np.ndarray
+    operating_input: np.ndarray
+
+    if TYPE_CHECKING:
+
+        def __init__(self, **settings: Any) -> None: ...
+
+    @classmethod
+    def around(
+        cls,
+        *,
+        A: ArrayLike,
+        B: ArrayLike,
+        operating_state: ArrayLike,
+        operating_input: ArrayLike,
+        state_limits: tuple[ArrayLike, ArrayLike],
+        input_limits: tuple[ArrayLike, ArrayLike],
+        **settings: Any,
+    ) -> Self:
+        """Returns the plant in deviations from an equilibrium, with the largest symmetric limits inside those given.
+
+        Args:
+            A: State matrix of x+ = A x + B u + c, shape (n, n).
+            B: Input matrix, shape (n, m).
+            operating_state: x0 with A x0 + B u0 + c = x0, shape (n,).
+            operating_input: u0, shape (m,).
+            state_limits: Pair (low, high) around x0, each a number or shape (n,); infinite where there is no limit.
+            input_limits: Pair (low, high) around u0, each a number or shape (m,).
+            settings: Other arguments of `LinearPlant`, in deviations; and `offset`, c, zero by default. Of a model that
+                is linearized at (x0, u0), c is x0 - A x0 - B u0.
+
+        Raises:
+            ValueError: If (x0, u0) is no equilibrium or not strictly between the limits, or an argument is wrong.
+        """
+        point = operating_state, operating_input
+        return cls(**_arguments_around(A, B, point, (state_limits, input_limits), settings))
+
+    def to_deviation(self, value: ArrayLike, of: str = "state") -> np.ndarray:
+        """Returns a physical state, input or output as its deviation from the operating point.
+
+        Args:
+            value: Shape (n,), (m,) or (p,).
+            of: "state", "input" or "output"; the output at the operating point is H x0.
+
+        Raises:
+            ValueError: If `of` is none of these, or the value no finite vector of its size.
+        """
+        center = self._operating_value(of)
+        return as_vector(value, len(center), f"the {of}") - center
+
+    def from_deviation(self, value: ArrayLike, of: str = "state") -> np.ndarray:
+        """Returns the physical state, input or output of a deviation; the inverse of `to_deviation`."""
+        center = self._operating_value(of)
+        return as_vector(value, len(center), f"the {of}") + center
+
+    def _operating_value(self, of: str) -> np.ndarray:
+        values = {"state": self.operating_state, "input": self.operating_input, "output": self.H @ self.operating_state}
+        if not isinstance(of, str) or of not in values:
+            raise ValueError(f"of must be one of {list(values)}, got {shown(of)}")
+        return values[of]
+
+
+def as_box_rows(value: Any, n: int) -> np.ndarray:
+    """Returns the rows c_j of the safe box |c_j x| <= 1, shape (k, n).
+
+    Args:
+        value: Half-widths, a number or shape (n,), where infinity leaves an entry free; or the rows themselves, (k, n).
+        n: Number of states.
+
+    Raises:
+        ValueError: If it is neither, or limits nothing.
+    """
+    numbers = as_setting(value)
+    if numbers is None or numbers.ndim > 2:
+        raise ValueError(f"box must be half-widths of shape ({n},) or rows of shape (any, {n}), got {shown(value)}")
+    if numbers.ndim == 2:
+        rows = as_matrix(numbers, (None, n), "box")
+    else:
+        limited = np.isfinite(numbers)
+        fits = (numbers >= SMALLEST_NUMBER) & (numbers < LARGEST_NUMBER) | (numbers == np.inf)
+        if numbers.shape not in ((), (n,)) or not fits.all() or not limited.any():
+            raise ValueError(
+                f"box must be positive half-widths of shape ({n},), infinite where a state has no limit but not "
+                f"everywhere, or rows of shape (any, {n}), got {shown(value)}"
+            )
+        rows = np.diag(1.0 / np.broadcast_to(numbers, (n,)))[np.broadcast_to(limited, (n,))]
+    if (np.abs(rows).max(axis=1) < SMALLEST_NUMBER).any():
+        raise ValueError(f"every row of box must limit something, got {shown(rows.tolist())}")
+    return rows
+
+
+def as_input_limits(value: Any, size: int) -> np.ndarray:
+    """Returns input limits as a positive finite array of shape (size,).
+
+    Raises:
+        ValueError: If it is anything else.
+    """
+    limits = as_setting(value)
+    if (
+        limits is None
+        or limits.shape not in ((), (size,))
+        or not ((limits >= SMALLEST_NUMBER) & (limits < LARGEST_NUMBER)).all()
+    ):
+        raise ValueError(f"u_max must be a positive number or shape ({size},), got {shown(value)}")
+    return np.broadcast_to(limits, (size,)).copy()
+
+
+def as_operating_point(value: Any, size: int, name: str) -> np.ndarray:
+    """Returns the state or the input that deviations are counted from, shape (size,); None stands for zero.
+
+    Raises:
+        ValueError: If it is no finite vector of this size.
+    """
+    return np.zeros(size) if value is None else as_vector(value, size, name)
+
+
+def _symmetric_limits(limits: Any, center: np.ndarray, name: str) -> np.ndarray:
+    """Returns the half-widths of the largest box around a point within limits, shape (size,); infinite where free.
+
+    Args:
+        limits: Pair (low, high), each a number or shape (size,), possibly infinite.
+        center: Shape (size,).
+        name: What the error message calls the limits.
+
+    Raises:
+        ValueError: If they are no such pair, or the center does not lie between them.
+    """
+    sides = [as_setting(side) for side in limits] if isinstance(limits, (tuple, list)) and len(limits) == 2 else []
+    for side in sides:
+        if side is None or side.shape not in ((), center.shape) or np.isnan(side).any():
+            sides = []
+    if not sides:
+        raise ValueError(
+            f"{name} must be a pair (low, high), each a number or shape {center.shape}, got {shown(limits)}"
+        )
+    low, high = (np.broadcast_to(np.asarray(side), center.shape) for side in sides)
+    if not ((low < center) & (center < high)).all():
+        raise ValueError(
+            f"{name} must have the operating point {shown(center.tolist())} strictly between them, got {shown(limits)}"
+        )
+    return np.minimum(high - center, center - low)
+
+
+def _require_equilibrium(
+    A: np.ndarray, B: np.ndarray, offset: np.ndarray, state: np.ndarray, applied: np.ndarray
+) -> None:
+    """Raises unless A x0 + B u0 + c = x0, but for rounding.
+
+    Args:
+        A: Shape (n, n).
+        B: Shape (n, m).
+        offset: c, shape (n,).
+        state: x0, shape (n,).
+        applied: u0, shape (m,).
+
+    Raises:
+        ValueError: Naming what is missing, and the equilibrium that belongs to u0 where there is a single one.
+    """
+    missing = A @ state + B @ applied + offset - state
+    terms = np.abs(A) @ np.abs(state) + np.abs(B) @ np.abs(applied) + np.abs(offset) + np.abs(state)
+    if (np.abs(missing) <= EQUILIBRIUM_PRECISION * terms).all():
+        return
+    remedy = "give the constant c of x+ = A x + B u + c as offset"
+    rest = np.eye(len(A)) - A
+    if np.linalg.cond(rest) < 1e9:
+        equilibrium = np.linalg.solve(rest, B @ applied + offset).tolist()
+        remedy = f"with this input the equilibrium is {shown(equilibrium)}, or {remedy}"
+    raise ValueError(
+        f"the operating point is no equilibrium: A x0 + B u0 + c - x0 = {shown(missing.tolist())}, not zero; {remedy}"
+    )
+
+
+def _arguments_around(
+    A: Any, B: Any, point: tuple[Any, Any], limits: tuple[Any, Any], settings: dict[str, Any]
+) -> dict[str, Any]:
+    """Returns the arguments of `LinearPlant` of `OperatingPoint.around`.
+
+    Raises:
+        ValueError: If the point is no equilibrium between the limits, or an argument does not fit.
+    """
+    twice = sorted({"box", "u_max"} & set(settings))
+    if twice:
+        raise ValueError(f"{' and '.join(twice)} follow from state_limits and input_limits: give these alone")
+    A = as_matrix(A, (None, None), "A")
+    A = as_matrix(A, (len(A), len(A)), "A")
+    B = as_matrix(B, (len(A), None), "B")
+    state = as_vector(point[0], len(A), "operating_state")
+    applied = as_vector(point[1], B.shape[1], "operating_input")
+    rest = {name: value for name, value in settings.items() if name != "offset"}
+    offset = settings.get("offset")
+    offset = np.zeros(len(A)) if offset is None else as_vector(offset, len(A), "offset")
+    _require_equilibrium(A, B, offset, state, applied)
+    box = _symmetric_limits(limits[0], state, "state_limits")
+    u_max = _symmetric_limits(limits[1], applied, "input_limits")
+    return rest | {
+        "A": A,
+        "B": B,
+        "box": box,
+        "u_max": u_max,
+        "operating_state": state,
+        "operating_input": applied,
+    }

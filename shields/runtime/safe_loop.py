@@ -1,0 +1,224 @@
+"""Estimator, safety filter and guarantee in one object, for a control loop without Gymnasium."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from enum import Enum, auto
+from operator import index
+from typing import Any
+
+import numpy as np
+
+from ncs_gym import Channel, Ellipsoid, Estimator, LinearPlant, Packet
+from ncs_gym.estimation.arrival_patterns import arrival_patterns
+from ncs_gym.validation import as_numbers, as_vector, shown
+from shields.certificate import Certificate
+from shields.runtime.filter import Decision, SafetyFilter
+from shields.runtime.guarantee import Report, starts_inside
+from shields.runtime.guarded_filter import GuardedFilter
+
+NOT_STARTED = "no episode is under way: call start"
+
+
+class _Phase(Enum):
+    """Where in a control step a loop is."""
+
+    STOPPED = auto()
+    STARTED = auto()
+    RECEIVED = auto()
+    DECIDED = auto()
+
+
+class SafeLoop:
+    """Keeps a real plant in its safe set, whatever its controller proposes (docs/deployment.md).
+
+    One control step is `receive`, which moves the estimate to now, your controller, and `decide`, whose input is
+    applied until the next step:
+
+        loop = SafeLoop(certificate, plant, channel)
+        loop.start(x_hat0)
+        while running:
+            x_hat = loop.receive(packets_that_arrived())
+            apply(loop.decide(controller(x_hat)).input)
+            wait_for_the_next_step()
+
+    `step` is both in one call, for proposals that do not need the newest estimate. Steps are counted from 0 at
+    `start`; a packet carries the number of the step at which its sample was taken.
+
+    The guarantee is that of `SafetyShield`, under the same assumptions (docs/shield.md): `guaranteed` says whether the
+    state is proved to be in S at this step, `reason` why not. What the loop cannot see is that the clock misses a step,
+    that the actuator applies something else (unless it is told), or that packets carry wrong stamps. A certificate
+    under a channel contract brings its error sets along. Not for use by several threads at once.
+
+    Args:
+        certificate: Verified exactly here.
+        plant: The plant it was made for.
+        channel: Its longest delay (older packets are discarded) and quantization step count, its losses do not.
+        mode: "project", "switch", "boundary" or "monitor"; see `SafetyFilter`.
+
+    Attributes:
+        filter: Makes the decisions.
+        contract: Channel contract of the certificate; None without one.
+
+    Raises:
+        CertificateError: If the certificate does not verify for the plant.
+        UnstablePlantError: If the plant is not Schur stable and the certificate has no contract.
+        ValueError: If a setting is of the wrong kind, or the channel rounds more coarsely than the contract allows.
+    """
+
+    def __init__(self, certificate: Certificate, plant: LinearPlant, channel: Channel, mode: str = "project") -> None:
+        self.filter = SafetyFilter(certificate, plant, mode)
+        if not isinstance(channel, Channel):
+            raise ValueError(f"channel must be a Channel (its contract is the certificate's), got {shown(channel)}")
+        self.contract = None if certificate.ages is None else certificate.ages.sets.contract
+        self._estimator = Estimator(plant, channel, patterns=arrival_patterns(plant, channel, self.contract))
+        self._guarded = GuardedFilter(self.filter)
+        self._phase = _Phase.STOPPED
+
+    def start(self, x_hat0: Any, initial_set: Ellipsoid | np.ndarray | None = None) -> None:
+        """Starts an episode at step 0; also how one is begun anew after the guarantee was lost.
+
+        Args:
+            x_hat0: First estimate, shape (n,), whose error lies in `plant.initial_error`.
+            initial_set: What the state is known to lie in besides, an ellipsoid or the state itself, shape (n,). It
+                counts where x_hat0 alone does not prove that the state is in S.
+
+        Raises:
+            ValueError: If an argument is not finite or does not fit the plant; nothing has changed then.
+        """
+        n = self.filter.plant.n
+        mean = as_vector(x_hat0, n, "x_hat0")
+        if initial_set is not None and not isinstance(initial_set, Ellipsoid):
+            initial_set = as_vector(initial_set, n, "initial_set")
+        if isinstance(initial_set, Ellipsoid) and initial_set.dim != n:
+            raise ValueError(f"initial_set must have dimension {n}, got {initial_set.dim}")
+        known = initial_set is not None and starts_inside(self.filter.certificate, initial_set)
+        self._phase = _Phase.STOPPED
+        self._estimator.reset(mean)
+        self._guarded.begin(self._report(), known)
+        self._phase = _Phase.STARTED
+
+    def receive(self, packets: Iterable[Packet] = (), applied: Any = None) -> np.ndarray:
+        """Returns the estimate at this control step, shape (n,): that of the last one moved on, then corrected.
+
+        At step 0 it is the first estimate: packets from before the first step are of no use.
+
+        Args:
+            packets: What arrived since the last call, in any order; duplicates and late ones are sorted out.
+            applied: What the actuator applied since the last decision, shape (m,), if that may be something else. If it
+                is, the estimate follows it and the guarantee ends; if it is no finite input, the estimate follows the
+                decision.
+
+        Raises:
+            RuntimeError: If `start` was not called, or nothing was decided since the last call.
+            ValueError: If what is given is no packet for this plant; nothing has changed then.
+        """
+        arrived = [_as_packet(each, self.filter.plant.p) for each in packets]
+        phase = self._require_started()
+        if phase is _Phase.RECEIVED:
+            raise RuntimeError("receive was called twice in a step: hand over all packets of a step in one call")
+        if phase is _Phase.DECIDED:
+            self._phase = _Phase.STOPPED  # if something is raised in between, what is known is not consistent
+            decided = np.array(self._guarded.decided)
+            told = decided if applied is None else _as_input(applied, decided.shape)
+            self._estimator.advance(decided if told is None else told, arrived)
+            self._guarded.advance(told, True, self._report())
+        self._phase = _Phase.RECEIVED
+        return self._estimator.mean.copy()
+
+    def decide(self, proposed: Any) -> Decision:
+        """Returns what to apply from now until the next step, and why.
+
+        Args:
+            proposed: Your controller's input, shape (m,) or a number if m = 1 [physical units]; clipped to the limits.
+                What is no finite input (None, say, if the controller failed) is replaced by u = K x_hat.
+
+        Raises:
+            RuntimeError: If `start` was not called, or this step was decided already.
+        """
+        if self._require_started() is _Phase.DECIDED:
+            raise RuntimeError("decide was called twice in a step: call receive in between, with the packets that came")
+        decision = self._guarded.decide(self._clipped(proposed))
+        self._phase = _Phase.DECIDED
+        return decision
+
+    def step(self, proposed: Any, packets: Iterable[Packet] = (), applied: Any = None) -> Decision:
+        """Returns the decision at this control step: `receive`, then `decide`."""
+        self.receive(packets, applied)
+        return self.decide(proposed)
+
+    @property
+    def guaranteed(self) -> bool:
+        """Whether the state is proved to be in S at this control step."""
+        return not self.reason
+
+    @property
+    def reason(self) -> str:
+        """Why it is not; empty while it is."""
+        return NOT_STARTED if self._phase is _Phase.STOPPED else self._guarded.reason
+
+    @property
+    def estimate(self) -> np.ndarray:
+        """x_hat at this control step, shape (n,)."""
+        return self._estimator.mean.copy()
+
+    @property
+    def error_shape(self) -> np.ndarray:
+        """Sigma_k, shape (n, n): x_hat - x lies in E(Sigma_k)."""
+        return self._estimator.shape.copy()
+
+    @property
+    def steps(self) -> int:
+        """Number of this control step, which a sample taken now is stamped with."""
+        return self._estimator.step
+
+    @property
+    def measurement_age(self) -> int:
+        """Steps since the newest sample used was taken; the first estimate counts as one of step 0."""
+        return self._estimator.age
+
+    def _require_started(self) -> _Phase:
+        if self._phase is _Phase.STOPPED:
+            raise RuntimeError("call start: there was none, or an earlier step failed half-way")
+        return self._phase
+
+    def _report(self) -> Report:
+        """Returns what the estimator says now."""
+        estimator = self._estimator
+        return self._guarded.reported(estimator.mean, estimator.shape, estimator.alarm)
+
+    def _clipped(self, proposed: Any) -> np.ndarray:
+        """Returns the proposal within the limits, shape (m,); as it is, or empty, where it is no finite input."""
+        plant, numbers = self.filter.plant, as_numbers(proposed)
+        if numbers is None:
+            return np.empty(0)
+        numbers = numbers.reshape(1) if numbers.ndim == 0 else numbers
+        if numbers.shape != (plant.m,) or not np.isfinite(numbers).all():
+            return numbers
+        return np.minimum(np.maximum(numbers, -plant.u_max), plant.u_max)
+
+
+def _as_packet(value: Any, size: int) -> Packet:
+    """Returns a packet with a measurement of its own, shape (size,).
+
+    Raises:
+        ValueError: If the stamp is no whole number, or the measurement is not numbers of that shape.
+    """
+    try:
+        stamp, measurement = value
+        stamp, numbers = index(stamp), as_numbers(measurement)
+    except (TypeError, ValueError):
+        numbers = None
+    if numbers is None or numbers.shape != (size,):
+        raise ValueError(
+            f"a packet is Packet(stamp, measurement) with a whole number and shape ({size},), got {shown(value)}"
+        )
+    return Packet(stamp, np.array(numbers))
+
+
+def _as_input(applied: Any, shape: tuple[int, ...]) -> np.ndarray | None:
+    """Returns the input reported by the actuator, shape (m,); None if it is none."""
+    numbers = as_numbers(applied)
+    if numbers is not None and numbers.ndim == 0:
+        numbers = numbers.reshape(1)
+    return numbers if numbers is not None and numbers.shape == shape and np.isfinite(numbers).all() else None

@@ -1,0 +1,92 @@
+"""Bounds in plain terms: what a number, half-widths, an ellipsoid or (E, w) stand for."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from ncs_gym import Ellipsoid
+from ncs_gym.uncertainty.declared_bound import as_bound, diagonal_inside, sample_box
+
+
+def test_number_is_the_radius_of_a_ball():
+    np.testing.assert_array_equal(as_bound(0.5, 3, "d").shape, 0.25 * np.eye(3))
+
+
+def test_half_widths_give_the_smallest_ellipsoid_around_their_box():
+    widths = np.array([0.1, 2.0, 30.0])
+    bound = as_bound(widths, 3, "d")
+    corners = [widths * signs for signs in itertools.product([-1.0, 1.0], repeat=3)]
+    np.testing.assert_allclose(bound.gauge(corners), 1.0, rtol=1e-12)
+
+
+def test_state_without_disturbance_costs_the_others_nothing():
+    np.testing.assert_allclose(as_bound([0.1, 0.0, 0.3], 3, "d").shape, 2.0 * np.diag([0.01, 0.0, 0.09]))
+
+
+@pytest.mark.parametrize(("w", "widths"), [(0.2, [0.2, 0.2]), ([0.2, 0.5], [0.2, 0.5])])
+def test_directions_and_sizes_give_an_ellipsoid_around_every_combination(w, widths):
+    E = np.array([[1.0, 2.0], [0.0, 1.0], [3.0, 0.0]])
+    bound = as_bound((E, w), 3, "d")
+    combinations = [E @ (np.array(widths) * signs) for signs in itertools.product([-1.0, 1.0], repeat=2)]
+    np.testing.assert_allclose(bound.gauge(combinations), 1.0, rtol=1e-9)
+    assert bound.gauge([0.0, 1.0, 0.0]) == np.inf  # off the plane that E spans
+
+
+def test_ellipsoid_is_taken_as_it_is():
+    own = Ellipsoid([[2.0, 0.3], [0.3, 1.0]])
+    assert as_bound(own, 2, "d") is own
+
+
+@pytest.mark.parametrize("zero", [0.0, [0.0, 0.0], ([[1.0], [1.0]], 0.0), Ellipsoid(np.zeros((2, 2)))])
+def test_zero_is_a_bound(zero):
+    np.testing.assert_array_equal(as_bound(zero, 2, "d").shape, np.zeros((2, 2)))
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (-1.0, r"d must be a number or shape \(2,\), each 0 or between"),
+        (np.nan, "d must be a number or shape"),
+        (np.inf, "d must be a number or shape"),
+        (1e-200, "each 0 or between 1e-37 and 1e"),
+        (1e60, "each 0 or between 1e-37 and 1e"),
+        ([0.1, 0.2, 0.3], r"d must be a number or shape \(2,\)"),
+        ([0.1, -0.2], "d must be a number or shape"),
+        (np.eye(2), r"d must be a number, half-widths of shape \(2,\), an Ellipsoid\(shape\), or a pair"),
+        ("small", "d must be a number, half-widths"),
+        (True, "d must be a number, half-widths"),
+        (Ellipsoid(np.eye(3)), "d must be an ellipsoid of dimension 2, got one of dimension 3"),
+        ((np.ones((3, 1)), 1.0), r"d: E of d = E w must have shape \(2, any\)"),
+        ((np.ones((2, 1)), [1.0, 2.0]), r"d: w of d = E w must be a number or shape \(1,\)"),
+        ((np.ones((2, 1)), -1.0), "d: w of d = E w must be"),
+    ],
+)
+def test_what_is_no_bound_is_refused_in_one_sentence(value, words):
+    with pytest.raises(ValueError, match=words) as caught:
+        as_bound(value, 2, "d")
+    assert "\n" not in str(caught.value)
+
+
+def test_box_of_half_widths_is_drawn_from_to_its_edges_and_no_further():
+    widths = np.array([0.1, 0.0, 30.0])
+    samples = np.abs(sample_box(as_bound(widths, 3, "d"), np.random.default_rng(0), 2000))
+    largest = samples.max(axis=1)
+    assert (largest <= widths * (1 + 1e-12)).all()
+    assert (largest >= 0.99 * widths).all()
+
+
+def test_box_along_principal_axes_stays_inside_and_reaches_the_boundary():
+    bound = Ellipsoid([[2.0, 0.9], [0.9, 1.0]])
+    gauges = bound.gauge(sample_box(bound, np.random.default_rng(0), 5000).T)
+    assert 0.95 < gauges.max() <= 1.0 + 1e-12
+
+
+@pytest.mark.parametrize(
+    "shape", [np.diag([4.0, 0.0, 1.0]), [[2.0, 0.9, 0], [0.9, 1.0, 0], [0, 0, 3.0]], np.ones((3, 3))]
+)
+def test_diagonal_shape_lies_inside(shape):
+    bound = Ellipsoid(shape)
+    inside = diagonal_inside(bound)
+    assert np.array_equal(inside, np.diag(np.diag(inside)))
+    assert np.linalg.eigvalsh(bound.shape - inside)[0] >= -1e-12

@@ -1,0 +1,225 @@
+"""Bounds of a plant: what is declared in plain terms adds to gamma and to the truncated covariances."""
+
+import copy
+import pickle
+import warnings
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import ncs_gym
+from ncs_gym import BoxDisturbance, Ellipsoid, Estimator, LinearPlant, NoNoiseWarning, truck_trailer
+from ncs_gym.uncertainty.disturbance_settings import BY_NAME, as_disturbance
+
+BOUNDS = {"disturbance_bound": 0.01, "sensor_bound": 0.02, "initial_bound": 0.03}
+SETS = {"disturbance_bound": "disturbance", "sensor_bound": "sensor_error", "initial_bound": "initial_error"}
+KINDS = {
+    "number": 0.05,
+    "half-widths": [0.05, 0.002],
+    "ellipsoid": Ellipsoid([[4e-3, 1e-3], [1e-3, 2e-3]]),
+    "directions": ([[0.1], [0.5]], 0.2),
+}
+
+
+def plain(**changes):
+    settings = {"A": 0.5 * np.eye(2), "B": np.ones((2, 1)), "box": [1.0, 2.0], "u_max": 1.0, "dt": 0.1} | BOUNDS
+    return LinearPlant(**(settings | changes))
+
+
+@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_declared_bound_alone_is_the_set_but_for_rounding(name, kind):
+    declared = plain(**{name: KINDS[kind]})
+    shape = getattr(declared, SETS[name]).shape
+    np.testing.assert_allclose(shape, getattr(declared, name).shape, rtol=1e-8, atol=1e-12)
+    assert np.linalg.eigvalsh(shape - getattr(declared, name).shape)[0] > -1e-20
+
+
+@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_declared_bound_adds_to_what_covariances_and_gamma_bound(name, kind):
+    base = truck_trailer()
+    plant = replace(base, **{name: KINDS[kind]})
+    for direction in np.random.default_rng(0).standard_normal((200, 2)):
+        need = getattr(base, SETS[name]).support(direction) + getattr(plant, name).support(direction)
+        assert getattr(plant, SETS[name]).support(direction) >= need * (1 - 1e-8)
+
+
+def test_sensor_error_with_a_quantizer_holds_the_declared_noise_too():
+    plant = replace(truck_trailer(), sensor_bound=[0.1, 0.001])
+    for direction in np.random.default_rng(0).standard_normal((200, 2)):
+        parts = [0.05 / np.sqrt(2.0) * np.linalg.norm(direction)]
+        parts += [plant.sensor_noise.bound.support(direction), plant.sensor_bound.support(direction)]
+        assert plant.sensor_error_with(0.05).support(direction) >= sum(parts)
+
+
+def test_zero_bounds_change_neither_sets_nor_fingerprint():
+    base = truck_trailer()
+    same = replace(base, **dict.fromkeys(BOUNDS, 0.0))
+    assert same.fingerprint == base.fingerprint
+    for name in SETS.values():
+        np.testing.assert_array_equal(getattr(same, name).shape, getattr(base, name).shape)
+
+
+# Computed before bounds in plain terms and half-widths existed: certificates saved then still belong to these plants.
+REGISTERED = {
+    "29a79af5f1181432d4aca2f00608251d0cfb5c931d2b1a52891c5b2d9711428f": truck_trailer,
+    "8cda9ead9750b9177572854dc51856bf866c023a0b01c027ee5eb2f738d8e58e": lambda: truck_trailer(4000.0),
+    "f2b8bd930f5e99a5a9d28b4772529b90353f9aa7f25ff42faccba8ea4d57c035": ncs_gym.cart_pole,
+    "5018bfaf7f890619cef0f066443a308c7c06b6a919636a9eb9683fac9ddb82b8": ncs_gym.batch_reactor,
+}
+
+
+@pytest.mark.parametrize("fingerprint", REGISTERED)
+def test_registered_plants_keep_their_fingerprints(fingerprint):
+    assert REGISTERED[fingerprint]().fingerprint == fingerprint
+
+
+def test_every_bound_changes_the_fingerprint():
+    plants = [plain(), *(plain(**{name: 0.04}) for name in BOUNDS)]
+    assert len({plant.fingerprint for plant in plants}) == 4
+
+
+def test_bounds_survive_replace_copies_and_pickles():
+    plant = plain(disturbance_bound=([[1.0], [0.5]], 0.1))
+    twins = [replace(plant), copy.deepcopy(plant), pickle.loads(pickle.dumps(plant)), replace(plant, A=plant.A)]
+    assert {twin.fingerprint for twin in twins} == {plant.fingerprint}
+    assert not pickle.loads(pickle.dumps(plant)).disturbance_bound.shape.flags.writeable
+    assert replace(plant, A=0.6 * np.eye(2)).fingerprint != plant.fingerprint
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_wrong_bounds_are_refused_by_name(name):
+    with pytest.raises(ValueError, match=f"{name} must be a number"):
+        plain(**{name: [0.1, 0.2, 0.3]})
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("gamma", [0.0, 1e-3])
+def test_every_disturbance_uses_the_declared_bound_and_stays_inside(name, kind, gamma):
+    plant = plain(gamma=gamma, disturbance_bound=KINDS[kind])
+    source, rng = as_disturbance(name, plant, False), np.random.default_rng(0)
+    memory = source.begin(rng, plant, 50)
+    d = np.stack([source.draw(rng, plant, rng.standard_normal((2, 50)), k, memory) for k in range(40)])
+    d = d.swapaxes(1, 2).reshape(-1, 2)
+    assert plant.allowed_disturbance.gauge(d).max() <= 1.0
+    first = as_disturbance(name, plant, False).draw(rng, plant, np.ones(2), 3, source.begin(rng, plant))
+    assert first.shape == (2,)
+    axis = plant.disturbance_bound.factor @ np.linalg.svd(plant.disturbance_bound.factor)[2][0]
+    beyond_gamma = np.abs(d @ axis).max() / np.linalg.norm(axis) - np.sqrt(gamma)
+    assert beyond_gamma > 0.4 * np.linalg.norm(axis)
+
+
+def test_unknown_disturbances_stay_in_the_sum_of_ball_and_bound():
+    plant = plain(gamma=1e-3, disturbance_bound=KINDS["ellipsoid"], process_noise_cov=1e-3 * np.eye(2))
+    ball, rng = Ellipsoid(plant.gamma * np.eye(2)), np.random.default_rng(1)
+    for name in ("ball", "box", "sinusoid"):
+        source = as_disturbance(name, plant, False)
+        memory = source.begin(rng, plant)
+        draws = [source.draw(rng, plant, np.zeros(2), k, memory) for k in range(60)]
+        assert all(ball.sum_contains(plant.disturbance_bound, (1 - 1e-9) * d) for d in draws)
+
+
+def test_box_disturbance_of_the_declared_half_widths_is_accepted_and_a_larger_one_refused():
+    plant = plain(disturbance_bound=[0.05, 0.002])
+    assert as_disturbance(BoxDisturbance([0.05, 0.002]), plant, False)
+    with pytest.raises(ValueError, match=r"the box is 1\.02 times as large"):
+        as_disturbance(BoxDisturbance([0.051, 0.00204]), plant, False)
+    with pytest.raises(ValueError, match="squared length"):
+        as_disturbance(BoxDisturbance([0.05, 0.002]), plain(disturbance_bound=0.0), False)
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+def test_loop_keeps_every_error_in_its_set_and_raises_no_alarm(name):
+    bounds = {"disturbance_bound": [0.02, 0.004], "sensor_bound": [0.05, 0.01], "initial_bound": [0.1, 0.01]}
+    plant = truck_trailer(4000.0, gamma=0.0, **bounds)
+    channel = ncs_gym.Channel(loss=0.3, quantization_step=0.02, delay=1)
+    env = gym.make("ncs_gym/LinearNCS-v0", plant=plant, channel=channel, disturbance=name)
+    many = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=50, plant=plant, channel=channel, disturbance=name)
+    rng = np.random.default_rng(0)
+    _, info = env.reset(seed=1)
+    _, infos = many.reset(seed=1)
+    for _ in range(60):
+        assert Ellipsoid(info["error_shape"]).gauge(info["estimation_error"]) <= 1.0
+        inverses = np.linalg.inv(infos["error_shape"])
+        assert np.einsum("ki,kij,kj->k", infos["estimation_error"], inverses, infos["estimation_error"]).max() <= 1.0
+        assert not info["assumption_violated"]
+        assert not infos["assumption_violated"].any()
+        info = env.step(rng.uniform(-1, 1, 1).astype(np.float32))[-1]
+        infos = many.step(rng.uniform(-1, 1, (50, 1)).astype(np.float32))[-1]
+
+
+@pytest.mark.parametrize(
+    ("bound", "sample"), [("sensor_bound", "sample_sensor_noise"), ("initial_bound", "sample_initial_error")]
+)
+def test_noise_is_drawn_from_the_declared_bound_up_to_its_edge(bound, sample):
+    plant = plain(**{bound: [0.2, 0.01]})
+    rng = np.random.default_rng(0)
+    gauges = getattr(plant, bound).gauge(getattr(plant, sample)(rng, 2000))
+    assert 0.99 < gauges.max() <= 1.0 + 1e-12
+    assert getattr(plant, sample)(rng).shape == (2,)
+
+
+def test_first_estimates_of_both_environments_are_off_by_the_declared_error():
+    plant = plain(initial_bound=[0.2, 0.01])
+    many = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=500, plant=plant)
+    errors = many.reset(seed=0)[1]["estimation_error"]
+    env = gym.make("ncs_gym/LinearNCS-v0", plant=plant)
+    singles = np.array([env.reset(seed=seed)[1]["estimation_error"] for seed in range(100)])
+    for each in (errors, singles):
+        assert 0.8 < plant.initial_bound.gauge(each).max() <= 1.0 + 1e-9
+
+
+def test_estimator_picks_useful_gains_from_declared_bounds_alone():
+    """Without a covariance the filter would not believe its sensors at all."""
+    plant = plain(A=0.95 * np.eye(2), disturbance_bound=0.1, sensor_bound=0.01)
+    estimator = Estimator(plant, ncs_gym.Channel())
+    estimator.reset(np.zeros(2))
+    for step in range(1, 6):
+        estimator.advance(np.zeros(1), [ncs_gym.Packet(step, np.array([0.3, -0.2]))])
+    np.testing.assert_allclose(estimator.mean, [0.3, -0.2], atol=0.02)
+
+
+def test_first_error_of_a_partly_known_state_is_bounded_where_it_is_unknown():
+    plant = plain(initial_cov=np.diag([1e-2, 0.0]), initial_bound=None)
+    assert plant.initial_error.shape[0, 0] == pytest.approx(1e-2 * plant.initial_noise.energy, rel=1e-6)
+    assert plant.initial_error.shape[1, 1] < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("given", "missing"),
+    [
+        ({}, ["disturbances", "sensor noise", "the first estimate"]),
+        ({"gamma": 1e-4}, ["sensor noise", "the first estimate"]),
+        ({"process_noise_cov": np.zeros((2, 2)), "sensor_bound": 0.0}, ["the first estimate"]),
+        ({"disturbance_bound": 0.1, "initial_cov": np.zeros((2, 2))}, ["sensor noise"]),
+    ],
+)
+def test_nothing_given_for_an_uncertainty_is_said_in_one_warning(given, missing):
+    with pytest.warns(NoNoiseWarning) as caught:
+        plain(**(dict.fromkeys(BOUNDS) | given))
+    (warning,) = caught
+    text = str(warning.message)
+    assert text.startswith(f"nothing is given for {' and '.join(missing)}: every certificate will assume")
+    assert text.endswith("a bound of 0 says so on purpose")
+    assert warning.filename == __file__  # where the plant is made, not where it is checked
+
+
+@pytest.mark.parametrize("bounds", [dict.fromkeys(BOUNDS, 0.0), BOUNDS])
+def test_zero_on_purpose_and_copies_are_silent(bounds):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        replace(plain(**bounds), u_max=2.0)
+
+
+def test_assumptions_name_what_is_zero_and_what_is_truncated():
+    assert plain().assumptions == ()
+    nothing = " ".join(plain(**dict.fromkeys(BOUNDS, 0.0)).assumptions)
+    for words in ("no disturbance acts", "measure without noise", "the first estimate is exact"):
+        assert f"It is assumed that {words}" in nothing or words in nothing
+    assert "Gaussian" not in nothing
+    (sentence,) = truck_trailer(delta=0.01).assumptions
+    assert "99 % (delta = 0.01) of process_noise_cov, measurement_noise_cov, initial_cov, not the rest" in sentence

@@ -1,0 +1,121 @@
+"""A plant as text: what people read, and files in which every number is exact."""
+
+import json
+import warnings
+
+import numpy as np
+import pytest
+
+from ncs_gym import Ellipsoid, LinearPlant, batch_reactor, cart_pole, truck_trailer
+
+ODD = LinearPlant(
+    A=[[0.1 + 0.2, 1 / 3], [1e-300 + 1e-20, np.pi / 10]],
+    B=[[0.0], [1e-7]],
+    box=[[1 / 3, 0.1], [0.0, 7.0]],
+    u_max=2 / 3,
+    dt=0.1,
+    disturbance_bound=Ellipsoid([[0.1, 0.03], [0.03, 0.7]]),
+    sensor_bound=([[1.0], [1 / 7]], 0.3),
+    initial_bound=0.0,
+    error_gain=[[0.1, 0.2]],
+    operating_state=[20.0, 0.0],
+    operating_input=[1 / 3],
+    state_names=["heat", "flow"],
+    state_units=["K", ""],
+)
+PLANTS = {"truck": truck_trailer(), "pole": cart_pole(full_state=False), "reactor": batch_reactor(), "odd": ODD}
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_file_gives_back_the_same_plant(name, tmp_path):
+    plant = PLANTS[name]
+    plant.save(tmp_path / "plant.json")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        twin = LinearPlant.load(tmp_path / "plant.json")
+    assert twin.fingerprint == plant.fingerprint
+    assert str(twin) == str(plant)
+    assert (twin.state_names, twin.input_units) == (plant.state_names, plant.input_units)
+    for bound in ("disturbance", "sensor_error", "initial_error"):
+        np.testing.assert_array_equal(getattr(twin, bound).shape, getattr(plant, bound).shape)
+
+
+def test_file_written_by_hand_takes_plain_terms(tmp_path):
+    content = {"A": [[0.5]], "B": [[1]], "box": [2], "u_max": 1, "dt": 0.1}
+    content |= {"disturbance_bound": 0.01, "sensor_bound": [0.02], "initial_bound": [[[1.0]], 0.03]}
+    (tmp_path / "plant.json").write_text(json.dumps({"format": "ncs-gym plant 1", "plant": content}))
+    plant = LinearPlant.load(tmp_path / "plant.json")
+    assert [
+        round(b.shape[0, 0] ** 0.5, 12) for b in (plant.disturbance_bound, plant.sensor_bound, plant.initial_bound)
+    ] == [
+        0.01,
+        0.02,
+        0.03,
+    ]
+
+
+def changed(change):
+    def write(path):
+        ODD.save(path)
+        document = json.loads(path.read_text())
+        change(document["plant"])
+        path.write_text(json.dumps(document))
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("write", "words"),
+    [
+        (lambda path: None, "cannot read the plant in .*: No such file"),
+        (lambda path: path.mkdir(), "cannot read the plant in .*: Is a directory"),
+        (lambda path: path.write_text("{"), "it is not valid JSON"),
+        (lambda path: path.write_bytes(b"\xff\xfe"), "it is not valid JSON"),
+        (lambda path: path.write_text("[" * 100_000), "it is not valid JSON"),
+        (lambda path: path.write_text("[]"), "is not a plant of format 'ncs-gym plant 1'"),
+        (lambda path: path.write_text('{"format": "ncs-gym certificate 2"}'), "is not a plant of format"),
+        (lambda path: path.write_text('{"format": "ncs-gym plant 1", "plant": 3}'), "is not a plant of format"),
+        (changed(lambda plant: plant.pop("A")), "it lacks A"),
+        (changed(lambda plant: plant.update(mass=3)), r"\['mass'\] are no arguments of LinearPlant"),
+        (changed(lambda plant: plant.update(C=plant.pop("box"))), "C= is not an argument"),
+        (changed(lambda plant: plant.update(A=[["1", "2"], ["3", "4"]])), "A must be a matrix of numbers"),
+        (changed(lambda plant: plant.update(A=[[np.nan, 0], [0, 1]])), "A must be finite"),
+        (changed(lambda plant: plant.update(delta=2)), "delta must be"),
+        (changed(lambda plant: plant.update(dt=None)), "dt must be a number"),
+        (
+            changed(lambda plant: plant.update(sensor_bound={"radius": 1})),
+            'a bound in the file of a plant must be .*"shape"',
+        ),
+        (changed(lambda plant: plant.update(sensor_bound={"shape": [[-1]]})), "shape must be positive semidefinite"),
+    ],
+)
+def test_wrong_files_are_refused_in_one_sentence(write, words, tmp_path):
+    write(tmp_path / "plant.json")
+    with pytest.raises(ValueError, match=words) as caught:
+        LinearPlant.load(tmp_path / "plant.json")
+    assert "\n" not in str(caught.value)
+
+
+def test_text_shows_limits_bounds_and_sampling_time_with_units():
+    lines = str(cart_pole(dt=0.02)).splitlines()
+    text = "\n".join(" ".join(line.split()) for line in lines)
+    for words in (
+        "4 states, 1 input, 4 outputs, a step every 0.02 s",
+        "not stable (spectral radius 1.09737): a certificate needs a contract of the channel",
+        "|angle| <= 0.2 rad",
+        "|force| <= 10 N",
+        "disturbance position up to 0.00288 m, speed up to 0.0036 m/s",
+        "first error position up to 2e-05 m",
+        "Gaussian noise is truncated: the bounds hold 95 %",
+    ):
+        assert words in text
+    assert "dynamics        stable (spectral radius 0.493817)" in str(truck_trailer())
+
+
+def test_text_shows_slanted_rows_and_the_operating_point():
+    text = str(ODD)
+    assert "|0.3333 (heat -20) +0.1 flow| <= 1" in text
+    assert "|flow| <= 0.1429" in text
+    assert "-0.333333 <= u1 <= 1 (operating point 0.333333)" in text
+    assert "It is assumed that the first estimate is exact." in text
+    assert "nan" not in text

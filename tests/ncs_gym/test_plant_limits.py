@@ -1,0 +1,128 @@
+"""The safe box, and limits around an operating point."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ncs_gym import LinearPlant, cart_pole, truck_trailer
+
+QUIET = {"disturbance_bound": 0.01, "sensor_bound": 0.01, "initial_bound": 0.01}
+MODEL = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.5]], "u_max": 1.0, "dt": 0.1} | QUIET
+ROOM = {"A": [[0.9]], "B": [[0.2]], "operating_state": [20.0], "operating_input": [10.0]} | QUIET | {"dt": 60.0}
+
+
+def test_half_widths_and_rows_say_the_same():
+    widths = LinearPlant(**MODEL, box=[2.0, 0.5])
+    rows = LinearPlant(**MODEL, box=[[0.5, 0.0], [0.0, 2.0]])
+    np.testing.assert_array_equal(widths.C, [[0.5, 0.0], [0.0, 2.0]])
+    assert widths.fingerprint == rows.fingerprint
+    np.testing.assert_allclose(widths.constraint_values(np.array([2.0, -0.25])), [0.0, -0.5])
+
+
+def test_number_limits_every_state_alike_and_infinity_none():
+    np.testing.assert_array_equal(LinearPlant(**MODEL, box=4.0).C, 0.25 * np.eye(2))
+    np.testing.assert_array_equal(LinearPlant(**MODEL, box=[np.inf, 4.0]).C, [[0.0, 0.25]])
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda C: LinearPlant(**MODEL, box=C),
+        lambda C: LinearPlant(**MODEL, box=[1.0, 1.0], box=C),
+        lambda C: truck_trailer(box=C),
+        lambda C: cart_pole(box=np.eye(4)),
+        lambda C: replace(truck_trailer(), box=C),
+        lambda C: LinearPlant.from_statespace((MODEL["A"], MODEL["B"], C, None), box=1.0, u_max=1.0, dt=0.1, C=C),
+    ],
+)
+def test_output_matrix_in_the_place_of_the_box_is_refused_with_both_remedies(make):
+    with pytest.raises(ValueError, match=r"C= is not an argument: pass box=.* \|c_j x\| <= 1 .* H=.* output matrix"):
+        make(np.eye(2))
+
+
+def test_rows_stay_what_they_are_when_a_plant_is_replaced():
+    plant = LinearPlant(**MODEL, box=[2.0, 0.5])
+    np.testing.assert_array_equal(replace(plant, A=0.5 * np.eye(2)).C, plant.C)
+    np.testing.assert_array_equal(plant.box, plant.C)
+
+
+def test_limits_around_an_operating_point_become_the_largest_symmetric_ones():
+    plant = LinearPlant.around(**ROOM, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0), input_names=["heating"])
+    np.testing.assert_allclose(1.0 / plant.C, [[2.0]])
+    np.testing.assert_allclose(plant.u_max, [2.0])
+    np.testing.assert_allclose(plant.to_deviation([21.5]), [1.5])
+    np.testing.assert_allclose(plant.from_deviation([-2.0]), [18.0])
+    np.testing.assert_allclose(plant.from_deviation([2.0], "input"), [12.0])
+    np.testing.assert_allclose(plant.to_deviation([0.0], "input"), [-10.0])
+
+
+def test_output_is_converted_by_the_output_matrix():
+    plant = replace(LinearPlant.around(**ROOM, state_limits=(18, 25), input_limits=(0, 12)), H=[[2.0]])
+    np.testing.assert_allclose(plant.to_deviation([41.0], "output"), [1.0])
+    np.testing.assert_allclose(plant.from_deviation([1.0], "output"), [41.0])
+
+
+def test_deviations_obey_the_equations_of_the_plant():
+    plant = LinearPlant.around(**ROOM, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0))
+    physical = plant.A @ [23.0] + plant.B @ [11.0]
+    moved = plant.A @ plant.to_deviation([23.0]) + plant.B @ plant.to_deviation([11.0], "input")
+    np.testing.assert_allclose(plant.from_deviation(moved), physical)
+
+
+def test_constant_of_the_model_makes_a_point_an_equilibrium():
+    settings = ROOM | {"operating_input": [4.0], "state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
+    plant = LinearPlant.around(**settings, offset=[1.2])
+    np.testing.assert_allclose(plant.u_max, [4.0])
+
+
+def test_operating_point_belongs_to_the_fingerprint_and_zero_is_none():
+    plant = LinearPlant(**MODEL, box=1.0)
+    assert replace(plant, operating_state=[0.0, 0.0]).fingerprint == plant.fingerprint
+    assert replace(plant, operating_state=[1.0, 0.0]).fingerprint != plant.fingerprint
+    assert replace(plant, operating_input=[1.0]).fingerprint != plant.fingerprint
+    np.testing.assert_array_equal(plant.operating_state, np.zeros(2))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"operating_state": [19.0]}, r"no equilibrium: .* not zero; with this input the equilibrium is \[20.0"),
+        ({"A": [[1.0]]}, "no equilibrium: .* give the constant c of x. = A x . B u . c as offset"),
+        ({"offset": [1.0]}, r"the equilibrium is \[30"),
+        ({"state_limits": (20.0, 25.0)}, r"state_limits must have the operating point \[20.0\] strictly between"),
+        ({"state_limits": (21.0, 25.0)}, "state_limits must have the operating point"),
+        ({"input_limits": (0.0, 9.0)}, "input_limits must have the operating point"),
+        ({"state_limits": 25.0}, r"state_limits must be a pair \(low, high\)"),
+        ({"state_limits": ([1.0, 2.0], 30.0)}, "state_limits must be a pair"),
+        ({"state_limits": (np.nan, 30.0)}, "state_limits must be a pair"),
+        ({"state_limits": (-np.inf, np.inf)}, "box must be positive half-widths"),
+        ({"input_limits": (-np.inf, np.inf)}, "u_max must be a positive number"),
+        ({"operating_state": [20.0, 1.0]}, "operating_state must have shape"),
+        ({"operating_input": "10"}, "operating_input must be a vector"),
+        ({"box": [1.0]}, "box follow from state_limits and input_limits"),
+        ({"offset": [1.0, 2.0]}, "offset must have shape"),
+    ],
+)
+def test_wrong_operating_points_are_refused_in_one_sentence(change, words):
+    settings = ROOM | {"state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)} | change
+    with pytest.raises(ValueError, match=words) as caught:
+        LinearPlant.around(**settings)
+    assert "\n" not in str(caught.value)
+
+
+def test_one_sided_limits_leave_the_other_side_free():
+    settings = {"state_limits": ([0.0, -np.inf], [np.inf, 3.0]), "input_limits": (-1.0, 1.0)}
+    point = {"operating_state": [1.0, 1.0], "operating_input": [0.4]}
+    plant = LinearPlant.around(A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.5]], dt=0.1, **point, **settings, **QUIET)
+    np.testing.assert_allclose(plant.C, [[1.0, 0.0], [0.0, 0.5]])
+    np.testing.assert_allclose(plant.u_max, [0.6])
+
+
+@pytest.mark.parametrize("convert", ["to_deviation", "from_deviation"])
+def test_wrong_values_are_not_converted(convert):
+    plant = LinearPlant(**MODEL, box=1.0)
+    with pytest.raises(ValueError, match="the state must have shape"):
+        getattr(plant, convert)([1.0])
+    with pytest.raises(ValueError, match="of must be one of"):
+        getattr(plant, convert)([1.0, 1.0], "speed")

@@ -1,0 +1,150 @@
+"""Plants of state-space models from python-control, scipy.signal and plain matrices, and delayed inputs."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import signal
+from scipy.integrate import solve_ivp
+
+from ncs_gym import LinearPlant, truck_trailer
+from ncs_gym.uncertainty.disturbance_settings import BY_NAME, as_disturbance
+
+A, B, C, D = np.array([[0.0, 1.0], [-2.0, -3.0]]), np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]]), np.zeros((1, 1))
+REST = {"box": [1.0, 2.0], "u_max": 3.0, "disturbance_bound": 0.001, "sensor_bound": 0.001, "initial_bound": 0.01}
+SAMPLED = signal.cont2discrete((A, B, C, D), 0.1)
+
+
+def control_model(matrices, dt):
+    """What `control.ss(...)` looks like from outside."""
+    return SimpleNamespace(**dict(zip("ABCD", matrices, strict=True)), dt=dt)
+
+
+CONTINUOUS = {
+    "python-control": control_model((A, B, C, D), 0),
+    "python-control, dt None": control_model((A, B, C, D), None),
+    "scipy": signal.StateSpace(A, B, C, D),
+    "scipy transfer function": signal.TransferFunction([1.0], [1.0, 3.0, 2.0]),
+    "tuple": (A, B, C, D),
+    "lists without D": [A.tolist(), B.tolist(), C.tolist(), None],
+}
+DISCRETE = {
+    "python-control": control_model(SAMPLED[:4], 0.1),
+    "scipy": signal.StateSpace(*SAMPLED[:4], dt=0.1),
+    "tuple": (*SAMPLED[:4], 0.1),
+    "dt unknown": control_model(SAMPLED[:4], True),
+}
+
+
+@pytest.mark.parametrize("name", CONTINUOUS)
+def test_continuous_model_is_sampled_exactly(name):
+    plant = LinearPlant.from_statespace(CONTINUOUS[name], dt=0.1, **REST)
+    assert plant.dt == 0.1
+    model = CONTINUOUS[name].to_ss() if name == "scipy transfer function" else SimpleNamespace(A=A, B=B, C=C)
+    end = solve_ivp(lambda _, x: model.A @ x + model.B[:, 0] * 1.7, (0.0, 0.1), [0.4, -0.9], rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(plant.A @ [0.4, -0.9] + plant.B @ [1.7], end.y[:, -1], atol=1e-9)
+    np.testing.assert_array_equal(plant.H, model.C)
+    np.testing.assert_array_equal(plant.C, [[1.0, 0.0], [0.0, 0.5]])
+
+
+@pytest.mark.parametrize("name", DISCRETE)
+def test_discrete_model_is_taken_as_it_is(name):
+    plant = LinearPlant.from_statespace(DISCRETE[name], dt=0.1, **REST)
+    np.testing.assert_array_equal(plant.A, SAMPLED[0])
+    if name != "dt unknown":
+        assert LinearPlant.from_statespace(DISCRETE[name], **REST).fingerprint == plant.fingerprint
+
+
+@pytest.mark.parametrize(
+    ("model", "changes", "words"),
+    [
+        ((A, B, C, D), {}, "the model has no sampling time: give dt"),
+        (DISCRETE["dt unknown"], {}, "the model has no sampling time: give dt"),
+        (DISCRETE["scipy"], {"dt": 0.2}, "dt must be that of the model in discrete time, 0.1, or be left out, got 0.2"),
+        ((A, B, C, np.ones((1, 1))), {"dt": 0.1}, "D of the model must be zero, .* subtract D u"),
+        ((A, B, C, D), {"dt": -0.1}, "dt must be a number > 0"),
+        ((A, B, C, D), {"dt": 0.1, "H": C}, "H come from the state-space model"),
+        ((A, B, C, D), {"dt": 0.1, "input_delay": -1}, "input_delay must be a whole number >= 1"),
+        ((A, B, C, D), {"dt": 0.1, "input_delay": 1.5}, "input_delay must be a whole number >= 1"),
+        ((A, B, np.eye(3), D), {"dt": 0.1}, r"C of the model must have shape \(any, 2\)"),
+        ((A[:1], B, C, D), {"dt": 0.1}, r"A of the model must have shape \(1, 1\), got \(1, 2\)"),
+        ((A, B, C, D, -0.1), {}, "dt must be a number > 0"),
+        ((A, B), {"dt": 0.1}, r"sys must be a state-space model of python-control \(control.ss"),
+        ("plant", {"dt": 0.1}, "sys must be a state-space model"),
+        (SimpleNamespace(num=[1.0]), {"dt": 0.1}, "sys must be a state-space model"),
+    ],
+)
+def test_wrong_models_are_refused_in_one_sentence(model, changes, words):
+    with pytest.raises(ValueError, match=words) as caught:
+        LinearPlant.from_statespace(model, **(REST | changes))
+    assert "\n" not in str(caught.value)
+
+
+def test_model_takes_limits_around_an_operating_point():
+    settings = {name: value for name, value in REST.items() if name not in ("box", "u_max")}
+    point = {"operating_state": [1.0, 0.0], "operating_input": [2.0]}
+    limits = {"state_limits": ([0.0, -1.0], [3.0, 1.0]), "input_limits": (0.0, 3.0)}
+    plant = LinearPlant.from_statespace((A, B, C, D), dt=0.1, input_delay=1, **point, **limits, **settings)
+    np.testing.assert_allclose(plant.C[:2], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    np.testing.assert_allclose(plant.u_max, [1.0])
+    np.testing.assert_allclose(plant.operating_state, [1.0, 0.0, 2.0])
+    np.testing.assert_allclose(plant.A @ plant.operating_state + plant.B @ [2.0], plant.operating_state)
+
+
+@pytest.mark.parametrize("delay", [1, 2, 5])
+def test_delayed_input_acts_that_many_steps_later(delay):
+    names = {"state_names": ["angle", "rate"], "input_names": ["torque"], "input_units": ["N m"]}
+    gain = {"error_gain": [[-1.0, -0.5]]}
+    settings = REST | names | gain
+    plant = LinearPlant.from_statespace((A, B, C, D), dt=0.1, input_delay=delay, **settings)
+    plain = LinearPlant.from_statespace((A, B, C, D), dt=0.1, **settings)
+    inputs = np.random.default_rng(0).uniform(-3.0, 3.0, (30, 1))
+    z, x = np.zeros(plant.n), np.zeros(2)
+    for k, u in enumerate(inputs):
+        z = plant.A @ z + plant.B @ u
+        x = plain.A @ x + plain.B @ (inputs[k - delay] if k >= delay else np.zeros(1))
+        np.testing.assert_allclose(z[:2], x, atol=1e-12)
+        np.testing.assert_allclose(plant.H @ z, plain.H @ x, atol=1e-12)
+    assert plant.n == 2 + delay
+    assert plant.state_names[2] == f"torque of {delay} step{'s' * (delay > 1)} ago"
+    assert plant.state_units[2:] == ("N m",) * delay
+    np.testing.assert_array_equal(plant.error_gain, [[-1.0, -0.5] + [0.0] * delay])
+
+
+def test_delayed_inputs_are_limited_but_never_count_as_violated():
+    plant = LinearPlant.from_statespace((A, B, C, D), dt=0.1, input_delay=2, **(REST | {"u_max": 0.7}))
+    assert np.linalg.matrix_rank(plant.C) == plant.n
+    assert (plant.constraint_values(np.array([0.0, 0.0, 0.7, -0.7])) < -0.5).all()
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+def test_disturbances_of_a_delayed_plant_leave_its_stored_inputs_alone(name):
+    noise = {"gamma": 1e-4, "process_noise_cov": 1e-4 * np.eye(2), "initial_cov": 1e-4 * np.eye(2)}
+    plant = LinearPlant.from_statespace((A, B, C, D), dt=0.1, input_delay=2, **(REST | noise))
+    source, rng = as_disturbance(name, plant, False), np.random.default_rng(0)
+    memory = source.begin(rng, plant)
+    for k in range(50):
+        d = source.draw(rng, plant, rng.standard_normal(4), k, memory) + 0.0 * plant.process_noise.sample(rng)
+        assert np.abs(d[:2]).max() > 0.0  # the adversary does not waste itself on stored inputs
+        np.testing.assert_array_equal(d[2:], 0.0)
+    np.testing.assert_array_equal(plant.process_noise.sample(rng)[2:], 0.0)
+    np.testing.assert_array_equal(plant.sample_initial_error(rng)[2:], 0.0)
+    assert (np.diag(plant.disturbance.shape)[2:] < 1e-12).all()
+    assert (np.diag(plant.initial_error.shape)[2:] < 1e-12).all()
+
+
+def test_disturbance_of_a_delayed_plant_holds_that_of_the_plant_itself():
+    noise = {"gamma": 1e-4, "process_noise_cov": 1e-4 * np.eye(2)}
+    plain, plant = (LinearPlant.from_statespace((A, B, C, D), dt=0.1, input_delay=d, **(REST | noise)) for d in (0, 1))
+    for direction in np.random.default_rng(0).standard_normal((100, 2)):
+        assert plant.disturbance.support([*direction, 0.0]) >= (1 - 1e-9) * plain.disturbance.support(direction)
+
+
+def test_model_of_the_truck_is_the_registered_plant():
+    rate = np.array([[0.0, 1.0], [-4.5, -4.6]])
+    truck = truck_trailer()
+    plant = LinearPlant.from_statespace(
+        (rate, B, np.eye(2), np.zeros((2, 1))), dt=0.5, box=[2.0, 2.0], u_max=4.0, gamma=5e-4,
+        **{name: 1e-4 * np.eye(2) for name in ("process_noise_cov", "measurement_noise_cov", "initial_cov")},
+    )  # fmt: skip
+    assert plant.fingerprint == truck.fingerprint
