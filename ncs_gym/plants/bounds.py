@@ -163,9 +163,9 @@ class HardBounds(ReadOnlyArrays):
     def initial_error(self) -> Ellipsoid:
         """Holds the error of the first estimate, shape (n, n), with room for rounding.
 
-        The ball of radius r0 in the directions of which P0 is not zero, plus `initial_bound`.
+        r0^2 I, the ball of radius r0, plus `initial_bound`.
         """
-        ball = Ellipsoid(self.initial_radius_squared * np.diag((np.diag(self.initial_cov) > 0.0).astype(np.float64)))
+        ball = Ellipsoid(self.initial_radius_squared * np.eye(self.n))
         nominal = _with_declared(ball, self.initial_bound, self.relative_weight)
         return Ellipsoid(INFLATION * nominal.shape + self.estimate_rounding)
 

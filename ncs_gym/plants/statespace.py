@@ -121,9 +121,14 @@ def delayed_arguments(plant: LinearPlant, input_delay: int) -> dict[str, Any]:
         input_delay: d, steps, at least 1.
 
     Raises:
-        ValueError: If the delay is no such number.
+        ValueError: If the delay is no such number, or the first error is given by a covariance.
     """
     delay = as_count(input_delay, "input_delay", low=1, high=LONGEST_INPUT_DELAY)
+    if np.any(plant.initial_cov):
+        raise ValueError(
+            "with input_delay the first error must be given by initial_bound: the bound of initial_cov is a ball in all "
+            "states, and inputs under way are known"
+        )
     n, m, stored = plant.n, plant.m, plant.m * delay
     A = np.zeros((n + stored, n + stored))
     A[:n, :n], A[:n, n : n + m] = plant.A, plant.B
@@ -142,7 +147,7 @@ def delayed_arguments(plant: LinearPlant, input_delay: int) -> dict[str, Any]:
         "H": np.pad(plant.H, ((0, 0), (0, stored))),
         "process_noise_cov": np.pad(plant.process_noise_cov, (0, stored)),
         "measurement_noise_cov": plant.measurement_noise_cov,
-        "initial_cov": np.pad(plant.initial_cov, (0, stored)),
+        "initial_cov": np.zeros((n + stored, n + stored)),
         "delta": plant.delta,
         "disturbance_bound": _padded(_unknown_disturbance(plant), stored),
         "sensor_bound": plant.sensor_bound,

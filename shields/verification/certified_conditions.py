@@ -107,8 +107,7 @@ def _first_error(plant: LinearPlant, weight: Matrix) -> Matrix:
     if plant.initial_bound is None:
         return noise
     declared = rational(plant.initial_bound.shape)
-    occupied = np.diag((np.diag(plant.initial_cov) > 0.0).astype(np.float64))
-    ball = scale(Fraction(plant.initial_radius_squared), rational(occupied))
+    ball = scale(Fraction(plant.initial_radius_squared), rational(np.eye(plant.n)))
     if not (any(map(any, noise)) and any(map(any, declared))):
         return add(noise, declared)
     nu = _smallest_trace_multiplier(ball, declared, weight)

@@ -183,12 +183,6 @@ def test_estimator_picks_useful_gains_from_declared_bounds_alone():
     np.testing.assert_allclose(estimator.mean, [0.3, -0.2], atol=0.02)
 
 
-def test_first_error_of_a_partly_known_state_is_bounded_where_it_is_unknown():
-    plant = plain(initial_cov=np.diag([1e-2, 0.0]), initial_bound=None)
-    assert plant.initial_error.shape[0, 0] == pytest.approx(1e-2 * plant.initial_noise.energy, rel=1e-6)
-    assert plant.initial_error.shape[1, 1] < 1e-12
-
-
 @pytest.mark.parametrize(
     ("given", "missing"),
     [

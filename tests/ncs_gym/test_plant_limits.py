@@ -28,11 +28,11 @@ def test_number_limits_every_state_alike_and_infinity_none():
 @pytest.mark.parametrize(
     "make",
     [
-        lambda C: LinearPlant(**MODEL, box=C),
-        lambda C: LinearPlant(**MODEL, box=[1.0, 1.0], box=C),
-        lambda C: truck_trailer(box=C),
-        lambda C: cart_pole(box=np.eye(4)),
-        lambda C: replace(truck_trailer(), box=C),
+        lambda C: LinearPlant(**MODEL, C=C),
+        lambda C: LinearPlant(**MODEL, box=[1.0, 1.0], C=C),
+        lambda C: truck_trailer(C=C),
+        lambda C: cart_pole(C=np.eye(4)),
+        lambda C: replace(truck_trailer(), C=C),
         lambda C: LinearPlant.from_statespace((MODEL["A"], MODEL["B"], C, None), box=1.0, u_max=1.0, dt=0.1, C=C),
     ],
 )

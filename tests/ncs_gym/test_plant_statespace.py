@@ -66,6 +66,7 @@ def test_discrete_model_is_taken_as_it_is(name):
         ((A, B, C, D), {"dt": 0.1, "H": C}, "H come from the state-space model"),
         ((A, B, C, D), {"dt": 0.1, "input_delay": -1}, "input_delay must be a whole number >= 1"),
         ((A, B, C, D), {"dt": 0.1, "input_delay": 1.5}, "input_delay must be a whole number >= 1"),
+        ((A, B, C, D), {"dt": 0.1, "input_delay": 1, "initial_cov": np.eye(2)}, "must be given by initial_bound"),
         ((A, B, np.eye(3), D), {"dt": 0.1}, r"C of the model must have shape \(any, 2\)"),
         ((A[:1], B, C, D), {"dt": 0.1}, r"A of the model must have shape \(1, 1\), got \(1, 2\)"),
         ((A, B, C, D, -0.1), {}, "dt must be a number > 0"),
@@ -119,7 +120,7 @@ def test_delayed_inputs_are_limited_but_never_count_as_violated():
 
 @pytest.mark.parametrize("name", BY_NAME)
 def test_disturbances_of_a_delayed_plant_leave_its_stored_inputs_alone(name):
-    noise = {"gamma": 1e-4, "process_noise_cov": 1e-4 * np.eye(2), "initial_cov": 1e-4 * np.eye(2)}
+    noise = {"gamma": 1e-4, "process_noise_cov": 1e-4 * np.eye(2)}
     plant = LinearPlant.from_statespace((A, B, C, D), dt=0.1, input_delay=2, **(REST | noise))
     source, rng = as_disturbance(name, plant, False), np.random.default_rng(0)
     memory = source.begin(rng, plant)
