@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.shields.test_verification import replaced
 
 from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, truck_trailer
 from shields import synthesize, verify
+from tests.shields.verification.test_verification import replaced
 
 BOUNDS = {
     "disturbance_bound": [0.03, 0.004],
