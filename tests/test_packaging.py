@@ -2,6 +2,7 @@
 
 import ast
 import importlib.util
+import re
 import subprocess
 import sys
 import tomllib
@@ -211,6 +212,12 @@ def test_command_is_declared_and_runs_as_a_module():
     run = subprocess.run([sys.executable, "-m", "experiments", "--help"], cwd=ROOT, capture_output=True, text=True)
     assert run.returncode == 0
     assert "compare" in run.stdout
+
+
+def test_files_that_the_makefile_names_exist():
+    named = re.findall(r"\b(?:benchmarks|examples)/\S+?\.(?:py|txt)\b", (ROOT / "Makefile").read_text())
+    assert len(named) > 8
+    assert [name for name in named if not (ROOT / name).exists()] == []
 
 
 def test_foreign_agents_package_is_refused_in_one_sentence(tmp_path):
