@@ -2,6 +2,7 @@
 
 import ast
 import importlib.util
+import re
 import subprocess
 import sys
 import tomllib
@@ -147,8 +148,8 @@ def test_nothing_is_compiled_at_first_use():
     assert not pinned & COMPILERS
     code = f"""
 import sys, gymnasium, numpy, ncs_gym, shields, shields.paper.algorithm, experiments.commands.certify
-bounds = dict(gamma=1e-6, sensor_bound=0.0, initial_bound=0.0)
-plant = ncs_gym.LinearPlant(A=[[0.9]], B=[[1.0]], box=[1.0], u_max=1.0, dt=0.1, **bounds)
+quiet = dict(sensor_bound=0.0, initial_bound=0.0)
+plant = ncs_gym.LinearPlant(A=[[0.9]], B=[[1.0]], box=[1.0], u_max=1.0, dt=0.1, gamma=1e-6, **quiet)
 certificate = shields.synthesize(plant)
 env = shields.SafetyShield(gymnasium.make("ncs_gym/LinearNCS-v0", plant=plant), certificate)
 many = shields.VectorSafetyShield(gymnasium.make_vec("ncs_gym/LinearNCS-v0", num_envs=2, plant=plant), certificate)
@@ -211,6 +212,12 @@ def test_command_is_declared_and_runs_as_a_module():
     run = subprocess.run([sys.executable, "-m", "experiments", "--help"], cwd=ROOT, capture_output=True, text=True)
     assert run.returncode == 0
     assert "compare" in run.stdout
+
+
+def test_files_that_the_makefile_names_exist():
+    named = re.findall(r"\b(?:benchmarks|examples)/\S+?\.(?:py|txt)\b", (ROOT / "Makefile").read_text())
+    assert len(named) > 8
+    assert [name for name in named if not (ROOT / name).exists()] == []
 
 
 def test_foreign_agents_package_is_refused_in_one_sentence(tmp_path):
