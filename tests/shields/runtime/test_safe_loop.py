@@ -5,8 +5,6 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
-from tests.attacks import RANDOM, certificate_of
-from tests.ncs_gym.adversary import Traffic
 
 from ncs_gym import (
     Channel,
@@ -26,6 +24,8 @@ from shields import CertificateError, SafeLoop, SafetyShield, VectorSafetyShield
 from shields.runtime.filter import MODES
 from shields.runtime.guarantee import ALARM, LARGE_ERROR, NOT_KNOWN_INSIDE, OTHER_INPUT
 from shields.runtime.safe_loop import NOT_STARTED
+from tests.ncs_gym.estimation.adversary import Traffic
+from tests.shields.attacks.extremes import RANDOM, certificate_of
 
 LATE = Channel(loss=0.3, quantization_step=0.01, delay=1, jitter=2)
 # Plant, contract, channel.
@@ -260,6 +260,17 @@ def test_another_input_than_decided_is_not_seen_without_packets():
         level = max(level, world.certificate.safe_set.gauge(world.x))
     assert level > 1.0
     assert loop.guaranteed
+
+
+@pytest.mark.parametrize(("held", "passes"), [(0.1, True), (4.0, False)])
+def test_missed_step_in_which_the_input_was_held_is_a_step(held, passes):
+    loop = loop_of("truck")
+    loop.start([1.5, 0.5])
+    loop.step(held)
+    decision = loop.step(held)  # for the step that the clock missed
+    assert decision.intervened is not passes
+    loop.receive(applied=held)
+    assert (loop.steps, loop.reason) == (2, "" if passes else OTHER_INPUT)
 
 
 @pytest.mark.parametrize("applied", [[np.nan], [0.0, 0.0], "left", np.inf])
