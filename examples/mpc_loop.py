@@ -22,8 +22,8 @@ problem = cp.Problem(cp.Minimize(cost), constraints)
 
 
 def controller(estimate: np.ndarray, step: int) -> np.ndarray | None:
-    """Pulls the coupling from one limit to the other; None where the solver fails, which is for the loop to handle."""
-    start.value, target.value = estimate, 2.0 if step % 40 < 20 else -2.0
+    """Pulls the coupling from one side to the other; None where the solver fails, which is for the loop to handle."""
+    start.value, target.value = estimate, 1.6 if step % 40 < 20 else -1.6
     try:
         problem.solve(solver=cp.CLARABEL)
     except cp.SolverError:
@@ -48,8 +48,8 @@ def run(mode: str, steps: int = 300) -> None:
         disturbance = plant.nominal_disturbance.sample_boundary(rng)
         state = plant.A @ state + plant.B @ decision.input + disturbance
         violations += bool((plant.constraint_values(state) > 0.0).any())
-    print(f"{mode:8s} overridden or counted: {overridden}, outside the box: {violations}, proved: {proved} of {steps}")
+    print(f"{mode}: outside the box in {violations} steps, {overridden} interventions, proved in {proved} of {steps}")
 
 
-run("monitor")  # applies what the controller proposes and says what it would have done
+run("monitor")  # Applies what the controller proposes, and counts what it would have overridden.
 run("project")

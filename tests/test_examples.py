@@ -15,11 +15,22 @@ SLOW = pytest.mark.slow
 # Arguments of a tiny run, and what has to stand in its output.
 RUNS = {
     "change_the_channel.py": ([], [rf"{re.escape('30 % lost, 2 steps late')} +root mean square error {NUMBER}"]),
+    "lost_hour.py": (
+        [],
+        [
+            "proved in 9600 of 9600 steps, outside the box in 0; now: True",
+            r"proved in 24\d\d of 9600 steps, outside the box in 0; now: True; the error ellipsoid is not inside",
+        ],
+    ),
+    "mpc_loop.py": (
+        [],
+        [r"monitor: outside the box in [1-9]\d* steps", r"project: outside the box in 0 steps, [1-9].* in 300 of 300"],
+    ),
     "own_plant.py": (
         ["--steps", "12800"],
         ["largest angle in the safe set: 0.500 rad", "without a violation: 64 of 64"],
     ),
-    "plain_loop.py": ([], [r"overridden: \d+ of 1000; closest to the limit: 0\.\d+"]),
+    "plain_loop.py": ([], [r"overridden: \d+ of 1000; closest to the limit: 0\.\d+", "proved to be safe: True"]),
     "quick_start.py": ([], ["violating steps: 0", r"overridden actions: [1-9]", "the proof held: True"]),
     "recurrent_ppo.py": (["--steps", "1024"], [rf"mean return of the last 4 episodes: {NUMBER}", "violating steps: 0"]),
     "sb3_ten_lines.py": (
@@ -33,6 +44,10 @@ RUNS = {
     "single_file_sac.py": (
         ["--total-timesteps", "420", "--learning-starts", "390"],
         [rf"last 2 of 2 episodes: {NUMBER}", r"violating steps: 0; actions overridden: [1-9]"],
+    ),
+    "unstable_plant_loop.py": (
+        [],
+        ["oldest sample in use: 4 steps, allowed: 4", r"closest to the limit: 0\.\d+", "proved: 5000 of 5000 steps"],
     ),
     "write_a_task.py": ([], [rf"return of doing nothing: {NUMBER}"]),
 }

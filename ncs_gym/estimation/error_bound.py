@@ -133,7 +133,8 @@ def _unconditional_set(plant: LinearPlant) -> ErrorSet:
     radius = plant.spectral_radius
     if not radius < 1.0:
         raise UnstablePlantError(
-            f"no error bound exists without packets: the spectral radius of A is {radius:.6g}, it must be < 1"
+            f"no error bound exists without packets: the spectral radius of A is {radius:.6g}, it must be < 1; give "
+            "the estimator error_set=certified_error_set(plant, contract) with the channel's contract"
         )
     # In coordinates z = T^-1 x, with W = (T T')^-1, the weight is the identity and units do not matter.
     T = np.linalg.cholesky(np.linalg.inv(plant.weight))

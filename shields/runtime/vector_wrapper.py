@@ -23,11 +23,9 @@ from shields.runtime.guarantee import (
     starts_inside,
 )
 from shields.runtime.one_step_test import norms
-from shields.runtime.wrapper import certificate_for, environment_behind
+from shields.runtime.wrapper import certificate_for, environment_behind, hint_for
 
 REASONS = np.array(EXPLANATIONS, dtype=object)
-FOR_SINGLE = ": use SafetyShield for a single environment"
-FOR_OTHERS = ": for gymnasium's sync and async vector environments give make_vec(..., wrappers=[SafetyShield])"
 
 
 class Clock(NamedTuple):
@@ -67,8 +65,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
     ) -> None:
         RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty)
         refused = VectorActionWrapper, VectorSafetyShield
-        hint = FOR_OTHERS if isinstance(env, VectorEnv) else FOR_SINGLE
-        inner = self._inner = environment_behind(env, VectorWrapper, refused, NCSVectorEnv, hint)
+        inner = self._inner = environment_behind(env, VectorWrapper, refused, NCSVectorEnv, hint_for(env))
         if env.single_action_space != inner.single_action_space:
             raise ValueError(f"a wrapper inside the shield changes the action space to {env.single_action_space}")
         VectorWrapper.__init__(self, env)

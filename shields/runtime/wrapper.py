@@ -11,7 +11,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv
 from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, StickyAction
 
-from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv
+from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv, NCSVectorEnv
 from ncs_gym.envs.env import applied_input, ncs_env
 from ncs_gym.validation import as_number, as_numbers, shown
 from shields.certificate import Certificate
@@ -23,8 +23,6 @@ T = TypeVar("T")
 
 # What changes, repeats or swallows actions between the shield and the plant.
 REFUSED = (gym.ActionWrapper, RepeatAction, StickyAction, MaxAndSkipObservation, Autoreset)
-
-FOR_VECTORS = ": use VectorSafetyShield for make_vec(...), or make_vec(..., wrappers=[SafetyShield])"
 
 # What the clock reads while a step is under way: if it raises, the next one does not follow from what is known.
 INTERRUPTED = (-1, -1)
@@ -75,8 +73,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         penalty: float = 0.0,
     ) -> None:
         RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty)
-        hint = FOR_VECTORS if isinstance(env, VectorEnv) else ""
-        inner = environment_behind(env, gym.Wrapper, (*REFUSED, SafetyShield), NCSEnv, hint)
+        inner = environment_behind(env, gym.Wrapper, (*REFUSED, SafetyShield), NCSEnv, hint_for(env))
         if env.action_space != inner.action_space:
             raise ValueError(f"a wrapper inside the shield changes the action space to {env.action_space}")
         gym.Wrapper.__init__(self, env)
@@ -180,6 +177,18 @@ def certificate_for(plant: LinearPlant, contract: ChannelContract | None = None)
 
         _synthesized[key] = synthesize(plant, contract=contract)
     return _synthesized[key]
+
+
+def hint_for(env: Any) -> str:
+    """Returns which shield an environment takes that the other one refuses; empty if neither takes it."""
+    inner = getattr(env, "unwrapped", None)
+    if isinstance(inner, NCSEnv):
+        return ": use SafetyShield for a single environment"
+    if isinstance(inner, NCSVectorEnv):
+        return ": use VectorSafetyShield for a vectorized environment"
+    if isinstance(inner, VectorEnv):
+        return ": for gymnasium's sync and async vector environments give make_vec(..., wrappers=[SafetyShield])"
+    return ""
 
 
 def environment_behind(env: Any, wrappers: type, refused: tuple[type, ...], wanted: type[T], hint: str = "") -> T:

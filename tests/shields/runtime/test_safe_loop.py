@@ -10,14 +10,17 @@ from ncs_gym import (
     Channel,
     ChannelContract,
     Ellipsoid,
+    Estimator,
     NCSEnv,
     Packet,
+    UnstablePlantError,
     batch_reactor,
     cart_pole,
+    certified_error_set,
     truck_trailer,
 )
 from ncs_gym.network.channel_state import ChannelState
-from shields import CertificateError, SafeLoop, SafetyShield
+from shields import CertificateError, SafeLoop, SafetyShield, VectorSafetyShield
 from shields.runtime.filter import MODES
 from shields.runtime.guarantee import ALARM, LARGE_ERROR, NOT_KNOWN_INSIDE, OTHER_INPUT
 from shields.runtime.safe_loop import NOT_STARTED
@@ -260,6 +263,17 @@ def test_another_input_than_decided_is_not_seen_without_packets():
     assert loop.guaranteed
 
 
+@pytest.mark.parametrize(("held", "passes"), [(0.1, True), (4.0, False)])
+def test_missed_step_in_which_the_input_was_held_is_a_step(held, passes):
+    loop = loop_of("truck")
+    loop.start([1.5, 0.5])
+    loop.step(held)
+    decision = loop.step(held)  # for the step that the clock missed
+    assert decision.intervened is not passes
+    loop.receive(applied=held)
+    assert (loop.steps, loop.reason) == (2, "" if passes else OTHER_INPUT)
+
+
 @pytest.mark.parametrize("applied", [[np.nan], [0.0, 0.0], "left", np.inf])
 def test_unusable_report_of_the_actuator_ends_the_guarantee_and_keeps_the_estimate(applied):
     loop, twin = started(), started()
@@ -429,6 +443,28 @@ def test_wrong_settings_are_refused():
     with pytest.raises(ValueError, match="mode must be"):
         SafeLoop(certificate, plant, channel, mode="hope")
     assert SafeLoop(certificate, plant, channel).contract == contract
+
+
+def test_shield_around_the_wrong_kind_of_environment_names_the_right_one(certificate):
+    cruise = "ncs_gym/TruckTrailerCruise-v0"
+    vectors, sync = gym.make_vec(cruise, num_envs=2), gym.make_vec(cruise, num_envs=2, vectorization_mode="sync")
+    wrong = [
+        (SafetyShield, vectors, "use VectorSafetyShield"),
+        (SafetyShield, sync, r"wrappers=\[SafetyShield\]"),
+        (VectorSafetyShield, sync, r"wrappers=\[SafetyShield\]"),
+        (VectorSafetyShield, gym.make(cruise), "use SafetyShield for"),
+        (SafetyShield, gym.make("Pendulum-v1"), "got PendulumEnv$"),
+    ]
+    for shield, env, message in wrong:
+        with pytest.raises(ValueError, match=message):
+            shield(env, certificate)
+
+
+def test_unstable_plant_without_its_error_set_is_refused_with_the_remedy():
+    plant, contract, channel = LOOPS["cart-pole"]
+    with pytest.raises(UnstablePlantError, match=r"error_set=certified_error_set\(plant, contract\)"):
+        Estimator(plant, channel)
+    Estimator(plant, channel, error_set=certified_error_set(plant, contract))
 
 
 @pytest.mark.parametrize("name", ["truck", "cart-pole"])
