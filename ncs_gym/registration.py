@@ -210,6 +210,13 @@ def register_all() -> None:
             gym.register(id=env_id, max_episode_steps=EPISODE_STEPS, **entry_points_of(name))
 
 
+def registered_ids() -> list[str]:
+    """Returns the ids of the environments that have a plant of their own: this module's, and those of users' plants."""
+    own = [env_id for env_id, name in ENTRY_POINTS.items() if globals()[name].plant is not None]
+    entry_point = entry_points_of("LINEAR_NCS")["entry_point"]
+    return own + [spec.id for spec in gym.registry.values() if spec.entry_point == entry_point and spec.kwargs]
+
+
 def entry_points_of(name: str) -> dict[str, Any]:
     """Returns where gymnasium finds a scenario of this module and its vector environment."""
     return {"entry_point": f"{__name__}:{name}", "vector_entry_point": f"{__name__}:{name}_VECTOR"}
