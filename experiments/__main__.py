@@ -36,8 +36,8 @@ def main() -> None:
         _require_own_agents()
         settings = _parse(sys.argv[1:])
         _run(settings)
-    except KeyboardInterrupt:
-        sys.exit(_complain("interrupted", _INTERRUPTED))
+    except KeyboardInterrupt as interrupt:
+        sys.exit(_complain(str(interrupt) or "interrupted", _INTERRUPTED))
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(_ERROR)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -11,6 +12,7 @@ import numpy as np
 
 from ncs_gym.envs.env import NCSEnv
 from ncs_gym.envs.vector_env import NCSVectorEnv
+from ncs_gym.json_settings import DISTURBANCES, TASKS, as_plant, from_json
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.plants.batch_reactor import batch_reactor
@@ -66,41 +68,50 @@ class Scenario:
     def settings(
         self,
         *,
-        plant: LinearPlant | None = None,
-        channel: Channel | None = None,
-        task: Task | None = None,
+        plant: LinearPlant | str | os.PathLike[str] | None = None,
+        channel: Channel | dict[str, Any] | None = None,
+        task: Task | dict[str, Any] | None = None,
         disturbance: Any = None,
-        initial_set: Ellipsoid | None = None,
+        initial_set: Ellipsoid | dict[str, Any] | None = None,
         terminate_on_violation: bool | None = None,
         allow_assumption_violation: bool = False,
-        contract: ChannelContract | None = None,
+        contract: ChannelContract | dict[str, Any] | None = None,
         render_mode: str | None = None,
+        horizon: int = EPISODE_STEPS,
     ) -> dict[str, Any]:
         """Returns the arguments of `NCSEnv`; None stands for the scenario's own value.
 
+        Settings may be JSON values, so that an `EnvSpec` may: dictionaries of fields (`Channel(**channel)`), a
+        disturbance by its name, a plant by the path of a file that `LinearPlant.save` wrote.
+
         Raises:
-            ValueError: If the scenario has no plant of its own and none is given.
+            ValueError: If the scenario has no plant of its own and none is given, or a JSON value is wrong.
         """
+        plant, contract = as_plant(plant), from_json(contract, (ChannelContract,), "contract")
         if plant is None:
             if self.plant is None:
-                raise ValueError("this environment has no plant of its own: give plant=LinearPlant(...)")
+                raise ValueError(
+                    "this environment has no plant of its own: give plant=LinearPlant(...), or register_plant it"
+                )
             plant, contract = self.plant(), self.contract if contract is None else contract
         if initial_set is None and self.start is not None and getattr(plant, "n", 0) == 2:
             initial_set = Ellipsoid(self.start**2 * np.eye(2))
         return {
             "plant": plant,
-            "channel": self.channel if channel is None else channel,
-            "task": self.task if task is None else task,
-            "disturbance": self._disturbance(plant) if disturbance is None else disturbance,
-            "initial_set": initial_set,
+            "channel": self.channel if channel is None else from_json(channel, (Channel,), "channel"),
+            "task": self.task if task is None else from_json(task, TASKS, "task"),
+            "disturbance": self._disturbance(plant)
+            if disturbance is None
+            else from_json(disturbance, DISTURBANCES, "disturbance"),
+            "initial_set": from_json(initial_set, (Ellipsoid,), "initial_set"),
             "terminate_on_violation": self.terminates if terminate_on_violation is None else terminate_on_violation,
             "allow_assumption_violation": allow_assumption_violation,
             "contract": contract,
             "render_mode": render_mode,
-            "horizon": EPISODE_STEPS,
+            "horizon": horizon,
         }
 
-    def _disturbance(self, plant: LinearPlant) -> Any:
+    def _disturbance(self, plant: Any) -> Any:
         if self.box is None or not isinstance(plant, LinearPlant) or self.box.check(plant) or self.box.excess(plant):
             return "ball"
         return self.box
@@ -196,9 +207,16 @@ def register_all() -> None:
     """Registers the ids with gymnasium; `import ncs_gym` calls it."""
     for env_id, name in ENTRY_POINTS.items():
         if env_id not in gym.registry:
-            gym.register(
-                id=env_id,
-                entry_point=f"{__name__}:{name}",
-                vector_entry_point=f"{__name__}:{name}_VECTOR",
-                max_episode_steps=EPISODE_STEPS,
-            )
+            gym.register(id=env_id, max_episode_steps=EPISODE_STEPS, **entry_points_of(name))
+
+
+def registered_ids() -> list[str]:
+    """Returns the ids of the environments that have a plant of their own: this module's, and those of users' plants."""
+    own = [env_id for env_id, name in ENTRY_POINTS.items() if globals()[name].plant is not None]
+    entry_point = entry_points_of("LINEAR_NCS")["entry_point"]
+    return own + [spec.id for spec in gym.registry.values() if spec.entry_point == entry_point and spec.kwargs]
+
+
+def entry_points_of(name: str) -> dict[str, Any]:
+    """Returns where gymnasium finds a scenario of this module and its vector environment."""
+    return {"entry_point": f"{__name__}:{name}", "vector_entry_point": f"{__name__}:{name}_VECTOR"}

@@ -75,7 +75,7 @@ def _tolerance(recorded: dict[str, Any]) -> str:
 def _assumptions(recorded: dict[str, Any]) -> str:
     """Returns the plant's assumptions, if they are recorded."""
     given = recorded.get("assumptions")
-    return "; ".join(each for each in given if isinstance(each, str)) if isinstance(given, list) else ""
+    return " ".join(each for each in given if isinstance(each, str)) if isinstance(given, list) else ""
 
 
 def _interruption(recorded: dict[str, Any]) -> str:

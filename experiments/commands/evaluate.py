@@ -9,6 +9,7 @@ from agents import evaluation
 from agents.control_loop import ControlLoop, ShieldSettings
 from experiments.analysis.summary import arm_summary, summary_text
 from experiments.runs import ExperimentSetup, RunResult, versions
+from experiments.runs.environments import module_and_id, registered_env
 from experiments.settings import EvaluateSettings
 from ncs_gym.envs.env import ncs_env
 from shields.atomic_write import write_atomically
@@ -19,17 +20,22 @@ def evaluate(settings: EvaluateSettings) -> None:
 
     Raises:
         AgentError: If the agent's files are missing, damaged or of another environment.
-        ValueError: If a setting is out of range.
+        ValueError: If a setting is out of range, or the agent is of another environment.
         CertificateError: If a given certificate does not verify.
         Infeasible: If no certificate is found.
         OSError: If the summary cannot be written.
     """
     from agents.agent import Agent  # imports torch
 
+    if settings.env is not None:
+        registered_env(settings.env)
     agent = Agent.load(settings.model)
+    env_id = settings.env or agent.env
+    if module_and_id(env_id)[1] != agent.env:
+        raise ValueError(f"the agent in {settings.model} was trained in {agent.env}, not in {env_id}")
     own = ncs_env(ControlLoop(env=agent.env, channel=agent.channel).single()).channel
     channel = settings.channel.applied_to(own) or agent.channel
-    setup = ExperimentSetup.of(agent.env, channel, settings.certificate)
+    setup = ExperimentSetup.of(env_id, channel, settings.certificate)
     mode = None if settings.shield == "none" else settings.shield
     shield = None if mode is None else ShieldSettings(setup.certificate, mode)
     evaluated = evaluation.evaluate(

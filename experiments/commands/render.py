@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from experiments.commands import require_extra
 from experiments.plots.animation import FORMATS, save_animation
-from experiments.runs.experiment_setup import registered_env
+from experiments.runs.environments import module_and_id, registered_env
 from experiments.runs.policies import UNTRAINED_POLICIES, policy_by_name
 from experiments.settings import RenderSettings
 from ncs_gym.envs.env import ncs_env
@@ -61,8 +61,9 @@ class _EpisodeRenderer:
     def __init__(self, settings: RenderSettings, mode: str) -> None:
         self._mode = mode
         certificate = None if settings.certificate is None else Certificate.load(settings.certificate)
-        self._env: gym.Env = gym.make(settings.env, render_mode="rgb_array")
-        self._policy = policy_by_name(settings.policy, settings.env, ncs_env(self._env), settings.seed)
+        _, env_id = module_and_id(settings.env)  # `_check` has imported the module
+        self._env: gym.Env = gym.make(env_id, render_mode="rgb_array")
+        self._policy = policy_by_name(settings.policy, env_id, ncs_env(self._env), settings.seed)
         if mode != "none":
             self._env = SafetyShield(self._env, certificate, mode=mode)
         self._observation, self._info = self._env.reset(seed=settings.seed)

@@ -1,32 +1,59 @@
-"""`ncs synthesize`: makes a certificate for an environment's plant."""
+"""`ncs synthesize`: makes a certificate for the plant of an environment or of a file."""
 
 from __future__ import annotations
 
-from tqdm import tqdm
-
 import shields
-from experiments.runs.experiment_setup import registered_env
+from experiments.runs.environments import registered_env
+from experiments.runs.synthesis_status import synthesis_status
 from experiments.settings import SynthesizeSettings
-from ncs_gym import ChannelContract
+from ncs_gym import ChannelContract, LinearPlant
+from shields.errors import SynthesisInterrupted
+
+_DEFAULT_ENV = "ncs_gym/TruckTrailerCruise-v0"
 
 
 def synthesize(settings: SynthesizeSettings) -> None:
     """Runs `ncs synthesize`.
 
     Raises:
-        ValueError: If the environment is unknown.
+        ValueError: If the environment is unknown, the plant's file cannot be read, or a setting is out of range.
         Infeasible: If no certificate is found.
+        SynthesisInterrupted: If it is interrupted; the best certificate so far is saved.
         OSError: If the file cannot be written.
     """
-    env = registered_env(settings.env)
-    plant, contract = env.plant, env.contract
-    if settings.max_age is not None:
-        contract = ChannelContract(settings.max_age, contract.quantization_step if contract else 0.0)
-    with tqdm(bar_format="{desc} [{elapsed}]", desc="synthesis", leave=False, disable=None) as line:
-        certificate = shields.synthesize(plant, settings.method, contract=contract, progress=line.set_description_str)
+    plant, contract = _plant_and_contract(settings)
+    try:
+        with synthesis_status() as show:
+            certificate = shields.synthesize(plant, settings.method, contract=contract, progress=show)
+    except SynthesisInterrupted as interrupt:
+        if interrupt.certificate is None:
+            raise
+        interrupt.certificate.save(settings.out)
+        size = interrupt.certificate.provenance["volume_of_box_ellipsoid"]
+        raise SynthesisInterrupted(
+            f"interrupted: the best certificate so far, which verifies ({size:.2%} of the box ellipsoid), was saved to "
+            f"{settings.out}"
+        ) from interrupt
     certificate.save(settings.out)
-    print(shields.verify(certificate, plant))
+    print(certificate, shields.verify(certificate, plant), sep="\n")
     if certificate.method == "paper":
         also = "hold" if certificate.provenance["exact_conditions_hold"] else "were not shown to hold"
         print(f"guarantee: {certificate.provenance['guarantee']}; our exact conditions {also} for it too")
     print(f"valid; saved to {settings.out}")
+
+
+def _plant_and_contract(settings: SynthesizeSettings) -> tuple[LinearPlant, ChannelContract | None]:
+    """Returns the plant of a file or an environment, and the contract of the environment with the changes asked for."""
+    if settings.plant is None:
+        env = registered_env(settings.env or _DEFAULT_ENV)
+        plant, contract = env.plant, env.contract
+    else:
+        plant, contract = LinearPlant.load(settings.plant), None
+    if settings.max_age is None and settings.quantization_step is None:
+        return plant, contract
+    max_age = settings.max_age if contract is None or settings.max_age is not None else contract.max_age
+    if max_age is None:
+        raise ValueError("--quantization-step belongs to a contract of the channel: give --max-age, too")
+    own_step = 0.0 if contract is None else contract.quantization_step
+    step = own_step if settings.quantization_step is None else settings.quantization_step
+    return plant, ChannelContract(max_age, step)

@@ -6,8 +6,10 @@ import json
 from dataclasses import asdict
 
 import shields
-from experiments.runs.experiment_setup import environment_ids, registered_env
+from experiments.runs.environments import registered_env
 from experiments.settings import VerifySettings
+from ncs_gym import LinearPlant
+from ncs_gym.registration import registered_ids
 from shields import Certificate, CertificateError
 from shields.atomic_write import write_atomically
 
@@ -17,18 +19,22 @@ def verify(settings: VerifySettings) -> None:
 
     Raises:
         CertificateError: If the certificate is damaged, of an unknown plant or does not verify.
-        ValueError: If the environment is unknown.
+        ValueError: If the environment is unknown, or the plant's file cannot be read.
         OSError: If the verdicts cannot be written.
     """
     certificate = Certificate.load(settings.file)
-    env_id = settings.env or _matching_env(certificate)
-    report = shields.verify(certificate, registered_env(env_id).plant)
-    print(f"against the plant of {env_id}:\n{report}")
+    if settings.plant is None:
+        origin = settings.env or _matching_env(certificate)
+        plant = registered_env(origin).plant
+    else:
+        origin, plant = str(settings.plant), LinearPlant.load(settings.plant)
+    report = shields.verify(certificate, plant)
+    print(f"{certificate}\nagainst the plant of {origin}:\n{report}")
     if certificate.ages is not None:
         print(f"it rests on {certificate.ages.sets.contract}")
     if settings.out is not None:
         conditions = [asdict(condition) for condition in report.conditions]
-        document = {"env": env_id, "valid": report.valid, "conditions": conditions}
+        document = {"env": origin, "valid": report.valid, "conditions": conditions}
         write_atomically(settings.out, json.dumps(document, indent=1) + "\n")
     if not report.valid:
         broken = sum(not condition.holds for condition in report.conditions)
@@ -40,10 +46,10 @@ def verify(settings: VerifySettings) -> None:
 
 def _matching_env(certificate: Certificate) -> str:
     """Returns the id of the registered environment whose plant the certificate was made for."""
-    for env_id in environment_ids():
+    for env_id in registered_ids():
         if registered_env(env_id).plant.fingerprint == certificate.fingerprint:
             return env_id
     raise CertificateError(
         "the certificate belongs to no registered environment's plant; "
-        "for one of your own call shields.verify(certificate, plant)"
+        "for one of your own give --env module:id or --plant FILE, or call shields.verify(certificate, plant)"
     )

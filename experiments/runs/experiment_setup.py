@@ -9,12 +9,13 @@ from typing import Any
 import gymnasium as gym
 
 from experiments.runs.arms import Arm
+from experiments.runs.environments import module_and_id, registered_env
 from experiments.runs.provenance import versions
+from experiments.runs.synthesis_status import synthesis_status
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings, ChannelSettings, LearningSettings, settings_json
-from ncs_gym import Channel, LinearPlant, NCSEnv, registration
+from ncs_gym import Channel, LinearPlant
 from ncs_gym.envs.env import ncs_env
-from ncs_gym.registration import ENTRY_POINTS
 from shields import Certificate, Report, verify
 from shields.runtime.wrapper import certificate_for
 from shields.verification import require_valid
@@ -29,6 +30,7 @@ class ExperimentSetup:
 
     Attributes:
         env: Id of a registered environment.
+        module: Module of the user's that registers it; empty for one of this package.
         channel: Channel that replaces the environment's own; None keeps it.
         plant: Plant of the environment.
         certificate: Certificate for the plant, under the environment's channel contract.
@@ -36,6 +38,7 @@ class ExperimentSetup:
     """
 
     env: str
+    module: str
     channel: Channel | None
     plant: LinearPlant
     certificate: Certificate
@@ -47,21 +50,27 @@ class ExperimentSetup:
     ) -> ExperimentSetup:
         """Returns the setup of a registered environment, with another channel or with changes of its own channel.
 
+        Args:
+            env_id: Id, or "module:id" if the user gave it.
+            channel: Replaces or changes the environment's own channel; None keeps it.
+            certificate_file: File of the certificate; by default one is synthesized.
+
         Raises:
             ValueError: If the environment is unknown or has no plant of its own, or it cannot have the channel.
             CertificateError: If a given certificate is damaged or does not verify for the plant.
             Infeasible: If no certificate is found.
         """
-        own = registered_env(env_id)
+        own, (module, name) = registered_env(env_id), module_and_id(env_id)
         if isinstance(channel, ChannelSettings):
             channel = channel.applied_to(own.channel)
-        env = own if channel is None else ncs_env(gym.make(env_id, channel=channel))
+        env = own if channel is None else ncs_env(gym.make(name, channel=channel))
         if certificate_file is None:
-            certificate = certificate_for(env.plant, env.contract)
+            with synthesis_status() as show:
+                certificate = certificate_for(env.plant, env.contract, show)
         else:
             certificate = Certificate.load(certificate_file)
             require_valid(certificate, env.plant)
-        return cls(env_id, channel, env.plant, certificate, verify(certificate, env.plant))
+        return cls(name, module, channel, env.plant, certificate, verify(certificate, env.plant))
 
     @property
     def title(self) -> str:
@@ -80,7 +89,8 @@ class ExperimentSetup:
         return TrainingRun(
             arm=arm_name,
             policy_kind="trained",
-            env=settings.env,
+            env=self.env,
+            module=self.module,
             channel=self.channel,
             seed=settings.seed,
             index=index,
@@ -105,19 +115,3 @@ class ExperimentSetup:
             "certificate_file": self.certificate.document,
             "versions": versions(),
         }
-
-
-def registered_env(env_id: str) -> NCSEnv:
-    """Returns a registered environment that has a plant of its own.
-
-    Raises:
-        ValueError: If the id is not one of ours that has a plant of its own.
-    """
-    if env_id not in environment_ids():
-        raise ValueError(f"unknown environment {env_id!r}; known are {', '.join(environment_ids())}")
-    return ncs_env(gym.make(env_id))
-
-
-def environment_ids() -> list[str]:
-    """Returns the ids of the registered environments that have a plant of their own."""
-    return [env_id for env_id, name in ENTRY_POINTS.items() if getattr(registration, name).plant is not None]

@@ -15,6 +15,7 @@ from agents.control_loop import ControlLoop, ShieldSettings
 from agents.evaluation import Policy, evaluate
 from agents.results import Episode, TrainingPoint, Trajectory
 from agents.settings import AgentSettings, OffPolicySettings
+from experiments.runs.environments import import_module, module_digest
 from experiments.runs.provenance import json_digest, versions
 from ncs_gym import Channel
 from ncs_gym.envs.env import ncs_env
@@ -35,6 +36,7 @@ class TrainingRun:
         policy_kind: "trained" is a trained agent; "untrained" an agent with its initial weights; "certified gain"
             applies u = K x_hat; "zero" applies no input.
         env: Id of a registered environment.
+        module: Module of the user's that registers it, imported where the run is executed; empty for none.
         channel: Channel that replaces the environment's own; None keeps it.
         seed: Seed of the experiment.
         index: Number of the run within its arm; runs with equal index are paired across arms.
@@ -52,6 +54,7 @@ class TrainingRun:
     arm: str
     policy_kind: PolicyKind
     env: str
+    module: str = ""
     channel: Channel | None = None
     seed: int
     index: int
@@ -91,9 +94,13 @@ class TrainingRun:
     @property
     def key(self) -> str:
         """SHA-256 of everything the result depends on: all settings, this project's source and versions of packages."""
-        names = set(self.__dataclass_fields__) - {"certificate", "grid_point"}
+        names = set(self.__dataclass_fields__) - {"certificate", "grid_point", "module"}
         content = {name: getattr(self, name) for name in names}
-        content |= {"certificate": self.certificate.checksum, "channel": self.channel and asdict(self.channel)}
+        content |= {
+            "module": module_digest(self.module),
+            "certificate": self.certificate.checksum,
+            "channel": self.channel and asdict(self.channel),
+        }
         return json_digest(content | {"settings": asdict(self.settings), "versions": versions()})
 
     @property
@@ -146,6 +153,8 @@ def execute_run(run: TrainingRun, on_progress: Callable[[int], None], log_folder
         on_progress: Called with the number of training and evaluation steps taken since its last call.
         log_folder: Folder of TensorBoard's events; earlier events in it are removed.
     """
+    if run.module:
+        import_module(run.module)
     trained = None
     if run.policy_kind == "trained":
         from agents.training import train  # imports torch, which the process that only collects results does without

@@ -14,18 +14,29 @@ class SynthesizeSettings:
     """Synthesizes a certificate for an environment's plant, verifies it exactly and saves it.
 
     Attributes:
-        env: Id of one of the four environments with a plant of their own.
+        env: Id of an environment with a plant of its own; module:id first imports the module, which registers one of
+            your own (`ncs_gym.register_plant`). By default ncs_gym/TruckTrailerCruise-v0.
+        plant: File of a plant that `LinearPlant.save` wrote, in place of an environment's.
         method: Synthesis method: ours, whose result is verified exactly, or the published one as printed.
         out: File for the certificate (JSON).
-        max_age: Largest measurement age of the channel contract [steps]; by default the environment's contract.
+        max_age: Largest measurement age of the channel contract [steps]; by default the environment's contract, none
+            for the plant of a file.
+        quantization_step: Coarsest quantization that the channel contract allows; by default the environment's, none
+            for the plant of a file.
         seed: Accepted by every command; the synthesis is deterministic and does not use it.
     """
 
-    env: str = "ncs_gym/TruckTrailerCruise-v0"
+    env: str | None = None
+    plant: Path | None = None
     method: Literal["certified", "paper"] = "certified"
     out: Path = Path("certificate.json")
     max_age: int | None = None
+    quantization_step: float | None = None
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a setting contradicts another."""
+        _refuse_both(self.env, self.plant)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,16 +45,28 @@ class VerifySettings:
 
     Attributes:
         file: File of the certificate (JSON).
-        env: Id of one of the four environments with a plant of their own; without it, the one whose plant has the
+        env: Id of an environment with a plant of its own, or module:id; without it, the one whose plant has the
             certificate's fingerprint.
+        plant: File of a plant that `LinearPlant.save` wrote, in place of an environment's.
         out: File for the verdicts (JSON).
         seed: Accepted by every command; the verification is deterministic and does not use it.
     """
 
     file: tyro.conf.Positional[Path]
     env: str | None = None
+    plant: Path | None = None
     out: Path | None = None
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a setting contradicts another."""
+        _refuse_both(self.env, self.plant)
+
+
+def _refuse_both(env: str | None, plant: Path | None) -> None:
+    """Raises ValueError if both an environment and the file of a plant are given."""
+    if env is not None and plant is not None:
+        raise ValueError("give either --env or --plant, not both")
 
 
 @dataclass(frozen=True, kw_only=True)

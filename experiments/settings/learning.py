@@ -22,7 +22,8 @@ class LearningSettings:
 
     Attributes:
         config: Settings file (settings.json) of an earlier run; its settings hold where none are given here.
-        env: Id of one of the four environments with a plant of their own.
+        env: Id of an environment with a plant of its own; module:id first imports the module, which registers one of
+            your own (`ncs_gym.register_plant`).
         seed: Seed of the experiment, >= 0; all runs derive their seeds from it.
         steps: Training steps per run, rounded up to whole rollouts.
         episodes: Evaluation episodes per run.
@@ -117,6 +118,7 @@ class EvaluateSettings:
 
     Attributes:
         model: Folder of a trained agent, such as models/shielded-0 in the output of `ncs compare` or `ncs train`.
+        env: Id of the environment the agent was trained in; module:id, to import the module that registers it.
         shield: Mode of the shield; "monitor" changes nothing and counts what it would have done.
         episodes: Number of evaluation episodes.
         seed: Seed of the episodes.
@@ -126,6 +128,7 @@ class EvaluateSettings:
     """
 
     model: tyro.conf.Positional[Path]
+    env: str | None = None
     shield: Literal["none", "monitor", "project", "switch", "boundary"] = "none"
     episodes: int = 200
     seed: int = 0
@@ -182,7 +185,8 @@ class RenderSettings:
     """Draws an episode of a policy, as an animation or its last frame (docs/rendering.md).
 
     Attributes:
-        env: Id of one of the four environments with a plant of their own.
+        env: Id of an environment with a plant of its own; module:id first imports the module, which registers one of
+            your own (`ncs_gym.register_plant`).
         out: File to write: .gif, .mp4, or .png for the last frame alone.
         policy: "greedy" (toward the task's goal as hard as it can), "zero", "random", or the folder of a
             trained agent.

@@ -10,15 +10,17 @@ from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from experiments.errors import SettingsError
-from ncs_gym.validation import MAX_QUOTED_LENGTH
+from ncs_gym.validation import MAX_QUOTED_LENGTH, shown
 from shields.atomic_write import write_atomically
 
 FORMAT = "ncs-gym settings 1"
 
 
 def settings_json(command: str, settings: Any) -> dict[str, Any]:
-    """Returns a command's settings as JSON values."""
+    """Returns a command's settings as JSON values; of an environment "module:id" the id alone."""
     values = json.loads(json.dumps(asdict(settings), default=str))
+    if isinstance(values.get("env"), str):
+        values["env"] = values["env"].rpartition(":")[2]  # a file names no module to import
     return {"format": FORMAT, "command": command, "settings": {k: v for k, v in values.items() if k != "config"}}
 
 
@@ -67,6 +69,12 @@ def _load(path: Path, command: str, kind: type) -> Any:
         raise SettingsError(f"{path} is not of format {FORMAT!r}")
     if document.get("command") != command or not isinstance(document.get("settings"), dict):
         raise SettingsError(f"{path} holds settings of ncs {document.get('command')}, not of ncs {command}")
+    env_id = document["settings"].get("env")
+    if isinstance(env_id, str) and ":" in env_id:
+        raise SettingsError(
+            f"unknown environment {shown(env_id)}: settings in a file import no module; let {path} name the id alone, "
+            "and give --env module:id if you trust the module"
+        )
     try:
         return _from_json(document["settings"], kind)
     except (TypeError, ValueError, OverflowError, RecursionError) as error:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ncs_gym.validation import as_count, as_number
+from ncs_gym.validation import as_count, as_number, shown
 
 # Packets in flight are kept in memory, for every environment [steps].
 LONGEST_DELAY = 1000
@@ -59,7 +59,7 @@ class Channel:
     uniformly random 0..`jitter` more, so packets may overtake each other.
 
     Attributes:
-        loss: Probability of losing a packet (1.0 is a blackout), or a `GilbertElliott`.
+        loss: Probability of losing a packet (1.0 is a blackout), or a `GilbertElliott` or a dictionary of its fields.
         quantization_step: Step q of the uniform mid-tread quantizer, in the units of y; 0 does not round.
         send_period: Steps between samples.
         delay: Fixed delay [steps].
@@ -78,6 +78,8 @@ class Channel:
     max_consecutive_losses: int | None = None
 
     def __post_init__(self) -> None:
+        if isinstance(self.loss, dict):
+            object.__setattr__(self, "loss", _bursts(self.loss))
         if not isinstance(self.loss, GilbertElliott):
             object.__setattr__(self, "loss", as_number(self.loss, "loss", low=0.0, high=1.0))
         step = as_number(self.quantization_step, "quantization_step", low=0.0)
@@ -106,3 +108,18 @@ class Channel:
         """Returns the measurement, of any shape, rounded to multiples of the quantization step."""
         q = self.quantization_step
         return np.rint(measurement / q) * q if q > 0.0 else measurement
+
+
+def _bursts(loss: dict[str, Any]) -> GilbertElliott:
+    """Returns the bursty loss whose fields a dictionary holds, as `dataclasses.asdict` leaves one.
+
+    Raises:
+        ValueError: If a field is unknown or missing, or no probability.
+    """
+    try:
+        return GilbertElliott(**loss)
+    except TypeError:
+        names = ", ".join(entry.name for entry in fields(GilbertElliott))
+        raise ValueError(
+            f"loss must be a probability or the fields of GilbertElliott ({names}), got {shown(loss)}"
+        ) from None

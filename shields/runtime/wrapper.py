@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import hypot
 from typing import Any, TypeVar
 
@@ -165,8 +166,15 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         }
 
 
-def certificate_for(plant: LinearPlant, contract: ChannelContract | None = None) -> Certificate:
+def certificate_for(
+    plant: LinearPlant, contract: ChannelContract | None = None, progress: Callable[[str], object] | None = None
+) -> Certificate:
     """Returns a synthesized certificate, made once per process, plant and channel contract.
+
+    Args:
+        plant: The plant.
+        contract: Channel contract; None for none.
+        progress: Called with a line of text per stage of the synthesis.
 
     Raises:
         Infeasible: If none is found.
@@ -175,7 +183,7 @@ def certificate_for(plant: LinearPlant, contract: ChannelContract | None = None)
     if key not in _synthesized:
         from shields.synthesis import synthesize  # the solver, which who has a certificate does without
 
-        _synthesized[key] = synthesize(plant, contract=contract)
+        _synthesized[key] = synthesize(plant, contract=contract, progress=progress)
     return _synthesized[key]
 
 

@@ -1,0 +1,105 @@
+"""Certificates as values: equal if their files are; in words."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ncs_gym import ChannelContract, cart_pole
+from shields import Certificate, synthesize
+from shields.certificate_file import _digest
+
+
+@pytest.fixture
+def path(certificate, tmp_path):
+    certificate.save(tmp_path / "certificate.json")
+    return tmp_path / "certificate.json"
+
+
+@pytest.fixture(scope="module")
+def by_age():
+    return synthesize(cart_pole(), contract=ChannelContract(3, 1e-4))
+
+
+def test_what_is_loaded_equals_what_was_saved(certificate, by_age, tmp_path):
+    for each in (certificate, by_age):
+        each.save(tmp_path / "c.json")
+        loaded = Certificate.load(tmp_path / "c.json")
+        assert loaded == each
+        assert hash(loaded) == hash(each)
+        assert len({loaded, each}) == 1
+    assert by_age != certificate
+    assert certificate != "certificate"
+
+
+def test_any_other_last_digit_makes_another_certificate(certificate, by_age):
+    for name in ("L", "K", "Sigma", "D"):
+        array = getattr(certificate, name).copy()
+        array.flat[0] = np.nextafter(array.flat[0], 1.0)
+        assert replace(certificate, **{name: array}) != certificate, name
+    moved = replace(certificate.multipliers, state=np.nextafter(certificate.multipliers.state, 0.0))
+    assert replace(certificate, multipliers=moved) != certificate
+    gains = by_age.ages.sets.gains.copy()
+    gains.flat[-1] = np.nextafter(gains.flat[-1], 1.0)
+    ages = replace(by_age.ages, sets=replace(by_age.ages.sets, gains=gains))
+    assert replace(by_age, ages=ages) != by_age
+    assert replace(certificate, fingerprint="0" * 64) != certificate
+
+
+def test_files_without_today_s_records_load_and_are_saved_byte_by_byte(path):
+    document = json.loads(path.read_text())
+    for name in ("share_of_box", "tolerated_scale", "assumptions"):
+        document["certificate"]["provenance"].pop(name, None)
+    literal = json.loads(json.dumps(document["certificate"]), parse_float=str, parse_int=str)
+    document["sha256"] = _digest(literal)
+    path.write_text(json.dumps(document, indent=1) + "\n")
+    before = path.read_bytes()
+    loaded = Certificate.load(path)
+    loaded.save(path)
+    assert path.read_bytes() == before
+    assert "99.97 % of the volume of the largest ellipsoid" in str(loaded)
+
+
+def test_printed_certificate_says_what_it_is_for(certificate, by_age):
+    text = str(certificate)
+    assert "certified" in text
+    assert "2 states, 1 input" in text
+    # A plane's largest ellipse fills pi/4 of its parallelogram.
+    volume = np.sqrt(np.linalg.det(certificate.L)) * np.pi / 16.0  # the box is 4 by 4
+    assert f"{100.0 * volume:.4g} % of the safe box's volume" in text
+    assert "99.97 % of the volume of the largest ellipsoid" in text
+    assert "none: any packets may be lost or late" in text
+    assert "never older than 3 steps; samples are rounded to 0.0001 or finer" in str(by_age)
+
+
+def test_tolerated_scale_is_one_that_some_certificate_exists_for(loaded, certificate):
+    scale = certificate.provenance["tolerated_scale"]
+    assert f"up to {scale:.2f} times those assumed" in str(certificate)
+
+    def scaled(factor):
+        names = ("process_noise_cov", "measurement_noise_cov", "initial_cov")
+        bounds = {name: factor**2 * getattr(loaded, name) for name in names}
+        return replace(loaded, gamma=factor**2 * loaded.gamma, **bounds)
+
+    assert synthesize(scaled(0.99 * scale)).provenance["tolerated_scale"] == pytest.approx(1 / 0.99, rel=1e-2)
+
+
+def test_printed_certificate_repeats_the_plant_s_assumptions(certificate):
+    sentences = ["It is assumed that the first estimate is exact.", "Gaussian noise is truncated."]
+    recorded = replace(certificate, provenance=certificate.provenance | {"assumptions": sentences})
+    assert " ".join(sentences) in " ".join(str(recorded).split())
+
+
+@pytest.mark.parametrize("junk", [3, None, [], {}, "text", [1, 2], 10**400])
+def test_strange_provenance_does_not_stop_printing(certificate, junk):
+    names = ("volume_of_box_ellipsoid", "share_of_box", "tolerated_scale", "assumptions", "interrupted_at")
+    strange = replace(certificate, provenance=dict.fromkeys(names, junk))
+    assert "fallback" in str(strange)
+
+
+def test_certificate_of_the_paper_s_method_prints_its_guarantee():
+    paper = Certificate(
+        L=np.eye(2), K=np.ones((1, 2)), method="paper", fingerprint="0", kappa=0.5, rho=1.2, epsilon=0.1, epsilon_up=0.2
+    )
+    assert "never guaranteed" in str(paper)

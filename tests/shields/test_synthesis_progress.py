@@ -1,0 +1,92 @@
+"""Long syntheses: what they say, and what an interrupted one leaves."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from shields import synthesize, verify
+from shields.errors import SynthesisInterrupted
+from tests.plants import random_plant
+
+
+def interrupting_at(stage):
+    """A progress function that interrupts, as Ctrl-C would, at a stage."""
+
+    def progress(line):
+        if line.startswith(stage):
+            raise KeyboardInterrupt
+
+    return progress
+
+
+def test_every_stage_says_what_is_sought_and_the_volume_reached(loaded):
+    lines = []
+    certificate = synthesize(loaded, progress=lines.append)
+    assert lines[0] == "error set"
+    assert lines[1].startswith("initial design 1 of 14: ")
+    assert any(line.startswith("alternation 1 of at most 40: ") for line in lines)
+    volume = certificate.provenance["volume_of_box_ellipsoid"]
+    assert lines[-1] == f"exact verification: {volume:.4f} of the box ellipsoid's volume"
+
+
+@pytest.mark.parametrize("stage", ["initial design 2", "alternation 1", "exact verification"])
+def test_interrupted_synthesis_hands_out_the_best_certificate_so_far(loaded, stage):
+    with pytest.raises(SynthesisInterrupted, match=f"interrupted: the synthesis was at {stage}.* of the box") as caught:
+        synthesize(loaded, progress=interrupting_at(stage))
+    certificate = caught.value.certificate
+    assert verify(certificate, loaded).valid
+    assert certificate.provenance["interrupted_at"].startswith(stage)
+    assert "other sets may be larger" in str(certificate)
+    assert isinstance(caught.value, KeyboardInterrupt)
+
+
+def test_synthesis_interrupted_before_it_has_a_set_has_no_certificate(loaded, monkeypatch):
+    solved = "shields.synthesis.invariant_set_program.InvariantSetProgram.solve"
+    monkeypatch.setattr(solved, lambda *arguments: None)
+    with pytest.raises(SynthesisInterrupted, match="had no certificate yet") as caught:
+        synthesize(loaded, progress=interrupting_at("initial design 3"))
+    assert caught.value.certificate is None
+
+
+def test_best_set_that_does_not_verify_is_not_handed_out(loaded, monkeypatch):
+    finished = "shields.synthesis.certification.with_best_gain"
+    monkeypatch.setattr(finished, lambda problem, design: replace(design, L=3.0 * design.L))
+    with pytest.raises(SynthesisInterrupted, match="had no certificate yet") as caught:
+        synthesize(loaded, progress=interrupting_at("alternation 1"))
+    assert caught.value.certificate is None
+
+
+def test_sixteen_states_take_less_than_a_minute_of_computing():
+    plant = random_plant(2, 16, 3)
+    start = time.process_time()
+    certificate = synthesize(plant)
+    assert time.process_time() - start < 60.0
+    assert verify(certificate, plant).valid
+    assert certificate.provenance["volume_of_box_ellipsoid"] > 0.88
+
+
+# Volumes of the program with 3n-row matrix inequalities, which this one replaced and to which it is equivalent.
+@pytest.mark.parametrize(
+    ("seed", "n", "m", "volume"),
+    [(0, 4, 2, 0.979989), (2, 4, 2, 0.922852), (1, 6, 2, 0.810750), (2, 6, 2, 0.958635)],
+)
+def test_volumes_are_those_of_the_conditions_as_they_stand(seed, n, m, volume):
+    assert synthesize(random_plant(seed, n, m)).provenance["volume_of_box_ellipsoid"] == pytest.approx(volume, abs=1e-3)
+
+
+def test_condensed_inequalities_are_those_of_the_conditions():
+    from shields.synthesis.design_problem import design_problem
+    from shields.synthesis.invariant_set_program import InvariantSetProgram
+
+    problem, _ = design_problem(random_plant(1, 4, 2))
+    multipliers, inputs = (0.85, 0.045, 0.105), np.array([0.8, 0.7])
+    design = InvariantSetProgram(problem, 1e-6).solve(multipliers, inputs, np.eye(4))
+    (lx, le, ld), L, K, Sigma = multipliers, design.L, design.K, problem.error_shapes[0]
+    closed, BK = problem.A + problem.B @ K, problem.B @ K
+    rest = L - closed @ L @ closed.T / lx - BK @ Sigma @ BK.T / le - problem.D_u / ld
+    assert np.linalg.eigvalsh(rest)[0] > -1e-7
+    used = np.einsum("ij,jk,ik->i", K, L, K) / inputs + np.einsum("ij,jk,ik->i", K, Sigma, K) / (1.0 - inputs)
+    assert used.max() <= 1.0
+    assert (np.einsum("ij,jk,ik->i", problem.C, L, problem.C) <= 1.0).all()
