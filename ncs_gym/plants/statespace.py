@@ -126,8 +126,8 @@ def delayed_arguments(plant: LinearPlant, input_delay: int) -> dict[str, Any]:
     delay = as_count(input_delay, "input_delay", low=1, high=LONGEST_INPUT_DELAY)
     if np.any(plant.initial_cov):
         raise ValueError(
-            "with input_delay the first error must be given by initial_bound: the bound of initial_cov is a ball in "
-            "all states, and inputs under way are known"
+            "with input_delay the first error must be given by initial_bound: that of initial_cov is a ball in all "
+            "states, and inputs under way are known"
         )
     n, m, stored = plant.n, plant.m, plant.m * delay
     A = np.zeros((n + stored, n + stored))
