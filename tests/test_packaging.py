@@ -25,7 +25,9 @@ LAYERS = {
         {"network", "tasks"},
         {"estimation", "rendering"},
         {"envs"},
+        {"json_settings"},
         {"registration"},
+        {"plant_registration"},
     ),
     "shields": (
         {"errors", "atomic_write"},
