@@ -38,7 +38,7 @@ def register_plant(
             box=[0.3, 0.5],  # |x_1| <= 0.3 m, |x_2| <= 0.5 m at every step
             u_max=2.0,
             dt=1.0,
-            disturbance_bound=[0.002, 0.005],  # largest change per step by what is not modeled [m]
+            disturbance_bound=[0.001, 0.002],  # largest change per step by what is not modeled [m]
             sensor_bound=0.01,
             initial_bound=0.01,
         )

@@ -2,6 +2,7 @@
 
 import ast
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -118,8 +119,16 @@ def evil(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("command", ["compare", "train", "sweep", "render", "synthesize"])
-def test_no_module_is_imported_for_an_id(command, evil):
-    assert_one_sentence(ncs(command, "--env", "evil:Evil-v0", cwd=evil), "unknown environment 'evil:Evil-v0'")
+def test_no_module_is_imported_for_an_id_alone(command, evil):
+    assert_one_sentence(ncs(command, "--env", "evil/Evil-v0", cwd=evil), "unknown environment 'evil/Evil-v0'")
+
+
+def test_module_that_the_user_names_is_imported(evil, monkeypatch):
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    run = ncs("synthesize", "--env", "evil:Evil-v0", cwd=evil)
+    assert_one_sentence(run, "module 'evil' registers no environment 'Evil-v0'")
+    del sys.modules["evil"]
+    (evil / "imported").unlink()
 
 
 def test_settings_of_others_import_no_module(evil):
@@ -127,6 +136,10 @@ def test_settings_of_others_import_no_module(evil):
     content["settings"]["env"] = "evil:Evil-v0"
     (evil / "settings.json").write_text(json.dumps(content))
     assert_one_sentence(ncs("compare", "--config", "settings.json", cwd=evil), "unknown environment 'evil:Evil-v0'")
+
+
+def test_settings_files_name_no_module():
+    assert settings_json("compare", CompareSettings(env="evil:Evil-v0"))["settings"]["env"] == "Evil-v0"
 
 
 def test_agents_of_others_import_no_module(evil):

@@ -161,7 +161,7 @@ def _interrupted(plant: LinearPlant, stage: str, best: Certificate | None) -> Sy
 
 def _with_tolerated_scale(certificate: Certificate, problem: DesignProblem) -> Certificate:
     """Returns the certificate with a record of how much larger all radii could be for some other set and gain."""
-    gain = max_margin_gain(problem, problem.covering_error_shape)
+    gain = max_margin_gain(problem, problem.covering_error_shape, searches=1)
     if gain is None or gain.margin < 1.0:  # the search for it is local, and covers the error sets of all ages by one
         return certificate
     return replace(certificate, provenance=certificate.provenance | {"tolerated_scale": gain.margin})

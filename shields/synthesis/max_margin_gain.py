@@ -14,7 +14,7 @@ from shields.synthesis.design_problem import DesignProblem
 # Weights of the inputs, and decay rates of the closed loop, of the linear-quadratic regulators the search begins with.
 _INPUT_WEIGHTS = (0.1, 1.0, 10.0, 100.0)
 _DECAY_RATES = (0.75, 0.9, 0.96, 0.985)
-# The search is continued from this many of them, those of largest margin.
+# The search is continued from this many of them.
 _LOCAL_SEARCHES = 3
 _ITERATIONS = 300
 # Logarithm of the use of every limit that is assigned to a gain that does not stabilize.
@@ -40,7 +40,9 @@ class MaxMarginGain:
     margin: float
 
 
-def max_margin_gain(problem: DesignProblem, Sigma: np.ndarray, *, input_limits: bool = True) -> MaxMarginGain | None:
+def max_margin_gain(
+    problem: DesignProblem, Sigma: np.ndarray, *, input_limits: bool = True, searches: int = _LOCAL_SEARCHES
+) -> MaxMarginGain | None:
     """Returns the gain that tolerates the largest radii; None if no stabilizing gain is found.
 
     For a gain and multipliers, (I) has a smallest solution L, a Lyapunov series, which grows with the square of the
@@ -51,10 +53,11 @@ def max_margin_gain(problem: DesignProblem, Sigma: np.ndarray, *, input_limits: 
         problem: The scaled design problem.
         Sigma: Shape of the error set, scaled, (n, n).
         input_limits: False drops (U), which tells whether the input limits are what binds.
+        searches: Number of regulators, those of largest margin, that the search begins at.
     """
     search = _GainSearch(problem, Sigma, input_limits)
     with np.errstate(all="ignore"):
-        initial = sorted(_initial_points(problem), key=search.largest_use)[:_LOCAL_SEARCHES]
+        initial = sorted(_initial_points(problem), key=search.largest_use)[:searches]
         improved = [search.improved(point) for point in initial]
     best = min(improved, key=search.largest_use, default=None)
     return None if best is None else search.gain_at(best)

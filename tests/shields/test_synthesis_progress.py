@@ -58,13 +58,13 @@ def test_best_set_that_does_not_verify_is_not_handed_out(loaded, monkeypatch):
     assert caught.value.certificate is None
 
 
-def test_sixteen_states_take_less_than_a_minute_of_computing():
-    plant = random_plant(2, 16, 3)
+def test_synthesis_for_sixteen_states_computes_for_seconds():
+    plant = random_plant(4, 16, 3)
     start = time.process_time()
     certificate = synthesize(plant)
-    assert time.process_time() - start < 60.0
+    assert time.process_time() - start < 20.0  # 2 s on an idle machine; the conditions as they stand took 20 s
     assert verify(certificate, plant).valid
-    assert certificate.provenance["volume_of_box_ellipsoid"] > 0.88
+    assert certificate.provenance["volume_of_box_ellipsoid"] > 0.999
 
 
 # Volumes of the program with 3n-row matrix inequalities, which this one replaced and to which it is equivalent.

@@ -366,7 +366,7 @@ def test_too_large_disturbance_raises_or_is_allowed_and_noticed():
     [
         ({"plant": 3}, "plant must be of type LinearPlant"),
         ({"terminate_on_violation": "no"}, "terminate_on_violation must be True or False"),
-        ({"channel": {"loss": 0.3}}, "channel must be of type Channel"),
+        ({"channel": "lossy"}, "channel must be of type Channel"),
         ({"task": "drive"}, "task must be of type Task"),
         ({"initial_set": np.eye(2)}, "initial_set must be of type Ellipsoid"),
         ({"initial_set": Ellipsoid(np.eye(3))}, "dimension 2, got 3"),

@@ -1,0 +1,154 @@
+"""Commands for a user's own plant: `--env module:id` and `--plant FILE`."""
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import termios
+import time
+
+import gymnasium as gym
+import pytest
+
+from ncs_gym import truck_trailer
+from shields import Certificate, verify
+from tests.command import assert_one_sentence, environment, ncs
+from tests.plants import random_plant
+
+MODULE = """
+from ncs_gym import Channel, register_plant, truck_trailer
+
+register_plant("Plants/Truck-v0", truck_trailer(mass=2000.0), channel=Channel(loss=0.2), max_episode_steps=20)
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with a module that registers a plant; neither the module nor the id outlives the test."""
+    (tmp_path / "own_plants.py").write_text(MODULE)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    yield tmp_path
+    sys.modules.pop("own_plants", None)
+    gym.registry.pop("Plants/Truck-v0", None)
+
+
+ENV = ("--env", "own_plants:Plants/Truck-v0")
+
+
+def test_certificate_for_a_registered_plant_is_made_and_verified(folder):
+    run = ncs("synthesize", *ENV, cwd=folder)
+    assert run.returncode == 0, run.stderr
+    assert "% of the safe box's volume" in run.stdout
+    certificate = Certificate.load(folder / "certificate.json")
+    assert verify(certificate, truck_trailer(mass=2000.0)).valid
+    assert ncs("verify", "certificate.json", *ENV, cwd=folder).stdout.endswith("valid\n")
+    assert_one_sentence(ncs("verify", "certificate.json", "--env", "ncs_gym/TruckTrailer-v0", cwd=folder), "verify")
+
+
+def test_own_plant_is_trained_in_and_evaluated_by_its_id(folder):
+    run = ncs(
+        "train", *ENV, "--steps", 64, "--episodes", 2, "--ppo.rollout", 16, "--ppo.envs", 2, "--out", "r", cwd=folder
+    )
+    assert run.returncode == 0, run.stderr
+    settings = json.loads((folder / "r" / "settings.json").read_text())
+    assert settings["settings"]["env"] == "Plants/Truck-v0"  # a file names no module
+    model = next((folder / "r" / "models").iterdir())
+    assert json.loads((model / "agent.json").read_text())["agent"]["env"] == "Plants/Truck-v0"
+    evaluated = ncs("evaluate", model, *ENV, "--episodes", 2, cwd=folder)
+    assert evaluated.returncode == 0, evaluated.stderr
+    other = ncs("evaluate", model, "--env", "ncs_gym/TruckTrailer-v0", cwd=folder)
+    assert_one_sentence(other, "was trained in Plants/Truck-v0, not in ncs_gym/TruckTrailer-v0")
+
+
+def test_own_plant_is_drawn(folder):
+    run = ncs("render", *ENV, "--out", "frame.png", "--steps", 2, "--shield", "none", cwd=folder)
+    assert run.returncode == 0, run.stderr
+    assert (folder / "frame.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("env_id", "words"),
+    [
+        ("own_plants:Plants/Tank-v0", "module 'own_plants' registers no environment 'Plants/Tank-v0'"),
+        ("no_such_module:Plants/Truck-v0", "there is no module 'no_such_module'"),
+        ("own_plants.inner:Plants/Truck-v0", "there is no module 'own_plants.inner'"),
+        ("../own_plants:Plants/Truck-v0", "needs the name of a module, got '../own_plants'"),
+        ("Plants/Truck-v0", "unknown environment 'Plants/Truck-v0'"),
+        ("own_plants:CartPole-v1", "expected an NCSEnv inside"),
+        ("ncs_gym:ncs_gym/LinearNCS-v0", "no plant of its own"),
+    ],
+)
+def test_wrong_ids_are_refused_in_one_sentence(folder, env_id, words):
+    assert_one_sentence(ncs("synthesize", "--env", env_id, cwd=folder), words)
+
+
+def test_error_of_the_module_itself_is_told(folder):
+    (folder / "own_plants.py").write_text("import something_that_is_missing")
+    assert_one_sentence(ncs("synthesize", *ENV, cwd=folder), "something_that_is_missing")
+
+
+def test_id_of_this_package_may_name_its_module(folder):
+    run = ncs("synthesize", "--env", "ncs_gym:ncs_gym/TruckTrailer-v0", cwd=folder)
+    assert run.returncode == 0, run.stderr
+
+
+def test_plant_of_a_file_is_certified(tmp_path):
+    random_plant(3, 3, 2).save(tmp_path / "plant.json")
+    made = ncs("synthesize", "--plant", "plant.json", cwd=tmp_path)
+    assert made.returncode == 0, made.stderr
+    assert Certificate.load(tmp_path / "certificate.json").ages is None
+    verified = ncs("verify", "certificate.json", "--plant", "plant.json", "--out", "v.json", cwd=tmp_path)
+    assert verified.stdout.endswith("valid\n")
+    assert json.loads((tmp_path / "v.json").read_text())["env"] == "plant.json"
+
+
+def test_plant_of_a_file_under_a_contract(tmp_path):
+    random_plant(3, 3, 2).save(tmp_path / "plant.json")
+    asked = ("--plant", "plant.json", "--max-age", 2, "--quantization-step", 0.001)
+    assert ncs("synthesize", *asked, cwd=tmp_path).returncode == 0
+    contract = Certificate.load(tmp_path / "certificate.json").ages.sets.contract
+    assert (contract.max_age, contract.quantization_step) == (2, 0.001)
+    alone = ncs("synthesize", "--plant", "plant.json", "--quantization-step", 0.001, cwd=tmp_path)
+    assert_one_sentence(alone, "give --max-age, too")
+
+
+@pytest.mark.parametrize("command", [("synthesize",), ("verify", "certificate.json")])
+def test_plant_of_a_file_is_no_environment(command, tmp_path, certificate):
+    certificate.save(tmp_path / "certificate.json")
+    both = ncs(*command, "--plant", "p.json", "--env", "ncs_gym/TruckTrailer-v0", cwd=tmp_path)
+    assert both.returncode == 2
+    assert "not both" in both.stderr
+    assert_one_sentence(ncs(*command, "--plant", "nowhere.json", cwd=tmp_path), "nowhere.json")
+
+
+def read_until(terminal, words, seconds=120.0):
+    """What a terminal shows until it has shown some words, or nothing more comes."""
+    seen, start = "", time.monotonic()
+    while words not in seen and time.monotonic() - start < seconds:
+        try:
+            seen += os.read(terminal, 4096).decode()
+        except OSError:  # the other end is closed
+            break
+    return seen
+
+
+def test_long_synthesis_shows_its_stage_and_saves_the_best_when_interrupted(tmp_path):
+    (tmp_path / "slow.py").write_text(
+        "from ncs_gym import register_plant\nfrom tests.plants import random_plant\n"
+        "register_plant('Plants/Slow-v0', random_plant(0, 12, 3))\n"
+    )
+    ours, theirs = pty.openpty()
+    termios.tcsetwinsize(theirs, (24, 110))
+    command = [sys.executable, "-m", "experiments", "synthesize", "--env", "slow:Plants/Slow-v0"]
+    process = subprocess.Popen(command, cwd=tmp_path, env=environment(), stderr=theirs, stdout=subprocess.DEVNULL)
+    os.close(theirs)
+    shown = read_until(ours, "of the box ellipsoid's volume [00:")
+    assert "initial design 1 of 14" not in shown  # silent for the first seconds
+    process.send_signal(signal.SIGINT)
+    end = read_until(ours, "certificate.json\r\n")
+    assert process.wait(60) == 130
+    assert "ncs: interrupted: the best certificate so far, which verifies (" in end
+    assert verify(Certificate.load(tmp_path / "certificate.json"), random_plant(0, 12, 3)).valid
+    os.close(ours)
