@@ -182,7 +182,7 @@ class ReachableSet(NamedTuple):
         """Returns what `ReachableSets.closest` does for plants with a single input, shape (1,)."""
         effect, offset = self.turn.dot(self.test.effect[:, 0]), self.turn.dot(self.offset)
         form = effect.dot(effect), effect.dot(offset), offset.dot(offset)
-        return closest_on_lines(u.item(), *form, self.radius - reserve, self.test.limits[0]).reshape(1)
+        return np.array([closest_on_lines(u.item(), *form, self.radius - reserve, self.test.limits[0])])
 
 
 def norms(vectors: np.ndarray) -> np.ndarray:
