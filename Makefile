@@ -77,7 +77,7 @@ $(RAY_INSTALLED): $(INSTALLED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[ray]'
 	touch $@
 
-# rl-zoo3 declares older versions than it runs with (docs/other_code.md).
+# rl-zoo3 declares older versions than it runs with (docs/integrations.md).
 $(ZOO_INSTALLED): examples/rl_zoo/requirements.txt $(INSTALLED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r examples/rl_zoo/requirements.txt
 	touch $@

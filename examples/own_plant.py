@@ -14,15 +14,16 @@ parser.add_argument("--steps", type=int, default=50_000)
 options = parser.parse_args()
 
 # The plant is a damped pendulum in discrete time, with the state (angle [rad], rate [rad/s]) and a torque as input.
-# Each row of C is one limit, |C x| <= 1: the angle stays within 0.5 rad and the rate within 2 rad/s.
+# The angle has to stay within 0.5 rad and the rate within 2 rad/s.
 plant = ncs_gym.LinearPlant(
     A=[[0.98, 0.095], [-0.38, 0.90]],
     B=[[0.005], [0.095]],
-    box=[[1 / 0.5, 0.0], [0.0, 1 / 2.0]],
+    box=[0.5, 2.0],
     u_max=3.0,
     dt=0.1,
     gamma=1e-5,  # The disturbance d satisfies |d|^2 <= gamma.
-    measurement_noise_cov=[[1e-5, 0.0], [0.0, 1e-4]],
+    measurement_noise_cov=[[1e-5, 0.0], [0.0, 1e-4]],  # Gaussian, truncated at 1 - delta = 95 %.
+    initial_bound=0.0,  # The first state is known.
     state_names=("angle", "rate"),
     state_units=("rad", "rad/s"),
 )

@@ -31,7 +31,7 @@ class WorstCaseVectorEnv(NCSVectorEnv):
 
     def _extreme_noise(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Returns sensor noise on the boundary of its bound, shape (p, count)."""
-        return INWARD * self.plant.sensor_noise.bound.sample_boundary(rng, count).T
+        return INWARD * self.plant.nominal_sensor_error.sample_boundary(rng, count).T
 
     def _first(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns states on the boundary of S and first errors on the boundary of theirs, shape (n, count) each."""
