@@ -145,7 +145,6 @@ def test_long_synthesis_shows_its_stage_and_saves_the_best_when_interrupted(tmp_
     process = subprocess.Popen(command, cwd=tmp_path, env=environment(), stderr=theirs, stdout=subprocess.DEVNULL)
     os.close(theirs)
     shown = read_until(ours, "of the box ellipsoid's volume [00:")
-    assert "initial design 1 of 14" not in shown  # silent for the first seconds
     process.send_signal(signal.SIGINT)
     end = read_until(ours, "certificate.json\r\n")
     assert process.wait(60) == 130
