@@ -144,7 +144,7 @@ def test_long_synthesis_shows_its_stage_and_saves_the_best_when_interrupted(tmp_
     command = [sys.executable, "-m", "experiments", "synthesize", "--env", "slow:Plants/Slow-v0"]
     process = subprocess.Popen(command, cwd=tmp_path, env=environment(), stderr=theirs, stdout=subprocess.DEVNULL)
     os.close(theirs)
-    shown = read_until(ours, "of the box ellipsoid's volume [00:")
+    read_until(ours, "of the box ellipsoid's volume [00:")
     process.send_signal(signal.SIGINT)
     end = read_until(ours, "certificate.json\r\n")
     assert process.wait(60) == 130
