@@ -30,19 +30,19 @@ class ExperimentSetup:
 
     Attributes:
         env: Id of a registered environment.
-        module: Module of the user's that registers it; empty for one of this package.
         channel: Channel that replaces the environment's own; None keeps it.
         plant: Plant of the environment.
         certificate: Certificate for the plant, under the environment's channel contract.
         verification: Exact verification of the certificate.
+        module: Module of the user's that registers the environment; empty for one of this package.
     """
 
     env: str
-    module: str
     channel: Channel | None
     plant: LinearPlant
     certificate: Certificate
     verification: Report
+    module: str = ""
 
     @classmethod
     def of(
@@ -70,7 +70,7 @@ class ExperimentSetup:
         else:
             certificate = Certificate.load(certificate_file)
             require_valid(certificate, env.plant)
-        return cls(name, module, channel, env.plant, certificate, verify(certificate, env.plant))
+        return cls(name, channel, env.plant, certificate, verify(certificate, env.plant), module)
 
     @property
     def title(self) -> str:

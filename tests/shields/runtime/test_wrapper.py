@@ -218,7 +218,7 @@ def test_certificate_is_synthesized_once_per_plant(monkeypatch):
 
     calls = []
     monkeypatch.setattr(wrapper, "_synthesized", {})
-    monkeypatch.setattr(synthesis, "synthesize", lambda plant, contract: calls.append(plant) or synthesize(plant))
+    monkeypatch.setattr(synthesis, "synthesize", lambda plant, **settings: calls.append(plant) or synthesize(plant))
     one, other = SafetyShield(gym.make(CRUISE)), SafetyShield(gym.make(CRUISE))
     assert one.certificate is other.certificate
     assert len(calls) == 1
