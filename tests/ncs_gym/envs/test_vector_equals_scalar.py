@@ -230,8 +230,8 @@ def test_graphs_that_nobody_uses_any_more_are_freed(monkeypatch):
     env.reset(seed=0)
     for _ in steps_of(env, 500):
         graphs.add(env._estimator.patterns)
-        gc.collect()
-        assert len(graphs) <= 3
+    gc.collect()
+    assert len(graphs) <= 3
     assert env.single.estimator._patterns is not env._estimator.patterns
 
 
