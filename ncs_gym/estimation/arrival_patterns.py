@@ -8,6 +8,7 @@ one node at a time, the vectorized one for all environments at once.
 from __future__ import annotations
 
 import threading
+import weakref
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -94,7 +95,8 @@ class ArrivalPatterns:
         self._arrivals: dict[tuple[int, int], int] = {}
         self._replays: dict[int, Replay] = {}
         self._lock = threading.RLock()
-        self._successor: ArrivalPatterns | None = None
+        # Weak, or an estimator that never moves on from this graph would keep all that came after it.
+        self._successor: weakref.ref[ArrivalPatterns] | None = None
         self._adopted_count, self.is_full = 0, False
         # What a pattern and what statistics take, in numbers of 8 bytes.
         n, p = recursion.plant.n, recursion.plant.p
@@ -168,9 +170,10 @@ class ArrivalPatterns:
     def keeping(self, patterns: np.ndarray) -> tuple[ArrivalPatterns, np.ndarray]:
         """Returns a graph with some patterns, shape (k,), only, and their numbers there."""
         with self._lock:
-            successor = self._successor
+            successor = None if self._successor is None else self._successor()
             if successor is None or successor.is_full:
-                successor = self._successor = ArrivalPatterns(self.recursion, self.channel)
+                successor = ArrivalPatterns(self.recursion, self.channel)
+                self._successor = weakref.ref(successor)
                 successor._lock = self._lock  # the recursion, which belongs to both, has a filter that moves
             for key, shared in list(_shared.items()):
                 if shared is self:

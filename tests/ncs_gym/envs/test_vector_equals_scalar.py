@@ -1,10 +1,12 @@
 """The vector environment equals the scalar one, fed with the same draws; shared graphs and copies change nothing."""
 
 import copy
+import gc
 import pickle
 import sys
 import threading
 import tracemalloc
+import weakref
 
 import gymnasium as gym
 import numpy as np
@@ -218,6 +220,19 @@ def test_graphs_of_long_buffers_and_large_plants_hold_fewer_patterns(plant, chan
         tracemalloc.stop()
     assert len(graphs) > 1
     assert 0.4 < max(sizes) / (8 * arrival_patterns.MAX_NUMBERS) < 1.6
+
+
+def test_graphs_that_nobody_uses_any_more_are_freed(monkeypatch):
+    # The environment for one that a vector environment holds is never stepped: it stays in the first graph.
+    monkeypatch.setattr(arrival_patterns, "_shared", {})
+    monkeypatch.setattr(arrival_patterns, "MAX_PATTERNS", 100)
+    env, graphs = NCSVectorEnv(3, **OVERTAKING), weakref.WeakSet()
+    env.reset(seed=0)
+    for _ in steps_of(env, 500):
+        graphs.add(env._estimator.patterns)
+    gc.collect()
+    assert len(graphs) <= 3
+    assert env.single.estimator._patterns is not env._estimator.patterns
 
 
 def test_graphs_of_many_plants_are_not_kept_for_ever(monkeypatch):
