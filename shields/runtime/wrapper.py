@@ -85,6 +85,8 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         self.filter = SafetyFilter(self.certificate, inner.plant, mode)
         self._guarded = GuardedFilter(self.filter)
         self._clock: tuple[int, int] | None = None
+        self._start: Any = None
+        self._starts_inside = False
         self._is_drawn = env.unwrapped.render_mode is not None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -99,7 +101,10 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
                 self._clock = before
             raise
         clock, report = self._read_clock(), self._observed(info)
-        self._guarded.begin(report, starts_inside(self.certificate, ncs_env(self.env).start), clock[1] == 0)
+        start = ncs_env(self.env).start
+        if start is not self._start:  # decided exactly, which takes longer than a step; starts are read-only
+            self._start, self._starts_inside = start, starts_inside(self.certificate, start)
+        self._guarded.begin(report, self._starts_inside, clock[1] == 0)
         self._interventions = 0
         u = np.zeros(self.filter.plant.m)
         margin = self.filter.margin(report.estimate, info["error_shape"], u)
