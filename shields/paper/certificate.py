@@ -38,7 +38,7 @@ def paper_certificate(plant: LinearPlant, *, dkappa: float, drho: float, search:
         )
     free = plant.n - int(np.linalg.matrix_rank(plant.C))
     if free:
-        raise Infeasible(f"the safe box leaves {free} of {plant.n} directions unbounded: add rows to C", "S", free)
+        raise Infeasible(f"the safe box leaves {free} of {plant.n} directions unbounded: add rows to box", "S", free)
     provenance = {"search": search, "dkappa": dkappa, "drho": drho}
 
     def meets_constraints(solution: OPSolution) -> bool:

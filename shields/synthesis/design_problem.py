@@ -114,7 +114,7 @@ def design_problem(plant: LinearPlant, contract: ChannelContract | None = None) 
     free = plant.n - int(np.linalg.matrix_rank(plant.C))
     if free:
         raise Infeasible(
-            f"the safe box leaves {free} of {plant.n} directions unbounded: add rows to C with generous limits",
+            f"the safe box leaves {free} of {plant.n} directions unbounded: add rows to box with generous limits",
             "S",
             free,
         )
