@@ -12,7 +12,7 @@ from ncs_gym import LinearPlant
 from ncs_gym.validation import read_only
 from shields.certificate import Certificate, CertificateError
 from shields.runtime.predicted_errors import SMALLEST_RADIUS, PredictedErrors
-from shields.runtime.projection import closest_admissible, closest_on_lines
+from shields.runtime.projection import closest_admissible, closest_on_line
 from shields.verification import ACTION_ROUNDING
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
 
@@ -177,12 +177,11 @@ class ReachableSet(NamedTuple):
         turned = self.turn.dot(center)
         return self.radius - float(turned.dot(turned)) ** 0.5, self.radius - float(center.dot(center)) ** 0.5
 
-    @np.errstate(all="ignore")
     def closest(self, u: np.ndarray, reserve: float) -> np.ndarray:
         """Returns what `ReachableSets.closest` does for plants with a single input, shape (1,)."""
         effect, offset = self.turn.dot(self.test.effect[:, 0]), self.turn.dot(self.offset)
-        form = effect.dot(effect), effect.dot(offset), offset.dot(offset)
-        return np.array([closest_on_lines(u.item(), *form, self.radius - reserve, self.test.limits[0])])
+        form = (float(effect.dot(effect)), float(effect.dot(offset)), float(offset.dot(offset)))
+        return np.array([closest_on_line(u.item(), *form, self.radius - reserve, self.test.limits[0])])
 
 
 def norms(vectors: np.ndarray) -> np.ndarray:
