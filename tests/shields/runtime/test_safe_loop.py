@@ -208,20 +208,14 @@ def attacked(name, mode, steps, seed=0):
     return level, error, overridden
 
 
-ATTACKED, ATTACK_STEPS = ("truck", "n=3 m=2 p=1", "cart-pole", "batch reactor"), 8500
-
-
-def test_the_attacks_take_as_many_steps_as_we_say():
-    assert len(ATTACKED) * 3 * ATTACK_STEPS > 100_000
-
-
+@pytest.mark.parametrize("steps", [2_000, pytest.param(10_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("mode", ["project", "switch", "boundary"])
-@pytest.mark.parametrize("name", ATTACKED)
-def test_no_disturbance_noise_or_packet_order_drives_the_plant_out_of_the_safe_set(name, mode):
-    level, error, overridden = attacked(name, mode, ATTACK_STEPS)
+@pytest.mark.parametrize("name", ["truck", "n=3 m=2 p=1", "cart-pole", "batch reactor"])
+def test_no_disturbance_noise_or_packet_order_drives_the_plant_out_of_the_safe_set(name, mode, steps):
+    level, error, overridden = attacked(name, mode, steps)
     assert level <= 1.0
     assert error <= 1.0
-    assert 0 < overridden <= ATTACK_STEPS
+    assert 0 < overridden <= steps
     if mode == "project":
         assert level > 0.9  # the attack comes close
 
@@ -469,7 +463,7 @@ def test_unstable_plant_without_its_error_set_is_refused_with_the_remedy():
 
 @pytest.mark.parametrize("name", ["truck", "cart-pole"])
 def test_memory_does_not_grow(name):
-    # What is kept of arrival patterns depends only on which were met: the same 5e4 steps once more meet no new one.
+    # What is kept of arrival patterns depends only on which were met: the same steps once more meet no new one.
     plant, _, channel = LOOPS[name]
     loop, blocks = loop_of(name), []
     for _ in range(2):
@@ -477,7 +471,7 @@ def test_memory_does_not_grow(name):
         rng = np.random.default_rng(0)
         state, x = ChannelState(channel, rng), np.zeros(plant.n)
         loop.start(x)
-        for step in range(1, 50_001):
+        for step in range(1, 15_001):
             x = plant.A @ x + plant.B @ loop.decide(plant.u_max).input
             loop.receive(state.exchange(rng, step, plant.H @ x if state.sends_at(step) else None))
         assert loop.guaranteed
