@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ncs_gym.estimation.error_statistics import ErrorRecursion, ErrorStatistics
 from ncs_gym.estimation.innovation_test import InnovationTest
+from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
 
 # Number of what is not worked out yet.
 UNKNOWN = -1

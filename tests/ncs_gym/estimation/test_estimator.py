@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from ncs_gym import Channel, Ellipsoid, ErrorSet, Estimator, LinearPlant, Packet, certified_error_set, truck_trailer
 from ncs_gym.estimation.arrival_patterns import patterns_of
-from ncs_gym.estimation.error_statistics import ErrorRecursion
 from ncs_gym.estimation.innovation_test import InnovationTest
+from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from ncs_gym.estimation.set_membership import SetMembership, enlarged_by_rounding
 from ncs_gym.network.channel import GilbertElliott
 from ncs_gym.network.channel_state import ChannelState

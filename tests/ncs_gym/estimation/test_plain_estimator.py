@@ -23,7 +23,7 @@ from ncs_gym import (
 )
 from ncs_gym.estimation import arrival_patterns
 from ncs_gym.estimation.arrival_patterns import patterns_of
-from ncs_gym.estimation.error_statistics import ErrorRecursion
+from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.channel_state import ChannelState
 from tests.fuzz import channels, examples, plants

@@ -25,8 +25,8 @@ from ncs_gym import (
 from ncs_gym.estimation import set_membership
 from ncs_gym.estimation.arrival_patterns import patterns_of
 from ncs_gym.estimation.error_bound import _check_ages
-from ncs_gym.estimation.error_statistics import ErrorRecursion, ErrorStatistics
 from ncs_gym.estimation.estimator import Estimator
+from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
 from ncs_gym.estimation.set_membership import SetMembership
 from ncs_gym.network.channel_state import ChannelState
 from ncs_gym.uncertainty.ellipsoid import is_inside

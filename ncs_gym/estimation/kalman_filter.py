@@ -1,4 +1,4 @@
-"""What is known of the estimation error, and what a prediction and an update make of it, whatever is measured."""
+"""The Kalman filter without its mean: covariance, gain and error ellipsoid, which do not depend on what is measured."""
 
 from __future__ import annotations
 
