@@ -1,6 +1,7 @@
 """What is installed is what is tested, and imports point one way."""
 
 import ast
+import importlib
 import importlib.util
 import re
 import subprocess
@@ -65,7 +66,7 @@ APART = [
     ("experiments.backends", "experiments.analysis"),
     ("experiments.plots", "experiments.backends"),
 ]
-MOST_MODULES, MOST_LINES_OF_FILE, MOST_LINES_OF_FUNCTION = 10, 300, 60
+MOST_MODULES, MOST_LINES_OF_FILE, MOST_LINES_OF_FUNCTION, MOST_PUBLIC_NAMES = 10, 300, 60, 200
 
 
 def name_of(path: Path) -> str:
@@ -173,6 +174,18 @@ def test_no_folder_has_more_than_ten_modules():
 def test_every_folder_says_what_it_is_for():
     for folder in {path.parent for path in MODULES}:
         assert ast.get_docstring(ast.parse((folder / "__init__.py").read_text())), folder
+
+
+def test_fewer_than_200_names_are_public_and_each_is_documented():
+    public = set()
+    for init in (path for path in MODULES if path.name == "__init__.py"):
+        package = importlib.import_module(".".join(init.parent.relative_to(ROOT).parts))
+        for name in getattr(package, "__all__", ()):
+            exported = getattr(package, name)
+            public.add((name, id(exported)))
+            if isinstance(exported, type) or callable(exported):
+                assert exported.__doc__, (package.__name__, name)
+    assert 100 < len(public) < MOST_PUBLIC_NAMES
 
 
 def test_files_and_functions_are_short():
