@@ -1,4 +1,4 @@
-"""`ncs audit`: checks the printed numbers of the paper claim by claim; docs/paper.md discusses the outcome."""
+"""`ncs audit`: checks the claims of the paper one by one; docs/paper.md discusses the outcome."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ def plant_claims(example: PaperExample) -> Iterator[Claim]:
         f"the exact zero-order hold differs by at most {gap:.1e}",
         Verdict.of(gap <= PRINTED_DIGITS),
     )
-    kappa = contraction(example.closed_loop, example.M)
+    kappa = _contraction(example.closed_loop, example.M)
     is_rounding = 0.0 < kappa - example.kappa <= 2 * PRINTED_DIGITS
     yield Claim(
         "(C1) the closed loop contracts by kappa",
@@ -32,7 +32,7 @@ def plant_claims(example: PaperExample) -> Iterator[Claim]:
     )
 
 
-def contraction(closed_loop: np.ndarray, M: np.ndarray) -> float:
+def _contraction(closed_loop: np.ndarray, M: np.ndarray) -> float:
     """Returns the smallest kappa with (A+BK)'M(A+BK) <= kappa M."""
     root = np.linalg.cholesky(M)
     inner = np.linalg.solve(root, closed_loop.T @ M @ closed_loop)

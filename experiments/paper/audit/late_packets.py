@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from experiments.paper.audit.claim import Claim, Verdict
-from experiments.paper.definition_three import DefinitionThreeFilter
+from experiments.paper.kalman_filter import DefinitionThreeFilter
 from experiments.paper.paper_example import PaperExample
 from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.estimation import VectorEstimator

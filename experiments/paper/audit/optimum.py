@@ -24,10 +24,10 @@ def optimum_claim(example: PaperExample) -> Claim:
     return Claim(
         f"K and M are the optimum of OP at kappa = {example.kappa}",
         _text(example.L, example.K),
-        f"without (C2) the optimum at u_max = {limit:g} has {_text(*printed)}. As sqrt(2 K L K') = {asked:.3f}, try "
-        f"u_max = {round(asked)}: the optimum without (C2) has {_text(*other)}. All of OP, with (C2) and the printed "
-        f"epsilon but gamma in place of its square root in alpha (alpha = {misread_alpha(example):.2f}): "
-        f"{_text(*complete)}",
+        f"without (C2) and (C4), which alpha enters, the optimum at u_max = {limit:g} has {_text(*printed)}. As "
+        f"sqrt(2 K L K') = {asked:.3f}, try u_max = {round(asked)}: without them the optimum has {_text(*other)}. All "
+        f"of OP with the printed epsilon, but gamma in place of its square root in alpha (alpha = "
+        f"{misread_alpha(example):.2f}): {_text(*complete)}",
         Verdict.of(bool(agrees)),
         f"within the rounding of kappa they are OP's optimum for u_max = {round(asked)} and that alpha: the first "
         "explains rows 5 and 6, the second rows 3 and 7"
@@ -43,8 +43,8 @@ def optimum(example: PaperExample, u_max: float, *, with_misread_margin: bool = 
     Args:
         example: The printed numbers.
         u_max: Input limit in place of the printed one [m/s^2].
-        with_misread_margin: True keeps all of OP, with gamma in place of its square root in alpha. False drops (C2),
-            and the communication error from the input limit, which alpha enters too.
+        with_misread_margin: True keeps all of OP, with gamma in place of its square root in alpha. False drops (C2)
+            and (C4), the constraints that alpha enters, and with (C4) the communication error in the input limit.
 
     Raises:
         ArithmeticError: If the solver finds no optimum.

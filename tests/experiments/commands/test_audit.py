@@ -106,7 +106,8 @@ def test_summary_counts_rows_and_distinct_defects(claims):
     assert "(rows 5, 6, 12)" in summary
 
 
-def test_text_takes_the_width_of_the_terminal():
+def test_text_takes_the_width_of_the_terminal(claims, monkeypatch):
+    monkeypatch.setattr("experiments.commands.audit.audited_claims", lambda example: iter(claims))
     widths = {columns: _longest_line(ncs("audit", COLUMNS=str(columns)).stdout) for columns in (70, 300)}
     assert 60 < widths[70] <= 70
     assert 90 < widths[300] <= 100

@@ -7,7 +7,7 @@ from filterpy.kalman import KalmanFilter
 from experiments.paper.audit import Verdict
 from experiments.paper.audit.case_study import sensor_claim
 from experiments.paper.audit.late_packets import discarded, largest_error, late_packet_claim, replayed, taken_as_current
-from experiments.paper.definition_three import DefinitionThreeFilter
+from experiments.paper.kalman_filter import DefinitionThreeFilter
 from experiments.paper.paper_example import PaperExample
 
 CASE = PaperExample()
