@@ -123,7 +123,7 @@ def test_modules_that_the_pages_name_exist():
 
 def test_architecture_describes_every_folder_and_no_other():
     page = (ROOT / "docs" / "architecture.md").read_text()
-    described = re.findall(rf"^\| `((?:{'|'.join(PACKAGES)})(?:/\w+)?)` \|", page, re.MULTILINE)
+    described = re.findall(rf"^\| `((?:{'|'.join(PACKAGES)})(?:/\w+)*)` \|", page, re.MULTILINE)
     folders = {path.parent.relative_to(ROOT) for package in PACKAGES for path in (ROOT / package).rglob("*.py")}
     assert sorted(described) == sorted(str(folder) for folder in folders)
 

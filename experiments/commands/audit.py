@@ -1,17 +1,24 @@
-"""`ncs audit`: checks the printed numbers of the paper claim by claim; docs/paper.md discusses the outcome."""
+"""`ncs audit`: checks the claims of the paper one by one; docs/paper.md discusses the outcome."""
 
 from __future__ import annotations
 
 import json
+import re
+import shutil
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict
-from textwrap import fill
+from textwrap import TextWrapper
 
-from experiments.paper.audit import HOLDS, ROUNDED, Claim, audited_claims
+from experiments.paper.audit import Claim, Verdict, audited_claims, defects
 from experiments.paper.paper_example import PaperExample
 from experiments.settings import AuditSettings
 from shields.atomic_write import write_atomically
 
-_WIDTH = 100
+# Lines follow the terminal between these widths, and have the greatest where there is no terminal.
+_LEAST_WIDTH, _GREATEST_WIDTH = 60, 100
+_INDENT = 16
+_RELATIONS = re.compile(r" (=|<=|>=|<|>) ")
 
 
 def audit(settings: AuditSettings) -> None:
@@ -24,18 +31,47 @@ def audit(settings: AuditSettings) -> None:
     document = json.dumps([asdict(claim) for claim in claims], indent=1)
     if settings.out is not None:
         write_atomically(settings.out, document + "\n")
-    print(document if settings.json else _text(claims))
+    columns = shutil.get_terminal_size((_GREATEST_WIDTH, 24)).columns
+    print(document if settings.json else _text(claims, min(max(columns, _LEAST_WIDTH), _GREATEST_WIDTH)))
 
 
-def _text(claims: list[Claim]) -> str:
-    """Returns the table for a terminal."""
+def _text(claims: Sequence[Claim], width: int) -> str:
+    """Returns the table and the summary for a terminal of that many columns."""
     blocks = []
     for number, claim in enumerate(claims, 1):
-        lines = [f"{number:2d}. {claim.verdict.upper():14s} {claim.claim}"]
+        lines = [_wrapped(f"{number:2d}.", f"{claim.verdict.upper()}: {claim.claim}", width, indent=4)]
         for label, text in (("printed", claim.printed), ("computed", claim.computed), ("charitably", claim.charitable)):
             if text:
-                indent = " " * 18
-                lines.append(fill(text, _WIDTH, initial_indent=f"    {label:12s}: ", subsequent_indent=indent))
+                lines.append(_wrapped(f"    {label}", text, width))
         blocks.append("\n".join(lines))
-    held = sum(claim.verdict in (HOLDS, ROUNDED) for claim in claims)
-    return "\n\n".join([*blocks, f"{held} of {len(claims)} claims hold."])
+    return "\n\n".join([*blocks, _summary(claims, width)])
+
+
+def _summary(claims: Sequence[Claim], width: int) -> str:
+    """Returns how many rows have each verdict, and the distinct defects behind those that do not hold."""
+    counts, found = Counter(claim.verdict for claim in claims), defects(claims)
+    text = (
+        f"Of {len(claims)} rows {counts[Verdict.HOLDS] + counts[Verdict.ROUNDED]} hold ({counts[Verdict.ROUNDED]} of "
+        f"them but for rounding), {counts[Verdict.FAILS]} do not hold, {counts[Verdict.UNDECIDED]} are undecided, "
+        f"{counts[Verdict.NOT_PRINTED]} is about what is not printed, {counts[Verdict.VACUOUS]} is vacuous. The rows "
+        f"that do not hold show {len(found)} distinct defects:"
+    )
+    lines = [_wrapped("", text, width, indent=0)]
+    for number, (defect, rows) in enumerate(found.items(), 1):
+        named = f"row{'s' * (len(rows) > 1)} {', '.join(map(str, rows))}"
+        lines.append(_wrapped(f"{number:2d}.", f"{defect} ({named})", width, indent=4))
+    return "\n".join(lines)
+
+
+def _wrapped(label: str, text: str, width: int, indent: int = _INDENT) -> str:
+    """Returns a label and a text in lines of at most that width; a formula is not broken at its relation."""
+    wrapper = TextWrapper(
+        width,
+        initial_indent=label.ljust(indent),
+        subsequent_indent=" " * indent,
+        break_on_hyphens=False,
+        break_long_words=False,
+    )
+    for product in ("K L K'", "x+'M x+"):
+        text = text.replace(product, product.replace(" ", "\0"))
+    return wrapper.fill(_RELATIONS.sub("\0\\1\0", text)).replace("\0", " ")

@@ -8,8 +8,8 @@ from dataclasses import asdict
 from tqdm import tqdm
 
 from experiments.analysis.text_table import text_table
-from experiments.paper.figures import reproduction_figures
 from experiments.paper.reproduction import Outcome, designs, simulate
+from experiments.paper.reproduction_figures import reproduction_figures
 from experiments.settings import ReproduceSettings
 from shields.atomic_write import write_atomically
 

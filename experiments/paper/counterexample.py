@@ -8,6 +8,7 @@ from operator import itemgetter
 
 import numpy as np
 
+from experiments.paper.sets import Ball, Box, Segment
 from ncs_gym import Ellipsoid
 from shields.verification.rational_matrix import (
     add,
@@ -18,6 +19,7 @@ from shields.verification.rational_matrix import (
     rational,
     scale,
     subtract,
+    to_float,
     transpose,
 )
 
@@ -36,7 +38,7 @@ class OneStep:
         error: e, shape (n,).
         following: x+ = (A+BK) x + d + e, shape (n,).
         level: x+'M x+ in floating point.
-        confirmed: Whether exact arithmetic confirms x in S, d'd <= gamma, e'e <= eps and x+ outside S.
+        confirmed: Whether exact arithmetic confirms x in S, d and e in their sets, and x+ outside S.
     """
 
     state: np.ndarray
@@ -48,80 +50,61 @@ class OneStep:
 
 
 def worst_step(
-    closed: np.ndarray, M: np.ndarray, gamma: float, epsilon: float, direction: np.ndarray | None = None
+    closed: np.ndarray, M: np.ndarray, disturbances: Ball | Box, errors: Ball | Segment, *, starts: int = _STARTS
 ) -> OneStep:
-    """Returns the step from {x'Mx <= 1} with d'd <= gamma, e'e <= epsilon that ends at the largest x+'M x+.
+    """Returns the step from {x'Mx <= 1} that ends at the largest x+'M x+.
 
-    It is found by ascent from random starts: for a fixed slope M x+ each of x, d, e is the extreme point of its set.
+    It is found by ascent from random slopes: for a fixed slope M x+ each of x, d, e is the extreme point of its set.
 
     Args:
         closed: State matrix of the closed loop, A + B K, shape (n, n).
         M: Matrix of the safe set, shape (n, n).
-        gamma: Largest d'd.
-        epsilon: Largest e'e.
-        direction: Vector along which e lies, shape (n,); None for every e in the ball.
+        disturbances: The set of d.
+        errors: The set of e.
+        starts: Number of random slopes.
     """
-    n = len(M)
     inverse = np.linalg.inv(M)
-    states, disturbances = Ellipsoid(0.5 * (inverse + inverse.T)), Ellipsoid(gamma * np.eye(n))
-    spread = np.eye(n) if direction is None else np.outer(direction, direction) / (direction @ direction)
-    errors = Ellipsoid(epsilon * spread)
+    states = Ellipsoid(0.5 * (inverse + inverse.T))
     rng = np.random.default_rng(0)
 
     def ascended() -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-        x, d, e = (source.sample_boundary(rng) for source in (states, disturbances, errors))
+        slope = rng.standard_normal(len(M))
         for _ in range(_ASCENT_STEPS):
-            slope = M @ (closed @ x + d + e)
-            x, d, e = (
-                states.extreme_point(closed.T @ slope),
-                disturbances.extreme_point(slope),
-                errors.extreme_point(slope),
-            )
-        end = closed @ x + d + e
-        return float(end @ M @ end), _INSIDE * x, _INSIDE * d, _INSIDE * e
+            x = states.extreme_point(closed.T @ slope)
+            d, e = disturbances.extreme_point(slope), errors.extreme_point(slope)
+            end = closed @ x + d + e
+            slope = M @ end
+        return float(end @ M @ end), x, d, e
 
-    level, x, d, e = max((ascended() for _ in range(_STARTS)), key=itemgetter(0))
-    return OneStep(x, d, e, closed @ x + d + e, level, _confirmed(closed, M, gamma, epsilon, x, d, e))
+    level, x, d, e = max((ascended() for _ in range(starts)), key=itemgetter(0))
+    x, d, e = (np.asarray(_INSIDE * point) for point in (x, d, e))
+    is_allowed = disturbances.contains(d) and errors.contains(e)
+    return OneStep(x, d, e, closed @ x + d + e, level, is_allowed and _leaves(closed, M, x, d, e))
 
 
-def stays_inside(
-    closed: np.ndarray, M: np.ndarray, gamma: float, epsilon: float, direction: np.ndarray | None = None
-) -> bool:
+def stays_inside(closed: np.ndarray, M: np.ndarray, disturbances: Ball, errors: Ball | Segment) -> bool:
     """Returns whether exact arithmetic proves that no such step leaves the set (False: not proved).
 
-    With P the closed loop's image of M^-1, e's shape and gamma I, any weights that sum to 1 give an ellipsoid around
+    With P the closed loop's image of M^-1 and the shapes of e and d, any weights that sum to 1 give an ellipsoid around
     the sum of the three; it lies in {x'Mx <= 1} if M - M (sum of P_i / weight_i) M >= 0. Arguments as in `worst_step`.
     """
-    n = len(M)
-    inverse = np.linalg.inv(M)
-    spread = np.eye(n) if direction is None else np.outer(direction, direction)
-    shapes = [closed @ inverse @ closed.T, epsilon * spread / (1.0 if direction is None else direction @ direction)]
-    sizes = np.sqrt([np.trace(M @ shape) for shape in (*shapes, gamma * np.eye(n))])
-    weights = [Fraction(float(size)) for size in sizes]
+    n, exact_M = len(M), rational(M)
+    others = [errors.exact_shape(n), disturbances.exact_shape(n)]
+    shapes = [closed @ np.linalg.inv(M) @ closed.T, *map(to_float, others)]
+    weights = [Fraction(float(np.sqrt(np.trace(M @ shape)))) for shape in shapes]
     total = sum(weights)
-    M_, closed_ = rational(M), multiply(rational(M), rational(closed))
     # M (closed M^-1 closed') M <= weight_1 (M - rest): by Schur, in M and closed alone.
-    square = Fraction(1) if direction is None else quadratic(rational(direction), rational(np.eye(n)))
-    terms = [
-        (Fraction(epsilon) / square, rational(spread), weights[1]),
-        (Fraction(gamma), rational(np.eye(n)), weights[2]),
-    ]
-    rest = M_
-    for factor, shape, weight in terms:
-        rest = subtract(rest, scale(factor * total / weight, congruence(M_, shape)))
-    top = [left + right for left, right in zip(scale(weights[0] / total, M_), transpose(closed_), strict=True)]
-    bottom = [left + right for left, right in zip(closed_, rest, strict=True)]
+    rest = exact_M
+    for shape, weight in zip(others, weights[1:], strict=True):
+        rest = subtract(rest, scale(total / weight, congruence(exact_M, shape)))
+    image = multiply(exact_M, rational(closed))
+    top = [left + right for left, right in zip(scale(weights[0] / total, exact_M), transpose(image), strict=True)]
+    bottom = [left + right for left, right in zip(image, rest, strict=True)]
     return is_positive_semidefinite(top + bottom)
 
 
-def _confirmed(closed, M, gamma, epsilon, x, d, e) -> bool:
-    """Returns whether the step starts inside all bounds and ends outside S, in rational arithmetic."""
-    x_, d_, e_, M_ = (rational(value) for value in (x, d, e, M))
-    following = add(multiply(x_, transpose(rational(closed))), d_, e_)
-    identity = rational(np.eye(len(M)))
-    return (
-        quadratic(x_, M_) <= 1
-        and quadratic(d_, identity) <= Fraction(gamma)
-        and quadratic(e_, identity) <= Fraction(epsilon)
-        and quadratic(following, M_) > 1
-    )
+def _leaves(closed: np.ndarray, M: np.ndarray, x: np.ndarray, d: np.ndarray, e: np.ndarray) -> bool:
+    """Returns whether the step starts in S and ends outside, in rational arithmetic."""
+    exact_x, exact_d, exact_e, exact_M = (rational(value) for value in (x, d, e, M))
+    following = add(multiply(exact_x, transpose(rational(closed))), exact_d, exact_e)
+    return quadratic(exact_x, exact_M) <= 1 < quadratic(following, exact_M)

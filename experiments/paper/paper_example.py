@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ncs_gym import LinearPlant, truck_trailer
+from ncs_gym import BoxDisturbance, LinearPlant, truck_trailer
+from ncs_gym.registration import CASE_STUDY_BOX
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,6 +22,7 @@ class PaperExample:
         kappa: Contraction factor of the closed loop.
         epsilon: Bound on e'e.
         largest_error: "The maximum system state error" of the simulation.
+        disturbance: The box [-0.02, 0.02] x [-0.01, 0.01] of the disturbance.
     """
 
     A: np.ndarray = field(default_factory=lambda: np.array([[0.7247, 0.1636], [-0.7361, -0.0278]]))
@@ -30,11 +32,17 @@ class PaperExample:
     kappa: float = 0.9029
     epsilon: float = 0.0094
     largest_error: float = 0.0017
+    disturbance: BoxDisturbance = CASE_STUDY_BOX
 
     @property
     def plant(self) -> LinearPlant:
         """The plant with the bounds printed beside it (defaults of `truck_trailer`)."""
         return truck_trailer()
+
+    @property
+    def disturbance_half_widths(self) -> np.ndarray:
+        """Half-widths of the box of the disturbance, shape (2,)."""
+        return np.asarray(self.disturbance.half_widths, dtype=np.float64)
 
     @property
     def L(self) -> np.ndarray:

@@ -108,7 +108,7 @@ class CertifySettings:
 
 @dataclass(frozen=True, kw_only=True)
 class AuditSettings:
-    """Checks the printed numbers of the paper (Liu et al. Section 5) claim by claim, from its own data.
+    """Checks the claims of the paper (Liu et al.) one by one, from its own printed numbers.
 
     Attributes:
         json: Print JSON instead of the table.

@@ -131,16 +131,15 @@ class PaperModel:
 
     Args:
         plant: The plant with its bounds.
-        charitable: Reads q_bar as lambda_max(Q) and omits the chi-square factor, which makes all constants smaller.
+        q_bar: Read in place of lambda_max(Q) + gamma.
+        quantile: Read in place of the chi-square factor chi2_{n,1-delta}.
     """
 
-    def __init__(self, plant: LinearPlant, *, charitable: bool = False) -> None:
+    def __init__(self, plant: LinearPlant, *, q_bar: float | None = None, quantile: float | None = None) -> None:
         self._gamma = plant.gamma
         self._p0 = _largest(plant.initial_cov)
-        self._q_bar = process_bound(plant.gamma, plant.process_noise_cov)
-        self._quantile = plant.process_noise.energy
-        if charitable:
-            self._q_bar, self._quantile = _largest(plant.process_noise_cov), 1.0
+        self._q_bar = process_bound(plant.gamma, plant.process_noise_cov) if q_bar is None else q_bar
+        self._quantile = plant.process_noise.energy if quantile is None else quantile
         self._norm = float(np.linalg.norm(plant.A, 2))
 
     def at(self, kappa: float, rho: float) -> PaperBounds:

@@ -16,6 +16,8 @@ import scipy.sparse as sp
 
 # A compiled module without type stubs.
 _clarabel: Any = clarabel
+# Relative tolerances of the solver: its own, and the least it can be asked for.
+_DEFAULT_TOLERANCE, _SMALLEST_TOLERANCE = 1e-8, 1e-12
 
 
 def affine_variables(*sizes: int) -> list[np.ndarray]:
@@ -59,18 +61,47 @@ def maximum(
         exponential: Triples (x, y, z) with y exp(x / y) <= z and y > 0, each of shape (N+1, 3).
         inaccurate: Whether a value of reduced accuracy counts: it is good enough to rank by, not to decide by.
     """
+    solution = _solution(objective, nonnegative, semidefinite, exponential, _DEFAULT_TOLERANCE)
+    accepted = [_clarabel.SolverStatus.Solved] + [_clarabel.SolverStatus.AlmostSolved] * inaccurate
+    return -float(solution.obj_val) if solution.status in accepted else -np.inf
+
+
+def maximizer(
+    objective: np.ndarray,
+    *,
+    nonnegative: np.ndarray,
+    semidefinite: Sequence[np.ndarray],
+    exponential: Sequence[np.ndarray] = (),
+) -> np.ndarray | None:
+    """Returns the numbers, shape (N,), at which `maximum` is attained, accurately; None if the solver finds none.
+
+    Near a maximum the objective is flat: its value with half as many digits is what the default tolerance gives, so
+    the solver goes on for as long as it can.
+    """
+    solution = _solution(objective, nonnegative, semidefinite, exponential, _SMALLEST_TOLERANCE)
+    accepted = (_clarabel.SolverStatus.Solved, _clarabel.SolverStatus.AlmostSolved)
+    return np.array(solution.x) if solution.status in accepted else None
+
+
+def _solution(
+    objective: np.ndarray,
+    nonnegative: np.ndarray,
+    semidefinite: Sequence[np.ndarray],
+    exponential: Sequence[np.ndarray],
+    tolerance: float,
+) -> Any:
+    """Returns what the solver found, up to a relative tolerance."""
     rows = np.concatenate([nonnegative, *map(_triangle, semidefinite), *exponential], axis=1)
     cones = [_clarabel.NonnegativeConeT(nonnegative.shape[1])]
     cones += [_clarabel.PSDTriangleConeT(matrix.shape[1]) for matrix in semidefinite]
     cones += [_clarabel.ExponentialConeT() for _ in exponential]
     settings = _clarabel.DefaultSettings()
     settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
     # Clarabel minimizes q'x subject to A x + s = b with s in the cones, so s = b - A x are the rows.
     size = len(objective) - 1
     A, b, q = sp.csc_array(-rows[:-1].T), rows[-1], -objective[:-1]
-    solution = _clarabel.DefaultSolver(sp.csc_array((size, size)), q, A, b, cones, settings).solve()
-    accepted = [_clarabel.SolverStatus.Solved] + [_clarabel.SolverStatus.AlmostSolved] * inaccurate
-    return -float(solution.obj_val) if solution.status in accepted else -np.inf
+    return _clarabel.DefaultSolver(sp.csc_array((size, size)), q, A, b, cones, settings).solve()
 
 
 def _triangle(matrix: np.ndarray) -> np.ndarray:

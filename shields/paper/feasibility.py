@@ -74,10 +74,15 @@ class FeasibilityScan:
         """
         return self._ranked(plant, model)[0]
 
-    def full_ratio(self, plant: LinearPlant) -> float:
-        """Returns the largest lambda_min(L)/alpha on all of OP over the most promising points; at least 1: feasible."""
-        problem, model, best = ReducedProblem(plant), PaperModel(plant), 0.0
-        for point in self._ranked(plant)[:_CONFIRMED_POINTS]:
+    def full_ratio(self, plant: LinearPlant, model: PaperModel | None = None) -> float:
+        """Returns the largest lambda_min(L)/alpha on all of OP over the most promising points; at least 1: feasible.
+
+        Args:
+            plant: The plant whose uncertainty counts.
+            model: Constants of OP; those of the plant by default.
+        """
+        problem, model, best = ReducedProblem(plant), model or PaperModel(plant), 0.0
+        for point in self._ranked(plant, model)[:_CONFIRMED_POINTS]:
             bounds = model.at(point.kappa, point.rho)
             best = max(best, problem.largest_eigenvalue(bounds) / bounds.alpha if bounds.alpha > 0.0 else np.inf)
             if best >= 1.0:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from ncs_gym import LinearPlant
 from shields.paper.bounds import PaperBounds
-from shields.paper.cone_program import affine_variables, lower_triangular, maximum, symmetric, transposed
+from shields.paper.cone_program import affine_variables, lower_triangular, maximizer, maximum, symmetric, transposed
 from shields.paper.optimization_problem import NormalizedPlant
 
 # In units of the safe box, a lambda_min(L) below this is the solver's inaccuracy.
@@ -53,7 +55,31 @@ class ReducedProblem:
         return self._unit.size**2 * value if value > _SMALLEST_EIGENVALUE else -np.inf
 
     def largest_log_det(self, bounds: PaperBounds) -> float:
-        """Returns the largest log det L under all constraints; minus infinity if the solver finds none.
+        """Returns the largest log det L under all constraints; minus infinity if the solver finds none."""
+        program = self._log_det_program(bounds, with_margin=True, with_error=True)
+        return maximum(**program, inaccurate=True) + 2.0 * self._n * float(np.log(self._unit.size))
+
+    def largest_set(
+        self, bounds: PaperBounds, *, with_margin: bool = True, with_error: bool = True
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Returns L, shape (n, n), and K, shape (m, n), of the largest log det L; None if the solver finds none.
+
+        Args:
+            bounds: kappa, rho and the constants of OP at them.
+            with_margin: False drops (C2).
+            with_error: False drops the communication error from the input limit, as in `largest_eigenvalue`.
+        """
+        n, m, unit = self._n, self._m, self._unit
+        numbers = maximizer(**self._log_det_program(bounds, with_margin=with_margin, with_error=with_error))
+        if numbers is None:
+            return None
+        triangle = n * (n + 1) // 2
+        L = symmetric(numbers[None, :triangle], n)[0]
+        F = numbers[triangle : triangle + m * n].reshape(m, n)
+        return unit.size**2 * L, unit.u_max[:, None] * np.linalg.solve(L, F.T).T / unit.size
+
+    def _log_det_program(self, bounds: PaperBounds, *, with_margin: bool, with_error: bool) -> dict[str, Any]:
+        """Returns the arguments of `maximum`; the first numbers are the entries of L, then those of F.
 
         log det L is the largest sum of log Z_ii with [diag(Z_ii), Z'; Z, L] >= 0 and Z lower triangular.
         """
@@ -62,18 +88,16 @@ class ReducedProblem:
         entries, F, beta, factor, logarithms, one = affine_variables(triangle, m * n, 1, triangle, n)
         L, F, Z = symmetric(entries, n), F.reshape(-1, m, n), lower_triangular(factor, n)
         alpha = bounds.alpha / self._unit.size**2
-        value = maximum(
-            logarithms.sum(axis=1),
-            nonnegative=self._box_slacks(L, one),
-            semidefinite=[
-                L - alpha * _multiple(one, n),  # (C2)
-                *self._matrices(L, F, beta, one, bounds, self._quotient(bounds)),
+        return {
+            "objective": logarithms.sum(axis=1),
+            "nonnegative": self._box_slacks(L, one),
+            "semidefinite": [
+                *([L - alpha * _multiple(one, n)] if with_margin else []),  # (C2)
+                *self._matrices(L, F, beta, one, bounds, self._quotient(bounds) if with_error else None),
                 np.block([[Z * np.eye(n), transposed(Z)], [Z, L]]),
             ],
-            exponential=[np.column_stack([logarithms[:, i], one, Z[:, i, i]]) for i in range(n)],
-            inaccurate=True,
-        )
-        return value + 2.0 * n * float(np.log(self._unit.size))
+            "exponential": [np.column_stack([logarithms[:, i], one, Z[:, i, i]]) for i in range(n)],
+        }
 
     def _box_slacks(self, L: np.ndarray, one: np.ndarray) -> np.ndarray:
         """Returns 1 - c_j L c_j' of (C3), shape (N+1, k)."""

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from shields.paper.cone_program import affine_variables, lower_triangular, maximum, symmetric, transposed
+from shields.paper.cone_program import affine_variables, lower_triangular, maximizer, maximum, symmetric, transposed
 
 
 def test_variables_and_the_constant_are_independent():
@@ -40,3 +40,12 @@ def test_constraints_that_contradict_or_do_not_bound_have_no_maximum():
     contradiction = np.column_stack([t - one, -t])
     assert maximum(t[:, 0], nonnegative=contradiction, semidefinite=[]) == -np.inf
     assert maximum(t[:, 0], nonnegative=t, semidefinite=[], inaccurate=True) == -np.inf
+
+
+def test_maximizer_is_where_the_maximum_is_attained():
+    # The largest t with [1, t; t, s] >= 0 and s <= 4 is 2, at s = 4.
+    t, s, one = affine_variables(1, 1)
+    matrix = np.block([[one[:, :, None], t[:, :, None]], [t[:, :, None], s[:, :, None]]])
+    found = maximizer(t[:, 0], nonnegative=4.0 * one - s, semidefinite=[matrix])
+    np.testing.assert_allclose(found, [2.0, 4.0], atol=1e-9)
+    assert maximizer(t[:, 0], nonnegative=np.column_stack([t - one, -t]), semidefinite=[]) is None

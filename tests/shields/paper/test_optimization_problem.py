@@ -110,3 +110,22 @@ def test_what_is_monotone():
 def test_unknown_search_is_refused():
     with pytest.raises(ValueError, match="search must be"):
         search_grid(SMALL, search="best")
+
+
+def test_largest_set_is_the_solution_of_op_as_printed():
+    bounds = PaperModel(SMALL).at(0.9, 1.05)
+    printed, found = solve_op(SMALL, bounds), ReducedProblem(SMALL).largest_set(bounds)
+    np.testing.assert_allclose(found[0], printed.L, atol=1e-3)
+    np.testing.assert_allclose(found[1], printed.K, atol=5e-3)
+    assert np.linalg.slogdet(found[0])[1] == pytest.approx(ReducedProblem(SMALL).largest_log_det(bounds), abs=1e-5)
+
+
+def test_largest_set_without_the_margin_exists_where_op_has_none():
+    plant = truck_trailer()
+    bounds, reduced = PaperModel(plant).at(0.9, 1.05), ReducedProblem(truck_trailer())
+    assert reduced.largest_set(bounds) is None
+    L, K = reduced.largest_set(bounds, with_margin=False, with_error=False)
+    assert np.linalg.eigvalsh(L)[0] < bounds.alpha
+    closed = plant.A + plant.B @ K
+    assert np.linalg.eigvalsh(0.9 * L - closed @ L @ closed.T)[0] >= -1e-6
+    assert (K @ L @ K.T).item() <= 8.0 + 1e-6

@@ -1,0 +1,66 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+
+from experiments.paper.audit import Verdict
+from experiments.paper.audit.case_study import sensor_claim
+from experiments.paper.audit.late_packets import discarded, largest_error, late_packet_claim, replayed, taken_as_current
+from experiments.paper.kalman_filter import DefinitionThreeFilter
+from experiments.paper.paper_example import PaperExample
+
+CASE = PaperExample()
+PLANT = CASE.plant
+EVERYWHERE = np.array([True])
+
+
+def textbook_filter(mean):
+    """Definition 3 by filterpy."""
+    kalman = KalmanFilter(dim_x=2, dim_z=2)
+    kalman.x, kalman.P = np.array(mean), np.array(PLANT.initial_cov)
+    kalman.F, kalman.H = PLANT.A + PLANT.B @ CASE.K, PLANT.H
+    kalman.Q, kalman.R = PLANT.process_noise_cov + PLANT.gamma * np.eye(2), np.array(PLANT.measurement_noise_cov)
+    return kalman
+
+
+@pytest.mark.parametrize("takes_late", [True, False])
+def test_filter_is_the_textbook_filter_where_a_late_packet_is_current_or_discarded(takes_late):
+    rng = np.random.default_rng(0)
+    mean = np.array([[1.0], [-0.5]])
+    ours = DefinitionThreeFilter(CASE, PLANT, mean.copy(), takes_late=takes_late)
+    textbook, samples = textbook_filter(mean), []
+    for step in range(30):
+        samples.append(rng.standard_normal((2, 1)))
+        age = (0, 2)[step % 2] if step >= 2 else None
+        ours.advance(np.zeros((1, 1)), samples[-1], [] if age is None else [(age, EVERYWHERE)])
+        textbook.predict()
+        if age is not None and (age == 0 or takes_late):
+            textbook.update(samples[step - age])
+        np.testing.assert_allclose(ours.mean, textbook.x, atol=1e-12)
+
+
+def test_filter_corrects_only_the_episodes_in_which_a_packet_arrives():
+    ours = DefinitionThreeFilter(CASE, PLANT, np.ones((2, 2)), takes_late=True)
+    ours.advance(np.zeros((1, 2)), np.full((2, 2), 5.0), [(0, np.array([True, False]))])
+    predicted = (PLANT.A + PLANT.B @ CASE.K) @ np.ones(2)
+    np.testing.assert_allclose(ours.mean[:, 1], predicted)
+    assert np.abs(ours.mean[:, 0] - predicted).max() > 0.1
+
+
+def test_late_packets_taken_as_current_break_the_bound_and_the_replaying_filter_keeps_it():
+    current, skipped, again = (largest_error(CASE, make) for make in (taken_as_current, discarded, replayed))
+    assert current > 3.0 * CASE.epsilon
+    assert again < 0.1 * CASE.epsilon
+    assert again <= skipped < 0.1 * CASE.epsilon
+
+
+def test_claim_would_hold_with_a_larger_epsilon():
+    assert late_packet_claim(CASE).verdict == Verdict.UNDECIDED
+    assert late_packet_claim(replace(CASE, epsilon=0.1)).verdict == Verdict.HOLDS
+
+
+def test_the_noise_that_is_not_printed_does_not_decide():
+    low, high = (float(part) for part in sensor_claim(CASE).computed.rsplit(" is ", 1)[1].split(" to "))
+    assert CASE.epsilon < low < high
+    assert largest_error(CASE, taken_as_current, noise_variance=1e-3) == pytest.approx(low, abs=6e-4)
