@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shields import synthesize, verify
+from shields import synthesize
 from shields.errors import SynthesisInterrupted
 from tests.plants import random_plant
+from tests.verdicts import verified
 
 
 def interrupting_at(stage):
@@ -35,7 +36,7 @@ def test_interrupted_synthesis_hands_out_the_best_certificate_so_far(loaded, sta
     with pytest.raises(SynthesisInterrupted, match=f"interrupted: the synthesis was at {stage}.* of the box") as caught:
         synthesize(loaded, progress=interrupting_at(stage))
     certificate = caught.value.certificate
-    assert verify(certificate, loaded).valid
+    assert verified(certificate, loaded).valid
     assert certificate.provenance["interrupted_at"].startswith(stage)
     assert "other sets may be larger" in str(certificate)
     assert isinstance(caught.value, KeyboardInterrupt)
