@@ -33,7 +33,9 @@ def test_every_stage_says_what_is_sought_and_the_volume_reached(loaded):
 
 @pytest.mark.parametrize("stage", ["initial design 2", "alternation 1", "exact verification"])
 def test_interrupted_synthesis_hands_out_the_best_certificate_so_far(loaded, stage):
-    with pytest.raises(SynthesisInterrupted, match=f"interrupted: the synthesis was at {stage}.* of the box") as caught:
+    with pytest.raises(
+        SynthesisInterrupted, match=f"interrupted: the synthesis was at {stage}.* of the safe box.s volume, "
+    ) as caught:
         synthesize(loaded, progress=interrupting_at(stage))
     certificate = caught.value.certificate
     assert verified(certificate, loaded).valid
