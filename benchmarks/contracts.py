@@ -66,7 +66,7 @@ def main() -> None:
     parser.add_argument("--ages", type=int, nargs="+", default=[1, 4, 8, 16])
     parser.add_argument("--out", default=None, help="file for a figure of it")
     options = parser.parse_args()
-    print(f"{'plant':32s}{'max_age':>8s}{'radius / box':>14s}{'vol/ellipsoid':>15s}{'synthesis [s]':>15s}", flush=True)
+    print(f"{'plant':32s}{'max_age':>8s}{'radius / box':>14s}{'vol/ellipsoid':>14s}{'synthesis [s]':>15s}", flush=True)
     figure, axes = plt.subplots(figsize=(8.0, 4.0), layout="constrained")
     for name, plant in PLANTS.items():
         radii = []
@@ -77,7 +77,7 @@ def main() -> None:
             certificate = synthesize(with_radius(plant, radii[-1] / 1.5), contract=contract)
             seconds = time.perf_counter() - start
             volume = certificate.provenance["volume_of_box_ellipsoid"]
-            print(f"{name:32s}{age:8d}{radii[-1]:14.3%}{volume:15.2f}{seconds:15.1f}", flush=True)
+            print(f"{name:32s}{age:8d}{radii[-1]:14.3%}{volume:14.2f}{seconds:15.1f}", flush=True)
         axes.semilogy(options.ages, 100.0 * np.array(radii), marker="o", label=name)
     axes.set_xlabel("max_age of the contract [steps]")
     axes.set_ylabel("largest disturbance radius [% of the box]")
