@@ -44,6 +44,7 @@ benchmark: $(INSTALLED) $(RAY_INSTALLED)
 	$(BIN)/python benchmarks/containment.py
 	$(BIN)/python benchmarks/synthesis.py
 	$(BIN)/python benchmarks/contracts.py
+	$(BIN)/python benchmarks/verification.py
 	$(BIN)/python benchmarks/numerical_trust.py
 	$(BIN)/python benchmarks/environment_speed.py
 	$(BIN)/python benchmarks/optimization_problem_grid.py
@@ -62,7 +63,7 @@ audit: $(AUDIT_INSTALLED)
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt torch
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[train,render,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[train,render,verify,dev]'
 	touch $@
 
 $(DOCS_INSTALLED): $(INSTALLED)

@@ -66,7 +66,7 @@ def main() -> None:
     parser.add_argument("--ages", type=int, nargs="+", default=[1, 4, 8, 16])
     parser.add_argument("--out", default=None, help="file for a figure of it")
     options = parser.parse_args()
-    print(f"{'plant':32s}{'max_age':>8s}{'radius / box':>14s}{'volume / box':>14s}{'synthesis [s]':>15s}", flush=True)
+    print(f"{'plant':32s}{'max_age':>8s}{'radius / box':>14s}{'vol/ellipsoid':>14s}{'synthesis [s]':>15s}", flush=True)
     figure, axes = plt.subplots(figsize=(8.0, 4.0), layout="constrained")
     for name, plant in PLANTS.items():
         radii = []

@@ -56,7 +56,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--largest", type=int, default=12)
     options = parser.parse_args()
-    print(f"{'':42s}{'seconds':>18s}{'volume / box':>20s}")
+    print(f"{'':42s}{'seconds':>18s}{'volume / ellipsoid':>20s}")
     print(f"{'plant':42s}{'median':>9s}{'longest':>9s}{'least .. most':>20s}{'infeasible':>12s}", flush=True)
     for mass in (1000.0, 4000.0):
         for gamma, what in ((5e-4, ""), (2e-3, ", D radius doubled")):

@@ -25,7 +25,7 @@ def description_of(certificate: Certificate) -> str:
         ("method", _METHODS[certificate.method]),
         ("plant", f"{_count(n, 'state')}, {_count(m, 'input')}, fingerprint {certificate.fingerprint[:16]}"),
         ("safe set", f"x'Mx <= 1, that reaches |x_i| <= {_numbers(np.sqrt(np.diag(certificate.L)))}"),
-        ("size", _size(recorded)),
+        ("size", size_of(recorded)),
         ("fallback", "u = K x_hat"),
         ("contract", _contract(certificate)),
         ("tolerance", _tolerance(recorded)),
@@ -41,10 +41,21 @@ def description_of(certificate: Certificate) -> str:
     return "\n".join(lines)
 
 
-def _size(recorded: dict[str, Any]) -> str:
-    """Returns the volume of the set as shares of the safe box and of the largest ellipsoid in it, as far as known."""
+def size_of(recorded: dict[str, Any]) -> str:
+    """Returns the volume of the set as shares of the safe box and of the largest ellipsoid in it, as far as known.
+
+    Args:
+        recorded: The provenance of a certificate.
+    """
+    unknown = recorded.get("share_of_box_unknown")
     shares = (
         _text(recorded.get("share_of_box"), "{:.4g} % of the safe box's volume", 100.0),
+        _text(
+            recorded.get("share_of_box_at_rest"),
+            "{:.4g} % of the volume of the safe box of the states, with no input under way",
+            100.0,
+        ),
+        f"an unknown share of the safe box ({unknown})" if isinstance(unknown, str) else "",
         _text(
             recorded.get("volume_of_box_ellipsoid"), "{:.4g} % of the volume of the largest ellipsoid in the box", 100.0
         ),

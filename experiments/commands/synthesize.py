@@ -7,6 +7,7 @@ from experiments.runs.environments import registered_env
 from experiments.runs.synthesis_status import synthesis_status
 from experiments.settings import SynthesizeSettings
 from ncs_gym import ChannelContract, LinearPlant
+from shields.certificate_text import size_of
 from shields.errors import SynthesisInterrupted
 
 _DEFAULT_ENV = "ncs_gym/TruckTrailerCruise-v0"
@@ -29,10 +30,9 @@ def synthesize(settings: SynthesizeSettings) -> None:
         if interrupt.certificate is None:
             raise
         interrupt.certificate.save(settings.out)
-        size = interrupt.certificate.provenance["volume_of_box_ellipsoid"]
+        size = size_of(interrupt.certificate.provenance)
         raise SynthesisInterrupted(
-            f"interrupted: the best certificate so far, which verifies ({size:.2%} of the box ellipsoid), was saved to "
-            f"{settings.out}"
+            f"interrupted: the best certificate so far, which verifies ({size}), was saved to {settings.out}"
         ) from interrupt
     certificate.save(settings.out)
     print(certificate, shields.verify(certificate, plant), sep="\n")

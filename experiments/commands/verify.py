@@ -20,6 +20,7 @@ def verify(settings: VerifySettings) -> None:
     Raises:
         CertificateError: If the certificate is damaged, of an unknown plant or does not verify.
         ValueError: If the environment is unknown, or the plant's file cannot be read.
+        ModuleNotFoundError: If the engine is "flint" and python-flint is not installed.
         OSError: If the verdicts cannot be written.
     """
     certificate = Certificate.load(settings.file)
@@ -28,7 +29,7 @@ def verify(settings: VerifySettings) -> None:
         plant = registered_env(origin).plant
     else:
         origin, plant = str(settings.plant), LinearPlant.load(settings.plant)
-    report = shields.verify(certificate, plant)
+    report = shields.verify(certificate, plant, engine=settings.engine)
     print(f"{certificate}\nagainst the plant of {origin}:\n{report}")
     if certificate.ages is not None:
         print(f"it rests on {certificate.ages.sets.contract}")

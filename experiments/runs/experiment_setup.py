@@ -17,6 +17,7 @@ from experiments.settings import BackendSettings, ChannelSettings, LearningSetti
 from ncs_gym import Channel, LinearPlant
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, Report, verify
+from shields.certificate_text import size_of
 from shields.runtime.wrapper import certificate_for
 from shields.verification import require_valid
 
@@ -75,9 +76,9 @@ class ExperimentSetup:
     @property
     def title(self) -> str:
         """One line about the certificate."""
-        volume = self.certificate.provenance.get("volume_of_box_ellipsoid")
-        size = f" ({volume:.2%} of the largest ellipsoid in the safe box)" if isinstance(volume, float) else ""
-        return f"certificate: {len(self.verification.conditions)} conditions hold in exact arithmetic{size}"
+        size = size_of(self.certificate.provenance)
+        conditions = f"certificate: {len(self.verification.conditions)} conditions hold in exact arithmetic"
+        return f"{conditions} ({size})" if size else conditions
 
     def training_run(self, settings: LearningSettings, arm_name: str, index: int, grid_point: str = "") -> TrainingRun:
         """Returns one training run of an arm.

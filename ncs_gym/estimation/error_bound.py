@@ -94,18 +94,27 @@ def _conditional_set(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
         raise ErrorSetError(
             f"no error set was found under a contract of max_age = {contract.max_age}: promise less age"
         )
-    _check_ages(sets, plant)
-    return ErrorSet(Sigma=sets.shapes[contract.max_age], rate=float(sets.rates[-1]), ages=sets)
+    error_set = ErrorSet(Sigma=sets.shapes[contract.max_age], rate=float(sets.rates[-1]), ages=sets)
+    require_error_set(error_set, plant)
+    return error_set
 
 
-def _check_ages(sets: ErrorSetsByAge, plant: LinearPlant) -> None:
-    """Raises unless (C0), (C1) and (C2) hold by more than rounding.
+def require_error_set(error_set: ErrorSet, plant: LinearPlant) -> None:
+    """Raises unless an error set's conditions hold by more than the rounding of evaluating them.
+
+    Estimators rest on them; (C2) includes room for the rounding of an updated estimate (docs/shield.md, "Rounding").
 
     Raises:
         ErrorSetError: Naming the condition.
     """
+    Sigma, rate, ages = error_set.Sigma, error_set.rate, error_set.ages
+    if ages is None:
+        grown = plant.A @ Sigma @ plant.A.T / rate + plant.disturbance.shape / (1.0 - rate)
+        needs = {"(E0)": [(Sigma, plant.initial_error.shape)], "(E1)": [(Sigma, grown)]}
+    else:
+        needs = ages.needs(plant)
     inverse = np.linalg.inv(np.linalg.cholesky(np.linalg.inv(plant.weight)))
-    for name, pairs in sets.needs(plant).items():
+    for name, pairs in needs.items():
         for outer, inner in pairs:
             gap = inverse @ (outer - inner) @ inverse.T
             rounding = ROUNDINGS * plant.n * np.finfo(float).eps * np.abs(inverse @ outer @ inverse.T).max()

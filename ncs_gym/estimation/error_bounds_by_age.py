@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ncs_gym.network.contract import ChannelContract
-from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.plants.linear_plant import INFLATION, LinearPlant
 from ncs_gym.plants.lqr import regulator_gain
 from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER, is_inside, joined, outer_sum
 from ncs_gym.validation import ReadOnlyArrays
@@ -38,6 +38,8 @@ class ErrorSetsByAge(ReadOnlyArrays):
         (C1) Sigma_{j+1} >= A Sigma_j A'/lam_j + D/(1-lam_j)                             j = 0..h
         (C2) Sigma_0 >= (I-T_j H) Sigma_j (I-T_j H)'/mu_j + T_j N T_j'/(1-mu_j)          j = 1..h+1
 
+    (C2) holds with room for the rounding of an estimate that is updated (docs/shield.md, "Rounding").
+
     Attributes:
         contract: The promise they rest on.
         shapes: Sigma_j, shape (h+2, n, n).
@@ -58,7 +60,10 @@ class ErrorSetsByAge(ReadOnlyArrays):
         self._make_arrays_read_only()
 
     def needs(self, plant: LinearPlant) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
-        """Returns, per condition, pairs (outer, inner) of shapes of which each outer must hold the inner one."""
+        """Returns, per condition, pairs (outer, inner) of shapes of which each outer must hold the inner one.
+
+        In (C2) the inner one includes the rounding of the updated estimate, as `SetMembership.updated` does.
+        """
         D, first = plant.disturbance.shape, plant.initial_error.shape
         identity = np.eye(plant.n)
         grown = [
@@ -72,7 +77,7 @@ class ErrorSetsByAge(ReadOnlyArrays):
         return {
             "(C0)": [(self.shapes[0], first)],
             "(C1)": list(zip(self.shapes[1:], grown, strict=True)),
-            "(C2)": [(self.shapes[0], update) for update in updated],
+            "(C2)": [(self.shapes[0], INFLATION * update + plant.estimate_rounding) for update in updated],
         }
 
 
@@ -103,6 +108,7 @@ def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsBy
     D = inverse @ plant.disturbance.shape @ inverse.T
     D = D + 1e-9 * float(np.trace(D)) / plant.n * np.eye(plant.n)
     first = inverse @ plant.initial_error.shape @ inverse.T + 1e-12 * np.eye(plant.n)
+    rounding = inverse @ plant.estimate_rounding @ inverse.T
     exact = plant.sensor_error_with(contract.quantization_step).shape
     noise = NOISE_MARGIN * exact + 1e-12 * np.diag(np.diag(H @ H.T)) * float(np.trace(D)) / plant.n
     start, steps = first, contract.max_age + 1
@@ -113,7 +119,7 @@ def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsBy
         updates = [_update(shape, H, noise) for shape in shapes[1:]]
         grown = first
         for _, _, shape in reversed(updates):
-            grown = joined(grown, shape)
+            grown = joined(grown, shape + rounding)
         if not float(np.trace(grown)) < LARGEST:
             return None
         if is_inside(SLACK * grown, start):

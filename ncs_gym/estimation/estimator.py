@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym.estimation.arrival_patterns import ArrivalPatterns, arrival_patterns, patterns_of
-from ncs_gym.estimation.error_bound import ErrorSet
+from ncs_gym.estimation.error_bound import ErrorSet, require_error_set
 from ncs_gym.estimation.statistics_table import NO_SAMPLE, UNKNOWN
 from ncs_gym.network.channel import Channel, Packet
 from ncs_gym.plants.linear_plant import LinearPlant
@@ -52,6 +52,7 @@ class Estimator:
 
     Raises:
         UnstablePlantError: If no error set is given and the plant is not Schur stable.
+        ErrorSetError: If the error set that is given does not meet its conditions, with room for rounding.
         ValueError: If the channel rounds more coarsely than the contract of the error set allows.
     """
 
@@ -64,8 +65,11 @@ class Estimator:
     ) -> None:
         self.plant, self.channel, self.buffer = plant, channel, channel.longest_delay
         if patterns is None:
-            shared = error_set is None
-            patterns = arrival_patterns(plant, channel, None) if shared else patterns_of(plant, channel, error_set)
+            if error_set is None:
+                patterns = arrival_patterns(plant, channel, None)
+            else:
+                require_error_set(error_set, plant)
+                patterns = patterns_of(plant, channel, error_set)
         self._patterns = patterns
         self.error_set = self._patterns.recursion.error_set
         ages = self.error_set.ages

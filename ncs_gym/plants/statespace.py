@@ -162,6 +162,20 @@ def delayed_arguments(plant: LinearPlant, input_delay: int) -> dict[str, Any]:
     }
 
 
+def inputs_under_way(plant: LinearPlant) -> int:
+    """Returns how many of the last states are inputs under way, as those of `delayed_arguments` are; 0 of most plants.
+
+    These are states (u_{k-d}, .., u_{k-1}) of a plant that the input itself reaches only as the newest of them.
+    """
+    n, m = plant.n, plant.m
+    if n <= m or plant.A[-m:].any() or not np.array_equal(plant.B, np.eye(n)[:, -m:]):
+        return 0
+    stored = m
+    while stored + m < n and np.array_equal(plant.A[-stored - m : -stored], np.eye(n)[n - stored :][:m]):
+        stored += m
+    return stored
+
+
 def _matrices(sys: Any) -> tuple[Any, Any, Any, Any, Any]:
     """Returns A, B, C, D and the sampling time of a model: 0 or None in continuous time, True if it is unknown.
 

@@ -20,6 +20,9 @@ FLAT = 2e-14
 OFF_FLAT = 1e-12
 # The multiplier of a term in an outer sum stays this far from 0 and 1, so that no division overflows.
 SMALLEST_MULTIPLIER = 1e-9
+# Relative rounding of a determinant of four entries, or per dimension of an eigenvalue, with room; products below the
+# second number may have lost all their digits.
+INCLUSION_ROUNDING, SMALLEST_PRODUCT = 64.0 * 2.0**-53, 1e-290
 # Newton's method for farthest points converges in about five steps, near the hard case in at most 25 of those tried;
 # a step below this fraction of nu is rounding.
 NEWTON_STEPS, NEWTON_PRECISION = 40, 1e-15
@@ -185,15 +188,30 @@ def _trust_region_root(slopes: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def is_inside(inner: np.ndarray, outer: np.ndarray) -> bool:
-    """Returns whether E(inner) is a subset of E(outer): outer - inner >= 0, without any tolerance."""
+    """Returns whether E(inner) is shown to be a subset of E(outer): outer - inner >= 0 in exact arithmetic.
+
+    What is said to be inside is inside: what the rounding of this test could have decided counts as outside, so that
+    proofs that begin with "it lies inside" need no room. Every entry of a difference is exact but for its own last
+    digit, hence its sign, a zero and a diagonal difference are exact; a set lies inside itself.
+    """
     difference = outer - inner
     if difference.shape == (2, 2):  # four times faster than an eigenvalue call, and the common case
         a, b, d = difference.item(0), difference.item(1), difference.item(3)
-        return a >= 0.0 and d >= 0.0 and a * d - b * b >= 0.0
+        return a >= 0.0 and d >= 0.0 and (b == 0.0 or a * d * (1.0 - INCLUSION_ROUNDING) > b * b + SMALLEST_PRODUCT)
+    diagonal = difference.diagonal()
+    if not (diagonal >= 0.0).all():
+        return False
+    if np.count_nonzero(difference) == np.count_nonzero(diagonal):
+        return True
     # In coordinates where the outer shape has unit diagonal: an eigenvalue's rounding then does not depend on units.
-    extent = np.sqrt(np.maximum(np.diag(outer), 0.0))
-    extent[extent == 0.0] = 1.0
-    return bool(np.linalg.eigvalsh(difference / np.outer(extent, extent))[0] >= 0.0)
+    extent = np.sqrt(outer.diagonal())
+    moved = diagonal > 0.0
+    if difference[~moved].any():
+        return False
+    # A direction in which nothing differs says nothing; in the others the smallest eigenvalue must exceed its rounding.
+    extent = extent[moved]
+    values = np.linalg.eigvalsh(difference[np.ix_(moved, moved)] / np.outer(extent, extent))
+    return bool(values[0] > INCLUSION_ROUNDING * len(values) * values[-1])
 
 
 def outer_sum(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.ndarray:

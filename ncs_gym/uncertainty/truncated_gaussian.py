@@ -64,13 +64,16 @@ class TruncatedGaussian(ReadOnlyArrays):
 def chi2_quantile(probability: float, degrees: int) -> float:
     """Returns the chi-square quantile chi2_{degrees, probability}, rounded up.
 
-    Liu et al. Theorem 5 needs the 1 - delta quantile, so `probability` is 1 - delta.
+    Liu et al. Theorem 5 needs the 1 - delta quantile, so `probability` is 1 - delta. That float lies up to 2^-54 from
+    the number; where delta is small this counts, and the quantile is one for delta less that much.
 
     Args:
         probability: In [0.001, 1).
         degrees: Degrees of freedom, >= 1.
     """
+    certainly_removed = (1.0 - probability) - 2.0**-54
     quantile = float(chi2.ppf(probability, degrees)) * (1.0 + 1e-12)
+    quantile = max(quantile, float(chi2.isf(certainly_removed, degrees)) * (1.0 + 1e-13))
     while chi2.cdf(quantile, degrees) < probability:
         quantile = float(np.nextafter(quantile, np.inf))
     return quantile

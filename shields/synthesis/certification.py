@@ -14,6 +14,7 @@ from ncs_gym import ErrorSet, LinearPlant
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.validation import shown
 from shields.certificate import Certificate
+from shields.certificate_text import size_of
 from shields.errors import Infeasible, SynthesisInterrupted
 from shields.proof import ContractProof, Multipliers
 from shields.synthesis.alternation import largest_set, with_best_gain, with_best_multipliers
@@ -22,6 +23,7 @@ from shields.synthesis.diagnosis import infeasibility, with_feasible_bounds
 from shields.synthesis.max_margin_gain import max_margin_gain
 from shields.synthesis.multipliers import best_input_multipliers, best_multipliers
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
+from shields.synthesis.share_of_box import share_of_box
 from shields.verification import Report, verify
 
 # Relative tightenings of the semidefinite programs, tried in turn until the result verifies exactly.
@@ -71,7 +73,7 @@ def synthesize(
         certificate = paper_certificate(plant, dkappa=dkappa, drho=drho, search=search)
         holds = _is_certifiable(plant, certificate.L, certificate.K)
         volume = np.linalg.det(np.linalg.solve(largest_box_ellipsoid(plant.C), certificate.L)) ** 0.5
-        description = _description(plant, float(volume)) | {"exact_conditions_hold": holds}
+        description = _description(plant, certificate.L, float(volume)) | {"exact_conditions_hold": holds}
         return replace(certificate, provenance=certificate.provenance | description)
     if contract is not None and not isinstance(contract, ChannelContract):
         raise ValueError(f"contract must be a ChannelContract or None, got {shown(contract)}")
@@ -154,9 +156,9 @@ def _interrupted(plant: LinearPlant, stage: str, best: Certificate | None) -> Sy
     message = f"interrupted: the synthesis was at {stage}"
     if best is None or not verify(best, plant).valid:
         return SynthesisInterrupted(f"{message} and had no certificate yet")
-    size = best.provenance["volume_of_box_ellipsoid"]
+    size = size_of(best.provenance)
     best = replace(best, provenance=best.provenance | {"interrupted_at": stage})
-    return SynthesisInterrupted(f"{message}, its best certificate has {size:.2%} of the box ellipsoid's volume", best)
+    return SynthesisInterrupted(f"{message}, its best certificate has {size}", best)
 
 
 def _with_tolerated_scale(certificate: Certificate, problem: DesignProblem) -> Certificate:
@@ -203,21 +205,19 @@ def _certificate(
             "solver": f"Clarabel {version('clarabel')} through cvxpy {version('cvxpy')}",
             "slack": slack,
         }
-        | _description(plant, float(np.exp(0.5 * design.log_det))),
+        | _description(plant, L, float(np.exp(0.5 * design.log_det))),
     )
 
 
-def _description(plant: LinearPlant, volume: float) -> dict[str, Any]:
+def _description(plant: LinearPlant, L: np.ndarray, volume: float) -> dict[str, Any]:
     """Returns what a reader of the certificate wants to know about its set and its plant.
 
     Args:
         plant: The plant.
+        L: Shape of the set, (n, n).
         volume: Volume of the set in units of the largest ellipsoid in the safe box.
     """
-    n = plant.n
-    description: dict[str, Any] = {"volume_of_box_ellipsoid": volume}
-    if len(plant.C) == n:  # the box is a parallelotope, which holds the unit ball as the unit cube's double does
-        description["share_of_box"] = volume * math.pi ** (n / 2) / math.gamma(n / 2 + 1) / 2.0**n
+    description: dict[str, Any] = {"volume_of_box_ellipsoid": volume} | share_of_box(plant, L)
     assumptions = getattr(plant, "assumptions", ())
     if assumptions:
         description["assumptions"] = [assumptions] if isinstance(assumptions, str) else list(assumptions)

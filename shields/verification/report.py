@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Literal
 
 from ncs_gym import LinearPlant
+from ncs_gym.validation import shown
 from shields.certificate import Certificate
 from shields.errors import CertificateError
 from shields.paper.conditions import paper_conditions
@@ -32,7 +36,9 @@ class Report:
         return "\n".join(rows)
 
 
-def verify(certificate: Certificate, plant: LinearPlant) -> Report:
+def verify(
+    certificate: Certificate, plant: LinearPlant, *, engine: Literal["rational", "flint"] = "rational"
+) -> Report:
     """Returns whether a certificate proves what it claims for a plant, in exact rational arithmetic.
 
     The conditions are (E0), (E1), (I), (S), (U) of theory.md section 3, and that D, N and r0^2 I contain what
@@ -42,13 +48,23 @@ def verify(certificate: Certificate, plant: LinearPlant) -> Report:
     Args:
         certificate: The certificate.
         plant: The plant, with its bounds.
+        engine: "rational" factorizes matrices of Python's fractions. "flint" is written separately, on python-flint,
+            and decides by the signs of characteristic polynomials; it also checks the chi-square quantiles.
 
     Raises:
+        ModuleNotFoundError: If the engine is "flint" and python-flint is not installed.
         ValueError: If an argument is of another kind.
     """
     if not isinstance(certificate, Certificate) or not isinstance(plant, LinearPlant):
         kinds = f"{type(certificate).__name__} and {type(plant).__name__}"
         raise ValueError(f"verify takes a Certificate and a LinearPlant, got {kinds}")
+    if not isinstance(engine, str) or engine not in ("rational", "flint"):
+        raise ValueError(f"engine must be 'rational' or 'flint', got {shown(engine)}")
+    return Report(tuple((_rational_conditions if engine == "rational" else _flint_conditions)(certificate, plant)))
+
+
+def _rational_conditions(certificate: Certificate, plant: LinearPlant) -> list[Condition]:
+    """Returns the conditions as the first engine judges them."""
     conditions = [flag("plant: the certificate belongs to it", certificate.fingerprint == plant.fingerprint)]
     fits = certificate.L.shape == (plant.n, plant.n) and certificate.K.shape == (plant.m, plant.n)
     if certificate.method == "paper":
@@ -58,7 +74,20 @@ def verify(certificate: Certificate, plant: LinearPlant) -> Report:
         fits = fits and multipliers_fit(certificate.proof(), plant)
         conditions.append(flag("shapes: L (n, n), K (m, n), one input multiplier per input", fits))
         conditions += certified_conditions(certificate, plant) if fits else []
-    return Report(tuple(conditions))
+    return conditions
+
+
+def _flint_conditions(certificate: Certificate, plant: LinearPlant) -> Iterable[Condition]:
+    """Returns the conditions as the second engine judges them.
+
+    Raises:
+        ModuleNotFoundError: If python-flint is not installed.
+    """
+    if importlib.util.find_spec("flint") is None:
+        raise ModuleNotFoundError("engine 'flint' needs python-flint: pip install 'ncs-gym[verify]'", name="flint")
+    from shields.verification.flint import flint_conditions  # an optional dependency
+
+    return flint_conditions(certificate, plant)
 
 
 def require_valid(certificate: Certificate, plant: LinearPlant) -> None:

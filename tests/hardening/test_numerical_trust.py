@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 from benchmarks.numerical_trust import badly_scaled_plant, outcome
 from ncs_gym import Channel, ChannelContract, certified_error_set
 from ncs_gym.envs.env import NCSEnv
-from shields import Infeasible, SafetyShield, synthesize, verify
+from shields import Infeasible, SafetyShield, synthesize
 from tests.fuzz import examples, plants
+from tests.verdicts import verified
 
 
 @pytest.mark.parametrize(("n", "m", "seeds"), [(1, 1, 3), (2, 1, 3), (3, 2, 2), (4, 2, 1)])
@@ -43,7 +44,7 @@ def judged(plant, contract=None):
     except Infeasible as infeasible:
         reason, binding = str(infeasible), infeasible.binding
     else:
-        assert verify(certificate, plant).valid
+        assert verified(certificate, plant).valid
         return certificate
     assert binding
     assert "\n" not in reason

@@ -15,8 +15,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from agents.agent import Agent
-from shields import Certificate, verify
+from shields import Certificate
 from tests.command import Run, assert_one_sentence, environment, ncs, ncs_process
+from tests.verdicts import verified
 
 ARM_KEYS = {
     "train_steps",
@@ -127,7 +128,7 @@ def test_report_is_one_self_contained_page(smoke):
 
 def test_saved_certificate_verifies(smoke, loaded):
     out, _ = smoke
-    assert verify(Certificate.load(out / "certificate.json"), loaded).valid
+    assert verified(Certificate.load(out / "certificate.json"), loaded).valid
 
 
 def test_killed_run_goes_on_by_its_settings_file_and_ends_like_an_uninterrupted_one(smoke, tmp_path):
@@ -217,8 +218,12 @@ def test_synthesize_then_verify(tmp_path):
     assert checked.returncode == 0, checked.stderr
     assert checked.stdout.strip().endswith("valid")
     assert json.loads((tmp_path / "report.json").read_text())["valid"] is True
-    other = ncs("verify", file, "--env", "ncs_gym/TruckTrailerCruise-v0")
-    assert_one_sentence(other, "does not verify")
+    again = ncs("verify", file, "--engine", "flint")
+    assert again.returncode == 0, again.stderr
+    assert "chi-square" in again.stdout
+    for engine in ("rational", "flint"):
+        other = ncs("verify", file, "--env", "ncs_gym/TruckTrailerCruise-v0", "--engine", engine)
+        assert_one_sentence(other, "does not verify")
 
 
 @pytest.mark.parametrize("arguments", [["verify", "--help"], ["compare", "--steps", "0"], ["verify", "nowhere.json"]])

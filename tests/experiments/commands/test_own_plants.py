@@ -13,9 +13,10 @@ import gymnasium as gym
 import pytest
 
 from ncs_gym import truck_trailer
-from shields import Certificate, verify
+from shields import Certificate
 from tests.command import assert_one_sentence, environment, ncs
 from tests.plants import random_plant
+from tests.verdicts import verified
 
 MODULE = """
 from ncs_gym import Channel, register_plant, truck_trailer
@@ -42,7 +43,7 @@ def test_certificate_for_a_registered_plant_is_made_and_verified(folder):
     assert run.returncode == 0, run.stderr
     assert "% of the safe box's volume" in run.stdout
     certificate = Certificate.load(folder / "certificate.json")
-    assert verify(certificate, truck_trailer(mass=2000.0)).valid
+    assert verified(certificate, truck_trailer(mass=2000.0)).valid
     assert ncs("verify", "certificate.json", *ENV, cwd=folder).stdout.endswith("valid\n")
     assert_one_sentence(ncs("verify", "certificate.json", "--env", "ncs_gym/TruckTrailer-v0", cwd=folder), "verify")
 
@@ -99,8 +100,8 @@ def test_plant_of_a_file_is_certified(tmp_path):
     made = ncs("synthesize", "--plant", "plant.json", cwd=tmp_path)
     assert made.returncode == 0, made.stderr
     assert Certificate.load(tmp_path / "certificate.json").ages is None
-    verified = ncs("verify", "certificate.json", "--plant", "plant.json", "--out", "v.json", cwd=tmp_path)
-    assert verified.stdout.endswith("valid\n")
+    checked = ncs("verify", "certificate.json", "--plant", "plant.json", "--out", "v.json", cwd=tmp_path)
+    assert checked.stdout.endswith("valid\n")
     assert json.loads((tmp_path / "v.json").read_text())["env"] == "plant.json"
 
 
@@ -149,5 +150,5 @@ def test_long_synthesis_shows_its_stage_and_saves_the_best_when_interrupted(tmp_
     end = read_until(ours, "certificate.json\r\n")
     assert process.wait(60) == 130
     assert "ncs: interrupted: the best certificate so far, which verifies (" in end
-    assert verify(Certificate.load(tmp_path / "certificate.json"), random_plant(0, 12, 3)).valid
+    assert verified(Certificate.load(tmp_path / "certificate.json"), random_plant(0, 12, 3)).valid
     os.close(ours)

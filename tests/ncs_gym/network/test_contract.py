@@ -24,7 +24,7 @@ from ncs_gym import (
 )
 from ncs_gym.estimation import set_membership
 from ncs_gym.estimation.arrival_patterns import patterns_of
-from ncs_gym.estimation.error_bound import _check_ages
+from ncs_gym.estimation.error_bound import require_error_set
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
 from ncs_gym.estimation.set_membership import SetMembership
@@ -323,16 +323,16 @@ def test_sets_by_age_that_fail_a_condition_are_an_error():
     plant, contract = PLANTS["cart-pole"]
     plant = replace(plant, initial_cov=np.zeros((4, 4)))
     errors = certified_error_set(plant, contract)
-    _check_ages(errors.ages, plant)
+    require_error_set(errors, plant)
     # The first set would hold no update, and the last not what the one before it moves into.
     for age, name in ((0, r"\(C2\)"), (contract.max_age + 1, r"\(C1\)")):
         shapes = errors.ages.shapes.copy()
         shapes[age] *= 0.5
         with pytest.raises(ErrorSetError, match=name):
-            _check_ages(replace(errors.ages, shapes=shapes), plant)
+            require_error_set(replace(errors, ages=replace(errors.ages, shapes=shapes)), plant)
     worse = replace(plant, initial_cov=np.eye(4))
     with pytest.raises(ErrorSetError, match=r"\(C0\)"):
-        _check_ages(errors.ages, worse)
+        require_error_set(errors, worse)
 
 
 def test_every_age_has_a_set_and_a_rate_of_its_own():

@@ -7,6 +7,7 @@ from scipy.optimize import minimize
 from ncs_gym import Ellipsoid
 from ncs_gym.uncertainty.ellipsoid import _farthest_coordinates, is_inside, joined, outer_sum, sum_gauge
 from ncs_gym.uncertainty.minkowski_sum import outside_sum
+from shields.verification.rational_matrix import is_positive_semidefinite, rational, subtract
 
 seeds = st.integers(0, 10_000)
 
@@ -172,6 +173,31 @@ def test_inclusion_has_no_tolerance():
         sheared = np.eye(n)
         sheared[0, 1] = sheared[1, 0] = 0.5
         assert not is_inside(sheared, np.eye(n))
+
+
+@pytest.mark.parametrize("n", [2, 3, 4])
+def test_what_is_said_to_be_inside_is_inside_in_exact_arithmetic(n):
+    """Shapes that touch but for their last digits: a test in float64 alone calls half of those outside inside."""
+    rng, outside, missed = np.random.default_rng(n), 0, 0
+    for _ in range(300):
+        root = rng.standard_normal((n, n - 1))
+        touching = root @ root.T  # singular, but for rounding
+        inner = np.zeros((n, n)) if rng.random() < 0.5 else np.diag(2.0 ** rng.integers(-3, 3, n))
+        outer = inner + 0.5 * (touching + touching.T)
+        exact = is_positive_semidefinite(subtract(rational(outer), rational(inner)))
+        outside += not exact
+        assert exact or not is_inside(inner, outer)
+        missed += not is_inside(inner, outer + 1e-12 * np.eye(n))  # little enough is lost by being careful
+    assert outside > 50
+    assert missed == 0
+
+
+def test_a_set_lies_inside_itself_however_flat():
+    rng = np.random.default_rng(0)
+    for n in (1, 2, 3, 6):
+        for rank in range(n + 1):
+            root = rng.standard_normal((n, rank))
+            assert is_inside(root @ root.T, root @ root.T)
 
 
 @given(seeds, st.integers(2, 5))

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, ChannelContract, batch_reactor, cart_pole
-from shields import Certificate, CertificateError, SafetyShield, verify
+from shields import Certificate, CertificateError, SafetyShield
 from shields.runtime.guarantee import LARGE_ERROR, NOT_KNOWN_INSIDE
 from tests.certificates import certificate_of
 from tests.shields.attacks.extremes import attack, harmful
+from tests.verdicts import verified
 
 PLANTS = {
     "cart-pole": (cart_pole(), ChannelContract(4)),
@@ -101,15 +102,15 @@ def promised():
 
 def test_certificate_under_a_contract_is_valid_and_survives_its_file(promised, tmp_path):
     plant, certificate = promised
-    assert verify(certificate, plant).valid
+    assert verified(certificate, plant).valid
     certificate.save(tmp_path / "c.json")
     loaded = Certificate.load(tmp_path / "c.json")
-    assert verify(loaded, plant).valid
+    assert verified(loaded, plant).valid
     assert loaded.ages.sets.contract == certificate.ages.sets.contract
     np.testing.assert_array_equal(loaded.ages.sets.shapes, certificate.ages.sets.shapes)
     np.testing.assert_array_equal(loaded.ages.inputs, certificate.ages.inputs)
     np.testing.assert_array_equal(loaded.error_shapes, certificate.ages.sets.shapes[:3])
-    names = [condition.name for condition in verify(certificate, plant).conditions]
+    names = [condition.name for condition in verified(certificate, plant).conditions]
     assert sum(name.startswith("(C1)") for name in names) == sum(name.startswith("(C2)") for name in names) == 3
     assert sum(name.startswith("(I)") for name in names) == 3
     assert sum(name.startswith("(U)") for name in names) == 6
@@ -160,7 +161,7 @@ MUTATIONS = {
 def test_mutation_of_a_proof_by_age_is_rejected_for_the_right_condition(name, promised):
     plant, certificate = promised
     mutate, expected = MUTATIONS[name]
-    report = verify(mutate(certificate, certificate.ages.sets), plant)
+    report = verified(mutate(certificate, certificate.ages.sets), plant)
     broken = [condition.name for condition in report.conditions if not condition.holds]
     for mark in expected:
         assert any(mark in found for found in broken), (mark, broken)
@@ -168,8 +169,8 @@ def test_mutation_of_a_proof_by_age_is_rejected_for_the_right_condition(name, pr
 
 def test_margins_by_age_agree_with_floating_point(promised):
     plant, certificate = promised
-    margins = {c.name.split(" ")[0] + c.name[-1]: [] for c in verify(certificate, plant).conditions}
-    for condition in verify(certificate, plant).conditions:
+    margins = {c.name.split(" ")[0] + c.name[-1]: [] for c in verified(certificate, plant).conditions}
+    for condition in verified(certificate, plant).conditions:
         margins[condition.name.split(" ")[0] + condition.name[-1]].append(condition.margin)
     s, ages, growth = certificate.ages.sets, certificate.ages, certificate.multipliers.rounding
     smallest = lambda matrix: np.linalg.eigvalsh(matrix)[0]  # noqa: E731
@@ -211,6 +212,6 @@ def test_proof_by_age_that_does_not_fit_together_is_no_certificate(promised, cha
 def test_certificate_for_other_outputs_does_not_fit(promised):
     _, certificate = promised
     other = batch_reactor(H=np.eye(4), measurement_noise_cov=1e-6 * np.eye(4))
-    report = verify(replace(certificate, fingerprint=other.fingerprint), other)
+    report = verified(replace(certificate, fingerprint=other.fingerprint), other)
     assert not report.valid
     assert "shapes" in next(condition.name for condition in report.conditions if not condition.holds)

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from ncs_gym import LinearPlant, truck_trailer
-from shields import Certificate, CertificateError, Infeasible, SafetyShield, certify, synthesize, verify
+from shields import Certificate, CertificateError, Infeasible, SafetyShield, certify, synthesize
 from shields.paper.bounds import PaperModel
 from shields.paper.feasibility import FeasibilityScan, largest_scale
 from shields.runtime.guarantee import NO_ERROR_SET
+from tests.verdicts import verified
 
 SMALL = truck_trailer(gamma=1e-6, process_noise_cov=1e-6 * np.eye(2))
 
@@ -24,7 +25,7 @@ def test_certificate_carries_the_papers_constants_and_no_error_set(paper):
     assert paper.Sigma is paper.error_set is paper.multipliers is None
     bounds = PaperModel(SMALL).at(paper.kappa, paper.rho)
     assert (paper.epsilon, paper.epsilon_up) == (bounds.epsilon, bounds.epsilon_up)
-    assert verify(paper, SMALL).valid
+    assert verified(paper, SMALL).valid
 
 
 @pytest.mark.parametrize("search", ["first", "largest"])
@@ -35,7 +36,7 @@ def test_certificate_carries_the_papers_constants_and_no_error_set(paper):
 def test_where_op_succeeds_its_constraints_hold_exactly(bounds, search):
     plant = truck_trailer(**bounds)
     certificate = synthesize(plant, method="paper", search=search)
-    report = verify(certificate, plant)
+    report = verified(certificate, plant)
     assert report.valid, str(report)
     assert {f"(C{i})" for i in (1, 2, 3, 7)} <= {c.name.split()[0] for c in report.conditions}
 
@@ -50,7 +51,7 @@ def test_saving_and_loading_is_exact(paper, tmp_path):
         paper.epsilon,
         paper.epsilon_up,
     )
-    assert verify(again, SMALL).valid
+    assert verified(again, SMALL).valid
 
 
 @pytest.mark.parametrize(
@@ -68,7 +69,7 @@ def test_saving_and_loading_is_exact(paper, tmp_path):
     ],
 )
 def test_altered_certificate_is_rejected_for_the_right_constraint(paper, change, mark):
-    found = [c.name for c in verify(replace(paper, **change(paper)), SMALL).conditions if not c.holds]
+    found = [c.name for c in verified(replace(paper, **change(paper)), SMALL).conditions if not c.holds]
     assert any(name.startswith(mark) for name in found), found
 
 
@@ -88,7 +89,7 @@ def test_exact_conditions_are_checked_separately(paper):
     assert "e'e <= epsilon" in paper.provenance["guarantee"]
     stronger = certify(SMALL, paper.L, paper.K)
     assert stronger is not None
-    assert verify(stronger, SMALL).valid
+    assert verified(stronger, SMALL).valid
     np.testing.assert_array_equal(stronger.L, paper.L)
     assert certify(SMALL, paper.L, 2.5 * paper.K) is None
 
@@ -126,7 +127,7 @@ def test_reported_scale_is_feasible_and_a_little_more_is_not():
             gamma=factor * 5e-4, process_noise_cov=factor * 1e-4 * np.eye(2), initial_cov=factor * 1e-4 * np.eye(2)
         )
 
-    assert verify(synthesize(scaled(0.97), "paper", dkappa=0.005, drho=0.01), scaled(0.97)).valid
+    assert verified(synthesize(scaled(0.97), "paper", dkappa=0.005, drho=0.01), scaled(0.97)).valid
     with pytest.raises(Infeasible):
         synthesize(scaled(1.05), "paper", dkappa=0.05, drho=0.05)  # proven over the whole domain, whatever the grid
 
@@ -149,7 +150,7 @@ def test_units_of_the_state_change_nothing(unit, paper):
         initial_cov=SMALL.initial_cov * unit**2,
     )
     certificate = synthesize(scaled, method="paper")
-    assert verify(certificate, scaled).valid
+    assert verified(certificate, scaled).valid
     assert (certificate.kappa, certificate.rho) == (paper.kappa, paper.rho)
     np.testing.assert_allclose(certificate.L / unit**2, paper.L, rtol=1e-4)
 
@@ -175,12 +176,12 @@ def test_an_input_limit_that_binds_is_named():
 def test_no_uncertainty_at_all_is_no_division_by_zero():
     zero = np.zeros((2, 2))
     plant = truck_trailer(gamma=0.0, process_noise_cov=zero, initial_cov=zero)
-    assert verify(synthesize(plant, method="paper"), plant).valid
+    assert verified(synthesize(plant, method="paper"), plant).valid
 
 
 @pytest.mark.parametrize("kappa", [float(np.nextafter(1.0, 0.0)), 1.0 - 1e-12, 0.0, -1.0, 1e70])
 def test_constants_at_the_edge_are_rejected_without_an_error(paper, kappa):
-    assert not verify(replace(paper, kappa=kappa, rho=1.0), SMALL).valid
+    assert not verified(replace(paper, kappa=kappa, rho=1.0), SMALL).valid
 
 
 def test_unbounded_box_is_infeasible():

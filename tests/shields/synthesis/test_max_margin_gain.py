@@ -6,10 +6,11 @@ import pytest
 from ncs_gym import ChannelContract, batch_reactor, cart_pole
 from ncs_gym.plants.lqr import regulator_gain
 from ncs_gym.uncertainty.truncated_gaussian import chi2_quantile
-from shields import Infeasible, synthesize, verify
+from shields import Infeasible, synthesize
 from shields.synthesis.design_problem import design_problem
 from shields.synthesis.max_margin_gain import _GainSearch, _initial_points, max_margin_gain
 from tests.plants import random_plant
+from tests.verdicts import verified
 
 CONTRACT = ChannelContract(2, 1e-4)
 PLANTS = {"cart-pole": cart_pole(), "reactor": batch_reactor()}
@@ -39,7 +40,7 @@ def test_its_margin_is_what_exact_verification_accepts(name):
     problem, _ = design_problem(plant, contract)
     margin = max_margin_gain(problem, problem.covering_error_shape).margin
     tolerated = radii_scaled(plant, 0.99 * margin)
-    assert verify(synthesize(tolerated, contract=contract), tolerated).valid
+    assert verified(synthesize(tolerated, contract=contract), tolerated).valid
     with pytest.raises(Infeasible, match="radii shrink to") as caught:
         synthesize(radii_scaled(plant, 2.0 * margin), contract=contract)
     assert caught.value.details["share_of_radii"] == pytest.approx(0.5, rel=1e-2)
@@ -119,7 +120,7 @@ def test_cart_pole_tolerates_at_least_the_measured_radii(full_state, age, radius
         measurement_noise_cov=np.diag((0.01 * radius * plant.H @ half_widths) ** 2) / chi2_quantile(0.95, plant.p),
         initial_cov=(0.01 * radius * half_widths.min()) ** 2 / chi2_quantile(0.95, n) * np.eye(n),
     )
-    assert verify(synthesize(plant, contract=ChannelContract(age)), plant).valid
+    assert verified(synthesize(plant, contract=ChannelContract(age)), plant).valid
 
 
 @pytest.mark.parametrize("contract", [ChannelContract(1), ChannelContract(3, 1e-3)])

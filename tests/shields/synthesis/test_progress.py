@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shields import synthesize, verify
+from shields import synthesize
 from shields.errors import SynthesisInterrupted
 from tests.plants import random_plant
+from tests.verdicts import verified
 
 
 def interrupting_at(stage):
@@ -32,10 +33,12 @@ def test_every_stage_says_what_is_sought_and_the_volume_reached(loaded):
 
 @pytest.mark.parametrize("stage", ["initial design 2", "alternation 1", "exact verification"])
 def test_interrupted_synthesis_hands_out_the_best_certificate_so_far(loaded, stage):
-    with pytest.raises(SynthesisInterrupted, match=f"interrupted: the synthesis was at {stage}.* of the box") as caught:
+    with pytest.raises(
+        SynthesisInterrupted, match=f"interrupted: the synthesis was at {stage}.* of the safe box.s volume, "
+    ) as caught:
         synthesize(loaded, progress=interrupting_at(stage))
     certificate = caught.value.certificate
-    assert verify(certificate, loaded).valid
+    assert verified(certificate, loaded).valid
     assert certificate.provenance["interrupted_at"].startswith(stage)
     assert "other sets may be larger" in str(certificate)
     assert isinstance(caught.value, KeyboardInterrupt)

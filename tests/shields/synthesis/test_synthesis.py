@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from ncs_gym import ChannelContract, LinearPlant, truck_trailer
-from shields import Infeasible, SafetyShield, synthesize, verify
+from shields import Infeasible, SafetyShield, synthesize
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from tests.plants import random_plant
+from tests.verdicts import verified
 
 
 def area_fraction(certificate, plant):
@@ -18,7 +19,7 @@ def area_fraction(certificate, plant):
 def test_without_process_noise_the_paper_plant_reaches_the_largest_ellipsoid_in_the_box():
     plant = truck_trailer(process_noise_cov=np.zeros((2, 2)))
     certificate = synthesize(plant)
-    assert verify(certificate, plant).valid
+    assert verified(certificate, plant).valid
     assert np.sqrt(np.linalg.det(certificate.L)) / 4.0 >= 0.999
 
 
@@ -28,7 +29,7 @@ def test_without_process_noise_the_paper_plant_reaches_the_largest_ellipsoid_in_
 def test_truck_trailers_reach_the_measured_volumes(mass, gamma, fraction):
     plant = truck_trailer(mass=mass, gamma=gamma)
     certificate = synthesize(plant)
-    assert verify(certificate, plant).valid
+    assert verified(certificate, plant).valid
     assert area_fraction(certificate, plant) >= fraction
 
 
@@ -38,7 +39,7 @@ def test_truck_trailers_reach_the_measured_volumes(mass, gamma, fraction):
 def test_random_stable_plants_get_a_certificate_that_verifies(seed, n, m):
     plant = random_plant(seed, n, m, p=max(1, n - 1))
     certificate = synthesize(plant)
-    assert verify(certificate, plant).valid
+    assert verified(certificate, plant).valid
     assert 0.3 < area_fraction(certificate, plant) <= 1.0
 
 
@@ -65,7 +66,7 @@ def test_box_with_more_rows_than_states_is_respected():
     angle = np.linspace(0.0, np.pi, 7)[:-1]
     plant = truck_trailer(box=np.stack([np.cos(angle), np.sin(angle)], axis=1) / 2.0)
     certificate = synthesize(plant)
-    assert verify(certificate, plant).valid
+    assert verified(certificate, plant).valid
     assert max(row @ certificate.L @ row for row in plant.C) <= 1.0
     assert area_fraction(certificate, plant) > 0.99
 
@@ -122,7 +123,7 @@ def test_weak_input_is_what_binds():
 
     contract = ChannelContract(1)
     certificate = synthesize(with_limit(1.0), contract=contract)
-    assert verify(certificate, with_limit(1.0)).valid
+    assert verified(certificate, with_limit(1.0)).valid
     with pytest.raises(Infeasible) as caught:
         synthesize(with_limit(1e-3), contract=contract)
     assert caught.value.binding == "U"
@@ -140,7 +141,7 @@ def test_weak_input_is_what_binds():
 )
 def test_flat_and_absent_uncertainty_gets_a_certificate(bounds):
     plant = truck_trailer(**bounds)
-    assert verify(synthesize(plant), plant).valid
+    assert verified(synthesize(plant), plant).valid
 
 
 def test_unknown_method_is_refused(plant):
@@ -199,4 +200,4 @@ def test_solver_whose_answers_are_a_little_wrong_gives_no_false_certificate(monk
         certificate = synthesize(plant)
     except Infeasible:
         return
-    assert verify(certificate, plant).valid
+    assert verified(certificate, plant).valid

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, truck_trailer
-from shields import synthesize, verify
+from shields import synthesize
 from tests.shields.verification.test_verification import replaced
+from tests.verdicts import verified
 
 BOUNDS = {
     "disturbance_bound": [0.03, 0.004],
@@ -28,12 +29,12 @@ def designed(request):
 
 
 def broken(certificate, plant):
-    return [condition.name for condition in verify(certificate, plant).conditions if not condition.holds]
+    return [condition.name for condition in verified(certificate, plant).conditions if not condition.holds]
 
 
 def test_certificate_for_declared_bounds_is_valid(designed):
     plant, certificate = designed
-    assert verify(certificate, plant).valid
+    assert verified(certificate, plant).valid
 
 
 @pytest.mark.parametrize(
@@ -64,7 +65,7 @@ def test_certificate_belongs_to_its_declared_bounds(designed, name):
 def test_noise_set_under_a_contract_holds_the_declared_noise():
     plant = truck_trailer(4000.0, **BOUNDS)
     certificate = synthesize(plant, contract=ChannelContract(1, 0.02))
-    assert verify(certificate, plant).valid
+    assert verified(certificate, plant).valid
     larger = replaced(plant, sensor_bound=Ellipsoid(1.001 * plant.sensor_bound.shape))
     found = broken(certificate, larger)
     assert len(found) == 1
@@ -78,8 +79,8 @@ def test_method_of_the_paper_refuses_bounds_that_its_theorems_do_not_know(name):
     with pytest.raises(ValueError, match=f"method 'paper' knows gamma and covariances alone, not {name}"):
         synthesize(plant, method="paper")
     paper = synthesize(small, method="paper")
-    assert verify(paper, small).valid
-    assert not verify(replace(paper, fingerprint=plant.fingerprint), plant).valid
+    assert verified(paper, small).valid
+    assert not verified(replace(paper, fingerprint=plant.fingerprint), plant).valid
 
 
 @pytest.mark.parametrize("input_delay", [1, 2])
@@ -89,7 +90,7 @@ def test_plant_with_delayed_inputs_goes_through_synthesis_and_verification(input
     settings = {"box": [1.0, 1.5], "u_max": 0.8, "dt": 0.1}
     plant = LinearPlant.from_statespace((rate, B, C, None), input_delay=input_delay, **settings, **bounds)
     certificate = synthesize(plant)
-    assert verify(certificate, plant).valid
+    assert verified(certificate, plant).valid
     rows = plant.C[:2]
     assert (np.einsum("ij,jk,ik->i", rows, certificate.L, rows) <= 1.0).all()
     assert certificate.safe_set.support(np.eye(plant.n)[0]) > 0.5

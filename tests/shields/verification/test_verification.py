@@ -5,14 +5,15 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid, truck_trailer
-from shields import CertificateError, synthesize, verify
+from shields import CertificateError, synthesize
 from shields.verification import require_valid
 from tests.certificates import certificate_of
 from tests.plants import random_plant
+from tests.verdicts import verified
 
 
 def broken(certificate, plant) -> list[str]:
-    return [condition.name for condition in verify(certificate, plant).conditions if not condition.holds]
+    return [condition.name for condition in verified(certificate, plant).conditions if not condition.holds]
 
 
 def with_multipliers(certificate, **change):
@@ -20,7 +21,7 @@ def with_multipliers(certificate, **change):
 
 
 def test_synthesized_certificate_is_valid(certificate, loaded):
-    report = verify(certificate, loaded)
+    report = verified(certificate, loaded)
     assert report.valid
     assert all(condition.margin >= 0.0 for condition in report.conditions)
     names = " ".join(condition.name for condition in report.conditions)
@@ -83,20 +84,20 @@ def test_a_valid_certificate_passes_as_required(certificate, loaded):
 
 def test_failed_conditions_have_a_negative_margin(certificate, loaded):
     for mutate, _ in MUTATIONS.values():
-        assert all(c.margin < 0.0 for c in verify(mutate(certificate), loaded).conditions if not c.holds)
+        assert all(c.margin < 0.0 for c in verified(mutate(certificate), loaded).conditions if not c.holds)
 
 
 def test_float32_rounding_of_actions_is_part_of_the_condition():
     # Without slack for it a certificate that is tight in (I) would pass; the exact D_u must reject it.
     plant = random_plant(3, 2, 1)
     certificate = certificate_of(plant)
-    assert verify(certificate, plant).valid
+    assert verified(certificate, plant).valid
     assert broken(with_multipliers(certificate, rounding=1e-30), plant) != []
 
 
 def test_plant_with_a_looser_bound_rejects_the_certificate(certificate, loaded):
     looser = truck_trailer(mass=4000.0, gamma=6e-4)
-    assert not verify(replace(certificate, fingerprint=looser.fingerprint), looser).valid
+    assert not verified(replace(certificate, fingerprint=looser.fingerprint), looser).valid
     worse_start = truck_trailer(mass=4000.0, initial_cov=0.1 * np.eye(2))
     found = broken(replace(certificate, fingerprint=worse_start.fingerprint), worse_start)
     assert any("(E0)" in name for name in found)
@@ -109,7 +110,7 @@ def test_multipliers_that_are_not_numbers_are_refused(certificate, change):
 
 
 def test_margins_agree_with_floating_point(certificate, loaded):
-    margins = {condition.name.split()[0]: condition.margin for condition in verify(certificate, loaded).conditions}
+    margins = {condition.name.split()[0]: condition.margin for condition in verified(certificate, loaded).conditions}
     c, p, multipliers = certificate, loaded, certificate.multipliers
     grown = p.A @ c.Sigma @ p.A.T / multipliers.error + c.D / (1 - multipliers.error)
     assert margins["(E1)"] == pytest.approx(np.linalg.eigvalsh(c.Sigma - grown)[0], rel=1e-6)
@@ -124,7 +125,7 @@ def test_margins_of_several_inputs_agree_with_floating_point():
     plant = replace(random_plant(3, 3, 2), u_max=[1e3, 2e3])
     certificate = with_multipliers(synthesize(plant), rounding=1e-9)
     c, s = certificate, certificate.multipliers
-    margins = {condition.name.split(" stays")[0]: condition.margin for condition in verify(c, plant).conditions}
+    margins = {condition.name.split(" stays")[0]: condition.margin for condition in verified(c, plant).conditions}
     closed, gain = plant.A + plant.B @ c.K, plant.B @ c.K
     spread = 2 * plant.B @ np.diag((plant.u_max * 2.0**-24) ** 2) @ plant.B.T
     D_u = (1 + s.rounding) * c.D + (1 + 1 / s.rounding) * spread
@@ -139,7 +140,7 @@ def test_margins_of_several_inputs_agree_with_floating_point():
 
 
 def test_report_prints_one_line_per_condition(certificate, loaded):
-    lines = str(verify(replace(certificate, K=certificate.K + 4.0), loaded)).splitlines()
+    lines = str(verified(replace(certificate, K=certificate.K + 4.0), loaded)).splitlines()
     assert any(line.startswith("BROKEN") and "(U)" in line for line in lines)
     assert any(line.startswith("holds") and "(E1)" in line for line in lines)
 
@@ -197,7 +198,7 @@ def test_only_positive_definiteness_excludes_a_flat_set():
 
 
 def test_every_condition_has_been_broken_alone(certificate, loaded):
-    names = [condition.name for condition in verify(certificate, loaded).conditions]
+    names = [condition.name for condition in verified(certificate, loaded).conditions]
     untested = [name for name in names if not any(mark in name for mark in (*ALONE, "L > 0"))]
     assert untested == []
 
@@ -205,4 +206,4 @@ def test_every_condition_has_been_broken_alone(certificate, loaded):
 @pytest.mark.parametrize("change", [{"process_noise_cov": np.zeros((2, 2))}, {"gamma": 0.0}])
 def test_disturbance_of_one_part_only_is_verified(change):
     plant = truck_trailer(**change)
-    assert verify(synthesize(plant), plant).valid
+    assert verified(synthesize(plant), plant).valid

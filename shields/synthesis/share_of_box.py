@@ -1,0 +1,76 @@
+"""What share of the safe box an ellipsoid in it fills: less than pi/4 of a plane's, less still in more dimensions."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
+
+from ncs_gym import LinearPlant
+from ncs_gym.plants.statespace import inputs_under_way
+
+# A box with more rows than states is a polytope, whose corners are too many to count in more dimensions or with more
+# rows than this.
+_MOST_DIMENSIONS, _MOST_ROWS = 5, 30
+
+
+def share_of_box(plant: LinearPlant, L: np.ndarray) -> dict[str, Any]:
+    """Returns the record, for a certificate, of the share of the safe box's volume that E(L) fills.
+
+    Where the last states are inputs under way (`LinearPlant.from_statespace(input_delay=...)`) the box is that of the
+    others, and what counts is which of its states are in E(L) with no input under way.
+
+    Args:
+        plant: The plant, with its safe box.
+        L: Shape of a set in the box, (n, n), positive definite.
+
+    Returns:
+        One entry: `share_of_box` or `share_of_box_at_rest`, a number in (0, 1], or `share_of_box_unknown`, the reason.
+    """
+    if not (np.isfinite(L).all() and np.linalg.eigvalsh(L)[0] > 0.0):
+        return {"share_of_box_unknown": "the set is flat in float64"}
+    stored = inputs_under_way(plant)
+    if not stored:
+        share = _share(plant.C, L)
+        return {"share_of_box_unknown": _reason(plant.C)} if share is None else {"share_of_box": share}
+    kept = plant.n - stored
+    rows = plant.C[plant.C[:, :kept].any(axis=1)]
+    if rows[:, kept:].any() or np.linalg.matrix_rank(rows[:, :kept]) < kept:
+        return {"share_of_box_unknown": "the box of the states depends on inputs under way, or is unbounded"}
+    share = _share(rows[:, :kept], np.linalg.inv(np.linalg.inv(L)[:kept, :kept]))
+    if share is None:
+        return {"share_of_box_unknown": _reason(rows[:, :kept])}
+    return {"share_of_box_at_rest": share}
+
+
+def _share(C: np.ndarray, L: np.ndarray) -> float | None:
+    """Returns the volume of E(L) in that of the box {|c_j x| <= 1}; None if that has too many corners."""
+    n = len(L)
+    values, axes = np.linalg.eigh(L)
+    # In coordinates in which E(L) is the unit ball, so that units do not matter.
+    volume = _volume(C @ (axes * np.sqrt(values)))
+    return None if volume is None else math.pi ** (n / 2) / math.gamma(n / 2 + 1) / volume
+
+
+def _volume(C: np.ndarray) -> float | None:
+    """Returns the volume of {z : |c_j z| <= 1}, c_j the rows of C, (k, n); None if it has too many corners."""
+    k, n = C.shape
+    if k == n:  # the cube [-1, 1]^n, mapped by the inverse of C
+        return 2.0**n / abs(float(np.linalg.det(C)))
+    if n == 1:
+        return 2.0 / float(np.abs(C).max())
+    if n > _MOST_DIMENSIONS or k > _MOST_ROWS:
+        return None
+    sides = np.concatenate([C, -C])
+    halfspaces = np.column_stack([sides, -np.ones(len(sides))])
+    try:
+        return float(ConvexHull(HalfspaceIntersection(halfspaces, np.zeros(n)).intersections).volume)
+    except QhullError:
+        return None
+
+
+def _reason(C: np.ndarray) -> str:
+    """Returns why there is no share."""
+    return f"a box of {C.shape[0]} rows in {C.shape[1]} dimensions has too many corners to compute its volume"

@@ -1,0 +1,126 @@
+"""Whether the sets D, N and r0^2 I of a plant hold what was declared of it (theory.md section 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from flint import arb, ctx, fmpq
+
+from ncs_gym import Ellipsoid, LinearPlant
+from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian
+from shields.proof import ContractProof
+from shields.verification.conditions import Condition
+from shields.verification.flint.exact import at_least_zero, definite, identity, is_so, matrix, number
+
+# Bits of ball arithmetic.
+PRECISION = 256
+# No term of a sum of ellipsoids gets a smaller weight.
+_SMALLEST_WEIGHT = 1e-9
+
+
+class Part(NamedTuple):
+    """One of the ellipsoids whose sum another one must hold.
+
+    Attributes:
+        shape: Its exact shape.
+        size: About the size of its best weight; any proves containment, a good one proves it of a small set.
+    """
+
+    shape: Any
+    size: float
+
+
+def bound_conditions(D: Any, ages: ContractProof | None, plant: LinearPlant) -> Iterator[Condition]:
+    """Checks D, the plant's own sets, and N of a contract, against what the plant declares.
+
+    Args:
+        D: Exact shape of the certificate's disturbance set, (n, n).
+        ages: The proof under a contract, if there is one.
+        plant: The plant.
+    """
+    weight, quantizer = plant.relative_weight, np.eye(plant.p)
+    own = matrix(plant.disturbance.shape)
+    ball = Part(number(plant.gamma) * identity(plant.n), _size(plant.gamma * np.eye(plant.n), weight))
+    disturbed = [ball, _noise(plant.process_noise, weight), _declared(plant.disturbance_bound, weight)]
+    yield _holds_sum("D: the plant's holds the disturbance and the process noise", own, disturbed)
+    yield definite("D: the certificate's holds the plant's", D - own)
+    sensed = [_noise(plant.sensor_noise, quantizer), _declared(plant.sensor_bound, quantizer)]
+    if ages is None:
+        yield _holds_sum("N: holds the sensor noise", matrix(plant.sensor_error.shape), sensed)
+    else:
+        step = number(ages.sets.contract.quantization_step)
+        box = plant.p * step * step / 4 * identity(plant.p)  # in the ball around the box of |v_i| <= step/2
+        sensed.append(Part(box, float(plant.p * step / 2)))
+        yield _holds_sum("N: holds the sensor noise and the quantization error", matrix(ages.sets.noise), sensed)
+    radius = (plant.initial_radius_squared * np.trace(weight)) ** 0.5
+    first = [_noise(plant.initial_noise, weight)._replace(size=radius), _declared(plant.initial_bound, weight)]
+    yield _holds_sum("r0: holds the error of the first estimate", matrix(plant.initial_error.shape), first)
+    yield from _truncations(plant)
+
+
+def keeps_enough(name: str, noise: TruncatedGaussian, plant: LinearPlant) -> Condition:
+    """Returns the condition that a truncation removes no more than the probability delta, in ball arithmetic."""
+    with ctx.workprec(PRECISION):
+        half = arb(number(noise.energy) / 2)
+        removed = half.gamma_upper(arb(fmpq(len(noise.covariance), 2)), regularized=1)
+        slack = (arb(number(plant.delta)) - removed).lower()
+        if not slack.is_finite():
+            return is_so(name, False)
+        return at_least_zero(name, slack.fmpq())
+
+
+def _truncations(plant: LinearPlant) -> Iterator[Condition]:
+    """Checks the chi-square quantiles of all noise that there is."""
+    for what, noise in (
+        ("process noise", plant.process_noise),
+        ("sensor noise", plant.sensor_noise),
+        ("first error", plant.initial_noise),
+    ):
+        if np.any(noise.covariance):
+            yield keeps_enough(f"chi-square: no more than delta of the {what} is truncated", noise, plant)
+
+
+def _noise(noise: TruncatedGaussian, weight: np.ndarray) -> Part:
+    """Returns the ellipsoid of truncated noise."""
+    shape = number(noise.energy) * matrix(noise.covariance)
+    return Part(shape, _size(noise.energy * noise.covariance, weight))
+
+
+def _declared(bound: Ellipsoid | None, weight: np.ndarray) -> Part:
+    """Returns a declared bound; zero if there is none."""
+    shape = np.zeros_like(weight) if bound is None else bound.shape
+    return Part(matrix(shape), _size(shape, weight))
+
+
+def _size(shape: np.ndarray, weight: np.ndarray) -> float:
+    """Returns sqrt(tr W P): the sum of P_i / w_i has the smallest weighted trace with w_i in this proportion."""
+    return float(max(np.vdot(weight, shape), 0.0)) ** 0.5
+
+
+def _holds_sum(name: str, outer: Any, parts: list[Part]) -> Condition:
+    """Returns the condition that an ellipsoid holds the sum of others: outer - sum of P_i / w_i >= 0.
+
+    For weights w_i > 0 of sum 1, (sum of sqrt(a'P_i a))^2 <= sum of a'P_i a / w_i for every a (Cauchy-Schwarz).
+    """
+    parts = [part for part in parts if any(part.shape.entries())]
+    weights = _weights([part.size for part in parts])
+    product = fmpq(1)
+    for weight in weights:
+        product *= weight
+    difference = product * outer
+    for part, weight in zip(parts, weights, strict=True):
+        difference -= (product / weight) * part.shape
+    return definite(name, difference, product)
+
+
+def _weights(sizes: list[float]) -> list[Any]:
+    """Returns rational weights of sum 1 near the proportion of some sizes; the largest takes what the others leave."""
+    if not sizes:
+        return []
+    largest = max(range(len(sizes)), key=lambda index: sizes[index])
+    total = sum(sizes) or 1.0
+    weights = [number(max(size / total, _SMALLEST_WEIGHT)) for size in sizes]
+    weights[largest] = 1 - sum((weight for index, weight in enumerate(weights) if index != largest), fmpq(0))
+    return weights

@@ -1,0 +1,18 @@
+"""All conditions of a certificate, of either method."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from ncs_gym import LinearPlant
+from shields.certificate import Certificate
+from shields.verification.conditions import Condition
+from shields.verification.flint.certified import certified_conditions
+from shields.verification.flint.exact import is_so
+from shields.verification.flint.paper import paper_conditions
+
+
+def flint_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
+    """Yields every condition of a certificate, judged without the code of the first engine."""
+    yield is_so("plant: the certificate belongs to it", certificate.fingerprint == plant.fingerprint)
+    yield from (paper_conditions if certificate.method == "paper" else certified_conditions)(certificate, plant)

@@ -1,0 +1,103 @@
+"""The room that error sets by age have for the rounding of an estimate that is updated with a certified gain."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from ncs_gym import Channel, ChannelContract, ErrorSet, LinearPlant, certified_error_set
+from ncs_gym.estimation.error_bounds_by_age import ErrorSetsByAge
+from ncs_gym.estimation.estimator import Estimator
+from ncs_gym.plants.linear_plant import INFLATION, SIMULATED_REACH
+from ncs_gym.uncertainty.ellipsoid import is_inside
+
+# Radius of Sigma_0 in half-widths of the box: of sensors so fine that the rounding of an estimate far out counts.
+RADIUS, GAIN, RATE = 1e-8, 0.9, 1.02
+# By how much all conditions hold, so that evaluating them in float64 shows it.
+SLACK = 1e-12
+
+
+def plant_with(sensor_radius):
+    return LinearPlant(
+        A=[[RATE]],
+        B=[[1.0]],
+        box=[1.0],
+        u_max=1.0,
+        dt=0.1,
+        sensor_bound=sensor_radius,
+        initial_bound=0.0,
+        disturbance_bound=0.0,
+    )
+
+
+def sets_that_just_hold(room):
+    """A plant and error sets for age 0 for which (C0), (C1) and (C2) hold, (C2) with the room or with none."""
+    carried = RATE * RADIUS
+    rounding = plant_with(1e-9)
+    newest, disturbance = RADIUS**2, rounding.disturbance.shape[0, 0]
+    older = (1.0 + SLACK) * (carried + disturbance**0.5) ** 2
+    allowed = (newest - rounding.estimate_rounding[0, 0]) / INFLATION if room else newest
+    kept = (1.0 - GAIN) * older**0.5
+    noise = (1.0 - SLACK) * (allowed**0.5 - kept) / GAIN  # radius of N: kept + GAIN noise is the radius of the result
+    inflation = plant_with(1e-9).sensor_error.shape[0, 0] / 1e-18
+    plant = plant_with(noise / inflation**0.5)
+    sets = ErrorSetsByAge(
+        contract=ChannelContract(0),
+        shapes=np.array([[[newest]], [[older]]]),
+        rates=np.array([carried / (carried + disturbance**0.5)]),
+        gains=np.array([[[GAIN]]]),
+        multipliers=np.array([kept / allowed**0.5]),
+        noise=plant.sensor_error_with(0.0).shape,
+    )
+    return plant, ErrorSet(Sigma=sets.shapes[0], rate=float(sets.rates[0]), ages=sets)
+
+
+def largest_gauge_after_an_update(plant, error_set):
+    """How far out of E(Sigma_0) updates in float64 take errors, 1 is its boundary, with error and noise at theirs."""
+    error, noise = (Fraction(float(shape[0, 0]) ** 0.5) for shape in (error_set.ages.shapes[1], error_set.ages.noise))
+    largest, rng = 0.0, np.random.default_rng(0)
+    for _ in range(500):
+        estimate = SIMULATED_REACH * plant.half_widths[0] * rng.uniform(0.7, 1.0)
+        sample = estimate - float(error - noise)
+        state = max(Fraction(estimate) - error, Fraction(sample) - noise)  # error and noise are within their bounds
+        updated = estimate + GAIN * (sample - estimate)
+        largest = max(largest, float((Fraction(updated) - state) / Fraction(RADIUS)))
+    return largest
+
+
+def test_without_room_an_updated_estimate_leaves_its_set_and_an_estimator_refuses_such_sets():
+    plant, error_set = sets_that_just_hold(room=False)
+    sets = error_set.ages
+    kept = (1.0 - GAIN) ** 2 * sets.shapes[1] / sets.multipliers[0]
+    plain = kept + GAIN**2 * sets.noise / (1.0 - sets.multipliers[0])
+    assert is_inside(plain, sets.shapes[0])  # (C2) as it stands in docs/contracts.md holds
+    assert largest_gauge_after_an_update(plant, error_set) > 1.0
+    with pytest.raises(ValueError, match=r"\(C2\)"):
+        Estimator(plant, Channel(), error_set)
+
+
+def test_with_room_an_updated_estimate_stays_in_its_set():
+    plant, error_set = sets_that_just_hold(room=True)
+    assert 0.5 < largest_gauge_after_an_update(plant, error_set) < 1.0
+    assert Estimator(plant, Channel(), error_set).error_set is error_set
+
+
+def test_sets_that_are_found_have_the_room():
+    """Fine sensors and an unmeasured state: without it what an update leaves is as large as the set."""
+    for pole, gamma, sensor in ((0.9, 1e-16, 1e-10), (1.01, 1e-12, 1e-7), (0.9, 1e-12, 1e-6)):
+        plant = LinearPlant(
+            A=[[1.02, 0.1], [0.0, pole]],
+            B=[[0.0], [1.0]],
+            H=[[1.0, 0.0]],
+            box=[1.0, 1.0],
+            u_max=1.0,
+            dt=0.1,
+            gamma=gamma,
+            sensor_bound=sensor,
+            initial_bound=0.0,
+        )
+        error_set = certified_error_set(plant, ChannelContract(2))
+        assert Estimator(plant, Channel(), error_set).error_set is error_set
+        outer, inner = zip(*error_set.ages.needs(plant)["(C2)"], strict=True)
+        for held, needed in zip(outer, inner, strict=True):
+            assert is_inside(needed, held)

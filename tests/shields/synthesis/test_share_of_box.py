@@ -1,0 +1,93 @@
+"""The share of the safe box that a set fills, against counts of random points."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from experiments.runs import ExperimentSetup
+from ncs_gym import LinearPlant, cart_pole, truck_trailer
+from ncs_gym.plants.statespace import inputs_under_way
+from shields import synthesize, verify
+from shields.certificate_text import size_of
+from shields.synthesis.share_of_box import share_of_box
+from tests.plants import random_plant
+
+# A continuous-time oscillator with delayed inputs.
+RATE, PUSH, SEEN = [[0.0, 1.0], [-0.2, -0.5]], [[0.0], [1.0]], [[1.0, 0.0]]
+BOUNDS = {"disturbance_bound": [0.0005, 0.003], "sensor_bound": 0.01, "initial_bound": 0.02}
+
+
+def delayed(steps):
+    settings = {"box": [1.0, 1.5], "u_max": 0.8, "dt": 0.1}
+    return LinearPlant.from_statespace((RATE, PUSH, SEEN, None), input_delay=steps, **settings, **BOUNDS)
+
+
+def counted(C, L, reach):
+    """The share of random points of the box {|c_j x| <= 1}, all with |x_i| <= reach, that lie in E(L)."""
+    points = np.random.default_rng(0).uniform(-reach, reach, (400_000, len(L)))
+    points = points[(np.abs(points @ C.T) <= 1.0).all(axis=1)]
+    return float((np.einsum("ki,ij,kj->k", points, np.linalg.inv(L), points) <= 1.0).mean())
+
+
+def test_largest_ellipse_fills_a_quarter_of_pi_whatever_the_units():
+    for units in ([1.0, 1.0], [1e-4, 1e5]):
+        plant = replace(truck_trailer(), box=np.diag(1.0 / np.array(units)))
+        assert share_of_box(plant, np.diag(np.square(units)))["share_of_box"] == pytest.approx(np.pi / 4.0, rel=1e-12)
+
+
+@pytest.mark.parametrize(("n", "rows"), [(1, 3), (2, 3), (2, 5), (3, 4), (3, 6)])
+def test_share_of_a_box_with_more_rows_than_states_agrees_with_counts(n, rows):
+    rng = np.random.default_rng(10 * n + rows)
+    C = np.concatenate([np.eye(n), rng.standard_normal((rows - n, n))])
+    root = rng.standard_normal((n, n))
+    L = root @ root.T + np.eye(n)
+    L /= np.einsum("ji,ik,jk->j", C, L, C).max()  # inside the box
+    share = share_of_box(replace(random_plant(0, n, 1), box=C), L)["share_of_box"]
+    assert share == pytest.approx(counted(C, L, 1.0), abs=5e-3)
+
+
+def test_rows_that_say_nothing_new_change_nothing():
+    plant = truck_trailer()
+    again = replace(plant, box=np.concatenate([plant.C, 0.9 * plant.C]))
+    L = np.diag([3.0, 1.0])
+    assert share_of_box(again, L)["share_of_box"] == pytest.approx(share_of_box(plant, L)["share_of_box"], rel=1e-9)
+
+
+def test_too_many_corners_are_a_reason_not_a_number(certificate):
+    plant = random_plant(0, 6, 1)
+    box = np.concatenate([np.eye(6), np.full((1, 6), 0.1)])
+    record = share_of_box(replace(plant, box=box), 0.5 * np.eye(6))
+    assert set(record) == {"share_of_box_unknown"}
+    assert "unknown share of the safe box (a box of 7 rows in 6 dimensions" in size_of(record)
+    assert "%" not in size_of(record)
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+def test_share_with_delayed_inputs_is_that_of_the_states_with_no_input_under_way(steps):
+    plant = delayed(steps)
+    assert inputs_under_way(plant) == steps
+    certificate = synthesize(plant)
+    states = np.random.default_rng(1).uniform(-1.0, 1.0, (100_000, 2)) * [1.0, 1.5]
+    at_rest = np.concatenate([states, np.zeros((len(states), steps))], axis=1)
+    share = float((certificate.safe_set.gauge(at_rest) <= 1.0).mean())
+    assert certificate.provenance["share_of_box_at_rest"] == pytest.approx(share, abs=6e-3)
+    assert "share_of_box" not in certificate.provenance
+    assert "of the safe box of the states, with no input under way" in str(certificate)
+
+
+def test_plants_without_delay_have_no_input_under_way():
+    assert [inputs_under_way(plant) for plant in (truck_trailer(), cart_pole(), random_plant(0, 3, 2))] == [0, 0, 0]
+    assert inputs_under_way(random_plant(0, 1, 2)) == 0
+
+
+def test_operating_point_shifts_nothing(certificate, loaded):
+    moved = replace(loaded, operating_state=[0.5, 0.1], operating_input=[0.2])
+    assert share_of_box(moved, certificate.L) == share_of_box(loaded, certificate.L)
+
+
+def test_first_line_of_an_experiment_says_both_shares(certificate, loaded):
+    setup = ExperimentSetup("ncs_gym/TruckTrailerCruise-v0", None, loaded, certificate, verify(certificate, loaded))
+    share = np.sqrt(np.linalg.det(certificate.L)) * np.pi / 16.0  # the box is 4 by 4
+    assert f"({100 * share:.4g} % of the safe box's volume, 99.97 % of the volume of the largest" in setup.title
+    assert setup.title.startswith("certificate: 17 conditions hold")

@@ -1,0 +1,181 @@
+"""The second verifier: its own arithmetic, and that a slip in either verifier is noticed by the other."""
+
+import ast
+import importlib.util
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flint import fmpq, fmpq_mat
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ncs_gym import ChannelContract, batch_reactor, truck_trailer
+from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, chi2_quantile
+from shields import synthesize, verify
+from shields.verification import flint as second_engine
+from shields.verification.flint.bounds import keeps_enough
+from shields.verification.flint.exact import at_least_zero, definite, is_semidefinite, matrix
+from shields.verification.rational_matrix import is_positive_semidefinite, rational
+from tests.certificates import certificate_of
+from tests.command import assert_one_sentence
+from tests.shields.verification.test_rational_matrix import minors_say_semidefinite
+from tests.shields.verification.test_verification import ALONE, MUTATIONS, replaced, with_multipliers
+from tests.verdicts import verified
+
+ROOT = Path(__file__).resolve().parents[3]
+# The record of a verdict, and what a certificate and a plant consist of.
+MAY_IMPORT = {
+    "ncs_gym",
+    "ncs_gym.uncertainty.truncated_gaussian",
+    "shields.certificate",
+    "shields.proof",
+    "shields.verification.conditions",
+}
+
+
+@given(st.integers(0, 100_000), st.integers(1, 4))
+@settings(max_examples=300, deadline=None)
+def test_semidefiniteness_agrees_with_all_principal_minors_and_the_first_engine(seed, n):
+    rng = np.random.default_rng(seed)
+    factor = rng.integers(-2, 3, (n, rng.integers(1, n + 1)))
+    symmetric = factor @ factor.T  # semidefinite, often singular
+    if rng.random() < 0.6:
+        i, j = rng.integers(n, size=2)
+        symmetric[i, j] = symmetric[j, i] = symmetric[i, j] + rng.integers(-1, 2)
+    assert is_semidefinite(matrix(symmetric)) == minors_say_semidefinite(symmetric)
+    for strictly in (False, True):
+        expected = is_positive_semidefinite(rational(symmetric), strict=strictly)
+        assert is_semidefinite(matrix(symmetric), strictly=strictly) == expected
+
+
+def test_no_tolerance_at_the_boundary():
+    for size in (fmpq(1), fmpq(10) ** 20, 1 / fmpq(10) ** 20):
+        for tiny in (fmpq(0), 1 / fmpq(10) ** 40, -1 / fmpq(10) ** 40):
+            condition = definite("(M)", size * fmpq_mat([[fmpq(1, 9), fmpq(1, 3)], [fmpq(1, 3), 1 + tiny]]))
+            assert condition.holds == (tiny >= 0)
+            assert (condition.margin >= 0.0) == (tiny >= 0)
+            assert at_least_zero("(S)", size * tiny).holds == (tiny >= 0)
+    edge = fmpq_mat([[1, 1], [1, 1]])
+    assert is_semidefinite(edge)
+    assert not is_semidefinite(edge, strictly=True)
+    assert not is_semidefinite(matrix(np.array([[1.0, 1e-300], [0.0, 1.0]])))
+
+
+def test_margins_beyond_any_float_keep_their_sign():
+    huge = fmpq(10) ** 400
+    assert [at_least_zero("(S)", slack).margin for slack in (huge, -huge)] == [np.inf, -np.inf]
+    assert [definite("(M)", fmpq_mat([[slack]])).margin for slack in (huge, -huge)] == [np.inf, -np.inf]
+    assert at_least_zero("(S)", -1 / huge).margin < 0.0
+
+
+def test_margins_are_those_of_the_first_engine(certificate, loaded):
+    reactor, contract = batch_reactor(), ChannelContract(2, 1e-3)
+    for each, plant in ((certificate, loaded), (certificate_of(reactor, contract=contract), reactor)):
+        first, second = (verify(each, plant, engine=engine) for engine in ("rational", "flint"))
+        margins = {condition.name: condition.margin for condition in second.conditions}
+        for condition in first.conditions:
+            assert margins[condition.name] == pytest.approx(condition.margin, rel=1e-6, abs=1e-15), condition.name
+
+
+def test_the_engines_have_no_code_in_common():
+    folder = Path(second_engine.__file__).parent
+    for path in folder.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            module = node.module if isinstance(node, ast.ImportFrom) else None
+            if module is not None and module.startswith(("ncs_gym", "shields")):
+                own = module.startswith("shields.verification.flint")
+                assert own or module in MAY_IMPORT, (path.name, module)
+                if module == "shields.verification.conditions":
+                    assert [alias.name for alias in node.names] == ["Condition"], path.name
+
+
+# What a slip would make of either engine, and a mutation that it then lets through.
+SLIPS = {
+    "first, definiteness": ("shields.verification.conditions.is_positive_semidefinite", "(E1)"),
+    "second, definiteness": ("shields.verification.flint.exact.is_semidefinite", "(E1)"),
+}
+
+
+@pytest.mark.parametrize("slip", SLIPS)
+def test_a_slip_in_one_engine_is_noticed_by_the_other(slip, certificate, loaded, monkeypatch):
+    target, name = SLIPS[slip]
+    broken = ALONE[name](certificate, loaded)
+    assert not verified(*broken).valid
+    monkeypatch.setattr(target, lambda *args, **settings: True)
+    with pytest.raises(AssertionError):
+        verified(*broken)
+
+
+@pytest.mark.parametrize("engine", ["rational", "flint"])
+def test_every_mutation_is_rejected_by_each_engine(engine, certificate, loaded):
+    for mutate, _ in MUTATIONS.values():
+        assert not verify(mutate(certificate), loaded, engine=engine).valid
+    for name, mutate in ALONE.items():
+        if name != "(U) input 1":  # made for another plant
+            assert not verify(*mutate(certificate, loaded), engine=engine).valid
+
+
+def test_large_limits_and_small_multipliers_are_judged_alike():
+    plant = truck_trailer(mass=4000.0)
+    certificate = certificate_of(plant)
+    for rounding in (1e-30, 1e-9, 1e-3, 1e3, 5e-324):
+        verified(with_multipliers(certificate, rounding=rounding), plant)
+    for factor in (1e-300, 1e-30, 1e30, 1e70):
+        verified(replace(certificate, L=factor * certificate.L), plant)
+        verified(replace(certificate, K=factor * certificate.K), plant)
+
+
+@pytest.mark.parametrize("delta", [1e-12, 1e-9, 1e-7, 1e-6, 1e-5, 1e-3, 0.05, 0.5, 0.999])
+def test_no_truncation_removes_more_than_delta(delta):
+    """1 - delta as a float may be smaller than the number, which once made quantiles of small delta too small."""
+    for factor in (1.0, 1.1, 1.3, 1.7, 1.9):
+        plant = truck_trailer(delta=min(delta * factor, 0.999))
+        for noise in (plant.process_noise, plant.sensor_noise, plant.initial_noise):
+            assert keeps_enough("chi-square", noise, plant).holds
+
+
+def test_quantile_a_hair_too_small_is_noticed_by_the_second_engine(certificate, loaded):
+    noise = loaded.process_noise
+    for factor, holds in ((1.0, True), (1.0 - 1e-9, False)):
+        changed = TruncatedGaussian(noise.covariance, factor * chi2_quantile(1.0 - loaded.delta, loaded.n))
+        report = verify(certificate, replaced(loaded, process_noise=changed), engine="flint")
+        broken = [condition.name for condition in report.conditions if not condition.holds]
+        assert broken == ([] if holds else ["chi-square: no more than delta of the process noise is truncated"])
+
+
+def test_paper_certificate_is_judged_by_both_up_to_its_boundary():
+    plant = truck_trailer(gamma=1e-6, process_noise_cov=1e-6 * np.eye(2))
+    paper = synthesize(plant, method="paper")
+    assert verified(paper, plant).valid
+    for factor in np.geomspace(0.3, 1.1, 40):
+        verified(replace(paper, L=factor * paper.L), plant)
+        verified(replace(paper, L=paper.L @ np.diag([1.0, factor])), plant)
+        verified(replace(paper, K=factor / 0.5 * paper.K), plant)
+
+
+def test_missing_library_is_one_sentence(certificate, loaded, tmp_path, monkeypatch):
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *rest: None if name == "flint" else found(name, *rest)
+    )
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'ncs-gym\[verify\]'"):
+        verify(certificate, loaded, engine="flint")
+    assert verify(certificate, loaded).valid
+    certificate.save(tmp_path / "c.json")
+    hide = (
+        "import importlib.util as u, sys; f = u.find_spec; u.find_spec = lambda n, *r: None if n == 'flint' else f(n)"
+    )
+    code = f"{hide}; from experiments.__main__ import main; sys.argv[0] = 'ncs'; main()"
+    command = [sys.executable, "-c", code, "verify", str(tmp_path / "c.json"), "--engine", "flint"]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert_one_sentence(run, "engine 'flint' needs python-flint", "pip install 'ncs-gym[verify]'")
+
+
+@pytest.mark.parametrize("engine", ["float", None, 3, []])
+def test_unknown_engine_is_refused(engine, certificate, loaded):
+    with pytest.raises(ValueError, match="engine must be 'rational' or 'flint'"):
+        verify(certificate, loaded, engine=engine)
