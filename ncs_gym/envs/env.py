@@ -208,7 +208,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self.steps += 1
         sends = self._channel_state.sends_at(self.steps)
         sample = self._process.measure(rng, self._state) if sends else None
-        packets = self._channel_state.exchange(rng, self.steps, sample)
+        packets = self._channel_state.exchange(rng, self.steps, sample, self.estimator.episode)
         self.estimator.advance(u, packets)
         reward = float(self.task.reward(self.plant, self._task_state, self._state, u))
         info = self._info(u, arrived=bool(packets))
