@@ -22,6 +22,7 @@ from ncs_gym.uncertainty.bounded_disturbances import BallDisturbance, BoxDisturb
 from ncs_gym.uncertainty.disturbance import Disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.extremal_disturbances import AdversarialDisturbance, SphereDisturbance
+from ncs_gym.uncertainty.gaussian_noise import escape_probability
 
 register_all()
 
@@ -54,6 +55,7 @@ __all__ = [
     "cart_pole",
     "certified_error_set",
     "contract_of",
+    "escape_probability",
     "register_plant",
     "truck_trailer",
 ]

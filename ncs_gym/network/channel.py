@@ -19,8 +19,8 @@ class Packet(NamedTuple):
     Attributes:
         stamp: Step at which the sample was taken, counted from the start of its episode.
         measurement: The (quantized) measurement, shape (p,).
-        episode: Number of that episode, counted from 0: stamps begin anew in each, so that an estimator discards packets
-            of any episode but its own (`Estimator.episode`).
+        episode: Number of that episode, counted from 0: stamps begin anew in each, so that an estimator discards
+            packets of any episode but its own (`Estimator.episode`).
     """
 
     stamp: int
