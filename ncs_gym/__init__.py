@@ -6,6 +6,7 @@ from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlan
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet
 from ncs_gym.network.contract import ChannelContract, contract_of
+from ncs_gym.network.escape_probability import escape_probability
 from ncs_gym.plant_registration import register_plant
 from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
@@ -22,7 +23,6 @@ from ncs_gym.uncertainty.bounded_disturbances import BallDisturbance, BoxDisturb
 from ncs_gym.uncertainty.disturbance import Disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.extremal_disturbances import AdversarialDisturbance, SphereDisturbance
-from ncs_gym.uncertainty.gaussian_noise import escape_probability
 
 register_all()
 

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from decimal import ROUND_CEILING, Context, Decimal
 from typing import Any
 
 from agents.results import Episode
 from experiments.analysis.statistics import clopper_pearson
+
+
+def rounded_up(bound: float) -> str:
+    """Returns a bound in two significant digits, no smaller than it is."""
+    return f"{float(Context(prec=2, rounding=ROUND_CEILING).create_decimal(Decimal(bound))):.2g}"
 
 
 def escape_summary(bound: float, steps: int, episodes_by_arm: Mapping[str, Sequence[Episode]]) -> dict[str, Any]:
@@ -31,11 +37,12 @@ def escape_summary(bound: float, steps: int, episodes_by_arm: Mapping[str, Seque
 def escape_sentences(summary: dict[str, Any]) -> list[str]:
     """Returns the content of an escape summary in a sentence per arm."""
     bound, sentences = summary["escape_probability"], []
+    limit = rounded_up(bound)
     for name, arm in summary["arms"].items():
         low, high = (100.0 * end for end in arm["rate_ci95"])
         sentences.append(
             f"{name}: the state left the safe set in {arm['episodes_outside_set']:,} of {arm['episodes']:,} evaluation "
-            f"episodes [{low:.2f}, {high:.2f} %]; under Gaussian noise the probability of that is at most {bound:.2g} "
+            f"episodes [{low:.2f}, {high:.2f} %]; under Gaussian noise the probability of that is at most {limit} "
             f"for an episode of {summary['steps']:,} steps."
         )
     if bound >= 1.0:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from experiments.analysis.escapes import rounded_up
 from experiments.analysis.text_table import text_table
 from experiments.attack.safety_counts import SafetyCounts
 from experiments.errors import SafetyBroken
@@ -19,7 +20,7 @@ def gaussian_table(counts: Mapping[str, SafetyCounts], limits: Mapping[str, floa
     for name, case in counts.items():
         low, high = case.interval
         numbers = f"{case.episodes:,}", f"{case.broken_episodes:,}"
-        rows.append([name, *numbers, f"[{low:.1e}, {high:.1e}]", f"{limits[name]:.1e}"])
+        rows.append([name, *numbers, f"[{low:.1e}, {high:.1e}]", rounded_up(limits[name])])
     return text_table(rows, rules=(1,))
 
 
@@ -33,5 +34,5 @@ def require_within(counts: Mapping[str, SafetyCounts], limits: Mapping[str, floa
         if case.interval[0] > limits[name]:
             raise SafetyBroken(
                 f"{name}: {case.broken_episodes:,} of {case.episodes:,} episodes left S, more than the bound "
-                f"{limits[name]:.2g} on their probability allows"
+                f"{rounded_up(limits[name])} on their probability allows"
             )

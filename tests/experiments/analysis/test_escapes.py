@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from agents.results import Episode
-from experiments.analysis.escapes import escape_sentences, escape_summary
+from experiments.analysis.escapes import escape_sentences, escape_summary, rounded_up
 from experiments.analysis.statistics import clopper_pearson
 from experiments.commands.compare import _escapes, _findings
 from experiments.runs.experiment_setup import ExperimentSetup
@@ -40,6 +40,14 @@ def test_episodes_outside_the_safe_set_are_counted_with_their_exact_interval():
     assert "3 of 5 evaluation episodes [14.66, 94.73 %]" in sentence
     assert "at most 0.25 for an episode of 200 steps" in sentence
     assert "says nothing" in escape_sentences(summary | {"escape_probability": 1.0})[-1]
+
+
+@pytest.mark.parametrize(
+    ("bound", "text"), [(301e-9, "3.1e-07"), (0.25, "0.25"), (0.2501, "0.26"), (1.0, "1"), (0.0, "0")]
+)
+def test_printed_bound_is_no_smaller_than_the_bound(bound, text):
+    assert rounded_up(bound) == text
+    assert float(text) >= bound
 
 
 @pytest.fixture(scope="module")

@@ -122,7 +122,7 @@ def test_counts_of_gaussian_noise_lie_within_the_bound_and_do_not_end_with_an_er
     certify(settings(tmp_path, jobs=1, noise="gaussian", delta=1e-4))
     printed = capsys.readouterr().out
     rows = [line for line in printed.partition("interval")[2].splitlines() if line.startswith("TruckTrailer")]
-    assert [row.split()[-1] for row in rows] == ["3.0e-02", "4.0e-02"]
+    assert [row.split()[-1] for row in rows] == ["0.031", "0.041"]
     stored = document(tmp_path)
     assert stored["escape_probability"][CRUISE] == pytest.approx((200 + 100 + 1) * 1e-4)
     assert stored["settings"]["gaussian"]
@@ -141,9 +141,9 @@ def test_gaussian_noise_makes_a_shielded_state_leave_the_safe_set_and_is_counted
 def test_more_exits_than_the_bound_allows_are_an_error():
     counts, limits = {"case": SafetyCounts(steps=2000, episodes=100, broken_episodes=20)}, {"case": 0.15}
     require_within(counts, limits)  # the interval [0.127, 0.292] does not contradict it
-    with pytest.raises(SafetyBroken, match=r"case: 20 of 100 episodes left S, more than the bound 0\.1 "):
+    with pytest.raises(SafetyBroken, match=r"case: 20 of 100 episodes left S, more than the bound 0\.11? "):
         require_within(counts, {"case": 0.1})
-    assert "[1.3e-01, 2.9e-01]  1.5e-01" in gaussian_table(counts, limits)
+    assert "[1.3e-01, 2.9e-01]   0.15" in gaussian_table(counts, limits)
 
 
 @pytest.fixture
