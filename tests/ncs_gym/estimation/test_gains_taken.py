@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.kalman_gain import KINDS, gains_taken, kalman_gain
 from ncs_gym import Channel, Estimator, truck_trailer
-from ncs_gym.estimation.error_statistics import ErrorRecursion
+from ncs_gym.estimation.kalman_filter import ErrorRecursion
 
 
 def test_kalman_gain_of_the_count_is_filterpys():

@@ -105,7 +105,7 @@ def follow(env, loop, act, steps, seed, tell=False):
         np.testing.assert_equal(decision.margin, info["shield_margin"])
         packets = [
             packet._replace(episode=loop.episode) for packet in tap.packets[::-1]
-        ]  # of the environment's episode
+        ]  # not the environment's number
         loop.receive(packets, applied=info["input"] if tell else None)
         assert_same(loop, info)
         assert loop.steps == step + 1 == env.unwrapped.steps
@@ -368,10 +368,10 @@ def test_packets_of_an_earlier_episode_are_of_no_use_if_steps_are_counted_on():
     loop = started(channel=Channel(delay=3))
     for _ in range(10):
         loop.step(0.0)
-    began = loop.steps
+    began, far = loop.steps, np.array([9.0, 9.0])
     loop.start([0.0, 0.0])
     loop.step(0.0)
-    loop.step(0.0, [Packet(stamp - began, np.array([9.0, 9.0])) for stamp in (began - 2, began)])
+    loop.step(0.0, [Packet(stamp - began, far, loop.episode) for stamp in (began - 2, began)])
     assert loop.guaranteed
     assert loop.measurement_age == 1
 
@@ -499,7 +499,7 @@ def test_memory_does_not_grow(name):
         loop.start(x)
         for step in range(1, 15_001):
             x = plant.A @ x + plant.B @ loop.decide(plant.u_max).input
-            loop.receive(state.exchange(rng, step, plant.H @ x if state.sends_at(step) else None))
+            loop.receive(state.exchange(rng, step, plant.H @ x if state.sends_at(step) else None, loop.episode))
         assert loop.guaranteed
     assert blocks[1] - blocks[0] > 1000  # the patterns met are seen
     assert sys.getallocatedblocks() - blocks[1] < 100
