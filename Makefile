@@ -42,6 +42,7 @@ types: $(INSTALLED)
 benchmark: $(INSTALLED) $(RAY_INSTALLED)
 	$(BIN)/python benchmarks/shield_decision.py
 	$(BIN)/python benchmarks/containment.py
+	$(BIN)/python benchmarks/kalman_gain.py
 	$(BIN)/python benchmarks/synthesis.py
 	$(BIN)/python benchmarks/contracts.py
 	$(BIN)/python benchmarks/verification.py

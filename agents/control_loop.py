@@ -39,12 +39,14 @@ class ControlLoop:
         shield: Settings of the shield; None applies the agent's actions as they are.
         violation_penalty: Subtracted from the reward of every step whose true state violates the safe box, in vector
             environments, which agents are trained in.
+        noise: "truncated", or "gaussian" for noise without a bound, which environments of this package can have.
     """
 
     env: str
     channel: Channel | None = None
     shield: ShieldSettings | None = None
     violation_penalty: float = 0.0
+    noise: str = "truncated"
 
     @property
     def without_penalties(self) -> ControlLoop:
@@ -71,7 +73,10 @@ class ControlLoop:
         return CostPenalty(envs, self.violation_penalty) if self.violation_penalty else envs
 
     def _settings(self, settings: dict[str, Any]) -> dict[str, Any]:
-        return settings if self.channel is None else {"channel": self.channel} | settings
+        own: dict[str, Any] = {} if self.channel is None else {"channel": self.channel}
+        if self.noise != "truncated":
+            own["noise"] = self.noise
+        return own | settings
 
 
 class CostPenalty(VectorWrapper):

@@ -46,7 +46,7 @@ def seconds_per_step(loop: SafeLoop, plant: LinearPlant, channel: Channel, steps
         seconds[:, step] = time.thread_time() - start, time.perf_counter() - clock
         x = plant.A @ x + plant.B @ decision.input + plant.process_noise.sample(rng)
         y = plant.H @ x + plant.sensor_noise.sample(rng)
-        packets = state.exchange(rng, step + 1, y if state.sends_at(step + 1) else None)
+        packets = state.exchange(rng, step + 1, y if state.sends_at(step + 1) else None, loop.episode)
     assert loop.guaranteed, loop.reason
     return seconds
 

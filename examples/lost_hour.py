@@ -23,7 +23,7 @@ def run(contract: ChannelContract | None) -> None:
         violations += bool((plant.constraint_values(state) > 0.0).any())
         connected = not hour // 6 <= step < hour // 6 + hour
         y = plant.H @ state + plant.sensor_noise.sample(rng)
-        packets = [Packet(loop.steps + 1, channel.quantize(y))] if connected else []
+        packets = [Packet(loop.steps + 1, channel.quantize(y), loop.episode)] if connected else []
     print(f"proved in {proved} of {step + 1} steps, outside the box in {violations}; now: {loop.guaranteed}; {reason}")
 
 

@@ -44,7 +44,7 @@ def run(mode: str, steps: int = 300) -> None:
         in_flight = []
         if rng.random() > 0.4:
             y = plant.H @ state + plant.sensor_noise.sample(rng)
-            in_flight = [Packet(loop.steps, channel.quantize(y))]
+            in_flight = [Packet(loop.steps, channel.quantize(y), loop.episode)]
         disturbance = plant.nominal_disturbance.sample_boundary(rng)
         state = plant.A @ state + plant.B @ decision.input + disturbance
         violations += bool((plant.constraint_values(state) > 0.0).any())

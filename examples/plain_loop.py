@@ -18,7 +18,9 @@ for step in range(1000):
     decision = loop.decide(proposed)
     overridden += decision.intervened
     y = plant.H @ x + plant.sensor_noise.sample(rng)
-    in_flight = [] if rng.random() < channel.loss else [Packet(stamp=loop.steps, measurement=channel.quantize(y))]
+    # The sensor counts steps and episodes as the loop does: a packet of an earlier episode would be discarded.
+    packet = Packet(stamp=loop.steps, measurement=channel.quantize(y), episode=loop.episode)
+    in_flight = [] if rng.random() < channel.loss else [packet]
     x = plant.A @ x + plant.B @ decision.input + plant.process_noise.sample(rng)
     worst = max(worst, float(np.abs(plant.C @ x).max()))
 print(f"overridden: {overridden} of 1000; closest to the limit: {worst:.3f} (violated above 1)")

@@ -26,7 +26,8 @@ for step in range(5000):
     is_lost = lost < channel.max_consecutive_losses and rng.random() < channel.loss
     lost, in_flight = (lost + 1, []) if is_lost else (0, None)
     if in_flight is None:
-        in_flight = [Packet(loop.steps, plant.H @ state + plant.sensor_noise.sample(rng))]
+        y = plant.H @ state + plant.sensor_noise.sample(rng)
+        in_flight = [Packet(loop.steps, y, loop.episode)]
     disturbance = plant.nominal_disturbance.sample_boundary(rng)
     state = plant.A @ state + plant.B @ decision.input + disturbance
     worst = max(worst, float(np.abs(plant.C @ state).max()))

@@ -6,6 +6,7 @@ from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlan
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet
 from ncs_gym.network.contract import ChannelContract, contract_of
+from ncs_gym.network.escape_probability import escape_probability
 from ncs_gym.plant_registration import register_plant
 from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
@@ -54,6 +55,7 @@ __all__ = [
     "cart_pole",
     "certified_error_set",
     "contract_of",
+    "escape_probability",
     "register_plant",
     "truck_trailer",
 ]

@@ -78,6 +78,7 @@ class Scenario:
         contract: ChannelContract | dict[str, Any] | None = None,
         render_mode: str | None = None,
         horizon: int = EPISODE_STEPS,
+        noise: str = "truncated",
     ) -> dict[str, Any]:
         """Returns the arguments of `NCSEnv`; None stands for the scenario's own value.
 
@@ -109,6 +110,7 @@ class Scenario:
             "contract": contract,
             "render_mode": render_mode,
             "horizon": horizon,
+            "noise": noise,
         }
 
     def _disturbance(self, plant: Any) -> Any:

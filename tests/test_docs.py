@@ -19,7 +19,7 @@ CODE = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
 REFERENCE = re.compile(r"^::: (\S+)$", re.MULTILINE)
 # A program, and what it prints if that follows.
 PROGRAM = re.compile(r"^```python\n(.*?)^```\n(?:\n```\n(.*?)^```)?", re.DOTALL | re.MULTILINE)
-QUICK_PAGES = ("README.md", "docs/index.md", "docs/ncs_gym.md", "docs/vector.md")
+QUICK_PAGES = ("README.md", "docs/index.md", "docs/ncs_gym.md", "docs/shield.md", "docs/vector.md")
 # Their programs train an agent, or synthesize certificates of unstable plants.
 SLOW_PAGES = ("docs/contracts.md", "docs/agents.md", "docs/integrations.md")
 MODULE = re.compile(rf"\b(?:{'|'.join(PACKAGES)}|tests|benchmarks)/[\w/]+\.py\b")

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import gymnasium as gym
 import numpy as np
 
-from ncs_gym import Channel, ChannelContract, GilbertElliott, LinearPlant, truck_trailer
+from ncs_gym import Channel, ChannelContract, GilbertElliott, LinearPlant, escape_probability, truck_trailer
 from ncs_gym.envs.env import ncs_env
-from ncs_gym.registration import ENTRY_POINTS, loaded_truck_trailer
+from ncs_gym.registration import ENTRY_POINTS, EPISODE_STEPS, loaded_truck_trailer
 from shields import Certificate
 from shields.runtime.wrapper import certificate_for
 
@@ -38,6 +38,14 @@ class AttackCase:
     plant: LinearPlant
     channel: Channel
     contract: ChannelContract | None = None
+
+    def with_delta(self, delta: float | None) -> AttackCase:
+        """Returns the case with a plant whose bounds hold for Gaussian noise at another level; None keeps it."""
+        return self if delta is None else replace(self, plant=replace(self.plant, delta=delta))
+
+    def escape_probability(self) -> float:
+        """Returns the bound on the probability that Gaussian noise drives an episode out of S."""
+        return escape_probability(self.plant, self.channel, EPISODE_STEPS)
 
     @property
     def certificate(self) -> Certificate:

@@ -11,7 +11,7 @@ import numpy as np
 
 from experiments.attack.attack_cases import attack_cases
 from experiments.attack.safety_counts import SafetyCounts
-from experiments.attack.worst_case import HostileAgents, WorstCaseVectorEnv
+from experiments.attack.worst_case import GaussianVectorEnv, HostileAgents, WorstCaseVectorEnv
 from experiments.runs.provenance import json_digest, versions
 from ncs_gym.registration import EPISODE_STEPS
 from shields import Certificate, VectorSafetyShield
@@ -31,12 +31,16 @@ class Campaign:
         random_plants: Number of random plants.
         envs: Number of environments in a batch, each of which runs one episode.
         shielded: Whether the shield acts; otherwise it only watches.
+        gaussian: Whether noise is Gaussian, without a bound; otherwise it is the worst within the bounds.
+        delta: Replaces the plants' own level at which Gaussian noise is inside the bounds; None keeps it.
     """
 
     seed: int
     random_plants: int
     envs: int
     shielded: bool
+    gaussian: bool = False
+    delta: float | None = None
 
     @property
     def key(self) -> str:
@@ -109,13 +113,15 @@ def run_batch(campaign: Campaign, batch: MonteCarloBatch, certificate: Path) -> 
 
 @lru_cache(maxsize=1)  # a shield's tables may take a hundred megabytes
 def _shields(campaign: Campaign, case: str, certificate: Path) -> dict[str, VectorSafetyShield]:
-    """Returns the shields of all modes around the same worst-case environments.
+    """Returns the shields of all modes around the same environments.
 
     Raises:
         CertificateError: If the certificate is damaged or does not verify for the case's plant.
     """
-    chosen, loaded = attack_cases(campaign.seed, campaign.random_plants)[case], Certificate.load(certificate)
+    chosen = attack_cases(campaign.seed, campaign.random_plants)[case].with_delta(campaign.delta)
+    loaded = Certificate.load(certificate)
     settings = {"plant": chosen.plant, "channel": chosen.channel, "contract": chosen.contract}
-    env = WorstCaseVectorEnv(campaign.envs, loaded, **settings)
+    kind = GaussianVectorEnv if campaign.gaussian else WorstCaseVectorEnv
+    env = kind(campaign.envs, loaded, **settings)
     modes = SHIELD_MODES if campaign.shielded else ("monitor",)
     return {mode: VectorSafetyShield(env, loaded, mode) for mode in modes}

@@ -47,8 +47,13 @@ class SafetyCounts:
 
     @property
     def bound(self) -> float:
-        """Upper end of the exact 95 % interval of the probability that an episode leaves S or the box."""
-        return clopper_pearson(self.broken_episodes, self.episodes)[1]
+        """Upper end of `interval`."""
+        return self.interval[1]
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Exact 95 % interval of the probability that an episode leaves S or the box."""
+        return clopper_pearson(self.broken_episodes, self.episodes)
 
     def document(self) -> dict[str, float]:
         """Returns counts, margin and bound as JSON values."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
-from ncs_gym import AdversarialDisturbance, LinearPlant, NCSVectorEnv
+from ncs_gym import AdversarialDisturbance, Disturbance, Ellipsoid, LinearPlant, NCSVectorEnv
 from ncs_gym.plants.process import BlockSampler
 from shields import Certificate
 
@@ -38,6 +38,47 @@ class WorstCaseVectorEnv(NCSVectorEnv):
         states = self.single.initial_set.sample_boundary(self.np_random, count)
         errors = self.plant.initial_noise.bound.sample_boundary(self.np_random, count)
         return (1.0 - 1e-9) * states.T, INWARD * errors.T
+
+
+class BoundedPush(Disturbance):
+    """What pushes the next state farthest out of S of all that is bounded by declaration; process noise is added.
+
+    It is the worst point of the ball of squared radius gamma, plus the worst one of `disturbance_bound` after that.
+
+    Args:
+        M: Shape (n, n), of S.
+    """
+
+    vectorized: ClassVar[bool] = True
+
+    def __init__(self, M: np.ndarray) -> None:
+        self.M = M
+
+    def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
+        d = np.zeros(nominal_next.shape)
+        for bound in (Ellipsoid(plant.gamma * np.eye(plant.n)), plant.disturbance_bound):
+            if bound is not None and np.any(bound.shape):
+                d = d + INWARD * bound.farthest_point((nominal_next + d).T, self.M).T
+        return d
+
+
+class GaussianVectorEnv(NCSVectorEnv):
+    """Gaussian noise without a bound, and the worst of what is bounded by declaration; starts on the boundary of S.
+
+    Args:
+        num_envs: N.
+        certificate: Certificate of the safe set S.
+        settings: Those of `NCSEnv` without disturbance, noise and initial set.
+    """
+
+    def __init__(self, num_envs: int, certificate: Certificate, **settings: Any) -> None:
+        settings |= {"noise": "gaussian", "disturbance": BoundedPush(certificate.M)}
+        super().__init__(num_envs, initial_set=certificate.safe_set, **settings)
+
+    def _first(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Returns states on the boundary of S and Gaussian first errors, shape (n, count) each."""
+        states = self.single.initial_set.sample_boundary(self.np_random, count)
+        return (1.0 - 1e-9) * states.T, self._process.first_error(self.np_random, count)
 
 
 class HostileAgents:

@@ -16,6 +16,7 @@ from experiments.attack import MonteCarloBatch, SafetyCounts
 from experiments.attack.attack_cases import AttackCase, attack_cases
 from experiments.attack.campaign_execution import execute_batches
 from experiments.attack.counts_store import CountsStore
+from experiments.attack.gaussian_table import GAUSSIAN_LEGEND, gaussian_table, require_within
 from experiments.attack.monte_carlo_batch import SETTLING_STEPS, SHIELD_MODES, Campaign
 from experiments.errors import SafetyBroken
 from experiments.runs import versions
@@ -32,7 +33,8 @@ def certify(settings: CertifySettings) -> None:
     """Runs `ncs certify`.
 
     Raises:
-        SafetyBroken: If a shielded state left S or its box, or a proof did not hold.
+        SafetyBroken: If a shielded state left S or its box, or a proof did not hold; with Gaussian noise, if episodes
+            left S more often than the bound on their probability allows.
         ResultsError: If the stored counts are damaged.
         CertificateError: If a certificate in the folder is damaged.
         OSError: If the folder cannot be written.
@@ -42,8 +44,11 @@ def certify(settings: CertifySettings) -> None:
         random_plants=settings.random_plants,
         envs=settings.envs,
         shielded=not settings.unshielded,
+        gaussian=settings.noise == "gaussian",
+        delta=settings.delta,
     )
     cases = attack_cases(campaign.seed, campaign.random_plants)
+    cases = {name: case.with_delta(campaign.delta) for name, case in cases.items()}
     certificates = _certificate_files(cases, settings.out / "certificates")
     keys = {case: f"{campaign.key} {Certificate.load(file).checksum}" for case, file in certificates.items()}
     store = CountsStore(settings.out / "tallies.jsonl", keys)
@@ -56,12 +61,19 @@ def certify(settings: CertifySettings) -> None:
     counts = {case: sum((store.counts[each] for each in some), SafetyCounts()) for case, some in batches.items()}
     total = sum(counts.values(), SafetyCounts())
     print(_table(counts, total), _LEGEND, sep="\n")
+    limits = {name: case.escape_probability() for name, case in cases.items()} if campaign.gaussian else {}
+    if limits:
+        print("", gaussian_table(counts, limits), GAUSSIAN_LEGEND, sep="\n")
     if steps > 0:
         print(f"{steps:,} steps in {seconds:.0f} s: {steps / seconds / 1e6:.2f} million per second")
     document = {"settings": asdict(campaign), "versions": versions(), "total": total.document()}
     document["cases"] = {case: each.document() for case, each in counts.items()}
+    if limits:
+        document["escape_probability"] = limits
     write_atomically(settings.out / "certify.json", json.dumps(document, indent=1) + "\n")
-    if campaign.shielded and (total.exits or total.violations or total.unproved):
+    if campaign.shielded and campaign.gaussian:
+        require_within(counts, limits)
+    elif campaign.shielded and (total.exits or total.violations or total.unproved):
         raise SafetyBroken(
             f"{total.exits:,} steps outside S, {total.violations:,} outside the box, {total.unproved:,} without a proof"
         )

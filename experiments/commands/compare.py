@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+
+from agents.control_loop import ControlLoop
+from experiments.analysis.escapes import escape_sentences, escape_summary
 from experiments.analysis.parquet_tables import write_tables
 from experiments.analysis.summary import arm_summary, covered_fraction, paired_differences, summary_text
 from experiments.backends.execution import results_of
@@ -23,7 +27,10 @@ from experiments.runs import (
 )
 from experiments.runs.training_run import PolicyKind
 from experiments.settings import CompareSettings, save_settings
+from ncs_gym import escape_probability
+from ncs_gym.envs.env import ncs_env
 from shields.atomic_write import write_atomically
+from shields.runtime.guarantee import starts_inside
 
 # Budget of `--smoke`: enough to pass through every part.
 _SMOKE = {"steps": 4_096, "episodes": 10, "seeds": 2}
@@ -46,7 +53,7 @@ def compare(settings: CompareSettings) -> None:
     arms = [Arm.of(name, settings.mode) for name in settings.arms]
     if len({arm.name for arm in arms}) != len(arms) or not arms:
         raise ValueError(f"--arms must be different ones, at least one, got {' '.join(settings.arms) or 'none'}")
-    setup = ExperimentSetup.of(settings.env, settings.channel, settings.certificate)
+    setup = ExperimentSetup.of(settings.env, settings.channel, settings.certificate, settings.noise)
     prepare_output(settings.out)
     save_settings(settings.out / "settings.json", "compare", settings)
     print(setup.title, flush=True)
@@ -54,6 +61,8 @@ def compare(settings: CompareSettings) -> None:
     results = results_of(runs, settings.out, settings)
     summary = _summary(settings, setup, runs, results)
     findings = _findings(summary)
+    if "gaussian_noise" in summary:
+        findings += escape_sentences(summary["gaussian_noise"])
     _write(settings.out, summary, results, setup, findings)
     count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
     print(f"\n{settings.env}: {count} per arm, {settings.episodes} evaluation episodes per run\n")
@@ -81,6 +90,7 @@ def _summary(
         fixed = _REFERENCES.get(name) in ("zero", "certified gain")
         return arm_summary(results_by_arm[name], modes[name], fixed_policy=fixed)
 
+    gaussian = {"gaussian_noise": _escapes(setup, modes, results_by_arm)} if settings.noise == "gaussian" else {}
     baseline = "unshielded" if "unshielded" in settings.arms else settings.arms[0]
     return {
         "arms": {name: arm(name) for name in settings.arms},
@@ -91,7 +101,23 @@ def _summary(
         },
         "units": {run.name: run.key for run in runs},
         "seeds": {run.index: {"training": run.training_seed, "evaluation": run.evaluation_seed} for run in runs},
-    } | setup.provenance("compare", settings)
+    } | (gaussian | setup.provenance("compare", settings))
+
+
+def _escapes(
+    setup: ExperimentSetup, modes: dict[str, str | None], results_by_arm: Mapping[str, Sequence[RunResult]]
+) -> dict[str, Any]:
+    """Returns the bound on the probability that an episode leaves the safe set, and how often shielded arms did.
+
+    The bound is about episodes that begin in the safe set; where not all do, it is 1.
+    """
+    env = ncs_env(ControlLoop(env=setup.env, channel=setup.channel, noise=setup.noise).single())
+    steps = gym.spec(setup.env).max_episode_steps or 1
+    begins_inside = starts_inside(setup.certificate, env.initial_set)
+    bound = escape_probability(env.plant, env.channel, steps) if begins_inside else 1.0
+    shielded = [name for name, mode in modes.items() if mode not in (None, "monitor")]
+    episodes = {name: [each for result in results_by_arm[name] for each in result.episodes] for name in shielded}
+    return escape_summary(bound, steps, episodes)
 
 
 def _findings(summary: dict[str, Any]) -> list[str]:
@@ -101,8 +127,9 @@ def _findings(summary: dict[str, Any]) -> list[str]:
         if not arm["shielded"]:
             continue
         upper = 100.0 * arm["eval_violation_rate_ci95"][1]
+        proof = "no broken assumption was seen" if "gaussian_noise" in summary else "the proof held"
         findings += [
-            f"{name}: the proof held in {arm['guaranteed_episodes']:,} of {arm['eval_episodes']:,} evaluation "
+            f"{name}: {proof} in {arm['guaranteed_episodes']:,} of {arm['eval_episodes']:,} evaluation "
             f"episodes; the largest x'Mx was {arm['largest_level']:.3f} (the safe set ends at 1).",
             f"{name}: {arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,} episodes violating; from these "
             f"episodes alone at most {upper:.2f} % with 95 % confidence.",

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-
+from agents.control_loop import ControlLoop
 from experiments.runs.arms import Arm
 from experiments.runs.environments import module_and_id, registered_env
 from experiments.runs.provenance import versions
@@ -36,6 +35,7 @@ class ExperimentSetup:
         certificate: Certificate for the plant, under the environment's channel contract.
         verification: Exact verification of the certificate.
         module: Module of the user's that registers the environment; empty for one of this package.
+        noise: "truncated", or "gaussian" for noise without a bound.
     """
 
     env: str
@@ -44,10 +44,15 @@ class ExperimentSetup:
     certificate: Certificate
     verification: Report
     module: str = ""
+    noise: str = "truncated"
 
     @classmethod
     def of(
-        cls, env_id: str, channel: ChannelSettings | Channel | None, certificate_file: Path | None = None
+        cls,
+        env_id: str,
+        channel: ChannelSettings | Channel | None,
+        certificate_file: Path | None = None,
+        noise: str = "truncated",
     ) -> ExperimentSetup:
         """Returns the setup of a registered environment, with another channel or with changes of its own channel.
 
@@ -55,23 +60,26 @@ class ExperimentSetup:
             env_id: Id, or "module:id" if the user gave it.
             channel: Replaces or changes the environment's own channel; None keeps it.
             certificate_file: File of the certificate; by default one is synthesized.
+            noise: "truncated", or "gaussian" for noise without a bound.
 
         Raises:
-            ValueError: If the environment is unknown or has no plant of its own, or it cannot have the channel.
+            ValueError: If the environment is unknown or has no plant of its own, or it cannot have the channel or the
+                noise.
             CertificateError: If a given certificate is damaged or does not verify for the plant.
             Infeasible: If no certificate is found.
         """
         own, (module, name) = registered_env(env_id), module_and_id(env_id)
         if isinstance(channel, ChannelSettings):
             channel = channel.applied_to(own.channel)
-        env = own if channel is None else ncs_env(gym.make(name, channel=channel))
+        changed = channel is not None or noise != "truncated"
+        env = ncs_env(ControlLoop(env=name, channel=channel, noise=noise).single()) if changed else own
         if certificate_file is None:
             with synthesis_status() as show:
                 certificate = certificate_for(env.plant, env.contract, show)
         else:
             certificate = Certificate.load(certificate_file)
             require_valid(certificate, env.plant)
-        return cls(name, channel, env.plant, certificate, verify(certificate, env.plant), module)
+        return cls(name, channel, env.plant, certificate, verify(certificate, env.plant), module, noise)
 
     @property
     def title(self) -> str:
@@ -93,6 +101,7 @@ class ExperimentSetup:
             env=self.env,
             module=self.module,
             channel=self.channel,
+            noise=self.noise,
             seed=settings.seed,
             index=index,
             steps=settings.steps,

@@ -38,6 +38,7 @@ class TrainingRun:
         env: Id of a registered environment.
         module: Module of the user's that registers it, imported where the run is executed; empty for none.
         channel: Channel that replaces the environment's own; None keeps it.
+        noise: "truncated", or "gaussian" for noise without a bound.
         seed: Seed of the experiment.
         index: Number of the run within its arm; runs with equal index are paired across arms.
         steps: Training steps.
@@ -56,6 +57,7 @@ class TrainingRun:
     env: str
     module: str = ""
     channel: Channel | None = None
+    noise: str = "truncated"
     seed: int
     index: int
     steps: int
@@ -79,7 +81,13 @@ class TrainingRun:
         shield = None
         if self.mode is not None:
             shield = ShieldSettings(self.certificate, self.mode, self.intervention_penalty)
-        return ControlLoop(env=self.env, channel=self.channel, shield=shield, violation_penalty=self.violation_penalty)
+        return ControlLoop(
+            env=self.env,
+            channel=self.channel,
+            shield=shield,
+            violation_penalty=self.violation_penalty,
+            noise=self.noise,
+        )
 
     @property
     def training_seed(self) -> int:

@@ -8,6 +8,8 @@ from typing import Literal
 
 import tyro
 
+from ncs_gym.plants.linear_plant import SMALLEST_DELTA
+
 
 @dataclass(frozen=True, kw_only=True)
 class SynthesizeSettings:
@@ -87,6 +89,9 @@ class CertifySettings:
         envs: Number of episodes in a batch, simulated side by side.
         jobs: Number of worker processes.
         unshielded: Let the shield only watch, to see what happens without it.
+        noise: "truncated" is the worst noise within the bounds; "gaussian" noise has none: it is drawn, next to
+            the worst of the other disturbances, and the bound on the probability of an exit is printed.
+        delta: Level at which the certificates' ellipsoids hold for a draw of Gaussian noise, in place of the plants'.
         seed: Seed of the campaign, >= 0.
     """
 
@@ -96,10 +101,14 @@ class CertifySettings:
     envs: int = 4096
     jobs: int = 2
     unshielded: bool = False
+    noise: Literal["truncated", "gaussian"] = "truncated"
+    delta: float | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
+        if self.delta is not None and not SMALLEST_DELTA <= self.delta <= 0.5:
+            raise ValueError(f"--delta must be between {SMALLEST_DELTA:g} and 0.5, got {self.delta:g}")
         if not 1.0 <= self.steps < 1e15:
             raise ValueError(f"--steps must be at least 1 and below 1e15, got {self.steps:g}")
         for name, least in (("random_plants", 0), ("envs", 4), ("jobs", 1), ("seed", 0)):

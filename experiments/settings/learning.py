@@ -85,12 +85,15 @@ class CompareSettings(BackendSettings, LearningSettings):
         seeds: Number of paired training runs per arm.
         arms: unshielded, monitor (unshielded, counts what the shield would have done), penalized (unshielded, with a
             penalty per violation), shielded, shielded:MODE, and each shielded one with +penalty (per intervention).
+        noise: "gaussian" draws noise that the certificate's bounds do not hold for always, and prints next to the
+            episodes that left the safe set the bound on their probability.
         smoke: Run a short version, whatever else is asked for, to see that everything works.
     """
 
     out: Path = Path("runs/compare")
     seeds: int = 3
     arms: tuple[str, ...] = ("unshielded", "penalized", "shielded")
+    noise: Literal["truncated", "gaussian"] = "truncated"
     smoke: bool = False
 
     def __post_init__(self) -> None:

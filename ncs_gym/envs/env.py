@@ -24,6 +24,7 @@ from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.tasks.task import Task
 from ncs_gym.uncertainty.disturbance_settings import as_disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
+from ncs_gym.uncertainty.gaussian_noise import as_noise
 from ncs_gym.validation import as_count, as_flag, read_only, shown
 
 T = TypeVar("T")
@@ -64,8 +65,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     The task's; see `Regulation` and `SpeedTracking`.
 
     ## Starting state
-    Uniform in `initial_set`, or `options={"state": x0}`. The first estimate is off by truncated Gaussian
-    noise and a uniform draw from the plant's `initial_bound`.
+    Uniform in `initial_set`, or `options={"state": x0}`. The first estimate is off by Gaussian noise
+    (truncated unless `noise` says otherwise) and a uniform draw from the plant's `initial_bound`.
 
     ## Episode end
     Terminates on a violation of the safe box only with `terminate_on_violation`. Truncation is `TimeLimit`'s.
@@ -100,6 +101,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         render_mode: "human" shows every step in a window, "rgb_array" makes `render` return an image; both need
             the extra `[render]` (docs/rendering.md).
         horizon: Steps the observation space is sized for.
+        noise: "truncated", or "gaussian" for process noise, sensor noise and first errors without a bound: what is
+            proved then holds with the probability that `escape_probability` leaves (docs/shield.md).
 
     Attributes:
         steps: Steps taken in this episode.
@@ -128,6 +131,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         contract: ChannelContract | None = None,
         render_mode: str | None = None,
         horizon: int = 200,
+        noise: str = "truncated",
     ) -> None:
         self.plant = _expect(plant, LinearPlant, "plant")
         self.channel = Channel() if channel is None else _expect(channel, Channel, "channel")
@@ -149,7 +153,9 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         patterns = arrival_patterns(plant, self.channel, self.contract)
         self.error_set = patterns.recursion.error_set
         self.estimator = Estimator(plant, self.channel, patterns=patterns)
-        self._process = LinearProcess(plant, self.disturbance, self.allow_assumption_violation)
+        self.noise = as_noise(noise, plant)
+        truncated = self.noise == "truncated"
+        self._process = LinearProcess(plant, self.disturbance, self.allow_assumption_violation, truncated=truncated)
         self.horizon = as_count(horizon, "horizon", low=1, high=LONGEST_HORIZON)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)
         self.observation_space = observation_space(plant, self.task, self.error_set, self.initial_set, self.horizon)
@@ -181,7 +187,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._task_state = self.task.begin(rng, self.plant)
         self._disturbance_memory = self._process.begin(rng)
         self._channel_state = ChannelState(self.channel, rng)
-        self.estimator.reset(self._state + self.plant.sample_initial_error(rng))
+        self.estimator.reset(self._state + self._process.first_error(rng))
         self.steps = 0
         self.episodes += 1
         self._violations = 0.0
@@ -208,7 +214,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self.steps += 1
         sends = self._channel_state.sends_at(self.steps)
         sample = self._process.measure(rng, self._state) if sends else None
-        packets = self._channel_state.exchange(rng, self.steps, sample)
+        packets = self._channel_state.exchange(rng, self.steps, sample, self.estimator.episode)
         self.estimator.advance(u, packets)
         reward = float(self.task.reward(self.plant, self._task_state, self._state, u))
         info = self._info(u, arrived=bool(packets))

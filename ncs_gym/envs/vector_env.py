@@ -70,7 +70,8 @@ class NCSVectorEnv(VectorEnv):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         bounds = single.observation_space.low, single.observation_space.high
         self._low, self._high = (np.asarray(bound, dtype=np.float64)[:, None] for bound in bounds)
-        self._process = LinearProcess(self.plant, single.disturbance, single.allow_assumption_violation, self.num_envs)
+        allowed, truncated = single.allow_assumption_violation, single.noise == "truncated"
+        self._process = LinearProcess(self.plant, single.disturbance, allowed, self.num_envs, truncated=truncated)
         patterns = arrival_patterns(self.plant, self.channel, self.contract)
         self._estimator = VectorEstimator(self.plant, patterns, self.num_envs)
         self._state = np.zeros((self.plant.n, self.num_envs))
@@ -206,7 +207,7 @@ class NCSVectorEnv(VectorEnv):
         """Returns states that episodes start at, and the errors of their first estimates, shape (n, count) each."""
         rng = self.np_random
         states = (1.0 - SAMPLE_ROUNDING) * self.single.initial_set.sample(rng, count)
-        return states.T, self.plant.sample_initial_error(rng, count).T
+        return states.T, self._process.first_error(rng, count)
 
     def _observation(self) -> np.ndarray:
         """Returns the observations, shape (N, n + extra)."""

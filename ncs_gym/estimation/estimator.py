@@ -48,6 +48,7 @@ class Estimator:
 
     Attributes:
         step: Steps since the start of the episode.
+        episode: Number of the episode, counted from 0; packets of any other are discarded.
         alarm: Whether a measurement contradicted the assumed bounds in this episode.
 
     Raises:
@@ -76,10 +77,20 @@ class Estimator:
         if ages is not None and not ages.contract.is_fine_enough_for(channel):
             raise ValueError(f"the channel rounds more coarsely than the contract of the error set: {ages.contract}")
         self._limit = plant.state_limit if np.isfinite(plant.state_limit).all() else None
-        self.reset(np.zeros(plant.n))
+        self.episode, self._is_new = 0, True
+        self._begin(np.zeros(plant.n))
 
     def reset(self, mean: np.ndarray) -> None:
-        """Starts an episode at step 0 with a first estimate, shape (n,), whose error lies in E(r0^2 I)."""
+        """Starts an episode at step 0 with a first estimate, shape (n,), whose error lies in E(r0^2 I).
+
+        The first call on an estimator that has not moved begins episode 0, every other one the next episode.
+        """
+        self.episode += not self._is_new
+        self._is_new = False
+        self._begin(mean)
+
+    def _begin(self, mean: np.ndarray) -> None:
+        """Forgets everything but a first estimate, shape (n,)."""
         self.step = self.age = 0
         self.alarm = False
         self.mean = np.array(mean, dtype=np.float64)
@@ -105,9 +116,10 @@ class Estimator:
 
         Args:
             u: Applied input, shape (m,) [physical units].
-            packets: In any order. Stamps from the future, from before the first step, older than the
-                replay buffer or seen before are discarded.
+            packets: In any order. Those of another episode are discarded, and stamps from the future, from before the
+                first step, older than the replay buffer or seen before.
         """
+        self._is_new = False
         self.step += 1
         self.age += 1
         u = np.array(u, dtype=np.float64)
@@ -124,6 +136,8 @@ class Estimator:
 
     def _take_in(self, packet: Packet, pattern: int) -> int:
         """Returns the pattern with one more packet, and keeps its sample."""
+        if packet.episode != self.episode:
+            return pattern
         age = self.step - packet.stamp
         after = self._patterns.after_arrival(pattern, age)
         if after == pattern:

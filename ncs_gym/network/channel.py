@@ -14,10 +14,18 @@ LONGEST_DELAY = 1000
 
 
 class Packet(NamedTuple):
-    """A sample on its way: the step it was taken at, and the (quantized) measurement, shape (p,)."""
+    """A sample on its way.
+
+    Attributes:
+        stamp: Step at which the sample was taken, counted from the start of its episode.
+        measurement: The (quantized) measurement, shape (p,).
+        episode: Number of that episode, counted from 0: stamps begin anew in each, so that an estimator discards
+            packets of any episode but its own (`Estimator.episode`).
+    """
 
     stamp: int
     measurement: np.ndarray
+    episode: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -82,20 +82,23 @@ class ChannelState:
         """Returns whether the sensor sends at this step."""
         return step % self.channel.send_period == 0
 
-    def exchange(self, rng: np.random.Generator, step: int, measurement: np.ndarray | None) -> list[Packet]:
+    def exchange(
+        self, rng: np.random.Generator, step: int, measurement: np.ndarray | None, episode: int = 0
+    ) -> list[Packet]:
         """Puts a sample on the channel and takes off what arrives.
 
         Args:
             rng: Source of randomness; how much is drawn does not depend on the measurement.
             step: The current step.
             measurement: y, shape (p,), to be quantized, stamped and sent; None where `sends_at` is False.
+            episode: Number of the estimator's episode, which the packet carries.
 
         Returns:
             The packets that arrive at this step, in the order in which they were sent.
         """
         self._loss_state, delay = transmit(self.channel, rng, self._loss_state, measurement is not None)
         if delay >= 0 and measurement is not None:
-            packet = Packet(step, self.channel.quantize(measurement))
+            packet = Packet(step, self.channel.quantize(measurement), episode)
             self.in_flight.setdefault(step + int(delay), []).append(packet)
         return self.in_flight.pop(step, [])
 

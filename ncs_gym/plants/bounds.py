@@ -192,13 +192,17 @@ class HardBounds(ReadOnlyArrays):
             P0 = P0 + self.initial_bound.shape / (self.n + 2)
         return read_only(Q), read_only(R), read_only(P0)
 
-    def sample_sensor_noise(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
-        """Returns v, shape (p,) or (count, p): truncated noise plus a uniform point of `sensor_bound`."""
-        return _plus_uniform(self.sensor_noise.sample(rng, count), self.sensor_bound, rng, count)
+    def sample_sensor_noise(
+        self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True
+    ) -> np.ndarray:
+        """Returns v, shape (p,) or (count, p): noise, truncated or not, plus a uniform point of `sensor_bound`."""
+        return _plus_uniform(self.sensor_noise.sample(rng, count, truncated=truncated), self.sensor_bound, rng, count)
 
-    def sample_initial_error(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
-        """Returns x_hat_0 - x_0, shape (n,) or (count, n): truncated noise plus a uniform point of `initial_bound`."""
-        return _plus_uniform(self.initial_noise.sample(rng, count), self.initial_bound, rng, count)
+    def sample_initial_error(
+        self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True
+    ) -> np.ndarray:
+        """Returns x_hat_0 - x_0, shape (n,) or (count, n): noise as above plus a uniform point of `initial_bound`."""
+        return _plus_uniform(self.initial_noise.sample(rng, count, truncated=truncated), self.initial_bound, rng, count)
 
 
 def _plus_uniform(

@@ -46,15 +46,22 @@ class LinearProcess:
 
     Args:
         plant: The plant with its bounds.
-        disturbance: What acts on it; truncated process noise is added unless it replaces that.
+        disturbance: What acts on it; process noise is added unless it replaces that.
         allow_assumption_violation: Let disturbances outside the certified bound pass instead of raising.
         size: Number of environments; None for one without that axis.
+        truncated: Whether process noise, sensor noise and first errors are truncated; False draws Gaussian ones.
     """
 
     def __init__(
-        self, plant: LinearPlant, disturbance: Disturbance, allow_assumption_violation: bool, size: int | None = None
+        self,
+        plant: LinearPlant,
+        disturbance: Disturbance,
+        allow_assumption_violation: bool,
+        size: int | None = None,
+        *,
+        truncated: bool = True,
     ) -> None:
-        self.plant, self.disturbance, self.size = plant, disturbance, size
+        self.plant, self.disturbance, self.size, self._truncated = plant, disturbance, size, truncated
         self._allow = allow_assumption_violation
         self._limit = plant.state_limit if np.isfinite(plant.state_limit).all() else None
         if size is not None and self._limit is not None:
@@ -69,19 +76,51 @@ class LinearProcess:
         plant, source = self.plant, self.disturbance
         noise = np.zeros((plant.n, count))
         if not source.replaces_process_noise:
-            noise = plant.process_noise.sample(rng, count).T
+            noise = plant.process_noise.sample(rng, count, truncated=self._truncated).T
         if not self._is_drawn_ahead:
             return noise
         d = source.draw(rng, plant, noise, None, None)
+        fits = self._trusted or np.shape(d) == noise.shape  # another shape could be broadcast; the check refuses it
+        return self._sum(d, noise if fits else None, count)
+
+    def _sum(self, d: Any, noise: np.ndarray | None, count: int | None) -> np.ndarray:
+        """Returns disturbance plus process noise, shape (n,) or (n, count), inside E(D) unless noise has no bound.
+
+        What the disturbance may be is decided as if the noise were truncated: on its sum with the noise pulled back
+        onto the ellipsoid of the truncation; what was pulled back is added afterwards.
+
+        Args:
+            d: What the disturbance drew.
+            noise: Process noise, shape (n,) or (n, count); None if the disturbance replaces it.
+            count: Number of environments or of draws; None for arrays without that axis.
+
+        Raises:
+            ValueError: If it lies outside its bound, or is no such array, and that is not allowed.
+        """
         if self._trusted:
-            return noise + d
-        if np.shape(d) == noise.shape:  # of another shape it could be broadcast; the check refuses it
-            d = noise + d
-        return checked_many(plant, d, count, allow_assumption_violation=self._allow)
+            return d if noise is None else d + noise
+        excess = None
+        if noise is not None:
+            inside = noise if self._truncated else self._pulled_in(noise)
+            excess = None if self._truncated else noise - inside
+            d = d + inside
+        if count is None:
+            total = checked(self.plant, d, allow_assumption_violation=self._allow)
+        else:
+            total = checked_many(self.plant, d, count, allow_assumption_violation=self._allow)
+        return total if excess is None else total + excess
+
+    def _pulled_in(self, noise: np.ndarray) -> np.ndarray:
+        """Returns process noise, shape (n,) or (n, count), with what lies outside its ellipsoid moved onto it."""
+        return noise / np.maximum(self.plant.process_noise.bound.gauge(noise.T), 1.0)
 
     def _draw_sensor_noise(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Returns sensor noise, shape (p, count)."""
-        return self.plant.sample_sensor_noise(rng, count).T
+        return self.plant.sample_sensor_noise(rng, count, truncated=self._truncated).T
+
+    def first_error(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
+        """Returns the error of a first estimate, shape (n,), or of `count` of them, shape (n, count)."""
+        return self.plant.sample_initial_error(rng, count, truncated=self._truncated).T
 
     def forget(self) -> None:
         """Forgets noise drawn ahead: after seeding, everything depends on the seed alone."""
@@ -118,13 +157,7 @@ class LinearProcess:
             return self.process_noise.next(rng)
         draw = source.draw if self.size is None else source.draw_many
         d = draw(rng, self.plant, nominal, steps, memory)
-        if not source.replaces_process_noise:
-            d = d + self.process_noise.next(rng)
-        if self._trusted:
-            return d
-        if self.size is None:
-            return checked(self.plant, d, allow_assumption_violation=self._allow)
-        return checked_many(self.plant, d, self.size, allow_assumption_violation=self._allow)
+        return self._sum(d, None if source.replaces_process_noise else self.process_noise.next(rng), self.size)
 
     def measure(self, rng: np.random.Generator, state: np.ndarray) -> np.ndarray:
         """Returns y = H x + v, shape (p,) or (p, size)."""

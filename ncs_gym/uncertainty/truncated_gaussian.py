@@ -40,23 +40,29 @@ class TruncatedGaussian(ReadOnlyArrays):
         """G with G G' = covariance; None when there is no noise (then no random number is drawn)."""
         return Ellipsoid(self.covariance).factor if np.any(self.covariance) else None
 
-    def sample(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
-        """Returns one draw, shape (n,), or `count` of them, shape (count, n), by rejection."""
+    def sample(self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True) -> np.ndarray:
+        """Returns one draw, shape (n,), or `count` of them, shape (count, n), by rejection.
+
+        Args:
+            rng: Source of randomness.
+            count: Number of draws; None for a single one.
+            truncated: False draws from the Gaussian itself, which has no bound.
+        """
         size = 1 if count is None else count
         if self.factor is None:
             points = np.zeros((size, self.covariance.shape[0]))
         else:
-            points = (self.factor @ self._truncated_normals(rng, size)).T
+            points = (self.factor @ self._normals(rng, size, self.energy if truncated else np.inf)).T
         return points[0] if count is None else points
 
-    def _truncated_normals(self, rng: np.random.Generator, count: int) -> np.ndarray:
+    def _normals(self, rng: np.random.Generator, count: int, energy: float) -> np.ndarray:
         """Returns standard normal columns, shape (n, count), each with a sum of squares of at most `energy`."""
         normals = rng.standard_normal((self.covariance.shape[0], count))
-        rejected = np.flatnonzero(~(np.square(normals).sum(axis=0) <= self.energy))
+        rejected = np.flatnonzero(~(np.square(normals).sum(axis=0) <= energy))
         while rejected.size:
             again = rng.standard_normal((len(normals), rejected.size))
             normals[:, rejected] = again
-            rejected = rejected[~(np.square(again).sum(axis=0) <= self.energy)]
+            rejected = rejected[~(np.square(again).sum(axis=0) <= energy)]
         return normals
 
 

@@ -43,7 +43,7 @@ class SafeLoop:
             wait_for_the_next_step()
 
     `step` is both in one call, for proposals that do not need the newest estimate. Steps are counted from 0 at
-    `start`; a packet carries the number of the step at which its sample was taken.
+    `start`; a packet carries the number of the step at which its sample was taken, and that of the episode.
 
     The guarantee is that of `SafetyShield`, under the same assumptions (docs/shield.md): `guaranteed` says whether the
     state is proved to be in S at this step, `reason` why not. What the loop cannot see is that the clock misses a step,
@@ -83,6 +83,8 @@ class SafeLoop:
             initial_set: What the state is known to lie in besides, an ellipsoid or the state itself, shape (n,). It
                 counts where x_hat0 alone does not prove that the state is in S.
 
+        Packets of earlier episodes are discarded from now on: `episode` is the number of the new one.
+
         Raises:
             ValueError: If an argument is not finite or does not fit the plant; nothing has changed then.
         """
@@ -104,7 +106,8 @@ class SafeLoop:
         At step 0 it is the first estimate: packets from before the first step are of no use.
 
         Args:
-            packets: What arrived since the last call, in any order; duplicates and late ones are sorted out.
+            packets: What arrived since the last call, in any order; duplicates, late ones and those of another episode
+                are sorted out.
             applied: What the actuator applied since the last decision, shape (m,), if that may be something else. If it
                 is, the estimate follows it and the guarantee ends; if it is no finite input, the estimate follows the
                 decision.
@@ -173,6 +176,11 @@ class SafeLoop:
         return self._estimator.step
 
     @property
+    def episode(self) -> int:
+        """Number of this episode, which its packets carry; 0 after the first `start`, one more after each other one."""
+        return self._estimator.episode
+
+    @property
     def measurement_age(self) -> int:
         """Steps since the newest sample used was taken; the first estimate counts as one of step 0."""
         return self._estimator.age
@@ -202,18 +210,20 @@ def _as_packet(value: Any, size: int) -> Packet:
     """Returns a packet with a measurement of its own, shape (size,).
 
     Raises:
-        ValueError: If the stamp is no whole number, or the measurement is not numbers of that shape.
+        ValueError: If stamp or episode is no whole number, or the measurement is not numbers of that shape.
     """
+    stamp = episode = 0
     try:
-        stamp, measurement = value
-        stamp, numbers = index(stamp), as_numbers(measurement)
+        stamp, measurement, episode = value if isinstance(value, Packet) else Packet(*value)
+        stamp, episode, numbers = index(stamp), index(episode), as_numbers(measurement)
     except (TypeError, ValueError):
         numbers = None
     if numbers is None or numbers.shape != (size,):
         raise ValueError(
-            f"a packet is Packet(stamp, measurement) with a whole number and shape ({size},), got {shown(value)}"
+            f"a packet is Packet(stamp, measurement) or Packet(stamp, measurement, episode) with whole numbers and a "
+            f"measurement of shape ({size},), got {shown(value)}"
         )
-    return Packet(stamp, np.array(numbers))
+    return Packet(stamp, np.array(numbers), episode)
 
 
 def _as_input(applied: Any, shape: tuple[int, ...]) -> np.ndarray | None:

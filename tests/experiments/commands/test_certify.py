@@ -8,6 +8,7 @@ import pytest
 
 from experiments.attack.attack_cases import AttackCase, attack_cases
 from experiments.attack.counts_store import CountsStore
+from experiments.attack.gaussian_table import gaussian_table, require_within
 from experiments.attack.monte_carlo_batch import Campaign, MonteCarloBatch, run_batch
 from experiments.attack.safety_counts import SafetyCounts
 from experiments.commands import certify as command
@@ -93,6 +94,56 @@ def test_nature_attains_every_bound(files):
     state = info["state"].T
     noise = shield.unwrapped._process.measure(np.random.default_rng(0), state) - case.plant.H @ state
     np.testing.assert_allclose(case.plant.sensor_noise.bound.gauge(noise.T), 1.0, atol=1e-6)
+
+
+# So many draws leave their ellipsoids that the monitor sees some of it, and episodes leave S.
+GAUSSIAN = replace(CAMPAIGN, gaussian=True, delta=0.4)
+
+
+def test_gaussian_nature_attains_what_is_bounded_and_draws_the_rest(tmp_path):
+    from experiments.attack.monte_carlo_batch import _shields
+
+    case = attack_cases(0, 1)[CRUISE].with_delta(GAUSSIAN.delta)
+    certificate = Certificate.load(command._certificate_files({CRUISE: case}, tmp_path)[CRUISE])
+    shield = _shields(GAUSSIAN, CRUISE, next(tmp_path.iterdir()))["project"]
+    assert shield.filter.plant.delta == case.plant.delta == GAUSSIAN.delta
+    _, info = shield.reset(seed=1)
+    np.testing.assert_allclose([certificate.safe_set.gauge(x) for x in info["state"]], 1.0, atol=1e-8)
+    assert case.plant.initial_noise.bound.gauge(info["estimation_error"]).max() > 1.0
+    source, nominal = shield.unwrapped._process.disturbance, 0.1 * np.ones((2, 5))
+    pushed = source.draw(None, case.plant, nominal, 0, None)
+    np.testing.assert_allclose(np.square(pushed).sum(axis=0), case.plant.gamma, rtol=1e-9)
+    worse = np.sqrt(case.plant.gamma) * np.array([np.cos(turns := np.linspace(0.0, 6.3, 400)), np.sin(turns)])
+    levels = [np.einsum("ik,ij,jk->k", x, certificate.M, x) for x in (nominal + pushed, nominal[:, :1] + worse)]
+    assert levels[0].min() >= levels[1].max() * (1.0 - 1e-9)
+
+
+def test_counts_of_gaussian_noise_lie_within_the_bound_and_do_not_end_with_an_error(tmp_path, small, capsys):
+    certify(settings(tmp_path, jobs=1, noise="gaussian", delta=1e-4))
+    printed = capsys.readouterr().out
+    rows = [line for line in printed.partition("interval")[2].splitlines() if line.startswith("TruckTrailer")]
+    assert [row.split()[-1] for row in rows] == ["0.031", "0.041"]
+    stored = document(tmp_path)
+    assert stored["escape_probability"][CRUISE] == pytest.approx((200 + 100 + 1) * 1e-4)
+    assert stored["settings"]["gaussian"]
+    assert stored["settings"]["delta"] == 1e-4
+
+
+def test_gaussian_noise_makes_a_shielded_state_leave_the_safe_set_and_is_counted(tmp_path):
+    case = attack_cases(0, 1)[CRUISE].with_delta(GAUSSIAN.delta)
+    file = command._certificate_files({CRUISE: case}, tmp_path)[CRUISE]
+    counts = run_batch(GAUSSIAN, MonteCarloBatch(CRUISE, 0), file)
+    assert counts.broken_episodes > 0
+    assert counts.level > 1.0
+    assert case.escape_probability() == 1.0
+
+
+def test_more_exits_than_the_bound_allows_are_an_error():
+    counts, limits = {"case": SafetyCounts(steps=2000, episodes=100, broken_episodes=20)}, {"case": 0.15}
+    require_within(counts, limits)  # the interval [0.127, 0.292] does not contradict it
+    with pytest.raises(SafetyBroken, match=r"case: 20 of 100 episodes left S, more than the bound 0\.11? "):
+        require_within(counts, {"case": 0.1})
+    assert "[1.3e-01, 2.9e-01]   0.15" in gaussian_table(counts, limits)
 
 
 @pytest.fixture
@@ -197,10 +248,12 @@ def test_counts_add_up_and_bound_the_probability():
         ({"jobs": 0}, "jobs"),
         ({"seed": -1}, "seed"),
         ({"random_plants": -1}, "random-plants"),
+        ({"delta": 0.0}, "delta"),
+        ({"delta": 0.6}, "delta"),
     ],
 )
 def test_wrong_settings_are_named(changes, flag, tmp_path):
-    with pytest.raises(ValueError, match=f"--{flag} must be at least"):
+    with pytest.raises(ValueError, match=f"--{flag} must be (at least|between)"):
         settings(tmp_path, **changes)
 
 

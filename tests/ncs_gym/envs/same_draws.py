@@ -100,7 +100,8 @@ class ScriptedEnv(NCSEnv):
 def scalar_versions(many: NCSVectorEnv) -> list[ScriptedEnv]:
     """Scalar environments that follow each environment of a vector, which is made to record."""
     single = many.single
-    many._process = RecordedProcess(many.plant, single.disturbance, single.allow_assumption_violation, many.num_envs)
+    allowed, truncated = single.allow_assumption_violation, single.noise == "truncated"
+    many._process = RecordedProcess(many.plant, single.disturbance, allowed, many.num_envs, truncated=truncated)
     many._process.noise_now = np.zeros((many.plant.p, many.num_envs))
     many.np_random = rng = RecordingGenerator(many.np_random)
     begin = many._begin
@@ -111,7 +112,17 @@ def scalar_versions(many: NCSVectorEnv) -> list[ScriptedEnv]:
         rng.notes = True
 
     many._begin = begin_unnoticed
-    names = ("plant", "channel", "task", "disturbance", "initial_set", "terminate_on_violation", "contract", "horizon")
+    names = (
+        "plant",
+        "channel",
+        "task",
+        "disturbance",
+        "initial_set",
+        "terminate_on_violation",
+        "contract",
+        "horizon",
+        "noise",
+    )
     settings = {name: getattr(single, name) for name in names}
     settings["allow_assumption_violation"] = single.allow_assumption_violation
     singles = [ScriptedEnv(**settings) for _ in range(many.num_envs)]

@@ -58,6 +58,17 @@ def test_registered_environments_equal_their_scalar_versions(name):
     compare(make(name, 3, max_episode_steps=None, terminate_on_violation=False).unwrapped, 200)
 
 
+@pytest.mark.parametrize("name", IDS)
+def test_registered_environments_with_gaussian_noise_equal_their_scalar_versions(name):
+    settings = {"max_episode_steps": None, "terminate_on_violation": False}
+    compare(make(name, 3, noise="gaussian", **settings).unwrapped, 200)
+
+
+def test_gaussian_noise_that_raises_alarms_equals_that_of_the_scalar_environment():
+    env = NCSVectorEnv(3, plant=truck_trailer(delta=0.9), channel=CHANNELS["overtaking"], noise="gaussian")
+    assert compare(env, 120) > 0
+
+
 @pytest.mark.parametrize("channel", ["case study", "overtaking", "rare bursts"])
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_episodes_that_begin_anew_equal_scalar_ones(channel, mode):

@@ -52,7 +52,7 @@ class PlainEstimator:
         self.step += 1
         self.priors[self.step] = Prior(self.mean, self.statistics)
         new = []
-        for stamp, measurement in packets:
+        for stamp, measurement, _ in packets:
             if stamp not in self.priors or stamp in self.samples:
                 continue
             if np.isfinite(measurement).all():

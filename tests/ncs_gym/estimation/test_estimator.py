@@ -124,6 +124,35 @@ def test_packets_from_nowhere_are_discarded(stamp):
     assert ignoring.age == 2
 
 
+def test_late_packets_of_the_episode_before_are_discarded():
+    # Their stamps are ones that the new episode knows too, and nothing in them contradicts an assumption.
+    plant, measurement = truck_trailer(), np.array([0.06, 0.0])
+    estimator = Estimator(plant, Channel(delay=2))
+    estimator.reset(np.zeros(2))
+    late = [Packet(stamp, measurement, estimator.episode) for stamp in (1, 2)]
+    estimator.reset(np.zeros(2))  # the true state is zero from now on
+    estimator.advance(np.zeros(1), [])
+    accepting = copy.deepcopy(estimator)
+    estimator.advance(np.zeros(1), late)
+    np.testing.assert_array_equal(estimator.mean, np.zeros(2))
+    assert (estimator.age, estimator.alarm) == (2, False)
+    # As packets of this episode they are used: the bound is false then, and no alarm says so.
+    accepting.advance(np.zeros(1), [packet._replace(episode=accepting.episode) for packet in late])
+    assert (accepting.age, accepting.alarm) == (0, False)
+    assert Ellipsoid(accepting.shape).gauge(accepting.mean) > 1.5
+
+
+def test_episodes_are_counted_from_the_first_one_on():
+    plant, episodes = truck_trailer(), []
+    estimator, moved = (Estimator(plant, Channel()) for _ in range(2))
+    moved.advance(np.zeros(1), [Packet(1, np.zeros(2))])
+    assert (moved.episode, moved.age) == (0, 0)
+    for each in (estimator, estimator, moved):
+        each.reset(np.zeros(2))
+        episodes.append(each.episode)
+    assert episodes == [0, 1, 1]
+
+
 def test_age_counts_from_the_newest_sample_used():
     plant = truck_trailer()
     estimator = Estimator(plant, Channel(delay=5))

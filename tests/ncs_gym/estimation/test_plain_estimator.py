@@ -83,12 +83,14 @@ def compare(plant, channel, error_set, seed, steps):
     one = Estimator(plant, channel, patterns=patterns)
     other = PlainEstimator(plant, channel, ErrorRecursion(plant, channel.quantization_step, error_set))
     alarms, ages = 0, []
-    for episode in range(2):  # the second one finds what the first one left
+    for episode in range(2):  # the second one finds what the first one left, and packets of the first
         mean = plant.initial_noise.sample(rng)
         one.reset(mean)
         other.reset(mean)
         for step, (u, packets) in enumerate(traffic(plant, channel, rng, steps // (episode + 1)), 1):
-            one.advance(u, packets)
+            own = [packet._replace(episode=episode) for packet in packets]
+            foreign = [each._replace(episode=1 - episode, measurement=each.measurement + 1e-3) for each in own]
+            one.advance(u, [*foreign, *own])
             other.advance(u, packets)
             assert_equal(one, other, step)
             ages.append(one.age)

@@ -103,7 +103,10 @@ def follow(env, loop, act, steps, seed, tell=False):
             np.testing.assert_array_equal(decision.input, info["input"])
         assert decision.intervened == info["shield_intervened"]
         np.testing.assert_equal(decision.margin, info["shield_margin"])
-        loop.receive(tap.packets[::-1], applied=info["input"] if tell else None)
+        packets = [
+            packet._replace(episode=loop.episode) for packet in tap.packets[::-1]
+        ]  # not the environment's number
+        loop.receive(packets, applied=info["input"] if tell else None)
         assert_same(loop, info)
         assert loop.steps == step + 1 == env.unwrapped.steps
         reasons.add(loop.reason)
@@ -316,7 +319,10 @@ def test_what_the_caller_keeps_is_its_own():
 
 @pytest.mark.parametrize(
     "packet",
-    [Packet(1, np.zeros(3)), Packet(1.5, np.zeros(2)), (1,), None, Packet(1, "near"), Packet("1", np.zeros(2))],
+    [
+        *(Packet(1, np.zeros(3)), Packet(1.5, np.zeros(2)), (1,), None, Packet(1, "near"), Packet("1", np.zeros(2))),
+        *(Packet(1, np.zeros(2), 0.5), Packet(1, np.zeros(2), None), (1, np.zeros(2), 0, 0)),
+    ],
 )
 def test_what_is_no_packet_is_refused_before_anything_moves(packet):
     loop = started(channel=Channel())
@@ -337,15 +343,35 @@ def test_measurement_that_is_not_finite_is_an_alarm():
     assert loop.guaranteed
 
 
+@pytest.mark.parametrize("stepped", [True, False])
+def test_packet_of_an_earlier_episode_is_discarded_whatever_its_stamp(stepped):
+    loop = started(channel=Channel(delay=3))
+    assert loop.episode == 0
+    late = Packet(1, np.array([9.0, 9.0]), loop.episode)
+    loop.decide(0.0)
+    if stepped:
+        loop.receive()
+    loop.start([0.0, 0.0])
+    assert loop.episode == 1
+    loop.step(0.0)
+    loop.step(0.0, [late])
+    assert loop.guaranteed
+    assert loop.measurement_age == 1
+    loop.step(0.0, [Packet(1, np.array([0.0, 0.0]), loop.episode)])  # its own is used, although the other came first
+    assert (loop.guaranteed, loop.measurement_age) == (True, 1)
+    loop.step(0.0, [late._replace(episode=loop.episode, stamp=2)])
+    assert loop.reason == ALARM
+
+
 def test_packets_of_an_earlier_episode_are_of_no_use_if_steps_are_counted_on():
     # The sensor counts its samples from the very first start; the loop subtracts where this episode began.
     loop = started(channel=Channel(delay=3))
     for _ in range(10):
         loop.step(0.0)
-    began = loop.steps
+    began, far = loop.steps, np.array([9.0, 9.0])
     loop.start([0.0, 0.0])
     loop.step(0.0)
-    loop.step(0.0, [Packet(stamp - began, np.array([9.0, 9.0])) for stamp in (began - 2, began)])
+    loop.step(0.0, [Packet(stamp - began, far, loop.episode) for stamp in (began - 2, began)])
     assert loop.guaranteed
     assert loop.measurement_age == 1
 
@@ -473,7 +499,7 @@ def test_memory_does_not_grow(name):
         loop.start(x)
         for step in range(1, 15_001):
             x = plant.A @ x + plant.B @ loop.decide(plant.u_max).input
-            loop.receive(state.exchange(rng, step, plant.H @ x if state.sends_at(step) else None))
+            loop.receive(state.exchange(rng, step, plant.H @ x if state.sends_at(step) else None, loop.episode))
         assert loop.guaranteed
     assert blocks[1] - blocks[0] > 1000  # the patterns met are seen
     assert sys.getallocatedblocks() - blocks[1] < 100

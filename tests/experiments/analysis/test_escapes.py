@@ -1,0 +1,78 @@
+"""What `ncs compare --noise gaussian` says: episodes that left the safe set, next to the bound on their probability."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from agents.results import Episode
+from experiments.analysis.escapes import escape_sentences, escape_summary, rounded_up
+from experiments.analysis.statistics import clopper_pearson
+from experiments.commands.compare import _escapes, _findings
+from experiments.runs.experiment_setup import ExperimentSetup
+from experiments.runs.training_run import execute_run
+from experiments.settings import CompareSettings
+from ncs_gym import Channel, LinearPlant, escape_probability, register_plant
+
+# Its safe box is 2 % wider than the bound of its noise: a draw that leaves its ellipsoid by more makes the state leave.
+DECLARED = {
+    **{"A": 0.01 * np.eye(2), "B": [[1e-3], [0.0]], "u_max": 1.0, "dt": 0.1, "delta": 2e-3},
+    **{"process_noise_cov": 0.1 * np.eye(2), "sensor_bound": 1e-3, "initial_bound": 1e-3},
+}
+RADIUS = np.sqrt(LinearPlant(box=[1.0, 1.0], **DECLARED).disturbance.shape[0, 0])
+PLANT, CHANNEL, STEPS = LinearPlant(box=2 * [1.02 * RADIUS], **DECLARED), Channel(loss=0.3), 60
+register_plant("Tests/Tight-v0", PLANT, channel=CHANNEL, max_episode_steps=STEPS)
+
+
+def episode(level):
+    return Episode(0, 200, 0.0, 0, 0, 0, True, level)
+
+
+def test_episodes_outside_the_safe_set_are_counted_with_their_exact_interval():
+    episodes = [episode(level) for level in (0.2, 1.0, 1.0 + 1e-9, 7.0, float("nan"))]
+    summary = escape_summary(0.25, 200, {"shielded": episodes})
+    assert summary["arms"]["shielded"] == {
+        "episodes": 5,
+        "episodes_outside_set": 3,
+        "rate_ci95": list(clopper_pearson(3, 5)),
+    }
+    (sentence,) = escape_sentences(summary)
+    assert "3 of 5 evaluation episodes [14.66, 94.73 %]" in sentence
+    assert "at most 0.25 for an episode of 200 steps" in sentence
+    assert "says nothing" in escape_sentences(summary | {"escape_probability": 1.0})[-1]
+
+
+@pytest.mark.parametrize(
+    ("bound", "text"), [(301e-9, "3.1e-07"), (0.25, "0.25"), (0.2501, "0.26"), (1.0, "1"), (0.0, "0")]
+)
+def test_printed_bound_is_no_smaller_than_the_bound(bound, text):
+    assert rounded_up(bound) == text
+    assert float(text) >= bound
+
+
+@pytest.fixture(scope="module")
+def setup():
+    return ExperimentSetup.of("Tests/Tight-v0", None, noise="gaussian")
+
+
+def test_comparison_under_gaussian_noise_plays_it_and_states_the_bound(setup):
+    settings = CompareSettings(env="Tests/Tight-v0", noise="gaussian", episodes=600)
+    run = replace(setup.training_run(settings, "shielded", 0), policy_kind="zero")
+    assert run.loop.single().unwrapped.noise == run.loop.vector(2).unwrapped.single.noise == "gaussian"
+    bounded = replace(run, noise="truncated")
+    assert run.key != bounded.key
+    result = execute_run(run, lambda steps: None)
+    summary = _escapes(setup, {"shielded": run.mode, "monitor": "monitor"}, {"shielded": [result]})
+    assert summary["escape_probability"] == escape_probability(PLANT, CHANNEL, STEPS) == pytest.approx(STEPS * 2e-3)
+    arm = summary["arms"]["shielded"]
+    assert 0.5 < arm["episodes_outside_set"] / arm["episodes"] / summary["escape_probability"] <= 1.0
+    assert list(summary["arms"]) == ["shielded"]
+    assert max(each.largest_level for each in execute_run(bounded, lambda steps: None).episodes) <= 1.0
+
+
+def test_proof_is_not_said_to_have_held_under_gaussian_noise():
+    arm = {"shielded": True, "eval_violation_rate_ci95": [0.0, 0.1], "guaranteed_episodes": 3, "eval_episodes": 4}
+    arm |= {"largest_level": 1.2, "eval_violating_episodes": 0}
+    summary = {"arms": {"shielded": arm}, "references": {}, "paired_differences": {"baseline": "", "arms": {}}}
+    assert "the proof held in 3 of 4" in _findings(summary)[0]
+    assert "no broken assumption was seen in 3 of 4" in _findings(summary | {"gaussian_noise": {}})[0]

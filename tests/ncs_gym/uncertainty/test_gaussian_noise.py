@@ -1,0 +1,209 @@
+"""Noise without a bound: what is untruncated and what stays bounded, and the probability that a bound is left."""
+
+import json
+from fractions import Fraction
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from scipy.stats import chi2, kstest
+
+from ncs_gym import (
+    BallDisturbance,
+    Channel,
+    LinearPlant,
+    NCSEnv,
+    NCSVectorEnv,
+    cart_pole,
+    escape_probability,
+    truck_trailer,
+)
+from ncs_gym.registration import registered_ids
+from tests.plants import random_plant
+
+IDS = ("TruckTrailer", "TruckTrailerCruise", "CartPole", "BatchReactor")
+DELTA = 0.2
+CALM = {"A": [[0.5]], "B": [[1.0]], "box": [[1.0]], "u_max": 1.0, "dt": 0.1, "delta": DELTA}
+
+
+def energies(covariance, draws):
+    """z' covariance^-1 z of draws, shape (count, n)."""
+    return np.einsum("ki,ij,kj->k", draws, np.linalg.inv(covariance), draws)
+
+
+def draws_of(env, count):
+    """Process noise plus disturbance, sensor noise and first errors, by what moves one environment or many."""
+    rng, process, plant = np.random.default_rng(0), env._process, env.plant
+    shape = (plant.n,) if process.size is None else (plant.n, process.size)
+    memory = process.begin(rng, process.size)
+    zero, steps = np.zeros(shape), 0 if process.size is None else np.zeros(process.size, np.int64)
+    moved = [process.disturb(rng, zero, steps, memory) for _ in range(count)]
+    measured = [process.measure(rng, zero) for _ in range(count)]
+    errors = [process.first_error(rng, process.size) for _ in range(count)]
+    return [
+        np.concatenate([np.reshape(each, (len(each), -1)).T for each in some]) for some in (moved, measured, errors)
+    ]
+
+
+def both(plant, **settings):
+    return NCSEnv(plant, **settings), NCSVectorEnv(20, plant=plant, **settings)
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_gaussian_noise_is_that_of_the_covariances_and_truncated_noise_is_not(many):
+    plant = truck_trailer(gamma=0.0, delta=DELTA)
+    covariances = plant.process_noise_cov, plant.measurement_noise_cov, plant.initial_cov
+    count = 100 if many else 2000
+    for noise in ("gaussian", "truncated"):
+        env = both(plant, noise=noise)[many]
+        for covariance, draws in zip(covariances, draws_of(env, count), strict=True):
+            assert (kstest(energies(covariance, draws), chi2(2).cdf).pvalue > 1e-3) == (noise == "gaussian")
+            outside = np.mean(energies(covariance, draws) > plant.process_noise.energy)
+            assert 0.7 * DELTA < outside < 1.3 * DELTA if noise == "gaussian" else outside == 0.0
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_registered_environments_take_it_and_their_spec_is_json(name):
+    env = gym.make(f"ncs_gym/{name}-v0", noise="gaussian")
+    again = gym.make(type(env.spec).from_json(env.spec.to_json()))
+    assert json.loads(env.spec.to_json())["kwargs"]["noise"] == again.unwrapped.noise == "gaussian"
+    many = gym.make_vec(f"ncs_gym/{name}-v0", num_envs=64, noise="gaussian", max_episode_steps=None)
+    escaped = False
+    _, info = many.reset(seed=0)
+    for _ in range(30):
+        shapes, errors = info["error_shape"], info["estimation_error"]
+        escaped |= bool((np.einsum("ki,ki->k", errors, np.linalg.solve(shapes, errors[..., None])[..., 0]) > 1.0).any())
+        *_, info = many.step(np.zeros(many.action_space.shape, np.float32))
+    assert escaped  # at delta = 0.05 some of 64 first errors alone lie outside their bound
+    assert f"ncs_gym/{name}-v0" in registered_ids()
+
+
+def test_what_is_bounded_by_declaration_stays_inside_its_bound():
+    bounds = {"disturbance_bound": 0.1, "sensor_bound": 0.2, "initial_bound": 0.3}
+    for kept, covariance in (
+        ("disturbance_bound", "measurement_noise_cov"),
+        ("sensor_bound", "initial_cov"),
+        ("initial_bound", "process_noise_cov"),
+    ):
+        others = {name: bound for name, bound in bounds.items() if name == kept}
+        for env in both(LinearPlant(**CALM, **others, **{covariance: [[1.0]]}), noise="gaussian"):
+            moved, measured, errors = draws_of(env, 1000)
+            sizes = {"disturbance_bound": moved, "sensor_bound": measured, "initial_bound": errors}
+            assert 0.9 * bounds[kept] < np.abs(sizes[kept]).max() <= bounds[kept] * (1.0 + 1e-9)
+
+
+def test_plant_that_declares_bounds_only_is_refused():
+    plant = LinearPlant(**CALM, gamma=0.01, sensor_bound=0.1, initial_bound=0.1)
+    for make in (lambda: NCSEnv(plant, noise="gaussian"), lambda: NCSVectorEnv(2, plant=plant, noise="gaussian")):
+        with pytest.raises(ValueError, match="needs a covariance"):
+            make()
+    assert escape_probability(plant, Channel(), 10**6) == 0.0
+
+
+@pytest.mark.parametrize("noise", ["Gaussian", None, 1, ["gaussian"]])
+def test_another_kind_of_noise_is_refused(noise):
+    with pytest.raises(ValueError, match="noise must be one of"):
+        gym.make("ncs_gym/TruckTrailer-v0", noise=noise)
+
+
+class OwnBall(BallDisturbance):
+    """A user's disturbance, which is checked at every step."""
+
+    vectorized = True
+
+
+class OwnBallAhead(OwnBall):
+    """One that is drawn for many steps at once."""
+
+    vectorized = memoryless = True
+
+
+class TooLarge(OwnBall):
+    """One that goes beyond gamma."""
+
+    def draw(self, rng, plant, nominal_next, step, memory):
+        return np.full(nominal_next.shape, 3.0)
+
+
+@pytest.mark.parametrize("disturbance", [OwnBall(), OwnBallAhead()])
+def test_own_disturbance_inside_its_bound_is_not_blamed_for_noise_outside_it(disturbance):
+    plant = LinearPlant(**CALM, gamma=0.01, process_noise_cov=[[0.01]], sensor_bound=0.1, initial_bound=0.1)
+    for env in both(plant, disturbance=disturbance, noise="gaussian"):
+        moved = draws_of(env, 500)[0]
+        assert np.mean(plant.disturbance.gauge(moved) > 1.0) > 0.01
+        # Uniform plus normal: a sum that was pulled back as a whole would be smaller.
+        assert np.var(moved) == pytest.approx(0.01 + 0.01 / 3.0, rel=0.25)
+
+
+def test_own_disturbance_outside_its_bound_is_still_refused():
+    plant = LinearPlant(**CALM, gamma=0.01, process_noise_cov=[[0.01]], sensor_bound=0.1, initial_bound=0.1)
+    for env in both(plant, disturbance=TooLarge(), noise="gaussian"):
+        env.reset(seed=0)
+        with pytest.raises(ValueError, match="lies outside its bound"):
+            env.step(env.action_space.sample())
+
+
+def test_a_disturbance_in_place_of_the_process_noise_stays_inside_its_bound():
+    plant = truck_trailer(delta=DELTA)
+    for env in both(plant, disturbance="sphere", noise="gaussian"):
+        moved, measured, _ = draws_of(env, 500)
+        assert plant.disturbance.gauge(moved).max() <= 1.0
+        assert plant.sensor_error.gauge(measured).max() > 1.0
+
+
+@pytest.mark.parametrize(("delta", "steps", "period"), [(1e-9, 200, 2), (1e-3, 7, 3), (0.05, 3, 1), (1e-12, 10**9, 1)])
+def test_escape_probability_is_the_sum_over_all_draws_rounded_up(delta, steps, period):
+    plant = truck_trailer(delta=delta)
+    wanted = (steps + steps // period + 1) * Fraction(delta)
+    bound = escape_probability(plant, Channel(send_period=period, loss=0.9, delay=3), steps)
+    assert Fraction(bound) >= wanted
+    assert bound == pytest.approx(float(wanted), rel=2e-4 if delta < 1e-11 else 1e-9)
+
+
+def test_escape_probability_counts_only_what_is_gaussian():
+    channel = Channel(send_period=10)
+    for name, draws in (("process_noise_cov", 100), ("measurement_noise_cov", 10), ("initial_cov", 1)):
+        plant = LinearPlant(
+            **CALM | {"delta": 1e-4}, gamma=0.1, sensor_bound=0.1, initial_bound=0.1, **{name: [[1e-3]]}
+        )
+        assert escape_probability(plant, channel, 100) == pytest.approx(draws * 1e-4, rel=1e-9)
+    assert escape_probability(truck_trailer(), channel, 10**6) == 1.0
+    assert escape_probability(truck_trailer(delta=1e-3), channel, 0) == pytest.approx(1e-3, rel=1e-9)
+
+
+@pytest.mark.parametrize("steps", [-1, 1.5, "many"])
+def test_escape_probability_refuses_other_arguments(steps):
+    with pytest.raises(ValueError, match="steps"):
+        escape_probability(truck_trailer(), Channel(), steps)
+    with pytest.raises(ValueError, match="expected a LinearPlant and a Channel"):
+        escape_probability(Channel(), truck_trailer(), 1)
+
+
+def test_share_of_episodes_with_an_escape_is_what_the_bound_says():
+    # Escapes counted where they happen, draw by draw: with independent draws the union bound is nearly attained.
+    plant, channel, steps, count = truck_trailer(gamma=0.0, delta=5e-4), Channel(send_period=2), 200, 2000
+    env = NCSVectorEnv(count, plant=plant, channel=channel, noise="gaussian")
+    rng, escaped = (
+        np.random.default_rng(1),
+        plant.initial_noise.bound.gauge(env._process.first_error(np.random.default_rng(0), count).T) > 1.0,
+    )
+    zero, none = np.zeros((2, count)), np.zeros(count, np.int64)
+    memory = env._process.begin(rng, count)
+    for step in range(1, steps + 1):
+        escaped |= plant.process_noise.bound.gauge(env._process.disturb(rng, zero, none, memory).T) > 1.0
+        if step % channel.send_period == 0:
+            escaped |= plant.sensor_noise.bound.gauge(env._process.measure(rng, zero).T) > 1.0
+    bound = escape_probability(plant, channel, steps)
+    assert 0.8 * bound < escaped.mean() < bound
+
+
+@pytest.mark.parametrize(
+    ("plant", "channel"), [(random_plant(3, 3, 2, p=2), Channel(loss=0.3, jitter=2)), (cart_pole(delta=0.5), Channel())]
+)
+def test_environments_with_the_same_seed_are_the_same(plant, channel):
+    runs = []
+    for _ in range(2):
+        env = NCSEnv(plant, channel, noise="gaussian")
+        infos = [env.reset(seed=3)[1]] + [env.step(np.zeros(plant.m, np.float32))[4] for _ in range(50)]
+        runs.append(np.array([info["state"] for info in infos]))
+    np.testing.assert_array_equal(*runs)

@@ -1,0 +1,109 @@
+"""The shield under noise that may leave every bound: what it still does, and how often the safe set is left."""
+
+import numpy as np
+import pytest
+
+from ncs_gym import (
+    Channel,
+    ChannelContract,
+    LinearPlant,
+    NCSEnv,
+    NCSVectorEnv,
+    batch_reactor,
+    cart_pole,
+    escape_probability,
+    truck_trailer,
+)
+from shields import SafetyShield, VectorSafetyShield
+from shields.runtime.filter import MODES
+from shields.runtime.guarantee import ALARM
+from tests.certificates import certificate_of
+
+# So large a delta that draws leave their ellipsoids all the time.
+WILD = 0.97
+LOOPS = {
+    "truck": (truck_trailer(mass=4000.0, delta=WILD), None, Channel(loss=0.3, send_period=2, delay=2)),
+    "cart-pole": (cart_pole(delta=WILD), ChannelContract(4), Channel(loss=0.6, max_consecutive_losses=2, jitter=2)),
+    "batch reactor": (
+        batch_reactor(delta=WILD),
+        ChannelContract(3),
+        Channel(loss=1.0, max_consecutive_losses=2, delay=1),
+    ),
+}
+
+
+def outside_bounds(info):
+    """Whether the estimation error lies outside its running ellipsoid, a truth value or shape (N,)."""
+    errors, shapes = (
+        np.atleast_2d(info["estimation_error"]),
+        np.reshape(info["error_shape"], (-1, *info["error_shape"].shape[-2:])),
+    )
+    return np.einsum("ki,ki->k", errors, np.linalg.solve(shapes, errors[..., None])[..., 0]) > 1.0
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("name", LOOPS)
+def test_shield_goes_on_when_draws_leave_their_ellipsoids(name, mode):
+    plant, contract, channel = LOOPS[name]
+    certificate, count, rng = certificate_of(plant, contract), 20, np.random.default_rng(0)
+    settings = {"channel": channel, "contract": contract, "noise": "gaussian"}
+    many = VectorSafetyShield(
+        NCSVectorEnv(count, plant=plant, max_episode_steps=60, **settings), certificate, mode=mode
+    )
+    one = SafetyShield(NCSEnv(plant, **settings), certificate, mode=mode)
+    _, infos = many.reset(seed=0)
+    _, info = one.reset(seed=0)
+    escaped, alarms, reasons = False, 0, set()
+    for _ in range(150):
+        *_, infos = many.step(rng.uniform(-1.0, 1.0, many.action_space.shape).astype(np.float32))
+        *_, info = one.step(rng.uniform(-1.0, 1.0, plant.m).astype(np.float32))
+        for each in (infos, info):
+            escaped |= bool(outside_bounds(each).any())
+            alarm = np.atleast_1d(each["assumption_violated"])
+            alarms += int(alarm.sum())
+            reasons |= set(np.atleast_1d(each["shield_reason"]).tolist())
+            # An alarm ends the proof at once; without one the flag cannot know what no packet showed.
+            assert not (np.atleast_1d(each["shield_guaranteed"]) & alarm).any()
+            assert (np.abs(each["input"]) <= plant.u_max).all()
+    assert escaped
+    assert alarms > 0
+    assert ALARM in reasons
+
+
+# Of a plant without memory, with inputs of no effect: a draw that leaves its ellipsoid by a few percent leaves S.
+DELTA, STEPS, COUNT = 2e-3, 100, 2000
+
+
+def tight_plant(delta):
+    """A plant whose safe box is 2 % wider than the bound that a level delta gives to its noise."""
+    declared = {"u_max": 1.0, "dt": 0.1, "process_noise_cov": [[0.1]], "sensor_bound": 1e-3, "initial_bound": 1e-3}
+    declared |= {"A": [[0.01]], "B": [[1e-3]], "delta": delta}
+    radius = np.sqrt(LinearPlant(box=[1.0], **declared).disturbance.shape[0, 0])
+    return LinearPlant(box=[1.02 * radius], **declared)
+
+
+def share_of_exits(plant, noise, mode="project"):
+    """The share of episodes whose state leaves S, under random proposals; episodes begin in S."""
+    certificate = certificate_of(plant)
+    env = NCSVectorEnv(COUNT, plant=plant, channel=Channel(loss=0.3), noise=noise, max_episode_steps=None)
+    shield, rng = VectorSafetyShield(env, certificate, mode=mode), np.random.default_rng(0)
+    _, info = shield.reset(seed=0)
+    assert info["shield_guaranteed"].all()
+    outside = np.zeros(COUNT, np.bool_)
+    for _ in range(STEPS):
+        *_, info = shield.step(rng.uniform(-1.0, 1.0, (COUNT, plant.m)).astype(np.float32))
+        outside |= np.einsum("ki,ij,kj->k", info["state"], certificate.M, info["state"]) > 1.0
+    return outside.mean()
+
+
+def test_share_of_episodes_that_leave_the_safe_set_is_below_the_union_bound_and_close_to_it():
+    plant = tight_plant(DELTA)
+    bound = escape_probability(plant, Channel(loss=0.3), STEPS)
+    assert bound == pytest.approx(STEPS * DELTA)  # nothing but the process noise is Gaussian
+    assert 0.5 * bound < share_of_exits(plant, "gaussian") <= bound
+    assert share_of_exits(plant, "truncated") == 0.0
+
+
+def test_a_smaller_delta_makes_leaving_rarer():
+    shares = [share_of_exits(tight_plant(delta), "gaussian") for delta in (DELTA, DELTA / 20.0)]
+    assert 0.0 < shares[1] < 0.2 * shares[0]
