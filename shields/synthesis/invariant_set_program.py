@@ -13,7 +13,7 @@ from shields.verification import ACTION_ROUNDING
 class InvariantSetProgram:
     """Maximizes log det L over (L, K) for fixed multipliers, with X <= L Sigma^-1 L linearized at a given L0.
 
-    With F = K L, S >= F L^-1 F' and T_j >= F G_j (le X_j)^-1 G_j' F' for every error set E(G_j G_j'), where X_j stands for
+    With F = K L, S >= F L^-1 F' and T_j >= F G_j (le X_j)^-1 G_j' F' for every error set E(G_j G_j'), X_j being
     G_j' L Sigma_j^-1 L G_j, the conditions of theory.md section 3 are linear in (L, F, S, T_j) for fixed multipliers:
 
         (I)  L - D_u/ld - (A L A' + A F' B' + B F A' + B S B')/lx - B T_j B' >= 0
