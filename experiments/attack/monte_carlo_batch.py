@@ -31,17 +31,20 @@ class Campaign:
         random_plants: Number of random plants.
         envs: Number of environments in a batch, each of which runs one episode.
         shielded: Whether the shield acts; otherwise it only watches.
+        env: Id, or "module:id", of the only environment to attack; None for all.
     """
 
     seed: int
     random_plants: int
     envs: int
     shielded: bool
+    env: str | None = None
 
     @property
     def key(self) -> str:
-        """SHA-256 of everything that the counts depend on except the certificates."""
-        return json_digest(asdict(self) | {"versions": versions()})
+        """SHA-256 of everything that the counts depend on except the certificates and the channels."""
+        given = {name: value for name, value in asdict(self).items() if value is not None}
+        return json_digest(given | {"versions": versions()})
 
     @property
     def batch_steps(self) -> int:
@@ -114,7 +117,8 @@ def _shields(campaign: Campaign, case: str, certificate: Path) -> dict[str, Vect
     Raises:
         CertificateError: If the certificate is damaged or does not verify for the case's plant.
     """
-    chosen, loaded = attack_cases(campaign.seed, campaign.random_plants)[case], Certificate.load(certificate)
+    cases = attack_cases(campaign.seed, campaign.random_plants, campaign.env)
+    chosen, loaded = cases[case], Certificate.load(certificate)
     settings = {"plant": chosen.plant, "channel": chosen.channel, "contract": chosen.contract}
     env = WorstCaseVectorEnv(campaign.envs, loaded, **settings)
     modes = SHIELD_MODES if campaign.shielded else ("monitor",)

@@ -87,6 +87,8 @@ class CertifySettings:
         envs: Number of episodes in a batch, simulated side by side.
         jobs: Number of worker processes.
         unshielded: Let the shield only watch, to see what happens without it.
+        env: Id of the only environment to attack, behind its own channel and, if it has no contract, every kind of
+            channel; module:id first imports the module, which registers one of your own. By default all of the above.
         seed: Seed of the campaign, >= 0.
     """
 
@@ -96,6 +98,7 @@ class CertifySettings:
     envs: int = 4096
     jobs: int = 2
     unshielded: bool = False
+    env: str | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
