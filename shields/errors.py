@@ -37,8 +37,9 @@ class Infeasible(ValueError):
             number of unbounded directions; for "C2" 1 - lambda_min(L)/alpha; where only exact verification failed, the
             violation of that condition.
         details: Further figures by name. Method "certified": `share_of_radii`, the fraction of the given radii for
-            which a design is found; under a channel contract also `max_age`, the largest age that is feasible, and
-            `largest_gamma`, the largest feasible gamma at the given age. Method "paper": `ratio`, the largest
+            which a design is found; the largest feasible value of each bound that the plant declares, changed alone:
+            `largest_gamma`, and as a fraction of the given one `disturbance_bound_factor`, `process_noise_cov_factor`
+            and so on; under a channel contract also `max_age`. Method "paper": `ratio`, the largest
             lambda_min(L)/alpha with its `kappa` and `rho`, and `largest_gamma`, `largest_noise_scale` and
             `largest_scale`, the largest uncertainty for which OP is feasible.
     """

@@ -8,7 +8,8 @@ from functools import cache
 import gymnasium as gym
 import numpy as np
 
-from ncs_gym import Channel, ChannelContract, GilbertElliott, LinearPlant, escape_probability, truck_trailer
+from experiments.runs.environments import module_and_id, registered_env
+from ncs_gym import Channel, ChannelContract, GilbertElliott, LinearPlant, NCSEnv, escape_probability, truck_trailer
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.registration import ENTRY_POINTS, EPISODE_STEPS, loaded_truck_trailer
 from shields import Certificate
@@ -54,27 +55,36 @@ class AttackCase:
 
 
 @cache
-def attack_cases(seed: int, random_plants: int) -> dict[str, AttackCase]:
+def attack_cases(seed: int, random_plants: int, env_id: str | None = None) -> dict[str, AttackCase]:
     """Returns the cases by name: every registered environment, and all kinds of channels for it and for random plants.
 
     Args:
         seed: Seed of the random plants.
         random_plants: Number of random plants.
+        env_id: Id, or "module:id", of the only environment to attack; None for all of these.
+
+    Raises:
+        ValueError: If there is no environment of that id.
     """
+    if env_id is not None:
+        env = registered_env(env_id)
+        return _env_cases(module_and_id(env_id)[1], env, all_channels=env.contract is None)
     found = {}
-    for env_id, name in ENTRY_POINTS.items():
-        if name == "LINEAR_NCS":  # has no plant of its own
-            continue
-        env, short = ncs_env(gym.make(env_id)), env_id.removeprefix("ncs_gym/")
-        found[f"{short}, its channel"] = AttackCase(env.plant, env.channel, env.contract)
-        if env.contract is not None:
-            for kind, channel in _extremes(env.contract).items():
-                found[f"{short}, {kind}"] = AttackCase(env.plant, channel, env.contract)
+    for registered, name in ENTRY_POINTS.items():
+        if name != "LINEAR_NCS":  # which has no plant of its own
+            found |= _env_cases(registered.removeprefix("ncs_gym/"), ncs_env(gym.make(registered)))
     plants = {"TruckTrailer-v0": truck_trailer(), "TruckTrailerCruise-v0": loaded_truck_trailer()}
     plants |= {f"random plant {index}": _random_plant(seed, index) for index in range(random_plants)}
     for name, plant in plants.items():
         found |= {f"{name}, {kind}": AttackCase(plant, channel) for kind, channel in _CHANNELS.items()}
     return found
+
+
+def _env_cases(name: str, env: NCSEnv, *, all_channels: bool = False) -> dict[str, AttackCase]:
+    """Returns the cases of an environment: its own channel, those that use its contract up, and all kinds if asked."""
+    channels = {"its channel": env.channel} | ({} if env.contract is None else _extremes(env.contract))
+    channels |= _CHANNELS if all_channels else {}
+    return {f"{name}, {kind}": AttackCase(env.plant, channel, env.contract) for kind, channel in channels.items()}
 
 
 def _extremes(contract: ChannelContract) -> dict[str, Channel]:

@@ -33,6 +33,7 @@ class Campaign:
         shielded: Whether the shield acts; otherwise it only watches.
         gaussian: Whether noise is Gaussian, without a bound; otherwise it is the worst within the bounds.
         delta: Replaces the plants' own level at which Gaussian noise is inside the bounds; None keeps it.
+        env: Id, or "module:id", of the only environment to attack; None for all.
     """
 
     seed: int
@@ -41,11 +42,13 @@ class Campaign:
     shielded: bool
     gaussian: bool = False
     delta: float | None = None
+    env: str | None = None
 
     @property
     def key(self) -> str:
-        """SHA-256 of everything that the counts depend on except the certificates."""
-        return json_digest(asdict(self) | {"versions": versions()})
+        """SHA-256 of everything that the counts depend on except the certificates and the channels."""
+        given = {name: value for name, value in asdict(self).items() if value is not None}
+        return json_digest(given | {"versions": versions()})
 
     @property
     def batch_steps(self) -> int:
@@ -118,8 +121,8 @@ def _shields(campaign: Campaign, case: str, certificate: Path) -> dict[str, Vect
     Raises:
         CertificateError: If the certificate is damaged or does not verify for the case's plant.
     """
-    chosen = attack_cases(campaign.seed, campaign.random_plants)[case].with_delta(campaign.delta)
-    loaded = Certificate.load(certificate)
+    cases = attack_cases(campaign.seed, campaign.random_plants, campaign.env)
+    chosen, loaded = cases[case].with_delta(campaign.delta), Certificate.load(certificate)
     settings = {"plant": chosen.plant, "channel": chosen.channel, "contract": chosen.contract}
     kind = GaussianVectorEnv if campaign.gaussian else WorstCaseVectorEnv
     env = kind(campaign.envs, loaded, **settings)

@@ -36,7 +36,7 @@ class WorstCaseVectorEnv(NCSVectorEnv):
     def _first(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns states on the boundary of S and first errors on the boundary of theirs, shape (n, count) each."""
         states = self.single.initial_set.sample_boundary(self.np_random, count)
-        errors = self.plant.initial_noise.bound.sample_boundary(self.np_random, count)
+        errors = self.plant.nominal_initial_error.sample_boundary(self.np_random, count)
         return (1.0 - 1e-9) * states.T, INWARD * errors.T
 
 

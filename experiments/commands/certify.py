@@ -36,6 +36,7 @@ def certify(settings: CertifySettings) -> None:
         SafetyBroken: If a shielded state left S or its box, or a proof did not hold; with Gaussian noise, if episodes
             left S more often than the bound on their probability allows.
         ResultsError: If the stored counts are damaged.
+        ValueError: If there is no environment of the given id.
         CertificateError: If a certificate in the folder is damaged.
         OSError: If the folder cannot be written.
     """
@@ -46,11 +47,14 @@ def certify(settings: CertifySettings) -> None:
         shielded=not settings.unshielded,
         gaussian=settings.noise == "gaussian",
         delta=settings.delta,
+        env=settings.env,
     )
-    cases = attack_cases(campaign.seed, campaign.random_plants)
+    cases = attack_cases(campaign.seed, campaign.random_plants, campaign.env)
     cases = {name: case.with_delta(campaign.delta) for name, case in cases.items()}
     certificates = _certificate_files(cases, settings.out / "certificates")
     keys = {case: f"{campaign.key} {Certificate.load(file).checksum}" for case, file in certificates.items()}
+    if campaign.env is not None:  # what a module registers may change
+        keys = {case: f"{key} {cases[case].channel}" for case, key in keys.items()}
     store = CountsStore(settings.out / "tallies.jsonl", keys)
     least = len(SHIELD_MODES) if campaign.shielded else 1
     batches = _batches(list(cases), settings.steps / campaign.batch_steps, least)

@@ -92,6 +92,8 @@ class CertifySettings:
         noise: "truncated" is the worst noise within the bounds; "gaussian" noise has none: it is drawn, next to
             the worst of the other disturbances, and the bound on the probability of an exit is printed.
         delta: Level at which the certificates' ellipsoids hold for a draw of Gaussian noise, in place of the plants'.
+        env: Id of the only environment to attack, behind its own channel and, if it has no contract, every kind of
+            channel; module:id first imports the module, which registers one of your own. By default all of the above.
         seed: Seed of the campaign, >= 0.
     """
 
@@ -103,6 +105,7 @@ class CertifySettings:
     unshielded: bool = False
     noise: Literal["truncated", "gaussian"] = "truncated"
     delta: float | None = None
+    env: str | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:

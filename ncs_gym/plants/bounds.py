@@ -160,14 +160,15 @@ class HardBounds(ReadOnlyArrays):
         return max(float(np.linalg.eigvalsh(self.initial_noise.bound.shape)[-1]), 0.0)
 
     @cached_property
-    def initial_error(self) -> Ellipsoid:
-        """Holds the error of the first estimate, shape (n, n), with room for rounding.
-
-        r0^2 I, the ball of radius r0, plus `initial_bound`.
-        """
+    def nominal_initial_error(self) -> Ellipsoid:
+        """Holds the error of the first estimate before inflation, shape (n, n): the ball of r0 plus `initial_bound`."""
         ball = Ellipsoid(self.initial_radius_squared * np.eye(self.n))
-        nominal = _with_declared(ball, self.initial_bound, self.relative_weight)
-        return Ellipsoid(INFLATION * nominal.shape + self.estimate_rounding)
+        return _with_declared(ball, self.initial_bound, self.relative_weight)
+
+    @cached_property
+    def initial_error(self) -> Ellipsoid:
+        """Holds the error of the first estimate, shape (n, n), with room for rounding."""
+        return Ellipsoid(INFLATION * self.nominal_initial_error.shape + self.estimate_rounding)
 
     @cached_property
     def estimate_rounding(self) -> np.ndarray:

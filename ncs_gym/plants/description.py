@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import shown
+from ncs_gym.validation import as_setting, shown
 
 if TYPE_CHECKING:
     from ncs_gym.plants.linear_plant import LinearPlant
@@ -153,7 +153,9 @@ def read_plant(path: str | os.PathLike[str], kind: type[LinearPlant]) -> dict[st
     if (missing and "C" not in content) or unknown:
         wrong = f"it lacks {', '.join(missing)}" if missing else f"{shown(unknown)} are no arguments of LinearPlant"
         raise ValueError(f"{shown(path)} is not the file of a plant: {wrong}")
-    return {name: _from_json(value) for name, value in content.items()}
+    arguments = {name: _from_json(value) for name, value in content.items()}
+    box = as_setting(arguments.get("box"))
+    return arguments if box is None else arguments | {"box": box}  # an array: `save` wrote computed rows
 
 
 def _as_json(value: Any) -> Any:

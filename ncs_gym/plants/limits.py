@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 
-from ncs_gym.validation import LARGEST_NUMBER, SMALLEST_NUMBER, as_matrix, as_setting, as_vector, shown
+from ncs_gym.validation import LARGEST_NUMBER, SMALLEST_NUMBER, as_matrix, as_numbers, as_setting, as_vector, shown
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -89,12 +89,12 @@ class OperatingPoint:
             ValueError: If `of` is none of these, or the value no finite vector of its size.
         """
         center = self._operating_value(of)
-        return as_vector(value, len(center), f"the {of}") - center
+        return _as_point(value, len(center), f"the {of}") - center
 
     def from_deviation(self, value: ArrayLike, of: str = "state") -> np.ndarray:
         """Returns the physical state, input or output of a deviation; the inverse of `to_deviation`."""
         center = self._operating_value(of)
-        return as_vector(value, len(center), f"the {of}") + center
+        return _as_point(value, len(center), f"the {of}") + center
 
     def _operating_value(self, of: str) -> np.ndarray:
         values = {"state": self.operating_state, "input": self.operating_input, "output": self.H @ self.operating_state}
@@ -127,9 +127,23 @@ def as_box_rows(value: Any, n: int) -> np.ndarray:
                 f"everywhere, or rows of shape (any, {n}), got {shown(value)}"
             )
         rows = np.diag(1.0 / np.broadcast_to(numbers, (n,)))[np.broadcast_to(limited, (n,))]
+    if isinstance(value, (tuple, list)) and _reads_as_two_sides(rows):  # computed rows, an array, may be anything
+        raise ValueError(
+            "box looks like lower and upper limits, but must be half-widths, or rows c_j with |c_j x| <= 1: limits "
+            "that are not symmetric are given by LinearPlant.around(state_limits=(low, high), ...); if these are rows, "
+            f"change the sign of one, which leaves its limit as it is, got {shown(value)}"
+        )
     if (np.abs(rows).max(axis=1) < SMALLEST_NUMBER).any():
         raise ValueError(f"every row of box must limit something, got {shown(rows.tolist())}")
     return rows
+
+
+def _reads_as_two_sides(rows: np.ndarray) -> bool:
+    """Returns whether rows, shape (k, n), read as (low, high), or as a pair (low, high) per state."""
+    k, n = rows.shape
+    sides = (rows[0], rows[1]) if k == 2 else ()
+    pairs = (rows[:, 0], rows[:, 1]) if k == n == 2 else ()
+    return any(bool((low < 0.0).all() and (high > 0.0).all()) for low, high in (x for x in (sides, pairs) if x))
 
 
 def as_input_limits(value: Any, size: int) -> np.ndarray:
@@ -144,7 +158,10 @@ def as_input_limits(value: Any, size: int) -> np.ndarray:
         or limits.shape not in ((), (size,))
         or not ((limits >= SMALLEST_NUMBER) & (limits < LARGEST_NUMBER)).all()
     ):
-        raise ValueError(f"u_max must be a positive number or shape ({size},), got {shown(value)}")
+        raise ValueError(
+            f"u_max must be a positive number or shape ({size},), got {shown(value)}; limits that are not symmetric "
+            "are given by LinearPlant.around(input_limits=(low, high), ...)"
+        )
     return np.broadcast_to(limits, (size,)).copy()
 
 
@@ -154,7 +171,17 @@ def as_operating_point(value: Any, size: int, name: str) -> np.ndarray:
     Raises:
         ValueError: If it is no finite vector of this size.
     """
-    return np.zeros(size) if value is None else as_vector(value, size, name)
+    return np.zeros(size) if value is None else _as_point(value, size, name)
+
+
+def _as_point(value: Any, size: int, name: str) -> np.ndarray:
+    """Returns a vector, shape (size,); a number stands for a vector of one entry.
+
+    Raises:
+        ValueError: If it is no finite vector of this size.
+    """
+    numbers = as_numbers(value)
+    return as_vector([value] if size == 1 and numbers is not None and numbers.ndim == 0 else value, size, name)
 
 
 def _symmetric_limits(limits: Any, center: np.ndarray, name: str) -> np.ndarray:
@@ -227,8 +254,8 @@ def _arguments_around(
     A = as_matrix(A, (None, None), "A")
     A = as_matrix(A, (len(A), len(A)), "A")
     B = as_matrix(B, (len(A), None), "B")
-    state = as_vector(point[0], len(A), "operating_state")
-    applied = as_vector(point[1], B.shape[1], "operating_input")
+    state = _as_point(point[0], len(A), "operating_state")
+    applied = _as_point(point[1], B.shape[1], "operating_input")
     rest = {name: value for name, value in settings.items() if name != "offset"}
     offset = settings.get("offset")
     offset = np.zeros(len(A)) if offset is None else as_vector(offset, len(A), "offset")

@@ -48,7 +48,7 @@ def as_bound(value: Any, size: int, name: str) -> Ellipsoid:
     if sizes is None or sizes.ndim > 1:
         raise ValueError(
             f"{name} must be a number, half-widths of shape ({size},), an Ellipsoid(shape), or a pair (E, w) for "
-            f"d = E w, got {shown(value)}"
+            f"d = E w (a covariance has an argument of its own), got {shown(value)}"
         )
     widths = _as_sizes(value, size, name)
     return Ellipsoid(widths[0] ** 2 * np.eye(size)) if sizes.ndim == 0 else _around_box(np.eye(size), widths)

@@ -70,6 +70,12 @@ class Ellipsoid(ReadOnlyArrays):
         values = np.where(values > FLAT * max(values[-1], 0.0), values, 0.0)
         return scale, values, vectors
 
+    @cached_property
+    def _extended(self) -> np.ndarray:
+        """Which principal axes have a length, shape (n,); all of them for a single point, where it does not matter."""
+        _, values, _ = self._principal_axes
+        return (values > 0.0) | (not values.any())
+
     def support(self, direction: np.ndarray) -> np.ndarray | float:
         """Returns max of a'z over the ellipsoid for a direction a (n,), or for each row of (k, n)."""
         direction = np.asarray(direction, dtype=np.float64)
@@ -103,12 +109,15 @@ class Ellipsoid(ReadOnlyArrays):
 
     def sample(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
         """Returns a uniformly distributed point, shape (n,), or `count` of them, shape (count, n)."""
-        radius = rng.random(None if count is None else (count, 1)) ** (1.0 / self.dim)
+        radius = rng.random(None if count is None else (count, 1)) ** (1.0 / np.count_nonzero(self._extended))
         return self.sample_boundary(rng, count) * radius
 
     def sample_boundary(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
-        """Returns boundary points, shape (n,) or (count, n): images of uniform directions of the unit sphere."""
-        directions = rng.standard_normal(self.dim if count is None else (count, self.dim))
+        """Returns boundary points, shape (n,) or (count, n): images of uniform directions of the unit sphere.
+
+        Of a flat ellipsoid they lie on its own boundary, not inside it: the sphere has as many dimensions as it.
+        """
+        directions = rng.standard_normal(self.dim if count is None else (count, self.dim)) * self._extended
         return (directions / np.linalg.norm(directions, axis=-1, keepdims=True)) @ self.factor.T
 
     def outer_sum(self, other: Ellipsoid) -> Ellipsoid:

@@ -89,7 +89,7 @@ class SafeLoop:
             ValueError: If an argument is not finite or does not fit the plant; nothing has changed then.
         """
         n = self.filter.plant.n
-        mean = as_vector(x_hat0, n, "x_hat0")
+        mean = as_vector(x_hat0, n, f"x_hat0 = ({', '.join(self.filter.plant.state_names)})")
         if initial_set is not None and not isinstance(initial_set, Ellipsoid):
             initial_set = as_vector(initial_set, n, "initial_set")
         if isinstance(initial_set, Ellipsoid) and initial_set.dim != n:
@@ -116,6 +116,10 @@ class SafeLoop:
             RuntimeError: If `start` was not called, or nothing was decided since the last call.
             ValueError: If what is given is no packet for this plant; nothing has changed then.
         """
+        if isinstance(packets, Packet) or not isinstance(packets, Iterable):
+            raise ValueError(
+                f"packets must be a list of Packet(stamp, measurement), empty if nothing arrived, got {shown(packets)}"
+            )
         arrived = [_as_packet(each, self.filter.plant.p) for each in packets]
         phase = self._require_started()
         if phase is _Phase.RECEIVED:
@@ -207,7 +211,7 @@ class SafeLoop:
 
 
 def _as_packet(value: Any, size: int) -> Packet:
-    """Returns a packet with a measurement of its own, shape (size,).
+    """Returns a packet with a measurement of its own, shape (size,), which may be given as a number if size = 1.
 
     Raises:
         ValueError: If stamp or episode is no whole number, or the measurement is not numbers of that shape.
@@ -218,6 +222,8 @@ def _as_packet(value: Any, size: int) -> Packet:
         stamp, episode, numbers = index(stamp), index(episode), as_numbers(measurement)
     except (TypeError, ValueError):
         numbers = None
+    if numbers is not None and numbers.ndim == 0:
+        numbers = numbers.reshape(1)
     if numbers is None or numbers.shape != (size,):
         raise ValueError(
             f"a packet is Packet(stamp, measurement) or Packet(stamp, measurement, episode) with whole numbers and a "

@@ -76,7 +76,10 @@ def synthesize(
         description = _description(plant, certificate.L, float(volume)) | {"exact_conditions_hold": holds}
         return replace(certificate, provenance=certificate.provenance | description)
     if contract is not None and not isinstance(contract, ChannelContract):
-        raise ValueError(f"contract must be a ChannelContract or None, got {shown(contract)}")
+        raise ValueError(
+            "contract must be ChannelContract(max_age=...), or contract_of(channel) for a Channel that keeps one, or "
+            f"None, got {shown(contract)}"
+        )
     return _largest_certificate(plant, contract, progress or (lambda line: None))
 
 
@@ -114,8 +117,7 @@ def _largest_certificate(plant: LinearPlant, contract: ChannelContract | None, p
     try:
         problem, errors = design_problem(plant, contract)
     except Infeasible as infeasible:
-        progress("no error set: searching for bounds that have one")
-        raise with_feasible_bounds(infeasible, plant, contract) from infeasible
+        raise _with_hints(infeasible, plant, contract, progress) from infeasible
     failure, slack = None, 0.0
     reached: tuple[str, CandidateDesign | None] = "start", None
 
@@ -139,10 +141,21 @@ def _largest_certificate(plant: LinearPlant, contract: ChannelContract | None, p
         stage, design = reached
         best = design and _certificate(plant, problem, with_best_gain(problem, design), errors, slack)
         raise _interrupted(plant, stage, best) from interrupt
-    if failure is None:
-        progress("no certificate: searching for the bounds that have one")
-        failure = with_feasible_bounds(infeasibility(problem), plant, contract)
-    raise failure
+    raise failure or _with_hints(infeasibility(problem), plant, contract, progress)
+
+
+def _with_hints(
+    infeasible: Infeasible, plant: LinearPlant, contract: ChannelContract | None, progress: Progress
+) -> Infeasible:
+    """Returns the exception with the bounds that would be feasible.
+
+    Raises:
+        SynthesisInterrupted: A KeyboardInterrupt that says why there is no certificate.
+    """
+    try:
+        return with_feasible_bounds(infeasible, plant, contract, progress)
+    except KeyboardInterrupt as interrupt:
+        raise SynthesisInterrupted(f"interrupted while feasible bounds were sought: {infeasible}") from interrupt
 
 
 def _progress_text(stage: str, design: CandidateDesign | None) -> str:

@@ -121,7 +121,14 @@ def design_problem(plant: LinearPlant, contract: ChannelContract | None = None) 
     try:
         errors = _inflated(certified_error_set(plant, contract))
     except UnstablePlantError as error:
-        raise Infeasible(f"(E1) cannot hold: {error}", "E1", plant.spectral_radius - 1.0) from error
+        raise Infeasible(
+            "(E1) cannot hold: without packets the estimation error grows for ever, because the spectral radius of A "
+            f"is {plant.spectral_radius:.6g}, not below 1: give contract=ChannelContract(max_age=...), the age in "
+            "steps that the newest sample never exceeds (if A is that of a model in continuous time, make the plant "
+            "by LinearPlant.from_statespace)",
+            "E1",
+            plant.spectral_radius - 1.0,
+        ) from error
     except ErrorSetError as error:
         raise Infeasible(str(error), "E1", 0.0) from error
     shapes = errors.Sigma[None] if errors.ages is None else errors.ages.shapes[:-1]

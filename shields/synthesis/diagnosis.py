@@ -2,21 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
-from ncs_gym import ChannelContract, LinearPlant
+import numpy as np
+
+from ncs_gym import ChannelContract, Ellipsoid, LinearPlant
 from shields.errors import Infeasible
 from shields.synthesis.design_problem import DesignProblem, design_problem
 from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
 from shields.synthesis.max_margin_gain import max_margin_gain
 
-# The largest feasible gamma is sought down to this fraction of the given one, and to this ratio.
-_SMALLEST_GAMMA, _GAMMA_PRECISION = 1e-6, 1.02
+# What may be declared of the uncertainties. The largest feasible value of each is sought down to this fraction of the
+# given one, and to this ratio.
+_BOUNDS = (
+    "gamma",
+    "disturbance_bound",
+    "sensor_bound",
+    "initial_bound",
+    "process_noise_cov",
+    "measurement_noise_cov",
+    "initial_cov",
+)
+_SMALLEST_FACTOR, _FACTOR_PRECISION = 1e-6, 1.02
 
 
 def infeasibility(problem: DesignProblem) -> Infeasible:
     """Returns the exception that names the binding condition and the fraction of the radii that is feasible."""
     fraction = min(_margin(problem), 1.0)
+    if fraction == 0.0:
+        unstabilized = "(I) no gain was found that stabilizes the plant, whatever the bounds are"
+        return Infeasible(unstabilized, "I", 1.0, {"share_of_radii": 0.0})
     binding = "U" if _margin(problem, input_limits=False) >= 1.0 else "I"
     what = "(U) the input limits are too tight" if binding == "U" else "(I) no invariant ellipsoid in the box was found"
     return Infeasible(
@@ -27,32 +43,71 @@ def infeasibility(problem: DesignProblem) -> Infeasible:
     )
 
 
-def with_feasible_bounds(infeasible: Infeasible, plant: LinearPlant, contract: ChannelContract | None) -> Infeasible:
-    """Returns the exception with the largest feasible age, and the largest feasible gamma at the contract's age.
+def with_feasible_bounds(
+    infeasible: Infeasible,
+    plant: LinearPlant,
+    contract: ChannelContract | None,
+    progress: Callable[[str], object] = lambda line: None,
+) -> Infeasible:
+    """Returns the exception with the largest feasible max_age, and with that of each bound that the plant declares.
+
+    Each is changed alone, the others being as they are given.
 
     Args:
         infeasible: The exception without these figures.
         plant: The plant for which no certificate was found.
-        contract: The channel contract; without one the exception is returned as it is.
+        contract: The channel contract. An unstable plant without one, or that no gain stabilizes, and an unbounded safe
+            box have no feasible bounds: the exception is then returned as it is.
+        progress: Called with a line of text per figure that is sought.
     """
-    if contract is None or infeasible.binding == "S":
+    without_contract = contract is None and infeasible.binding == "E1"
+    if without_contract or infeasible.binding == "S" or infeasible.details.get("share_of_radii") == 0.0:
         return infeasible
-    hints, details = [str(infeasible)], dict(infeasible.details)
-    if contract.max_age > 0:
+    hints, details = [], dict(infeasible.details)
+    if contract is not None and contract.max_age > 0:
+        progress("no certificate: searching for a max_age that has one")
         age = _largest_age(plant, contract)
-        hints.append("no smaller max_age works either" if age is None else f"max_age = {age} is the largest that works")
+        hints.append("no smaller max_age works" if age is None else f"max_age = {age} is the largest that works")
         details |= {} if age is None else {"max_age": age}
-    if plant.gamma > 0.0:
-        gamma = _largest_gamma(plant, contract)
-        hints.append(
-            "no smaller gamma works either" if gamma is None else f"gamma = {gamma:.3g} is the largest that works"
-        )
-        details |= {} if gamma is None else {"largest_gamma": gamma}
-    message = f"{'; '.join(hints)} (asked: max_age = {contract.max_age}, gamma = {plant.gamma:g})"
-    return Infeasible(message, infeasible.binding, infeasible.shortfall, details)
+    for name in _BOUNDS:
+        if _is_declared(plant, name):
+            progress(f"no certificate: searching for a {name} that has one")
+            factor = _largest_factor(plant, name, contract)
+            hints.append(_hint(plant, name, factor))
+            details |= {} if factor is None else _figure(plant, name, factor)
+    changed = f"; each changed alone: {'; '.join(hints)}" if hints else ""
+    asked = "" if contract is None else f" (asked: max_age = {contract.max_age})"
+    return Infeasible(f"{infeasible}{changed}{asked}", infeasible.binding, infeasible.shortfall, details)
 
 
-def _is_feasible(plant: LinearPlant, contract: ChannelContract) -> bool:
+def _is_declared(plant: LinearPlant, name: str) -> bool:
+    """Returns whether the plant declares an uncertainty by this name that is not zero."""
+    value = getattr(plant, name)
+    return value is not None and bool(np.any(value.shape if isinstance(value, Ellipsoid) else value))
+
+
+def _hint(plant: LinearPlant, name: str, factor: float | None) -> str:
+    """Returns the largest feasible value of a bound in words, given its fraction of the declared one."""
+    if factor is None:
+        return f"no smaller {name} works"
+    largest = f"gamma = {factor * plant.gamma:.3g}" if name == "gamma" else f"{factor:.3g} times the given {name}"
+    given = f" (given: {plant.gamma:g})" if name == "gamma" else ""
+    return f"{largest} is the largest that works{given}"
+
+
+def _figure(plant: LinearPlant, name: str, factor: float) -> dict[str, float]:
+    """Returns the largest feasible value of a bound as it stands in the details of the exception."""
+    return {"largest_gamma": factor * plant.gamma} if name == "gamma" else {f"{name}_factor": factor}
+
+
+def _with_scaled(plant: LinearPlant, name: str, factor: float) -> LinearPlant:
+    """Returns the plant with one of its bounds multiplied: lengths of an ellipsoid, entries of anything else."""
+    value = getattr(plant, name)
+    scaled = Ellipsoid(factor**2 * value.shape) if isinstance(value, Ellipsoid) else factor * value
+    return replace(plant, **{name: scaled})
+
+
+def _is_feasible(plant: LinearPlant, contract: ChannelContract | None) -> bool:
     """Returns whether a gain is found that tolerates the plant's radii."""
     try:
         problem, _ = design_problem(plant, contract)
@@ -70,14 +125,14 @@ def _largest_age(plant: LinearPlant, contract: ChannelContract) -> int | None:
     return low if low >= 0 else None
 
 
-def _largest_gamma(plant: LinearPlant, contract: ChannelContract) -> float | None:
-    """Returns nearly the largest feasible gamma below the plant's; None if there is none above a millionth of it."""
-    low, high = _SMALLEST_GAMMA * plant.gamma, plant.gamma
-    if not _is_feasible(replace(plant, gamma=low), contract):
+def _largest_factor(plant: LinearPlant, name: str, contract: ChannelContract | None) -> float | None:
+    """Returns nearly the largest feasible fraction of a bound; None if there is none above a millionth."""
+    low, high = _SMALLEST_FACTOR, 1.0
+    if not _is_feasible(_with_scaled(plant, name, low), contract):
         return None
-    while high > _GAMMA_PRECISION * low:
+    while high > _FACTOR_PRECISION * low:
         middle = (low * high) ** 0.5
-        low, high = (middle, high) if _is_feasible(replace(plant, gamma=middle), contract) else (low, middle)
+        low, high = (middle, high) if _is_feasible(_with_scaled(plant, name, middle), contract) else (low, middle)
     return low
 
 

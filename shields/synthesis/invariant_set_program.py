@@ -13,8 +13,15 @@ from shields.verification import ACTION_ROUNDING
 class InvariantSetProgram:
     """Maximizes log det L over (L, K) for fixed multipliers, with X <= L Sigma^-1 L linearized at a given L0.
 
-    With F = K L the conditions (I), (U), (S) of theory.md section 3 are linear matrix inequalities. The program is
-    canonicalized once; multipliers and linearization are its parameters.
+    With F = K L, S >= F L^-1 F' and T_j >= F G_j (le X_j)^-1 G_j' F' for every error set E(G_j G_j'), X_j being
+    G_j' L Sigma_j^-1 L G_j, the conditions of theory.md section 3 are linear in (L, F, S, T_j) for fixed multipliers:
+
+        (I)  L - D_u/ld - (A L A' + A F' B' + B F A' + B S B')/lx - B T_j B' >= 0
+        (U)  S_ii/mu_i + le T_j,ii/(1 - mu_i) <= 1
+
+    So only matrices of n and of n + m rows have to be positive semidefinite, whatever the number of inputs. Inputs are
+    counted in units in which no column of B is longer than 1: limits so wide that they hardly count would spoil the
+    solver's accuracy. The program is canonicalized once; multipliers and linearization are its parameters.
 
     Args:
         problem: The scaled design problem.
@@ -26,41 +33,36 @@ class InvariantSetProgram:
         n, m = problem.n, problem.m
         self._problem, self._slack = problem, slack
         self._error_factors = list(np.linalg.cholesky((1.0 + slack) * problem.maximal_error_shapes))
+        self._unit = 1.0 / np.maximum(np.linalg.norm(problem.B, axis=0), 1.0)
         self._L, self._F = cp.Variable((n, n), symmetric=True), cp.Variable((m, n))
-        self._lx, self._mu = cp.Parameter(nonneg=True), cp.Parameter(m, nonneg=True)
+        self._S = cp.Variable((m, m), symmetric=True)
         self._D_u = cp.Parameter((n, n), symmetric=True)
-        # Slopes and offsets of the blocks le X and (1 - mu_i) X, in coordinates in which Sigma is the identity (a small
-        # Sigma would spoil the solver's accuracy). Each block has parameters of its own, because cvxpy allows no
-        # products of parameters.
-        self._slopes = [[cp.Parameter((n, n)) for _ in range(m + 1)] for _ in self._error_factors]
-        self._offsets = [[cp.Parameter((n, n), symmetric=True) for _ in range(m + 1)] for _ in self._error_factors]
+        self._by_state = cp.Parameter(nonneg=True)
+        self._by_mu, self._by_rest = cp.Parameter(m, nonneg=True), cp.Parameter(m, nonneg=True)
+        # Slope and offset of le X in coordinates in which Sigma is the identity (a small Sigma would spoil the solver's
+        # accuracy).
+        self._slopes = [cp.Parameter((n, n)) for _ in self._error_factors]
+        self._offsets = [cp.Parameter((n, n), symmetric=True) for _ in self._error_factors]
         self._program = cp.Problem(cp.Maximize(cp.log_det(self._L)), self._constraints())
 
     def _constraints(self) -> list[cp.Constraint]:
         """Returns (S), and (I) and (U) for every maximal error set, as linear matrix inequalities."""
-        problem, L = self._problem, self._L
-        constraints: list[cp.Constraint] = [cp.diag(problem.C @ L @ problem.C.T) <= 1.0 - self._slack]
-        for G, slopes, offsets in zip(self._error_factors, self._slopes, self._offsets, strict=True):
-            X = [G.T @ L @ slope + slope.T @ L @ G - offset for slope, offset in zip(slopes, offsets, strict=True)]
-            constraints += self._constraints_of_one_set(G, X)
-        return constraints
-
-    def _constraints_of_one_set(self, G: np.ndarray, X: list[cp.Expression]) -> list[cp.Constraint]:
-        """Returns (I) and (U) for the error set E(G G'), given the blocks le X and (1 - mu_i) X in its coordinates."""
-        problem, L, F = self._problem, self._L, self._F
-        zero = np.zeros((problem.n, problem.n))
-        closed_loop, error_input = problem.A @ L + problem.B @ F, problem.B @ F @ G
-        blocks = [
-            [L - self._D_u, closed_loop, error_input],
-            [closed_loop.T, self._lx * L, zero],
-            [error_input.T, zero, X[0]],
+        A, B, L, F, S = self._problem.A, self._problem.B * self._unit, self._L, self._F, self._S
+        cross = A @ F.T @ B.T
+        kept = L - self._D_u - self._by_state * (A @ L @ A.T + cross + cross.T + B @ S @ B.T)
+        limit = 1.0 - self._slack - 2.0 * float(ACTION_ROUNDING)
+        constraints: list[cp.Constraint] = [
+            cp.diag(self._problem.C @ L @ self._problem.C.T) <= 1.0 - self._slack,
+            cp.bmat([[S, F], [F.T, L]]) >> 0,
         ]
-        constraints: list[cp.Constraint] = [cp.bmat(blocks) >> 0]
-        limit = np.array([[1.0 - self._slack - 2.0 * float(ACTION_ROUNDING)]])
-        for i in range(problem.m):
-            row = F[i : i + 1, :]
-            blocks = [[limit, row, row @ G], [row.T, self._mu[i] * L, zero], [(row @ G).T, zero, X[i + 1]]]
-            constraints.append(cp.bmat(blocks) >> 0)
+        for G, slope, offset in zip(self._error_factors, self._slopes, self._offsets, strict=True):
+            T = cp.Variable(S.shape, symmetric=True)
+            X = G.T @ L @ slope + slope.T @ L @ G - offset
+            constraints += [
+                cp.bmat([[T, F @ G], [(F @ G).T, X]]) >> 0,
+                kept - B @ T @ B.T >> 0,
+                cp.multiply(self._by_mu, cp.diag(S)) + cp.multiply(self._by_rest, cp.diag(T)) <= limit,
+            ]
         return constraints
 
     def solve(
@@ -77,18 +79,17 @@ class InvariantSetProgram:
             linearize_at: The shape L0 at which X is linearized, (n, n).
         """
         lx, le, ld = multipliers
-        self._lx.value = lx * (1.0 - self._slack)
+        self._by_state.value = 1.0 / (lx * (1.0 - self._slack))
         self._D_u.value = self._problem.D_u * ((1.0 + self._slack) / ld)
-        self._mu.value = inputs
+        self._by_mu.value, self._by_rest.value = self._unit**2 / inputs, self._unit**2 * le / (1.0 - inputs)
         # With Sigma = G G' the linearized G'XG is G'L (Sigma^-1 L0 G) + its transpose - (G^-1 L0 G)'(G^-1 L0 G).
-        for G, slopes, offsets in zip(self._error_factors, self._slopes, self._offsets, strict=True):
+        for G, slope, offset in zip(self._error_factors, self._slopes, self._offsets, strict=True):
             inner = np.linalg.solve(G, linearize_at @ G)
-            slope, offset = np.linalg.solve(G.T, inner), inner.T @ inner
-            for factor, P, R in zip((le, *(1.0 - inputs)), slopes, offsets, strict=True):
-                P.value, R.value = factor * slope, 0.5 * factor * (offset + offset.T)
+            squared = inner.T @ inner
+            slope.value, offset.value = le * np.linalg.solve(G.T, inner), 0.5 * le * (squared + squared.T)
         if not is_solved(self._program):
             return None
-        L, F = value_of(self._L), value_of(self._F)
+        L, F = value_of(self._L), self._unit[:, None] * value_of(self._F)
         L = 0.5 * (L + L.T)
         sign, log_det = np.linalg.slogdet(L)
         if sign <= 0 or np.linalg.eigvalsh(L)[0] <= 0.0:

@@ -150,7 +150,7 @@ def test_more_exits_than_the_bound_allows_are_an_error():
 def small(monkeypatch):
     """A campaign of two cases."""
     chosen = {name: attack_cases(0, 1)[name] for name in (CRUISE, "TruckTrailer-v0, perfect")}
-    monkeypatch.setattr(command, "attack_cases", lambda seed, random_plants: chosen)
+    monkeypatch.setattr(command, "attack_cases", lambda seed, random_plants, env_id: chosen)
 
 
 def settings(out, **changes):

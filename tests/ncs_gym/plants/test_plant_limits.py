@@ -57,6 +57,20 @@ def test_limits_around_an_operating_point_become_the_largest_symmetric_ones():
     np.testing.assert_allclose(plant.to_deviation([0.0], "input"), [-10.0])
 
 
+def test_rows_that_are_computed_may_have_any_signs(tmp_path):
+    rows = np.array([[-1.0, -2.0], [1.0, 3.0]])
+    LinearPlant(**MODEL, box=rows).save(tmp_path / "plant.json")
+    np.testing.assert_array_equal(LinearPlant.load(tmp_path / "plant.json").C, rows)
+
+
+def test_a_number_stands_for_a_vector_of_one_entry():
+    limits = {"state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
+    plant = LinearPlant.around(**ROOM | {"operating_state": 20.0, "operating_input": 10.0}, **limits)
+    assert plant.fingerprint == LinearPlant.around(**ROOM, **limits).fingerprint
+    np.testing.assert_allclose(plant.to_deviation(21.5, "output"), [1.5])
+    np.testing.assert_allclose(plant.from_deviation(2.0, "input"), [12.0])
+
+
 def test_output_is_converted_by_the_output_matrix():
     plant = replace(LinearPlant.around(**ROOM, state_limits=(18, 25), input_limits=(0, 12)), H=[[2.0]])
     np.testing.assert_allclose(plant.to_deviation([41.0], "output"), [1.0])

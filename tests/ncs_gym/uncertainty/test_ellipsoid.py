@@ -53,6 +53,14 @@ def test_flat_ellipsoid_contains_only_its_plane():
     assert not point.contains([0.0, 1e-300])
 
 
+def test_samples_of_a_flat_ellipsoid_reach_its_boundary_and_fill_it_evenly():
+    rng, segment = np.random.default_rng(5), Ellipsoid(np.outer([1.0, 2.0], [1.0, 2.0]))
+    ends = segment.sample_boundary(rng, 50)
+    np.testing.assert_allclose(np.abs(ends), np.tile([1.0, 2.0], (50, 1)))
+    assert np.mean(np.abs(segment.sample(rng, 4000)[:, 0]) < 0.5) == pytest.approx(0.5, abs=0.03)
+    assert not Ellipsoid(np.zeros((2, 2))).sample(rng, 3).any()
+
+
 def test_points_off_a_flat_ellipsoid_have_no_gauge_in_whatever_direction_it_lies():
     rng = np.random.default_rng(4)
     for _ in range(20):

@@ -317,6 +317,27 @@ def test_what_the_caller_keeps_is_its_own():
     assert loop.guaranteed
 
 
+@pytest.mark.parametrize("packets", [None, Packet(1, np.zeros(2)), 0.5])
+def test_what_is_no_list_of_packets_is_refused_before_anything_moves(packets):
+    loop = started(channel=Channel())
+    loop.decide(0.0)
+    with pytest.raises(ValueError, match="packets must be a list of Packet"):
+        loop.receive(packets)
+    assert loop.steps == 0
+    assert loop.receive([]).shape == (2,)
+
+
+def test_measurement_of_one_output_may_be_a_number():
+    plant = truck_trailer(H=[[1.0, 0.0]])
+    loops = [SafeLoop(certificate_of(plant), plant, Channel()) for _ in range(2)]
+    for loop, measurement in zip(loops, (0.03, [0.03]), strict=True):
+        loop.start([0.0, 0.0])
+        loop.step(0.0)
+        loop.receive([Packet(1, measurement)])
+    np.testing.assert_array_equal(loops[0].estimate, loops[1].estimate)
+    assert loops[0].measurement_age == 0
+
+
 @pytest.mark.parametrize(
     "packet",
     [
@@ -436,8 +457,8 @@ def test_start_is_in_the_safe_set_only_if_estimate_or_set_say_so():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (([0.0],), "x_hat0 must have shape"),
-        (([np.nan, 0.0],), "x_hat0 must be finite"),
+        (([0.0],), r"x_hat0 = \(.*, .*\) must have shape"),
+        (([np.nan, 0.0],), r"x_hat0 = \(.*\) must be finite"),
         (([0.0, 0.0], [1.0]), "initial_set must have shape"),
         (([0.0, 0.0], Ellipsoid(np.eye(3))), "initial_set must have dimension 2"),
     ],

@@ -3,10 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ncs_gym import ChannelContract, batch_reactor, cart_pole
+from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, batch_reactor, cart_pole, truck_trailer
 from ncs_gym.plants.lqr import regulator_gain
 from ncs_gym.uncertainty.truncated_gaussian import chi2_quantile
 from shields import Infeasible, synthesize
+from shields.errors import SynthesisInterrupted
 from shields.synthesis.design_problem import design_problem
 from shields.synthesis.max_margin_gain import _GainSearch, _initial_points, max_margin_gain
 from tests.plants import random_plant
@@ -100,6 +101,60 @@ def test_largest_gamma_and_age_are_what_synthesis_accepts():
     assert max_margin_gain(problem, problem.covering_error_shape).margin >= 1.0
     problem, _ = design_problem(batch_reactor(), ChannelContract(age + 1, 1e-3))
     assert max_margin_gain(problem, problem.covering_error_shape).margin < 1.0 + 1e-4
+
+
+PENDULUM = {"A": [[1.1, 0.1], [0.1, 1.0]], "B": [[0.0], [0.1]], "box": [0.3, 1.0], "u_max": 5.0, "dt": 0.1}
+SMALL = {"disturbance_bound": [1e-4, 1e-3], "sensor_bound": 1e-3, "initial_bound": (np.eye(2), [1e-3, 1e-3])}
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("disturbance_bound", [0.05, 0.3]),
+        ("sensor_bound", 0.2),
+        ("initial_bound", (np.eye(2), [0.2, 0.2])),
+        ("process_noise_cov", 1e-3 * np.eye(2)),
+    ],
+)
+def test_message_names_what_was_declared_and_the_largest_factor_that_works(name, value):
+    plant = LinearPlant(**PENDULUM | SMALL | {name: value})
+    with pytest.raises(Infeasible, match=rf"{name} is the largest that works") as caught:
+        synthesize(plant, contract=ChannelContract(0))
+    assert "gamma" not in str(caught.value)
+    assert all(declared in str(caught.value) for declared in SMALL)
+    factor = caught.value.details[f"{name}_factor"]
+    assert f"{factor:.3g} times the given {name}" in str(caught.value)
+
+    def scaled(by):
+        size = value if name == "process_noise_cov" else getattr(plant, name)
+        return replace(plant, **{name: Ellipsoid(by**2 * size.shape) if isinstance(size, Ellipsoid) else by * size})
+
+    assert synthesize(scaled(0.98 * factor), contract=ChannelContract(0)) is not None
+    with pytest.raises(Infeasible):
+        synthesize(scaled(1.05 * factor), contract=ChannelContract(0))
+
+
+def test_bounds_of_a_stable_plant_are_named_without_a_contract_too():
+    plant = truck_trailer(gamma=0.0, disturbance_bound=2.0, process_noise_cov=np.zeros((2, 2)), sensor_bound=0.01)
+    with pytest.raises(Infeasible, match=r"times the given disturbance_bound is the largest.*no smaller sensor_bound"):
+        synthesize(plant)
+
+
+def test_plant_that_no_gain_stabilizes_is_not_blamed_on_its_bounds():
+    plant = LinearPlant(**PENDULUM | SMALL | {"A": [[1.1, 0.0], [0.0, 0.5]]})
+    with pytest.raises(Infeasible, match="no gain was found that stabilizes the plant") as caught:
+        synthesize(plant, contract=ChannelContract(0))
+    assert caught.value.details == {"share_of_radii": 0.0}
+
+
+def test_interrupted_search_for_feasible_bounds_says_why_there_is_no_certificate():
+    def progress(line):
+        if line.startswith("no certificate"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(SynthesisInterrupted, match=r"interrupted while feasible bounds were sought: \(I\)") as caught:
+        synthesize(truck_trailer(gamma=0.5), progress=progress)
+    assert caught.value.certificate is None
 
 
 def test_regulator_decays_as_fast_as_asked_for():

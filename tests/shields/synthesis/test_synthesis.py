@@ -1,4 +1,5 @@
 import pickle
+from dataclasses import replace
 
 import cvxpy as cp
 import gymnasium as gym
@@ -87,6 +88,12 @@ def test_units_do_not_change_what_is_found():
     )
     same = truck_trailer(mass=4000.0, gamma=0.0, process_noise_cov=2e-4 * np.eye(2), initial_cov=np.zeros((2, 2)))
     assert area_fraction(synthesize(plant), plant) == pytest.approx(area_fraction(synthesize(same), same), abs=2e-3)
+
+
+@pytest.mark.parametrize("u_max", [1e2, 1e4, 1e6])
+def test_input_limits_too_wide_to_bind_do_not_spoil_the_programs(u_max):
+    plant = replace(random_plant(3, 2, 1), u_max=u_max)
+    assert area_fraction(synthesize(plant), plant) > 0.9999
 
 
 def test_too_large_disturbance_is_infeasible_and_says_by_how_much():
