@@ -56,11 +56,16 @@ class ExtremalNoise(NCSEnv):
     Every other sample the noise points where the error points already, so that the filter goes on believing it.
     """
 
-    def _measure(self):
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self._process.measure = self._extreme_sample
+
+    def _extreme_sample(self, rng, state):
         bound = self.plant.sensor_noise.bound
-        stubborn = self.plant.H @ (self.estimator.belief.mean - self._state)
-        v = bound.extreme_point(stubborn) if self.np_random.random() < 0.5 else bound.sample_boundary(self.np_random)
-        return self.plant.H @ self._state + v
+        stubborn = self.plant.H @ (self.estimator.belief.mean - state)
+        v = bound.extreme_point(stubborn) if rng.random() < 0.5 else bound.sample_boundary(rng)
+        assert bound.gauge(v) > 0.999
+        return self.plant.H @ state + (1 - 1e-12) * v
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
