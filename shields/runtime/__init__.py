@@ -6,7 +6,8 @@ axis counts environments. `guarded_filter` is both for one control loop. `safe_l
 and `vector_wrapper` around Gymnasium environments.
 """
 
-from shields.runtime.filter import Decision, SafetyFilter
+from shields.runtime.decisions import Decision
+from shields.runtime.filter import SafetyFilter
 from shields.runtime.guarantee import GuaranteeMonitor, MonitorState
 from shields.runtime.safe_loop import SafeLoop
 from shields.runtime.vector_wrapper import VectorSafetyShield
