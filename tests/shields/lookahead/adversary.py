@@ -18,6 +18,7 @@ EDGES = {
     "longest gap each time": Channel(loss=1.0, max_consecutive_losses=3),
     "overtaking": Channel(loss=0.4, max_consecutive_losses=1, jitter=2),
 }
+OUTSIDE = "a state that is guaranteed lies outside the box"
 # Plant, horizon.
 STABLE = {
     "truck": (truck_trailer(), 3),
@@ -108,7 +109,7 @@ def attack(env: SafetyShield, policy_name: str, seed: int, episodes: int, steps:
             counts["stored"] += info["shield_plan_length"] == before - 1
             if held:
                 worst = info["constraint_values"].max()
-                assert worst <= 0.0
+                assert worst <= 0.0, OUTSIDE
                 counts["closest"] = max(counts["closest"], 1.0 + worst)
                 counts["outside S"] += not env.certificate.safe_set.contains(info["state"])
     return counts
