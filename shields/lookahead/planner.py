@@ -15,8 +15,6 @@ from shields.runtime.one_step_test import OneStepTest
 
 # A first input this close to the proposed one, in units of the limits, is tried as the proposed one itself.
 AS_PROPOSED = 1e-5
-# Solvers cannot be copied to another process; they are set up where they are used.
-_NOT_COPIED = {"_programs": {}}
 
 
 class Plan(NamedTuple):
@@ -32,7 +30,7 @@ class Plan(NamedTuple):
 
 
 class Planner:
-    """Finds certified plans: candidates first, then the convex program for some lengths (docs/lookahead.md).
+    """Finds certified plans: candidates first, then the convex program (docs/lookahead.md).
 
     Args:
         first: The one-step test.
@@ -50,10 +48,7 @@ class Planner:
         self._plant = first.plant
         braking = regulator(first.plant)
         self._gains = np.array([gain] if braking is None else [gain, braking])
-        self._programs: dict[int, PlanProgram] = {}
-
-    def __getstate__(self) -> dict:
-        return self.__dict__ | _NOT_COPIED
+        self._program = PlanProgram(self.test.prediction)
 
     def find(
         self, estimates: np.ndarray, shapes: np.ndarray, proposed: np.ndarray, stored: np.ndarray
@@ -69,13 +64,13 @@ class Planner:
         tightening = self.test.tightenings_of(shapes)
         candidates = self._candidates(estimates, proposed, stored)
         certified = self.test.certified(estimates, tightening, candidates)
-        plans: list[Plan | None] = []
-        for e, u in enumerate(proposed):
-            plan = _closest(candidates[e], certified[e], u)
-            if plan is None or plan.distance > 0.0:
-                alone = Tightening(*(part[e : e + 1] for part in tightening))
-                plan = self._solved(estimates[e : e + 1], alone, u, plan)
-            plans.append(plan)
+        plans = [_closest(*each) for each in zip(candidates, certified, proposed, strict=True)]
+        left = [e for e, plan in enumerate(plans) if plan is None or plan.distance > 0.0]
+        if left and self.horizon > 1:
+            some = Tightening(*(part[left] for part in tightening))
+            for e, plan in zip(left, self._solved(estimates[left], some, proposed[left]), strict=True):
+                if plan is not None:
+                    plans[e] = min(plan, plans[e] or plan, key=lambda each: each.distance)
         return plans
 
     def _candidates(self, estimates: np.ndarray, proposed: np.ndarray, stored: np.ndarray) -> np.ndarray:
@@ -88,44 +83,27 @@ class Planner:
         order = [*range(gains), 0, *range(gains)]  # each gain from the start
         return completed(self._plant, estimates, beginnings, self._gains[order])
 
-    def _solved(self, estimate: np.ndarray, tightening: Tightening, proposed: np.ndarray, best: Plan | None):
-        """Returns the closer of a plan and of those that the program finds, from short to long."""
-        box, radius = self.test.room(estimate, tightening)
-        for length in lengths(self.horizon):
-            if length not in self._programs:
-                self._programs[length] = PlanProgram(self.test.prediction, length)
-            program, end = self._programs[length], length - 1
-            turn = tightening.turn[0, end]
-            found = program.solve(estimate[0], box[0, :end], turn, float(radius[0, end]), proposed)
-            if found is None:
-                continue
-            plan = self._checked(estimate, tightening, proposed, found)
-            if plan is not None and (best is None or plan.distance < best.distance):
-                best = plan
-            if best is not None and best.distance == 0.0:
-                break
-        return best
+    def _solved(self, estimates: np.ndarray, tightening: Tightening, proposed: np.ndarray) -> list[Plan | None]:
+        """Returns what of the program's plans is certified, as inputs that can be applied.
 
-    def _checked(
-        self, estimate: np.ndarray, tightening: Tightening, proposed: np.ndarray, found: np.ndarray
-    ) -> Plan | None:
-        """Returns what of a solver's plan is certified, as inputs that can be applied."""
-        length, limits = len(found), self._plant.u_max
-        tried = np.zeros((1, 2, self.horizon, self._plant.m))
-        tried[0, :, :length] = expressible(found, limits)
-        if (np.abs(found[0] - proposed) <= AS_PROPOSED * limits).all():
-            tried[0, 0, 0] = proposed
-        certified = self.test.certified(estimate, tightening, tried)
-        certified[..., length:] = False
-        return _closest(tried[0], certified[0], proposed)
+        The program is solved for the whole horizon: on the registered plants that admits as much, and comes as close,
+        as every shorter length besides. Of its plan the shortest part that is certified counts.
 
-
-def lengths(horizon: int) -> list[int]:
-    """Returns the lengths that the program is tried with, the shorter first: half the horizon, and all of it.
-
-    On the registered plants that admits as much as every length from 2 to N, in a third of the time or less.
-    """
-    return [length for length in (horizon // 2, horizon) if length > 1]
+        Args:
+            estimates: x_hat, shape (E, n).
+            tightening: Of the error shapes of each.
+            proposed: Shape (E, m).
+        """
+        limits, (box, radius) = self._plant.u_max, self.test.room(estimates, tightening)
+        tried = np.full((len(estimates), 2, self.horizon, self._plant.m), np.nan)
+        for e, u in enumerate(proposed):
+            data = estimates[e], box[e, :-1], tightening.turn[e, -1], float(radius[e, -1]), u
+            if (found := self._program.solve(*data)) is not None:
+                tried[e] = expressible(found, limits)
+                if (np.abs(found[0] - u) <= AS_PROPOSED * limits).all():
+                    tried[e, 0, 0] = u
+        certified = self.test.certified(estimates, tightening, tried)
+        return [_closest(*each) for each in zip(tried, certified, proposed, strict=True)]
 
 
 def _closest(plans: np.ndarray, certified: np.ndarray, proposed: np.ndarray) -> Plan | None:

@@ -20,34 +20,36 @@ MOST_ITERATIONS = 60
 
 
 class PlanProgram:
-    """min |u_0 - proposed|^2 over plans of fixed length that pass the plan test: linear rows and one cone.
+    """min |u_0 - proposed|^2 over plans of N inputs that pass the plan test: linear rows and one cone.
 
-    Variables are the inputs in units of their limits. The solver is set up once, with a problem that only fixes the
-    scaling, so that a solution depends on its own data alone; then vectors and the entries of the cone are updated.
+    Variables are the inputs in units of their limits. The solver is set up once, with the pattern of the problem; then
+    vectors and the entries of the cone are updated, so that a solution depends on its own data alone.
 
     Args:
         prediction: Of the plant.
-        length: Number of inputs.
     """
 
-    def __init__(self, prediction: Prediction, length: int) -> None:
-        plant = prediction.plant
+    def __init__(self, prediction: Prediction) -> None:
+        plant, length = prediction.plant, prediction.steps
         self._n, self._m, self._length = plant.n, plant.m, length
-        self._limits = plant.u_max
+        self._limits, self._weights = plant.u_max, (plant.u_max / plant.u_max.max()) ** 2
         scale = np.tile(plant.u_max, length)
-        self._free = read_only(prediction.free[:length])
-        self._end = read_only(prediction.forced[length - 1, :, : len(scale)] * scale)
-        forced = prediction.forced[: length - 1, :, : len(scale)] * scale
+        self._free = prediction.free
+        self._end = read_only(prediction.forced[-1] * scale)
+        forced = prediction.forced[:-1] * scale
         rows = (plant.C @ forced).reshape(-1, len(scale))
         self._rows = read_only(np.concatenate([rows, -rows]))
         self._reserve = SOLVER_RESERVE + float(ACTION_ROUNDING) * np.abs(rows).sum(axis=1)
-        root = prediction.ends[length - 1].root
+        root = prediction.ends[-1].root
         self._end_reserve = SOLVER_RESERVE + float(ACTION_ROUNDING) * float(
             np.linalg.norm(root @ self._end, axis=0).sum()
         )
         self._C = plant.C
         self._arrange(root)
         self._solver: Any = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_solver": None}  # set up anew where it is used
 
     def _arrange(self, root: np.ndarray) -> None:
         """Fixes where the entries of the matrix are, those of the cone being what changes."""
@@ -68,11 +70,11 @@ class PlanProgram:
     def solve(
         self, estimate: np.ndarray, room: np.ndarray, turn: np.ndarray, radius: float, proposed: np.ndarray
     ) -> np.ndarray | None:
-        """Returns a plan, shape (length, m) [physical units], of which nothing is known; None if the solver fails.
+        """Returns a plan, shape (N, m) [physical units], of which nothing is known; None if the solver fails.
 
         Args:
             estimate: x_hat, shape (n,).
-            room: Largest |c_i c_j| for j = 1..length-1, shape (length-1, k).
+            room: Largest |c_i c_j| for j = 1..N-1, shape (N-1, k).
             turn: T G of the last step, shape (n, n).
             radius: Largest |T G c_j| of the last step.
             proposed: Shape (m,).
@@ -101,7 +103,7 @@ class PlanProgram:
         cone = np.concatenate([[radius - self._end_reserve], turn @ centers[-1]])
         b = np.concatenate([allowed - drift, allowed + drift, ones, cone])
         q = np.zeros(self._length * self._m)
-        q[: self._m] = -2.0 * self._limits * proposed
+        q[: self._m] = -2.0 * self._weights * proposed / self._limits
         self._entries[self._in_cone] = -(turn @ self._end).ravel()
         return self._entries[self._order], b, q
 
@@ -110,8 +112,11 @@ class PlanProgram:
         size, settings = self._length * self._m, _clarabel.DefaultSettings()
         settings.verbose, settings.presolve_enable, settings.max_iter = False, False, MOST_ITERATIONS
         settings.input_sparse_dropzeros = False
+        # Everything is in units of its limits already, and what is solved less precisely is tested as well.
+        settings.equilibrate_enable = settings.iterative_refinement_enable = False
+        settings.max_threads = 1
         P = np.zeros(size)
-        P[: self._m] = 2.0 * self._limits**2
+        P[: self._m] = 2.0 * self._weights
         count = len(self._rows) + 2 * size
         cones = [_clarabel.NonnegativeConeT(count), _clarabel.SecondOrderConeT(self._n + 1)]
         b = np.ones(count + self._n + 1)
