@@ -112,8 +112,8 @@ class PlanProgram:
         size, settings = self._length * self._m, _clarabel.DefaultSettings()
         settings.verbose, settings.presolve_enable, settings.max_iter = False, False, MOST_ITERATIONS
         settings.input_sparse_dropzeros = False
-        # Everything is in units of its limits already, and what is solved less precisely is tested as well.
-        settings.equilibrate_enable = settings.iterative_refinement_enable = False
+        # Everything is in units of its limits already.
+        settings.equilibrate_enable = False
         settings.max_threads = 1
         P = np.zeros(size)
         P[: self._m] = 2.0 * self._weights
