@@ -37,6 +37,7 @@ LAYERS = {
         {"certificate"},
         {"verification", "paper", "synthesis"},
         {"runtime"},
+        {"lookahead"},
     ),
     "agents": (
         {"settings", "results", "sb3_vec_env", "control_loop"},
@@ -59,6 +60,8 @@ APART = [
     ("shields.runtime", "shields.synthesis"),
     ("shields.runtime", "shields.paper"),
     ("shields.verification", "shields.synthesis"),
+    ("shields.lookahead", "shields.synthesis"),
+    ("shields.lookahead", "shields.paper"),
     ("ncs_gym.network", "ncs_gym.tasks"),
     ("ncs_gym.tasks", "ncs_gym.network"),
     ("ncs_gym.estimation", "ncs_gym.rendering"),
@@ -132,9 +135,9 @@ def test_no_modules_import_each_other():
     assert edges == {}
 
 
-def test_only_synthesis_and_paper_import_a_solver():
+def test_only_synthesis_paper_and_lookahead_import_a_solver():
     users = {path.parent.relative_to(ROOT).as_posix() for path in MODULES if imports_of(path, SOLVERS)}
-    assert users == {"shields/synthesis", "shields/paper"}
+    assert users == {"shields/synthesis", "shields/paper", "shields/lookahead"}
 
 
 def test_environment_and_shields_do_not_import_the_learners():
@@ -200,7 +203,7 @@ def test_files_and_functions_are_short():
 @pytest.mark.parametrize(
     ("module", "later"),
     [
-        ("shields", {"cvxpy", "torch", "matplotlib"}),
+        ("shields", {"cvxpy", "clarabel", "torch", "matplotlib"}),
         ("experiments.commands.compare", {"torch", "stable_baselines3"}),
         ("experiments.backends.worker_init", {"numpy", "gymnasium"}),
         ("experiments.__main__", {"numpy", "tyro"}),

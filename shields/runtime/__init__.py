@@ -1,12 +1,13 @@
 """The shield at run time: which inputs keep the next state safe, what is applied instead, and what is proved.
 
 `predicted_errors` and `one_step_test` decide whether an input passes, `projection` finds the closest one that does,
-`filter` makes the decision, and `guarantee` follows whether the proof of safety holds: written for arrays whose last
-axis counts environments. `guarded_filter` is both for one control loop. `safe_loop` puts it into a real loop, `wrapper`
-and `vector_wrapper` around Gymnasium environments.
+`filter` makes the decision (`decisions`: what it says), and `guarantee` follows whether the proof of safety holds:
+written for arrays whose last axis counts environments. `guarded_filter` is both for one control loop. `safe_loop` puts
+it into a real loop, `wrapper` and `vector_wrapper` around Gymnasium environments.
 """
 
-from shields.runtime.filter import Decision, SafetyFilter
+from shields.runtime.decisions import Decision
+from shields.runtime.filter import SafetyFilter
 from shields.runtime.guarantee import GuaranteeMonitor, MonitorState
 from shields.runtime.safe_loop import SafeLoop
 from shields.runtime.vector_wrapper import VectorSafetyShield

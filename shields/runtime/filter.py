@@ -4,49 +4,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ncs_gym import LinearPlant
-from ncs_gym.validation import ReadOnlyArrays, as_numbers, shown
+from ncs_gym.validation import ReadOnlyArrays, as_count, as_numbers, read_only, shown
 from shields.certificate import Certificate
+from shields.runtime.decisions import FALLBACK, INVALID, PROJECTED, REASONS, SAFE, UNSAFE, Decision
 from shields.runtime.one_step_test import MOST_INPUTS_WITH_VERTICES, OneStepTest, ReachableSets, require_computable
 from shields.runtime.predicted_errors import PredictedErrors, predicted_errors
 from shields.verification import ACTION_ROUNDING, require_valid
 
-MODES = ("project", "switch", "boundary", "monitor")
-REASONS = ("safe", "projected", "fallback", "unsafe", "invalid")
-SAFE, PROJECTED, FALLBACK, UNSAFE, INVALID = range(5)
+if TYPE_CHECKING:
+    from shields.lookahead import Lookahead
+
+MODES = ("project", "switch", "boundary", "monitor", "lookahead")
+# Longest plan of mode "lookahead", in steps, where none is given, and the longest there is.
+DEFAULT_HORIZON, LONGEST_HORIZON = 6, 50
 # The test must be passed by this much, in units of the safe set: far more than the rounding of its computation.
 MARGIN = 1e-9
 # Single error shapes that are remembered; they recur, since they depend only on what arrived when.
 MOST_REMEMBERED = 4096
 FLOAT64 = np.dtype(np.float64)
-
-
-class Decision(NamedTuple):
-    """What the shield decided; of many decisions, arrays whose last axis is the environment.
-
-    Attributes:
-        input: Input to apply, shape (m,), within the limits; u_max times a float32 action if not the proposed one.
-        intervened: Whether it differs from the proposed one; in mode "monitor": whether that of "switch" would.
-        passed: Whether it meets the one-step test, so that x+ is in S even if x is not.
-        fallback: Whether it is K x_hat, so that x+ is in S if x is and Sigma_k lies inside the certificate's Sigma.
-        margin: 1 - h - |A x_hat + B u|_M at the input to apply. Positive only if the test is met; the test is sharper
-            and admits some inputs for which this is slightly negative. NaN without a usable estimate.
-        reason: "safe" (passed as proposed), "projected", "fallback" (u = K x_hat), "unsafe" (applied as proposed by
-            "monitor"), or "invalid" (what was proposed is no input within the limits, or estimate or error shape is
-            unusable: u = K x_hat, zero without a usable estimate, in "monitor" what was proposed if it is an input).
-            Of many decisions, indices of `REASONS`.
-    """
-
-    input: np.ndarray
-    intervened: Any
-    passed: Any
-    fallback: Any
-    margin: Any
-    reason: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,20 +42,28 @@ class SafetyFilter(ReadOnlyArrays):
         mode: What becomes of an input that does not pass: "project" applies the closest one that does (Euclidean
             distance in physical units, to within float32), "switch" (and "project" if there is none) K x_hat.
             "boundary" applies K x_hat unless *every* input within the limits passes. "monitor" applies what is
-            proposed and says whether "switch" would have; it protects nothing.
+            proposed and says whether "switch" would have; it protects nothing. "lookahead" lets an input pass after
+            which a certified plan keeps the state in the box until it is in S, and stores that plan
+            (docs/lookahead.md).
+        horizon: Longest plan of mode "lookahead", in steps; None is 6. Other modes take none.
 
     Attributes:
         test: The one-step test.
+        lookahead: What is special about mode "lookahead"; None in others.
 
     Raises:
         CertificateError: If the certificate does not verify for the plant, or float64 is too coarse for it.
-        ValueError: If the mode is unknown, or "boundary" for more than twelve inputs.
+        ValueError: If the mode is unknown, or "boundary" for more than twelve inputs, or the horizon is no whole number
+            from 1 to 50 or given for another mode than "lookahead".
     """
 
     certificate: Certificate
     plant: LinearPlant
     mode: str = "project"
+    horizon: int | None = None
     test: OneStepTest = field(init=False, repr=False)
+    lookahead: Lookahead | None = field(init=False, repr=False)
+    _no_plan: np.ndarray = field(init=False, repr=False)
     _remembered: dict[bytes, PredictedErrors] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -89,7 +77,26 @@ class SafetyFilter(ReadOnlyArrays):
         require_valid(self.certificate, self.plant)
         require_computable(self.certificate, self.plant)
         object.__setattr__(self, "test", OneStepTest(self.certificate.L, self.plant))
+        object.__setattr__(self, "_no_plan", read_only(np.empty((0, self.plant.m))))
+        object.__setattr__(self, "lookahead", self._lookahead())
         object.__setattr__(self, "_remembered", {})
+
+    def _lookahead(self) -> Lookahead | None:
+        """Returns what mode "lookahead" needs, with the default horizon if none is given; None in other modes.
+
+        Raises:
+            ValueError: If the horizon is wrong, or given for another mode.
+        """
+        if self.mode != "lookahead":
+            if self.horizon is not None:
+                raise ValueError(f'horizon is for mode "lookahead", mode {self.mode!r} takes none')
+            return None
+        from shields.lookahead import Lookahead  # the solver, which other modes do without
+
+        given = DEFAULT_HORIZON if self.horizon is None else self.horizon
+        horizon = as_count(given, "horizon", low=1, high=LONGEST_HORIZON)
+        object.__setattr__(self, "horizon", horizon)
+        return Lookahead(self.test, self.certificate.K, horizon, MARGIN)
 
     @cached_property
     def reserve(self) -> float:
@@ -97,17 +104,24 @@ class SafetyFilter(ReadOnlyArrays):
         effect = float(np.linalg.norm(self.test.effect, axis=0) @ self.plant.u_max)
         return 2.0 * MARGIN + float(ACTION_ROUNDING) * effect
 
-    def decide(self, estimate: np.ndarray, error_shape: np.ndarray, input_proposed: np.ndarray) -> Decision:
+    def decide(
+        self, estimate: np.ndarray, error_shape: np.ndarray, input_proposed: np.ndarray, stored: Any = ()
+    ) -> Decision:
         """Returns the input to apply; never raises.
 
         Args:
             estimate: x_hat, shape (n,), float64.
             error_shape: Sigma_k, shape (n, n): x_hat - x lies in E(Sigma_k).
             input_proposed: Shape (m,) [physical units]; the very float64 value that would be applied.
+            stored: In mode "lookahead" the `plan` of the last decision, shape (k, m), if its input was applied and one
+                step has passed since. What is no plan of at most `horizon` inputs within the limits counts as none.
         """
-        return self.decide_knowing(_as_array(estimate), self.errors_of(error_shape), _as_array(input_proposed))
+        known = _as_array(estimate), self.errors_of(error_shape), _as_array(input_proposed)
+        return self.decide_knowing(*known, stored)
 
-    def decide_knowing(self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray) -> Decision:
+    def decide_knowing(
+        self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray, stored: Any = ()
+    ) -> Decision:
         """Returns what `decide` does, given `errors_of` the error shape."""
         if (estimate.shape, proposed.shape) == self.test.single and self.mode != "boundary":
             try:
@@ -117,9 +131,12 @@ class SafetyFilter(ReadOnlyArrays):
             if decision is not None:
                 return decision
         n, m = self.plant.n, self.plant.m
-        decided = self.decide_many(_as_column(estimate, n), errors.batch(), _as_column(proposed, m))
+        plans = None if self.lookahead is None else self.lookahead.as_stored(stored)[..., None]
+        decided = self.decide_many(_as_column(estimate, n), errors.batch(), _as_column(proposed, m), plans)
         one = Decision(*(array[..., 0].tolist() for array in decided))
-        return one._replace(input=np.array(one.input), reason=REASONS[one.reason])
+        plan = decided.plan[..., 0]
+        plan = plan[~np.isnan(plan[:, 0])] if len(plan) else self._no_plan
+        return one._replace(input=np.array(one.input), reason=REASONS[one.reason], plan=plan)
 
     def _decide_single(self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray) -> Decision | None:
         """Returns the decision in the common cases: an input that passes, and a single input that is projected."""
@@ -129,21 +146,26 @@ class SafetyFilter(ReadOnlyArrays):
             return None
         slack, margin = alone.slack(proposed)
         if slack >= MARGIN:
-            return Decision(proposed.copy(), False, True, False, margin, REASONS[SAFE])
+            return Decision(proposed.copy(), False, True, False, margin, REASONS[SAFE], self._no_plan)
         if self.mode != "project" or self.plant.m > 1:
             return None
         closest = self._expressible(alone.closest(proposed, self.reserve))
         slack, margin = alone.slack(closest)
-        return Decision(closest, True, True, False, margin, REASONS[PROJECTED]) if slack >= MARGIN else None
+        if not slack >= MARGIN:  # neither NaN
+            return None
+        return Decision(closest, True, True, False, margin, REASONS[PROJECTED], self._no_plan)
 
     @np.errstate(all="ignore")  # what is not finite passes no test
-    def decide_many(self, estimates: np.ndarray, errors: PredictedErrors, proposed: np.ndarray) -> Decision:
+    def decide_many(
+        self, estimates: np.ndarray, errors: PredictedErrors, proposed: np.ndarray, stored: np.ndarray | None = None
+    ) -> Decision:
         """Returns the inputs to apply in N environments, and what `Decision` says about them, as new arrays.
 
         Args:
             estimates: x_hat, shape (n, N).
             errors: What is known of the Sigma_k of each.
             proposed: Shape (m, N) [physical units].
+            stored: In mode "lookahead" the `plan` of the last decisions, shape (horizon, m, N); None for none.
         """
         sets = self.test.reachable(estimates, errors)
         slack, margin = sets.slack(proposed)
@@ -151,11 +173,22 @@ class SafetyFilter(ReadOnlyArrays):
         valid = np.all(np.abs(proposed) <= self.plant.u_max[:, None], axis=0)
         passed = (judged >= MARGIN) & valid
         fallback, reason = np.zeros(len(passed), np.bool_), np.zeros(len(passed), np.int64)
-        decided = Decision(proposed.copy(), ~passed, passed, fallback, margin, reason)
-        if self.mode == "project":
+        plan = np.full((self.horizon or 0, *proposed.shape), np.nan)
+        decided = Decision(proposed.copy(), ~passed, passed, fallback, margin, reason, plan, fallback.copy())
+        if self.mode in ("project", "lookahead"):
             self._project(decided, np.flatnonzero(~passed & valid), sets)
         self._fall_back(decided, np.flatnonzero(~decided.passed), sets, estimates, valid)
+        if self.lookahead is not None:
+            stored = plan.copy() if stored is None else stored
+            self.lookahead.complete(decided, estimates, errors, proposed, stored)
         return decided
+
+    def first_plan(self, estimate: np.ndarray, errors: PredictedErrors) -> np.ndarray:
+        """Returns a certified plan that may be stored before the first decision, shape (k, m); empty without one."""
+        if self.lookahead is None:
+            return self._no_plan
+        first = self.decide_knowing(estimate, errors, self._gained(_as_column(estimate, self.plant.n))[:, 0])
+        return np.concatenate([first.input[None], first.plan]) if first.passed else self._no_plan
 
     def errors_of(self, error_shape: Any) -> PredictedErrors:
         """Returns what is known of one error shape, (n, n), without a last axis; remembered, since shapes recur."""

@@ -6,13 +6,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ncs_gym import Ellipsoid
+from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.plants.linear_plant import SIMULATED_REACH
 from shields.certificate import Certificate
-from shields.runtime.filter import MARGIN, Decision, SafetyFilter
+from shields.runtime.decisions import Decision
+from shields.runtime.filter import MARGIN, SafetyFilter
 from shields.runtime.one_step_test import FARTHEST
 from shields.runtime.predicted_errors import PredictedErrors
-from shields.verification.rational_matrix import is_positive_semidefinite, rational, subtract
+from shields.verification.rational_matrix import (
+    is_positive_semidefinite,
+    multiply,
+    quadratic,
+    rational,
+    subtract,
+    transpose,
+)
 
 ALARM = "a measurement contradicts the assumed bounds"
 OTHER_INPUT = "the input applied is not the one decided"
@@ -34,7 +42,8 @@ class MonitorState(NamedTuple):
 
     Attributes:
         broken: Code of what broke the proof for the rest of the episode; 0 for nothing.
-        inside: Whether x in S is proved, up to what broke.
+        inside: Whether x in S is proved, up to what broke; in mode "lookahead" also if x is proved in the box and the
+            inputs stored are what is left of a certified plan.
         certified: Whether the error ellipsoid lies inside a certified one.
     """
 
@@ -57,8 +66,23 @@ class Report(NamedTuple):
     alarm: Any
 
 
+class StartKnown(NamedTuple):
+    """What is known of the start of an episode before any estimate.
+
+    Attributes:
+        in_safe_set: Whether every possible start lies in S.
+        in_box: Whether every possible start lies in the safe box.
+    """
+
+    in_safe_set: bool
+    in_box: bool
+
+
 class GuaranteeMonitor:
     """Whether x in S is proved now, and why not (docs/shield.md, "How you see that an assumption broke").
+
+    In mode "lookahead" it is whether x is in the box now and stays there: "in S, or in the box with a certified tail
+    stored". Whoever hands the store from decision to decision drops it where the input applied is another one.
 
     An alarm of the innovation monitor, an input other than the decided one, a step that is not one step and an estimate
     so far out that rounding counts break the error bound for the rest of the episode. The others are recoverable: a
@@ -77,7 +101,8 @@ class GuaranteeMonitor:
         """Returns the state at the start of an episode.
 
         Args:
-            known_inside: Whether every possible start lies in S (`starts_inside`).
+            known_inside: Whether every possible start lies in S (`starts_inside`), or in the box with a certified plan
+                stored.
             unmoved: Whether the environment has not moved since.
             report: What is observed.
         """
@@ -95,7 +120,8 @@ class GuaranteeMonitor:
             same_input: Whether the input applied is the one decided.
             report: What is observed after the step.
         """
-        carried = state.inside & state.certified & decision.fallback
+        # A stored plan was certified for every error that it can meet: it needs no certified error set on its way.
+        carried = state.inside & (state.certified & decision.fallback | decision.stored)
         broken = _first(state.broken, moved_once == False, OTHER_STEPS)  # noqa: E712
         broken = _first(broken, same_input == False, OTHER_INPUT)  # noqa: E712
         return self._observe(broken, decision.passed | carried, report)
@@ -140,6 +166,14 @@ def _first(broken: Any, condition: Any, explanation: str) -> Any:
     return broken + (broken == 0) * condition * CODES[explanation]
 
 
+def start_known(safety_filter: SafetyFilter, initial: Ellipsoid | np.ndarray | None) -> StartKnown:
+    """Returns what is known of starts in an ellipsoid E(P), of one state, shape (n,), or of any (None)."""
+    if initial is None:
+        return StartKnown(False, False)
+    inside = starts_inside(safety_filter.certificate, initial)
+    return StartKnown(inside, inside or starts_in_box(safety_filter.plant, initial))
+
+
 def starts_inside(certificate: Certificate, initial: Ellipsoid | np.ndarray) -> bool:
     """Returns whether all possible starts lie in S, decided in exact arithmetic.
 
@@ -154,3 +188,17 @@ def starts_inside(certificate: Certificate, initial: Ellipsoid | np.ndarray) -> 
     state = rational(initial)[0]
     one = rational(np.ones(1))[0]
     return is_positive_semidefinite([one + state] + [[x, *row] for x, row in zip(state, L, strict=True)])
+
+
+def starts_in_box(plant: LinearPlant, initial: Ellipsoid | np.ndarray) -> bool:
+    """Returns whether all possible starts lie in the safe box, decided in exact arithmetic.
+
+    Args:
+        plant: Gives the rows c_i.
+        initial: An ellipsoid E(P), in the box exactly if c_i P c_i' <= 1 for all rows; or a single state, shape (n,).
+    """
+    rows = rational(plant.C)
+    if isinstance(initial, Ellipsoid):
+        shape = rational(initial.shape)
+        return all(quadratic([row], shape) <= 1 for row in rows)
+    return all(abs(product) <= 1 for (product,) in multiply(rows, transpose(rational(initial))))

@@ -6,12 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from shields.runtime.filter import Decision, SafetyFilter
-from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, MonitorState, Report
+from shields.runtime.decisions import Decision
+from shields.runtime.filter import MARGIN, SafetyFilter
+from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, MonitorState, Report, StartKnown
+from shields.runtime.predicted_errors import PredictedErrors
 
 
 class GuardedFilter:
-    """Decides the inputs of one control loop and follows whether they prove that its state stays in S.
+    """Decides the inputs of one control loop and follows whether they prove that its state stays in S, or in the box.
+
+    In mode "lookahead" the stored plan is kept here from decision to decision.
 
     Every step is one `decide` and then one `advance`. Nothing here knows where estimates come from.
 
@@ -31,15 +35,24 @@ class GuardedFilter:
         self._state: MonitorState
         self._decision: Decision
         self.decided: list[float] = []
+        self._stored: np.ndarray
 
-    def begin(self, report: Report, known_inside: bool, unmoved: bool = True) -> None:
-        """Begins an episode; the arguments are those of `GuaranteeMonitor.start`."""
+    def begin(self, report: Report, known: StartKnown, unmoved: bool = True) -> None:
+        """Begins an episode.
+
+        Args:
+            report: What is observed.
+            known: What is known of the start.
+            unmoved: Whether the plant has not moved since.
+        """
         self.report = report
-        self._state = self._monitor.start(known_inside, unmoved, report)
+        self._stored, is_safe = first_store(self.filter, report.estimate, report.errors, known)
+        self._state = self._monitor.start(is_safe, unmoved, report)
 
     def decide(self, proposed: np.ndarray) -> Decision:
         """Returns the decision about a proposed input, shape (m,), at the estimate reported last; never raises."""
-        self._decision = self.filter.decide_knowing(self.report.estimate, self.report.errors, proposed)
+        self._decision = self.filter.decide_knowing(self.report.estimate, self.report.errors, proposed, self._stored)
+        self._stored = self._decision.plan.copy() if len(self._decision.plan) else self._decision.plan
         self.decided = self._decision.input.tolist()  # the caller may write into the array
         return self._decision
 
@@ -52,6 +65,8 @@ class GuardedFilter:
             report: What is observed after the step.
         """
         same_input = applied is not None and applied.tolist() == self.decided
+        if not (moved_once and same_input):  # what is stored was certified for other states
+            self._stored = self._stored[:0]
         self._state = self._monitor.advance(self._state, self._decision, moved_once, same_input, report)
         self.report = report
 
@@ -60,6 +75,32 @@ class GuardedFilter:
         return Report(estimate, self.filter.errors_of(error_shape), alarm)
 
     @property
+    def plan_length(self) -> int:
+        """Number of inputs stored for the steps to come."""
+        return len(self._stored)
+
+    @property
     def reason(self) -> str:
-        """Why the state is not proved to be in S now; empty while it is."""
+        """Why the state is not proved safe now; empty while it is."""
         return EXPLANATIONS[self._monitor.reasons(self._state)]
+
+
+def first_store(
+    safety_filter: SafetyFilter, estimate: np.ndarray, errors: PredictedErrors, known: StartKnown
+) -> tuple[np.ndarray, bool]:
+    """Returns what is stored before the first decision, shape (k, m), and whether the start is proved safe.
+
+    It is where it is known to be in S; in mode "lookahead" also where it is known to be in the box, by what starts are
+    possible or by the estimate, and a first plan is certified.
+
+    Args:
+        safety_filter: Decides.
+        estimate: x_hat_0, shape (n,).
+        errors: What is known of Sigma_0.
+        known: What is known of the start.
+    """
+    lookahead = safety_filter.lookahead
+    if lookahead is None or known.in_safe_set or safety_filter.test.knows_inside(estimate, errors, MARGIN):
+        return np.empty((0, safety_filter.plant.m)), known.in_safe_set
+    plan = safety_filter.first_plan(estimate, errors)
+    return plan, len(plan) > 0 and (known.in_box or lookahead.knows_in_box(estimate, errors))

@@ -26,6 +26,7 @@ class PredictedErrors(NamedTuple):
         half_widths: Largest error of each state, shape (n, k); NaN for an unusable shape.
         largest: Bound of the largest error norm, sqrt(lambda_max(M Sigma_k)), shape (k,); NaN for an unusable shape.
         certified: Whether E(Sigma_k) lies inside a certified error set, shape (k,).
+        shape: Sigma_k itself, shape (n, n, k).
     """
 
     turn: np.ndarray
@@ -33,6 +34,7 @@ class PredictedErrors(NamedTuple):
     half_widths: np.ndarray
     largest: Any
     certified: Any
+    shape: np.ndarray
 
     def of(self, numbers: np.ndarray) -> PredictedErrors:
         """Returns those of environments that have the shapes with these numbers, shape (N,)."""
@@ -40,8 +42,9 @@ class PredictedErrors(NamedTuple):
 
     def single(self) -> PredictedErrors:
         """Returns the first without a last axis."""
-        turn, half_widths = self.turn[..., 0].copy(), self.half_widths[..., 0].copy()
-        return PredictedErrors(turn, self.radius.item(0), half_widths, self.largest.item(0), self.certified.item(0))
+        turn, half_widths, shape = (array[..., 0].copy() for array in (self.turn, self.half_widths, self.shape))
+        radius, largest, certified = (array.item(0) for array in (self.radius, self.largest, self.certified))
+        return PredictedErrors(turn, radius, half_widths, largest, certified, shape)
 
     def batch(self) -> PredictedErrors:
         """Returns a single one as a batch of one."""
@@ -91,6 +94,7 @@ def predicted_errors(test: OneStepTest, shapes: np.ndarray, certified_shapes: np
         half_widths=np.ascontiguousarray((half_widths + unusable[:, None]).T),
         largest=np.sqrt(np.maximum(own, 0.0)) + unusable,
         certified=np.array(inside, np.bool_) & usable,
+        shape=np.ascontiguousarray(shapes.transpose(1, 2, 0)),
     )
 
 

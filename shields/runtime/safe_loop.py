@@ -13,8 +13,9 @@ from ncs_gym import Channel, Ellipsoid, Estimator, LinearPlant, Packet
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
 from ncs_gym.validation import as_numbers, as_vector, shown
 from shields.certificate import Certificate
-from shields.runtime.filter import Decision, SafetyFilter
-from shields.runtime.guarantee import Report, starts_inside
+from shields.runtime.decisions import Decision
+from shields.runtime.filter import SafetyFilter
+from shields.runtime.guarantee import Report, start_known
 from shields.runtime.guarded_filter import GuardedFilter
 
 NOT_STARTED = "no episode is under way: call start"
@@ -54,7 +55,8 @@ class SafeLoop:
         certificate: Verified exactly here.
         plant: The plant it was made for.
         channel: Its longest delay (older packets are discarded) and quantization step count, its losses do not.
-        mode: "project", "switch", "boundary" or "monitor"; see `SafetyFilter`.
+        mode: "project", "lookahead", "switch", "boundary" or "monitor"; see `SafetyFilter`.
+        horizon: Longest plan of mode "lookahead", in steps; see `SafetyFilter`.
 
     Attributes:
         filter: Makes the decisions.
@@ -66,8 +68,15 @@ class SafeLoop:
         ValueError: If a setting is of the wrong kind, or the channel rounds more coarsely than the contract allows.
     """
 
-    def __init__(self, certificate: Certificate, plant: LinearPlant, channel: Channel, mode: str = "project") -> None:
-        self.filter = SafetyFilter(certificate, plant, mode)
+    def __init__(
+        self,
+        certificate: Certificate,
+        plant: LinearPlant,
+        channel: Channel,
+        mode: str = "project",
+        horizon: int | None = None,
+    ) -> None:
+        self.filter = SafetyFilter(certificate, plant, mode, horizon)
         if not isinstance(channel, Channel):
             raise ValueError(f"channel must be a Channel (its contract is the certificate's), got {shown(channel)}")
         self.contract = None if certificate.ages is None else certificate.ages.sets.contract
@@ -81,7 +90,7 @@ class SafeLoop:
         Args:
             x_hat0: First estimate, shape (n,), whose error lies in `plant.initial_error`.
             initial_set: What the state is known to lie in besides, an ellipsoid or the state itself, shape (n,). It
-                counts where x_hat0 alone does not prove that the state is in S.
+                counts where x_hat0 alone does not prove that the state is in S (in mode "lookahead": in the box).
 
         Packets of earlier episodes are discarded from now on: `episode` is the number of the new one.
 
@@ -94,7 +103,7 @@ class SafeLoop:
             initial_set = as_vector(initial_set, n, "initial_set")
         if isinstance(initial_set, Ellipsoid) and initial_set.dim != n:
             raise ValueError(f"initial_set must have dimension {n}, got {initial_set.dim}")
-        known = initial_set is not None and starts_inside(self.filter.certificate, initial_set)
+        known = start_known(self.filter, initial_set)
         self._phase = _Phase.STOPPED
         self._estimator.reset(mean)
         self._guarded.begin(self._report(), known)
@@ -156,13 +165,18 @@ class SafeLoop:
 
     @property
     def guaranteed(self) -> bool:
-        """Whether the state is proved to be in S at this control step."""
+        """Whether the state is proved to be in S at this control step; in mode "lookahead": to stay in the box."""
         return not self.reason
 
     @property
     def reason(self) -> str:
         """Why it is not; empty while it is."""
         return NOT_STARTED if self._phase is _Phase.STOPPED else self._guarded.reason
+
+    @property
+    def plan_length(self) -> int:
+        """Number of inputs stored for the steps after this decision; 0 in other modes than "lookahead"."""
+        return 0 if self._phase is _Phase.STOPPED else self._guarded.plan_length
 
     @property
     def estimate(self) -> np.ndarray:

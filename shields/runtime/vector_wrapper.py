@@ -12,7 +12,8 @@ from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.validation import as_number, as_numbers, shown
 from shields.certificate import Certificate
-from shields.runtime.filter import Decision, SafetyFilter
+from shields.runtime.decisions import Decision
+from shields.runtime.filter import SafetyFilter
 from shields.runtime.guarantee import (
     CODES,
     EXPLANATIONS,
@@ -20,8 +21,9 @@ from shields.runtime.guarantee import (
     GuaranteeMonitor,
     MonitorState,
     Report,
-    starts_inside,
+    start_known,
 )
+from shields.runtime.guarded_filter import first_store
 from shields.runtime.one_step_test import norms
 from shields.runtime.wrapper import certificate_for, environment_behind, hint_for
 
@@ -46,8 +48,9 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
     Args:
         env: An `NCSVectorEnv`, possibly wrapped; not by wrappers that change actions.
         certificate: None synthesizes one for the environment's plant and contract, once per process.
-        mode: "project", "switch", "boundary" or "monitor"; see `SafetyFilter`.
+        mode: "project", "lookahead", "switch", "boundary" or "monitor"; see `SafetyFilter`.
         penalty: Subtracted from the reward per intervention counted, >= 0.
+        horizon: Longest plan of mode "lookahead", in steps; see `SafetyFilter`.
 
     Raises:
         CertificateError: If the certificate does not verify for the environment's plant.
@@ -62,8 +65,9 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         certificate: Certificate | None = None,
         mode: str = "project",
         penalty: float = 0.0,
+        horizon: int | None = None,
     ) -> None:
-        RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty)
+        RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty, horizon=horizon)
         refused = VectorActionWrapper, VectorSafetyShield
         inner = self._inner = environment_behind(env, VectorWrapper, refused, NCSVectorEnv, hint_for(env))
         if env.single_action_space != inner.single_action_space:
@@ -73,12 +77,14 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         if certificate is not None and not isinstance(certificate, Certificate):
             raise ValueError(f"certificate must be a Certificate or None, got {shown(certificate)}")
         self.certificate = certificate_for(inner.plant, inner.contract) if certificate is None else certificate
-        self.filter = SafetyFilter(self.certificate, inner.plant, mode)
+        self.filter = SafetyFilter(self.certificate, inner.plant, mode, horizon)
         self._monitor = GuaranteeMonitor(self.filter)
-        self._starts_inside = starts_inside(self.certificate, inner.single.initial_set)
+        self._start_known = start_known(self.filter, inner.single.initial_set)
         count, nothing = self.num_envs, np.zeros(self.num_envs, np.bool_)
         self._state = MonitorState(np.full(count, CODES[OTHER_STEPS]), nothing, nothing)
         self._interventions = np.zeros(count, np.int64)
+        # Plans stored in mode "lookahead", NaN beyond their ends.
+        self._stored = np.full((self.filter.horizon or 0, inner.plant.m, count), np.nan)
         self._table: Any = None
         self._no_reason = np.full(count, "", dtype=object)
         self._no_reason.flags.writeable = False
@@ -106,8 +112,10 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         idle = Decision(nothing, none, none, none, self._idle_margins(np.arange(self.num_envs)), none)
         kept = idle._replace(passed=self._state.inside)  # environments left alone keep what is proved of them
         self._state = self._monitor.advance(self._state, kept, unmoved, ~none, self._report)
+        self._stored[..., ~unmoved] = np.nan
         self._start(restarted, now.steps == 0)
         self._clock = now
+        idle = idle._replace(plan=self._stored)
         return observation, info | self._info(idle, idle.input, self._state, self._interventions)
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -120,7 +128,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         if self._clock is None:
             raise gym.error.ResetNeeded("call reset before the first step")
         proposed = self._inner.inputs_of(actions).copy()
-        decided = self.filter.decide_many(self._report.estimate, self._report.errors, proposed)
+        decided = self.filter.decide_many(self._report.estimate, self._report.errors, proposed, self._stored)
         if self.filter.mode != "monitor" and np.count_nonzero(decided.intervened):
             actions = overridden(actions, decided, self.filter.plant.u_max)
         before, self._clock = self._clock, self._interrupted
@@ -130,7 +138,9 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         self._report = self._observed(info)
         self._state = self._advanced(state, decided, moved_once, info, self._report)
         self._interventions = self._interventions + decided.intervened
-        added, charged = {}, decided.intervened
+        added, charged, self._stored = {}, decided.intervened, decided.plan.copy()
+        if len(self._stored):  # what is stored was certified for the states that follow
+            self._stored[..., ~(moved_once & _same_input(info, decided))] = np.nan
         if np.count_nonzero(restarted):
             charged = charged & ~restarted
             if "final_info" in info:  # SAME_STEP: the step ended an episode before it began the next
@@ -142,6 +152,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         self._clock = now
         if self.penalty:
             rewards = rewards - self.penalty * charged
+        decided = decided._replace(plan=self._stored)
         info = info | added | self._info(decided, proposed, self._state, self._interventions)
         return observation, rewards, terminated, truncated, info
 
@@ -161,16 +172,21 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         self, state: MonitorState, decided: Decision, moved_once: np.ndarray, info: dict[str, Any], report: Report
     ) -> MonitorState:
         """Returns what is known after a step that applied these decisions, as far as the info says so."""
-        applied = _columns(info.get("input"), decided.input.T.shape)
-        same_input = (applied == decided.input).all(axis=0)
-        return self._monitor.advance(state, decided, moved_once, same_input, report)
+        return self._monitor.advance(state, decided, moved_once, _same_input(info, decided), report)
 
     def _start(self, restarted: np.ndarray, begun: np.ndarray) -> None:
         """Begins anew where episodes began, `begun` where nothing has moved since; shape (N,) each."""
-        known, starts = np.full(self.num_envs, self._starts_inside), self._inner.starts
+        known, starts = [self._start_known] * self.num_envs, self._inner.starts
         for e in np.flatnonzero(restarted & ~np.isnan(starts[:, 0])).tolist():
-            known[e] = starts_inside(self.certificate, starts[e])
-        started = self._monitor.start(known, begun, self._report)
+            known[e] = start_known(self.filter, starts[e])
+        is_safe = np.array([each.in_safe_set for each in known])
+        if len(self._stored):
+            self._stored[..., restarted] = np.nan
+            for e in np.flatnonzero(restarted & ~is_safe).tolist():
+                estimate, errors = self._report.estimate[:, e].copy(), self._report.errors.of(np.array([e])).single()
+                plan, is_safe[e] = first_store(self.filter, estimate, errors, known[e])
+                self._stored[: len(plan), :, e] = plan
+        started = self._monitor.start(is_safe, begun, self._report)
         both = zip(started, self._state, strict=True)
         self._state = MonitorState(*(np.where(restarted, new, old) for new, old in both))
         self._interventions = np.where(restarted, 0, self._interventions)
@@ -209,7 +225,10 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         """Returns the shield's keys, new arrays, for steps that applied these decisions."""
         reasons = self._monitor.reasons(state)
         doubted = np.count_nonzero(reasons) > 0
-        return {
+        ahead = {}
+        if len(self._stored):
+            ahead["shield_plan_length"] = np.count_nonzero(~np.isnan(decided.plan[:, 0]), axis=0)
+        return ahead | {
             "shield_intervened": decided.intervened,
             "input_proposed": proposed.T,
             "shield_correction": norms(decided.input - proposed),
@@ -240,6 +259,12 @@ def _columns(value: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Returns rows as columns, the transpose of `shape`; NaN for what has another shape or is no numbers."""
     numbers = as_numbers(value)
     return np.full(shape[::-1], np.nan) if numbers is None or numbers.shape != shape else numbers.T
+
+
+def _same_input(info: dict[str, Any], decided: Decision) -> np.ndarray:
+    """Returns where the input applied is the one decided, shape (N,), as far as the info says so."""
+    applied = _columns(info.get("input"), decided.input.T.shape)
+    return (applied == decided.input).all(axis=0)
 
 
 def _alarms(value: Any, count: int) -> np.ndarray:

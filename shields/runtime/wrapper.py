@@ -17,7 +17,7 @@ from ncs_gym.envs.env import applied_input, ncs_env
 from ncs_gym.validation import as_number, as_numbers, shown
 from shields.certificate import Certificate
 from shields.runtime.filter import SafetyFilter
-from shields.runtime.guarantee import Report, starts_inside
+from shields.runtime.guarantee import Report, StartKnown, start_known
 from shields.runtime.guarded_filter import GuardedFilter
 
 T = TypeVar("T")
@@ -49,15 +49,20 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
     | `input_proposed` | the agent's input, shape (m,) [physical units]; zeros at reset |
     | `shield_correction` | Euclidean norm of input - input_proposed |
     | `shield_margin` | 1 - h - norm(A x_hat + B u)_M for the input applied (`Decision.margin`); at reset for u = 0 |
-    | `shield_guaranteed` | whether x in S is proved now |
+    | `shield_guaranteed` | whether x in S is proved now (in mode "lookahead": in the box, to stay) |
     | `shield_reason` | why not; empty while guaranteed |
     | `episode_interventions` | running number in this episode |
+    | `shield_plan_length` | in mode "lookahead" only: inputs stored for later steps, after this decision |
+
+    In mode "lookahead" an input passes too if a certified plan that begins with it keeps the state in the box until it
+    is in S; `shield_guaranteed` then says whether the state is proved to be in the box now and to stay there.
 
     Args:
         env: An `NCSEnv`, possibly wrapped.
         certificate: None synthesizes one for the environment's plant and contract, once per process.
-        mode: "project", "switch", "boundary" or "monitor"; see `SafetyFilter`.
+        mode: "project", "lookahead", "switch", "boundary" or "monitor"; see `SafetyFilter`.
         penalty: Subtracted from the reward per intervention counted, >= 0.
+        horizon: Longest plan of mode "lookahead", in steps; see `SafetyFilter`.
 
     Raises:
         CertificateError: If the certificate does not verify for the environment's plant.
@@ -72,8 +77,9 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         certificate: Certificate | None = None,
         mode: str = "project",
         penalty: float = 0.0,
+        horizon: int | None = None,
     ) -> None:
-        RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty)
+        RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty, horizon=horizon)
         inner = environment_behind(env, gym.Wrapper, (*REFUSED, SafetyShield), NCSEnv, hint_for(env))
         if env.action_space != inner.action_space:
             raise ValueError(f"a wrapper inside the shield changes the action space to {env.action_space}")
@@ -82,11 +88,11 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         if certificate is not None and not isinstance(certificate, Certificate):
             raise ValueError(f"certificate must be a Certificate or None, got {shown(certificate)}")
         self.certificate = certificate_for(inner.plant, inner.contract) if certificate is None else certificate
-        self.filter = SafetyFilter(self.certificate, inner.plant, mode)
+        self.filter = SafetyFilter(self.certificate, inner.plant, mode, horizon)
         self._guarded = GuardedFilter(self.filter)
         self._clock: tuple[int, int] | None = None
         self._start: Any = None
-        self._starts_inside = False
+        self._known = StartKnown(False, False)
         self._is_drawn = env.unwrapped.render_mode is not None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -103,8 +109,8 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         clock, report = self._read_clock(), self._observed(info)
         start = ncs_env(self.env).start
         if start is not self._start:  # decided exactly, which takes longer than a step; starts are read-only
-            self._start, self._starts_inside = start, starts_inside(self.certificate, start)
-        self._guarded.begin(report, self._starts_inside, clock[1] == 0)
+            self._start, self._known = start, start_known(self.filter, start)
+        self._guarded.begin(report, self._known, clock[1] == 0)
         self._interventions = 0
         u = np.zeros(self.filter.plant.m)
         margin = self.filter.margin(report.estimate, info["error_shape"], u)
@@ -160,7 +166,8 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
 
     def _info(self, proposed: np.ndarray, applied: np.ndarray, margin: float, *, intervened: bool) -> dict[str, Any]:
         reason = self._guarded.reason
-        return {
+        ahead = {} if self.filter.lookahead is None else {"shield_plan_length": self._guarded.plan_length}
+        return ahead | {
             "shield_intervened": intervened,
             "input_proposed": proposed.copy(),
             "shield_correction": hypot(*(applied - proposed).tolist()) if intervened else 0.0,

@@ -124,7 +124,7 @@ def test_loop_decides_and_proves_what_the_wrapper_does_with_the_same_packets(nam
         reasons, overridden = follow(env, loop_of(name, mode), policy(act, env, rng), 150, seed)
         seen |= reasons
         intervened += overridden
-    assert 0 < sum(intervened) <= len(intervened)
+    assert (sum(intervened) > 0) is (mode != "lookahead" or name != "n=3 m=2 p=1")  # there a plan saves every proposal
     assert "" in seen
     if mode != "monitor" and name != "truck with a contract":  # that channel may break its contract
         assert seen == {""}

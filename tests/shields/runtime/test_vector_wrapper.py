@@ -9,7 +9,8 @@ from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatist
 from ncs_gym import Channel, ChannelContract, NCSVectorEnv, SphereDisturbance, batch_reactor, truck_trailer
 from shields import CertificateError, Decision, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.runtime.filter import MODES
-from shields.runtime.guarantee import EXPLANATIONS, OTHER_STEPS, GuaranteeMonitor, Report, starts_inside
+from shields.runtime.guarantee import EXPLANATIONS, OTHER_STEPS, GuaranteeMonitor, Report, start_known
+from shields.runtime.guarded_filter import first_store
 from shields.runtime.vector_wrapper import Clock, _moved, overridden
 from tests.certificates import certificate_of
 from tests.shields.attacks.extremes import CHANNELS, TRUCKS, harmful
@@ -30,22 +31,26 @@ class Watched:
 
     def __init__(self, shield: SafetyFilter):
         self.shield, self.monitor, self.row = shield, GuaranteeMonitor(shield), {}
+        self.stored = np.empty((0, shield.plant.m))
 
     def _seen(self, row):
         self.row = row
         return Report(row["estimate"], self.shield.errors_of(row["error_shape"]), bool(row["assumption_violated"]))
 
     def decide(self, u):
-        return self.shield.decide(self.row["estimate"], self.row["error_shape"], u)
+        return self.shield.decide(self.row["estimate"], self.row["error_shape"], u, self.stored)
 
     def margin(self, u):
         return self.shield.margin(self.row["estimate"], self.row["error_shape"], u)
 
-    def start(self, known_inside, row):
-        self.state = self.monitor.start(known_inside, True, self._seen(row))
+    def start(self, known, row):
+        report = self._seen(row)
+        self.stored, is_safe = first_store(self.shield, report.estimate, report.errors, known)
+        self.state = self.monitor.start(is_safe, True, report)
 
     def step(self, decision, row):
         same_input = np.array_equal(decision.input, row["input"])
+        self.stored = decision.plan if same_input else decision.plan[:0]
         self.state = self.monitor.advance(self.state, decision, True, same_input, self._seen(row))
 
     @property
@@ -59,11 +64,11 @@ def drive(env, steps, policy):
     safety_filter = SafetyFilter(shield.certificate, inner.plant, shield.filter.mode)
     watched = [Watched(safety_filter) for _ in range(env.num_envs)]
     _, info = env.reset(seed=0)
-    inside = starts_inside(shield.certificate, inner.single.initial_set)
+    inside = start_known(safety_filter, inner.single.initial_set)
     counts = np.zeros(env.num_envs, int)
     for e, one in enumerate(watched):
         one.start(inside, {key: value[e] for key, value in info.items()})
-    totals = {"interventions": 0, "guaranteed": 0, "reasons": set()}
+    totals, plans = {"interventions": 0, "guaranteed": 0, "reasons": set()}, []
     for _ in range(steps):
         actions = policy(info)
         episodes = inner.episodes.copy()
@@ -81,17 +86,20 @@ def drive(env, steps, policy):
             else:
                 np.testing.assert_allclose(row["input"], decision.input, rtol=3e-7, atol=1e-9)
                 one.step(decision._replace(input=row["input"]), row)
+                plans.append(len(one.stored))
                 counts[e] += decision.intervened
                 assert row["shield_intervened"] == decision.intervened
                 assert row["shield_margin"] == pytest.approx(decision.margin, abs=1e-6)
                 correction = np.linalg.norm(row["input"] - row["input_proposed"])
                 assert row["shield_correction"] == pytest.approx(correction, abs=1e-12)
+            assert row.get("shield_plan_length", 0) == len(one.stored)
             assert row["shield_reason"] == one.reason
             assert row["shield_guaranteed"] == (not one.reason)
             assert row["episode_interventions"] == counts[e]
         totals["interventions"] += int(info["shield_intervened"].sum())
         totals["guaranteed"] += int(info["shield_guaranteed"].sum())
         totals["reasons"] |= set(info["shield_reason"].tolist())
+    totals["planned"] = np.count_nonzero(plans)
     return totals
 
 
@@ -107,6 +115,7 @@ def test_infos_equal_those_of_scalar_shields(name, mode):
     totals = drive(env, 150, policy)
     assert totals["interventions"] > 0
     assert totals["guaranteed"] > 0
+    assert (totals["planned"] > 0) == (mode == "lookahead")
 
 
 def test_reasons_of_broken_proofs_equal_those_of_scalar_shields():

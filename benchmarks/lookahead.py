@@ -1,0 +1,156 @@
+"""What mode "lookahead" admits and what it costs, against the one-step test and the same program in cvxpy.
+
+    python benchmarks/lookahead.py [--beliefs 2000]
+
+Beliefs are a true state drawn uniformly from the box, an error on the boundary of the error ellipsoid that is met in
+the middle of an episode (the one of median size), and the estimate that follows. A belief is admitted if some input is
+certified: by a plan of at most N steps, or for the second column by the one-step test alone. The upper bound plans for
+the true state without disturbance, with N inputs and the same end: no shield with this safe set admits more.
+Times are of beliefs that fail the one-step test, for proposals drawn uniformly from the limits.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import NamedTuple
+
+import cvxpy as cp
+import gymnasium as gym
+import numpy as np
+
+from ncs_gym import Ellipsoid, LinearPlant
+from shields import SafetyFilter
+from shields.runtime.wrapper import certificate_for
+
+# Environment, horizon.
+CASES = (("TruckTrailer", 3), ("TruckTrailerCruise", 3), ("CartPole", 12), ("BatchReactor", 6))
+EPISODES, STEPS = 5, 60
+# So many beliefs are given to cvxpy.
+CVXPY = 60
+
+
+class Beliefs(NamedTuple):
+    """States, estimates and proposals, shapes (count, n), (count, n) and (count, m), and one error shape."""
+
+    states: np.ndarray
+    estimates: np.ndarray
+    proposed: np.ndarray
+    shape: np.ndarray
+
+
+class PlainProgram:
+    """The plan of N inputs with the closest first one, stated for cvxpy (DPP) and solved by Clarabel."""
+
+    def __init__(self, shield: SafetyFilter) -> None:
+        plant, steps = shield.plant, shield.horizon
+        self.plans = shield.lookahead.planner.test
+        self.start, self.proposed = cp.Parameter(plant.n), cp.Parameter(plant.m)
+        self.room, self.turn, self.radius = (
+            cp.Parameter((steps, len(plant.C))),
+            cp.Parameter((plant.n, plant.n)),
+            cp.Parameter(),
+        )
+        self.u, self.c = cp.Variable((steps, plant.m)), cp.Variable((steps + 1, plant.n))
+        self.turned = cp.Variable(plant.n)
+        constraints = [self.c[0] == self.start, cp.abs(self.u) <= np.tile(plant.u_max, (steps, 1))]
+        constraints += [self.c[1:] == self.c[:-1] @ plant.A.T + self.u @ plant.B.T]
+        constraints += [cp.abs(self.c[1:-1] @ plant.C.T) <= self.room[:-1]] if steps > 1 else []
+        constraints += [self.turned == self.turn @ self.c[-1], cp.norm(self.turned) <= self.radius]
+        self.problem = cp.Problem(cp.Minimize(cp.sum_squares(self.u[0] - self.proposed)), constraints)
+
+    def solve(self, estimate: np.ndarray, shape: np.ndarray, proposed: np.ndarray) -> bool:
+        known = self.plans.tightenings_of(shape[None])
+        room, radius = self.plans.room(estimate[None], known)
+        if not (np.isfinite(radius[0, -1]) and radius[0, -1] > 0.0):
+            return False
+        self.start.value, self.proposed.value = estimate, proposed
+        self.room.value, self.turn.value, self.radius.value = room[0], known.turn[0, -1], radius[0, -1]
+        return solved(self.problem)
+
+
+class FreePlan:
+    """Whether N inputs bring a known state into S through the box if nothing disturbs it."""
+
+    def __init__(self, plant: LinearPlant, root: np.ndarray, steps: int) -> None:
+        self.start, u, c = cp.Parameter(plant.n), cp.Variable((steps, plant.m)), cp.Variable((steps + 1, plant.n))
+        constraints = [c[0] == self.start, cp.abs(u) <= np.tile(plant.u_max, (steps, 1))]
+        constraints += [c[1:] == c[:-1] @ plant.A.T + u @ plant.B.T, cp.abs(c[1:] @ plant.C.T) <= 1.0]
+        self.problem = cp.Problem(cp.Minimize(cp.norm(root @ c[-1])), constraints)
+
+    def exists(self, state: np.ndarray) -> bool:
+        self.start.value = state
+        return solved(self.problem) and float(self.problem.value) <= 1.0
+
+
+def solved(problem: cp.Problem) -> bool:
+    try:
+        problem.solve(solver=cp.CLARABEL)
+    except cp.SolverError:  # it happens where there is hardly a solution
+        return False
+    return problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
+
+
+def drawn(env: gym.Env, count: int) -> Beliefs:
+    inner, rng, shapes = env.unwrapped, np.random.default_rng(0), []
+    for seed in range(EPISODES):
+        env.reset(seed=seed)
+        shapes += [env.step(np.zeros(inner.plant.m, np.float32))[4]["error_shape"] for _ in range(STEPS)]
+    shape = sorted(shapes, key=lambda each: np.trace(inner.plant.weight @ each))[len(shapes) // 2]
+    states = np.empty((0, inner.plant.n))
+    while len(states) < count:
+        more = rng.uniform(-1, 1, (count, inner.plant.n)) * inner.plant.half_widths
+        states = np.concatenate([states, more[(np.abs(more @ inner.plant.C.T) <= 1.0).all(axis=1)]])
+    states = states[:count]
+    errors = Ellipsoid(shape).sample_boundary(rng, count)
+    return Beliefs(states, states + errors, rng.uniform(-1, 1, (count, inner.plant.m)) * inner.plant.u_max, shape)
+
+
+def timed(decide, beliefs: list[tuple[np.ndarray, ...]]) -> np.ndarray:
+    """Microseconds per call, each the better of two."""
+    times = np.empty((2, len(beliefs)))
+    for row in times:
+        for e, belief in enumerate(beliefs):
+            start = time.perf_counter()
+            decide(*belief)
+            row[e] = 1e6 * (time.perf_counter() - start)
+    return times.min(axis=0)
+
+
+def report(name: str, horizon: int, count: int) -> str:
+    env = gym.make(f"ncs_gym/{name}-v0")
+    plant, certificate = env.unwrapped.plant, certificate_for(env.unwrapped.plant, env.unwrapped.contract)
+    shield = SafetyFilter(certificate, plant, "lookahead", horizon)
+    project = SafetyFilter(certificate, plant)
+    beliefs = drawn(env, count)
+    inside = np.mean(certificate.safe_set.gauge(beliefs.states) <= 1.0)
+    cases = [(x_hat, beliefs.shape, u) for x_hat, u in zip(beliefs.estimates, beliefs.proposed, strict=True)]
+    one_step = np.mean([project.decide(*each).passed for each in cases])
+    admitted = np.mean([shield.decide(*each).passed for each in cases])
+    free = FreePlan(plant, shield.test.root, horizon)
+    bound = np.mean([free.exists(state) for state in beliefs.states[: 4 * CVXPY]])
+    searched = [each for each in cases if shield.decide(*each).reason != "safe"]
+    if not searched:
+        return f"{name:20s} {horizon:3d} every proposal passes the one-step test"
+    ours, plain = timed(shield.decide, searched), PlainProgram(shield)
+    others = timed(plain.solve, [searched[i % len(searched)] for i in range(CVXPY)])
+    quick = timed(project.decide, [each for each in cases if project.decide(*each).reason == "safe"][:300])
+    return (
+        f"{name:20s} {horizon:3d} {inside:7.1%} {one_step:9.1%} {admitted:9.1%} {bound:8.1%}   "
+        f"{np.median(quick):8.0f} {np.median(ours):8.0f} {np.quantile(ours, 0.99):8.0f} {np.median(others):8.0f} "
+        f"{np.median(others) / np.median(ours):6.1f}x"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--beliefs", type=int, default=2000)
+    count = parser.parse_args().beliefs
+    print("                             share of states in S, of beliefs admitted          us per decision")
+    print("environment            N       S   one step lookahead    bound   one step   search      99%    cvxpy  ratio")
+    for name, horizon in CASES:
+        print(report(name, horizon, count), flush=True)
+
+
+if __name__ == "__main__":
+    main()

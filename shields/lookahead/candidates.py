@@ -1,0 +1,47 @@
+"""Plans that cost no solver: a given beginning, and then a saturated gain at the predicted centers."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import LinAlgError, solve_discrete_are
+
+from ncs_gym import LinearPlant
+
+# Weight of inputs, in units of their limits, against states, in units of the box, in the regulator that brakes.
+INPUT_WEIGHT = 1e-2
+
+
+def regulator(plant: LinearPlant) -> np.ndarray | None:
+    """Returns the gain, shape (m, n), of a regulator with little weight on its inputs; None if there is none."""
+    R = INPUT_WEIGHT * np.diag(plant.u_max**-2.0)
+    try:
+        P = solve_discrete_are(plant.A, plant.B, plant.weight, R)
+        gain = -np.linalg.solve(R + plant.B.T @ P @ plant.B, plant.B.T @ P @ plant.A)
+    except (LinAlgError, ValueError):
+        return None
+    return gain if np.isfinite(gain).all() else None
+
+
+def expressible(inputs: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    """Returns the nearest u_max * float32 actions; the last axis is the input's."""
+    return limits * np.minimum(np.maximum(inputs / limits, -1.0), 1.0).astype(np.float32)
+
+
+@np.errstate(all="ignore")  # what is not finite passes no test
+def completed(plant: LinearPlant, estimates: np.ndarray, beginnings: np.ndarray, gains: np.ndarray) -> np.ndarray:
+    """Returns plans that go on with u_j = gain c_j, saturated and expressible, where a beginning is NaN.
+
+    Args:
+        plant: Gives A, B and the limits.
+        estimates: x_hat, shape (E, n).
+        beginnings: Inputs of P plans, shape (E, P, N, m), NaN where they are not given.
+        gains: Shape (P, m, n).
+    """
+    plans, given = beginnings.copy(), ~np.isnan(beginnings[..., 0])
+    centers = np.repeat(estimates[:, None], beginnings.shape[1], axis=1)
+    turned = gains.swapaxes(1, 2)
+    for j in range(beginnings.shape[2]):
+        gained = expressible((centers[:, :, None] @ turned)[:, :, 0], plant.u_max)
+        u = plans[:, :, j] = np.where(given[:, :, j, None], plans[:, :, j], gained)
+        centers = centers @ plant.A.T + u @ plant.B.T
+    return plans

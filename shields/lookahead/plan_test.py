@@ -1,0 +1,91 @@
+"""The test of plans: whether inputs keep every possible state in the box and end in the safe set."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from shields.lookahead.prediction import Prediction
+from shields.lookahead.tightening import Tightening, tightenings
+from shields.runtime.one_step_test import FARTHEST
+from shields.runtime.predicted_errors import SMALLEST_RADIUS
+
+# Error shapes whose tightenings are remembered; they recur, since they depend only on what arrived when.
+MOST_REMEMBERED = 4096
+
+
+class PlanTest:
+    """Whether a plan u_0..u_{j-1} is certified (docs/lookahead.md).
+
+    With c_0 = x_hat and c_{i+1} = A c_i + B u_i it is if |c c_i| + rho_i(c) <= 1 for the rows c of the box and i =
+    1..j-1, which is the exact condition for every possible x_{k+i} to lie in the box, and c_j + E(Sigma_pred,j) lies in
+    S by the one-step test's condition. Then x_{k+j} is in S, hence in the box. For j = 1 it is the one-step test.
+
+    Args:
+        prediction: Of the plant.
+        margin: By which the test must be passed, in units of the box and of S.
+
+    Attributes:
+        prediction: The same.
+    """
+
+    def __init__(self, prediction: Prediction, margin: float) -> None:
+        self.prediction, self._margin = prediction, margin
+        plant, ends = prediction.plant, prediction.ends
+        self._rows = np.ascontiguousarray(plant.C.T)
+        sizes = np.abs(plant.C) @ prediction.size_free
+        self._row_rounding = prediction.rounding[:, None, None] * sizes
+        self._end_rounding = np.array([end.rounding * end.columns for end in ends])
+        self._columns = np.array([end.columns for end in ends])
+        self._remembered: dict[bytes, Tightening] = {}
+
+    def tightenings_of(self, shapes: np.ndarray) -> Tightening:
+        """Returns the tightenings of error shapes Sigma_k, shape (E, n, n); remembered, since shapes recur."""
+        shapes = np.ascontiguousarray(shapes)
+        keys = [shape.tobytes() for shape in shapes]
+        new = {key: e for e, key in enumerate(keys) if key not in self._remembered}
+        if len(self._remembered) + len(new) > MOST_REMEMBERED:
+            self._remembered.clear()
+            new = {key: e for e, key in enumerate(keys)}
+        if new:
+            found = tightenings(self.prediction, shapes[list(new.values())])
+            self._remembered |= {key: Tightening(*(part[e] for part in found)) for e, key in enumerate(new)}
+        known = [self._remembered[key] for key in keys]
+        return Tightening(*(np.stack(parts) for parts in zip(*known, strict=True)))
+
+    @np.errstate(all="ignore")  # what is not finite is not certified
+    def room(self, estimates: np.ndarray, tightening: Tightening) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the largest |c_i c_j|, shape (E, N, k), and |T G c_j|, shape (E, N), that pass; NaN for no usable."""
+        size = np.abs(estimates)
+        box = tightening.room - (self._row_rounding @ size[:, None, :, None])[..., 0] - self._margin
+        radius = tightening.radius - size @ self._end_rounding.T
+        far = ~(size @ self._columns.T < FARTHEST) | ~(radius >= SMALLEST_RADIUS)
+        return box, np.where(far, np.nan, radius - self._margin)
+
+    @np.errstate(all="ignore")
+    def certified(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray) -> np.ndarray:
+        """Returns which first parts of plans are certified: those of 1..N inputs, shape (E, P, N).
+
+        Args:
+            estimates: x_hat, shape (E, n).
+            tightening: Of the error shapes of each.
+            plans: Inputs, shape (E, P, N, m) [physical units].
+        """
+        box, radius = self.room(estimates, tightening)
+        centers = self.prediction.centers(estimates, plans)
+        inside = (np.abs(centers @ self._rows) <= box[:, None]).all(axis=-1)
+        allowed = (np.abs(plans) <= self.prediction.plant.u_max).all(axis=-1)
+        turned = (tightening.turn[:, None] @ centers[..., None])[..., 0]
+        ends = np.sqrt((turned * turned).sum(axis=-1)) <= radius[:, None]
+        before = np.logical_and.accumulate(inside, axis=-1)
+        before = np.concatenate([np.ones_like(before[..., :1]), before[..., :-1]], axis=-1)
+        return ends & before & np.logical_and.accumulate(allowed, axis=-1)
+
+    @np.errstate(all="ignore")
+    def knows_in_box(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
+        """Returns whether |c_i x_hat| + sqrt(c_i Sigma_k c_i') <= 1 for all rows, which proves that x is in the box."""
+        rows, extents = self.prediction.plant.C, np.sqrt(np.diag(error_shape))
+        rounding = float(self.prediction.rounding[0])
+        size = np.abs(rows) @ extents
+        reach = np.sqrt(np.maximum(((rows @ error_shape) * rows).sum(axis=1), 0.0) + rounding * size**2)
+        reach = reach + np.abs(rows @ estimate) + rounding * (np.abs(rows) @ np.abs(estimate))
+        return bool((reach <= 1.0 - self._margin).all())

@@ -1,0 +1,123 @@
+"""The convex program whose solution is tried as a plan; whatever a solver says about it is not believed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import clarabel
+import numpy as np
+from scipy.sparse import csc_matrix
+
+from ncs_gym.validation import read_only
+from shields.lookahead.prediction import Prediction
+from shields.verification import ACTION_ROUNDING
+
+# Its types are not declared.
+_clarabel: Any = clarabel
+# What the program keeps away from the limits of the plan test, in units of the box and of S: the solver's precision.
+SOLVER_RESERVE = 1e-7
+MOST_ITERATIONS = 60
+
+
+class PlanProgram:
+    """min |u_0 - proposed|^2 over plans of N inputs that pass the plan test: linear rows and one cone.
+
+    Variables are the inputs in units of their limits. The solver is set up once, with the pattern of the problem; then
+    vectors and the entries of the cone are updated, so that a solution depends on its own data alone.
+
+    Args:
+        prediction: Of the plant.
+    """
+
+    def __init__(self, prediction: Prediction) -> None:
+        plant, length = prediction.plant, prediction.steps
+        self._n, self._m, self._length = plant.n, plant.m, length
+        self._limits, self._weights = plant.u_max, (plant.u_max / plant.u_max.max()) ** 2
+        scale = np.tile(plant.u_max, length)
+        self._free = prediction.free
+        self._end = read_only(prediction.forced[-1] * scale)
+        forced = prediction.forced[:-1] * scale
+        rows = (plant.C @ forced).reshape(-1, len(scale))
+        self._rows = read_only(np.concatenate([rows, -rows]))
+        self._reserve = SOLVER_RESERVE + float(ACTION_ROUNDING) * np.abs(rows).sum(axis=1)
+        root = prediction.ends[-1].root
+        self._end_reserve = SOLVER_RESERVE + float(ACTION_ROUNDING) * float(
+            np.linalg.norm(root @ self._end, axis=0).sum()
+        )
+        self._C = plant.C
+        self._arrange(root)
+        self._solver: Any = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_solver": None}  # set up anew where it is used
+
+    def _arrange(self, root: np.ndarray) -> None:
+        """Fixes where the entries of the matrix are, those of the cone being what changes."""
+        size = self._length * self._m
+        identity = np.eye(size)
+        linear = np.concatenate([self._rows, identity, -identity])
+        row, column = np.nonzero(linear)
+        first = len(linear) + 1  # the row before holds the radius
+        cone_rows, cone_columns = (each.ravel() for each in np.indices((self._n, size)))
+        rows, columns = np.concatenate([row, first + cone_rows]), np.concatenate([column, cone_columns])
+        self._entries = np.concatenate([linear[row, column], -(root @ self._end).ravel()])
+        self._in_cone = slice(len(row), None)
+        numbered = csc_matrix((np.arange(1.0, len(rows) + 1.0), (rows, columns)), shape=(first + self._n, size))
+        self._order = numbered.data.astype(np.intp) - 1
+        numbered.data = self._entries[self._order]
+        self._typical = numbered
+
+    def solve(
+        self, estimate: np.ndarray, room: np.ndarray, turn: np.ndarray, radius: float, proposed: np.ndarray
+    ) -> np.ndarray | None:
+        """Returns a plan, shape (N, m) [physical units], of which nothing is known; None if the solver fails.
+
+        Args:
+            estimate: x_hat, shape (n,).
+            room: Largest |c_i c_j| for j = 1..N-1, shape (N-1, k).
+            turn: T G of the last step, shape (n, n).
+            radius: Largest |T G c_j| of the last step.
+            proposed: Shape (m,).
+        """
+        try:
+            A, b, q = self._data(estimate, room, turn, radius, proposed)
+            if not (np.isfinite(b).all() and np.isfinite(A).all() and np.isfinite(q).all()):
+                return None
+            if self._solver is None:
+                self._solver = self._set_up()
+            self._solver.update(A=A, b=b, q=q)
+            plan = np.array(self._solver.solve().x, dtype=np.float64)
+        except Exception:  # whatever a solver does wrong, there is another plan or none
+            self._solver = None
+            return None
+        usable = plan.shape == (self._length * self._m,) and np.isfinite(plan).all()
+        return plan.reshape(self._length, self._m) * self._limits if usable else None
+
+    def _data(
+        self, estimate: np.ndarray, room: np.ndarray, turn: np.ndarray, radius: float, proposed: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns entries of the matrix, right-hand side and linear cost."""
+        centers = self._free @ estimate
+        drift, allowed = (centers[:-1] @ self._C.T).ravel(), room.ravel() - self._reserve
+        ones = np.ones(2 * self._length * self._m)
+        cone = np.concatenate([[radius - self._end_reserve], turn @ centers[-1]])
+        b = np.concatenate([allowed - drift, allowed + drift, ones, cone])
+        q = np.zeros(self._length * self._m)
+        q[: self._m] = -2.0 * self._weights * proposed / self._limits
+        self._entries[self._in_cone] = -(turn @ self._end).ravel()
+        return self._entries[self._order], b, q
+
+    def _set_up(self) -> Any:
+        """Returns a solver with the pattern of the problem."""
+        size, settings = self._length * self._m, _clarabel.DefaultSettings()
+        settings.verbose, settings.presolve_enable, settings.max_iter = False, False, MOST_ITERATIONS
+        settings.input_sparse_dropzeros = False
+        # Everything is in units of its limits already.
+        settings.equilibrate_enable = False
+        settings.max_threads = 1
+        P = np.zeros(size)
+        P[: self._m] = 2.0 * self._weights
+        count = len(self._rows) + 2 * size
+        cones = [_clarabel.NonnegativeConeT(count), _clarabel.SecondOrderConeT(self._n + 1)]
+        b = np.ones(count + self._n + 1)
+        return _clarabel.DefaultSolver(csc_matrix(np.diag(P)), np.zeros(size), self._typical, b, cones, settings)

@@ -1,0 +1,238 @@
+"""The plan test against extreme errors and disturbances, sampled ones, and rational arithmetic."""
+
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from ncs_gym import Ellipsoid, LinearPlant, batch_reactor, cart_pole, truck_trailer
+from ncs_gym.network.contract import ChannelContract
+from shields import SafetyFilter
+from shields.lookahead import PlanTest, Prediction
+from shields.lookahead.tightening import Tightening
+from shields.runtime.filter import MARGIN
+from shields.runtime.one_step_test import OneStepTest
+from tests.certificates import certificate_of
+from tests.plants import random_plant
+
+STEPS = 5
+PLANTS = {
+    "truck": (truck_trailer(mass=4000.0), None),
+    "cart-pole": (cart_pole(), ChannelContract(4)),
+    "batch reactor": (batch_reactor(), ChannelContract(3)),
+    "n=3 m=2": (replace(random_plant(1, 3, 2), u_max=1.0), None),
+    "n=6 m=2": (replace(random_plant(5, 6, 2), u_max=0.3), None),
+}
+
+
+@pytest.fixture(scope="module", params=PLANTS)
+def case(request):
+    plant, contract = PLANTS[request.param]
+    certificate = certificate_of(plant, contract)
+    return plant, certificate, PlanTest(Prediction(OneStepTest(certificate.L, plant), STEPS), MARGIN)
+
+
+def beliefs(plant, certificate, rng, count):
+    """Estimates in and around the box, error shapes of all forms inside the certified one, and plans."""
+    estimates = rng.uniform(-1, 1, (count, plant.n)) * plant.half_widths * rng.uniform(0.2, 1.5, (count, 1))
+    factor = np.linalg.cholesky(certificate.Sigma)
+    turns = np.linalg.qr(rng.standard_normal((count, plant.n, plant.n)))[0]
+    sizes = 10.0 ** rng.uniform(-3, 0, (count, plant.n))
+    shapes = factor @ (turns * (0.7 * sizes)[:, None]) @ turns.swapaxes(1, 2) @ factor.T
+    plans = rng.uniform(-1, 1, (count, 1, STEPS, plant.m)) * plant.u_max * rng.uniform(0.2, 1.0, (count, 1, 1, 1))
+    return estimates, 0.5 * (shapes + shapes.swapaxes(1, 2)), plans
+
+
+def states(plant, x, plan, disturbances):
+    """x_1..x_N of the true plant."""
+    reached = []
+    for u, d in zip(plan, disturbances, strict=True):
+        x = plant.A @ x + plant.B @ u + d
+        reached.append(x)
+    return np.array(reached)
+
+
+def extreme_run(plant, x_hat, shape, plan, direction, step):
+    """The states if error and disturbances all push x_{step+1} in a direction, as far as they can."""
+    pulls = [direction]
+    for _ in range(step + 1):
+        pulls.append(plant.A.T @ pulls[-1])
+    error = Ellipsoid(shape).extreme_point(pulls[step + 1])
+    disturbances = [
+        plant.disturbance.extreme_point(pulls[step - i]) if i <= step else 0 * x_hat for i in range(len(plan))
+    ]
+    return states(plant, x_hat + error, plan, disturbances)
+
+
+def test_tightenings_are_what_extreme_errors_and_disturbances_attain(case):
+    plant, certificate, test = case
+    rng = np.random.default_rng(0)
+    estimates, shapes, plans = beliefs(plant, certificate, rng, 12)
+    rooms = test.tightenings_of(shapes).room
+    for x_hat, shape, (plan,), room in zip(estimates, shapes, plans, rooms, strict=True):
+        nominal = states(plant, x_hat, plan, np.zeros((STEPS, plant.n)))
+        for step in range(STEPS):
+            for row, left in zip(plant.C, room[step], strict=True):
+                pushed = extreme_run(plant, x_hat, shape, plan, row, step)[step]
+                assert row @ (pushed - nominal[step]) == pytest.approx(1.0 - left, rel=1e-6, abs=1e-9)
+
+
+def farthest(plant, certificate, x_hat, shape, plan, step, rng):
+    """Largest |x_{step+1}|_M found by ascent over error and disturbances, from many starts."""
+    worst = 0.0
+    for _ in range(4):
+        direction = rng.standard_normal(plant.n)
+        for _ in range(15):
+            reached = extreme_run(plant, x_hat, shape, plan, direction, step)[step]
+            direction = certificate.M @ reached
+        worst = max(worst, certificate.safe_set.gauge(reached))
+    return worst
+
+
+def test_certified_plans_keep_every_possible_state_in_the_box_and_end_in_the_safe_set(case):
+    plant, certificate, test = case
+    rng = np.random.default_rng(1)
+    estimates, shapes, plans = beliefs(plant, certificate, rng, 60)
+    certified = test.certified(estimates, test.tightenings_of(shapes), plans)[:, 0]
+    lengths, levels = 0, []
+    for x_hat, shape, (plan,), passed in zip(estimates, shapes, plans, certified, strict=True):
+        for step in np.flatnonzero(passed).tolist():
+            lengths += step > 0
+            for j in range(step + 1):
+                reached = [extreme_run(plant, x_hat, shape, plan, row, j)[j] for row in (*plant.C, *-plant.C)]
+                assert np.abs(np.array(reached) @ plant.C.T).max() <= 1.0
+            levels.append(farthest(plant, certificate, x_hat, shape, plan, step, rng))
+            assert levels[-1] <= 1.0
+    assert lengths > 10
+    assert max(levels) > 0.9
+
+
+def test_what_is_not_certified_fails_for_a_reason(case):
+    # The box part is exact: where it fails, an error and disturbances leave the box; else the end must be close to S.
+    plant, certificate, test = case
+    rng = np.random.default_rng(2)
+    estimates, shapes, plans = beliefs(plant, certificate, rng, 60)
+    certified = test.certified(estimates, test.tightenings_of(shapes), plans)[:, 0]
+    left = kept = 0
+    for x_hat, shape, (plan,), passed in zip(estimates, shapes, plans, certified, strict=True):
+        outside = False
+        for step in range(STEPS):
+            ends = passed[step]
+            if not ends and not outside:
+                # the exact containment is sharper than the test, though not by much
+                assert farthest(plant, certificate, x_hat, shape, plan, step, rng) > 0.6
+                left += 1
+            if ends:
+                assert not outside
+                kept += 1
+            rows = [extreme_run(plant, x_hat, shape, plan, row, step)[step] for row in (*plant.C, *-plant.C)]
+            outside |= bool(np.abs(np.array(rows) @ plant.C.T).max() > 1.0 + 1e-8)
+    assert left > 5
+    assert kept > 10
+
+
+def test_sampled_errors_and_disturbances_stay_inside(case):
+    plant, certificate, test = case
+    rng = np.random.default_rng(3)
+    estimates, shapes, plans = beliefs(plant, certificate, rng, 30)
+    certified = test.certified(estimates, test.tightenings_of(shapes), plans)[:, 0]
+    for x_hat, shape, (plan,), passed in zip(estimates, shapes, plans, certified, strict=True):
+        for step in np.flatnonzero(passed).tolist()[:1]:
+            x = x_hat + Ellipsoid(shape).sample_boundary(rng, 300)
+            for u in plan[: step + 1]:
+                x = x @ plant.A.T + plant.B @ u + plant.disturbance.sample_boundary(rng, 300)
+                assert (np.abs(x @ plant.C.T) <= 1.0).all()
+            assert (certificate.safe_set.gauge(x) <= 1.0).all()
+
+
+def test_plans_of_one_input_are_certified_by_the_one_step_test(case):
+    plant, certificate, test = case
+    shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(4)
+    estimates, shapes, plans = beliefs(plant, certificate, rng, 200)
+    certified = test.certified(estimates, test.tightenings_of(shapes), plans)[:, 0, 0]
+    safe = [
+        shield.decide(x_hat, shape, plan[0, 0]).reason == "safe"
+        for x_hat, shape, plan in zip(estimates, shapes, plans, strict=True)
+    ]
+    assert (certified == safe).mean() > 0.99  # but for what more is taken off for rounding
+    assert certified.any()
+
+
+@pytest.mark.parametrize("where", ["estimate", "shape", "input"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e120, 1e300])
+def test_nothing_is_certified_of_what_cannot_be_used(case, where, value):
+    plant, certificate, test = case
+    estimate, shape = np.zeros((1, plant.n)), 1e-6 * certificate.Sigma[None].copy()
+    plan = np.zeros((1, 1, STEPS, plant.m))
+    assert test.certified(estimate, test.tightenings_of(shape), plan).any()
+    {"estimate": estimate, "shape": shape, "input": plan[:, 0, 0]}[where][0].flat[0] = value
+    assert not test.certified(estimate, test.tightenings_of(shape), plan).any()
+
+
+def test_inputs_beyond_their_limits_are_not_certified(case):
+    plant, certificate, test = case
+    estimate, shape = np.zeros((1, plant.n)), 1e-6 * certificate.Sigma[None]
+    plan = np.zeros((1, 1, STEPS, plant.m))
+    plan[0, 0, 2, 0] = np.nextafter(plant.u_max[0], np.inf)
+    certified = test.certified(estimate, test.tightenings_of(shape), plan)[0, 0]
+    assert not certified[2:].any()
+    assert certified[:2].any()
+
+
+def test_indefinite_shapes_leave_no_room(case):
+    _, certificate, test = case
+    tightening = test.tightenings_of(-certificate.Sigma[None])
+    assert np.isnan(tightening.room).all()
+    assert np.isnan(tightening.radius).all()
+
+
+@pytest.mark.parametrize("size", [1.0, 1e4, 1e7, 1e10])
+def test_certified_is_true_in_rational_arithmetic_however_far_out_the_estimate_is(size):
+    # Estimates along a direction that A annihilates: products of huge numbers cancel.
+    plant = LinearPlant(
+        A=np.array([[0.5, -0.3], [0.25, -0.15]]),
+        B=np.ones((2, 1)),
+        box=np.eye(2),
+        u_max=1.0,
+        dt=0.1,
+        gamma=1e-6,
+        sensor_bound=0.0,
+        initial_bound=0.0,
+    )
+    certificate, rng = certificate_of(plant), np.random.default_rng(0)
+    test = PlanTest(Prediction(OneStepTest(certificate.L, plant), 2), 0.0)
+    known = test.tightenings_of(np.zeros((1, 2, 2)))
+    *_, axes = np.linalg.svd(plant.A)
+    support = plant.disturbance.support(np.eye(2))
+    passed, closest = 0, 0.0
+    for _ in range(100):
+        base = axes[1] * size * rng.uniform(0.5, 1.0)
+        inwards, plan = rng.choice([-1.0, 1.0]) * axes[0], rng.uniform(-1, 1, (1, 1, 2, 1))
+        low, high = 0.0, 8.0
+        for _ in range(50):  # to the edge of what is certified
+            middle = 0.5 * (low + high)
+            passes = test.certified((base + middle * inwards)[None], known, plan)[0, 0, 1]
+            low, high = (middle, high) if passes else (low, middle)
+        x = base + low * inwards
+        if test.certified(x[None], known, plan)[0, 0, 1]:
+            passed += 1
+            for row, u, s in zip(plant.A, plant.B[:, 0], support, strict=True):
+                center = sum(Fraction(a) * Fraction(b) for a, b in zip(row.tolist(), x.tolist(), strict=True))
+                center += Fraction(float(u)) * Fraction(float(plan[0, 0, 0, 0]))
+                assert abs(center) + Fraction(float(s)) * (1 - Fraction(1, 10**14)) <= 1
+                closest = max(closest, float(abs(center) + Fraction(float(s))))
+    assert passed > 20
+    assert closest > 1.0 - 1e-6 or size > 1e7
+
+
+def test_tightenings_are_remembered_and_do_not_depend_on_the_batch(case):
+    plant, certificate, test = case
+    _, shapes, _ = beliefs(plant, certificate, np.random.default_rng(5), 6)
+    fresh = PlanTest(test.prediction, MARGIN)
+    together = fresh.tightenings_of(np.concatenate([shapes, shapes[:2]]))
+    for e, shape in enumerate((*shapes, *shapes[:2])):
+        alone = PlanTest(test.prediction, MARGIN).tightenings_of(shape[None])
+        for name in Tightening._fields:
+            np.testing.assert_allclose(getattr(together, name)[e], getattr(alone, name)[0], rtol=1e-12, atol=1e-12)
+    assert len(fresh._remembered) == 6
