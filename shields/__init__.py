@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from shields.certificate import Certificate
 from shields.errors import CertificateError, Infeasible
-from shields.proof import Multipliers
+from shields.proof_data import Multipliers
 from shields.runtime import Decision, SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.verification import Condition, Report, verify
 

@@ -14,7 +14,7 @@ from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_number, read_only, 
 from shields import certificate_file
 from shields.certificate_text import description_of
 from shields.errors import CertificateError
-from shields.proof import CertifiedProof, ContractProof, Multipliers, PaperConstants
+from shields.proof_data import CertifiedProof, ContractProof, Multipliers, PaperConstants
 
 # The fields that a certificate of each method has besides L and K, and that one of the other method must not have.
 _FIELDS = {

@@ -17,7 +17,7 @@ from ncs_gym.network.contract import ChannelContract
 from ncs_gym.validation import as_setting
 from shields.atomic_write import write_atomically
 from shields.errors import CertificateError
-from shields.proof import ContractProof, Multipliers
+from shields.proof_data import ContractProof, Multipliers
 
 _FORMAT = "ncs-gym certificate 2"
 # The arrays of the error sets by age: keys of the file, and the attributes of `ErrorSetsByAge` they stand for.

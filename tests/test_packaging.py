@@ -32,7 +32,7 @@ LAYERS = {
     ),
     "shields": (
         {"errors", "atomic_write"},
-        {"proof"},
+        {"proof_data"},
         {"certificate_file", "certificate_text"},
         {"certificate"},
         {"verification", "paper", "synthesis"},

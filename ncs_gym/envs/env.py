@@ -15,8 +15,8 @@ from ncs_gym.estimation.arrival_patterns import arrival_patterns
 from ncs_gym.estimation.error_bound import UnstablePlantError
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel
-from ncs_gym.network.channel_state import ChannelState
 from ncs_gym.network.contract import ChannelContract, contract_of
+from ncs_gym.network.transmission import ChannelState
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.process import LinearProcess
 from ncs_gym.rendering import Annotation, Renderer

@@ -147,10 +147,10 @@ class LinearProcess:
             ValueError: If a disturbance lies outside its bound and that is not allowed.
         """
         nominal = self.plant.A.dot(state) + self.plant.B.dot(u)
-        moved = nominal + self.disturb(rng, nominal, steps, memory)
+        moved = nominal + self.draw_disturbance(rng, nominal, steps, memory)
         return moved if self._limit is None else np.minimum(np.maximum(moved, -self._limit), self._limit)
 
-    def disturb(self, rng: np.random.Generator, nominal: np.ndarray, steps: Any, memory: Any) -> np.ndarray:
+    def draw_disturbance(self, rng: np.random.Generator, nominal: np.ndarray, steps: Any, memory: Any) -> np.ndarray:
         """Returns process noise and disturbance, of the shape of A x + B u."""
         source = self.disturbance
         if self._is_drawn_ahead:

@@ -16,7 +16,7 @@ from ncs_gym.validation import shown
 from shields.certificate import Certificate
 from shields.certificate_text import size_of
 from shields.errors import Infeasible, SynthesisInterrupted
-from shields.proof import ContractProof, Multipliers
+from shields.proof_data import ContractProof, Multipliers
 from shields.synthesis.alternation import largest_set, with_best_gain, with_best_multipliers
 from shields.synthesis.design_problem import INFLATION, CandidateDesign, DesignProblem, design_problem
 from shields.synthesis.diagnosis import infeasibility, with_feasible_bounds

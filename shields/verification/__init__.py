@@ -7,6 +7,6 @@ states the conditions of theory.md section 3.
 
 from shields.verification.certified_conditions import ACTION_ROUNDING
 from shields.verification.conditions import Condition
-from shields.verification.report import Report, require_valid, verify
+from shields.verification.verifier import Report, require_valid, verify
 
 __all__ = ["ACTION_ROUNDING", "Condition", "Report", "require_valid", "verify"]

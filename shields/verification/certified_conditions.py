@@ -11,7 +11,7 @@ import numpy as np
 from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER
 from shields.certificate import Certificate
-from shields.proof import CertifiedProof, ContractProof
+from shields.proof_data import CertifiedProof, ContractProof
 from shields.verification.conditions import Condition, flag, matrix_condition, scalar_condition
 from shields.verification.rational_matrix import (
     Matrix,

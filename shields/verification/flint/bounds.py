@@ -10,7 +10,7 @@ from flint import arb, ctx, fmpq
 
 from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian
-from shields.proof import ContractProof
+from shields.proof_data import ContractProof
 from shields.verification.conditions import Condition
 from shields.verification.flint.exact import at_least_zero, definite, identity, is_so, matrix, number
 

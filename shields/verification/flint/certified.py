@@ -12,7 +12,7 @@ from flint import fmpq
 
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
-from shields.proof import CertifiedProof, ContractProof
+from shields.proof_data import CertifiedProof, ContractProof
 from shields.verification.conditions import Condition
 from shields.verification.flint.bounds import bound_conditions
 from shields.verification.flint.exact import at_least_zero, definite, form, identity, is_so, mapped, matrix, number

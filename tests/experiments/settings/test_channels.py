@@ -5,7 +5,7 @@ from experiments.commands.sweep import _grid_points
 from experiments.settings.channel import ChannelSettings, _bursts
 from experiments.settings.learning import SweepSettings
 from ncs_gym import Channel, GilbertElliott
-from ncs_gym.network.channel_state import ChannelState
+from ncs_gym.network.transmission import ChannelState
 
 OWN = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
 

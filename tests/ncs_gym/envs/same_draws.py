@@ -9,7 +9,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from ncs_gym import LinearPlant, NCSEnv, NCSVectorEnv
-from ncs_gym.network.channel_state import ChannelState, LossState
+from ncs_gym.network.transmission import ChannelState, LossState
 from ncs_gym.plants.lqr import regulator_gain
 from ncs_gym.plants.process import LinearProcess
 
@@ -45,8 +45,8 @@ class ScriptedGenerator:
 class RecordedProcess(LinearProcess):
     """The process of a vector, which notes noise and disturbances; those do not count among the uniform numbers."""
 
-    def disturb(self, rng: Any, nominal: np.ndarray, steps: Any, memory: Any) -> np.ndarray:
-        self.steps, self.disturbance_now = np.copy(steps), super().disturb(rng.rng, nominal, steps, memory)
+    def draw_disturbance(self, rng: Any, nominal: np.ndarray, steps: Any, memory: Any) -> np.ndarray:
+        self.steps, self.disturbance_now = np.copy(steps), super().draw_disturbance(rng.rng, nominal, steps, memory)
         return self.disturbance_now
 
     def measure(self, rng: Any, state: np.ndarray) -> np.ndarray:
@@ -58,10 +58,10 @@ class RecordedProcess(LinearProcess):
 class ScriptedProcess(LinearProcess):
     """The process of a scalar environment with the noise and the disturbances of one environment of a vector."""
 
-    def disturb(self, rng: Any, nominal: np.ndarray, steps: Any, memory: Any) -> np.ndarray:
+    def draw_disturbance(self, rng: Any, nominal: np.ndarray, steps: Any, memory: Any) -> np.ndarray:
         source = self.disturbance
         if source.vectorized and not source.memoryless and source.replaces_process_noise:  # it is a function of these
-            own = super().disturb(rng, nominal, steps, memory)
+            own = super().draw_disturbance(rng, nominal, steps, memory)
             np.testing.assert_allclose(own, self.disturbance_now, atol=1e-7)
         return self.disturbance_now
 

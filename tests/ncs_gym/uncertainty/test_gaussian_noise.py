@@ -37,7 +37,7 @@ def draws_of(env, count):
     shape = (plant.n,) if process.size is None else (plant.n, process.size)
     memory = process.begin(rng, process.size)
     zero, steps = np.zeros(shape), 0 if process.size is None else np.zeros(process.size, np.int64)
-    moved = [process.disturb(rng, zero, steps, memory) for _ in range(count)]
+    moved = [process.draw_disturbance(rng, zero, steps, memory) for _ in range(count)]
     measured = [process.measure(rng, zero) for _ in range(count)]
     errors = [process.first_error(rng, process.size) for _ in range(count)]
     return [
@@ -190,7 +190,7 @@ def test_share_of_episodes_with_an_escape_is_what_the_bound_says():
     zero, none = np.zeros((2, count)), np.zeros(count, np.int64)
     memory = env._process.begin(rng, count)
     for step in range(1, steps + 1):
-        escaped |= plant.process_noise.bound.gauge(env._process.disturb(rng, zero, none, memory).T) > 1.0
+        escaped |= plant.process_noise.bound.gauge(env._process.draw_disturbance(rng, zero, none, memory).T) > 1.0
         if step % channel.send_period == 0:
             escaped |= plant.sensor_noise.bound.gauge(env._process.measure(rng, zero).T) > 1.0
     bound = escape_probability(plant, channel, steps)

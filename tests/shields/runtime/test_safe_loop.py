@@ -19,7 +19,7 @@ from ncs_gym import (
     certified_error_set,
     truck_trailer,
 )
-from ncs_gym.network.channel_state import ChannelState
+from ncs_gym.network.transmission import ChannelState
 from shields import CertificateError, SafeLoop, SafetyShield, VectorSafetyShield
 from shields.runtime.filter import MODES
 from shields.runtime.guarantee import ALARM, LARGE_ERROR, NOT_KNOWN_INSIDE, OTHER_INPUT

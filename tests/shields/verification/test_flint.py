@@ -32,7 +32,7 @@ MAY_IMPORT = {
     "ncs_gym",
     "ncs_gym.uncertainty.truncated_gaussian",
     "shields.certificate",
-    "shields.proof",
+    "shields.proof_data",
     "shields.verification.conditions",
 }
 
