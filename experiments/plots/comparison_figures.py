@@ -28,7 +28,8 @@ def comparison_figures(
     figures = {
         "training": training_figure(arms),
         "scatter": scatter_figure(summary["arms"], arms),
-        "phase": phase_figure(plant, certificate, arms),
         "episode": episode_figure(plant, arms),
     }
+    if plant.n > 1:  # a single state has no phase plane
+        figures["phase"] = phase_figure(plant, certificate, arms)
     return {name: (figure.caption, figure.png) for name, figure in figures.items()}

@@ -16,7 +16,7 @@ from experiments.plots.phase_plane import _plane, phase_figure
 from experiments.plots.scatter import scatter_figure
 from experiments.plots.time_series import _shown_arms, episode_figure
 from experiments.plots.training_curves import _RATE_WINDOW, _common_steps, _rates, training_figure
-from ncs_gym import Ellipsoid
+from ncs_gym import Ellipsoid, LinearPlant
 from tests.experiments.results import ALL_ARMS, history, run, summary_of, trajectory
 from tests.plants import random_plant
 
@@ -352,6 +352,13 @@ def test_every_figure_is_a_png_with_a_caption_of_its_own(plant):
     assert set(figures) == {"training", "scatter", "phase", "episode"}
     assert all(png.startswith(b"\x89PNG") for _, png in figures.values())
     assert len({caption for caption, _ in figures.values()}) == 4
+
+
+def test_a_single_state_has_no_phase_plane():
+    single = LinearPlant(A=[[0.9]], B=[[1.0]], box=[1.0], u_max=1.0, dt=0.1, disturbance_bound=0.01, initial_bound=0.0)
+    shown = arms("unshielded", "shielded", trajectory=trajectory(np.zeros((11, 1))))
+    figures = comparison_figures(single, SimpleNamespace(L=np.eye(1)), summary_of(shown), shown)
+    assert set(figures) == {"training", "scatter", "episode"}
 
 
 def test_legend_below_has_at_least_the_rows_asked_for(plant):
