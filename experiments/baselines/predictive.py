@@ -18,13 +18,15 @@ HORIZON = 20
 class PredictiveFilter:
     """The closest input from which a nominal plan exists that ends in the safe set.
 
-    It solves (Wabersich and Zeilinger, "Linear model predictive safety certification for learning-based control", 2018,
-    and "A predictive safety filter for learning-based control of constrained nonlinear dynamical systems", 2021), with x_0 = x_hat taken for the true state and neither disturbance nor error set,
+    It solves, with x_0 = x_hat taken for the true state and neither disturbance nor error set,
 
         min |u_0 - proposed|^2  s.t.  x_{i+1} = A x_i + B u_i,  |u_i| <= u_max,  |c_j x_i| <= 1 (0 < i < N),  x_N in S.
 
     Where the proposed input followed by u = K x is such a plan already, nothing is solved. Where the program has no
     solution, the rest of the last plan is applied, as the authors do, and u = K x_hat when it is used up.
+
+    Wabersich and Zeilinger: "Linear model predictive safety certification for learning-based control" (2018) and "A
+    predictive safety filter for learning-based control of constrained nonlinear dynamical systems" (2021).
 
     Args:
         certificate: Gives S and K; verified exactly here.
