@@ -37,11 +37,8 @@ class EstimateFilter(VectorWrapper):
 
     def __init__(self, env: VectorEnv, rule: Rule, penalty: float = 0.0) -> None:
         super().__init__(env)
-        inner = env.unwrapped
-        if not isinstance(inner, NCSVectorEnv):
-            raise ValueError(f"a filter by the estimate needs an NCSVectorEnv inside, got {type(inner).__name__}")
-        self._limits, self._rule, self.penalty = inner.plant.u_max, rule, penalty
-        self._inputs_of = inner.inputs_of
+        inner = _environment_behind(env)
+        self._limits, self._inputs_of, self._rule, self.penalty = inner.plant.u_max, inner.inputs_of, rule, penalty
         self._begins_at_once = inner.autoreset_mode is AutoresetMode.SAME_STEP
         self._begins_next = inner.autoreset_mode is AutoresetMode.NEXT_STEP
         self._done = self._begun = np.zeros(self.num_envs, np.bool_)
@@ -82,8 +79,19 @@ def filtered(env: VectorEnv, name: str, certificate: Certificate, penalty: float
         ValueError: If its innermost environment is not an `NCSVectorEnv`.
         CertificateError: If the certificate does not verify for the environment's plant.
     """
-    plant = getattr(env.unwrapped, "plant", None)
-    return EstimateFilter(env, FILTERS[name](certificate, plant), penalty)  # pyright: ignore[reportArgumentType]
+    return EstimateFilter(env, FILTERS[name](certificate, _environment_behind(env).plant), penalty)
+
+
+def _environment_behind(env: VectorEnv) -> NCSVectorEnv:
+    """Returns the innermost environment.
+
+    Raises:
+        ValueError: If it is not an `NCSVectorEnv`.
+    """
+    inner = env.unwrapped
+    if not isinstance(inner, NCSVectorEnv):
+        raise ValueError(f"a filter by the estimate needs an NCSVectorEnv inside, got {type(inner).__name__}")
+    return inner
 
 
 def _info(applied: np.ndarray, proposed: np.ndarray, intervened: np.ndarray) -> dict[str, Any]:
