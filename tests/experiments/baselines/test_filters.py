@@ -84,11 +84,9 @@ def test_predictive_filter_finds_the_closest_input_with_a_nominal_plan(certifica
     predictive, grid = PredictiveFilter(certificate, loaded, horizon=2), np.linspace(-1.0, 1.0, 401) * loaded.u_max
     rng, found = np.random.default_rng(3), 0
     first, second = (each.ravel()[:, None] for each in np.meshgrid(grid, grid, indexing="ij"))
-    for _ in range(40):
-        estimate, proposed = (
-            1.2 * rng.uniform(-1.0, 1.0, 2) * loaded.half_widths,
-            rng.uniform(-1.0, 1.0, 1) * loaded.u_max,
-        )
+    for _ in range(60):
+        estimate = 1.3 * rng.uniform(-1.0, 1.0, 2) * loaded.half_widths
+        proposed = rng.uniform(-1.0, 1.0, 1) * loaded.u_max
         one = loaded.A @ estimate + first @ loaded.B.T
         two = one @ loaded.A.T + second @ loaded.B.T
         fine = (np.abs(one @ loaded.C.T) <= 1.0).all(axis=1)

@@ -62,7 +62,7 @@ def test_name_says_which_filter_and_which_policy(name, mode, policy):
     ],
 )
 def test_unknown_arms_are_refused_with_those_that_are_known(name):
-    with pytest.raises(ValueError, match="unknown arm .*known are unshielded"):
+    with pytest.raises(ValueError, match=r"unknown arm .*known are unshielded"):
         Arm.of(name)
 
 
