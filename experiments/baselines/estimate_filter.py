@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,11 @@ from shields import Certificate
 Rule = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 # How each filter is made from a certificate and its plant.
-FILTERS: dict[str, Callable[[Certificate, LinearPlant], Rule]] = {"trusting": TrustingFilter, "psf": PredictiveFilter}
+FILTERS: dict[str, Callable[[Certificate, LinearPlant], Rule]] = {
+    "trusting": TrustingFilter,
+    "trusting:lookahead": partial(TrustingFilter, mode="lookahead"),
+    "psf": PredictiveFilter,
+}
 
 
 class EstimateFilter(VectorWrapper):

@@ -127,13 +127,14 @@ def _escapes(
 ) -> dict[str, Any]:
     """Returns the bound on the probability that an episode leaves the safe set, and how often shielded arms did.
 
-    The bound is about episodes that begin in the safe set; where not all do, it is 1.
+    The bound is about episodes that begin in the safe set; where not all do, it is 1. Mode "lookahead" may leave that
+    set on purpose and is not listed.
     """
     env = ncs_env(ControlLoop(env=setup.env, channel=setup.channel, noise=setup.noise).single())
     steps = gym.spec(setup.env).max_episode_steps or 1
     begins_inside = starts_inside(setup.certificate, env.initial_set)
     bound = escape_probability(env.plant, env.channel, steps) if begins_inside else 1.0
-    shielded = [name for name, mode in modes.items() if is_shield(mode)]
+    shielded = [name for name, mode in modes.items() if is_shield(mode) and mode != "lookahead"]
     episodes = {name: [each for result in results_by_arm[name] for each in result.episodes] for name in shielded}
     return escape_summary(bound, steps, episodes)
 

@@ -66,7 +66,7 @@ class ArmStyle:
         if arm.violation_weight is not None:
             dash = float(np.clip(_PRICE_DASH * 2.0 ** np.log10(max(arm.violation_weight, 1e-9)), 0.5, 50.0))
             return cls(color, (0, (dash, 1.6)), marker, hollow=True, size=7.0)
-        changed = arm.penalizes_interventions or arm.is_residual
+        changed = arm.penalizes_interventions or arm.is_residual or arm.mode == "trusting:lookahead"
         return cls(color, _DASHED if changed else _SOLID, marker, hollow=changed, size=10.0 if changed else 7.0)
 
     @property
@@ -105,4 +105,4 @@ def _look(arm: Arm) -> str:
 
 def _default(arm: Arm) -> str:
     """Returns the key of an arm behind a filter that does not name a mode of the shield."""
-    return "shielded" if arm.is_shielded else str(arm.mode)
+    return "shielded" if arm.is_shielded else str(arm.mode).partition(":")[0]

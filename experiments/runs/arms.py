@@ -12,10 +12,10 @@ from shields.runtime.filter import MODES
 _SHIELD_MODES = tuple(mode for mode in MODES if mode != "monitor")
 PENALTY_SUFFIX, RESIDUAL_SUFFIX, TEST_SUFFIX = "+penalty", "+residual", " at test"
 _KNOWN_ARMS = (
-    "unshielded, monitor, penalized, penalized:WEIGHT, lagrangian, and FILTER, 'FILTER at test' and CONTROLLER+FILTER "
-    f"with FILTER one of shielded, shielded:MODE, {', '.join(FILTERS)} (modes: {', '.join(_SHIELD_MODES)}, each also a "
-    f"FILTER's name if it is lookahead) and CONTROLLER one of untrained, {', '.join(CONTROLLERS)}; with a filter in "
-    "training also FILTER+penalty, and every trained one with +residual"
+    "unshielded, monitor, penalized, penalized:WEIGHT, lagrangian, FILTER, 'FILTER at test', FILTER+penalty, each also "
+    "with +residual; CONTROLLER and CONTROLLER+FILTER, with FILTER one of shielded, shielded:MODE, "
+    f"lookahead, {', '.join(FILTERS)} (modes: {', '.join(_SHIELD_MODES)}) and CONTROLLER one of untrained, "
+    f"{', '.join(CONTROLLERS)}"
 )
 
 # Results of the training runs of each arm, in the order of their indices.
@@ -123,7 +123,7 @@ def _trained(name: str, mode: str) -> Arm | None:
 
 def _mode(name: str, mode: str) -> str | None:
     """Returns the mode that the name of a filter stands for; None if this is no name of one."""
-    if name in FILTERS or (name == "lookahead" and name in _SHIELD_MODES):
+    if name in FILTERS or name == "lookahead":
         return name
     kind, colon, own = name.partition(":")
     if kind != "shielded" or (colon and own not in _SHIELD_MODES):

@@ -13,7 +13,7 @@ from experiments.settings.backend import BackendSettings
 from experiments.settings.channel import ChannelSettings
 
 Algorithm = Literal["PPO", "A2C", "SAC", "TD3", "TRPO", "TQC", "CrossQ"]
-Mode = Literal["project", "switch", "boundary"]
+Mode = Literal["project", "switch", "boundary", "lookahead"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,8 @@ class LearningSettings:
         episodes: Evaluation episodes per run.
         algo: Learning algorithm; TRPO, TQC and CrossQ need sb3-contrib.
         mode: What the shield applies in place of an unsafe action: the closest safe input ("project"), or the certified
-            K x_hat ("switch"; "boundary" applies it unless every action would be safe).
+            K x_hat ("switch"; "boundary" applies it unless every action would be safe), or, where a certified plan that
+            leaves S and returns begins with it, the action itself ("lookahead").
         intervention_penalty: Subtracted from the training reward per intervention, in arms with "+penalty".
         violation_penalty: Subtracted from the training reward per violating step, in the arm "penalized".
         certificate: Certificate file to use instead of synthesizing one.
@@ -92,7 +93,8 @@ class CompareSettings(BackendSettings, LearningSettings):
         seeds: Number of paired training runs per arm.
         arms: unshielded, monitor (unshielded, counts what the shield would have done), penalized (unshielded, with a
             penalty per violation), penalized:WEIGHT, lagrangian (PPO-Lagrangian adapts that penalty), shielded,
-            shielded:MODE, trusting (the shield's test without its error set), psf (a nominal predictive safety filter).
+            shielded:MODE, lookahead, trusting and trusting:lookahead (the shield without its error set), psf (a nominal
+            predictive safety filter).
             shield-at-test, trusting-at-test and psf-at-test are trained unshielded; +penalty costs reward per
             intervention, +residual adds the agent's action to K x_hat. Controllers that are not trained: proportional,
             lqr, random, K-x_hat, zero-input and untrained, alone or behind a filter as in proportional+shielded.
@@ -160,7 +162,7 @@ class EvaluateSettings:
 
     model: tyro.conf.Positional[Path]
     env: str | None = None
-    shield: Literal["none", "monitor", "project", "switch", "boundary"] = "none"
+    shield: Literal["none", "monitor", "project", "switch", "boundary", "lookahead"] = "none"
     episodes: int = 200
     seed: int = 0
     certificate: Path | None = None
@@ -233,7 +235,7 @@ class RenderSettings:
     env: str = "ncs_gym/TruckTrailerCruise-v0"
     out: Annotated[Path, tyro.conf.arg(aliases=["--gif"])] = Path("episode.gif")
     policy: str = "greedy"
-    shield: Literal["project", "switch", "boundary", "monitor", "none"] = "project"
+    shield: Literal["project", "switch", "boundary", "lookahead", "monitor", "none"] = "project"
     side_by_side: bool = False
     certificate: Path | None = None
     seed: int = 0

@@ -69,6 +69,23 @@ def test_trusting_filter_decides_as_the_shield_without_an_error(certificate, loa
     assert 20 < np.count_nonzero(applied != cases[1]) < 380
 
 
+def test_trusting_lookahead_keeps_its_plans_and_leaves_the_safe_set_on_purpose(certificate, loaded):
+    shield, trusting = SafetyFilter(certificate, loaded, "lookahead"), TrustingFilter(certificate, loaded, "lookahead")
+    state, stored, reasons = np.zeros(2), (), set()
+    proposals = loaded.u_max * np.sign(np.repeat(np.random.default_rng(2).standard_normal(8), 6))[:, None]
+    farthest = 0.0
+    for k, proposed in enumerate(proposals):
+        decision = shield.decide(state, np.zeros((2, 2)), proposed, stored)
+        u = trusting(state[None], proposed[None], np.array([k == 0]))[0]
+        np.testing.assert_allclose(u, decision.input, atol=1e-6)
+        stored, state = decision.plan, loaded.A @ state + loaded.B @ decision.input
+        reasons.add(decision.reason)
+        farthest = max(farthest, state @ certificate.M @ state)
+        assert np.abs(loaded.C @ state).max() <= 1.0
+    assert {"safe", "planned"} <= reasons
+    assert farthest > 0.9
+
+
 def test_trusting_filter_still_keeps_the_disturbance_out_if_the_estimate_is_true(certificate, loaded, trusting, cases):
     estimates, proposed = (array[certificate.safe_set.contains(cases[0])] for array in cases)
     applied = trusting(estimates, proposed, np.zeros(len(estimates), np.bool_))

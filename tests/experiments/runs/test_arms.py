@@ -35,6 +35,9 @@ def layers(env):
         ("shielded:switch", "switch", "trained"),
         ("trusting", "trusting", "trained"),
         ("psf+penalty", "psf", "trained"),
+        ("lookahead", "lookahead", "trained"),
+        ("lookahead at test", "lookahead", "trained"),
+        ("lqr+trusting:lookahead", "trusting:lookahead", "lqr"),
         ("shield at test", "boundary", "trained"),
         ("trusting at test", "trusting", "trained"),
         ("shielded+penalty+residual", "boundary", "trained"),
@@ -49,7 +52,7 @@ def layers(env):
 def test_name_says_which_filter_and_which_policy(name, mode, policy):
     arm = Arm.of(name, "boundary")
     assert (arm.name, arm.mode, arm.policy) == (name, mode, policy)
-    assert arm.is_shielded == (mode not in (None, "trusting", "psf"))
+    assert arm.is_shielded == (mode is not None and mode.partition(":")[0] not in ("trusting", "psf"))
     assert Arm.of(name.replace(" ", "-"), "boundary") == arm
 
 
