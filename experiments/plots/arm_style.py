@@ -62,7 +62,7 @@ class ArmStyle:
         arm = Arm.of(name)
         color, marker = ARM_COLORS_AND_MARKERS[_look(arm)]
         if name == "monitor" or not arm.filters_training:
-            return cls(color, _DOTTED, marker, hollow=True, size=11.0)
+            return cls(color, _DOTTED, marker if arm.filters_training else "h", hollow=True, size=11.0)
         if arm.violation_weight is not None:
             dash = float(np.clip(_PRICE_DASH * 2.0 ** np.log10(max(arm.violation_weight, 1e-9)), 0.5, 50.0))
             return cls(color, (0, (dash, 1.6)), marker, hollow=True, size=7.0)

@@ -278,7 +278,7 @@ def test_every_condition_has_a_table_and_every_arm_an_explanation():
     change = {"conditions": {"gaussian": run("shielded", violations=(3, 0)).episodes}}
     page = Reader(comparison("shielded", "trusting", "lagrangian", "lqr+psf", "shield at test", change=change))
     table = {row[0]: row[1:] for row in page.tables["Evaluation: gaussian"]}
-    assert table["trusting"][:2] == ["3 of 6 50.0 % [11.8, 88.2]", "9"]
+    assert table["trusting"][:2] == ["3 of 650.0 % [11.8, 88.2]", "9"]
     assert "3 of 3" not in table["trusting"][4]
     assert table["shielded"][4] == "6 of 6"
     text = " ".join("".join(page.text).split())
