@@ -26,6 +26,15 @@ ARM_COLORS_AND_MARKERS = {
     "psf": ("#117733", ">"),
     "controller": ("#BBBBBB", "*"),
 }
+# Markers of policies that are not trained, in the color of what they are behind.
+_CONTROLLER_MARKERS = {
+    "proportional": "*",
+    "lqr": "H",
+    "random": "8",
+    "K x_hat": "1",
+    "zero input": "2",
+    "untrained": "3",
+}
 _SOLID, _DOTTED, _DASHED = "-", (0, (1.0, 1.3)), (0, (4.5, 1.6))
 # Length of a dash that stands for a price of 1 per violating step, in line widths; it doubles with every factor of ten.
 _PRICE_DASH = 6.0
@@ -63,6 +72,8 @@ class ArmStyle:
         color, marker = ARM_COLORS_AND_MARKERS[_look(arm)]
         if name == "monitor" or not arm.filters_training:
             return cls(color, _DOTTED, marker if arm.filters_training else "h", hollow=True, size=11.0)
+        if not arm.is_trained:
+            return cls(color, _DASHED, _CONTROLLER_MARKERS[arm.policy], hollow=False, size=9.0)
         if arm.violation_weight is not None:
             dash = float(np.clip(_PRICE_DASH * 2.0 ** np.log10(max(arm.violation_weight, 1e-9)), 0.5, 50.0))
             return cls(color, (0, (dash, 1.6)), marker, hollow=True, size=7.0)

@@ -1,5 +1,6 @@
 """Filters that take the estimate for the truth: what they keep, what they lose, and that they promise nothing."""
 
+from dataclasses import replace
 from functools import partial
 
 import gymnasium as gym
@@ -13,6 +14,7 @@ from experiments.baselines.predictive import PredictiveFilter
 from experiments.baselines.trusting import TrustingFilter
 from ncs_gym.envs.env import ncs_env
 from shields import SafetyFilter
+from tests.certificates import certificate_of
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 NEVER = np.zeros(1, np.bool_)
@@ -49,6 +51,21 @@ def test_trusting_filter_is_caught_leaving_the_safe_set_and_the_shield_is_not(ce
     assert 0.8 * overridden[1] < overridden[0] <= overridden[1]
     assert not any(episode.guaranteed for episode in trusted)
     assert all(episode.guaranteed for episode in shielded)
+
+
+def test_trusting_lookahead_is_caught_leaving_the_box_and_lookahead_is_not():
+    reactor = ControlLoop(env="ncs_gym/BatchReactor-v0")
+    env = ncs_env(reactor.single())
+    certificate = certificate_of(env.plant, env.contract)
+    policy = controller("lqr", env, certificate.K, 0)
+    trusting = replace(reactor, filter=partial(filtered, name="trusting:lookahead", certificate=certificate))
+    lookahead = replace(reactor, shield=ShieldSettings(certificate, "lookahead"))
+    violating = [
+        sum(episode.violation_steps for episode in evaluate(loop, policy, 4, 7).episodes)
+        for loop in (trusting, lookahead)
+    ]
+    assert violating[0] >= 3  # an episode ends at its first violation
+    assert violating[1] == 0
 
 
 @pytest.mark.parametrize("name", FILTERS)
