@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from agents.agent import Agent, AgentError
-    from agents.callbacks import SafetyCallback
+    from agents.callbacks import DualAscentCallback, SafetyCallback
     from agents.control_loop import ControlLoop, ShieldSettings
     from agents.evaluation import evaluate
     from agents.results import Episode, Evaluation, TrainingPoint, Trajectory
     from agents.sb3_vec_env import SB3VecEnv
-    from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
+    from agents.settings import A2CSettings, LagrangianSettings, OffPolicySettings, PPOSettings
     from agents.training import TrainingResult, train
 
 __all__ = [
@@ -24,8 +24,10 @@ __all__ = [
     "Agent",
     "AgentError",
     "ControlLoop",
+    "DualAscentCallback",
     "Episode",
     "Evaluation",
+    "LagrangianSettings",
     "OffPolicySettings",
     "PPOSettings",
     "SB3VecEnv",
@@ -40,12 +42,12 @@ __all__ = [
 
 _MODULES = {
     "agent": ("Agent", "AgentError"),
-    "callbacks": ("SafetyCallback",),
+    "callbacks": ("DualAscentCallback", "SafetyCallback"),
     "control_loop": ("ControlLoop", "ShieldSettings"),
     "evaluation": ("evaluate",),
     "results": ("Episode", "Evaluation", "TrainingPoint", "Trajectory"),
     "sb3_vec_env": ("SB3VecEnv",),
-    "settings": ("A2CSettings", "OffPolicySettings", "PPOSettings"),
+    "settings": ("A2CSettings", "LagrangianSettings", "OffPolicySettings", "PPOSettings"),
     "training": ("TrainingResult", "train"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

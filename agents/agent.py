@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.algorithms import ALGORITHMS, build_model
 from agents.control_loop import ControlLoop
+from agents.loop_wrappers import with_gain
 from agents.sb3_vec_env import SB3VecEnv
 from agents.settings import AgentSettings
 from ncs_gym import Channel, GilbertElliott
@@ -74,6 +75,7 @@ class Agent:
         channel: Channel the agent was trained with; None for that of the id.
         model: The stable-baselines3 model.
         normalization: Normalization of the model's observations.
+        residual_gain: Normalized gain, shape (m, n), to whose action that of the model is added; None for none.
     """
 
     algorithm: str
@@ -82,10 +84,12 @@ class Agent:
     channel: Channel | None
     model: BaseAlgorithm
     normalization: Normalization
+    residual_gain: np.ndarray | None = None
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Returns deterministic actions, shape (N, m), for raw observations, shape (N, entries)."""
-        return self.model.predict(self.normalization(observations), deterministic=True)[0]
+        actions = self.model.predict(self.normalization(observations), deterministic=True)[0]
+        return actions if self.residual_gain is None else with_gain(self.residual_gain, observations, actions)
 
     @cached_property
     def checksum(self) -> str:
@@ -113,6 +117,8 @@ class Agent:
             },
             "sha256_of_model": hashlib.sha256(buffer.getvalue()).hexdigest(),
         }
+        if self.residual_gain is not None:
+            content["residual_gain"] = self.residual_gain.tolist()
         document = {"format": _FORMAT, "sha256": _digest(content), "agent": content}
         return {"model.zip": buffer.getvalue(), "agent.json": (json.dumps(document, indent=1) + "\n").encode()}
 
@@ -194,6 +200,12 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
     usable = mean.shape == variance.shape == model.observation_space.shape
     if not (usable and np.isfinite(mean).all() and np.isfinite(variance).all() and (variance >= 0.0).all()):
         raise AgentError("the agent is damaged: its normalization has a wrong shape or value")
+    gain = content.get("residual_gain")
+    if gain is not None:
+        gain = np.array(gain, dtype=np.float64)
+        fits = gain.ndim == 2 and gain.shape[:1] == model.action_space.shape and gain.shape[1] <= len(mean)
+        if not (fits and np.isfinite(gain).all()):
+            raise AgentError("the agent is damaged: its residual gain has a wrong shape or value")
     return Agent(
         algorithm=algorithm,
         settings=settings,
@@ -201,6 +213,7 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         channel=channel,
         model=model,
         normalization=Normalization(mean, variance, float(numbers["epsilon"]), float(numbers["clip"])),
+        residual_gain=gain,
     )
 
 

@@ -1,4 +1,4 @@
-"""Counts violations and interventions during training, step by step."""
+"""What happens beside the learning, step by step: violations are counted, and their price is adapted."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
+from agents.loop_wrappers import CostPenalty
 from agents.results import TrainingPoint
 from agents.sb3_vec_env import SB3VecEnv
+from agents.settings import LagrangianSettings
 
 # The history has about this many points where every step of all environments is a rollout.
 _MAX_POINTS = 200
@@ -70,6 +72,43 @@ class SafetyCallback(BaseCallback):
         self.history.append(TrainingPoint(self.num_timesteps, mean, self.violation_steps, self.interventions))
         if self._on_progress is not None:
             self._on_progress(self.num_timesteps - last.steps)
+
+
+class DualAscentCallback(BaseCallback):
+    """Raises the penalty of violations while the agent violates: the dual ascent of PPO-Lagrangian.
+
+    The agent maximizes the mean of reward - multiplier * cost, the multiplier minimizes it over the numbers >= 0. After
+    every rollout in which episodes ended, with J their mean number of violating steps and d the limit,
+
+        multiplier <- max(0, multiplier + learning_rate (J - d)).
+
+    This is Ray, Achiam and Amodei's constrained baseline ("Benchmarking Safe Exploration in Deep Reinforcement
+    Learning", 2019) with a plain gradient step in place of Adam, and Stooke, Achiam and Abbeel's PID controller
+    ("Responsive Safety in Reinforcement Learning by PID Lagrangian Methods", 2020) with the integral term alone. The
+    cost is part of the reward, so one value function estimates both, where theirs have one each. With a limit of zero
+    the multiplier never falls. TensorBoard gets `safety/multiplier`.
+
+    Args:
+        settings: Limit and learning rate.
+        priced: The environment's penalty, which is set.
+    """
+
+    def __init__(self, settings: LagrangianSettings, priced: CostPenalty) -> None:
+        super().__init__()
+        self._settings, self._priced = settings, priced
+        self._costs: list[float] = []
+
+    def _on_step(self) -> bool:
+        ended = np.flatnonzero(self.locals["dones"]).tolist()
+        self._costs += [float(self.locals["infos"][e]["episode_violations"]) for e in ended]
+        return True
+
+    def _on_rollout_end(self) -> None:
+        if self._costs:
+            excess = float(np.mean(self._costs)) - self._settings.cost_limit
+            self._priced.penalty = max(0.0, self._priced.penalty + self._settings.learning_rate * excess)
+            self._costs = []
+        self.logger.record("safety/multiplier", self._priced.penalty)
 
 
 def _batch_info(env: VecEnv) -> dict[str, np.ndarray] | None:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import SyncVectorEnv, VectorEnv, VectorWrapper
+from gymnasium.vector import SyncVectorEnv, VectorEnv
 
 import ncs_gym  # noqa: F401  (registers the environments)
+from agents.loop_wrappers import CostPenalty, ResidualActions
+from agents.settings import LagrangianSettings
 from ncs_gym import Channel
 from shields import Certificate, SafetyShield, VectorSafetyShield
 
@@ -29,7 +32,7 @@ class ShieldSettings:
     penalty: float = 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ControlLoop:
     """An environment together with everything between it and the agent.
 
@@ -40,6 +43,10 @@ class ControlLoop:
         violation_penalty: Subtracted from the reward of every step whose true state violates the safe box, in vector
             environments, which agents are trained in.
         noise: "truncated", or "gaussian" for noise without a bound, which environments of this package can have.
+        disturbance: Replaces the disturbance of the id; None keeps it.
+        filter: Puts another safety filter around vector environments, in place of a shield.
+        lagrangian: How the violation penalty is adapted in training, instead of a fixed one.
+        residual_gain: Normalized gain, shape (m, n), to whose action an agent in training adds its own.
     """
 
     env: str
@@ -47,12 +54,16 @@ class ControlLoop:
     shield: ShieldSettings | None = None
     violation_penalty: float = 0.0
     noise: str = "truncated"
+    disturbance: Any = None
+    filter: Callable[[VectorEnv], VectorEnv] | None = None
+    lagrangian: LagrangianSettings | None = None
+    residual_gain: np.ndarray | None = None
 
     @property
     def without_penalties(self) -> ControlLoop:
-        """The same loop with the environment's own rewards."""
+        """The same loop as it is evaluated: with the environment's own rewards, the policy's actions being complete."""
         shield = self.shield and replace(self.shield, penalty=0.0)
-        return replace(self, shield=shield, violation_penalty=0.0)
+        return replace(self, shield=shield, violation_penalty=0.0, lagrangian=None, residual_gain=None)
 
     def single(self, **settings: Any) -> gym.Env:
         """Returns one environment, without the penalty of a violation; `settings` are passed to `gym.make`."""
@@ -70,31 +81,18 @@ class ControlLoop:
             if self.shield is not None:
                 mode, penalty = self.shield.mode, self.shield.penalty
                 envs = VectorSafetyShield(envs, self.shield.certificate, mode=mode, penalty=penalty)
+        if self.filter is not None:
+            envs = self.filter(envs)
+        if self.residual_gain is not None:
+            envs = ResidualActions(envs, self.residual_gain)
+        if self.lagrangian is not None:
+            return CostPenalty(envs, self.lagrangian.multiplier)
         return CostPenalty(envs, self.violation_penalty) if self.violation_penalty else envs
 
     def _settings(self, settings: dict[str, Any]) -> dict[str, Any]:
         own: dict[str, Any] = {} if self.channel is None else {"channel": self.channel}
         if self.noise != "truncated":
             own["noise"] = self.noise
+        if self.disturbance is not None:
+            own["disturbance"] = self.disturbance
         return own | settings
-
-
-class CostPenalty(VectorWrapper):
-    """Subtracts a penalty from the reward of every step after which the true state violates the safe box.
-
-    Args:
-        env: A vector environment with `cost` in its infos.
-        penalty: Subtracted per violating step.
-    """
-
-    def __init__(self, env: VectorEnv, penalty: float) -> None:
-        super().__init__(env)
-        self.penalty = penalty
-
-    def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Steps the environments; the cost of an episode's last step is read from its final info."""
-        observation, rewards, terminated, truncated, info = self.env.step(actions)
-        cost, done = info["cost"], terminated | truncated
-        if "final_info" in info:
-            cost = np.where(done, info["final_info"]["cost"], cost)
-        return observation, rewards - self.penalty * cost, terminated, truncated, info

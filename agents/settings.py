@@ -102,6 +102,27 @@ class OffPolicySettings(_Settings):
     width: int = 64
 
 
+@dataclass(frozen=True, kw_only=True)
+class LagrangianSettings:
+    """Settings of PPO-Lagrangian: how the price of a violating step is adapted (Ray et al. 2019).
+
+    Attributes:
+        cost_limit: Largest mean cost of an episode (violating steps) that the agent is trained for.
+        learning_rate: Added to the multiplier per violating step of a mean episode above the limit.
+        multiplier: Price of a violating step at the start of the training.
+    """
+
+    cost_limit: float = 0.0
+    learning_rate: float = 0.05
+    multiplier: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        for entry in fields(self):
+            if not 0.0 <= (value := getattr(self, entry.name)) < math.inf:
+                raise ValueError(f"{entry.name} must be >= 0, got {value!r}")
+
+
 AgentSettings = PPOSettings | A2CSettings | OffPolicySettings
 
 

@@ -12,8 +12,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.agent import Agent, Normalization
 from agents.algorithms import build_model, checked_settings
-from agents.callbacks import SafetyCallback
+from agents.callbacks import DualAscentCallback, SafetyCallback
 from agents.control_loop import ControlLoop
+from agents.loop_wrappers import CostPenalty
 from agents.results import TrainingPoint
 from agents.sb3_vec_env import SB3VecEnv
 from agents.settings import AgentSettings, OffPolicySettings
@@ -67,11 +68,15 @@ def train(
     settings = checked_settings(algorithm, settings)
     if isinstance(settings, OffPolicySettings) and steps <= settings.learning_starts:
         raise ValueError(f"{steps} steps train nothing: learning starts after {settings.learning_starts}")
-    env = VecNormalize(SB3VecEnv(loop.vector(settings.envs)), gamma=settings.discount)
+    envs = loop.vector(settings.envs)
+    env = VecNormalize(SB3VecEnv(envs), gamma=settings.discount)
     model = build_model(algorithm, env, settings, seed, steps)
     model.set_logger(configure(str(log_folder), ["tensorboard"]) if log_folder else Logger(None, []))
     callback = SafetyCallback(on_progress)
-    model.learn(steps, callback=callback)
+    adapting = []
+    if loop.lagrangian is not None and isinstance(envs, CostPenalty):
+        adapting = [DualAscentCallback(loop.lagrangian, envs)]
+    model.learn(steps, callback=[callback, *adapting])
     agent = _agent(loop, algorithm, settings, model, env)
     return TrainingResult(
         agent, callback.history, model.num_timesteps, callback.violation_steps, callback.interventions
@@ -95,4 +100,5 @@ def _agent(
         channel=loop.channel,
         model=model,
         normalization=Normalization.of(env),
+        residual_gain=loop.residual_gain,
     )

@@ -12,6 +12,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from experiments.runs.conditions import AS_TRAINED
 from experiments.runs.training_run import RunResult
 from shields.atomic_write import write_atomically
 
@@ -30,13 +31,14 @@ def write_tables(out: Path, results: Sequence[RunResult], provenance: dict[str, 
     Raises:
         OSError: If a file cannot be written.
     """
-    for name, attribute in (("episodes", "episodes"), ("training", "history")):
-        rows = [
-            {"arm": result.arm, "run": result.index, **asdict(entry)}
-            for result in results
-            for entry in getattr(result, attribute)
-        ]
-        write_atomically(out / f"{name}.parquet", parquet(rows, provenance))
+    episodes, points = [], []
+    for result in results:
+        own = {"arm": result.arm, "run": result.index}
+        for condition, played in ({AS_TRAINED: result.episodes} | result.conditions).items():
+            episodes += [own | asdict(episode) | {"condition": condition} for episode in played]
+        points += [own | asdict(point) for point in result.history]
+    write_atomically(out / "episodes.parquet", parquet(episodes, provenance))
+    write_atomically(out / "training.parquet", parquet(points, provenance))
 
 
 def parquet(rows: list[dict[str, Any]], provenance: dict[str, Any]) -> bytes:

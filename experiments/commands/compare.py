@@ -11,9 +11,10 @@ from typing import Any
 import gymnasium as gym
 
 from agents.control_loop import ControlLoop
+from experiments.analysis.arm_table import condition_text, summary_text
 from experiments.analysis.escapes import escape_sentences, escape_summary
 from experiments.analysis.parquet_tables import write_tables
-from experiments.analysis.summary import arm_summary, covered_fraction, paired_differences, summary_text
+from experiments.analysis.summary import arm_summary, covered_fraction, paired_differences
 from experiments.backends.execution import results_of
 from experiments.plots.comparison_figures import comparison_figures
 from experiments.report.comparison import comparison_report
@@ -25,7 +26,7 @@ from experiments.runs import (
     by_arm,
     prepare_output,
 )
-from experiments.runs.training_run import PolicyKind
+from experiments.runs.arms import is_shield
 from experiments.settings import CompareSettings, save_settings
 from ncs_gym import escape_probability
 from ncs_gym.envs.env import ncs_env
@@ -34,7 +35,6 @@ from shields.runtime.guarantee import starts_inside
 
 # Budget of `--smoke`: enough to pass through every part.
 _SMOKE = {"steps": 4_096, "episodes": 10, "seeds": 2}
-_REFERENCES: dict[str, PolicyKind] = {"zero input": "zero", "K x_hat": "certified gain", "untrained": "untrained"}
 
 
 def compare(settings: CompareSettings) -> None:
@@ -50,9 +50,7 @@ def compare(settings: CompareSettings) -> None:
     """
     if settings.smoke:
         settings = replace(settings, **_SMOKE)
-    arms = [Arm.of(name, settings.mode) for name in settings.arms]
-    if len({arm.name for arm in arms}) != len(arms) or not arms:
-        raise ValueError(f"--arms must be different ones, at least one, got {' '.join(settings.arms) or 'none'}")
+    settings = _with_full_names(settings)
     setup = ExperimentSetup.of(settings.env, settings.channel, settings.certificate, settings.noise)
     prepare_output(settings.out)
     save_settings(settings.out / "settings.json", "compare", settings)
@@ -65,18 +63,38 @@ def compare(settings: CompareSettings) -> None:
         findings += escape_sentences(summary["gaussian_noise"])
     _write(settings.out, summary, results, setup, findings)
     count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
-    print(f"\n{settings.env}: {count} per arm, {settings.episodes} evaluation episodes per run\n")
-    print(summary_text(summary["arms"], summary["references"]), *findings, f"files: {settings.out}", sep="\n")
+    trained = max(arm["train_steps"] for arm in summary["arms"].values())
+    print(f"\n{settings.env}: {count} and {trained:,} training steps per arm, {settings.episodes} episodes per run\n")
+    print(_tables(summary), *findings, f"files: {settings.out}", sep="\n")
+
+
+def _with_full_names(settings: CompareSettings) -> CompareSettings:
+    """Returns the settings with the full names of arms, each of which is listed once.
+
+    Raises:
+        ValueError: If an arm is unknown or is given twice, or there is none.
+    """
+    arms, references = (
+        tuple(Arm.of(name, settings.mode).name for name in names) for names in (settings.arms, settings.references)
+    )
+    if len(set(arms)) != len(arms) or not arms:
+        raise ValueError(f"--arms must be different ones, at least one, got {' '.join(settings.arms) or 'none'}")
+    references = tuple(name for name in dict.fromkeys(references) if name not in arms)
+    return replace(settings, arms=arms, references=references)
+
+
+def _tables(summary: dict[str, Any]) -> str:
+    """Returns the tables for a terminal: training and evaluation, then one per other condition."""
+    arms, references = summary["arms"], summary["references"]
+    conditions = next(iter(arms.values()))["conditions"]
+    others = [condition_text(condition, arms, references) for condition in conditions]
+    return "\n\n".join([summary_text(arms, references), *others])
 
 
 def _training_runs(settings: CompareSettings, setup: ExperimentSetup) -> list[TrainingRun]:
     """Returns the runs of every arm and of the reference policies, those that train first because they take longer."""
-    runs = []
-    for index in range(settings.seeds):
-        trained = [setup.training_run(settings, name, index) for name in settings.arms]
-        unshielded = replace(trained[0], mode=None, intervention_penalty=0.0, violation_penalty=0.0)
-        references = [replace(unshielded, arm=name, policy_kind=kind) for name, kind in _REFERENCES.items()]
-        runs += trained + references
+    names = settings.arms + settings.references
+    runs = [setup.training_run(settings, name, index) for index in range(settings.seeds) for name in names]
     return sorted(runs, key=lambda run: run.policy_kind != "trained")
 
 
@@ -87,14 +105,14 @@ def _summary(
     results_by_arm, modes = by_arm(results), {run.arm: run.mode for run in runs}
 
     def arm(name: str) -> dict[str, Any]:
-        fixed = _REFERENCES.get(name) in ("zero", "certified gain")
+        fixed = Arm.of(name).policy not in ("trained", "untrained")
         return arm_summary(results_by_arm[name], modes[name], fixed_policy=fixed)
 
     gaussian = {"gaussian_noise": _escapes(setup, modes, results_by_arm)} if settings.noise == "gaussian" else {}
     baseline = "unshielded" if "unshielded" in settings.arms else settings.arms[0]
     return {
         "arms": {name: arm(name) for name in settings.arms},
-        "references": {name: arm(name) for name in _REFERENCES},
+        "references": {name: arm(name) for name in settings.references},
         "paired_differences": {
             "baseline": baseline,
             "arms": paired_differences({name: results_by_arm[name] for name in settings.arms}, baseline),
@@ -109,13 +127,14 @@ def _escapes(
 ) -> dict[str, Any]:
     """Returns the bound on the probability that an episode leaves the safe set, and how often shielded arms did.
 
-    The bound is about episodes that begin in the safe set; where not all do, it is 1.
+    The bound is about episodes that begin in the safe set; where not all do, it is 1. Mode "lookahead" may leave that
+    set on purpose and is not listed.
     """
     env = ncs_env(ControlLoop(env=setup.env, channel=setup.channel, noise=setup.noise).single())
     steps = gym.spec(setup.env).max_episode_steps or 1
     begins_inside = starts_inside(setup.certificate, env.initial_set)
     bound = escape_probability(env.plant, env.channel, steps) if begins_inside else 1.0
-    shielded = [name for name, mode in modes.items() if mode not in (None, "monitor")]
+    shielded = [name for name, mode in modes.items() if is_shield(mode) and mode != "lookahead"]
     episodes = {name: [each for result in results_by_arm[name] for each in result.episodes] for name in shielded}
     return escape_summary(bound, steps, episodes)
 

@@ -7,7 +7,8 @@ from dataclasses import asdict
 
 from agents import evaluation
 from agents.control_loop import ControlLoop, ShieldSettings
-from experiments.analysis.summary import arm_summary, summary_text
+from experiments.analysis.arm_table import summary_text
+from experiments.analysis.summary import arm_summary
 from experiments.runs import ExperimentSetup, RunResult, versions
 from experiments.runs.environments import module_and_id, registered_env
 from experiments.settings import EvaluateSettings

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 
-from experiments.analysis.summary import arm_summary, summary_text
+from experiments.analysis.arm_table import summary_text
+from experiments.analysis.summary import arm_summary
 from experiments.backends.execution import results_of
 from experiments.runs import Arm, ExperimentSetup, prepare_output
 from experiments.settings import BackendSettings, TrainSettings, save_settings

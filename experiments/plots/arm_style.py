@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
 
-from experiments.runs.arms import PENALTY_SUFFIX
+from experiments.runs.arms import Arm
 
 # Color (Okabe and Ito's palette, which color-blind readers can distinguish) and marker (for print without color).
 ARM_COLORS_AND_MARKERS = {
@@ -19,8 +20,24 @@ ARM_COLORS_AND_MARKERS = {
     "shielded:project": ("#56B4E9", "v"),
     "shielded:switch": ("#009E73", "P"),
     "shielded:boundary": ("#CC79A7", "X"),
+    "shielded:lookahead": ("#000080", "p"),
+    "lagrangian": ("#DDCC77", "d"),
+    "trusting": ("#7F0000", "<"),
+    "psf": ("#117733", ">"),
+    "controller": ("#BBBBBB", "*"),
+}
+# Markers of policies that are not trained, in the color of what they are behind.
+_CONTROLLER_MARKERS = {
+    "proportional": "*",
+    "lqr": "H",
+    "random": "8",
+    "K x_hat": "1",
+    "zero input": "2",
+    "untrained": "3",
 }
 _SOLID, _DOTTED, _DASHED = "-", (0, (1.0, 1.3)), (0, (4.5, 1.6))
+# Length of a dash that stands for a price of 1 per violating step, in line widths; it doubles with every factor of ten.
+_PRICE_DASH = 6.0
 
 
 @dataclass(frozen=True)
@@ -42,19 +59,26 @@ class ArmStyle:
     size: float
 
     @classmethod
-    def of(cls, arm: str) -> ArmStyle:
+    def of(cls, name: str) -> ArmStyle:
         """Returns the style of an arm: the color stands for the shield, dashed lines and hollow markers for a penalty.
 
-        The monitor's agent is the unshielded one, so its curves lie on those of the unshielded arm and are dotted.
+        Dotted lines and hollow markers stand for what acts in evaluation alone; so they do for the monitor, whose agent
+        is the unshielded one and whose curves lie on that arm's.
 
         Raises:
-            KeyError: If the arm is unknown.
+            ValueError: If the arm is unknown.
         """
-        color, marker = ARM_COLORS_AND_MARKERS[arm.removesuffix(PENALTY_SUFFIX)]
-        if arm == "monitor":
-            return cls(color, _DOTTED, marker, hollow=True, size=11.0)
-        penalized = arm.endswith(PENALTY_SUFFIX)
-        return cls(color, _DASHED if penalized else _SOLID, marker, hollow=penalized, size=10.0 if penalized else 7.0)
+        arm = Arm.of(name)
+        color, marker = ARM_COLORS_AND_MARKERS[_look(arm)]
+        if name == "monitor" or not arm.filters_training:
+            return cls(color, _DOTTED, marker if arm.filters_training else "h", hollow=True, size=11.0)
+        if not arm.is_trained:
+            return cls(color, _DASHED, _CONTROLLER_MARKERS[arm.policy], hollow=False, size=9.0)
+        if arm.violation_weight is not None:
+            dash = float(np.clip(_PRICE_DASH * 2.0 ** np.log10(max(arm.violation_weight, 1e-9)), 0.5, 50.0))
+            return cls(color, (0, (dash, 1.6)), marker, hollow=True, size=7.0)
+        changed = arm.penalizes_interventions or arm.is_residual or arm.mode == "trusting:lookahead"
+        return cls(color, _DASHED if changed else _SOLID, marker, hollow=changed, size=10.0 if changed else 7.0)
 
     @property
     def line(self) -> dict[str, Any]:
@@ -76,3 +100,20 @@ class ArmStyle:
         """Returns the arm's entry in a legend."""
         shape = self.line | {"lw": 2.0} if line else {"ls": "none"}
         return Line2D([], [], **shape, **(self.points if points else {}))
+
+
+def _look(arm: Arm) -> str:
+    """Returns the key of an arm's color and marker."""
+    if not arm.is_trained and arm.mode is None:
+        return "controller"
+    if arm.penalizes_violations:
+        return "lagrangian" if arm.adapts_penalty else "penalized"
+    if arm.mode is None:
+        return "unshielded"
+    named = f"shielded:{arm.mode}"
+    return named if arm.is_shielded and (named in arm.name or arm.mode == "lookahead") else _default(arm)
+
+
+def _default(arm: Arm) -> str:
+    """Returns the key of an arm behind a filter that does not name a mode of the shield."""
+    return "shielded" if arm.is_shielded else str(arm.mode).partition(":")[0]

@@ -25,8 +25,8 @@ def comparison_figures(
         results: Results of the runs of every arm.
     """
     arms = {name: results[name] for name in summary["arms"]}
-    figures = {
-        "training": training_figure(arms),
+    trained = {name: runs for name, runs in arms.items() if runs[0].history}
+    figures = ({"training": training_figure(trained)} if trained else {}) | {
         "scatter": scatter_figure(summary["arms"], arms),
         "episode": episode_figure(plant, arms),
     }

@@ -8,8 +8,8 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from experiments.analysis.statistics import CONFIDENCE, RESAMPLES
-from experiments.plots.arm_style import ARM_COLORS_AND_MARKERS, ArmStyle
-from experiments.runs.arms import PENALTY_SUFFIX, Arm
+from experiments.plots.arm_style import ArmStyle
+from experiments.runs.arms import Arm
 from shields import Report
 
 # Pixels of a figure per pixel of the page: the widest figures then fill it, and letters have the same size in all.
@@ -69,7 +69,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.tests["arm"] = lambda name: name.removesuffix(PENALTY_SUFFIX) in ARM_COLORS_AND_MARKERS
+    environment.tests["arm"] = _is_trained_arm
     environment.filters |= {
         "arm_of": Arm.of,
         "arm_color": lambda name: ArmStyle.of(name).color,
@@ -80,6 +80,14 @@ def _environment() -> Environment:
         "thousands": lambda count: f"{count:,}",
     }
     return environment
+
+
+def _is_trained_arm(name: str) -> bool:
+    """Returns whether a text is the name of an arm whose agents are trained: figures give it a color."""
+    try:
+        return Arm.of(name).is_trained
+    except ValueError:
+        return False
 
 
 def _image(caption: str, png: bytes) -> dict[str, Any]:

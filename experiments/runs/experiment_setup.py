@@ -8,6 +8,7 @@ from typing import Any
 
 from agents.control_loop import ControlLoop
 from experiments.runs.arms import Arm
+from experiments.runs.conditions import other_conditions
 from experiments.runs.environments import module_and_id, registered_env
 from experiments.runs.provenance import versions
 from experiments.runs.synthesis_status import synthesis_status
@@ -89,15 +90,17 @@ class ExperimentSetup:
         return f"{conditions} ({size})" if size else conditions
 
     def training_run(self, settings: LearningSettings, arm_name: str, index: int, grid_point: str = "") -> TrainingRun:
-        """Returns one training run of an arm.
+        """Returns one training run of an arm, or the run of an arm in which nothing is trained.
 
         Raises:
-            ValueError: If the arm is unknown.
+            ValueError: If the arm or a condition is unknown.
         """
         arm = Arm.of(arm_name, settings.mode)
+        price = settings.violation_penalty if arm.violation_weight is None else arm.violation_weight
+        fixed_price = arm.penalizes_violations and not arm.adapts_penalty
         return TrainingRun(
-            arm=arm_name,
-            policy_kind="trained",
+            arm=arm.name,
+            policy_kind=arm.policy,
             env=self.env,
             module=self.module,
             channel=self.channel,
@@ -108,8 +111,12 @@ class ExperimentSetup:
             episodes=settings.episodes,
             certificate=self.certificate,
             mode=arm.mode,
+            filters_training=arm.filters_training,
             intervention_penalty=settings.intervention_penalty if arm.penalizes_interventions else 0.0,
-            violation_penalty=settings.violation_penalty if arm.penalizes_violations else 0.0,
+            violation_penalty=price if fixed_price else 0.0,
+            lagrangian=settings.lagrangian if arm.adapts_penalty else None,
+            is_residual=arm.is_residual,
+            conditions=other_conditions(settings.evaluated_under),
             algorithm=settings.algo,
             settings=settings.agent,
             grid_point=grid_point,

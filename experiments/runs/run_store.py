@@ -16,7 +16,7 @@ from experiments.runs.provenance import json_digest
 from experiments.runs.training_run import RunResult, TrainingRun
 from shields.atomic_write import write_atomically
 
-_FORMAT = "ncs-gym unit 1"
+_FORMAT = "ncs-gym unit 2"
 
 
 def prepare_output(folder: Path) -> None:
@@ -104,11 +104,16 @@ class RunStore:
 def _to_json(result: RunResult) -> dict[str, Any]:
     """Returns a result as JSON values: NaN is null, and files are represented by their checksums."""
     content = asdict(result)
-    for name in ("history", "episodes"):
-        content[name] = [{key: None if x != x else x for key, x in entry.items()} for entry in content[name]]
+    content["history"], content["episodes"] = _without_nan(content["history"]), _without_nan(content["episodes"])
+    content["conditions"] = {name: _without_nan(episodes) for name, episodes in content["conditions"].items()}
     content["trajectory"] = {name: array.tolist() for name, array in content["trajectory"].items()}
     content["files"] = {name: hashlib.sha256(file).hexdigest() for name, file in result.files.items()}
     return content
+
+
+def _without_nan(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Returns entries with null in the place of NaN."""
+    return [{key: None if x != x else x for key, x in entry.items()} for entry in entries]
 
 
 def _from_json(content: dict[str, Any], files: dict[str, bytes]) -> RunResult:
@@ -122,6 +127,10 @@ def _from_json(content: dict[str, Any], files: dict[str, bytes]) -> RunResult:
     values = content | {
         "history": [TrainingPoint(**restored(point)) for point in content["history"]],
         "episodes": [Episode(**restored(episode)) for episode in content["episodes"]],
+        "conditions": {
+            name: [Episode(**restored(episode)) for episode in episodes]
+            for name, episodes in content["conditions"].items()
+        },
         "trajectory": Trajectory(**arrays),
         "files": files,
     }

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -14,7 +15,9 @@ import numpy as np
 from agents.control_loop import ControlLoop, ShieldSettings
 from agents.evaluation import Policy, evaluate
 from agents.results import Episode, TrainingPoint, Trajectory
-from agents.settings import AgentSettings, OffPolicySettings
+from agents.settings import AgentSettings, LagrangianSettings, OffPolicySettings
+from experiments.baselines import FILTERS, controller, filtered
+from experiments.runs.conditions import AS_TRAINED, under
 from experiments.runs.environments import import_module, module_digest
 from experiments.runs.provenance import json_digest, versions
 from ncs_gym import Channel
@@ -24,7 +27,7 @@ from shields import Certificate
 if TYPE_CHECKING:
     from agents.training import TrainingResult
 
-PolicyKind = Literal["trained", "untrained", "certified gain", "zero"]
+PolicyKind = Literal["trained", "untrained", "zero input", "K x_hat", "random", "proportional", "lqr"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,8 +36,8 @@ class TrainingRun:
 
     Attributes:
         arm: Name of the arm that the run belongs to.
-        policy_kind: "trained" is a trained agent; "untrained" an agent with its initial weights; "certified gain"
-            applies u = K x_hat; "zero" applies no input.
+        policy_kind: "trained" is a trained agent; "untrained" an agent with its initial weights; the others are
+            controllers (`experiments.baselines.CONTROLLERS`).
         env: Id of a registered environment.
         module: Module of the user's that registers it, imported where the run is executed; empty for none.
         channel: Channel that replaces the environment's own; None keeps it.
@@ -44,9 +47,13 @@ class TrainingRun:
         steps: Training steps.
         episodes: Evaluation episodes.
         certificate: Certificate of the shield, which also defines x'Mx.
-        mode: Mode of the shield; None for no shield.
+        mode: Mode of the shield, or name of another filter; None for neither.
+        filters_training: Whether shield or filter act in training too.
         intervention_penalty: Subtracted from the training reward per intervention.
         violation_penalty: Subtracted from the training reward per violating step.
+        lagrangian: How that penalty is adapted during training; None for a fixed one.
+        is_residual: Whether the agent adds to the action of u = K x_hat.
+        conditions: Conditions that the policy is evaluated under besides that of its training.
         algorithm: Name of the learning algorithm, a key of `agents.algorithms`.
         settings: Settings of the learning algorithm.
         grid_point: Name of the point of a sweep's grid; part of the run's name only.
@@ -64,8 +71,12 @@ class TrainingRun:
     episodes: int
     certificate: Certificate
     mode: str | None
+    filters_training: bool = True
     intervention_penalty: float = 0.0
     violation_penalty: float = 0.0
+    lagrangian: LagrangianSettings | None = None
+    is_residual: bool = False
+    conditions: tuple[str, ...] = ()
     algorithm: str
     settings: AgentSettings
     grid_point: str = ""
@@ -77,17 +88,29 @@ class TrainingRun:
 
     @property
     def loop(self) -> ControlLoop:
-        """Control loop that the policy is trained and evaluated in."""
-        shield = None
-        if self.mode is not None:
+        """Control loop that the policy is evaluated in, with the penalties of its training."""
+        shield, wrapper = None, None
+        if self.mode in FILTERS:
+            wrapper = partial(filtered, name=self.mode, certificate=self.certificate, penalty=self.intervention_penalty)
+        elif self.mode is not None:
             shield = ShieldSettings(self.certificate, self.mode, self.intervention_penalty)
         return ControlLoop(
             env=self.env,
             channel=self.channel,
             shield=shield,
+            filter=wrapper,
             violation_penalty=self.violation_penalty,
             noise=self.noise,
+            lagrangian=self.lagrangian,
         )
+
+    @property
+    def training_loop(self) -> ControlLoop:
+        """Control loop that the policy is trained in."""
+        loop = self.loop if self.filters_training else replace(self.loop, shield=None, filter=None)
+        if not self.is_residual:
+            return loop
+        return replace(loop, residual_gain=self.certificate.K / ncs_env(loop.single()).plant.u_max[:, None])
 
     @property
     def training_seed(self) -> int:
@@ -108,13 +131,14 @@ class TrainingRun:
             "module": module_digest(self.module),
             "certificate": self.certificate.checksum,
             "channel": self.channel and asdict(self.channel),
+            "lagrangian": self.lagrangian and asdict(self.lagrangian),
         }
         return json_digest(content | {"settings": asdict(self.settings), "versions": versions()})
 
     @property
     def total_steps(self) -> int:
         """Training steps, in whole rollouts, and evaluation steps."""
-        evaluation = self.episodes * (gym.spec(self.env).max_episode_steps or 1)
+        evaluation = self.episodes * (gym.spec(self.env).max_episode_steps or 1) * (1 + len(self.conditions))
         if self.policy_kind != "trained":
             return evaluation
         steps_per_env = 1 if isinstance(self.settings, OffPolicySettings) else self.settings.rollout
@@ -140,6 +164,7 @@ class RunResult:
         episodes: Evaluation episodes.
         trajectory: Trajectory of the first evaluation episode.
         files: Contents of the trained agent's files by name; empty if nothing was trained.
+        conditions: Evaluation episodes under other conditions than that of the training, by the condition's name.
     """
 
     arm: str
@@ -151,6 +176,7 @@ class RunResult:
     episodes: list[Episode]
     trajectory: Trajectory
     files: dict[str, bytes]
+    conditions: dict[str, list[Episode]] = field(default_factory=dict)
 
 
 def execute_run(run: TrainingRun, on_progress: Callable[[int], None], log_folder: Path | None = None) -> RunResult:
@@ -170,7 +196,7 @@ def execute_run(run: TrainingRun, on_progress: Callable[[int], None], log_folder
         if log_folder is not None:
             shutil.rmtree(log_folder, ignore_errors=True)
         trained = train(
-            run.loop,
+            run.training_loop,
             run.steps,
             run.training_seed,
             run.algorithm,
@@ -178,8 +204,13 @@ def execute_run(run: TrainingRun, on_progress: Callable[[int], None], log_folder
             log_folder=log_folder,
             on_progress=on_progress,
         )
-    policy = _policy(run, trained)
-    evaluation = evaluate(run.loop, policy, run.episodes, run.evaluation_seed, run.certificate.M, on_progress)
+    evaluations = {}
+    for condition in (AS_TRAINED, *run.conditions):
+        loop, policy = under(condition, run.loop), _policy(run, trained)  # a random policy begins anew each time
+        evaluations[condition] = evaluate(
+            loop, policy, run.episodes, run.evaluation_seed, run.certificate.M, on_progress
+        )
+    evaluation = evaluations.pop(AS_TRAINED)
     return RunResult(
         arm=run.arm,
         index=run.index,
@@ -190,6 +221,7 @@ def execute_run(run: TrainingRun, on_progress: Callable[[int], None], log_folder
         episodes=evaluation.episodes,
         trajectory=evaluation.trajectory,
         files=trained.agent.files() if trained else {},
+        conditions={condition: each.episodes for condition, each in evaluations.items()},
     )
 
 
@@ -197,13 +229,9 @@ def _policy(run: TrainingRun, trained: TrainingResult | None) -> Policy:
     """Returns the policy to evaluate."""
     if trained is not None:
         return lambda observations, infos: trained.agent.act(observations)
-    plant = ncs_env(run.loop.single()).plant
     if run.policy_kind == "untrained":
         from agents.training import untrained
 
         agent = untrained(run.loop, run.training_seed, run.algorithm, run.settings)
         return lambda observations, infos: agent.act(observations)
-    if run.policy_kind == "certified gain":
-        gain = run.certificate.K / plant.u_max[:, None]
-        return lambda observations, infos: np.clip(infos["estimate"] @ gain.T, -1.0, 1.0)
-    return lambda observations, infos: np.zeros((len(observations), plant.m), np.float32)
+    return controller(run.policy_kind, ncs_env(run.loop.single()), run.certificate.K, run.evaluation_seed)

@@ -8,12 +8,12 @@ from typing import Annotated, Literal
 
 import tyro
 
-from agents.settings import A2CSettings, AgentSettings, OffPolicySettings, PPOSettings
+from agents.settings import A2CSettings, AgentSettings, LagrangianSettings, OffPolicySettings, PPOSettings
 from experiments.settings.backend import BackendSettings
 from experiments.settings.channel import ChannelSettings
 
 Algorithm = Literal["PPO", "A2C", "SAC", "TD3", "TRPO", "TQC", "CrossQ"]
-Mode = Literal["project", "switch", "boundary"]
+Mode = Literal["project", "switch", "boundary", "lookahead"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,8 @@ class LearningSettings:
         episodes: Evaluation episodes per run.
         algo: Learning algorithm; TRPO, TQC and CrossQ need sb3-contrib.
         mode: What the shield applies in place of an unsafe action: the closest safe input ("project"), or the certified
-            K x_hat ("switch"; "boundary" applies it unless every action would be safe).
+            K x_hat ("switch"; "boundary" applies it unless every action would be safe), or, where a certified plan that
+            leaves S and returns begins with it, the action itself ("lookahead").
         intervention_penalty: Subtracted from the training reward per intervention, in arms with "+penalty".
         violation_penalty: Subtracted from the training reward per violating step, in the arm "penalized".
         certificate: Certificate file to use instead of synthesizing one.
@@ -37,6 +38,7 @@ class LearningSettings:
         ppo: Settings of PPO and TRPO.
         a2c: Settings of A2C.
         off_policy: Settings of SAC, TD3, TQC and CrossQ.
+        lagrangian: How the arm "lagrangian" adapts its penalty per violating step.
     """
 
     config: Path | None = None
@@ -53,6 +55,12 @@ class LearningSettings:
     ppo: PPOSettings = field(default_factory=PPOSettings)
     a2c: A2CSettings = field(default_factory=A2CSettings)
     off_policy: OffPolicySettings = field(default_factory=OffPolicySettings)
+    lagrangian: LagrangianSettings = field(default_factory=LagrangianSettings)
+
+    @property
+    def evaluated_under(self) -> tuple[str, ...]:
+        """Conditions that policies are evaluated under, besides that of the training."""
+        return ()
 
     @property
     def agent(self) -> AgentSettings:
@@ -84,7 +92,15 @@ class CompareSettings(BackendSettings, LearningSettings):
         out: Output folder; created if it does not exist.
         seeds: Number of paired training runs per arm.
         arms: unshielded, monitor (unshielded, counts what the shield would have done), penalized (unshielded, with a
-            penalty per violation), shielded, shielded:MODE, and each shielded one with +penalty (per intervention).
+            penalty per violation), penalized:WEIGHT, lagrangian (PPO-Lagrangian adapts that penalty), shielded,
+            shielded:MODE, lookahead, trusting and trusting:lookahead (the shield without its error set), psf (a nominal
+            predictive safety filter).
+            shield-at-test, trusting-at-test and psf-at-test are trained unshielded; +penalty costs reward per
+            intervention, +residual adds the agent's action to K x_hat. Controllers that are not trained: proportional,
+            lqr, random, K-x_hat, zero-input and untrained, alone or behind a filter as in proportional+shielded.
+        references: Arms that are listed below the others and not drawn.
+        conditions: What policies are evaluated under besides "as trained": worst-case-disturbance, worse-channel (more
+            loss, later packets, within the contract), gaussian (noise without a bound).
         noise: "gaussian" draws noise that the certificate's bounds do not hold for always, and prints next to the
             episodes that left the safe set the bound on their probability.
         smoke: Run a short version, whatever else is asked for, to see that everything works.
@@ -92,9 +108,23 @@ class CompareSettings(BackendSettings, LearningSettings):
 
     out: Path = Path("runs/compare")
     seeds: int = 3
-    arms: tuple[str, ...] = ("unshielded", "penalized", "shielded")
+    arms: tuple[str, ...] = ("unshielded", "penalized", "trusting", "shielded")
+    references: tuple[str, ...] = (
+        "zero input",
+        "K x_hat",
+        "untrained",
+        "proportional",
+        "proportional+trusting",
+        "proportional+shielded",
+    )
+    conditions: tuple[str, ...] = ("as trained",)
     noise: Literal["truncated", "gaussian"] = "truncated"
     smoke: bool = False
+
+    @property
+    def evaluated_under(self) -> tuple[str, ...]:
+        """Conditions that policies are evaluated under, besides that of the training."""
+        return self.conditions
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
@@ -132,7 +162,7 @@ class EvaluateSettings:
 
     model: tyro.conf.Positional[Path]
     env: str | None = None
-    shield: Literal["none", "monitor", "project", "switch", "boundary"] = "none"
+    shield: Literal["none", "monitor", "project", "switch", "boundary", "lookahead"] = "none"
     episodes: int = 200
     seed: int = 0
     certificate: Path | None = None
@@ -205,7 +235,7 @@ class RenderSettings:
     env: str = "ncs_gym/TruckTrailerCruise-v0"
     out: Annotated[Path, tyro.conf.arg(aliases=["--gif"])] = Path("episode.gif")
     policy: str = "greedy"
-    shield: Literal["project", "switch", "boundary", "monitor", "none"] = "project"
+    shield: Literal["project", "switch", "boundary", "lookahead", "monitor", "none"] = "project"
     side_by_side: bool = False
     certificate: Path | None = None
     seed: int = 0

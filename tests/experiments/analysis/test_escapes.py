@@ -57,7 +57,7 @@ def setup():
 
 def test_comparison_under_gaussian_noise_plays_it_and_states_the_bound(setup):
     settings = CompareSettings(env="Tests/Tight-v0", noise="gaussian", episodes=600)
-    run = replace(setup.training_run(settings, "shielded", 0), policy_kind="zero")
+    run = replace(setup.training_run(settings, "shielded", 0), policy_kind="zero input")
     assert run.loop.single().unwrapped.noise == run.loop.vector(2).unwrapped.single.noise == "gaussian"
     bounded = replace(run, noise="truncated")
     assert run.key != bounded.key

@@ -18,7 +18,7 @@ def endless(certificate):
     """A run that would run for hours."""
     return TrainingRun(
         arm="zero input",
-        policy_kind="zero",
+        policy_kind="zero input",
         env="ncs_gym/TruckTrailerCruise-v0",
         seed=0,
         index=0,

@@ -22,7 +22,7 @@ from experiments.settings import BackendSettings
 def run(certificate):
     return TrainingRun(
         arm="unshielded",
-        policy_kind="zero",
+        policy_kind="zero input",
         env="ncs_gym/TruckTrailerCruise-v0",
         seed=0,
         index=0,

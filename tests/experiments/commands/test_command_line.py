@@ -62,20 +62,22 @@ def test_smoke_run_leaves_every_file_of_the_contract(smoke):
     left = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file() and "tensorboard" not in path.parts}
     expected = {"summary.json", "settings.json", "episodes.parquet", "training.parquet", "report.html"}
     expected |= {"certificate.json"}
-    arms, references = ("shielded", "unshielded", "penalized"), ("zero-input", "K-x_hat", "untrained")
+    arms = ("shielded", "unshielded", "penalized", "trusting")
+    references = ("zero-input", "K-x_hat", "untrained")
+    references += ("proportional", "proportional+trusting", "proportional+shielded")
     for arm in arms:
         expected |= {f"models/{arm}-{i}/{name}" for i in range(2) for name in ("model.zip", "agent.json")}
     expected |= {f"units/{name}-{i}.json" for i in range(2) for name in arms + references}
     assert {path for path in left if not path.startswith("figures/")} == expected
     assert {f"figures/{name}.png" for name in ("training", "phase", "episode")} <= left
-    assert len(list(out.rglob("events.out.tfevents*"))) == 6
+    assert len(list(out.rglob("events.out.tfevents*"))) == 8
 
 
 def test_summary_holds_the_keys_of_the_contract_and_adds_up(smoke):
     out, _ = smoke
     summary = json.loads((out / "summary.json").read_text())
     rows = pq.read_table(out / "episodes.parquet").to_pylist()
-    assert set(summary["arms"]) == {"unshielded", "penalized", "shielded"}
+    assert set(summary["arms"]) == {"unshielded", "penalized", "trusting", "shielded"}
     for name, arm in summary["arms"].items():
         assert set(arm) >= ARM_KEYS
         mine = [row for row in rows if row["arm"] == name]
@@ -90,7 +92,7 @@ def test_summary_holds_the_keys_of_the_contract_and_adds_up(smoke):
     assert shielded["largest_level"] <= 1.0
     assert unshielded["train_violation_steps"] > 0
     assert summary["paired_differences"]["baseline"] == "unshielded"
-    assert set(summary["paired_differences"]["arms"]) == {"penalized", "shielded"}
+    assert set(summary["paired_differences"]["arms"]) == {"penalized", "trusting", "shielded"}
 
 
 def test_tables_say_where_they_come_from(smoke):
@@ -112,7 +114,10 @@ def test_tables_say_where_they_come_from(smoke):
 def test_smoke_run_prints_the_table_and_the_files(smoke):
     out, run = smoke
     assert "shielded" in run.stdout
-    assert "violating episodes" in run.stdout
+    lines = run.stdout.splitlines()
+    table = lines[next(i for i, line in enumerate(lines) if "training:" in line) :]
+    assert all(name in {line.split("  ")[0] for line in table} for name in ("trusting", "proportional+shielded"))
+    assert max(len(line) for line in table if not line.startswith(("The", "shielded:", "files"))) <= 100
     assert str(out) in run.stdout
     assert "step/s" in run.stderr
 
@@ -151,14 +156,14 @@ def test_killed_run_goes_on_by_its_settings_file_and_ends_like_an_uninterrupted_
     finished = len(list(units.glob("*.json")))
     again = ncs("compare", "--config", smoke[0] / "settings.json", "--out", out, "--jobs", 1)
     assert again.returncode == 0, again.stderr
-    assert f"{finished} of 12 runs were finished before" in again.stderr
+    assert f"{finished} of 20 runs were finished before" in again.stderr
     assert (out / "summary.json").read_bytes() == (smoke[0] / "summary.json").read_bytes()
 
 
 def test_finished_run_is_not_run_again_and_damage_is_one_sentence(smoke, tmp_path):
     shutil.copytree(smoke[0], tmp_path / "out")
     again = ncs("compare", "--smoke", "--out", tmp_path / "out")
-    assert "12 of 12 runs were finished before" in again.stderr
+    assert "12 of 20 runs were finished before" in again.stderr
     assert again.stdout.splitlines()[:-1] == smoke[1].stdout.splitlines()[:-1]
     unit = tmp_path / "out" / "units" / "shielded-1.json"
     unit.write_text(unit.read_text()[:100])

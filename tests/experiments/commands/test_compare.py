@@ -5,7 +5,8 @@ import pytest
 
 from agents.results import Episode
 from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
-from experiments.analysis.summary import _rows, covered_fraction, paired_differences, summarize_arm
+from experiments.analysis.arm_table import _rows
+from experiments.analysis.summary import covered_fraction, paired_differences, summarize_arm
 from experiments.commands.compare import _training_runs
 from experiments.runs.arms import Arm, by_arm
 from experiments.runs.experiment_setup import ExperimentSetup
@@ -61,6 +62,9 @@ def test_each_arm_has_its_shield_and_its_penalties(setup):
         "zero input": None,
         "K x_hat": None,
         "untrained": None,
+        "proportional": None,
+        "proportional+trusting": None,
+        "proportional+shielded": "switch",
     }
     penalized = {name for name, loop in loops.items() if loop.shield and loop.shield.penalty == 0.3}
     assert penalized == {"shielded:switch+penalty"}
@@ -149,8 +153,8 @@ def test_paired_differences_are_those_of_runs_with_equal_index():
 
 def test_no_violation_is_printed_with_its_upper_bound():
     summary = summarize_arm([result([1.0] * 10, [0] * 10)], fixed_policy=True) | {"mode": "monitor"}
-    row = _rows({"monitor": summary})[2]
-    assert row[3] == "0 of 10 [0.0, 30.8 %]"
+    row = _rows({"monitor": summary})[-1]
+    assert row[3] == "0 [0.0, 30.8 %]"
     assert row[2] == "(20.0 %)"
 
 

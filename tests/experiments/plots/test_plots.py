@@ -58,7 +58,7 @@ def test_all_arms_look_different_and_a_penalty_keeps_the_color():
     assert len({(look.color, str(look.dashes)) for look in looks}) == len(ALL_ARMS)
     assert len({(look.marker, look.hollow) for look in looks}) == len(ALL_ARMS)
     assert ArmStyle.of("shielded:switch+penalty").color == ArmStyle.of("shielded:switch").color
-    with pytest.raises(KeyError):
+    with pytest.raises(ValueError, match="unknown arm"):
         ArmStyle.of("hoped")
 
 

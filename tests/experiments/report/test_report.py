@@ -272,3 +272,20 @@ def test_the_shield_is_explained_as_its_mode_acts(mode):
     assert Arm.of("shielded", mode).mode == mode
     assert ("closest input" in comparison("shielded", mode=mode)) == (mode == "project")
     assert ("where not every input" in swept("shielded", mode=mode)) == (mode == "boundary")
+
+
+def test_every_condition_has_a_table_and_every_arm_an_explanation():
+    change = {"conditions": {"gaussian": run("shielded", violations=(3, 0)).episodes}}
+    page = Reader(comparison("shielded", "trusting", "lagrangian", "lqr+psf", "shield at test", change=change))
+    table = {row[0]: row[1:] for row in page.tables["Evaluation: gaussian"]}
+    assert table["trusting"][:2] == ["3 of 650.0 % [11.8, 88.2]", "9"]
+    assert "3 of 3" not in table["trusting"][4]
+    assert table["shielded"][4] == "6 of 6"
+    text = " ".join("".join(page.text).split())
+    for words in (
+        "with the estimate taken for the true state: no error set, and no proof.",
+        "dual ascent on the cost of an episode",
+        'the controller "lqr", which is not trained; a nominal predictive safety filter',
+        "It acts in evaluation alone; the agent was trained without it.",
+    ):
+        assert words in text, words

@@ -1,0 +1,65 @@
+"""The tables of `ncs compare`, `train` and `evaluate` on a terminal, at most 100 columns wide for the usual names."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from experiments.analysis.text_table import text_table
+
+_HEADERS = (
+    ("", "training:", "", "evaluation:", "", "", "", ""),
+    ("", "violating", "over-", "violating", "violating", "left", "over-", "return"),
+    ("", "steps", "ridden", "episodes", "steps", "S", "ridden", "[95 % CI]"),
+)
+# Columns of these rows that are about the evaluation.
+_EVALUATION = (0, 3, 4, 5, 6, 7)
+
+
+def summary_text(arms: dict[str, dict[str, Any]], references: dict[str, dict[str, Any]]) -> str:
+    """Returns the table for a terminal; references stand below a rule.
+
+    Violating episodes have their exact interval, the return has Student's (`experiments.analysis.summary`). "Left S"
+    counts episodes in which the true state was outside the safe set at some step.
+    """
+    return text_table(_rows(arms | references), rules=(len(_HEADERS), len(_HEADERS) + len(arms)))
+
+
+def condition_text(condition: str, arms: dict[str, dict[str, Any]], references: dict[str, dict[str, Any]]) -> str:
+    """Returns the table of the evaluation under a condition, with its name in the corner."""
+    rows = _rows({name: arm | arm["conditions"][condition] for name, arm in (arms | references).items()})
+    rows = [[row[i] for i in _EVALUATION] for row in rows]
+    rows[0] = [f"{condition}:", *[""] * (len(_EVALUATION) - 1)]
+    return text_table(rows, rules=(len(_HEADERS), len(_HEADERS) + len(arms)))
+
+
+def _rows(arms: dict[str, dict[str, Any]]) -> list[list[str]]:
+    """Returns the header's rows, then one row of text per summary of an arm."""
+    return [*map(list, _HEADERS), *([name, *_cells(arm)] for name, arm in arms.items())]
+
+
+def _cells(arm: dict[str, Any]) -> list[str]:
+    """Returns the numbers of an arm as text."""
+    low, high = arm["eval_violation_rate_ci95"]
+    trained = arm["train_steps"] > 0
+    return [
+        f"{arm['train_violation_steps']:,}" if trained else "-",
+        _overridden(arm, "train_intervention_rate") if trained else "-",
+        f"{arm['eval_violating_episodes']:,} [{100 * low:.1f}, {100 * high:.1f} %]",
+        f"{arm['eval_violation_steps']:,}",
+        f"{arm['eval_episodes_outside_set']:,}",
+        _overridden(arm, "intervention_rate"),
+        _return_text(arm),
+    ]
+
+
+def _overridden(arm: dict[str, Any], key: str) -> str:
+    """Returns a rate of interventions; in brackets what a monitor would have done."""
+    text = f"{100 * arm[key]:.1f} %"
+    return {"monitor": f"({text})", None: "-"}.get(arm["mode"], text)
+
+
+def _return_text(arm: dict[str, Any]) -> str:
+    """Returns mean and half-width of Student's interval, which is symmetric."""
+    interval = arm["eval_return_ci95"]
+    half = "[n/a]" if interval is None else f"+-{0.5 * (interval[1] - interval[0]):.1f}"
+    return f"{arm['eval_return_mean']:.1f} {half}"

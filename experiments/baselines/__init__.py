@@ -1,0 +1,9 @@
+"""What the shield is compared with: filters that take the estimate for the truth, and linear controllers.
+
+None of them comes with a proof under estimation errors, so none reports `shield_guaranteed`.
+"""
+
+from experiments.baselines.controllers import CONTROLLERS, controller
+from experiments.baselines.estimate_filter import FILTERS, EstimateFilter, filtered
+
+__all__ = ["CONTROLLERS", "FILTERS", "EstimateFilter", "controller", "filtered"]

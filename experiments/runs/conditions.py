@@ -1,0 +1,96 @@
+"""The conditions under which agents are evaluated, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from agents.control_loop import ControlLoop
+from ncs_gym import Channel, ChannelContract, GilbertElliott
+from ncs_gym.envs.env import ncs_env
+from ncs_gym.network import contract_of
+
+# The condition that agents are trained under.
+AS_TRAINED = "as trained"
+
+
+def condition_named(name: str) -> str:
+    """Returns a condition's name as it is printed; hyphens stand for spaces.
+
+    Raises:
+        ValueError: If it is unknown.
+    """
+    for known in (AS_TRAINED, *_CHANGES):
+        if known.replace("-", " ") == name.replace("-", " "):
+            return known
+    raise ValueError(f"unknown condition {name!r}; known are {', '.join((AS_TRAINED, *_CHANGES))}")
+
+
+def other_conditions(names: Sequence[str]) -> tuple[str, ...]:
+    """Returns the different conditions that are named, without that of the training.
+
+    Raises:
+        ValueError: If one is unknown.
+    """
+    return tuple(dict.fromkeys(name for each in names if (name := condition_named(each)) != AS_TRAINED))
+
+
+def under(condition: str, loop: ControlLoop) -> ControlLoop:
+    """Returns a control loop under a condition; everything else stays the same.
+
+    Args:
+        condition: A name that `condition_named` returns.
+        loop: The control loop as it was in training.
+
+    Raises:
+        ValueError: If the condition is unknown, or the channel cannot be worse within the contract.
+    """
+    return loop if condition == AS_TRAINED else _CHANGES[condition_named(condition)](loop)
+
+
+def worse_channel(channel: Channel, contract: ChannelContract | None) -> Channel:
+    """Returns a channel on which half of the packets that arrived are lost too, and the others are later.
+
+    All are as late as the latest were, and, as far as a contract allows it, later by one transmission period. Without
+    a contract every delay is allowed; with one, losses are where the channel loses packets at all.
+
+    Args:
+        channel: The channel that agents were trained with.
+        contract: What the certificate assumes of the channel; None for nothing.
+
+    Raises:
+        ValueError: If there is no worse channel within the contract.
+    """
+    later = channel.send_period
+    promised = contract_of(channel)
+    if contract is not None:
+        later = max(0, min(later, contract.max_age - promised.max_age)) if promised is not None else 0
+    loses = contract is None or channel.most_consecutive_losses != 0
+    worse = replace(
+        channel,
+        loss=_more_loss(channel.loss) if loses else channel.loss,
+        delay=channel.longest_delay + later,
+        jitter=0,
+    )
+    if worse == channel or (contract is not None and not contract.is_kept_by(worse)):
+        raise ValueError(f"no channel within the contract is worse than {channel}")
+    return worse
+
+
+def _more_loss(loss: float | GilbertElliott) -> float | GilbertElliott:
+    """Returns losses that let half as many packets through, in each state of a bursty channel."""
+    if isinstance(loss, GilbertElliott):
+        return replace(loss, loss_good=_more_loss(loss.loss_good), loss_bad=_more_loss(loss.loss_bad))
+    return 0.5 * (1.0 + loss)
+
+
+def _on_worse_channel(loop: ControlLoop) -> ControlLoop:
+    env = ncs_env(loop.single())
+    return replace(loop, channel=worse_channel(env.channel, env.contract))
+
+
+_CHANGES: dict[str, Callable[[ControlLoop], ControlLoop]] = {
+    "worst-case disturbance": lambda loop: replace(loop, disturbance="adversarial"),
+    "worse channel": _on_worse_channel,
+    "gaussian": lambda loop: replace(loop, noise="gaussian"),
+}

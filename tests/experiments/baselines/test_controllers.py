@@ -1,0 +1,85 @@
+"""Linear controllers by name: what they do to the plants they are made for."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from experiments.baselines import CONTROLLERS, controller
+from experiments.baselines.controllers import equilibrium
+from ncs_gym.envs.env import ncs_env
+
+SETPOINTS = ("ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0")
+
+
+def env_of(env_id):
+    return ncs_env(gym.make(env_id))
+
+
+def settled(env, name, K, target, steps=600):
+    """State and input after following a target without disturbance, from rest, and the largest |c_j x| on the way."""
+    policy, x = controller(name, env, K, 0), np.zeros(env.plant.n)
+    for _ in range(steps):
+        observation = np.append(x, target)[None].astype(np.float32)
+        u = env.plant.u_max * policy(observation, {"estimate": x[None]})[0]
+        x = env.plant.A @ x + env.plant.B @ u
+    return x, u
+
+
+@pytest.mark.parametrize("env_id", SETPOINTS)
+def test_equilibrium_is_one_and_has_the_output_asked_for(env_id):
+    env = env_of(env_id)
+    x, u = equilibrium(env.plant, env.task.output)
+    np.testing.assert_allclose(env.plant.A @ x + env.plant.B @ u, x, atol=1e-9)
+    assert env.task.output @ x == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("env_id", SETPOINTS)
+def test_regulator_with_set_point_reaches_the_target(env_id):
+    env = env_of(env_id)
+    x, _ = settled(env, "lqr", np.zeros((env.plant.m, env.plant.n)), 0.2)
+    assert env.task.output @ x == pytest.approx(0.2, abs=2e-3)
+
+
+def test_speed_controllers_remove_the_error():
+    env = env_of("ncs_gym/TruckTrailerCruise-v0")
+    proportional = controller("proportional", env, np.zeros((1, 2)), 0)
+    error, estimates = np.array([[0.0, 0.0, 1.5], [0.0, 0.0, -20.0]], np.float32), np.zeros((2, 2))
+    u = env.plant.u_max * proportional(error, {"estimate": estimates})
+    np.testing.assert_allclose(u[0] * env.plant.dt, 1.5)
+    np.testing.assert_allclose(u[1], -env.plant.u_max)
+    regulator, x, left = controller("lqr", env, np.zeros((1, 2)), 0), np.zeros(2), 8.0
+    for _ in range(40):
+        u = env.plant.u_max * regulator(np.append(x, left)[None], {"estimate": x[None]})[0]
+        x, left = env.plant.A @ x + env.plant.B @ u, left - env.plant.dt * u[0]
+    assert abs(left) < 0.05
+
+
+def test_regulation_needs_no_target_and_the_others_their_gain():
+    env, K = env_of("ncs_gym/TruckTrailer-v0"), np.array([[0.3, -0.2]])
+    estimates = np.array([[0.5, -0.1], [9.0, -9.0]])
+    for name in ("proportional", "K x_hat"):
+        actions = controller(name, env, K, 0)(estimates, {"estimate": estimates})
+        np.testing.assert_allclose(actions, np.clip(estimates @ K.T / env.plant.u_max, -1.0, 1.0))
+    assert not controller("zero input", env, K, 0)(estimates, {"estimate": estimates}).any()
+
+
+def test_random_inputs_depend_on_the_seed_alone():
+    env, estimates = env_of("ncs_gym/BatchReactor-v0"), np.zeros((500, 4))
+    one, again, other = (controller("random", env, np.zeros((2, 4)), seed) for seed in (1, 1, 2))
+    first = one(estimates, {"estimate": estimates})
+    np.testing.assert_array_equal(first, again(estimates, {"estimate": estimates}))
+    assert (first != other(estimates, {"estimate": estimates})).any()
+    assert 0.95 < np.abs(first).max() <= 1.0
+    assert np.abs(first.mean(axis=0)).max() < 0.1
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.parametrize("env_id", [*SETPOINTS, "ncs_gym/TruckTrailer-v0", "ncs_gym/TruckTrailerCruise-v0"])
+def test_actions_of_every_controller_fit_every_environment(name, env_id):
+    env = env_of(env_id)
+    rng, (m, n) = np.random.default_rng(0), (env.plant.m, env.plant.n)
+    policy = controller(name, env, rng.standard_normal((m, n)), 0)
+    observations = rng.standard_normal((7, *env.observation_space.shape)).astype(np.float32)
+    actions = policy(observations, {"estimate": observations[:, :n].astype(np.float64)})
+    assert actions.shape == (7, m)
+    assert np.abs(actions).max() <= 1.0

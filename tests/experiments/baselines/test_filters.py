@@ -1,0 +1,201 @@
+"""Filters that take the estimate for the truth: what they keep, what they lose, and that they promise nothing."""
+
+from dataclasses import replace
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from agents.control_loop import ControlLoop, ShieldSettings
+from agents.evaluation import evaluate
+from experiments.baselines import FILTERS, controller, filtered
+from experiments.baselines.predictive import PredictiveFilter
+from experiments.baselines.trusting import TrustingFilter
+from ncs_gym.envs.env import ncs_env
+from shields import SafetyFilter
+from tests.certificates import certificate_of
+
+CRUISE = "ncs_gym/TruckTrailerCruise-v0"
+NEVER = np.zeros(1, np.bool_)
+
+
+@pytest.fixture(scope="module")
+def trusting(certificate, loaded):
+    return TrustingFilter(certificate, loaded)
+
+
+@pytest.fixture(scope="module")
+def cases(certificate, loaded):
+    """Estimates inside and around S, and inputs within the limits."""
+    rng = np.random.default_rng(0)
+    estimates = certificate.safe_set.sample_boundary(rng, 400) * rng.uniform(0.0, 1.1, (400, 1))
+    return estimates, rng.uniform(-1.0, 1.0, (400, 1)) * loaded.u_max
+
+
+def played(certificate, **filters):
+    """The proportional controller on the cruise, always with the same seed."""
+    loop = ControlLoop(env=CRUISE, **filters)
+    policy = controller("proportional", ncs_env(loop.single()), certificate.K, 0)
+    return evaluate(loop, policy, 20, 7, certificate.M).episodes
+
+
+def test_trusting_filter_is_caught_leaving_the_safe_set_and_the_shield_is_not(certificate):
+    trusted = played(certificate, filter=partial(filtered, name="trusting", certificate=certificate))
+    shielded = played(certificate, shield=ShieldSettings(certificate))
+    assert sum(episode.largest_level > 1.0 for episode in trusted) >= 3
+    assert sum(episode.violation_steps for episode in trusted) >= 3
+    assert max(episode.largest_level for episode in shielded) <= 1.0
+    assert sum(episode.violation_steps for episode in shielded) == 0
+    overridden = [sum(each.interventions for each in episodes) for episodes in (trusted, shielded)]
+    assert 0.8 * overridden[1] < overridden[0] <= overridden[1]
+    assert not any(episode.guaranteed for episode in trusted)
+    assert all(episode.guaranteed for episode in shielded)
+
+
+def test_trusting_lookahead_is_caught_leaving_the_box_and_lookahead_is_not():
+    reactor = ControlLoop(env="ncs_gym/BatchReactor-v0")
+    env = ncs_env(reactor.single())
+    certificate = certificate_of(env.plant, env.contract)
+    policy = controller("lqr", env, certificate.K, 0)
+    trusting = replace(reactor, filter=partial(filtered, name="trusting:lookahead", certificate=certificate))
+    lookahead = replace(reactor, shield=ShieldSettings(certificate, "lookahead"))
+    violating = [
+        sum(episode.violation_steps for episode in evaluate(loop, policy, 4, 7).episodes)
+        for loop in (trusting, lookahead)
+    ]
+    assert violating[0] >= 3  # an episode ends at its first violation
+    assert violating[1] == 0
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_no_filter_speaks_of_a_guarantee(name, certificate):
+    envs = filtered(gym.make_vec(CRUISE, num_envs=2), name, certificate)
+    _, info = envs.reset(seed=0)
+    *_, after = envs.step(np.ones((2, 1), np.float32))
+    for keys in (info, after):
+        assert {"shield_intervened", "input_proposed", "shield_correction"} <= set(keys)
+        assert not {"shield_guaranteed", "shield_reason"} & set(keys)
+
+
+def test_trusting_filter_decides_as_the_shield_without_an_error(certificate, loaded, trusting, cases):
+    shield, nothing = SafetyFilter(certificate, loaded), np.zeros((2, 2))
+    applied = trusting(*cases, np.zeros(400, np.bool_))
+    for estimate, proposed, chosen in zip(*cases, applied, strict=True):
+        np.testing.assert_array_equal(chosen, shield.decide(estimate, nothing, proposed).input)
+    assert 20 < np.count_nonzero(applied != cases[1]) < 380
+
+
+def test_trusting_lookahead_keeps_its_plans_and_leaves_the_safe_set_on_purpose(certificate, loaded):
+    shield, trusting = SafetyFilter(certificate, loaded, "lookahead"), TrustingFilter(certificate, loaded, "lookahead")
+    state, stored, reasons = np.zeros(2), (), set()
+    proposals = loaded.u_max * np.sign(np.repeat(np.random.default_rng(2).standard_normal(8), 6))[:, None]
+    farthest = 0.0
+    for k, proposed in enumerate(proposals):
+        decision = shield.decide(state, np.zeros((2, 2)), proposed, stored)
+        u = trusting(state[None], proposed[None], np.array([k == 0]))[0]
+        np.testing.assert_allclose(u, decision.input, atol=1e-6)
+        stored, state = decision.plan, loaded.A @ state + loaded.B @ decision.input
+        reasons.add(decision.reason)
+        farthest = max(farthest, state @ certificate.M @ state)
+        assert np.abs(loaded.C @ state).max() <= 1.0
+    assert {"safe", "planned"} <= reasons
+    assert farthest > 0.9
+
+
+def test_trusting_filter_still_keeps_the_disturbance_out_if_the_estimate_is_true(certificate, loaded, trusting, cases):
+    estimates, proposed = (array[certificate.safe_set.contains(cases[0])] for array in cases)
+    applied = trusting(estimates, proposed, np.zeros(len(estimates), np.bool_))
+    nominal = estimates @ loaded.A.T + applied @ loaded.B.T
+    worst = nominal + loaded.disturbance.farthest_point(nominal, certificate.M)
+    levels = np.einsum("ei,ij,ej->e", worst, certificate.M, worst)
+    assert levels.max() <= 1.0 + 1e-9
+    assert levels.max() > 0.99
+
+
+def test_predictive_filter_finds_the_closest_input_with_a_nominal_plan(certificate, loaded):
+    """Two steps, by trying inputs on a grid."""
+    predictive, grid = PredictiveFilter(certificate, loaded, horizon=2), np.linspace(-1.0, 1.0, 401) * loaded.u_max
+    rng, found = np.random.default_rng(3), 0
+    first, second = (each.ravel()[:, None] for each in np.meshgrid(grid, grid, indexing="ij"))
+    for _ in range(60):
+        estimate = 1.3 * rng.uniform(-1.0, 1.0, 2) * loaded.half_widths
+        proposed = rng.uniform(-1.0, 1.0, 1) * loaded.u_max
+        one = loaded.A @ estimate + first @ loaded.B.T
+        two = one @ loaded.A.T + second @ loaded.B.T
+        fine = (np.abs(one @ loaded.C.T) <= 1.0).all(axis=1)
+        fine &= np.einsum("ei,ij,ej->e", two, certificate.M, two) <= 1.0
+        if fine.any():
+            best = np.abs(first[fine] - proposed).min()
+            chosen = predictive(estimate[None], proposed[None], ~NEVER)[0]
+            assert abs(abs(chosen - proposed).item() - best) <= 0.03
+            found += best > 0.1
+    assert found >= 5
+
+
+def test_predictive_filter_keeps_the_box_where_the_model_is_the_truth(certificate, loaded):
+    predictive, state, raw, changed = PredictiveFilter(certificate, loaded), np.zeros(2), np.zeros(2), 0
+    rng = np.random.default_rng(1)
+    proposals = loaded.u_max * np.sign(np.repeat(rng.standard_normal(12), 10))[:, None]
+    widest = 0.0
+    for k, proposed in enumerate(proposals):
+        u = predictive(state[None], proposed[None], np.array([k == 0]))[0]
+        changed += (u != proposed).any()
+        state = loaded.A @ state + loaded.B @ u
+        raw = loaded.A @ raw + loaded.B @ proposed
+        assert np.abs(loaded.C @ state).max() <= 1.0 + 1e-5
+        widest = max(widest, np.abs(loaded.C @ raw).max())
+    assert widest > 1.0
+    assert 0 < changed < len(proposals)
+
+
+def test_predictive_filter_applies_the_rest_of_its_plan_and_then_the_gain(certificate, loaded):
+    predictive = PredictiveFilter(certificate, loaded, horizon=3)
+    inside, outside, zero = np.zeros((1, 2)), 5.0 * loaded.half_widths[None], np.zeros((1, 1))
+    lost = np.clip(outside @ certificate.K.T, -loaded.u_max, loaded.u_max)
+    np.testing.assert_array_equal(predictive(outside, zero, ~NEVER), lost)
+    pushed = np.full((1, 1), 0.5)
+    np.testing.assert_array_equal(predictive(inside, pushed, ~NEVER), pushed)
+    state, plan = loaded.B @ pushed[0], []
+    for _ in range(2):
+        plan.append(certificate.K @ state)
+        state = loaded.A @ state + loaded.B @ plan[-1]
+    for planned in (*plan, lost[0]):
+        np.testing.assert_allclose(predictive(outside, zero, NEVER)[0], planned, atol=1e-15)
+    predictive(inside, pushed, NEVER)
+    np.testing.assert_array_equal(predictive(outside, zero, ~NEVER), lost)  # another episode
+
+
+@pytest.mark.parametrize("autoreset", ["NextStep", "SameStep"])
+def test_what_is_not_changed_is_passed_on_bit_for_bit_and_a_reset_counts_nothing(autoreset, certificate):
+    def steps(wrap):
+        envs = wrap(gym.make_vec(CRUISE, num_envs=3, max_episode_steps=5, autoreset_mode=autoreset))
+        envs.reset(seed=4)
+        return [envs.step(np.full((3, 1), 0.1, np.float32)) for _ in range(14)]
+
+    for bare, behind in zip(
+        steps(lambda envs: envs), steps(partial(filtered, name="trusting", certificate=certificate)), strict=True
+    ):
+        np.testing.assert_array_equal(bare[0], behind[0])
+        np.testing.assert_array_equal(bare[1], behind[1])
+        np.testing.assert_array_equal(behind[4]["shield_correction"], 0.0)
+        assert not behind[4]["shield_intervened"].any()
+
+    envs = filtered(gym.make_vec(CRUISE, num_envs=2, max_episode_steps=3), "trusting", certificate, penalty=2.0)
+    free = filtered(gym.make_vec(CRUISE, num_envs=2, max_episode_steps=3), "trusting", certificate)
+    for each in (envs, free):
+        each.reset(seed=1, options={"state": 0.95 * np.linalg.cholesky(certificate.L)[:, 0]})
+    overridden = 0
+    for k in range(4):
+        actions = np.full((2, 1), 1.0 if k < 3 else -1.0)
+        (_, paid, *_, info), (_, own, *_) = envs.step(actions), free.step(actions)
+        np.testing.assert_allclose(own - paid, 2.0 * info["shield_intervened"])
+        overridden += info["shield_intervened"].sum()
+        if k == 3:
+            assert not info["shield_intervened"].any()
+    assert overridden > 0
+
+
+def test_only_an_environment_with_an_estimate_can_be_filtered(certificate):
+    with pytest.raises(ValueError, match="needs an NCSVectorEnv"):
+        filtered(gym.make_vec("CartPole-v1", num_envs=1), "psf", certificate)

@@ -1,0 +1,114 @@
+"""Names of arms, and the control loops that their agents are trained and evaluated in."""
+
+import numpy as np
+import pytest
+
+from agents.control_loop import CostPenalty
+from agents.loop_wrappers import ResidualActions
+from agents.settings import LagrangianSettings, PPOSettings
+from experiments.baselines import EstimateFilter
+from experiments.runs import Arm, ExperimentSetup
+from experiments.settings import CompareSettings
+from shields import VectorSafetyShield, verify
+
+
+@pytest.fixture(scope="module")
+def run_of(certificate, loaded):
+    setup = ExperimentSetup("ncs_gym/TruckTrailerCruise-v0", None, loaded, certificate, verify(certificate, loaded))
+    return lambda name, **settings: setup.training_run(CompareSettings(**settings), name, 0)
+
+
+def layers(env):
+    """Classes of the wrappers, from outside."""
+    found = []
+    while hasattr(env, "env"):
+        found.append(type(env))
+        env = env.env
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "mode", "policy"),
+    [
+        ("unshielded", None, "trained"),
+        ("lagrangian", None, "trained"),
+        ("shielded:switch", "switch", "trained"),
+        ("trusting", "trusting", "trained"),
+        ("psf+penalty", "psf", "trained"),
+        ("lookahead", "lookahead", "trained"),
+        ("lookahead at test", "lookahead", "trained"),
+        ("lqr+trusting:lookahead", "trusting:lookahead", "lqr"),
+        ("shield at test", "boundary", "trained"),
+        ("trusting at test", "trusting", "trained"),
+        ("shielded+penalty+residual", "boundary", "trained"),
+        ("zero input", None, "zero input"),
+        ("K x_hat+shielded", "boundary", "K x_hat"),
+        ("lqr+psf", "psf", "lqr"),
+        ("random+shielded:project", "project", "random"),
+        ("untrained+trusting", "trusting", "untrained"),
+        ("proportional", None, "proportional"),
+    ],
+)
+def test_name_says_which_filter_and_which_policy(name, mode, policy):
+    arm = Arm.of(name, "boundary")
+    assert (arm.name, arm.mode, arm.policy) == (name, mode, policy)
+    assert arm.is_shielded == (mode is not None and mode.partition(":")[0] not in ("trusting", "psf"))
+    assert Arm.of(name.replace(" ", "-"), "boundary") == arm
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("penalized:", "penalized:-1", "penalized:nan", "penalized:inf", "penalized+penalty", "lagrangian:1"),
+        *("trusting:project", "psf:switch", "unshielded at test", "at test", "trusting+psf", "unshielded+shielded"),
+        *("proportional+", "proportional+monitored", "lqr+penalty", "lqr+residual", "+shielded", "K x_hat+K x_hat"),
+    ],
+)
+def test_unknown_arms_are_refused_with_those_that_are_known(name):
+    with pytest.raises(ValueError, match=r"unknown arm .*known are unshielded"):
+        Arm.of(name)
+
+
+def test_weight_of_a_penalty_may_be_part_of_the_name(run_of):
+    weights = {name: run_of(name, violation_penalty=3.0) for name in ("penalized", "penalized:0.1", "penalized:1e-2")}
+    assert [run.violation_penalty for run in weights.values()] == [3.0, 0.1, 0.01]
+    assert {run.arm for run in weights.values()} == set(weights)
+
+
+def test_filter_at_test_is_not_there_in_training(run_of):
+    for name, kind in (("shield at test", VectorSafetyShield), ("trusting at test", EstimateFilter)):
+        run = run_of(name)
+        assert layers(run.training_loop.vector(2)) == []
+        assert layers(run.loop.vector(2)) == [kind]
+    for name in ("shielded", "trusting", "psf"):
+        run = run_of(name)
+        assert layers(run.training_loop.vector(2)) == layers(run.loop.vector(2)) != []
+
+
+def test_lagrangian_has_its_settings_and_starts_at_its_multiplier(run_of):
+    settings = LagrangianSettings(multiplier=0.5, cost_limit=2.0)
+    run = run_of("lagrangian", lagrangian=settings)
+    assert run.lagrangian == settings
+    envs = run.training_loop.vector(2)
+    assert (layers(envs), envs.penalty) == ([CostPenalty], 0.5)
+    assert layers(run.loop.without_penalties.vector(2)) == []
+    assert run.key != run_of("lagrangian").key
+    assert run_of("unshielded", lagrangian=settings).lagrangian is None
+
+
+def test_residual_agents_add_to_the_certified_gain_outside_of_the_filter(run_of, certificate, loaded):
+    run = run_of("shielded+residual")
+    assert layers(run.training_loop.vector(2)) == [ResidualActions, VectorSafetyShield]
+    assert layers(run.loop.vector(2)) == [VectorSafetyShield]
+    np.testing.assert_allclose(run.training_loop.residual_gain, certificate.K / loaded.u_max)
+
+
+@pytest.mark.parametrize("name", ["trusting", "shield at test", "lagrangian", "shielded+residual", "lqr+trusting"])
+def test_every_arm_plays(run_of, name):
+    from experiments.runs import execute_run
+
+    tiny = PPOSettings(envs=2, rollout=64, batch_size=64, epochs=1, width=8)
+    result = execute_run(run_of(name, steps=256, episodes=2, ppo=tiny), lambda steps: None)
+    assert (result.arm, len(result.episodes)) == (name, 2)
+    assert result.train_steps == (0 if name.startswith("lqr") else 256)
+    assert (result.episodes[0].guaranteed, result.episodes[1].guaranteed) == (2 * (name[:6] == "shield",))

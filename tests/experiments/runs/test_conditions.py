@@ -1,0 +1,126 @@
+"""Conditions of evaluation: what they change, and what is kept of them."""
+
+import json
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from agents.control_loop import ControlLoop
+from experiments.analysis.arm_table import condition_text, summary_text
+from experiments.analysis.summary import arm_summary
+from experiments.runs import ExperimentSetup, RunStore, execute_run
+from experiments.runs.conditions import condition_named, other_conditions, under, worse_channel
+from experiments.settings import CompareSettings
+from ncs_gym import AdversarialDisturbance, Channel, ChannelContract, GilbertElliott
+from ncs_gym.envs.env import ncs_env
+from shields import verify
+
+CRUISE, CART_POLE, REACTOR = (f"ncs_gym/{name}-v0" for name in ("TruckTrailerCruise", "CartPole", "BatchReactor"))
+ALL = ("worst-case disturbance", "worse channel", "gaussian")
+
+
+@pytest.fixture(scope="module")
+def setup(certificate, loaded):
+    return ExperimentSetup(CRUISE, None, loaded, certificate, verify(certificate, loaded))
+
+
+def run_of(setup, name, conditions=ALL, episodes=8):
+    return setup.training_run(CompareSettings(conditions=conditions, episodes=episodes), name, 0)
+
+
+def test_names_take_hyphens_and_the_condition_of_training_is_no_other_one():
+    assert condition_named("worst-case-disturbance") == "worst-case disturbance"
+    assert other_conditions(("as-trained", "worse-channel", "worse channel")) == ("worse channel",)
+    with pytest.raises(ValueError, match="unknown condition 'worse'; known are as trained, worst-case disturbance"):
+        condition_named("worse")
+
+
+def test_each_condition_changes_one_thing_in_both_kinds_of_environment():
+    loop = ControlLoop(env=CRUISE)
+    assert under("as trained", loop) is loop
+    for single in (lambda x: ncs_env(x.single()), lambda x: x.vector(2).unwrapped.single):
+        own = single(loop)
+        disturbed, late, unbounded = (single(under(name, loop)) for name in ALL)
+        assert isinstance(disturbed.disturbance, AdversarialDisturbance)
+        assert (disturbed.channel, disturbed.noise) == (own.channel, own.noise)
+        assert late.channel == replace(own.channel, loss=0.65, delay=4)
+        assert type(late.disturbance) is type(own.disturbance)
+        assert (unbounded.noise, unbounded.channel) == ("gaussian", own.channel)
+
+
+@pytest.mark.parametrize("env_id", [CART_POLE, REACTOR])
+def test_worse_channel_keeps_the_contract_of_the_certificate(env_id):
+    env = ncs_env(gym.make(env_id))
+    worse = worse_channel(env.channel, env.contract)
+    assert env.contract.is_kept_by(worse)
+    assert worse.loss == 0.6
+    assert worse.delay == env.channel.longest_delay
+    assert worse != env.channel
+
+
+def test_worse_channel_uses_what_the_contract_leaves_and_bursts_get_denser():
+    bursts = GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.5, loss_good=0.0, loss_bad=0.6)
+    channel = Channel(loss=bursts, send_period=2, max_consecutive_losses=1)
+    worse = worse_channel(channel, ChannelContract(max_age=4))
+    assert (worse.loss.loss_good, worse.loss.loss_bad, worse.delay) == (0.5, 0.8, 1)
+    assert worse_channel(Channel(), None) == Channel(loss=0.5, delay=1)
+    assert worse_channel(Channel(), ChannelContract(max_age=3)) == Channel(delay=1)
+    with pytest.raises(ValueError, match="no channel within the contract is worse"):
+        worse_channel(Channel(), ChannelContract(max_age=0))
+
+
+@pytest.fixture(scope="module")
+def results(setup):
+    names = ("proportional", "proportional+trusting", "proportional+shielded", "random")
+    return {name: execute_run(run_of(setup, name), lambda steps: None) for name in names}
+
+
+def test_conditions_are_stored_beside_the_evaluation_as_trained(setup, results, tmp_path):
+    run, result = run_of(setup, "proportional+shielded"), results["proportional+shielded"]
+    assert tuple(result.conditions) == ALL
+    alone = execute_run(run_of(setup, "proportional+shielded", ()), lambda steps: None)
+    assert (alone.episodes, alone.conditions) == (result.episodes, {})
+    for condition, episodes in result.conditions.items():
+        assert episodes == execute_run(run_of(setup, run.arm, (condition,)), lambda steps: None).conditions[condition]
+        assert episodes != result.episodes
+    store = RunStore(tmp_path)
+    store.save(run, result)
+    assert store.load(run).conditions == result.conditions
+    assert store.load(replace(run, conditions=ALL[:1])) is None
+
+
+def test_shield_holds_where_the_filter_that_trusts_the_estimate_breaks(results):
+    outside = {
+        name: [sum(each.largest_level > 1.0 for each in result.conditions[condition]) for condition in ALL]
+        for name, result in results.items()
+    }
+    assert outside["proportional+shielded"] == [0, 0, 0]
+    assert outside["proportional+trusting"][0] >= 6
+    assert outside["proportional+trusting"][0] > sum(
+        each.largest_level > 1.0 for each in results["proportional+trusting"].episodes
+    )
+    assert all(each.guaranteed for each in results["proportional+shielded"].conditions["worst-case disturbance"])
+
+
+def test_random_policy_acts_alike_under_every_condition(setup):
+    run = run_of(setup, "random", ("as trained",))
+    first, again = (execute_run(run, lambda steps: None).trajectory.inputs for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+
+
+def test_summary_and_table_have_a_block_per_condition(results):
+    modes = {"proportional": None, "proportional+trusting": "trusting", "proportional+shielded": "project"}
+    arms = {name: arm_summary([results[name]], mode, fixed_policy=True) for name, mode in modes.items()}
+    json.dumps(arms, allow_nan=False)
+    assert {name: arm["shielded"] for name, arm in arms.items()} == dict.fromkeys(modes, False) | {
+        "proportional+shielded": True
+    }
+    pushed = arms["proportional+trusting"]["conditions"]["worst-case disturbance"]
+    assert pushed["eval_violation_steps"] > arms["proportional+trusting"]["eval_violation_steps"]
+    text = condition_text("worst-case disturbance", arms, {})
+    assert text.startswith("worst-case disturbance:")
+    assert f" {pushed['eval_violation_steps']:,} " in text
+    for printed in (text, summary_text(arms, {})):
+        assert max(map(len, printed.splitlines())) <= 100
