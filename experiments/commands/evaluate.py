@@ -48,7 +48,8 @@ def evaluate(settings: EvaluateSettings) -> None:
     )
     result = RunResult(settings.shield, 0, 0, 0, 0, [], evaluated.episodes, evaluated.trajectory, {})
     arms = {f"shield: {settings.shield}": arm_summary([result], mode, fixed_policy=True)}
-    print(f"{agent.algorithm} of {settings.model} in {agent.env}\n\n{summary_text(arms, {})}")
+    print(f"{agent.algorithm} of {settings.model} in {agent.env}, {settings.episodes:,} episodes", end="\n\n")
+    print(summary_text(arms, {}))
     if settings.out is not None:
         content = {
             "arms": arms,

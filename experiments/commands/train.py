@@ -32,4 +32,5 @@ def train(settings: TrainSettings) -> None:
     setup.certificate.save(settings.out / "certificate.json")
     content = {"arms": arms} | setup.provenance("train", settings)
     write_atomically(settings.out / "summary.json", json.dumps(content, indent=1) + "\n")
+    print(f"{results[0].train_steps:,} training steps, {settings.episodes:,} episodes\n")
     print(summary_text(arms, {}), f"agent: {settings.out / 'models' / run.name}", sep="\n")
