@@ -42,7 +42,7 @@ LAYERS = {
     "agents": (
         {"settings", "results", "sb3_vec_env", "loop_wrappers"},
         {"control_loop"},
-        {"algorithms", "callbacks", "evaluation"},
+        {"algorithms", "callbacks", "evaluation", "sharing"},
         {"agent"},
         {"training"},
     ),
