@@ -3,6 +3,9 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= runs/compare
+# Where torch comes from; empty for pip's own index, whose torch for Linux brings gigabytes of libraries for graphics cards.
+# Without them: make TORCH_INDEX=https://download.pytorch.org/whl/cpu
+TORCH_INDEX ?=
 PACKAGES := ncs_gym shields agents experiments
 INSTALLED := $(VENV)/.installed
 DOCS_INSTALLED := $(VENV)/.installed-docs
@@ -40,6 +43,7 @@ types: $(INSTALLED)
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 benchmark: $(INSTALLED) $(RAY_INSTALLED)
+	$(BIN)/python benchmarks/import_time.py
 	$(BIN)/python benchmarks/shield_decision.py
 	$(BIN)/python benchmarks/containment.py
 	$(BIN)/python benchmarks/kalman_gain.py
@@ -61,10 +65,11 @@ docs: $(DOCS_INSTALLED)
 audit: $(AUDIT_INSTALLED)
 	$(BIN)/pip-audit --strict --no-deps --disable-pip --progress-spinner off -r constraints.txt
 
-$(INSTALLED): pyproject.toml constraints.txt
+$(INSTALLED): pyproject.toml constraints.txt tests/requirements.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt torch
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[train,render,verify,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[train,contrib,render,verify,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r tests/requirements.txt
 	touch $@
 
 $(DOCS_INSTALLED): $(INSTALLED)

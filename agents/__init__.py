@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from agents.agent import Agent, AgentError
-    from agents.callbacks import DualAscentCallback, SafetyCallback
+    from agents.callbacks import DualAscentCallback, EvaluationCallback, SafetyCallback
     from agents.control_loop import ControlLoop, ShieldSettings
     from agents.evaluation import evaluate
     from agents.results import Episode, Evaluation, TrainingPoint, Trajectory
@@ -27,6 +27,7 @@ __all__ = [
     "DualAscentCallback",
     "Episode",
     "Evaluation",
+    "EvaluationCallback",
     "LagrangianSettings",
     "OffPolicySettings",
     "PPOSettings",
@@ -42,7 +43,7 @@ __all__ = [
 
 _MODULES = {
     "agent": ("Agent", "AgentError"),
-    "callbacks": ("DualAscentCallback", "SafetyCallback"),
+    "callbacks": ("DualAscentCallback", "EvaluationCallback", "SafetyCallback"),
     "control_loop": ("ControlLoop", "ShieldSettings"),
     "evaluation": ("evaluate",),
     "results": ("Episode", "Evaluation", "TrainingPoint", "Trajectory"),

@@ -17,10 +17,12 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.algorithms import ALGORITHMS, build_model
-from agents.control_loop import ControlLoop
+from agents.control_loop import ControlLoop, ShieldSettings
 from agents.loop_wrappers import with_gain
+from agents.results import Evaluation
 from agents.sb3_vec_env import SB3VecEnv
 from agents.settings import AgentSettings
+from agents.sharing.card import card_text
 from ncs_gym import Channel, GilbertElliott
 from shields.atomic_write import write_atomically
 
@@ -122,14 +124,32 @@ class Agent:
         document = {"format": _FORMAT, "sha256": _digest(content), "agent": content}
         return {"model.zip": buffer.getvalue(), "agent.json": (json.dumps(document, indent=1) + "\n").encode()}
 
-    def save(self, folder: Path) -> None:
-        """Writes the two files into an existing folder.
+    def save(
+        self, folder: str | Path, shield: ShieldSettings | None = None, evaluation: Evaluation | None = None
+    ) -> None:
+        """Writes a folder that can be shared: `model.zip`, `agent.json`, the card `README.md`, and `certificate.json`.
+
+        Args:
+            folder: The folder, which is made if it does not exist; files of these names are replaced.
+            shield: The shield that the agent is meant to act behind, whose certificate is saved; None for none.
+            evaluation: Episodes whose figures the card gives; None leaves them out.
 
         Raises:
-            OSError: If one cannot be written.
+            ValueError: If the certificate is for another plant than that of the agent's environment.
+            OSError: If a file cannot be written.
         """
-        for name, content in self.files().items():
+        folder, plant = Path(folder), _plant_fingerprint(self.env)
+        if shield is not None and shield.certificate.fingerprint != plant:
+            raise ValueError(f"the certificate is for another plant than that of {self.env}: their fingerprints differ")
+        of_agent = {name: getattr(self, name) for name in ("algorithm", "settings", "env", "channel", "checksum")}
+        files = self.files() | {"README.md": card_text(**of_agent, shield=shield, evaluation=evaluation).encode()}
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, content in files.items():
             write_atomically(folder / name, content)
+        if shield is None:
+            (folder / "certificate.json").unlink(missing_ok=True)
+        else:
+            shield.certificate.save(folder / "certificate.json")
 
     @classmethod
     def load(cls, folder: str | Path) -> Agent:

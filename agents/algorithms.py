@@ -39,8 +39,9 @@ def checked_settings(name: str, settings: AgentSettings | None) -> AgentSettings
         raise ValueError(f"unknown algorithm {name!r}; known are {', '.join(ALGORITHMS)}")
     package, kind = ALGORITHMS[name]
     if importlib.util.find_spec(package) is None:
+        extra = "contrib" if package == "sb3_contrib" else "train"
         distribution = package.replace("_", "-")
-        raise ModuleNotFoundError(f"{name} needs {distribution}: pip install {distribution}")
+        raise ModuleNotFoundError(f"{name} needs {distribution}: in a clone of ncs-gym, pip install -e '.[{extra}]'")
     if settings is not None and not isinstance(settings, kind):
         raise ValueError(f"{name} takes {kind.__name__}, got {type(settings).__name__}")
     return settings or kind()

@@ -1,4 +1,4 @@
-"""What happens beside the learning, step by step: violations are counted, and their price is adapted."""
+"""What happens beside the learning: violations are counted, their price is adapted, and the policy is evaluated."""
 
 from __future__ import annotations
 
@@ -6,15 +6,21 @@ from collections.abc import Callable
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
-from agents.loop_wrappers import CostPenalty
+from agents.control_loop import ControlLoop
+from agents.evaluation import evaluate
+from agents.loop_wrappers import CostPenalty, with_gain
 from agents.results import TrainingPoint
 from agents.sb3_vec_env import SB3VecEnv
 from agents.settings import LagrangianSettings
 
 # The history has about this many points where every step of all environments is a rollout.
 _MAX_POINTS = 200
+# The policy is evaluated about this often.
+_EVALUATIONS = 10
+# Infos of single environments that are counted.
+_COUNTED = ("cost", "shield_intervened", "shield_correction")
 
 
 class SafetyCallback(BaseCallback):
@@ -22,8 +28,8 @@ class SafetyCallback(BaseCallback):
 
     The counts come from the info of every step, whereas `Monitor` only sees the last step of each episode. The callback
     works with any stable-baselines3 algorithm, on `SB3VecEnv` and on single environments. TensorBoard gets
-    `safety/violation_rate` and `safety/intervention_rate` (per step since the last log) and `safety/violation_steps`
-    (total).
+    `safety/violation_rate` and `safety/intervention_rate` (per step since the last log), `safety/mean_correction` (the
+    mean norm of applied minus proposed input since the last log, with a shield) and `safety/violation_steps` (total).
 
     Args:
         on_progress: Called with the number of steps taken since its last call.
@@ -39,6 +45,7 @@ class SafetyCallback(BaseCallback):
         self.history: list[TrainingPoint] = []
         self._on_progress = on_progress
         self.violation_steps = self.interventions = 0
+        self._corrections: float | None = None
 
     def _on_training_start(self) -> None:
         self._interval = self.locals["total_timesteps"] // _MAX_POINTS
@@ -47,9 +54,11 @@ class SafetyCallback(BaseCallback):
         batch = _batch_info(self.training_env)
         if batch is None:
             infos = self.locals["infos"]
-            batch = {key: [info[key] for info in infos] for key in ("cost", "shield_intervened") if key in infos[0]}
+            batch = {key: [info[key] for info in infos] for key in _COUNTED if key in infos[0]}
         self.violation_steps += int((np.asarray(batch["cost"]) > 0.0).sum())
         self.interventions += int(np.sum(batch.get("shield_intervened", 0)))
+        if "shield_correction" in batch:
+            self._corrections = (self._corrections or 0.0) + float(np.sum(batch["shield_correction"]))
         return True
 
     def _on_rollout_end(self) -> None:
@@ -67,6 +76,9 @@ class SafetyCallback(BaseCallback):
         self.logger.record("safety/violation_rate", (self.violation_steps - last.violation_steps) / taken)
         self.logger.record("safety/intervention_rate", (self.interventions - last.interventions) / taken)
         self.logger.record("safety/violation_steps", self.violation_steps)
+        if self._corrections is not None:
+            self.logger.record("safety/mean_correction", self._corrections / taken)
+            self._corrections = 0.0
         returns = [episode["r"] for episode in self.model.ep_info_buffer or ()]
         mean = float(np.mean(returns)) if returns else float("nan")
         self.history.append(TrainingPoint(self.num_timesteps, mean, self.violation_steps, self.interventions))
@@ -109,6 +121,58 @@ class DualAscentCallback(BaseCallback):
             self._priced.penalty = max(0.0, self._priced.penalty + self._settings.learning_rate * excess)
             self._costs = []
         self.logger.record("safety/multiplier", self._priced.penalty)
+
+
+class EvaluationCallback(BaseCallback):
+    """Evaluates the policy about every tenth part of the training, and once more at its end, and logs the results.
+
+    TensorBoard gets `eval/mean_reward` (mean return, without penalties), `eval/success_rate` (episodes without a
+    violation of the true state) and `eval/intervention_rate` (per step). The names of the first two are those of
+    stable-baselines3's `EvalCallback`. All evaluations use common random numbers, none of which are the training's:
+    what is learned is the same with and without this callback. The policy acts deterministically.
+
+    Args:
+        loop: The control loop to evaluate in.
+        seed: Seed of the evaluations.
+        episodes: Episodes of each evaluation, played side by side.
+    """
+
+    def __init__(self, loop: ControlLoop, seed: int, episodes: int = 20) -> None:
+        super().__init__()
+        self._loop, self._seed, self._episodes = loop, seed, episodes
+        self._due = 0
+
+    def _on_training_start(self) -> None:
+        self._interval = self.locals["total_timesteps"] / _EVALUATIONS
+
+    def _on_rollout_start(self) -> None:
+        if self.num_timesteps >= self._due:
+            self._evaluate()
+            self._due = self.num_timesteps + self._interval
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_training_end(self) -> None:
+        self._evaluate()
+
+    def _evaluate(self) -> None:
+        """Plays the episodes and writes their results to TensorBoard."""
+        episodes = evaluate(self._loop, lambda seen, _: self._act(seen), self._episodes, self._seed).episodes
+        steps = sum(episode.steps for episode in episodes)
+        safe = [episode.violation_steps == 0 for episode in episodes]
+        self.logger.record("eval/mean_reward", float(np.mean([episode.episode_return for episode in episodes])))
+        self.logger.record("eval/success_rate", float(np.mean(safe)))
+        self.logger.record("eval/intervention_rate", sum(episode.interventions for episode in episodes) / steps)
+        self.logger.dump(self.num_timesteps)
+
+    def _act(self, observations: np.ndarray) -> np.ndarray:
+        """Returns deterministic actions, shape (N, m), for raw observations, shape (N, entries)."""
+        env, gain, seen = self.model.get_env(), self._loop.residual_gain, observations
+        if isinstance(env, VecNormalize):
+            seen = np.asarray(env.normalize_obs(observations))
+        actions = self.model.predict(seen, deterministic=True)[0]
+        return actions if gain is None else with_gain(gain, observations, actions)
 
 
 def _batch_info(env: VecEnv) -> dict[str, np.ndarray] | None:

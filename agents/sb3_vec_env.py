@@ -18,6 +18,8 @@ from ncs_gym import NCSVectorEnv
 _WITH_RESET_MASK = (NCSVectorEnv, SyncVectorEnv, AsyncVectorEnv)
 # Infos of an episode's last step that become part of info["episode"], as with `Monitor(info_keywords=...)`.
 _EPISODE_KEYS = ("episode_violations", "is_success")
+# Infos in the dicts of every step, asked for or not: what algorithms for constrained problems read.
+_STEP_KEYS = ("cost",)
 # Attributes that change with the episodes of an `NCSVectorEnv`, but never in its scalar prototype.
 _STATEFUL_ATTRIBUTES = ("steps", "episodes", "np_random", "starts", "spec", "num_envs", "metadata")
 
@@ -33,13 +35,13 @@ class SB3VecEnv(VecEnv):
 
     Like `Monitor` it adds `info["episode"]` (`r`, `l`, `t`) to the last step of an episode, with `episode_violations`
     and `is_success` where there are such infos. Filling a dict per environment and step is slow. Therefore the dicts
-    hold by default only what the library needs: `batch_info` has all values of the last step as arrays, and `info_keys`
-    names values to be copied into the dicts.
+    hold by default only what the library needs, and `cost` where there is such an info: `batch_info` has all values of
+    the last step as arrays, and `info_keys` names further values to be copied into the dicts.
 
     Args:
         vector_env: The vector environment.
         allow_reset_transitions: Whether to accept environments that take a step to reset.
-        info_keys: Infos that the dicts of every step hold; those of an episode's last step hold all infos.
+        info_keys: Infos that the dicts of every step hold besides `cost`; those of an episode's last step hold all.
 
     Attributes:
         vector_env: The vector environment.
@@ -58,7 +60,7 @@ class SB3VecEnv(VecEnv):
             raise ValueError(f"vector_env must be a gymnasium VectorEnv, got {type(vector_env).__name__}")
         if isinstance(vector_env.single_observation_space, (gym.spaces.Dict, gym.spaces.Tuple)):
             raise ValueError(f"observations must be arrays, got {vector_env.single_observation_space}")
-        self.vector_env, self._info_keys = vector_env, tuple(info_keys)
+        self.vector_env, self._info_keys = vector_env, (*_STEP_KEYS, *info_keys)
         self._mode = vector_env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
         self._masks = isinstance(vector_env.unwrapped, _WITH_RESET_MASK)
         if self._mode is not AutoresetMode.SAME_STEP and not self._masks and not allow_reset_transitions:

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.agent import Agent, Normalization
 from agents.algorithms import build_model, checked_settings
-from agents.callbacks import DualAscentCallback, SafetyCallback
+from agents.callbacks import DualAscentCallback, EvaluationCallback, SafetyCallback
 from agents.control_loop import ControlLoop
 from agents.loop_wrappers import CostPenalty
 from agents.results import TrainingPoint
@@ -58,7 +59,7 @@ def train(
             (starts, disturbances, noise, packet losses) as long as their episodes last equally long.
         algorithm: A name in `agents.algorithms.ALGORITHMS`.
         settings: Settings of the algorithm; None for its defaults.
-        log_folder: Folder for TensorBoard's events; None writes none.
+        log_folder: Folder for TensorBoard's events, with evaluations on the way; None for neither.
         on_progress: Called with the number of steps taken since its last call.
 
     Raises:
@@ -73,10 +74,12 @@ def train(
     model = build_model(algorithm, env, settings, seed, steps)
     model.set_logger(configure(str(log_folder), ["tensorboard"]) if log_folder else Logger(None, []))
     callback = SafetyCallback(on_progress)
-    adapting = []
+    beside: list[BaseCallback] = [callback]
     if loop.lagrangian is not None and isinstance(envs, CostPenalty):
-        adapting = [DualAscentCallback(loop.lagrangian, envs)]
-    model.learn(steps, callback=[callback, *adapting])
+        beside.append(DualAscentCallback(loop.lagrangian, envs))
+    if log_folder:
+        beside.append(EvaluationCallback(loop, seed))
+    model.learn(steps, callback=beside)
     agent = _agent(loop, algorithm, settings, model, env)
     return TrainingResult(
         agent, callback.history, model.num_timesteps, callback.violation_steps, callback.interventions

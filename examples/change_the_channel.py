@@ -1,4 +1,7 @@
-"""Shows how to choose the network: the estimation error of the same plant, input and seed behind six channels."""
+"""Shows how to choose the network: the estimation error of the same plant, input and seed behind six channels.
+
+Takes about one second on one core.
+"""
 
 import gymnasium as gym
 import numpy as np

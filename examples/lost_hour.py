@@ -1,4 +1,7 @@
-"""Loses every packet for an hour: a proof for any silence goes on, one under a contract ends until packets return."""
+"""Loses every packet for an hour: a proof for any silence goes on, one under a contract ends until packets return.
+
+Takes about three seconds on one core.
+"""
 
 import numpy as np
 

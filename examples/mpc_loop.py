@@ -1,4 +1,7 @@
-"""Runs a model predictive controller in a loop without Gymnasium, alone and behind a SafeLoop, under packet loss."""
+"""Runs a model predictive controller in a loop without Gymnasium, alone and behind a SafeLoop, under packet loss.
+
+Takes about three seconds on one core.
+"""
 
 import cvxpy as cp
 import numpy as np

@@ -1,4 +1,7 @@
-"""Shows all steps for a plant of your own: its model, a certificate, a shield, and training behind the shield."""
+"""Shows all steps for a plant of your own: its model, a certificate, a shield, and training behind the shield.
+
+Takes about 12 seconds on one core.
+"""
 
 import argparse
 

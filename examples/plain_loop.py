@@ -1,4 +1,7 @@
-"""Shows a control loop of your own without Gymnasium: the estimate, your controller, and the input that is safe."""
+"""Shows a control loop of your own without Gymnasium: the estimate, your controller, and the input that is safe.
+
+Takes about two seconds on one core.
+"""
 
 import numpy as np
 

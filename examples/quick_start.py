@@ -1,4 +1,7 @@
-"""Shows the smallest shielded episode: the policy is random, and still the coupling never exceeds its limits."""
+"""Shows the smallest shielded episode: the policy is random, and still the coupling never exceeds its limits.
+
+Takes about two seconds on one core.
+"""
 
 import gymnasium as gym
 

@@ -1,4 +1,7 @@
-"""Shows stable-baselines3's PPO, SAC and TD3 without any adapter: the shield is a wrapper like any other."""
+"""Shows stable-baselines3's PPO, SAC and TD3 without any adapter: the shield is a wrapper like any other.
+
+Takes about 35 seconds on one core.
+"""
 
 import argparse
 
@@ -9,7 +12,7 @@ from stable_baselines3.common.monitor import Monitor
 from shields import SafetyShield
 
 parser = argparse.ArgumentParser()
-parser.add_argument("--steps", type=int, default=10_000)
+parser.add_argument("--steps", type=int, default=1000)
 options = parser.parse_args()
 
 # Monitor adds these infos of the last step to each episode; the last step has the totals of the episode.

@@ -1,6 +1,8 @@
 """Shows PPO in one file, written with torch and gymnasium alone, with or without a shield.
 
 Compare `python examples/single_file_ppo.py` with `python examples/single_file_ppo.py --shield none`.
+
+Takes about 35 seconds on one core.
 """
 
 from collections import deque

@@ -1,4 +1,7 @@
-"""Balances a cart-pole over a network with a contract; a reckless operator proposes the inputs."""
+"""Balances a cart-pole over a network with a contract; a reckless operator proposes the inputs.
+
+Takes about three seconds on one core.
+"""
 
 import numpy as np
 

@@ -1,4 +1,7 @@
-"""Shows how to write a task: the coupling is to follow a sine, and the observation contains the phase of the sine."""
+"""Shows how to write a task: the coupling is to follow a sine, and the observation contains the phase of the sine.
+
+Takes about one second on one core.
+"""
 
 from dataclasses import dataclass
 

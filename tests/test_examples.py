@@ -1,5 +1,7 @@
 """Every example runs as it is, with a tiny budget, and prints what it is about."""
 
+import ast
+import importlib.util
 import os
 import re
 import subprocess
@@ -37,6 +39,8 @@ RUNS = {
         ["--steps", "210"],
         [rf"{name}: last return {NUMBER}; 0 violating steps, [1-9]\d* actions" for name in ("PPO", "SAC", "TD3")],
     ),
+    "minari_dataset.py": ([], [re.escape("600 steps in 3 episodes; violating steps of each: [0.0, 0.0, 0.0]")]),
+    "sb3_processes.py": ([], [r"10 episodes, violating steps: 0\b"]),
     "single_file_ppo.py": (
         ["--total-timesteps", "512", "--num-envs", "2", "--epochs", "2"],
         [rf"last 2 of 2 episodes: {NUMBER}", r"violating steps: 0; actions overridden: [1-9]"],
@@ -45,20 +49,31 @@ RUNS = {
         ["--total-timesteps", "420", "--learning-starts", "390"],
         [rf"last 2 of 2 episodes: {NUMBER}", r"violating steps: 0; actions overridden: [1-9]"],
     ),
+    "tianshou_processes.py": (
+        [],
+        [rf"full throttle: \[{NUMBER} {NUMBER}\]; {re.escape('violating steps: [0.0, 0.0]')}"],
+    ),
+    "torchrl_rollout.py": ([], [rf"return of 200 random steps: {NUMBER}; violating steps: 0\b"]),
     "unstable_plant_loop.py": (
         [],
         ["oldest sample in use: 4 steps, allowed: 4", r"closest to the limit: 0\.\d+", "proved: 5000 of 5000 steps"],
     ),
     "write_a_task.py": ([], [rf"return of doing nothing: {NUMBER}"]),
 }
-TRAINING = {"own_plant.py", "recurrent_ppo.py", "sb3_ten_lines.py", "single_file_sac.py"}
+TRAINING = {"own_plant.py", "recurrent_ppo.py", "sb3_processes.py", "sb3_ten_lines.py", "single_file_sac.py"}
+# Packages that no extra installs, and the versions that the examples were tried with (docs/integrations.md).
+FOREIGN = {
+    "minari_dataset.py": {"minari": "0.5.4", "jax": None},
+    "tianshou_processes.py": {"tianshou": "2.0.1"},
+    "torchrl_rollout.py": {"torchrl": "0.14.1"},
+}
 
 
-def run_example(name, *arguments):
+def run_example(name, *arguments, **variables):
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     command = [sys.executable, str(ROOT / "examples" / name), *arguments]
     # One thread per process: tests run side by side.
-    environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"} | variables
     return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600)
 
 
@@ -66,12 +81,28 @@ def test_every_example_is_run_here():
     assert {path.name for path in (ROOT / "examples").glob("*.py")} == set(RUNS)
 
 
+def test_every_example_says_how_long_it_takes():
+    for name in RUNS:
+        text = ast.get_docstring(ast.parse((ROOT / "examples" / name).read_text()))
+        assert re.search(r"^Takes about .* (seconds?) on one core", text, re.MULTILINE), name
+
+
+def test_versions_of_foreign_packages_are_those_that_the_page_names():
+    page = (ROOT / "docs" / "integrations.md").read_text()
+    for name, packages in FOREIGN.items():
+        (row,) = (line for line in page.splitlines() if name in line)
+        assert all(version in row for version in packages.values() if version)
+
+
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[SLOW] if name in TRAINING else []) for name in sorted(RUNS)]
+    "name", [pytest.param(name, marks=[SLOW] if name in TRAINING | FOREIGN.keys() else []) for name in sorted(RUNS)]
 )
-def test_example_runs_and_prints_what_it_is_about(name):
+def test_example_runs_and_prints_what_it_is_about(name, tmp_path):
+    missing = [package for package in FOREIGN.get(name, ()) if importlib.util.find_spec(package) is None]
+    if missing:
+        pytest.skip(f"{', '.join(missing)} not installed: a virtual environment of its own (docs/integrations.md)")
     arguments, expected = RUNS[name]
-    run = run_example(name, *arguments)
+    run = run_example(name, *arguments, MINARI_DATASETS_PATH=str(tmp_path))
     assert run.returncode == 0, run.stderr
     for pattern in expected:
         assert re.search(pattern, run.stdout), f"{pattern!r} is not in {run.stdout!r}"

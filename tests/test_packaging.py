@@ -42,7 +42,7 @@ LAYERS = {
     "agents": (
         {"settings", "results", "sb3_vec_env", "loop_wrappers"},
         {"control_loop"},
-        {"algorithms", "callbacks", "evaluation"},
+        {"algorithms", "callbacks", "evaluation", "sharing"},
         {"agent"},
         {"training"},
     ),
@@ -204,10 +204,12 @@ def test_files_and_functions_are_short():
 @pytest.mark.parametrize(
     ("module", "later"),
     [
-        ("shields", {"cvxpy", "clarabel", "torch", "matplotlib"}),
+        ("ncs_gym", {"scipy.stats", "filterpy", "pygame", "matplotlib"}),
+        ("shields", {"cvxpy", "clarabel", "torch", "matplotlib", "scipy.stats", "filterpy"}),
         ("experiments.commands.compare", {"torch", "stable_baselines3"}),
         ("experiments.backends.worker_init", {"numpy", "gymnasium"}),
         ("experiments.__main__", {"numpy", "tyro"}),
+        ("experiments.settings", {"scipy.stats", "filterpy", "cvxpy", "matplotlib", "torch"}),
     ],
 )
 def test_what_takes_long_is_imported_when_it_is_needed(module, later):

@@ -14,5 +14,5 @@ def require_extra(extra: str, *packages: str) -> None:
     missing = [name for name in packages if importlib.util.find_spec(name) is None]
     if missing:
         raise ModuleNotFoundError(
-            f"this command needs {', '.join(missing)}: install the extra, pip install 'ncs-gym[{extra}]'"
+            f"this command needs {', '.join(missing)}: in a clone of ncs-gym, pip install -e '.[{extra}]'"
         )

@@ -37,7 +37,7 @@ def render(settings: RenderSettings) -> None:
     if settings.policy not in UNTRAINED_POLICIES:
         require_extra("train", "stable_baselines3", "torch")
     if settings.out.suffix == ".mp4":
-        require_extra("render", "moviepy")
+        require_extra("render", "imageio_ffmpeg")
     modes = ("none", settings.shield) if settings.side_by_side else (settings.shield,)
     renderers = [_EpisodeRenderer(settings, mode) for mode in modes]
     frames = map(_side_by_side, _frames(renderers, settings.steps))

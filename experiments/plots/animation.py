@@ -61,14 +61,23 @@ def _gif(frames: Iterable[Image.Image], fps: int) -> bytes:
 
 
 def _mp4(frames: Iterable[Image.Image], fps: int) -> bytes:
-    from moviepy.video.io.ImageSequenceClip import ImageSequenceClip
+    import imageio_ffmpeg
 
-    images = [np.asarray(each) for each in frames]
-    images += images[-1:] * max(1, _LAST_FRAME_TIME * fps // 1000)  # moviepy drops the last one
-    clip = ImageSequenceClip(images, fps=fps)
+    remaining = iter(frames)
+    image = next(remaining)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "episode.mp4"
-        clip.write_videofile(str(file), audio=False, logger=None)
+        # Blocks of 2 pixels: by default the writer would stretch frames to multiples of 16.
+        writer = imageio_ffmpeg.write_frames(str(file), image.size, fps=fps, macro_block_size=2)
+        writer.send(None)
+        try:
+            writer.send(image.tobytes())
+            for image in remaining:
+                writer.send(image.tobytes())
+            for _ in range(_LAST_FRAME_TIME * fps // 1000):
+                writer.send(image.tobytes())
+        finally:
+            writer.close()
         return file.read_bytes()
 
 

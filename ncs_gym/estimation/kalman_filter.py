@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
 
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.set_membership import SHAPE_STEP, SetMembership
@@ -146,6 +145,8 @@ def _kalman_filter(plant: LinearPlant, quantization_step: float) -> Any:
 
     The covariances are the plant's own for this purpose, and that of the sensor plus q^2/12 of a quantizer.
     """
+    from filterpy.kalman import KalmanFilter  # takes long to import
+
     kalman: Any = KalmanFilter(dim_x=plant.n, dim_z=plant.p)
     kalman.F, kalman.H = plant.A, plant.H
     process, sensor, _ = plant.kalman_covariances

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fractions import Fraction
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from ncs_gym.network.channel import Channel
 from ncs_gym.plants.linear_plant import LinearPlant
@@ -55,5 +55,5 @@ def _escape(noise: TruncatedGaussian, delta: float) -> Fraction:
     """
     if not np.any(noise.covariance):
         return Fraction(0)
-    tail = float(chi2.sf(noise.energy, len(noise.covariance)))
+    tail = float(chdtrc(len(noise.covariance), noise.energy))
     return max(Fraction(delta), Fraction(tail) * (1 + Fraction(TAIL_ROUNDING)) if tail > delta else Fraction(0))

@@ -30,7 +30,9 @@ def _require_pygame() -> Any:
         import pygame
         import pygame.font
     except ImportError as error:
-        raise gym.error.DependencyNotInstalled('rendering needs pygame-ce: pip install "ncs-gym[render]"') from error
+        raise gym.error.DependencyNotInstalled(
+            "rendering needs pygame-ce: in a clone of ncs-gym, pip install -e '.[render]'"
+        ) from error
     return pygame
 
 

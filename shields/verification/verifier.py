@@ -84,7 +84,8 @@ def _flint_conditions(certificate: Certificate, plant: LinearPlant) -> Iterable[
         ModuleNotFoundError: If python-flint is not installed.
     """
     if importlib.util.find_spec("flint") is None:
-        raise ModuleNotFoundError("engine 'flint' needs python-flint: pip install 'ncs-gym[verify]'", name="flint")
+        sentence = "engine 'flint' needs python-flint: in a clone of ncs-gym, pip install -e '.[verify]'"
+        raise ModuleNotFoundError(sentence, name="flint")
     from shields.verification.flint import flint_conditions  # an optional dependency
 
     return flint_conditions(certificate, plant)

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 
 from agents.agent import Agent, AgentError, Normalization
-from agents.control_loop import ControlLoop
+from agents.control_loop import ControlLoop, ShieldSettings
+from agents.evaluation import evaluate
 from agents.settings import OffPolicySettings, PPOSettings
 from agents.training import train
-from ncs_gym import Channel, GilbertElliott
+from ncs_gym import Channel, GilbertElliott, truck_trailer
+from shields import Certificate
+from tests.certificates import certificate_of
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 OBSERVATIONS = np.random.default_rng(0).standard_normal((50, 3))
@@ -44,6 +47,57 @@ def test_loaded_agent_acts_like_the_saved_one(algorithm, tmp_path):
         np.testing.assert_array_equal(again.act(OBSERVATIONS), agent.act(OBSERVATIONS))
         assert (again.algorithm, again.settings, again.env) == (algorithm, SETTINGS[algorithm], CRUISE)
         assert again.channel == bursts
+
+
+def test_shared_folder_has_the_agent_its_shield_and_a_card(agent, certificate, tmp_path):
+    shield = ShieldSettings(certificate, "switch")
+    loop = ControlLoop(env=CRUISE, shield=shield)
+    evaluation = evaluate(loop, lambda seen, _: np.ones((len(seen), 1), np.float32), episodes=3, seed=1)
+    shared = tmp_path / "new" / "folder"
+    agent.save(shared, shield, evaluation)
+    assert {file.name for file in shared.iterdir()} == {"README.md", "agent.json", "certificate.json", "model.zip"}
+    assert Certificate.load(shared / "certificate.json") == certificate
+    card = (shared / "README.md").read_text()
+    assert card.startswith(f"# PPO in {CRUISE}\n")
+    for words in (
+        certificate.fingerprint,
+        certificate.checksum,
+        agent.checksum,
+        "loss=0.3",
+        'mode "switch"',
+        "width=16",
+    ):
+        assert words in card
+    interventions = sum(episode.interventions for episode in evaluation.episodes)
+    assert interventions > 0
+    assert f"{interventions} of 600 steps" in card
+    assert "violated the safe box: 0 of 3" in card
+    np.testing.assert_array_equal(Agent.load(shared).act(OBSERVATIONS), agent.act(OBSERVATIONS))
+
+
+def test_program_on_the_card_loads_the_agent_and_its_shield(agent, certificate, tmp_path, monkeypatch):
+    agent.save(tmp_path, ShieldSettings(certificate))
+    monkeypatch.chdir(tmp_path)
+    program = (tmp_path / "README.md").read_text().partition("```python\n")[2].partition("```")[0]
+    names = {}
+    exec(program, names)
+    assert names["agent"].checksum == agent.checksum
+    loop = names["loop"]
+    assert (loop.env, loop.channel, loop.shield) == (CRUISE, None, ShieldSettings(certificate))
+
+
+def test_card_without_a_shield_names_none(folder, agent, certificate):
+    agent.save(folder, ShieldSettings(certificate))
+    agent.save(folder)
+    assert {file.name for file in folder.iterdir()} == {"README.md", "agent.json", "model.zip"}
+    assert "| shield | none |" in (folder / "README.md").read_text()
+
+
+def test_certificate_of_another_plant_is_not_saved(agent, tmp_path):
+    other = certificate_of(truck_trailer())
+    with pytest.raises(ValueError, match="another plant"):
+        agent.save(tmp_path / "x", ShieldSettings(other))
+    assert not (tmp_path / "x").exists()
 
 
 def test_model_file_is_stable_baselines3s(folder, agent):

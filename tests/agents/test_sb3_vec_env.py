@@ -124,9 +124,19 @@ def test_options_reach_the_environment_once():
             env.reset()
 
 
+def test_infos_hold_the_cost_without_being_asked_for():
+    env = SB3VecEnv(gym.make_vec(CRUISE, num_envs=3))
+    env.reset()
+    for _ in range(30):
+        *_, infos = env.step(np.ones((3, 1), np.float32))
+        assert all(set(info) == {"cost"} for info in infos)
+        assert [info["cost"] for info in infos] == env.batch_info["cost"].tolist()
+    assert max(info["cost"] for info in infos) == 1.0
+
+
 def test_infos_hold_what_is_asked_for():
     shield = VectorSafetyShield(gym.make_vec(CRUISE, num_envs=3))
-    env = SB3VecEnv(shield, info_keys=("cost", "shield_intervened"))
+    env = SB3VecEnv(shield, info_keys=("shield_intervened",))
     env.reset()
     *_, infos = env.step(np.ones((3, 1), np.float32))
     assert all(set(info) == {"cost", "shield_intervened"} for info in infos)

@@ -1,4 +1,5 @@
 import copy
+from dataclasses import astuple
 
 import gymnasium as gym
 import numpy as np
@@ -128,7 +129,7 @@ def test_missing_package_is_one_sentence(monkeypatch):
     import importlib.util
 
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ModuleNotFoundError, match="TQC needs sb3-contrib: pip install sb3-contrib"):
+    with pytest.raises(ModuleNotFoundError, match=r"TQC needs sb3-contrib: in a clone .* '\.\[contrib\]'$"):
         train(CRUISE, 64, 0, "TQC", TINY_REPLAY)
 
 
@@ -141,9 +142,64 @@ def test_rates_reach_tensorboard(algorithm, settings, shielded, tmp_path):
     events.Reload()
     tags = events.Tags()["scalars"]
     assert {"safety/violation_rate", "safety/intervention_rate", "safety/violation_steps", "time/fps"} <= set(tags)
+    assert max(event.value for event in events.Scalars("safety/mean_correction")) > 0.0
+    assert {event.value for event in events.Scalars("eval/success_rate")} == {1.0}
+    evaluated = [event.step for event in events.Scalars("eval/mean_reward")]
+    assert evaluated[0] == 0
+    assert evaluated[-1] == result.steps
+    assert len(evaluated) >= 4
     if algorithm == "PPO":
         rates = [event.value for event in events.Scalars("safety/intervention_rate")]
         assert sum(rates) * 256 == pytest.approx(result.interventions, abs=1)
+
+
+def test_mean_correction_is_that_of_every_step(certificate):
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.logger import Logger
+
+    from agents import SafetyCallback, SB3VecEnv
+
+    corrections, recorded = [], []
+
+    class Recorder(VectorWrapper):
+        def step(self, actions):
+            result = self.env.step(actions)
+            corrections.extend(np.linalg.norm(result[4]["input"] - result[4]["input_proposed"], axis=1))
+            return result
+
+    class Recording(Logger):
+        def record(self, key, value, exclude=None):
+            if key == "safety/mean_correction":
+                recorded.append(value)
+
+    loop = ControlLoop(env=CRUISE.env, shield=ShieldSettings(certificate))
+    model = PPO("MlpPolicy", SB3VecEnv(Recorder(loop.vector(4))), n_steps=64, batch_size=128, n_epochs=1, device="cpu")
+    model.set_logger(Recording(None, []))
+    model.learn(512, callback=SafetyCallback())
+    assert len(corrections) == 512
+    np.testing.assert_allclose(recorded, np.mean(np.reshape(corrections, (2, 256)), axis=1), rtol=1e-9)
+
+
+@pytest.mark.parametrize(("algorithm", "settings"), [("PPO", TINY), ("SAC", TINY_REPLAY)])
+def test_evaluations_on_the_way_change_nothing(algorithm, settings, tmp_path):
+    plain, logged = (train(CRUISE, 1024, 3, algorithm, settings, log_folder=log) for log in (None, tmp_path))
+    assert plain.agent.checksum == logged.agent.checksum
+    np.testing.assert_array_equal([astuple(one) for one in plain.history], [astuple(one) for one in logged.history])
+
+
+def test_evaluation_of_the_end_is_that_of_the_returned_agent(shielded, tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    from agents import evaluate
+
+    result = train(shielded, 512, 5, settings=TINY, log_folder=tmp_path)
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    episodes = evaluate(shielded, lambda seen, _: result.agent.act(seen), 20, 5).episodes
+    mean = np.mean([episode.episode_return for episode in episodes])
+    assert events.Scalars("eval/mean_reward")[-1].value == pytest.approx(mean, rel=1e-5)
+    rate = sum(episode.interventions for episode in episodes) / sum(episode.steps for episode in episodes)
+    assert events.Scalars("eval/intervention_rate")[-1].value == pytest.approx(rate, rel=1e-5)
 
 
 def test_monitor_keeps_the_episodes_totals():

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'ncs-gym[ray]'")
+ray = pytest.importorskip("ray", reason="Ray is not installed: pip install -e '.[ray]'")
 
 from experiments.backends import ray_backend, ray_cluster  # noqa: E402
 from experiments.backends.ray_cluster import portable_task, require_answer  # noqa: E402

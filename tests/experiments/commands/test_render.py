@@ -178,4 +178,4 @@ def test_missing_pygame_is_one_sentence(tmp_path, monkeypatch):
         importlib.util, "find_spec", lambda name, *rest: find(name, *rest) if name != "pygame" else None
     )
     run = ncs("render", cwd=tmp_path)
-    assert_one_sentence(run, "this command needs pygame", "pip install 'ncs-gym[render]'")
+    assert_one_sentence(run, "this command needs pygame", "pip install -e '.[render]'")

@@ -59,6 +59,17 @@ def test_quantile_is_of_the_kept_mass_not_of_the_removed_one():
     assert chi2_quantile(0.95, 2) >= -2.0 * np.log(0.05)
 
 
+@pytest.mark.parametrize("degrees", [1, 2, 3, 7])
+@pytest.mark.parametrize("probability", [0.001, 0.5, 0.95, 1.0 - 1e-9, 1.0 - 2.0**-53])
+def test_quantile_is_that_of_scipy_stats_rounded_up(probability, degrees):
+    quantile = chi2_quantile(probability, degrees)
+    assert chi2.cdf(quantile, degrees) >= probability
+    # One for delta less 2^-54, the rounding of 1 - delta, as the docstring says.
+    removed = (1.0 - probability) - 2.0**-54
+    assert chi2.isf(removed, degrees) <= quantile
+    assert quantile <= max(chi2.isf(removed, degrees), chi2.ppf(probability, degrees)) * (1.0 + 1e-11)
+
+
 def test_truncated_noise_stays_in_its_bound_and_keeps_its_mass():
     rng = np.random.default_rng(4)
     covariance = np.array([[2.0, 0.3], [0.3, 0.5]])

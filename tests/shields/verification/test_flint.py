@@ -162,7 +162,7 @@ def test_missing_library_is_one_sentence(certificate, loaded, tmp_path, monkeypa
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name, *rest: None if name == "flint" else found(name, *rest)
     )
-    with pytest.raises(ModuleNotFoundError, match=r"pip install 'ncs-gym\[verify\]'"):
+    with pytest.raises(ModuleNotFoundError, match=r"pip install -e '\.\[verify\]'"):
         verify(certificate, loaded, engine="flint")
     assert verify(certificate, loaded).valid
     certificate.save(tmp_path / "c.json")
@@ -172,7 +172,7 @@ def test_missing_library_is_one_sentence(certificate, loaded, tmp_path, monkeypa
     code = f"{hide}; from experiments.__main__ import main; sys.argv[0] = 'ncs'; main()"
     command = [sys.executable, "-c", code, "verify", str(tmp_path / "c.json"), "--engine", "flint"]
     run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert_one_sentence(run, "engine 'flint' needs python-flint", "pip install 'ncs-gym[verify]'")
+    assert_one_sentence(run, "engine 'flint' needs python-flint", "pip install -e '.[verify]'")
 
 
 @pytest.mark.parametrize("engine", ["float", None, 3, []])

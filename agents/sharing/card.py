@@ -1,0 +1,91 @@
+"""The card of a shared agent: where it was trained, behind which shield, and what it did in an evaluation."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from agents.control_loop import ShieldSettings
+from agents.results import Evaluation
+from agents.settings import AgentSettings
+from ncs_gym import Channel
+
+_USE = """## Use
+
+The weights are in `model.zip`, everything else in `agent.json`. Nothing is unpickled. Checksums find damage, not
+forgery.
+
+```python
+from agents import Agent, ControlLoop{imports}
+
+agent = Agent.load(".")
+loop = ControlLoop(env=agent.env, channel=agent.channel{shield})
+```
+"""
+
+
+def card_text(
+    *,
+    algorithm: str,
+    settings: AgentSettings,
+    env: str,
+    channel: Channel | None,
+    checksum: str,
+    shield: ShieldSettings | None,
+    evaluation: Evaluation | None,
+) -> str:
+    """Returns the card of an agent, in Markdown.
+
+    Args:
+        algorithm: Name of the algorithm.
+        settings: Settings the agent was trained with.
+        env: Id of the environment the agent was trained in.
+        channel: Channel the agent was trained with; None for that of the id.
+        checksum: SHA-256 of the weights.
+        shield: The shield that the agent is meant to act behind; None for none.
+        evaluation: Episodes of the agent in that loop; None leaves the figures out.
+    """
+    plant = getattr(gym.make(env).unwrapped, "plant", None)
+    rows = {
+        "environment": f"`{env}`",
+        "plant": "none" if plant is None else f"fingerprint `{plant.fingerprint}`",
+        "channel": _channel(env, channel),
+        "shield": "none" if shield is None else f'mode "{shield.mode}", penalty {shield.penalty:g} per intervention',
+        "settings": ", ".join(f"{each.name}={getattr(settings, each.name)!r}" for each in fields(settings)),
+        "SHA-256 of the weights": f"`{checksum}`",
+    }
+    table = [f"| {name} | {value} |" for name, value in rows.items()]
+    parts = [f"# {algorithm} in {env}\n", "| | |", "|---|---|", *table, ""]
+    if shield is not None:
+        parts += ["## Certificate", "", "```", str(shield.certificate), "```", ""]
+        parts += [f"`certificate.json`, SHA-256 `{shield.certificate.checksum}`; `ncs verify certificate.json`", ""]
+    if evaluation is not None:
+        parts += ["## Evaluation", "", *_figures(evaluation), ""]
+    known = "" if shield is None else f', shield=ShieldSettings(Certificate.load("certificate.json"), "{shield.mode}")'
+    imports = "" if shield is None else ", ShieldSettings\nfrom shields import Certificate"
+    return "\n".join([*parts, _USE.format(imports=imports, shield=known)])
+
+
+def _channel(env: str, channel: Channel | None) -> str:
+    """Returns the channel in words of Python; that of the id where the agent has none of its own."""
+    own: Any = channel or getattr(gym.make(env).unwrapped, "channel", None)
+    return f"`{own}`" + ("" if channel else ", that of the id")
+
+
+def _figures(evaluation: Evaluation) -> list[str]:
+    """Returns what happened in the episodes, one line per figure."""
+    episodes = evaluation.episodes
+    steps = sum(episode.steps for episode in episodes)
+    violating = sum(episode.violation_steps > 0 for episode in episodes)
+    returns = [episode.episode_return for episode in episodes]
+    interventions = sum(episode.interventions for episode in episodes)
+    return [
+        f"- mean return: {np.mean(returns):.4g}, of {len(episodes)} episodes and {steps} steps",
+        f"- episodes in which the true state violated the safe box: {violating} of {len(episodes)}",
+        f"- violating steps: {sum(episode.violation_steps for episode in episodes)} of {steps}",
+        f"- interventions of the shield: {interventions} of {steps} steps",
+        f"- episodes in which the guarantee held throughout: {sum(each.guaranteed for each in episodes)}",
+    ]
