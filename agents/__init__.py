@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from agents.sb3_vec_env import SB3VecEnv
     from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
     from agents.training import TrainingResult, train
+    from agents.tuned import tuned_settings
 
 __all__ = [
     "A2CSettings",
@@ -36,6 +37,7 @@ __all__ = [
     "Trajectory",
     "evaluate",
     "train",
+    "tuned_settings",
 ]
 
 _MODULES = {
@@ -47,6 +49,7 @@ _MODULES = {
     "sb3_vec_env": ("SB3VecEnv",),
     "settings": ("A2CSettings", "OffPolicySettings", "PPOSettings"),
     "training": ("TrainingResult", "train"),
+    "tuned": ("tuned_settings",),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

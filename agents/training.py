@@ -67,7 +67,11 @@ def train(
     settings = checked_settings(algorithm, settings)
     if isinstance(settings, OffPolicySettings) and steps <= settings.learning_starts:
         raise ValueError(f"{steps} steps train nothing: learning starts after {settings.learning_starts}")
-    env = VecNormalize(SB3VecEnv(loop.vector(settings.envs)), gamma=settings.discount)
+    env = VecNormalize(
+        SB3VecEnv(loop.vector(settings.envs)),
+        gamma=settings.discount,
+        norm_reward=getattr(settings, "normalize_rewards", True),
+    )
     model = build_model(algorithm, env, settings, seed, steps)
     model.set_logger(configure(str(log_folder), ["tensorboard"]) if log_folder else Logger(None, []))
     callback = SafetyCallback(on_progress)

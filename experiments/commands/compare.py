@@ -55,8 +55,9 @@ def compare(settings: CompareSettings) -> None:
         raise ValueError(f"--arms must be different ones, at least one, got {' '.join(settings.arms) or 'none'}")
     setup = ExperimentSetup.of(settings.env, settings.channel, settings.certificate, settings.noise)
     prepare_output(settings.out)
+    print(setup.title, settings.agent_line, sep="\n", flush=True)
+    settings = settings.completed
     save_settings(settings.out / "settings.json", "compare", settings)
-    print(setup.title, flush=True)
     runs = _training_runs(settings, setup)
     results = results_of(runs, settings.out, settings)
     summary = _summary(settings, setup, runs, results)

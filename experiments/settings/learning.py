@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import tyro
 
-from agents.settings import A2CSettings, AgentSettings, OffPolicySettings, PPOSettings
+from agents.settings import AgentSettings
+from experiments.settings.agent_overrides import (
+    A2COverrides,
+    AgentOverrides,
+    OffPolicyOverrides,
+    PPOOverrides,
+    complete_settings,
+    described_settings,
+)
 from experiments.settings.backend import BackendSettings
 from experiments.settings.channel import ChannelSettings
 
@@ -34,7 +42,7 @@ class LearningSettings:
         violation_penalty: Subtracted from the training reward per violating step, in the arm "penalized".
         certificate: Certificate file to use instead of synthesizing one.
         channel: Changes of the environment's channel.
-        ppo: Settings of PPO and TRPO.
+        ppo: Settings of PPO and TRPO; what is not given is tuned for the environment (agents/tuned), or the default.
         a2c: Settings of A2C.
         off_policy: Settings of SAC, TD3, TQC and CrossQ.
     """
@@ -50,14 +58,35 @@ class LearningSettings:
     violation_penalty: float = 1.0
     certificate: Path | None = None
     channel: ChannelSettings = field(default_factory=ChannelSettings)
-    ppo: PPOSettings = field(default_factory=PPOSettings)
-    a2c: A2CSettings = field(default_factory=A2CSettings)
-    off_policy: OffPolicySettings = field(default_factory=OffPolicySettings)
+    ppo: PPOOverrides = field(default_factory=PPOOverrides)
+    a2c: A2COverrides = field(default_factory=A2COverrides)
+    off_policy: OffPolicyOverrides = field(default_factory=OffPolicyOverrides)
 
     @property
     def agent(self) -> AgentSettings:
-        """Settings of the chosen learning algorithm."""
-        return {"PPO": self.ppo, "TRPO": self.ppo, "A2C": self.a2c}.get(self.algo, self.off_policy)
+        """All settings of the chosen learning algorithm: those given, those tuned for the environment, the defaults."""
+        return complete_settings(self._registered_id, self.algo, getattr(self, self._kind))
+
+    @property
+    def agent_line(self) -> str:
+        """One line with all settings of the chosen learning algorithm and where they come from."""
+        return described_settings(self._registered_id, self.algo, getattr(self, self._kind))
+
+    @property
+    def completed(self) -> Self:
+        """The same settings with every value of the chosen learning algorithm given, as settings.json records them."""
+        given: AgentOverrides = getattr(self, self._kind)
+        return replace(self, **{self._kind: type(given)(**asdict(self.agent))})
+
+    @property
+    def _kind(self) -> str:
+        """Name of the field with the changes of the chosen learning algorithm's settings."""
+        return {"PPO": "ppo", "TRPO": "ppo", "A2C": "a2c"}.get(self.algo, "off_policy")
+
+    @property
+    def _registered_id(self) -> str:
+        """Id of the environment without the module that registers it."""
+        return self.env.rpartition(":")[2]
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""

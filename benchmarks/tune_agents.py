@@ -1,0 +1,139 @@
+"""Searches PPO's settings for each registered environment, behind its shield (mode project).
+
+    python benchmarks/tune_agents.py [--env ncs_gym/CartPole-v0 ...] [--candidates 16] [--finalists 4] [--out runs/tune]
+    python benchmarks/tune_agents.py --write
+
+A random search in two rounds: every candidate is trained once with half of the steps, the best ones twice with all of
+them; the settings with the highest mean return of these last two trainings are chosen. The first candidate is the
+default settings. Seeds are those of `ncs compare --seed 1000000`, so that neither the seeds of a study (`--seed 0`) nor
+those of the table (benchmarks/tuned_agents.py) were searched on. Every result is a line of OUT/results.jsonl: started
+again, the search continues where it stopped. `--write` also writes the chosen settings to agents/tuned/ppo.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from agents import ControlLoop, PPOSettings, ShieldSettings, evaluate, train
+from ncs_gym.envs.env import ncs_env
+from ncs_gym.registration import registered_ids
+from shields.runtime.wrapper import certificate_for
+
+TUNED = Path(__file__).resolve().parent.parent / "agents" / "tuned" / "ppo.json"
+SEARCH_SEED = 1_000_000
+STEPS, EPISODES = 150_000, 200
+SPACE: dict[str, tuple[Any, ...]] = {
+    "discount": (0.9, 0.95, 0.98, 0.99, 0.995),
+    "gae_lambda": (0.8, 0.9, 0.95, 0.98),
+    "learning_rate": (5e-4, 1e-3, 2e-3, 3e-3, 5e-3),
+    "rollout": (32, 64, 128),
+    "batch_size": (512, 1024, 2048, 4096),
+    "epochs": (5, 10, 20),
+    "entropy": (0.0, 1e-3, 1e-2),
+    "log_std": (-1.5, -0.7, 0.0),
+    "width": (32, 64, 128),
+    "normalize_rewards": (True, True, False),
+}
+
+
+def shielded_loop(env_id: str) -> ControlLoop:
+    """The environment behind the shield of a synthesized certificate."""
+    env = ncs_env(gym.make(env_id))
+    return ControlLoop(env=env_id, shield=ShieldSettings(certificate_for(env.plant, env.contract)))
+
+
+def seeds_of(experiment_seed: int, index: int) -> tuple[int, int]:
+    """Seeds of training and of evaluation of one run, as `ncs compare` derives them."""
+    first, second = np.random.SeedSequence([experiment_seed, index]).generate_state(2)
+    return int(first >> 1), int(second >> 1)
+
+
+def mean_return(loop: ControlLoop, policy: Callable[..., np.ndarray], seed: int, episodes: int = EPISODES) -> float:
+    """Mean return of a policy over the episodes of a seed."""
+    return float(np.mean([each.episode_return for each in evaluate(loop, policy, episodes, seed).episodes]))
+
+
+def trained_return(loop: ControlLoop, settings: PPOSettings, steps: int, experiment_seed: int, index: int) -> float:
+    """Mean return of an agent after its training."""
+    training_seed, evaluation_seed = seeds_of(experiment_seed, index)
+    agent = train(loop, steps, training_seed, settings=settings).agent
+    return mean_return(loop, lambda observations, infos: agent.act(observations), evaluation_seed)
+
+
+def candidate(env_id: str, number: int) -> PPOSettings:
+    """The settings of a number: the defaults, then random ones."""
+    if number == 0:
+        return PPOSettings()
+    rng = np.random.default_rng([SEARCH_SEED, registered_ids().index(env_id), number])
+    return PPOSettings(**{name: values[rng.integers(len(values))] for name, values in SPACE.items()})
+
+
+class Results:
+    """Returns by environment, settings, steps and run, kept in a file as they come."""
+
+    def __init__(self, file: Path) -> None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        self._file = file
+        lines = file.read_text().splitlines() if file.exists() else []
+        self._known = {self._key(entry): entry["return"] for entry in map(json.loads, lines)}
+
+    @staticmethod
+    def _key(entry: dict[str, Any]) -> str:
+        return json.dumps({name: entry[name] for name in ("env", "settings", "steps", "run")}, sort_keys=True)
+
+    def of(self, loop: ControlLoop, settings: PPOSettings, steps: int, run: int) -> float:
+        """The return of a training, which is run unless it was before."""
+        entry = {"env": loop.env, "settings": asdict(settings), "steps": steps, "run": run}
+        if (key := self._key(entry)) not in self._known:
+            self._known[key] = trained_return(loop, settings, steps, SEARCH_SEED, run)
+            with self._file.open("a") as file:
+                file.write(json.dumps(entry | {"return": self._known[key]}) + "\n")
+        return self._known[key]
+
+
+def search(env_id: str, results: Results, candidates: int, finalists: int) -> PPOSettings:
+    """Prints both rounds and returns the chosen settings."""
+    loop, chosen = shielded_loop(env_id), [candidate(env_id, number) for number in range(candidates)]
+    first = [results.of(loop, each, STEPS // 2, 0) for each in chosen]
+    order = sorted(range(candidates), key=lambda number: -first[number])
+    shown = ", ".join(f"#{number} {first[number]:.2f}" for number in order)
+    print(f"{env_id}, half of the steps: {shown}", flush=True)
+    last = {number: [results.of(loop, chosen[number], STEPS, run) for run in (1, 2)] for number in order[:finalists]}
+    for number, returns in last.items():
+        print(f"  #{number}, all steps: " + ", ".join(f"{each:.2f}" for each in returns), flush=True)
+    best = max(last, key=lambda number: float(np.mean(last[number])))
+    print(f"  chosen: #{best}, {changes(chosen[best])}", flush=True)
+    return chosen[best]
+
+
+def changes(settings: PPOSettings) -> dict[str, Any]:
+    """The settings that differ from the defaults."""
+    return {name: value for name, value in asdict(settings).items() if value != getattr(PPOSettings(), name)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--env", nargs="+", default=registered_ids())
+    parser.add_argument("--candidates", type=int, default=16)
+    parser.add_argument("--finalists", type=int, default=4)
+    parser.add_argument("--out", type=Path, default=Path("runs/tune"))
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
+    results = Results(options.out / "results.jsonl")
+    found = {each: search(each, results, options.candidates, options.finalists) for each in options.env}
+    if options.write:
+        known = json.loads(TUNED.read_text()) if TUNED.exists() else {}
+        known |= {env_id: asdict(settings) for env_id, settings in found.items()}
+        TUNED.write_text(json.dumps(known, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
