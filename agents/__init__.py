@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from agents.sb3_vec_env import SB3VecEnv
     from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
     from agents.training import TrainingResult, train
-    from agents.tuned import tuned_settings
+    from agents.tuned import tuned_settings, tuned_steps
 
 __all__ = [
     "A2CSettings",
@@ -38,6 +38,7 @@ __all__ = [
     "evaluate",
     "train",
     "tuned_settings",
+    "tuned_steps",
 ]
 
 _MODULES = {
@@ -49,7 +50,7 @@ _MODULES = {
     "sb3_vec_env": ("SB3VecEnv",),
     "settings": ("A2CSettings", "OffPolicySettings", "PPOSettings"),
     "training": ("TrainingResult", "train"),
-    "tuned": ("tuned_settings",),
+    "tuned": ("tuned_settings", "tuned_steps"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

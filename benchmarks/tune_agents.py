@@ -1,13 +1,14 @@
 """Searches PPO's settings for each registered environment, behind its shield (mode project).
 
-    python benchmarks/tune_agents.py [--env ncs_gym/CartPole-v0 ...] [--candidates 16] [--finalists 4] [--out runs/tune]
+    python benchmarks/tune_agents.py [--env ncs_gym/CartPole-v0 ...] [--candidates 6] [--finalists 2] [--out runs/tune]
     python benchmarks/tune_agents.py --write
 
-A random search in two rounds: every candidate is trained once with half of the steps, the best ones twice with all of
-them; the settings with the highest mean return of these last two trainings are chosen. The first candidate is the
-default settings. Seeds are those of `ncs compare --seed 1000000`, so that neither the seeds of a study (`--seed 0`) nor
-those of the table (benchmarks/tuned_agents.py) were searched on. Every result is a line of OUT/results.jsonl: started
-again, the search continues where it stopped. `--write` also writes the chosen settings to agents/tuned/ppo.json.
+A random search in two rounds: every candidate is trained once with 150,000 steps, the best ones once more, on another
+seed, with the steps that belong to the environment; the settings with the highest return of this last training are
+chosen. The first candidate is the default settings, the second a guess by hand, the others are drawn from `SPACE`.
+Seeds are those of `ncs compare --seed 1000000`, so that neither the seeds of a study (`--seed 0`) nor those of the
+table (benchmarks/tuned_agents.py) were searched on. Every result is a line of OUT/results.jsonl: started again, the
+search continues where it stopped. `--write` also writes the chosen settings to agents/tuned/ppo.json.
 """
 
 from __future__ import annotations
@@ -29,17 +30,22 @@ from shields.runtime.wrapper import certificate_for
 
 TUNED = Path(__file__).resolve().parent.parent / "agents" / "tuned" / "ppo.json"
 SEARCH_SEED = 1_000_000
-STEPS, EPISODES = 150_000, 200
+EPISODES = 200
+# Steps of the first round and of a training; the unstable plants are trained for four times as long.
+STEPS, MORE_STEPS = 150_000, 600_000
+UNSTABLE = ("ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0")
+GUESS = PPOSettings(envs=128, rollout=32, discount=0.98, gae_lambda=0.95)
 SPACE: dict[str, tuple[Any, ...]] = {
-    "discount": (0.9, 0.95, 0.98, 0.99, 0.995),
-    "gae_lambda": (0.8, 0.9, 0.95, 0.98),
-    "learning_rate": (5e-4, 1e-3, 2e-3, 3e-3, 5e-3),
-    "rollout": (32, 64, 128),
-    "batch_size": (512, 1024, 2048, 4096),
+    "envs": (128,),
+    "rollout": (16, 32),
+    "batch_size": (512, 1024, 2048),
     "epochs": (5, 10, 20),
-    "entropy": (0.0, 1e-3, 1e-2),
-    "log_std": (-1.5, -0.7, 0.0),
-    "width": (32, 64, 128),
+    "learning_rate": (1e-3, 2e-3, 3e-3, 5e-3),
+    "discount": (0.9, 0.95, 0.98, 0.99),
+    "gae_lambda": (0.9, 0.95, 0.98),
+    "log_std": (-1.5, -0.7, -0.3),
+    "width": (64, 128),
+    "entropy": (0.0, 1e-3),
     "normalize_rewards": (True, True, False),
 }
 
@@ -48,6 +54,11 @@ def shielded_loop(env_id: str) -> ControlLoop:
     """The environment behind the shield of a synthesized certificate."""
     env = ncs_env(gym.make(env_id))
     return ControlLoop(env=env_id, shield=ShieldSettings(certificate_for(env.plant, env.contract)))
+
+
+def steps_of(env_id: str) -> int:
+    """Steps of a training in an environment."""
+    return MORE_STEPS if env_id in UNSTABLE else STEPS
 
 
 def seeds_of(experiment_seed: int, index: int) -> tuple[int, int]:
@@ -69,9 +80,9 @@ def trained_return(loop: ControlLoop, settings: PPOSettings, steps: int, experim
 
 
 def candidate(env_id: str, number: int) -> PPOSettings:
-    """The settings of a number: the defaults, then random ones."""
-    if number == 0:
-        return PPOSettings()
+    """The settings of a number: the defaults, the guess, then random ones."""
+    if number < 2:
+        return (PPOSettings(), GUESS)[number]
     rng = np.random.default_rng([SEARCH_SEED, registered_ids().index(env_id), number])
     return PPOSettings(**{name: values[rng.integers(len(values))] for name, values in SPACE.items()})
 
@@ -101,15 +112,15 @@ class Results:
 
 def search(env_id: str, results: Results, candidates: int, finalists: int) -> PPOSettings:
     """Prints both rounds and returns the chosen settings."""
-    loop, chosen = shielded_loop(env_id), [candidate(env_id, number) for number in range(candidates)]
-    first = [results.of(loop, each, STEPS // 2, 0) for each in chosen]
+    loop, steps = shielded_loop(env_id), steps_of(env_id)
+    chosen = [candidate(env_id, number) for number in range(candidates)]
+    first = [results.of(loop, each, STEPS, 0) for each in chosen]
     order = sorted(range(candidates), key=lambda number: -first[number])
     shown = ", ".join(f"#{number} {first[number]:.2f}" for number in order)
-    print(f"{env_id}, half of the steps: {shown}", flush=True)
-    last = {number: [results.of(loop, chosen[number], STEPS, run) for run in (1, 2)] for number in order[:finalists]}
-    for number, returns in last.items():
-        print(f"  #{number}, all steps: " + ", ".join(f"{each:.2f}" for each in returns), flush=True)
-    best = max(last, key=lambda number: float(np.mean(last[number])))
+    print(f"{env_id}, {STEPS} steps: {shown}", flush=True)
+    last = {number: results.of(loop, chosen[number], steps, 1) for number in order[:finalists]}
+    print(f"  {steps} steps: " + ", ".join(f"#{number} {each:.2f}" for number, each in last.items()), flush=True)
+    best = max(last, key=lambda number: last[number])
     print(f"  chosen: #{best}, {changes(chosen[best])}", flush=True)
     return chosen[best]
 
@@ -122,8 +133,8 @@ def changes(settings: PPOSettings) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env", nargs="+", default=registered_ids())
-    parser.add_argument("--candidates", type=int, default=16)
-    parser.add_argument("--finalists", type=int, default=4)
+    parser.add_argument("--candidates", type=int, default=6)
+    parser.add_argument("--finalists", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("runs/tune"))
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
@@ -131,7 +142,7 @@ def main() -> None:
     found = {each: search(each, results, options.candidates, options.finalists) for each in options.env}
     if options.write:
         known = json.loads(TUNED.read_text()) if TUNED.exists() else {}
-        known |= {env_id: asdict(settings) for env_id, settings in found.items()}
+        known |= {env_id: {"steps": steps_of(env_id)} | asdict(settings) for env_id, settings in found.items()}
         TUNED.write_text(json.dumps(known, indent=1) + "\n")
 
 

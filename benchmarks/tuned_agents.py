@@ -2,11 +2,11 @@
 
     python benchmarks/tuned_agents.py [--env ncs_gym/CartPole-v0 ...] [--seeds 5] [--out runs/tuned_agents]
 
-Agents are trained with 150,000 steps and the settings of agents/tuned, or with the defaults. The best linear controller
-is the one of benchmarks/linear_controllers.py with the highest return on the seeds of the search
-(benchmarks/tune_agents.py). Every policy plays 200 episodes per seed, the same for all policies, of the seeds of `ncs
-compare --seed 2000000`; intervals are Student's over seeds. "agent - best other" pairs the tuned agent with the best of
-the others, seed by seed.
+The tuned agent has the settings and steps of agents/tuned; with `--defaults` there is one with the default settings and
+150,000 steps, too. The best linear controller is the one of benchmarks/linear_controllers.py with the highest return on
+a seed of the search (benchmarks/tune_agents.py). Every policy plays 200 episodes per seed, the same for all policies,
+of the seeds of `ncs compare --seed 2000000`; intervals are Student's over seeds. The last line of an environment pairs
+the tuned agent with the best of those that need no training, seed by seed. What was measured is kept in OUT.
 """
 
 from __future__ import annotations
@@ -19,18 +19,20 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 from linear_controllers import LinearController, linear_controllers
-from tune_agents import EPISODES, SEARCH_SEED, STEPS, mean_return, seeds_of, shielded_loop
+from tune_agents import EPISODES, SEARCH_SEED, mean_return, seeds_of, shielded_loop
 
-from agents import ControlLoop, PPOSettings, train, tuned_settings
+from agents import ControlLoop, PPOSettings, train, tuned_settings, tuned_steps
 from experiments.analysis.statistics import mean_interval
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.registration import registered_ids
 
 TABLE_SEED = 2_000_000
-TRAINED = {"tuned agent": tuned_settings, "agent, default settings": lambda env_id: PPOSettings()}
+Policy = Callable[..., np.ndarray]
+TUNED, DEFAULTS = "tuned agent", "agent, default settings"
+DEFAULT_STEPS = 150_000
 
 
-def random_actions(inputs: int, seed: int) -> Callable[..., np.ndarray]:
+def random_actions(inputs: int, seed: int) -> Policy:
     rng = np.random.default_rng(seed)
     return lambda observations, infos: rng.uniform(-1.0, 1.0, (len(observations), inputs))
 
@@ -42,43 +44,41 @@ def best_linear(loop: ControlLoop) -> LinearController:
     return max(candidates, key=lambda each: mean_return(loop, each.policy(env.plant), seed))
 
 
-def untrained_returns(loop: ControlLoop, seeds: int) -> dict[str, list[float]]:
-    """Mean returns by policy and seed of what needs no training."""
+def policies(loop: ControlLoop, with_defaults: bool) -> dict[str, Callable[[int], Policy]]:
+    """What makes the policy of a seed, by name."""
     env, linear = ncs_env(gym.make(loop.env)), best_linear(loop)
     plant, entries = env.plant, env.observation_space.shape[0] - env.plant.n
     certified = LinearController("K x_hat", loop.shield.certificate.K, np.zeros((plant.m, entries)))
-    found: dict[str, list[float]] = {"random": [], certified.name: [], linear.name: []}
-    for index in range(seeds):
-        seed = seeds_of(TABLE_SEED, index)[1]
-        found["random"].append(mean_return(loop, random_actions(plant.m, seed), seed))
-        for controller in (certified, linear):
-            found[controller.name].append(mean_return(loop, controller.policy(plant), seed))
-    return found
+    settings, steps = tuned_settings(loop.env), tuned_steps(loop.env)
+    found: dict[str, Callable[[int], Policy]] = {TUNED: lambda seed: trained(loop, settings, steps, seed)}
+    if with_defaults:
+        found[DEFAULTS] = lambda seed: trained(loop, PPOSettings(), DEFAULT_STEPS, seed)
+    found["random"] = lambda seed: random_actions(plant.m, seed)
+    return found | {each.name: lambda seed, each=each: each.policy(plant) for each in (certified, linear)}
 
 
-def agent_returns(loop: ControlLoop, settings: PPOSettings, seeds: int) -> list[float]:
-    """Mean returns of agents by seed of their training and evaluation."""
-    returns = []
-    for index in range(seeds):
-        training_seed, evaluation_seed = seeds_of(TABLE_SEED, index)
-        agent = train(loop, STEPS, training_seed, settings=settings).agent
-        returns.append(mean_return(loop, lambda observations, infos, a=agent: a.act(observations), evaluation_seed))
-    return returns
+def trained(loop: ControlLoop, settings: PPOSettings, steps: int, seed: int) -> Policy:
+    """An agent after its training."""
+    agent = train(loop, steps, seed, settings=settings).agent
+    return lambda observations, infos: agent.act(observations)
 
 
-def measured(env_id: str, seeds: int, folder: Path) -> dict[str, list[float]]:
-    """Mean returns by policy and seed, from the file of an earlier run if there is one."""
-    file = folder / f"{env_id.rpartition('/')[2]}-{seeds}.json"
-    known = json.loads(file.read_text()) if file.exists() else {}
-    loop = shielded_loop(env_id)
-    if not known:
-        known = untrained_returns(loop, seeds)
-    for name, settings in TRAINED.items():
-        if name not in known:
-            known[name] = agent_returns(loop, settings(env_id), seeds)
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_text(json.dumps(known, indent=1) + "\n")
-    return known
+class Measurements:
+    """Mean returns by policy and seed of an environment, kept in a file so that what was measured is not again."""
+
+    def __init__(self, folder: Path, env_id: str) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._file, self._loop = folder / f"{env_id.rpartition('/')[2]}.json", shielded_loop(env_id)
+        self.returns: dict[str, list[float]] = json.loads(self._file.read_text()) if self._file.exists() else {}
+
+    def extend(self, seeds: int, with_defaults: bool) -> None:
+        """Measures what is missing."""
+        for name, make in policies(self._loop, with_defaults).items():
+            returns = self.returns.setdefault(name, [])
+            for index in range(len(returns), seeds):
+                training_seed, evaluation_seed = seeds_of(TABLE_SEED, index)
+                returns.append(mean_return(self._loop, make(training_seed), evaluation_seed))
+                self._file.write_text(json.dumps(self.returns, indent=1) + "\n")
 
 
 def with_interval(values: list[float], sign: str = "") -> str:
@@ -88,22 +88,25 @@ def with_interval(values: list[float], sign: str = "") -> str:
 
 def rows(env_id: str, returns: dict[str, list[float]]) -> list[str]:
     """The lines of a Markdown table of an environment."""
-    others = [name for name in returns if name not in TRAINED]
+    others = [name for name in returns if name not in (TUNED, DEFAULTS)]
     best = max(others, key=lambda name: float(np.mean(returns[name])))
-    gain = [one - other for one, other in zip(returns["tuned agent"], returns[best], strict=True)]
-    lines = [f"| `{env_id}` | {name} | {with_interval(returns[name])} |" for name in [*TRAINED, *others]]
-    return [*lines, f"| `{env_id}` | tuned agent - {best} | {with_interval(gain, '+')} |"]
+    gain = [one - other for one, other in zip(returns[TUNED], returns[best], strict=True)]
+    lines = [f"| `{env_id}` | {name} | {with_interval(values)} |" for name, values in returns.items()]
+    return [*lines, f"| `{env_id}` | {TUNED} - {best} | {with_interval(gain, '+')} |"]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env", nargs="+", default=registered_ids())
+    parser.add_argument("--defaults", action="store_true")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--out", type=Path, default=Path("runs/tuned_agents"))
     options = parser.parse_args()
     print(f"{options.seeds} seeds, {EPISODES} episodes each\n\n| environment | policy | mean return |\n|---|---|---|")
     for env_id in options.env:
-        print("\n".join(rows(env_id, measured(env_id, options.seeds, options.out))), flush=True)
+        measurements = Measurements(options.out, env_id)
+        measurements.extend(options.seeds, options.defaults)
+        print("\n".join(rows(env_id, measurements.returns)), flush=True)
 
 
 if __name__ == "__main__":

@@ -20,10 +20,21 @@ def tuned_settings(env_id: str, algorithm: str = "PPO") -> AgentSettings | None:
         env_id: Id by which the environment is registered.
         algorithm: Name of the learning algorithm.
     """
-    if algorithm not in _FILES:
+    entry = _entry(env_id, algorithm)
+    if entry is None:
         return None
-    values = _entries(algorithm).get(env_id)
-    return None if values is None else _FILES[algorithm](**values)
+    return _FILES[algorithm](**{name: value for name, value in entry.items() if name != "steps"})
+
+
+def tuned_steps(env_id: str, algorithm: str = "PPO") -> int | None:
+    """Returns the number of training steps that belongs to the tuned settings of an environment; None without any."""
+    entry = _entry(env_id, algorithm)
+    return None if entry is None else entry["steps"]
+
+
+def _entry(env_id: str, algorithm: str) -> dict[str, Any] | None:
+    """Returns the entry of an environment in the file of an algorithm."""
+    return _entries(algorithm).get(env_id) if algorithm in _FILES else None
 
 
 @cache

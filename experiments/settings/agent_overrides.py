@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from agents.settings import A2CSettings, AgentSettings, OffPolicySettings, PPOSettings, check_setting
-from agents.tuned import tuned_settings
+from agents.tuned import tuned_settings, tuned_steps
 
 
 class _Overrides:
@@ -105,6 +105,8 @@ _KINDS: dict[type, type[AgentSettings]] = {
     A2COverrides: A2CSettings,
     OffPolicyOverrides: OffPolicySettings,
 }
+# Training steps where none belong to tuned settings.
+_DEFAULT_STEPS = 150_000
 AgentOverrides = PPOOverrides | A2COverrides | OffPolicyOverrides
 
 
@@ -116,18 +118,34 @@ def given_values(overrides: Any) -> dict[str, Any]:
 def complete_settings(env_id: str, algorithm: str, overrides: AgentOverrides) -> AgentSettings:
     """Returns all settings of an algorithm: the values given, those tuned for the environment, and the defaults.
 
+    Args:
+        env_id: Id of the environment, or "module:id".
+        algorithm: Name of the algorithm.
+        overrides: The values given.
+
     Raises:
         ValueError: If values that are given do not fit together with the others.
     """
-    tuned = tuned_settings(env_id, algorithm)
+    tuned = tuned_settings(_registered_id(env_id), algorithm)
     kept = {} if tuned is None else asdict(tuned)
     return _KINDS[type(overrides)](**kept | given_values(overrides))
+
+
+def default_steps(env_id: str, algorithm: str) -> int:
+    """Returns the training steps that belong to the settings tuned for an environment, or the default."""
+    return tuned_steps(_registered_id(env_id), algorithm) or _DEFAULT_STEPS
 
 
 def described_settings(env_id: str, algorithm: str, overrides: AgentOverrides) -> str:
     """Returns one line with all settings of an algorithm and where they come from."""
     settings, given = asdict(complete_settings(env_id, algorithm, overrides)), given_values(overrides)
-    source = "default settings" if tuned_settings(env_id, algorithm) is None else f"settings tuned for {env_id}"
+    name = _registered_id(env_id)
+    source = "default settings" if tuned_settings(name, algorithm) is None else f"settings tuned for {name}"
     if given:
         source = "settings as given" if len(given) == len(settings) else f"{source}, as given {', '.join(given)}"
     return f"{algorithm}, {source}: " + ", ".join(f"{name} {value}" for name, value in settings.items())
+
+
+def _registered_id(env_id: str) -> str:
+    """Returns the id of "module:id", by which the environment is registered."""
+    return env_id.rpartition(":")[2]

@@ -15,6 +15,7 @@ from experiments.settings.agent_overrides import (
     OffPolicyOverrides,
     PPOOverrides,
     complete_settings,
+    default_steps,
     described_settings,
 )
 from experiments.settings.backend import BackendSettings
@@ -33,7 +34,8 @@ class LearningSettings:
         env: Id of an environment with a plant of its own; module:id first imports the module, which registers one of
             your own (`ncs_gym.register_plant`).
         seed: Seed of the experiment, >= 0; all runs derive their seeds from it.
-        steps: Training steps per run, rounded up to whole rollouts.
+        steps: Training steps per run, rounded up to whole rollouts; if not given, those of the settings tuned for the
+            environment, or 150,000.
         episodes: Evaluation episodes per run.
         algo: Learning algorithm; TRPO, TQC and CrossQ need sb3-contrib.
         mode: What the shield applies in place of an unsafe action: the closest safe input ("project"), or the certified
@@ -50,7 +52,7 @@ class LearningSettings:
     config: Path | None = None
     env: str = "ncs_gym/TruckTrailerCruise-v0"
     seed: int = 0
-    steps: int = 150_000
+    steps: int | None = None
     episodes: int = 200
     algo: Algorithm = "PPO"
     mode: Mode = "project"
@@ -65,34 +67,34 @@ class LearningSettings:
     @property
     def agent(self) -> AgentSettings:
         """All settings of the chosen learning algorithm: those given, those tuned for the environment, the defaults."""
-        return complete_settings(self._registered_id, self.algo, getattr(self, self._kind))
+        return complete_settings(self.env, self.algo, getattr(self, self._kind))
+
+    @property
+    def training_steps(self) -> int:
+        """Training steps per run: those given, or those that belong to the environment."""
+        return self.steps or default_steps(self.env, self.algo)
 
     @property
     def agent_line(self) -> str:
         """One line with all settings of the chosen learning algorithm and where they come from."""
-        return described_settings(self._registered_id, self.algo, getattr(self, self._kind))
+        return described_settings(self.env, self.algo, getattr(self, self._kind))
 
     @property
     def completed(self) -> Self:
-        """The same settings with every value of the chosen learning algorithm given, as settings.json records them."""
+        """The same settings with the steps and all settings of the chosen algorithm given, for settings.json."""
         given: AgentOverrides = getattr(self, self._kind)
-        return replace(self, **{self._kind: type(given)(**asdict(self.agent))})
+        return replace(self, steps=self.training_steps, **{self._kind: type(given)(**asdict(self.agent))})
 
     @property
     def _kind(self) -> str:
         """Name of the field with the changes of the chosen learning algorithm's settings."""
         return {"PPO": "ppo", "TRPO": "ppo", "A2C": "a2c"}.get(self.algo, "off_policy")
 
-    @property
-    def _registered_id(self) -> str:
-        """Id of the environment without the module that registers it."""
-        return self.env.rpartition(":")[2]
-
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
         for name in ("seeds", "steps", "episodes"):
-            if getattr(self, name, 1) < 1:
-                raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
+            if (value := getattr(self, name, None)) is not None and value < 1:
+                raise ValueError(f"--{name} must be at least 1, got {value}")
         if self.seed < 0:
             raise ValueError(f"--seed must be >= 0, got {self.seed}")
         for name in ("intervention_penalty", "violation_penalty"):

@@ -2,7 +2,7 @@ from dataclasses import asdict, fields, replace
 
 import pytest
 
-from agents import tuned_settings
+from agents import tuned_settings, tuned_steps
 from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
 from experiments.__main__ import _parse
 from experiments.settings import CompareSettings, SweepSettings, TrainSettings, save_settings
@@ -42,6 +42,15 @@ def test_algorithm_that_was_not_tuned_gets_the_defaults(algo):
     settings = CompareSettings(env=CART_POLE, algo=algo)
     assert settings.agent == type(settings.agent)()
     assert f"{algo}, default settings:" in settings.agent_line
+
+
+def test_steps_are_those_given_or_tuned_or_the_default():
+    assert tuned_steps(CART_POLE) == CompareSettings(env=CART_POLE).training_steps == 600_000
+    assert CompareSettings(env=CART_POLE, steps=150_000).training_steps == 150_000
+    assert CompareSettings(env="plants:Plants/Tanks-v0").training_steps == 150_000
+    assert CompareSettings(env=CART_POLE, algo="A2C").training_steps == 150_000
+    assert SweepSettings(env=CART_POLE).training_steps == 50_000
+    assert CompareSettings(env=CART_POLE).completed.steps == 600_000
 
 
 def test_option_wins_over_the_tuned_value_also_if_it_equals_the_default():
