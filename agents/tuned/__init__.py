@@ -4,6 +4,6 @@
 docs/agents.md says how they were searched for and how good the agents are.
 """
 
-from agents.tuned.tuned_settings import tuned_settings, tuned_steps
+from agents.tuned.entries import tuned_settings, tuned_steps
 
 __all__ = ["tuned_settings", "tuned_steps"]

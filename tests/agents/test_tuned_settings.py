@@ -6,7 +6,7 @@ import pytest
 
 from agents import tuned_settings, tuned_steps
 from agents.settings import PPOSettings
-from agents.tuned.tuned_settings import _entries
+from agents.tuned.entries import _entries
 from ncs_gym.registration import ENTRY_POINTS, registered_ids
 
 FILE = Path(__file__).resolve().parents[2] / "agents" / "tuned" / "ppo.json"
