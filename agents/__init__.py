@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from agents.sb3_vec_env import SB3VecEnv
     from agents.settings import A2CSettings, LagrangianSettings, OffPolicySettings, PPOSettings
     from agents.training import TrainingResult, train
+    from agents.tuned import tuned_settings, tuned_steps
 
 __all__ = [
     "A2CSettings",
@@ -39,6 +40,8 @@ __all__ = [
     "Trajectory",
     "evaluate",
     "train",
+    "tuned_settings",
+    "tuned_steps",
 ]
 
 _MODULES = {
@@ -50,6 +53,7 @@ _MODULES = {
     "sb3_vec_env": ("SB3VecEnv",),
     "settings": ("A2CSettings", "LagrangianSettings", "OffPolicySettings", "PPOSettings"),
     "training": ("TrainingResult", "train"),
+    "tuned": ("tuned_settings", "tuned_steps"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

@@ -78,6 +78,7 @@ def build_model(name: str, env: VecEnv, settings: AgentSettings, seed: int, step
     if isinstance(settings, PPOSettings):
         common["batch_size"] = min(settings.batch_size, settings.rollout * env.num_envs)
         common["n_epochs" if name == "PPO" else "n_critic_updates"] = settings.epochs
+        common |= {"ent_coef": settings.entropy} if name == "PPO" else {}
     return cls("MlpPolicy", env, **common)
 
 

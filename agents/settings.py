@@ -13,7 +13,7 @@ class _Settings:
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
         for entry in fields(self):  # type: ignore[arg-type]
-            _check(entry.name, getattr(self, entry.name))
+            check_setting(entry.name, getattr(self, entry.name))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +33,8 @@ class PPOSettings(_Settings):
         gae_lambda: Parameter lambda of generalized advantage estimation.
         log_std: Initial log standard deviation of the actions.
         width: Units in each of the two hidden layers of the policy and of the value function.
+        entropy: Weight of the policy's entropy in PPO's loss, which keeps it exploring; TRPO has no such term.
+        normalize_rewards: Whether rewards are divided by the standard deviation of the discounted return.
     """
 
     envs: int = 64
@@ -44,6 +46,8 @@ class PPOSettings(_Settings):
     gae_lambda: float = 0.9
     log_std: float = -0.7
     width: int = 64
+    entropy: float = 0.0
+    normalize_rewards: bool = True
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
@@ -126,7 +130,7 @@ class LagrangianSettings:
 AgentSettings = PPOSettings | A2CSettings | OffPolicySettings
 
 
-def _check(name: str, value: Any) -> None:
+def check_setting(name: str, value: Any) -> None:
     """Raises ValueError if a setting is out of the range that belongs to its name."""
     if name in ("discount", "gae_lambda"):
         if not 0.0 <= value <= 1.0:
@@ -134,11 +138,14 @@ def _check(name: str, value: Any) -> None:
     elif name == "learning_rate":
         if not 0.0 < value < math.inf:
             raise ValueError(f"learning_rate must be positive, got {value!r}")
-    elif name == "noise":
+    elif name in ("noise", "entropy"):
         if not 0.0 <= value < math.inf:
-            raise ValueError(f"noise must be >= 0, got {value!r}")
+            raise ValueError(f"{name} must be >= 0, got {value!r}")
     elif name == "log_std":
         if not math.isfinite(value):
             raise ValueError(f"log_std must be finite, got {value!r}")
+    elif name == "normalize_rewards":
+        if not isinstance(value, bool):
+            raise ValueError(f"normalize_rewards must be True or False, got {value!r}")
     elif isinstance(value, bool) or not isinstance(value, int) or value < 1:
         raise ValueError(f"{name} must be a whole number >= 1, got {value!r}")

@@ -70,7 +70,8 @@ def train(
     if isinstance(settings, OffPolicySettings) and steps <= settings.learning_starts:
         raise ValueError(f"{steps} steps train nothing: learning starts after {settings.learning_starts}")
     envs = loop.vector(settings.envs)
-    env = VecNormalize(SB3VecEnv(envs), gamma=settings.discount)
+    normalized = getattr(settings, "normalize_rewards", True)
+    env = VecNormalize(SB3VecEnv(envs), gamma=settings.discount, norm_reward=normalized)
     model = build_model(algorithm, env, settings, seed, steps)
     model.set_logger(configure(str(log_folder), ["tensorboard"]) if log_folder else Logger(None, []))
     callback = SafetyCallback(on_progress)

@@ -42,7 +42,7 @@ LAYERS = {
     "agents": (
         {"settings", "results", "sb3_vec_env", "loop_wrappers"},
         {"control_loop"},
-        {"algorithms", "callbacks", "evaluation", "sharing"},
+        {"algorithms", "callbacks", "evaluation", "sharing", "tuned"},
         {"agent"},
         {"training"},
     ),
@@ -262,4 +262,5 @@ def test_wheel_holds_the_four_packages_and_nothing_else(tmp_path):
     assert {name for name in names if not name.endswith(".dist-info")} == set(ORDER)
     sources = {path for package in ORDER for path in (ROOT / package).rglob("*") if path.is_file()}
     assert files >= {path.relative_to(ROOT).as_posix() for path in sources if "__pycache__" not in path.parts}
-    assert {f"{package}/py.typed" for package in ORDER} | {"experiments/report/templates/page.html.j2"} <= files
+    data = {"experiments/report/templates/page.html.j2", "agents/tuned/ppo.json"}
+    assert {f"{package}/py.typed" for package in ORDER} | data <= files

@@ -53,8 +53,9 @@ def compare(settings: CompareSettings) -> None:
     settings = _with_full_names(settings)
     setup = ExperimentSetup.of(settings.env, settings.channel, settings.certificate, settings.noise)
     prepare_output(settings.out)
+    print(setup.title, settings.agent_line, sep="\n", flush=True)
+    settings = settings.completed
     save_settings(settings.out / "settings.json", "compare", settings)
-    print(setup.title, flush=True)
     runs = _training_runs(settings, setup)
     results = results_of(runs, settings.out, settings)
     summary = _summary(settings, setup, runs, results)

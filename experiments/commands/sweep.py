@@ -68,6 +68,8 @@ def sweep(settings: SweepSettings) -> None:
         Arm.of(name, settings.mode)
     setups = [ExperimentSetup.of(settings.env, each.channel(settings.channel), settings.certificate) for each in points]
     prepare_output(settings.out)
+    print(settings.agent_line, flush=True)
+    settings = settings.completed
     save_settings(settings.out / "settings.json", "sweep", settings)
     runs = [
         setup.training_run(settings, name, index, grid_point=point.name)

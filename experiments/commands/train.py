@@ -25,6 +25,8 @@ def train(settings: TrainSettings) -> None:
     Arm.of(settings.arm, settings.mode)
     setup = ExperimentSetup.of(settings.env, settings.channel, settings.certificate)
     prepare_output(settings.out)
+    print(settings.agent_line, flush=True)
+    settings = settings.completed
     save_settings(settings.out / "settings.json", "train", settings)
     run = setup.training_run(settings, settings.arm, 0)
     results = results_of([run], settings.out, BackendSettings(jobs=1))

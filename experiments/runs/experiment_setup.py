@@ -107,7 +107,7 @@ class ExperimentSetup:
             noise=self.noise,
             seed=settings.seed,
             index=index,
-            steps=settings.steps,
+            steps=settings.training_steps,
             episodes=settings.episodes,
             certificate=self.certificate,
             mode=arm.mode,

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import tyro
 
-from agents.settings import A2CSettings, AgentSettings, LagrangianSettings, OffPolicySettings, PPOSettings
+from agents.settings import AgentSettings, LagrangianSettings
+from experiments.settings.agent_overrides import (
+    A2COverrides,
+    AgentOverrides,
+    OffPolicyOverrides,
+    PPOOverrides,
+    complete_settings,
+    default_steps,
+    described_settings,
+)
 from experiments.settings.backend import BackendSettings
 from experiments.settings.channel import ChannelSettings
 
@@ -25,7 +34,8 @@ class LearningSettings:
         env: Id of an environment with a plant of its own; module:id first imports the module, which registers one of
             your own (`ncs_gym.register_plant`).
         seed: Seed of the experiment, >= 0; all runs derive their seeds from it.
-        steps: Training steps per run, rounded up to whole rollouts.
+        steps: Training steps per run, rounded up to whole rollouts; if not given, those of the settings tuned for the
+            environment, or 150,000.
         episodes: Evaluation episodes per run.
         algo: Learning algorithm; TRPO, TQC and CrossQ need sb3-contrib.
         mode: What the shield applies in place of an unsafe action: the closest safe input ("project"), or the certified
@@ -35,7 +45,7 @@ class LearningSettings:
         violation_penalty: Subtracted from the training reward per violating step, in the arm "penalized".
         certificate: Certificate file to use instead of synthesizing one.
         channel: Changes of the environment's channel.
-        ppo: Settings of PPO and TRPO.
+        ppo: Settings of PPO and TRPO; what is not given is tuned for the environment (agents/tuned), or the default.
         a2c: Settings of A2C.
         off_policy: Settings of SAC, TD3, TQC and CrossQ.
         lagrangian: How the arm "lagrangian" adapts its penalty per violating step.
@@ -44,7 +54,7 @@ class LearningSettings:
     config: Path | None = None
     env: str = "ncs_gym/TruckTrailerCruise-v0"
     seed: int = 0
-    steps: int = 150_000
+    steps: int | None = None
     episodes: int = 200
     algo: Algorithm = "PPO"
     mode: Mode = "project"
@@ -52,9 +62,9 @@ class LearningSettings:
     violation_penalty: float = 1.0
     certificate: Path | None = None
     channel: ChannelSettings = field(default_factory=ChannelSettings)
-    ppo: PPOSettings = field(default_factory=PPOSettings)
-    a2c: A2CSettings = field(default_factory=A2CSettings)
-    off_policy: OffPolicySettings = field(default_factory=OffPolicySettings)
+    ppo: PPOOverrides = field(default_factory=PPOOverrides)
+    a2c: A2COverrides = field(default_factory=A2COverrides)
+    off_policy: OffPolicyOverrides = field(default_factory=OffPolicyOverrides)
     lagrangian: LagrangianSettings = field(default_factory=LagrangianSettings)
 
     @property
@@ -64,14 +74,35 @@ class LearningSettings:
 
     @property
     def agent(self) -> AgentSettings:
-        """Settings of the chosen learning algorithm."""
-        return {"PPO": self.ppo, "TRPO": self.ppo, "A2C": self.a2c}.get(self.algo, self.off_policy)
+        """All settings of the chosen learning algorithm: those given, those tuned for the environment, the defaults."""
+        return complete_settings(self.env, self.algo, getattr(self, self._kind))
+
+    @property
+    def training_steps(self) -> int:
+        """Training steps per run: those given, or those that belong to the environment."""
+        return self.steps or default_steps(self.env, self.algo)
+
+    @property
+    def agent_line(self) -> str:
+        """One line with all settings of the chosen learning algorithm and where they come from."""
+        return described_settings(self.env, self.algo, getattr(self, self._kind))
+
+    @property
+    def completed(self) -> Self:
+        """The same settings with the steps and all settings of the chosen algorithm given, for settings.json."""
+        given: AgentOverrides = getattr(self, self._kind)
+        return replace(self, steps=self.training_steps, **{self._kind: type(given)(**asdict(self.agent))})
+
+    @property
+    def _kind(self) -> str:
+        """Name of the field with the changes of the chosen learning algorithm's settings."""
+        return {"PPO": "ppo", "TRPO": "ppo", "A2C": "a2c"}.get(self.algo, "off_policy")
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
         for name in ("seeds", "steps", "episodes"):
-            if getattr(self, name, 1) < 1:
-                raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
+            if (value := getattr(self, name, None)) is not None and value < 1:
+                raise ValueError(f"--{name} must be at least 1, got {value}")
         if self.seed < 0:
             raise ValueError(f"--seed must be >= 0, got {self.seed}")
         for name in ("intervention_penalty", "violation_penalty"):

@@ -1,5 +1,5 @@
 import copy
-from dataclasses import astuple
+from dataclasses import astuple, replace
 
 import gymnasium as gym
 import numpy as np
@@ -110,6 +110,12 @@ def test_rate_falls_from_its_full_value_to_that_of_the_last_rollout():
     assert [schedule(remaining) for remaining in (0.75, 0.5, 0.25, 0.0)] == pytest.approx(
         [TINY.learning_rate * fraction for fraction in (1.0, 0.75, 0.5, 0.25)]
     )
+
+
+@pytest.mark.parametrize("change", [{"entropy": 0.1}, {"normalize_rewards": False}])
+def test_weight_of_the_entropy_and_normalization_of_rewards_change_what_is_learned(change):
+    agent, other = (train(CRUISE, 512, 0, settings=settings).agent for settings in (TINY, replace(TINY, **change)))
+    assert agent.checksum != other.checksum
 
 
 def test_too_few_steps_to_learn_are_refused():
@@ -268,6 +274,8 @@ def test_untrained_agent_is_reproducible():
         (PPOSettings, {"epochs": 1.5}),
         (PPOSettings, {"width": True}),
         (PPOSettings, {"log_std": np.nan}),
+        (PPOSettings, {"entropy": -1e-3}),
+        (PPOSettings, {"normalize_rewards": 1}),
         (A2CSettings, {"rollout": 0}),
         (OffPolicySettings, {"noise": -0.1}),
         (OffPolicySettings, {"buffer_size": 0}),

@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from agents import tuned_settings
 from agents.results import Episode
 from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
 from experiments.analysis.arm_table import _rows
@@ -13,6 +14,7 @@ from experiments.runs.experiment_setup import ExperimentSetup
 from experiments.runs.run_store import prepare_output
 from experiments.runs.training_run import RunResult
 from experiments.settings import CompareSettings
+from experiments.settings.agent_overrides import A2COverrides, OffPolicyOverrides, PPOOverrides
 from shields import verify
 
 ALL_ARMS = ("unshielded", "monitor", "penalized", "shielded", "shielded:switch+penalty", "shielded:boundary")
@@ -82,9 +84,10 @@ def test_unknown_arms_are_refused(name):
     [("PPO", PPOSettings), ("TRPO", PPOSettings), ("A2C", A2CSettings), ("SAC", OffPolicySettings)],
 )
 def test_settings_reach_every_run(setup, algo, settings):
-    given = {"ppo": PPOSettings(envs=3), "a2c": A2CSettings(envs=3), "off_policy": OffPolicySettings(envs=3)}
+    given = {"ppo": PPOOverrides(envs=3), "a2c": A2COverrides(envs=3), "off_policy": OffPolicyOverrides(envs=3)}
+    expected = replace(tuned_settings(setup.env) if algo == "PPO" else settings(), envs=3)
     for run in runs_of(setup, steps=7, episodes=9, algo=algo, **given):
-        assert (run.steps, run.episodes, run.algorithm, run.settings) == (7, 9, algo, settings(envs=3))
+        assert (run.steps, run.episodes, run.algorithm, run.settings) == (7, 9, algo, expected)
 
 
 def result(returns, violations, interventions=0, index=0):

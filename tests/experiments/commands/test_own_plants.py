@@ -12,6 +12,7 @@ import time
 import gymnasium as gym
 import pytest
 
+from agents.settings import PPOSettings
 from ncs_gym import truck_trailer
 from shields import Certificate
 from tests.command import assert_one_sentence, environment, ncs
@@ -67,6 +68,8 @@ def test_own_plant_is_trained_in_and_evaluated_by_its_id(folder):
     assert run.returncode == 0, run.stderr
     settings = json.loads((folder / "r" / "settings.json").read_text())
     assert settings["settings"]["env"] == "Plants/Truck-v0"  # a file names no module
+    assert settings["settings"]["ppo"] == vars(PPOSettings(rollout=16, envs=2))
+    assert "PPO, default settings, as given envs, rollout:" in run.stdout
     model = next((folder / "r" / "models").iterdir())
     assert json.loads((model / "agent.json").read_text())["agent"]["env"] == "Plants/Truck-v0"
     evaluated = ncs("evaluate", model, *ENV, "--episodes", 2, cwd=folder)

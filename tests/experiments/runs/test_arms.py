@@ -5,10 +5,11 @@ import pytest
 
 from agents.control_loop import CostPenalty
 from agents.loop_wrappers import ResidualActions
-from agents.settings import LagrangianSettings, PPOSettings
+from agents.settings import LagrangianSettings
 from experiments.baselines import EstimateFilter
 from experiments.runs import Arm, ExperimentSetup
 from experiments.settings import CompareSettings
+from experiments.settings.agent_overrides import PPOOverrides
 from shields import VectorSafetyShield, verify
 
 
@@ -107,7 +108,7 @@ def test_residual_agents_add_to_the_certified_gain_outside_of_the_filter(run_of,
 def test_every_arm_plays(run_of, name):
     from experiments.runs import execute_run
 
-    tiny = PPOSettings(envs=2, rollout=64, batch_size=64, epochs=1, width=8)
+    tiny = PPOOverrides(envs=2, rollout=64, batch_size=64, epochs=1, width=8)
     result = execute_run(run_of(name, steps=256, episodes=2, ppo=tiny), lambda steps: None)
     assert (result.arm, len(result.episodes)) == (name, 2)
     assert result.train_steps == (0 if name.startswith("lqr") else 256)

@@ -49,7 +49,7 @@ def test_settings_of_learning_are_still_checked(kind):
 @pytest.mark.parametrize("kind", [CompareSettings, SweepSettings])
 def test_ray_missing_is_one_sentence_that_says_what_to_install(kind, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "ray", None)  # as if it were not installed
-    with pytest.raises(ModuleNotFoundError, match=r"this command needs ray: .* pip install 'ncs-gym\[ray\]'"):
+    with pytest.raises(ModuleNotFoundError, match=r"this command needs ray: .* pip install -e '.\[ray\]'"):
         _run(kind(engine="ray", out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 

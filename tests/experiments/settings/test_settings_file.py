@@ -3,10 +3,10 @@ from dataclasses import replace
 
 import pytest
 
-from agents.settings import PPOSettings
 from experiments.__main__ import _parse
 from experiments.errors import SettingsError
 from experiments.settings import ChannelSettings, CompareSettings, SweepSettings, config_defaults, save_settings
+from experiments.settings.agent_overrides import PPOOverrides
 
 
 @pytest.mark.parametrize(
@@ -22,7 +22,7 @@ from experiments.settings import ChannelSettings, CompareSettings, SweepSettings
                 algo="SAC",
                 smoke=True,
                 channel=ChannelSettings(loss=1e-3, delay=4),
-                ppo=PPOSettings(learning_rate=1e-5, log_std=-1.5),
+                ppo=PPOOverrides(learning_rate=1e-5, log_std=-1.5),
             ),
         ),
         ("sweep", SweepSettings(losses=(0.0, 1 / 3), quantization_steps=(0.05,))),
