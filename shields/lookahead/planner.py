@@ -16,8 +16,8 @@ from shields.runtime.one_step_test import OneStepTest
 
 # A first input this close to the proposed one, in units of the limits, is tried as the proposed one itself.
 AS_PROPOSED = 1e-5
-# How often a plan is moved towards others where there are several directions.
-MOVES = 2
+# Between which candidates, numbered as in `_candidates`, certified plans are looked for.
+STARTS, TARGETS = (3, 3, 4, 4, 5), (0, 1, 0, 1, 3)
 
 
 class Plans(NamedTuple):
@@ -86,13 +86,13 @@ class Planner:
         candidates = self._candidates(estimates, proposed, projected, stored)
         plans = self._best(estimates, tightening, candidates, proposed)
         if self.horizon > 1:
-            away = plans.distances > 0.0
-            solved = np.flatnonzero(away & (np.isnan(stored[:, 0, 0]) | (plans.lengths == 0)))
-            if solved.size:
-                known = Tightening(*(part[solved] for part in tightening))
-                plans.improve(solved, self._solved(estimates[solved], known, proposed[solved]))
-            away[solved] = False
-            self._move(plans, np.flatnonzero(away), estimates, tightening, proposed, candidates[:, :2])
+            stores = ~np.isnan(stored[:, 0, 0])
+            away = np.flatnonzero((plans.distances > 0.0) & stores)
+            self._move(plans, away, estimates, tightening, proposed, candidates)
+            left = np.flatnonzero((plans.distances > 0.0) & ~(stores & (plans.lengths > 0)))
+            if left.size:
+                known = Tightening(*(part[left] for part in tightening))
+                plans.improve(left, self._solved(estimates[left], known, proposed[left]))
         return plans
 
     def _candidates(
@@ -130,25 +130,34 @@ class Planner:
         estimates: np.ndarray,
         tightening: Tightening,
         proposed: np.ndarray,
-        targets: np.ndarray,
+        candidates: np.ndarray,
     ) -> None:
-        """Moves the plans of the environments chosen towards plans that begin with the proposal, and past obstacles."""
+        """Looks between candidates, and then from what is found towards the proposal and past what is in between.
+
+        Args:
+            plans: The best candidates; what is found closer takes their place.
+            chosen: Which environments, as indices.
+            estimates: x_hat, shape (E, n).
+            tightening: Of the error shapes of each.
+            proposed: Shape (E, m).
+            candidates: Shape (E, 7, N, m).
+        """
         if not chosen.size:
             return
-        limits, m = self._plant.u_max, self._plant.m
+        x_hat, wanted, tried = estimates[chosen], proposed[chosen], candidates[chosen]
         known = Tightening(*(part[chosen] for part in tightening))
-        start, wanted, targets = estimates[chosen], proposed[chosen], targets[chosen]
-        for _ in range(MOVES if m > 1 else 1):
-            own = plans.some(chosen)
-            points = waypoints(own.inputs[:, 0], wanted, limits)
-            towards = targets
-            if points.shape[1]:
-                beginnings = np.full((*points.shape[:2], self.horizon, m), np.nan)
-                beginnings[:, :, 0] = points
-                past = completed(self._plant, start, beginnings, np.repeat(self._braking[None], points.shape[1], 0))
-                towards = np.concatenate([targets, past], axis=1)
-            tried = expressible(moved(self.test, start, known, own.inputs, towards), limits)
-            plans.improve(chosen, self._best(start, known, tried, wanted))
+        found = moved(self.test, x_hat, known, tried[:, STARTS], tried[:, TARGETS])
+        plans.improve(chosen, self._best(x_hat, known, expressible(found, self._plant.u_max), wanted))
+        if self._plant.m > 1:
+            own = plans.inputs[chosen]
+            points = waypoints(own[:, 0], wanted, self._plant.u_max)
+            beginnings = np.full((*points.shape[:2], *own.shape[1:]), np.nan)
+            beginnings[:, :, 0] = points
+            gains = np.repeat(self._braking[None], points.shape[1], axis=0)
+            past = completed(self._plant, x_hat, beginnings, gains)
+            past = np.concatenate([tried[:, :2], past], axis=1)
+            found = moved(self.test, x_hat, known, np.repeat(own[:, None], past.shape[1], axis=1), past)
+            plans.improve(chosen, self._best(x_hat, known, expressible(found, self._plant.u_max), wanted))
 
     def _solved(self, estimates: np.ndarray, tightening: Tightening, proposed: np.ndarray) -> Plans:
         """Returns what of the program's plans is certified, as inputs that can be applied.

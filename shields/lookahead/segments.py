@@ -19,38 +19,39 @@ ANGLES = (-1.2, -0.8, -0.4, 0.4, 0.8, 1.2)
 def moved(
     test: PlanTest, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray, targets: np.ndarray
 ) -> np.ndarray:
-    """Returns certified plans moved towards others until the test of the best length allows no more.
+    """Returns what the plan test allows between plans and others, as close to the others as possible.
 
-    On the way every |c_i c_j| is the absolute value of a linear function and |T G c_j|^2 is quadratic, so that the end
-    of the way is known; for each length the rows before it and its own end count.
+    On the way every |c_i c_j| is the absolute value of a linear function and |T G c_j|^2 is quadratic, so that where
+    the way enters and leaves what is allowed is known; for each length the rows before it and its own end count.
+    Neither end of the way needs to be certified.
 
     Args:
         test: The plan test.
         estimates: x_hat, shape (E, n).
         tightening: Of the error shapes of each.
-        plans: Shape (E, N, m).
+        plans: Shape (E, Q, N, m).
         targets: Shape (E, Q, N, m).
 
     Returns:
-        Shape (E, Q, N, m); neither rounded nor tested.
+        Shape (E, Q, N, m); neither rounded nor tested. Where nothing is allowed, the plans themselves.
     """
-    box, radius = test.room(estimates, tightening)
-    both = test.prediction.centers(estimates, np.concatenate([plans[:, None], targets], axis=1))
-    start, way = both[:, :1], both[:, 1:] - both[:, :1]
-    rows = test.prediction.plant.C.T
-    values, changes = start @ rows, way @ rows
-    room = box[:, None] - np.copysign(1.0, changes) * values
-    allowed = np.where(changes != 0.0, room / np.abs(changes), np.inf).min(axis=-1)
-    allowed = np.minimum.accumulate(allowed, axis=-1)
-    before = np.concatenate([np.full_like(allowed[..., :1], np.inf), allowed[..., :-1]], axis=-1)
-    turn = tightening.turn[:, None]
-    values, changes = (turn @ start[..., None])[..., 0], (turn @ way[..., None])[..., 0]
-    a, b = (changes * changes).sum(axis=-1), (changes * values).sum(axis=-1)
-    missing = (values * values).sum(axis=-1) - np.square(radius)[:, None]
-    ends = np.where((missing <= 0.0) & (radius > 0.0)[:, None], (np.sqrt(b * b - a * missing) - b) / a, -1.0)
-    fraction = np.nan_to_num(np.minimum(before, ends), nan=0.0).max(axis=-1)
-    fraction = (1.0 - SHORTENED) * np.minimum(np.maximum(fraction, 0.0), 1.0)
-    return plans[:, None] + fraction[..., None, None] * (targets - plans[:, None])
+    box, radius = (part.transpose(*range(1, part.ndim), 0)[..., None] for part in test.room(estimates, tightening))
+    start, turned = test.judged(estimates, tightening, plans)
+    way, turning = (end - begin for end, begin in zip(
+        test.judged(estimates, tightening, targets), (start, turned), strict=True))
+    middle, half = -start / way, box / np.abs(way)
+    still = way == 0.0
+    outside = np.where(np.abs(start) <= box, -np.inf, np.inf)
+    low, high = np.where(still, outside, middle - half).max(axis=1), np.where(still, -outside, middle + half).min(axis=1)
+    a, b = (turning * turning).sum(axis=1), (turning * turned).sum(axis=1)
+    root = np.sqrt(b * b - a * ((turned * turned).sum(axis=1) - radius * radius))
+    first, last = (-b - root) / a, (root - b) / a
+    first[1:] = np.maximum(first[1:], np.maximum.accumulate(low[:-1], axis=0))
+    last[1:] = np.minimum(last[1:], np.minimum.accumulate(high[:-1], axis=0))
+    first, last = np.maximum(first, 0.0), np.minimum(last, 1.0)
+    possible = (first <= last) & (radius > 0.0)
+    fraction = np.where(possible, last - SHORTENED * (last - first), 0.0).max(axis=0)
+    return plans + fraction[..., None, None] * (targets - plans)
 
 
 def waypoints(first: np.ndarray, proposed: np.ndarray, limits: np.ndarray) -> np.ndarray:
