@@ -33,7 +33,7 @@ class PlanTest:
         plant, ends = prediction.plant, prediction.ends
         self._rows = plant.C
         sizes = np.abs(plant.C) @ prediction.size_free
-        self._row_rounding = prediction.rounding[:, None, None] * sizes
+        self._row_rounding = (prediction.rounding[:, None, None] * sizes).reshape(-1, plant.n).T
         self._end_rounding = np.array([end.rounding * end.columns for end in ends])
         self._columns = np.array([end.columns for end in ends])
         # Where in the table the tightenings of a shape are.
@@ -60,14 +60,13 @@ class PlanTest:
     def room(self, estimates: np.ndarray, tightening: Tightening) -> tuple[np.ndarray, np.ndarray]:
         """Returns the largest |c_i c_j|, shape (E, N, k), and |T G c_j|, shape (E, N), that pass; NaN for no usable."""
         size = np.abs(estimates)
-        box = tightening.room - (self._row_rounding @ size[:, None, :, None])[..., 0] - self._margin
+        rounding = (size @ self._row_rounding).reshape(tightening.room.shape)
+        box = tightening.room - rounding - self._margin
         radius = tightening.radius - size @ self._end_rounding.T
         far = ~(size @ self._columns.T < FARTHEST) | ~(radius >= SMALLEST_RADIUS)
         return box, np.where(far, np.nan, radius - self._margin)
 
-    def judged(
-        self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def judged(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns c_i c_j, shape (N, k, E, P), and T G c_j, shape (N, n, E, P): sums over long last axes are fast.
 
         Args:

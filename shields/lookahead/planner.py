@@ -10,14 +10,11 @@ from shields.lookahead.candidates import completed, expressible, regulator
 from shields.lookahead.plan_test import PlanTest
 from shields.lookahead.prediction import Prediction
 from shields.lookahead.program import PlanProgram
-from shields.lookahead.segments import moved, waypoints
 from shields.lookahead.tightening import Tightening
 from shields.runtime.one_step_test import OneStepTest
 
 # A first input this close to the proposed one, in units of the limits, is tried as the proposed one itself.
 AS_PROPOSED = 1e-5
-# Between which candidates, numbered as in `_candidates`, certified plans are looked for.
-STARTS, TARGETS = (3, 3, 4, 4, 5), (0, 1, 0, 1, 3)
 
 
 class Plans(NamedTuple):
@@ -45,7 +42,7 @@ class Plans(NamedTuple):
 
 
 class Planner:
-    """Finds certified plans: candidates first, moved towards the proposal, then the program (docs/lookahead.md).
+    """Finds certified plans: candidates first, then the convex program (docs/lookahead.md).
 
     Args:
         first: The one-step test.
@@ -86,10 +83,8 @@ class Planner:
         candidates = self._candidates(estimates, proposed, projected, stored)
         plans = self._best(estimates, tightening, candidates, proposed)
         if self.horizon > 1:
-            stores = ~np.isnan(stored[:, 0, 0])
-            away = np.flatnonzero((plans.distances > 0.0) & stores)
-            self._move(plans, away, estimates, tightening, proposed, candidates)
-            left = np.flatnonzero((plans.distances > 0.0) & ~(stores & (plans.lengths > 0)))
+            needed = (plans.lengths == 0) | np.isnan(stored[:, 0, 0])
+            left = np.flatnonzero(needed & (plans.distances > 0.0))
             if left.size:
                 known = Tightening(*(part[left] for part in tightening))
                 plans.improve(left, self._solved(estimates[left], known, proposed[left]))
@@ -109,9 +104,7 @@ class Planner:
         gains += [K, braking, K, braking]  # either gain from the start
         return completed(self._plant, estimates, beginnings, np.array(gains))
 
-    def _best(
-        self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray, proposed: np.ndarray
-    ) -> Plans:
+    def _best(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray, proposed: np.ndarray) -> Plans:
         """Returns of P plans, shape (E, P, N, m), the certified ones with the closest first input, of equals the shortest."""
         certified = self.test.certified(estimates, tightening, plans)
         any_length = certified.any(axis=-1)
@@ -122,42 +115,6 @@ class Planner:
         best = np.where(tied, lengths, self.horizon + 1).argmin(axis=1)
         rows = np.arange(len(plans))
         return Plans(plans[rows, best], lengths[rows, best], distances[rows, best])
-
-    def _move(
-        self,
-        plans: Plans,
-        chosen: np.ndarray,
-        estimates: np.ndarray,
-        tightening: Tightening,
-        proposed: np.ndarray,
-        candidates: np.ndarray,
-    ) -> None:
-        """Looks between candidates, and then from what is found towards the proposal and past what is in between.
-
-        Args:
-            plans: The best candidates; what is found closer takes their place.
-            chosen: Which environments, as indices.
-            estimates: x_hat, shape (E, n).
-            tightening: Of the error shapes of each.
-            proposed: Shape (E, m).
-            candidates: Shape (E, 7, N, m).
-        """
-        if not chosen.size:
-            return
-        x_hat, wanted, tried = estimates[chosen], proposed[chosen], candidates[chosen]
-        known = Tightening(*(part[chosen] for part in tightening))
-        found = moved(self.test, x_hat, known, tried[:, STARTS], tried[:, TARGETS])
-        plans.improve(chosen, self._best(x_hat, known, expressible(found, self._plant.u_max), wanted))
-        if self._plant.m > 1:
-            own = plans.inputs[chosen]
-            points = waypoints(own[:, 0], wanted, self._plant.u_max)
-            beginnings = np.full((*points.shape[:2], *own.shape[1:]), np.nan)
-            beginnings[:, :, 0] = points
-            gains = np.repeat(self._braking[None], points.shape[1], axis=0)
-            past = completed(self._plant, x_hat, beginnings, gains)
-            past = np.concatenate([tried[:, :2], past], axis=1)
-            found = moved(self.test, x_hat, known, np.repeat(own[:, None], past.shape[1], axis=1), past)
-            plans.improve(chosen, self._best(x_hat, known, expressible(found, self._plant.u_max), wanted))
 
     def _solved(self, estimates: np.ndarray, tightening: Tightening, proposed: np.ndarray) -> Plans:
         """Returns what of the program's plans is certified, as inputs that can be applied.
