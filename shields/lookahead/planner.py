@@ -105,7 +105,7 @@ class Planner:
         return completed(self._plant, estimates, beginnings, np.array(gains))
 
     def _best(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray, proposed: np.ndarray) -> Plans:
-        """Returns of P plans, shape (E, P, N, m), the certified ones with the closest first input, of equals the shortest."""
+        """Returns of P plans, shape (E, P, N, m), the certified one that begins closest, of equal ones the shortest."""
         certified = self.test.certified(estimates, tightening, plans)
         any_length = certified.any(axis=-1)
         lengths = np.where(any_length, certified.argmax(axis=-1) + 1, 0)
