@@ -39,8 +39,9 @@ def completed(plant: LinearPlant, estimates: np.ndarray, beginnings: np.ndarray,
     """
     number, steps = beginnings.shape[1:3]
     plans = np.ascontiguousarray(beginnings.transpose(2, 1, 0, 3))  # products with few large matrices are fast
-    missing = np.isnan(plans)
-    some, every = missing.any(axis=(1, 2, 3)).tolist(), missing.all(axis=(1, 2, 3)).tolist()
+    missing: np.ndarray = np.asarray(np.isnan(plans))
+    flat = missing.reshape(steps, -1)
+    some, every = np.any(flat, axis=1), np.all(flat, axis=1)
     turned, A, B = gains.swapaxes(1, 2), plant.A.T, plant.B.T
     centers = np.repeat(estimates[None], number, axis=0)
     for j in range(steps):

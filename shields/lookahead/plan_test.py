@@ -94,9 +94,9 @@ class PlanTest:
         """
         box, radius = self.room(estimates, tightening)
         values, turned = self.judged(estimates, tightening, plans)
-        inside = (np.abs(values) <= box.transpose(1, 2, 0)[..., None]).all(axis=1)
-        allowed = (np.abs(plans) <= self.prediction.plant.u_max).all(axis=-1).transpose(2, 0, 1)
-        passed = np.sqrt((turned * turned).sum(axis=1)) <= radius.T[..., None]
+        inside = np.all(np.abs(values) <= box.transpose(1, 2, 0)[..., None], axis=1)
+        allowed = np.all(np.abs(plans) <= self.prediction.plant.u_max, axis=-1).transpose(2, 0, 1)
+        passed = np.asarray(np.sqrt((turned * turned).sum(axis=1)) <= radius.T[..., None])
         passed[1:] &= np.logical_and.accumulate(inside[:-1], axis=0)
         return (passed & np.logical_and.accumulate(allowed, axis=0)).transpose(1, 2, 0)
 
