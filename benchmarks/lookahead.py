@@ -1,12 +1,19 @@
-"""What mode "lookahead" admits and what it costs, against the one-step test and the same program in cvxpy.
+"""What mode "lookahead" admits and what it costs, against mode "project" and the same program in cvxpy.
 
-    python benchmarks/lookahead.py [--beliefs 2000]
+    python benchmarks/lookahead.py [--sections beliefs loop training] [--beliefs 2000] [--steps 150000]
+
+Section "loop" runs 64 environments in both modes with random actions and with actions pushed towards the upper limits,
+and says how often and how far inputs were changed and how long a frame takes. Section "training" trains PPO on the
+batch reactor behind both modes and runs every agent behind both. Times are CPU times; what follows is about section
+"beliefs".
 
 Beliefs are a true state drawn uniformly from the box, an error on the boundary of the error ellipsoid that is met in
 the middle of an episode (the one of median size), and the estimate that follows. A belief is admitted if some input is
 certified: by a plan of at most N steps, or for the second column by the one-step test alone. The upper bound plans for
 the true state without disturbance, with N inputs and the same end: no shield with this safe set admits more.
-Times are of beliefs that fail the one-step test, for proposals drawn uniformly from the limits.
+Times are of beliefs that fail the one-step test, for proposals drawn uniformly from the limits: with nothing stored
+("search", the solver is called unless a candidate begins with the proposal), and with the plan found stored ("stored").
+"too far" is how much farther from the proposal the input is then than the search with the solver finds, in u_max.
 """
 
 from __future__ import annotations
@@ -18,9 +25,12 @@ from typing import NamedTuple
 import cvxpy as cp
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.vec_env import VecNormalize
 
+from agents import PPOSettings, SB3VecEnv
+from agents.algorithms import build_model
 from ncs_gym import Ellipsoid, LinearPlant
-from shields import SafetyFilter
+from shields import SafetyFilter, VectorSafetyShield
 from shields.runtime.wrapper import certificate_for
 
 # Environment, horizon.
@@ -28,6 +38,10 @@ CASES = (("TruckTrailer", 3), ("TruckTrailerCruise", 3), ("CartPole", 12), ("Bat
 EPISODES, STEPS = 5, 60
 # So many beliefs are given to cvxpy.
 CVXPY = 60
+SECTIONS = ("beliefs", "loop", "training")
+MODES = ("project", "lookahead")
+# Steps of 64 environments that are measured, and before that.
+ENVS, MEASURED, WARM = 64, 150, 50
 
 
 class Beliefs(NamedTuple):
@@ -107,13 +121,13 @@ def drawn(env: gym.Env, count: int) -> Beliefs:
 
 
 def timed(decide, beliefs: list[tuple[np.ndarray, ...]]) -> np.ndarray:
-    """Microseconds per call, each the better of two."""
+    """Microseconds of CPU time per call, each the better of two."""
     times = np.empty((2, len(beliefs)))
     for row in times:
         for e, belief in enumerate(beliefs):
-            start = time.perf_counter()
+            start = time.process_time()
             decide(*belief)
-            row[e] = 1e6 * (time.perf_counter() - start)
+            row[e] = 1e6 * (time.process_time() - start)
     return times.min(axis=0)
 
 
@@ -134,22 +148,112 @@ def report(name: str, horizon: int, count: int) -> str:
         return f"{name:20s} {horizon:3d} every proposal passes the one-step test"
     ours, plain = timed(shield.decide, searched), PlainProgram(shield)
     others = timed(plain.solve, [searched[i % len(searched)] for i in range(CVXPY)])
+    found = [shield.decide(*each) for each in searched]
+    pairs = [
+        (case, one, shield.decide(*case[:2], -case[2])) for case, one in zip(searched, found, strict=True)
+    ]  # what is stored was made for another proposal
+    pairs = [
+        (*each, np.concatenate([each[2].input[None], each[2].plan])) for each in pairs if each[2].reason == "planned"
+    ]
+    again = timed(shield.decide, [(*case, stored) for case, _, _, stored in pairs])
+    far = [
+        np.linalg.norm(shield.decide(*case, stored).input - case[2]) - np.linalg.norm(one.input - case[2])
+        for case, one, _, stored in pairs
+    ]
     quick = timed(project.decide, [each for each in cases if project.decide(*each).reason == "safe"][:300])
     return (
         f"{name:20s} {horizon:3d} {inside:7.1%} {one_step:9.1%} {admitted:9.1%} {bound:8.1%}   "
-        f"{np.median(quick):8.0f} {np.median(ours):8.0f} {np.quantile(ours, 0.99):8.0f} {np.median(others):8.0f} "
-        f"{np.median(others) / np.median(ours):6.1f}x"
+        f"{np.median(quick):8.0f} {np.median(ours):8.0f} {np.quantile(ours, 0.99):8.0f} "
+        f"{np.median(again):8.0f} {np.median(others):8.0f} "
+        f"{np.median(others) / np.median(ours):6.1f}x {np.median(others) / np.median(again):6.1f}x "
+        f"{np.mean(far) / plant.u_max.max():8.2f}"
     )
+
+
+def shielded(name: str, mode: str, horizon: int, **settings) -> VectorSafetyShield:
+    env = gym.make_vec(f"ncs_gym/{name}-v0", num_envs=ENVS, **settings)
+    return VectorSafetyShield(env, mode=mode, horizon=horizon if mode == "lookahead" else None)
+
+
+def driven(env, act, steps: int) -> tuple[float, ...]:
+    """Microseconds per frame, share of inputs overridden, mean correction and reward per frame."""
+    observation, info = env.reset(seed=0)
+    sums, start = np.zeros(3), 0.0
+    for step in range(WARM + steps):
+        if step == WARM:
+            sums[:], start = 0.0, time.process_time()
+        observation, rewards, _, _, info = env.step(act(observation))
+        sums += info["shield_intervened"].mean(), info["shield_correction"].mean(), rewards.mean()
+    return 1e6 * (time.process_time() - start) / (steps * ENVS), *(sums / steps)
+
+
+def loop() -> None:
+    print("environment            actions     us per frame: project lookahead   overridden            correction")
+    for name, horizon in CASES[1:]:
+        for actions, mean, spread in (("random", 0.0, None), ("pushed", 0.8, 0.5)):
+            results = []
+            for mode in MODES:
+                env, rng = shielded(name, mode, horizon), np.random.default_rng(0)
+                shape = env.action_space.shape
+
+                def act(_, rng=rng, shape=shape, mean=mean, spread=spread):
+                    drawn = rng.uniform(-1, 1, shape) if spread is None else rng.normal(mean, spread, shape)
+                    return np.clip(drawn, -1, 1).astype(np.float32)
+
+                results.append(driven(env, act, MEASURED))
+            (first, few, small, _), (second, many, large, _) = results
+            print(
+                f"{name:22s} {actions:10s} {first:22.1f} {second:9.1f}   {few:6.1%} -> {many:6.1%}   "
+                f"{small:7.3f} -> {large:7.3f}",
+                flush=True,
+            )
+
+
+def training(steps: int) -> None:
+    name, horizon = CASES[-1]
+    settings, agents, rates = PPOSettings(envs=ENVS), {}, {}
+    for count in (1, steps):  # what only the first training of a process takes time for is not measured
+        for mode in MODES:
+            env = SB3VecEnv(shielded(name, mode, horizon, autoreset_mode="SameStep"))
+            normalized = VecNormalize(env, gamma=settings.discount)
+            model, start = build_model("PPO", normalized, settings, 0), time.process_time()
+            model.learn(count)
+            rates[mode] = model.num_timesteps / (time.process_time() - start)
+            agents[mode] = model, normalized
+    print(f"PPO on {name}, frames per second of CPU time:", {mode: round(rate) for mode, rate in rates.items()})
+    print(f"ratio {rates['lookahead'] / rates['project']:.2f}")
+    for trained, (model, normalized) in agents.items():
+        for mode in MODES:
+
+            def act(observation, model=model, normalized=normalized):
+                return model.predict(normalized.normalize_obs(observation), deterministic=True)[0]
+
+            _, share, correction, reward = driven(shielded(name, mode, horizon), act, 2 * MEASURED)
+            print(
+                f"trained behind {trained:9s} run behind {mode:9s}: overridden {share:6.1%}, correction "
+                f"{correction:.3f}, reward per step {reward:.4f}",
+                flush=True,
+            )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sections", nargs="+", choices=SECTIONS, default=SECTIONS)
     parser.add_argument("--beliefs", type=int, default=2000)
-    count = parser.parse_args().beliefs
-    print("                             share of states in S, of beliefs admitted          us per decision")
-    print("environment            N       S   one step lookahead    bound   one step   search      99%    cvxpy  ratio")
-    for name, horizon in CASES:
-        print(report(name, horizon, count), flush=True)
+    parser.add_argument("--steps", type=int, default=150_000)
+    options = parser.parse_args()
+    if "beliefs" in options.sections:
+        print("                             share of states in S, of beliefs admitted          us per decision")
+        print(
+            "environment            N       S   one step lookahead    bound   one step   search      99%   stored    "
+            "cvxpy  search  stored  too far"
+        )
+        for name, horizon in CASES:
+            print(report(name, horizon, options.beliefs), flush=True)
+    if "loop" in options.sections:
+        loop()
+    if "training" in options.sections:
+        training(options.steps)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@
 
 from shields.lookahead.decision import Lookahead
 from shields.lookahead.plan_test import PlanTest
-from shields.lookahead.planner import Plan, Planner
+from shields.lookahead.planner import Planner, Plans
 from shields.lookahead.prediction import Prediction
 
-__all__ = ["Lookahead", "Plan", "PlanTest", "Planner", "Prediction"]
+__all__ = ["Lookahead", "PlanTest", "Planner", "Plans", "Prediction"]

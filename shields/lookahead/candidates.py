@@ -37,11 +37,19 @@ def completed(plant: LinearPlant, estimates: np.ndarray, beginnings: np.ndarray,
         beginnings: Inputs of P plans, shape (E, P, N, m), NaN where they are not given.
         gains: Shape (P, m, n).
     """
-    plans, given = beginnings.copy(), ~np.isnan(beginnings[..., 0])
-    centers = np.repeat(estimates[:, None], beginnings.shape[1], axis=1)
-    turned = gains.swapaxes(1, 2)
-    for j in range(beginnings.shape[2]):
-        gained = expressible((centers[:, :, None] @ turned)[:, :, 0], plant.u_max)
-        u = plans[:, :, j] = np.where(given[:, :, j, None], plans[:, :, j], gained)
-        centers = centers @ plant.A.T + u @ plant.B.T
-    return plans
+    number, steps = beginnings.shape[1:3]
+    plans = np.ascontiguousarray(beginnings.transpose(2, 1, 0, 3))  # products with few large matrices are fast
+    missing: np.ndarray = np.asarray(np.isnan(plans))
+    flat = missing.reshape(steps, -1)
+    some, every = np.any(flat, axis=1), np.all(flat, axis=1)
+    turned, A, B = gains.swapaxes(1, 2), plant.A.T, plant.B.T
+    centers = np.repeat(estimates[None], number, axis=0)
+    for j in range(steps):
+        u = plans[j]
+        if some[j]:
+            gained = np.minimum(np.maximum(centers @ turned, -plant.u_max), plant.u_max)
+            u = plans[j] = gained if every[j] else np.where(missing[j], gained, u)
+        if j + 1 < steps:
+            centers = centers @ A + u @ B
+    plans = np.where(missing, expressible(plans, plant.u_max), plans)
+    return np.ascontiguousarray(plans.transpose(2, 1, 0, 3))

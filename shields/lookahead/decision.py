@@ -9,7 +9,7 @@ import numpy as np
 from ncs_gym.validation import as_numbers
 from shields.lookahead.planner import Planner
 from shields.runtime.decisions import INVALID, PLANNED, PROJECTED, SAFE, STORED, Decision
-from shields.runtime.one_step_test import OneStepTest
+from shields.runtime.one_step_test import OneStepTest, norms
 from shields.runtime.predicted_errors import PredictedErrors
 
 
@@ -57,20 +57,12 @@ class Lookahead:
             return
         changed = np.zeros(some.shape, np.bool_)
         searched = np.flatnonzero(decided.reason[some] != INVALID)
-        for i, plan in zip(
-            searched.tolist(), self._plans(some[searched], estimates, errors, proposed, stored), strict=True
-        ):
-            e = some[i]
-            projected = decided.reason[e] == PROJECTED
-            if plan is None or (projected and plan.distance >= np.linalg.norm(decided.input[:, e] - proposed[:, e])):
-                continue
-            changed[i] = True
-            decided.input[:, e], decided.plan[: len(plan.inputs) - 1, :, e] = plan.inputs[0], plan.inputs[1:]
-            decided.passed[e], decided.fallback[e], decided.reason[e] = True, False, PLANNED
+        if searched.size:
+            changed[searched] = self._plan(decided, some[searched], estimates, errors, proposed, stored)
         left = ~changed & (decided.reason[some] != PROJECTED) & ~np.isnan(stored[0, 0, some])
-        for e in some[left].tolist():
-            decided.input[:, e], decided.plan[:-1, :, e] = stored[0, :, e], stored[1:, :, e]
-            decided.fallback[e], decided.stored[e], decided.reason[e] = False, True, STORED
+        resumed = some[left]
+        decided.input[:, resumed], decided.plan[:-1, :, resumed] = stored[0][:, resumed], stored[1:, :, resumed]
+        decided.fallback[resumed], decided.stored[resumed], decided.reason[resumed] = False, True, STORED
         some = some[changed | left]
         if some.size:
             decided.intervened[some] = (decided.input[:, some] != proposed[:, some]).any(axis=0)
@@ -79,19 +71,37 @@ class Lookahead:
             )
             decided.passed[some] = (slack >= self._margin) | (decided.reason[some] == PLANNED)
 
-    def _plans(
-        self, some: np.ndarray, estimates: np.ndarray, errors: PredictedErrors, proposed: np.ndarray, stored: np.ndarray
-    ) -> list[Any]:
-        """Returns the plans found for some environments."""
-        if not some.size:
-            return []
-        shapes = errors.shape[..., some].transpose(2, 0, 1)
-        return self.planner.find(
+    def _plan(
+        self,
+        decided: Decision,
+        some: np.ndarray,
+        estimates: np.ndarray,
+        errors: PredictedErrors,
+        proposed: np.ndarray,
+        stored: np.ndarray,
+    ) -> np.ndarray:
+        """Begins new plans in some environments where one is found that is closer than the projected input.
+
+        Returns:
+            Where it did, shape (len(some),).
+        """
+        projected = decided.reason[some] == PROJECTED
+        closest = np.where(projected, decided.input[:, some], np.nan)
+        found = self.planner.find(
             np.ascontiguousarray(estimates[:, some].T),
-            shapes,
+            errors.shape[..., some].transpose(2, 0, 1),
             proposed[:, some].T,
+            closest.T,
             stored[..., some].transpose(2, 0, 1),
         )
+        begun = (found.lengths > 0) & ~(projected & (found.distances >= norms(closest - proposed[:, some])))
+        inputs, lengths, _ = found.some(begun)
+        kept = np.arange(1, self.planner.horizon) < lengths[:, None]
+        some = some[begun]
+        decided.input[:, some] = inputs[:, 0].T
+        decided.plan[:-1, :, some] = np.where(kept[..., None], inputs[:, 1:], np.nan).transpose(1, 2, 0)
+        decided.passed[some], decided.fallback[some], decided.reason[some] = True, False, PLANNED
+        return begun
 
     def knows_in_box(self, estimate: np.ndarray, errors: PredictedErrors) -> bool:
         """Returns whether an estimate, shape (n,), proves that x is in the box."""

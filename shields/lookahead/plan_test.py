@@ -31,12 +31,14 @@ class PlanTest:
     def __init__(self, prediction: Prediction, margin: float) -> None:
         self.prediction, self._margin = prediction, margin
         plant, ends = prediction.plant, prediction.ends
-        self._rows = np.ascontiguousarray(plant.C.T)
+        self._rows = plant.C
         sizes = np.abs(plant.C) @ prediction.size_free
-        self._row_rounding = prediction.rounding[:, None, None] * sizes
+        self._row_rounding = (prediction.rounding[:, None, None] * sizes).reshape(-1, plant.n).T
         self._end_rounding = np.array([end.rounding * end.columns for end in ends])
         self._columns = np.array([end.columns for end in ends])
-        self._remembered: dict[bytes, Tightening] = {}
+        # Where in the table the tightenings of a shape are.
+        self._remembered: dict[bytes, int] = {}
+        self._table: Tightening | None = None
 
     def tightenings_of(self, shapes: np.ndarray) -> Tightening:
         """Returns the tightenings of error shapes Sigma_k, shape (E, n, n); remembered, since shapes recur."""
@@ -48,18 +50,38 @@ class PlanTest:
             new = {key: e for e, key in enumerate(keys)}
         if new:
             found = tightenings(self.prediction, shapes[list(new.values())])
-            self._remembered |= {key: Tightening(*(part[e] for part in found)) for e, key in enumerate(new)}
-        known = [self._remembered[key] for key in keys]
-        return Tightening(*(np.stack(parts) for parts in zip(*known, strict=True)))
+            known = [part[: len(self._remembered)] for part in self._table or found]
+            self._table = Tightening(*(np.concatenate(pair) for pair in zip(known, found, strict=True)))
+            self._remembered |= {key: len(self._remembered) + e for e, key in enumerate(new)}
+        numbers = [self._remembered[key] for key in keys]
+        return Tightening(*(part[numbers] for part in self._table or tightenings(self.prediction, shapes)))
 
     @np.errstate(all="ignore")  # what is not finite is not certified
     def room(self, estimates: np.ndarray, tightening: Tightening) -> tuple[np.ndarray, np.ndarray]:
         """Returns the largest |c_i c_j|, shape (E, N, k), and |T G c_j|, shape (E, N), that pass; NaN for no usable."""
         size = np.abs(estimates)
-        box = tightening.room - (self._row_rounding @ size[:, None, :, None])[..., 0] - self._margin
+        rounding = (size @ self._row_rounding).reshape(tightening.room.shape)
+        box = tightening.room - rounding - self._margin
         radius = tightening.radius - size @ self._end_rounding.T
         far = ~(size @ self._columns.T < FARTHEST) | ~(radius >= SMALLEST_RADIUS)
         return box, np.where(far, np.nan, radius - self._margin)
+
+    def judged(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns c_i c_j, shape (N, k, E, P), and T G c_j, shape (N, n, E, P): sums over long last axes are fast.
+
+        Args:
+            estimates: x_hat, shape (E, n).
+            tightening: Of the error shapes of each.
+            plans: Inputs, shape (E, P, N, m) [physical units].
+        """
+        centers = self.prediction.centers(estimates, plans)
+        steps, n, count, number = centers.shape
+        values = self._rows @ centers.reshape(steps, n, -1)
+        turn = tightening.turn.transpose(1, 2, 3, 0)[..., None]
+        turned = turn[:, :, 0] * centers[:, 0, None]
+        for i in range(1, n):
+            turned += turn[:, :, i] * centers[:, i, None]
+        return values.reshape(steps, -1, count, number), turned
 
     @np.errstate(all="ignore")
     def certified(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray) -> np.ndarray:
@@ -71,14 +93,12 @@ class PlanTest:
             plans: Inputs, shape (E, P, N, m) [physical units].
         """
         box, radius = self.room(estimates, tightening)
-        centers = self.prediction.centers(estimates, plans)
-        inside = (np.abs(centers @ self._rows) <= box[:, None]).all(axis=-1)
-        allowed = (np.abs(plans) <= self.prediction.plant.u_max).all(axis=-1)
-        turned = (tightening.turn[:, None] @ centers[..., None])[..., 0]
-        ends = np.sqrt((turned * turned).sum(axis=-1)) <= radius[:, None]
-        before = np.logical_and.accumulate(inside, axis=-1)
-        before = np.concatenate([np.ones_like(before[..., :1]), before[..., :-1]], axis=-1)
-        return ends & before & np.logical_and.accumulate(allowed, axis=-1)
+        values, turned = self.judged(estimates, tightening, plans)
+        inside = np.all(np.abs(values) <= box.transpose(1, 2, 0)[..., None], axis=1)
+        allowed = np.all(np.abs(plans) <= self.prediction.plant.u_max, axis=-1).transpose(2, 0, 1)
+        passed = np.asarray(np.sqrt((turned * turned).sum(axis=1)) <= radius.T[..., None])
+        passed[1:] &= np.logical_and.accumulate(inside[:-1], axis=0)
+        return (passed & np.logical_and.accumulate(allowed, axis=0)).transpose(1, 2, 0)
 
     @np.errstate(all="ignore")
     def knows_in_box(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:

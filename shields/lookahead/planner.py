@@ -17,16 +17,28 @@ from shields.runtime.one_step_test import OneStepTest
 AS_PROPOSED = 1e-5
 
 
-class Plan(NamedTuple):
-    """A certified plan.
+class Plans(NamedTuple):
+    """Certified plans of E environments.
 
     Attributes:
-        inputs: u_0..u_{j-1}, shape (j, m) [physical units].
-        distance: Euclidean distance of u_0 from the proposed input.
+        inputs: u_0..u_{N-1}, shape (E, N, m) [physical units]; beyond a plan's length they are not certified.
+        lengths: Shape (E,), 0 where no plan is certified.
+        distances: Euclidean distances of u_0 from the proposed inputs, shape (E,), infinite without a plan.
     """
 
     inputs: np.ndarray
-    distance: float
+    lengths: np.ndarray
+    distances: np.ndarray
+
+    def some(self, chosen: np.ndarray) -> Plans:
+        """Returns those of some environments, given by their indices."""
+        return Plans(*(part[chosen] for part in self))
+
+    def improve(self, chosen: np.ndarray, others: Plans) -> None:
+        """Puts other plans of the environments chosen in place where they begin closer to the proposed inputs."""
+        closer = others.distances < self.distances[chosen]
+        for part, other in zip(self, others, strict=True):
+            part[chosen[closer]] = other[closer]
 
 
 class Planner:
@@ -47,43 +59,64 @@ class Planner:
         self.test, self.horizon = PlanTest(Prediction(first, horizon), margin), horizon
         self._plant = first.plant
         braking = regulator(first.plant)
-        self._gains = np.array([gain] if braking is None else [gain, braking])
+        self._gain, self._braking = gain, gain if braking is None else braking
         self._program = PlanProgram(self.test.prediction)
 
     def find(
-        self, estimates: np.ndarray, shapes: np.ndarray, proposed: np.ndarray, stored: np.ndarray
-    ) -> list[Plan | None]:
-        """Returns for each of E environments the certified plan found whose first input is closest; None without.
+        self,
+        estimates: np.ndarray,
+        shapes: np.ndarray,
+        proposed: np.ndarray,
+        projected: np.ndarray,
+        stored: np.ndarray,
+    ) -> Plans:
+        """Returns certified plans of E environments whose first inputs are close to the proposed ones.
 
         Args:
             estimates: x_hat, shape (E, n).
             shapes: Sigma_k, shape (E, n, n).
             proposed: Inputs within the limits, shape (E, m).
+            projected: The closest inputs that pass the one-step test, shape (E, m); NaN where there are none.
             stored: Plans still stored, shape (E, N, m), NaN beyond their ends.
         """
         tightening = self.test.tightenings_of(shapes)
-        candidates = self._candidates(estimates, proposed, stored)
-        certified = self.test.certified(estimates, tightening, candidates)
-        plans = [_closest(*each) for each in zip(candidates, certified, proposed, strict=True)]
-        left = [e for e, plan in enumerate(plans) if plan is None or plan.distance > 0.0]
-        if left and self.horizon > 1:
-            some = Tightening(*(part[left] for part in tightening))
-            for e, plan in zip(left, self._solved(estimates[left], some, proposed[left]), strict=True):
-                if plan is not None:
-                    plans[e] = min(plan, plans[e] or plan, key=lambda each: each.distance)
+        candidates = self._candidates(estimates, proposed, projected, stored)
+        plans = self._best(estimates, tightening, candidates, proposed)
+        if self.horizon > 1:
+            needed = (plans.lengths == 0) | np.isnan(stored[:, 0, 0])
+            left = np.flatnonzero(needed & (plans.distances > 0.0))
+            if left.size:
+                known = Tightening(*(part[left] for part in tightening))
+                plans.improve(left, self._solved(estimates[left], known, proposed[left]))
         return plans
 
-    def _candidates(self, estimates: np.ndarray, proposed: np.ndarray, stored: np.ndarray) -> np.ndarray:
-        """Returns the plans tried without a solver, shape (E, P, N, m)."""
-        gains = len(self._gains)
-        count, number = len(estimates), 2 * gains + 1
-        beginnings = np.full((count, number, self.horizon, self._plant.m), np.nan)
-        beginnings[:, : gains + 1, 0] = proposed[:, None]  # the proposal and each gain, and
-        beginnings[:, gains, 1:] = stored[:, 1:]  # the proposal and what is stored for later;
-        order = [*range(gains), 0, *range(gains)]  # each gain from the start
-        return completed(self._plant, estimates, beginnings, self._gains[order])
+    def _candidates(
+        self, estimates: np.ndarray, proposed: np.ndarray, projected: np.ndarray, stored: np.ndarray
+    ) -> np.ndarray:
+        """Returns the plans tried first, shape (E, 7, N, m)."""
+        K, braking = self._gain, self._braking
+        beginnings = np.full((len(estimates), 7, self.horizon, self._plant.m), np.nan)
+        beginnings[:, :3, 0] = proposed[:, None]  # the proposal and then the regulator,
+        beginnings[:, 1, 1:] = stored[:, 1:]  # what is stored for later,
+        gains = [braking, K, K]  # or K;
+        beginnings[:, 3] = stored  # what is stored;
+        beginnings[:, 4, 0] = projected  # the projected input and then the regulator;
+        gains += [K, braking, K, braking]  # either gain from the start
+        return completed(self._plant, estimates, beginnings, np.array(gains))
 
-    def _solved(self, estimates: np.ndarray, tightening: Tightening, proposed: np.ndarray) -> list[Plan | None]:
+    def _best(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray, proposed: np.ndarray) -> Plans:
+        """Returns of P plans, shape (E, P, N, m), the certified one that begins closest, of equal ones the shortest."""
+        certified = self.test.certified(estimates, tightening, plans)
+        any_length = certified.any(axis=-1)
+        lengths = np.where(any_length, certified.argmax(axis=-1) + 1, 0)
+        distances = np.sqrt(np.square(plans[:, :, 0] - proposed[:, None]).sum(axis=-1))
+        distances = np.where(any_length, distances, np.inf)
+        tied = distances == distances.min(axis=1, keepdims=True)
+        best = np.where(tied, lengths, self.horizon + 1).argmin(axis=1)
+        rows = np.arange(len(plans))
+        return Plans(plans[rows, best], lengths[rows, best], distances[rows, best])
+
+    def _solved(self, estimates: np.ndarray, tightening: Tightening, proposed: np.ndarray) -> Plans:
         """Returns what of the program's plans is certified, as inputs that can be applied.
 
         The program is solved for the whole horizon: on the registered plants that admits as much, and comes as close,
@@ -102,22 +135,4 @@ class Planner:
                 tried[e] = expressible(found, limits)
                 if (np.abs(found[0] - u) <= AS_PROPOSED * limits).all():
                     tried[e, 0, 0] = u
-        certified = self.test.certified(estimates, tightening, tried)
-        return [_closest(*each) for each in zip(tried, certified, proposed, strict=True)]
-
-
-def _closest(plans: np.ndarray, certified: np.ndarray, proposed: np.ndarray) -> Plan | None:
-    """Returns the certified plan with the closest first input, of equal ones the shortest.
-
-    Args:
-        plans: Shape (P, N, m).
-        certified: Which of their first parts are, shape (P, N).
-        proposed: Shape (m,).
-    """
-    if not certified.any():
-        return None
-    lengths = np.where(certified.any(axis=1), certified.argmax(axis=1) + 1, 0)
-    distances = np.sqrt(np.square(plans[:, 0] - proposed).sum(axis=1))
-    order = sorted((float(distances[p]), int(lengths[p]), p) for p in np.flatnonzero(lengths))
-    distance, length, best = order[0]
-    return Plan(plans[best, :length].copy(), distance)
+        return self._best(estimates, tightening, tried, proposed)

@@ -47,19 +47,20 @@ class Prediction:
         self.size_forced = read_only(np.cumsum(pushes, axis=0))
         self.rounding = read_only(8.0 * (n + m) * (np.arange(1, steps + 1) + 2.0) * float(np.finfo(float).eps))
         self.ends = tuple(EndTest(first, self, j) for j in range(steps))
-        self._free = np.ascontiguousarray(self.free.reshape(steps * n, n).T)
-        self._forced = np.ascontiguousarray(self.forced.reshape(steps * n, steps * m).T)
+        self._free = np.ascontiguousarray(self.free.reshape(steps * n, n))
+        self._forced = np.ascontiguousarray(self.forced.reshape(steps * n, steps * m))
 
     def centers(self, estimates: np.ndarray, plans: np.ndarray) -> np.ndarray:
-        """Returns c_1..c_N, shape (E, P, N, n).
+        """Returns c_1..c_N, shape (N, n, E, P).
 
         Args:
             estimates: x_hat, shape (E, n).
             plans: Inputs of P plans for each, shape (E, P, N, m) [physical units]; zero beyond a plan's end.
         """
         count, number = plans.shape[:2]
-        moved = (estimates @ self._free)[:, None] + plans.reshape(count, number, -1) @ self._forced
-        return moved.reshape(count, number, self.steps, self.plant.n)
+        pushed = (self._forced @ plans.reshape(count * number, -1).T).reshape(-1, count, number)
+        moved = (self._free @ estimates.T)[..., None] + pushed
+        return moved.reshape(self.steps, self.plant.n, count, number)
 
 
 class EndTest(OneStepTest):
