@@ -5,6 +5,7 @@ import pytest
 
 from ncs_gym import Ellipsoid, NCSEnv, NCSVectorEnv
 from shields import SafetyFilter, SafetyShield, VectorSafetyShield
+from shields.lookahead.planner import Plans
 from shields.runtime.guarantee import starts_in_box
 from tests.certificates import certificate_of
 from tests.shields.lookahead.adversary import box_ellipsoid, case
@@ -82,7 +83,12 @@ def test_an_estimate_proves_the_box_only_with_room_for_its_error():
 def test_a_projected_input_leaves_nothing_of_an_earlier_plan(monkeypatch):
     plant, horizon, _, contract = case("cruise", "bursts")
     shield = SafetyFilter(certificate_of(plant, contract), plant, "lookahead", horizon=horizon)
-    monkeypatch.setattr(shield.lookahead.planner, "find", lambda estimates, *rest: [None] * len(estimates))
+
+    def nothing_found(estimates, *rest):
+        count = len(estimates)
+        return Plans(np.full((count, horizon, plant.m), np.nan), np.zeros(count, np.int64), np.full(count, np.inf))
+
+    monkeypatch.setattr(shield.lookahead.planner, "find", nothing_found)
     rng, shape, stored = np.random.default_rng(0), shield.certificate.error_shapes[0], np.zeros((2, plant.m))
     kept, reach = 0, np.sqrt(np.diag(shield.certificate.L))
     for _ in range(100):
