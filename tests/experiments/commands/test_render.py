@@ -74,6 +74,13 @@ def test_lookahead_is_drawn_with_its_plan(tmp_path):
     assert plans[1].sum() > plans[1][plane].sum()  # the legend
 
 
+def test_stored_plan_keeps_its_color_in_a_gif(tmp_path):
+    render(settings(shield="lookahead", steps=12, out=tmp_path / "a.gif"))
+    with Image.open(tmp_path / "a.gif") as image:
+        image.seek(image.n_frames - 1)
+        assert (np.asarray(image.convert("RGB")) == theme.PLAN).all(axis=2).sum() > 20
+
+
 def test_last_picture_alone_and_scaling(tmp_path):
     render(settings(shield="none", out=tmp_path / "last.png", width=321))
     with Image.open(tmp_path / "last.png") as image:
