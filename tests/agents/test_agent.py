@@ -75,15 +75,16 @@ def test_shared_folder_has_the_agent_its_shield_and_a_card(agent, certificate, t
     np.testing.assert_array_equal(Agent.load(shared).act(OBSERVATIONS), agent.act(OBSERVATIONS))
 
 
-def test_program_on_the_card_loads_the_agent_and_its_shield(agent, certificate, tmp_path, monkeypatch):
-    agent.save(tmp_path, ShieldSettings(certificate))
+@pytest.mark.parametrize(("mode", "horizon"), [("project", None), ("lookahead", 4)])
+def test_program_on_the_card_loads_the_agent_and_its_shield(agent, certificate, tmp_path, monkeypatch, mode, horizon):
+    agent.save(tmp_path, ShieldSettings(certificate, mode, horizon=horizon))
     monkeypatch.chdir(tmp_path)
     program = (tmp_path / "README.md").read_text().partition("```python\n")[2].partition("```")[0]
     names = {}
     exec(program, names)
     assert names["agent"].checksum == agent.checksum
     loop = names["loop"]
-    assert (loop.env, loop.channel, loop.shield) == (CRUISE, None, ShieldSettings(certificate))
+    assert (loop.env, loop.channel, loop.shield) == (CRUISE, None, ShieldSettings(certificate, mode, horizon=horizon))
 
 
 def test_card_without_a_shield_names_none(folder, agent, certificate):
