@@ -25,6 +25,7 @@ from agents.settings import AgentSettings
 from agents.sharing.card import card_text
 from ncs_gym import Channel, GilbertElliott
 from shields.atomic_write import write_atomically
+from shields.runtime.filter import LONGEST_HORIZON, MODES
 
 _FORMAT = "ncs-gym agent 1"
 
@@ -78,6 +79,8 @@ class Agent:
         model: The stable-baselines3 model.
         normalization: Normalization of the model's observations.
         residual_gain: Normalized gain, shape (m, n), to whose action that of the model is added; None for none.
+        shield_mode: Mode of the shield that the agent was trained behind; None for no shield.
+        horizon: Horizon of that shield in mode "lookahead" [steps]; None in other modes.
     """
 
     algorithm: str
@@ -87,6 +90,8 @@ class Agent:
     model: BaseAlgorithm
     normalization: Normalization
     residual_gain: np.ndarray | None = None
+    shield_mode: str | None = None
+    horizon: int | None = None
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Returns deterministic actions, shape (N, m), for raw observations, shape (N, entries)."""
@@ -110,6 +115,7 @@ class Agent:
             "settings": asdict(self.settings),
             "env": self.env,
             "channel": None if self.channel is None else asdict(self.channel),
+            "shield": None if self.shield_mode is None else {"mode": self.shield_mode, "horizon": self.horizon},
             "plant": _plant_fingerprint(self.env),
             "normalization": {
                 "mean": self.normalization.mean.tolist(),
@@ -212,6 +218,7 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         raise AgentError(f"the agent is of an unknown algorithm, {algorithm!r}")
     settings = ALGORITHMS[algorithm][1](**content["settings"])
     channel = _channel_from_json(content["channel"])
+    shield_mode, horizon = _shield_from_json(content.get("shield"))
     model = build_model(algorithm, SB3VecEnv(ControlLoop(env=env_id, channel=channel).vector(1)), settings, seed=0)
     _, parameters, _ = load_from_zip_file(io.BytesIO(weights), load_data=False, device="cpu")
     model.set_parameters(parameters, exact_match=True, device="cpu")
@@ -234,7 +241,19 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         model=model,
         normalization=Normalization(mean, variance, float(numbers["epsilon"]), float(numbers["clip"])),
         residual_gain=gain,
+        shield_mode=shield_mode,
+        horizon=horizon,
     )
+
+
+def _shield_from_json(content: dict[str, Any] | None) -> tuple[str | None, int | None]:
+    """Returns mode and horizon of the shield that an agent was trained behind; None each for no shield."""
+    if content is None:
+        return None, None
+    mode, horizon = content["mode"], content["horizon"]
+    if mode not in MODES or not (horizon is None or (type(horizon) is int and 1 <= horizon <= LONGEST_HORIZON)):
+        raise AgentError("the agent is damaged: there is no shield of that mode and horizon")
+    return mode, horizon
 
 
 def _digest(content: Any) -> str:

@@ -15,6 +15,7 @@ from agents.loop_wrappers import CostPenalty, ResidualActions
 from agents.settings import LagrangianSettings
 from ncs_gym import Channel
 from shields import Certificate, SafetyShield, VectorSafetyShield
+from shields.runtime.filter import DEFAULT_HORIZON
 
 
 @dataclass(frozen=True)
@@ -23,13 +24,25 @@ class ShieldSettings:
 
     Attributes:
         certificate: Certificate of the safe set; it is verified when the shield is built.
-        mode: Mode of `SafetyShield`: "project", "switch", "boundary" or "monitor".
+        mode: Mode of `SafetyShield`: "project", "lookahead", "switch", "boundary" or "monitor".
         penalty: Subtracted from the reward for every intervention.
+        horizon: Longest plan of mode "lookahead" [steps]; None becomes the shield's default there.
     """
 
     certificate: Certificate
     mode: str = "project"
     penalty: float = 0.0
+    horizon: int | None = None
+
+    def __post_init__(self) -> None:
+        """Puts the default in the place of a horizon that is not given, so that whoever keeps it keeps a number."""
+        if self.mode == "lookahead" and self.horizon is None:
+            object.__setattr__(self, "horizon", DEFAULT_HORIZON)
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of `SafetyShield` and `VectorSafetyShield` after the environment."""
+        return {name: getattr(self, name) for name in ("certificate", "mode", "penalty", "horizon")}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -67,10 +80,8 @@ class ControlLoop:
 
     def single(self, **settings: Any) -> gym.Env:
         """Returns one environment, without the penalty of a violation; `settings` are passed to `gym.make`."""
-        env, shield = gym.make(self.env, **self._settings(settings)), self.shield
-        if shield is None:
-            return env
-        return SafetyShield(env, shield.certificate, mode=shield.mode, penalty=shield.penalty)
+        env = gym.make(self.env, **self._settings(settings))
+        return env if self.shield is None else SafetyShield(env, **self.shield.arguments)
 
     def vector(self, count: int, **settings: Any) -> VectorEnv:
         """Returns `count` environments: the id's own vector environment, or gymnasium's of single environments."""
@@ -79,8 +90,7 @@ class ControlLoop:
         else:
             envs = gym.make_vec(self.env, num_envs=count, **self._settings(settings))
             if self.shield is not None:
-                mode, penalty = self.shield.mode, self.shield.penalty
-                envs = VectorSafetyShield(envs, self.shield.certificate, mode=mode, penalty=penalty)
+                envs = VectorSafetyShield(envs, **self.shield.arguments)
         if self.filter is not None:
             envs = self.filter(envs)
         if self.residual_gain is not None:

@@ -68,7 +68,7 @@ class _Rollout:
         if self._terminates and isinstance(self._envs.unwrapped, NCSVectorEnv):
             self._envs = loop.vector(count, terminate_on_violation=False)
         self._running = np.ones(count, np.bool_)
-        names = ("return", "steps", "violations", "estimate_violations", "interventions")
+        names = ("return", "steps", "violations", "estimate_violations", "interventions", "planned")
         self._totals = {name: np.zeros(count) for name in names}
         self._guaranteed, self._level = np.ones(count, np.bool_), np.zeros(count)
 
@@ -104,6 +104,7 @@ class _Rollout:
                 violation_steps=int(totals["violations"][e]),
                 estimate_violation_steps=int(totals["estimate_violations"][e]),
                 interventions=int(totals["interventions"][e]),
+                planned=int(totals["planned"][e]),
                 guaranteed=bool(self._guaranteed[e]),
                 largest_level=float(self._level[e]) if self._level_matrix is not None else float("nan"),
             )
@@ -118,6 +119,7 @@ class _Rollout:
             "violations": info["cost"] > 0.0,
             "estimate_violations": np.abs(info["estimate"] @ self._C.T).max(axis=1) > 1.0,
             "interventions": info.get("shield_intervened", np.zeros(len(rewards), np.bool_)),
+            "planned": info.get("shield_plan_length", np.zeros(len(rewards), np.int64)) > 0,
         }
         for name, value in values.items():
             self._totals[name] += np.where(self._running, value, 0)

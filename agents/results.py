@@ -38,6 +38,8 @@ class Episode:
         interventions: Steps in which the shield intervened, or would have in mode "monitor".
         guaranteed: Whether the shield's guarantee held at every step; False without a shield.
         largest_level: Largest x'Mx of the true state; NaN without a certificate.
+        planned: Steps after whose decision the shield of mode "lookahead" had inputs of a certified plan in store; 0 in
+            other modes.
     """
 
     index: int
@@ -48,6 +50,7 @@ class Episode:
     interventions: int
     guaranteed: bool
     largest_level: float
+    planned: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -105,4 +105,6 @@ def _agent(
         model=model,
         normalization=Normalization.of(env),
         residual_gain=loop.residual_gain,
+        shield_mode=loop.shield and loop.shield.mode,
+        horizon=loop.shield and loop.shield.horizon,
     )

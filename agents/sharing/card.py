@@ -53,7 +53,7 @@ def card_text(
         "environment": f"`{env}`",
         "plant": "none" if plant is None else f"fingerprint `{plant.fingerprint}`",
         "channel": _channel(env, channel),
-        "shield": "none" if shield is None else f'mode "{shield.mode}", penalty {shield.penalty:g} per intervention',
+        "shield": _shield_text(shield),
         "settings": ", ".join(f"{each.name}={getattr(settings, each.name)!r}" for each in fields(settings)),
         "SHA-256 of the weights": f"`{checksum}`",
     }
@@ -64,7 +64,9 @@ def card_text(
         parts += [f"`certificate.json`, SHA-256 `{shield.certificate.checksum}`; `ncs verify certificate.json`", ""]
     if evaluation is not None:
         parts += ["## Evaluation", "", *_figures(evaluation), ""]
-    known = "" if shield is None else f', shield=ShieldSettings(Certificate.load("certificate.json"), "{shield.mode}")'
+    known = "" if shield is None else f', shield=ShieldSettings(Certificate.load("certificate.json"), "{shield.mode}"'
+    if shield is not None:
+        known += ")" if shield.horizon is None else f", horizon={shield.horizon})"
     imports = "" if shield is None else ", ShieldSettings\nfrom shields import Certificate"
     return "\n".join([*parts, _USE.format(imports=imports, shield=known)])
 
@@ -89,3 +91,11 @@ def _figures(evaluation: Evaluation) -> list[str]:
         f"- interventions of the shield: {interventions} of {steps} steps",
         f"- episodes in which the guarantee held throughout: {sum(each.guaranteed for each in episodes)}",
     ]
+
+
+def _shield_text(shield: ShieldSettings | None) -> str:
+    """Returns mode, horizon and penalty of a shield in words."""
+    if shield is None:
+        return "none"
+    horizon = "" if shield.horizon is None else f", plans of at most {shield.horizon} steps"
+    return f'mode "{shield.mode}"{horizon}, penalty {shield.penalty:g} per intervention'

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from experiments.analysis.text_table import text_table
@@ -11,15 +12,16 @@ _HEADERS = (
     ("", "violating", "over-", "violating", "violating", "left", "over-", "return"),
     ("", "steps", "ridden", "episodes", "steps", "S", "ridden", "[95 % CI]"),
 )
-# Columns of these rows that are about the evaluation.
-_EVALUATION = (0, 3, 4, 5, 6, 7)
+# Number of columns after the first that are about the training.
+_TRAINING_COLUMNS = 2
 
 
 def summary_text(arms: dict[str, dict[str, Any]], references: dict[str, dict[str, Any]]) -> str:
     """Returns the table for a terminal; references stand below a rule.
 
     Violating episodes have their exact interval, the return has Student's (`experiments.analysis.summary`). "Left S"
-    counts episodes in which the true state was outside the safe set at some step.
+    counts episodes in which the true state was outside the safe set at some step, "from a plan" the steps after whose
+    decision the shield of mode "lookahead" had inputs of a certified plan in store.
     """
     return text_table(_rows(arms | references), rules=(len(_HEADERS), len(_HEADERS) + len(arms)))
 
@@ -27,14 +29,23 @@ def summary_text(arms: dict[str, dict[str, Any]], references: dict[str, dict[str
 def condition_text(condition: str, arms: dict[str, dict[str, Any]], references: dict[str, dict[str, Any]]) -> str:
     """Returns the table of the evaluation under a condition, with its name in the corner."""
     rows = _rows({name: arm | arm["conditions"][condition] for name, arm in (arms | references).items()})
-    rows = [[row[i] for i in _EVALUATION] for row in rows]
-    rows[0] = [f"{condition}:", *[""] * (len(_EVALUATION) - 1)]
+    rows = [[row[0], *row[1 + _TRAINING_COLUMNS :]] for row in rows]
+    rows[0] = [f"{condition}:", *[""] * (len(rows[0]) - 1)]
     return text_table(rows, rules=(len(_HEADERS), len(_HEADERS) + len(arms)))
+
+
+def _with_plans(rows: list[list[str]], arms: Mapping[str, dict[str, Any]]) -> list[list[str]]:
+    """Returns the rows with a column of the steps that live from a plan before the last one, if an arm looks ahead."""
+    if not any(arm["mode"] == "lookahead" for arm in arms.values()):
+        return rows
+    shares = [f"{100 * arm['plan_rate']:.1f} %" if arm["mode"] == "lookahead" else "-" for arm in arms.values()]
+    cells = ["", "from a", "plan", *shares]
+    return [[*row[:-1], cell, row[-1]] for row, cell in zip(rows, cells, strict=True)]
 
 
 def _rows(arms: dict[str, dict[str, Any]]) -> list[list[str]]:
     """Returns the header's rows, then one row of text per summary of an arm."""
-    return [*map(list, _HEADERS), *([name, *_cells(arm)] for name, arm in arms.items())]
+    return _with_plans([*map(list, _HEADERS), *([name, *_cells(arm)] for name, arm in arms.items())], arms)
 
 
 def _cells(arm: dict[str, Any]) -> list[str]:

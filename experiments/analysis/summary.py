@@ -27,7 +27,9 @@ def summarize_arm(results: Sequence[RunResult], *, fixed_policy: bool) -> dict[s
     dependent. `eval_return_ci95` is Student's interval over the mean returns of the runs (null for a single run),
     because training differs from run to run; for a policy that is the same in all runs (`fixed_policy`) it is over the
     episodes. The bootstrap intervals are over the same values. `eval_episodes_outside_set` counts episodes in which the
-    true state left the safe set. `conditions` holds the same numbers of the evaluation under each other condition.
+    true state left the safe set. `plan_rate` is the share of steps that live from a plan: after whose decision inputs
+    of a certified plan are in store (mode "lookahead", 0 in others). `conditions` holds the same numbers of the
+    evaluation under each other condition.
     """
     train_steps = sum(result.train_steps for result in results)
     conditions = {
@@ -68,6 +70,7 @@ def _evaluated(runs: Sequence[Sequence[Episode]], *, fixed_policy: bool) -> dict
         "eval_return_ci95_over": "episodes" if fixed_policy else "runs",
         "eval_return_by_run": means,
         "intervention_rate": sum(episode.interventions for episode in episodes) / eval_steps,
+        "plan_rate": sum(episode.planned for episode in episodes) / eval_steps,
         "guaranteed_episodes": sum(episode.guaranteed for episode in episodes),
         "largest_level": max(episode.largest_level for episode in episodes),
     }

@@ -6,17 +6,18 @@ import zlib
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from experiments.attack.attack_cases import attack_cases
 from experiments.attack.safety_counts import SafetyCounts
-from experiments.attack.worst_case import GaussianVectorEnv, HostileAgents, WorstCaseVectorEnv
+from experiments.attack.worst_case import GaussianVectorEnv, HostileAgents, WorstCaseVectorEnv, starts_in_box
 from experiments.runs.provenance import json_digest, versions
 from ncs_gym.registration import EPISODE_STEPS
 from shields import Certificate, VectorSafetyShield
 
-# Modes of the shield, one per batch in turn.
+# Modes of the shield, one per batch in turn, where none is chosen.
 SHIELD_MODES = ("project", "switch", "boundary")
 # Episodes start on the boundary of S; the largest level is taken from this step on.
 SETTLING_STEPS = 20
@@ -34,6 +35,8 @@ class Campaign:
         gaussian: Whether noise is Gaussian, without a bound; otherwise it is the worst within the bounds.
         delta: Replaces the plants' own level at which Gaussian noise is inside the bounds; None keeps it.
         env: Id, or "module:id", of the only environment to attack; None for all.
+        mode: Only mode of the shield; None for `SHIELD_MODES`.
+        horizon: Longest plan of mode "lookahead" [steps]; None in other modes.
     """
 
     seed: int
@@ -43,6 +46,20 @@ class Campaign:
     gaussian: bool = False
     delta: float | None = None
     env: str | None = None
+    mode: str | None = None
+    horizon: int | None = None
+
+    @property
+    def looks_ahead(self) -> bool:
+        """Whether the shield is that of mode "lookahead", whose claim is the safe box."""
+        return self.mode == "lookahead"
+
+    @property
+    def kinds_of_batches(self) -> int:
+        """Number of kinds of batches, which take turns."""
+        if self.looks_ahead:
+            return 2
+        return len(SHIELD_MODES) if self.shielded and self.mode is None else 1
 
     @property
     def key(self) -> str:
@@ -82,26 +99,30 @@ def run_batch(campaign: Campaign, batch: MonteCarloBatch, certificate: Path) -> 
     """
     shields = list(_shields(campaign, batch.case, certificate).values())
     shield = shields[batch.index % len(shields)]
+    plant = shield.filter.plant
     root = np.linalg.inv(np.linalg.cholesky(shield.certificate.L))
     seeds = np.random.SeedSequence([campaign.seed, zlib.crc32(batch.case.encode()), batch.index])
     seed, policy_seed = seeds.generate_state(2, np.uint64).tolist()
-    _, info = shield.reset(seed=seed >> 1)
     rng = np.random.default_rng(policy_seed)
-    agents = HostileAgents(campaign.envs, shield.filter.plant, shield.certificate, rng)
-    exits = violations = interventions = 0
+    info = _begin(campaign, shield, seed >> 1, rng)
+    agents = HostileAgents(campaign.envs, plant, shield.certificate, rng)
+    outside_starts = np.count_nonzero(_squares(root, info) > 1.0)
+    exits = violations = interventions = planned = 0
     unproved = campaign.envs - np.count_nonzero(info["shield_guaranteed"])
     broken, level = np.zeros(campaign.envs, np.bool_), 0.0
     for step in range(EPISODE_STEPS):
         *_, info = shield.step(agents.act(info["estimate"]))
-        squares = np.square(root @ info["state"].T).sum(axis=0)
+        squares = _squares(root, info)
         outside_set, outside_box = ~(squares <= 1.0), info["cost"] != 0.0
         exits += np.count_nonzero(outside_set)
         violations += np.count_nonzero(outside_box)
         interventions += np.count_nonzero(info["shield_intervened"])
         unproved += campaign.envs - np.count_nonzero(info["shield_guaranteed"])
-        broken |= outside_set | outside_box
+        planned += np.count_nonzero(info.get("shield_plan_length", 0))
+        broken |= outside_box | (outside_set & (not campaign.looks_ahead))
         if step >= SETTLING_STEPS:
-            level = max(level, float(np.nan_to_num(squares, nan=np.inf).max()))
+            reached = info["constraint_values"] + 1.0 if campaign.looks_ahead else np.sqrt(squares)
+            level = max(level, float(np.nan_to_num(reached, nan=np.inf).max()))
     return SafetyCounts(
         steps=campaign.batch_steps,
         episodes=campaign.envs,
@@ -110,13 +131,38 @@ def run_batch(campaign: Campaign, batch: MonteCarloBatch, certificate: Path) -> 
         broken_episodes=int(broken.sum()),
         interventions=int(interventions),
         unproved=int(unproved),
-        level=level**0.5,
+        level=level,
+        planned=int(planned),
+        outside_starts=int(outside_starts),
     )
+
+
+def _begin(campaign: Campaign, shield: VectorSafetyShield, seed: int, rng: np.random.Generator) -> dict[str, Any]:
+    """Starts the episodes of a batch and returns their infos.
+
+    In mode "lookahead" half of the starts are drawn from the box; those for which no first plan is certified, of which
+    nothing is claimed, are replaced by others on the boundary of S.
+    """
+    if not campaign.looks_ahead:
+        return shield.reset(seed=seed)[1]
+    plant, certificate, count = shield.filter.plant, shield.certificate, campaign.envs
+    _, info = shield.reset(seed=seed, options={"state": starts_in_box(rng, plant, certificate, count)})
+    if not info["shield_guaranteed"].all():
+        states = (1.0 - 1e-9) * certificate.safe_set.sample_boundary(rng, count)
+        _, info = shield.reset(options={"state": states, "reset_mask": ~info["shield_guaranteed"]})
+    return info
+
+
+def _squares(root: np.ndarray, info: dict[str, Any]) -> np.ndarray:
+    """Returns x'Mx of the true states, shape (N,)."""
+    return np.square(root @ info["state"].T).sum(axis=0)
 
 
 @lru_cache(maxsize=1)  # a shield's tables may take a hundred megabytes
 def _shields(campaign: Campaign, case: str, certificate: Path) -> dict[str, VectorSafetyShield]:
-    """Returns the shields of all modes around the same environments.
+    """Returns the shields of all kinds of batches: those of S around the same environments, one for each mode.
+
+    In mode "lookahead" disturbances push out of S in every other batch, and towards the box in between.
 
     Raises:
         CertificateError: If the certificate is damaged or does not verify for the case's plant.
@@ -126,5 +172,11 @@ def _shields(campaign: Campaign, case: str, certificate: Path) -> dict[str, Vect
     settings = {"plant": chosen.plant, "channel": chosen.channel, "contract": chosen.contract}
     kind = GaussianVectorEnv if campaign.gaussian else WorstCaseVectorEnv
     env = kind(campaign.envs, loaded, **settings)
-    modes = SHIELD_MODES if campaign.shielded else ("monitor",)
+    if campaign.looks_ahead:
+        other = env if campaign.gaussian else WorstCaseVectorEnv(campaign.envs, loaded, pushes_to_box=True, **settings)
+        envs = {"to the box": other, "out of S": env}
+        return {
+            name: VectorSafetyShield(each, loaded, "lookahead", horizon=campaign.horizon) for name, each in envs.items()
+        }
+    modes = (campaign.mode,) if campaign.mode else SHIELD_MODES if campaign.shielded else ("monitor",)
     return {mode: VectorSafetyShield(env, loaded, mode) for mode in modes}

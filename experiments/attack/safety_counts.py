@@ -12,15 +12,20 @@ from experiments.analysis.statistics import clopper_pearson
 class SafetyCounts:
     """Counts of some episodes.
 
+    The claim of mode "lookahead" is the safe box alone: there only violations break an episode.
+
     Attributes:
         steps: Number of simulated steps.
         episodes: Number of episodes.
         exits: Number of steps whose true state lay outside S.
         violations: Number of steps whose true state lay outside the safe box.
-        broken_episodes: Number of episodes with an exit or a violation.
+        broken_episodes: Number of episodes with an exit or a violation; in mode "lookahead" with a violation.
         interventions: Number of steps in which the shield intervened.
         unproved: Number of steps at which the shield's proof did not hold.
-        level: Largest sqrt(x'Mx) of a true state after `monte_carlo_batch.SETTLING_STEPS`.
+        level: Largest sqrt(x'Mx) of a true state after `monte_carlo_batch.SETTLING_STEPS`; in mode "lookahead" the
+            largest |c_j x|.
+        planned: Number of steps after whose decision inputs of a certified plan were in store.
+        outside_starts: Number of episodes that began outside S, with a certified plan.
     """
 
     steps: int = 0
@@ -31,6 +36,8 @@ class SafetyCounts:
     interventions: int = 0
     unproved: int = 0
     level: float = 0.0
+    planned: int = 0
+    outside_starts: int = 0
 
     def __add__(self, other: SafetyCounts) -> SafetyCounts:
         """Returns the counts of both."""
@@ -42,7 +49,7 @@ class SafetyCounts:
 
     @property
     def margin(self) -> float:
-        """Smallest 1 - sqrt(x'Mx): the distance of the states from the boundary of S, in units of S."""
+        """Smallest 1 - sqrt(x'Mx), or in mode "lookahead" 1 - |c_j x|: the distance from the boundary."""
         return 1.0 - self.level
 
     @property
@@ -52,7 +59,7 @@ class SafetyCounts:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Exact 95 % interval of the probability that an episode leaves S or the box."""
+        """Exact 95 % interval of the probability that an episode is broken."""
         return clopper_pearson(self.broken_episodes, self.episodes)
 
     def document(self) -> dict[str, float]:

@@ -21,11 +21,14 @@ class WorstCaseVectorEnv(NCSVectorEnv):
     Args:
         num_envs: N.
         certificate: Certificate of the safe set S.
+        pushes_to_box: Whether disturbances push towards the nearest face of the safe box instead.
         settings: Those of `NCSEnv` without disturbance and initial set.
     """
 
-    def __init__(self, num_envs: int, certificate: Certificate, **settings: Any) -> None:
-        push = AdversarialDisturbance(certificate.M)
+    def __init__(
+        self, num_envs: int, certificate: Certificate, *, pushes_to_box: bool = False, **settings: Any
+    ) -> None:
+        push = AdversarialDisturbance(None if pushes_to_box else certificate.M)
         super().__init__(num_envs, disturbance=push, initial_set=certificate.safe_set, **settings)
         self._process.sensor_noise = BlockSampler(self._extreme_noise, num_envs)
 
@@ -79,6 +82,19 @@ class GaussianVectorEnv(NCSVectorEnv):
         """Returns states on the boundary of S and Gaussian first errors, shape (n, count) each."""
         states = self.single.initial_set.sample_boundary(self.np_random, count)
         return (1.0 - 1e-9) * states.T, self._process.first_error(self.np_random, count)
+
+
+def starts_in_box(rng: np.random.Generator, plant: LinearPlant, certificate: Certificate, count: int) -> np.ndarray:
+    """Returns starts, shape (count, n): half on the boundary of S, half drawn uniformly from the box.
+
+    In directions that no row of the box limits, `half_widths` limit them.
+    """
+    states = (1.0 - 1e-9) * certificate.safe_set.sample_boundary(rng, count)
+    chosen, missing = np.arange(count) % 2 == 1, np.arange(count) % 2 == 1
+    while missing.any():
+        states[missing] = rng.uniform(-1.0, 1.0, (int(missing.sum()), plant.n)) * plant.half_widths
+        missing = chosen & (np.abs(states @ plant.C.T).max(axis=1) > 1.0)
+    return states
 
 
 class HostileAgents:

@@ -11,14 +11,14 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 
 from experiments.baselines.predictive import PredictiveFilter
 from experiments.baselines.trusting import TrustingFilter
-from ncs_gym import LinearPlant, NCSVectorEnv
+from ncs_gym import NCSVectorEnv
 from shields import Certificate
 
 # Maps estimates (N, n), proposed inputs (N, m) and where an episode has just begun (N,) to the inputs to apply, (N, m).
 Rule = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 # How each filter is made from a certificate and its plant.
-FILTERS: dict[str, Callable[[Certificate, LinearPlant], Rule]] = {
+FILTERS: dict[str, Callable[..., Rule]] = {
     "trusting": TrustingFilter,
     "trusting:lookahead": partial(TrustingFilter, mode="lookahead"),
     "psf": PredictiveFilter,
@@ -77,14 +77,17 @@ class EstimateFilter(VectorWrapper):
         return observation, rewards - self.penalty * intervened, terminated, truncated, info
 
 
-def filtered(env: VectorEnv, name: str, certificate: Certificate, penalty: float = 0.0) -> EstimateFilter:
-    """Returns a vector environment behind the filter of a name in `FILTERS`.
+def filtered(
+    env: VectorEnv, name: str, certificate: Certificate, penalty: float = 0.0, horizon: int | None = None
+) -> EstimateFilter:
+    """Returns a vector environment behind the filter of a name in `FILTERS`; "trusting:lookahead" takes a horizon.
 
     Raises:
         ValueError: If its innermost environment is not an `NCSVectorEnv`.
         CertificateError: If the certificate does not verify for the environment's plant.
     """
-    return EstimateFilter(env, FILTERS[name](certificate, _environment_behind(env).plant), penalty)
+    given = {} if horizon is None else {"horizon": horizon}
+    return EstimateFilter(env, FILTERS[name](certificate, _environment_behind(env).plant, **given), penalty)
 
 
 def _environment_behind(env: VectorEnv) -> NCSVectorEnv:

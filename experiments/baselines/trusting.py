@@ -21,14 +21,17 @@ class TrustingFilter:
         certificate: Verified exactly here.
         plant: The plant it was made for.
         mode: "project" or "lookahead"; see `SafetyFilter`.
+        horizon: Longest plan of mode "lookahead" [steps]; None for that of `SafetyFilter`.
 
     Raises:
         CertificateError: If the certificate does not verify for the plant.
         ValueError: If there is no such mode.
     """
 
-    def __init__(self, certificate: Certificate, plant: LinearPlant, mode: str = "project") -> None:
-        self._filter = SafetyFilter(certificate, plant, mode)
+    def __init__(
+        self, certificate: Certificate, plant: LinearPlant, mode: str = "project", horizon: int | None = None
+    ) -> None:
+        self._filter = SafetyFilter(certificate, plant, mode, horizon)
         self._no_error = self._filter.errors_of_many(np.zeros((1, plant.n, plant.n)))
         self._plans = np.empty((0, plant.m, 0))
 

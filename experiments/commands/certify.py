@@ -11,30 +11,27 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from experiments.analysis.text_table import text_table
 from experiments.attack import MonteCarloBatch, SafetyCounts
 from experiments.attack.attack_cases import AttackCase, attack_cases
 from experiments.attack.campaign_execution import execute_batches
 from experiments.attack.counts_store import CountsStore
+from experiments.attack.counts_table import counts_table
 from experiments.attack.gaussian_table import GAUSSIAN_LEGEND, gaussian_table, require_within
-from experiments.attack.monte_carlo_batch import SETTLING_STEPS, SHIELD_MODES, Campaign
+from experiments.attack.monte_carlo_batch import Campaign
 from experiments.errors import SafetyBroken
 from experiments.runs import versions
 from experiments.settings import CertifySettings
 from shields import Certificate
 from shields.atomic_write import write_atomically
-
-_LEGEND = f"""failed: episodes that left S or the box; p <: upper end of the exact 95 % interval of their probability;
-margin: smallest 1 - sqrt(x'Mx) from step {SETTLING_STEPS} on (episodes start on the boundary); overridden: steps that
-the shield changed or, unshielded, would have changed"""
+from shields.runtime.filter import DEFAULT_HORIZON
 
 
 def certify(settings: CertifySettings) -> None:
     """Runs `ncs certify`.
 
     Raises:
-        SafetyBroken: If a shielded state left S or its box, or a proof did not hold; with Gaussian noise, if episodes
-            left S more often than the bound on their probability allows.
+        SafetyBroken: If a shielded state left S or its box (in mode "lookahead": its box), or a proof did not hold;
+            with Gaussian noise, if more episodes did so than the bound on their probability allows.
         ResultsError: If the stored counts are damaged.
         ValueError: If there is no environment of the given id.
         CertificateError: If a certificate in the folder is damaged.
@@ -48,6 +45,8 @@ def certify(settings: CertifySettings) -> None:
         gaussian=settings.noise == "gaussian",
         delta=settings.delta,
         env=settings.env,
+        mode=settings.mode,
+        horizon=(settings.horizon or DEFAULT_HORIZON) if settings.mode == "lookahead" else None,
     )
     cases = attack_cases(campaign.seed, campaign.random_plants, campaign.env)
     cases = {name: case.with_delta(campaign.delta) for name, case in cases.items()}
@@ -56,20 +55,21 @@ def certify(settings: CertifySettings) -> None:
     if campaign.env is not None:  # what a module registers may change
         keys = {case: f"{key} {cases[case].channel}" for case, key in keys.items()}
     store = CountsStore(settings.out / "tallies.jsonl", keys)
-    least = len(SHIELD_MODES) if campaign.shielded else 1
-    batches = _batches(list(cases), settings.steps / campaign.batch_steps, least)
+    batches = _batches(list(cases), settings.steps / campaign.batch_steps, campaign.kinds_of_batches)
     missing = {case: deque(each for each in some if each not in store.counts) for case, some in batches.items()}
     start, steps = time.perf_counter(), campaign.batch_steps * sum(map(len, missing.values()))
     execute_batches(campaign, missing, certificates, store, settings.jobs)
     seconds = time.perf_counter() - start
     counts = {case: sum((store.counts[each] for each in some), SafetyCounts()) for case, some in batches.items()}
     total = sum(counts.values(), SafetyCounts())
-    print(_table(counts, total), _LEGEND, sep="\n")
+    print(counts_table(counts | {"all": total}, looks_ahead=campaign.looks_ahead))
     limits = {name: case.escape_probability() for name, case in cases.items()} if campaign.gaussian else {}
     if limits:
         print("", gaussian_table(counts, limits), GAUSSIAN_LEGEND, sep="\n")
     if steps > 0:
-        print(f"{steps:,} steps in {seconds:.0f} s: {steps / seconds / 1e6:.2f} million per second")
+        rate = steps / seconds
+        speed = f"{rate / 1e6:.2f} million" if rate >= 1e5 else f"{rate:,.0f}"
+        print(f"{steps:,} steps in {seconds:.0f} s: {speed} per second")
     document = {"settings": asdict(campaign), "versions": versions(), "total": total.document()}
     document["cases"] = {case: each.document() for case, each in counts.items()}
     if limits:
@@ -77,10 +77,20 @@ def certify(settings: CertifySettings) -> None:
     write_atomically(settings.out / "certify.json", json.dumps(document, indent=1) + "\n")
     if campaign.shielded and campaign.gaussian:
         require_within(counts, limits)
-    elif campaign.shielded and (total.exits or total.violations or total.unproved):
-        raise SafetyBroken(
-            f"{total.exits:,} steps outside S, {total.violations:,} outside the box, {total.unproved:,} without a proof"
-        )
+    elif campaign.shielded:
+        _require_safe(total, campaign)
+
+
+def _require_safe(total: SafetyCounts, campaign: Campaign) -> None:
+    """Returns if the shield kept what it claims in every step.
+
+    Raises:
+        SafetyBroken: If it did not.
+    """
+    left_set = total.exits > 0 and not campaign.looks_ahead
+    if left_set or total.violations or total.unproved:
+        outside_set = "" if campaign.looks_ahead else f"{total.exits:,} steps outside S, "
+        raise SafetyBroken(f"{outside_set}{total.violations:,} outside the box, {total.unproved:,} without a proof")
 
 
 def _certificate_files(cases: dict[str, AttackCase], folder: Path) -> dict[str, Path]:
@@ -108,13 +118,3 @@ def _batches(cases: list[str], count: float, least: int) -> dict[str, list[Monte
         name: [MonteCarloBatch(name, index) for index in range(each + (number < extra))]
         for number, name in enumerate(cases)
     }
-
-
-def _table(counts: dict[str, SafetyCounts], total: SafetyCounts) -> str:
-    """Returns the results as text."""
-    rows = [["case", "steps", "outside S", "outside box", "episodes", "failed", "p <", "margin", "overridden"]]
-    for name, case in [*counts.items(), ("all", total)]:
-        numbers = case.steps, case.exits, case.violations, case.episodes, case.broken_episodes
-        rates = f"{case.bound:.1e}", f"{case.margin:.1e}", f"{case.interventions / case.steps:.1%}"
-        rows.append([name, *(f"{number:,}" for number in numbers), *rates])
-    return text_table(rows, rules=(1, len(rows) - 1))

@@ -147,10 +147,11 @@ def _findings(summary: dict[str, Any]) -> list[str]:
         if not arm["shielded"]:
             continue
         upper = 100.0 * arm["eval_violation_rate_ci95"][1]
+        limit = "may be left in this mode, the box may not" if arm["mode"] == "lookahead" else "ends at 1"
         proof = "no broken assumption was seen" if "gaussian_noise" in summary else "the proof held"
         findings += [
             f"{name}: {proof} in {arm['guaranteed_episodes']:,} of {arm['eval_episodes']:,} evaluation "
-            f"episodes; the largest x'Mx was {arm['largest_level']:.3f} (the safe set ends at 1).",
+            f"episodes; the largest x'Mx was {arm['largest_level']:.3f} (the safe set {limit}).",
             f"{name}: {arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,} episodes violating; from these "
             f"episodes alone at most {upper:.2f} % with 95 % confidence.",
         ]

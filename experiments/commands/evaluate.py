@@ -38,7 +38,8 @@ def evaluate(settings: EvaluateSettings) -> None:
     channel = settings.channel.applied_to(own) or agent.channel
     setup = ExperimentSetup.of(env_id, channel, settings.certificate)
     mode = None if settings.shield == "none" else settings.shield
-    shield = None if mode is None else ShieldSettings(setup.certificate, mode)
+    horizon = (settings.horizon or agent.horizon) if mode == "lookahead" else None
+    shield = None if mode is None else ShieldSettings(setup.certificate, mode, horizon=horizon)
     evaluated = evaluation.evaluate(
         ControlLoop(env=agent.env, channel=channel, shield=shield),
         lambda observations, infos: agent.act(observations),
@@ -55,6 +56,7 @@ def evaluate(settings: EvaluateSettings) -> None:
             "arms": arms,
             "env": agent.env,
             "channel": asdict(channel) if channel else None,
+            "horizon": shield and shield.horizon,
             "episodes": settings.episodes,
             "seed": settings.seed,
             "model": {"folder": str(settings.model), "sha256": agent.checksum},

@@ -65,7 +65,7 @@ class _EpisodeRenderer:
         self._env: gym.Env = gym.make(env_id, render_mode="rgb_array")
         self._policy = policy_by_name(settings.policy, env_id, ncs_env(self._env), settings.seed)
         if mode != "none":
-            self._env = SafetyShield(self._env, certificate, mode=mode)
+            self._env = SafetyShield(self._env, certificate, mode=mode, horizon=settings.horizon)
         self._observation, self._info = self._env.reset(seed=settings.seed)
         self.is_over, self._steps = False, 0
 

@@ -97,9 +97,11 @@ def _palette() -> Image.Image:
     marks = (*marks, theme.LATE_TEXT, theme.SHIELD, theme.BODYWORK)
     ramp = [theme.load_color(level) for level in np.linspace(0.6, 0.95, 9)]
     edges = [theme.blend(mark, ground, fraction) for mark, ground, fraction in product(marks, grounds, _EDGE_FRACTIONS)]
-    colors = list(dict.fromkeys([*grounds, *marks, theme.GRID, theme.CARGO, theme.CRATE, theme.GLASS, *ramp, *edges]))[
-        :255
+    plan = [
+        theme.blend(theme.PLAN, ground, fraction) for ground in (theme.PAPER, theme.SAFE_FILL) for fraction in (0, 0.5)
     ]
+    others = theme.GRID, theme.CARGO, theme.CRATE, theme.GLASS
+    colors = list(dict.fromkeys([*grounds, *marks, *others, *ramp, *plan, *edges]))[:255]
     image = Image.new("P", (1, 1))
     image.putpalette([part for color in colors for part in color])
     return image

@@ -111,6 +111,7 @@ class ExperimentSetup:
             episodes=settings.episodes,
             certificate=self.certificate,
             mode=arm.mode,
+            horizon=settings.horizon if arm.mode in ("lookahead", "trusting:lookahead") else None,
             filters_training=arm.filters_training,
             intervention_penalty=settings.intervention_penalty if arm.penalizes_interventions else 0.0,
             violation_penalty=price if fixed_price else 0.0,

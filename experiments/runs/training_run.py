@@ -48,6 +48,7 @@ class TrainingRun:
         episodes: Evaluation episodes.
         certificate: Certificate of the shield, which also defines x'Mx.
         mode: Mode of the shield, or name of another filter; None for neither.
+        horizon: Longest plan of modes that look ahead [steps]; None in other modes, and for the default.
         filters_training: Whether shield or filter act in training too.
         intervention_penalty: Subtracted from the training reward per intervention.
         violation_penalty: Subtracted from the training reward per violating step.
@@ -71,6 +72,7 @@ class TrainingRun:
     episodes: int
     certificate: Certificate
     mode: str | None
+    horizon: int | None = None
     filters_training: bool = True
     intervention_penalty: float = 0.0
     violation_penalty: float = 0.0
@@ -91,9 +93,10 @@ class TrainingRun:
         """Control loop that the policy is evaluated in, with the penalties of its training."""
         shield, wrapper = None, None
         if self.mode in FILTERS:
-            wrapper = partial(filtered, name=self.mode, certificate=self.certificate, penalty=self.intervention_penalty)
+            own = {"certificate": self.certificate, "penalty": self.intervention_penalty, "horizon": self.horizon}
+            wrapper = partial(filtered, name=self.mode, **own)
         elif self.mode is not None:
-            shield = ShieldSettings(self.certificate, self.mode, self.intervention_penalty)
+            shield = ShieldSettings(self.certificate, self.mode, self.intervention_penalty, self.horizon)
         return ControlLoop(
             env=self.env,
             channel=self.channel,

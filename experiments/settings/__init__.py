@@ -13,10 +13,10 @@ from experiments.settings.learning import (
     CompareSettings,
     EvaluateSettings,
     LearningSettings,
-    RenderSettings,
     SweepSettings,
     TrainSettings,
 )
+from experiments.settings.rendering import RenderSettings
 from experiments.settings.settings_file import config_defaults, save_settings, settings_json
 
 __all__ = [

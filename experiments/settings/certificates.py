@@ -8,6 +8,7 @@ from typing import Literal
 
 import tyro
 
+from experiments.settings.horizon import require_horizon
 from ncs_gym.plants.linear_plant import SMALLEST_DELTA
 
 
@@ -75,7 +76,7 @@ def _refuse_both(env: str | None, plant: Path | None) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class CertifySettings:
-    """Attacks shielded control loops within the assumptions, and counts the states that leave the safe set.
+    """Attacks shielded control loops within the assumptions, and counts the states that leave the safe set or box.
 
     The plants are those of the registered environments and random ones, behind every kind of channel. Disturbances push
     the next state farthest out, initial states and first estimation errors lie on the boundaries of their sets, sensor
@@ -88,6 +89,9 @@ class CertifySettings:
         random_plants: Number of random plants, each behind four kinds of channels.
         envs: Number of episodes in a batch, simulated side by side.
         jobs: Number of worker processes.
+        mode: Mode of the shield; by default project, switch and boundary in turn. The claim of lookahead is the box:
+            states may leave S, and half of the episodes are drawn from all of the box.
+        horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
         unshielded: Let the shield only watch, to see what happens without it.
         noise: "truncated" is the worst noise within the bounds; "gaussian" noise has none: it is drawn, next to
             the worst of the other disturbances, and the bound on the probability of an exit is printed.
@@ -102,6 +106,8 @@ class CertifySettings:
     random_plants: int = 4
     envs: int = 4096
     jobs: int = 2
+    mode: Literal["project", "lookahead", "switch", "boundary"] | None = None
+    horizon: int | None = None
     unshielded: bool = False
     noise: Literal["truncated", "gaussian"] = "truncated"
     delta: float | None = None
@@ -118,6 +124,9 @@ class CertifySettings:
             if getattr(self, name) < least:
                 flag = name.replace("_", "-")
                 raise ValueError(f"--{flag} must be at least {least}, got {getattr(self, name)}")
+        if self.unshielded and self.mode is not None:
+            raise ValueError(f"give either --mode {self.mode} or --unshielded, not both")
+        require_horizon(self.horizon, self.mode)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,10 +1,10 @@
-"""Settings of the commands that train agents, evaluate them or draw their episodes."""
+"""Settings of the commands that train agents or evaluate them."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Literal, Self
 
 import tyro
 
@@ -20,9 +20,10 @@ from experiments.settings.agent_overrides import (
 )
 from experiments.settings.backend import BackendSettings
 from experiments.settings.channel import ChannelSettings
+from experiments.settings.horizon import require_horizon
 
 Algorithm = Literal["PPO", "A2C", "SAC", "TD3", "TRPO", "TQC", "CrossQ"]
-Mode = Literal["project", "switch", "boundary", "lookahead"]
+Mode = Literal["project", "lookahead", "switch", "boundary"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,9 +39,10 @@ class LearningSettings:
             environment, or 150,000.
         episodes: Evaluation episodes per run.
         algo: Learning algorithm; TRPO, TQC and CrossQ need sb3-contrib.
-        mode: What the shield applies in place of an unsafe action: the closest safe input ("project"), or the certified
-            K x_hat ("switch"; "boundary" applies it unless every action would be safe), or, where a certified plan that
-            leaves S and returns begins with it, the action itself ("lookahead").
+        mode: What the shield applies in place of an unsafe action: the closest safe input ("project"), the closest one
+            after which a certified plan keeps the state in the box ("lookahead"), or the certified K x_hat ("switch";
+            "boundary" applies it unless every action would be safe).
+        horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
         intervention_penalty: Subtracted from the training reward per intervention, in arms with "+penalty".
         violation_penalty: Subtracted from the training reward per violating step, in the arm "penalized".
         certificate: Certificate file to use instead of synthesizing one.
@@ -58,6 +60,7 @@ class LearningSettings:
     episodes: int = 200
     algo: Algorithm = "PPO"
     mode: Mode = "project"
+    horizon: int | None = None
     intervention_penalty: float = 0.1
     violation_penalty: float = 1.0
     certificate: Path | None = None
@@ -108,6 +111,8 @@ class LearningSettings:
         for name in ("intervention_penalty", "violation_penalty"):
             if not 0.0 <= getattr(self, name) < float("inf"):
                 raise ValueError(f"--{name.replace('_', '-')} must be >= 0, got {getattr(self, name)}")
+        arms = getattr(self, "arm", ""), *getattr(self, "arms", ()), *getattr(self, "references", ())
+        require_horizon(self.horizon, self.mode, *arms)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,6 +189,7 @@ class EvaluateSettings:
         model: Folder of a trained agent, such as models/shielded-0 in the output of `ncs compare` or `ncs train`.
         env: Id of the environment the agent was trained in; module:id, to import the module that registers it.
         shield: Mode of the shield; "monitor" changes nothing and counts what it would have done.
+        horizon: Longest plan of mode "lookahead" [steps]; by default that of the agent's training, otherwise 6.
         episodes: Number of evaluation episodes.
         seed: Seed of the episodes.
         certificate: Certificate file to use instead of synthesizing one.
@@ -193,7 +199,8 @@ class EvaluateSettings:
 
     model: tyro.conf.Positional[Path]
     env: str | None = None
-    shield: Literal["none", "monitor", "project", "switch", "boundary", "lookahead"] = "none"
+    shield: Literal["none", "monitor", "project", "lookahead", "switch", "boundary"] = "none"
+    horizon: int | None = None
     episodes: int = 200
     seed: int = 0
     certificate: Path | None = None
@@ -206,6 +213,7 @@ class EvaluateSettings:
             raise ValueError(f"--episodes must be at least 1, got {self.episodes}")
         if self.seed < 0:
             raise ValueError(f"--seed must be >= 0, got {self.seed}")
+        require_horizon(self.horizon, self.shield)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,34 +250,3 @@ class SweepSettings(BackendSettings, LearningSettings):
         """Raises ValueError if a value is out of range."""
         LearningSettings.__post_init__(self)
         BackendSettings.__post_init__(self)
-
-
-@dataclass(frozen=True, kw_only=True)
-class RenderSettings:
-    """Draws an episode of a policy, as an animation or its last frame (docs/rendering.md).
-
-    Attributes:
-        env: Id of an environment with a plant of its own; module:id first imports the module, which registers one of
-            your own (`ncs_gym.register_plant`).
-        out: File to write: .gif, .mp4, or .png for the last frame alone.
-        policy: "greedy" (toward the task's goal as hard as it can), "zero", "random", or the folder of a
-            trained agent.
-        shield: Mode of the shield; "none" for no shield.
-        side_by_side: Draw the same episode without a shield at the left, with it at the right.
-        certificate: Certificate file to use instead of synthesizing one.
-        seed: Seed of the episode (of both, side by side) and of the random policy.
-        steps: Largest number of steps.
-        fps: Frames per second; one frame per step.
-        width: Width of the animation [pixels]; by default as drawn.
-    """
-
-    env: str = "ncs_gym/TruckTrailerCruise-v0"
-    out: Annotated[Path, tyro.conf.arg(aliases=["--gif"])] = Path("episode.gif")
-    policy: str = "greedy"
-    shield: Literal["project", "switch", "boundary", "lookahead", "monitor", "none"] = "project"
-    side_by_side: bool = False
-    certificate: Path | None = None
-    seed: int = 0
-    steps: int = 200
-    fps: int = 10
-    width: int | None = None

@@ -32,6 +32,8 @@ class Annotation:
         intervened: Whether the shield replaces the proposed input.
         interventions: Number of interventions in this episode, this step included.
         protects: Whether the shield's input is applied; False for a shield that only monitors.
+        plan: Inputs that the shield has in store for the steps after this one, shape (k, m) [physical units]; None for
+            a shield that stores none.
     """
 
     safe_set: Ellipsoid
@@ -40,6 +42,7 @@ class Annotation:
     intervened: bool = False
     interventions: int = 0
     protects: bool = True
+    plan: np.ndarray | None = None
 
 
 class PacketRecord(NamedTuple):
@@ -117,6 +120,17 @@ class FrameRecord:
         """Whether a shield that protects replaced the input that led here."""
         annotation = self.annotation
         return annotation is not None and annotation.intervened and annotation.protects
+
+    @property
+    def planned_states(self) -> np.ndarray:
+        """Where the inputs in the shield's store lead from the estimate, undisturbed, shape (k + 1, n), or (0, n)."""
+        plan = None if self.annotation is None else self.annotation.plan
+        if plan is None or len(plan) == 0:
+            return np.empty((0, self.plant.n))
+        states = [self.estimate]
+        for u in plan:
+            states.append(self.plant.A @ states[-1] + self.plant.B @ u)
+        return np.array(states)
 
 
 class EpisodeRecord:

@@ -43,28 +43,43 @@ def draw_panel(canvas: Canvas, frame: FrameRecord) -> None:
     _draw_packets(canvas, frame, y)
 
 
-def draw_legend(canvas: Canvas, *, shielded: bool) -> None:
-    """Draws what the marks of the phase plane and of the packets mean."""
-    top = theme.PANEL.bottom - 48
+def draw_legend(canvas: Canvas, *, shielded: bool, plans: bool) -> None:
+    """Draws what the marks of the phase plane and of the packets mean.
+
+    Args:
+        canvas: Where it is drawn.
+        shielded: Whether there is a safe set.
+        plans: Whether the shield stores plans.
+    """
+    rows = [theme.PANEL.bottom - 8 - (17 if plans else 20) * i for i in reversed(range(4 if plans else 3))]
     first, second, third = (theme.PANEL.x + offset for offset in (7.0, 112.0, 229.0))
-    canvas.circle((first, top), 4.0, theme.INK)
-    canvas.circle((first, top + 20), 5.0, theme.ESTIMATE, width=1.5)
-    _draw_disc(canvas, (first, top + 40), theme.ERROR_FILL, theme.LATE)
-    canvas.dashed([(second - 7, top), (second + 8, top)], theme.DANGER, 1.5, dash=3.0)
+    canvas.circle((first, rows[0]), 4.0, theme.INK)
+    canvas.circle((first, rows[1]), 5.0, theme.ESTIMATE, width=1.5)
+    _draw_disc(canvas, (first, rows[2]), theme.ERROR_FILL, theme.LATE)
+    canvas.dashed([(second - 7, rows[0]), (second + 8, rows[0])], theme.DANGER, 1.5, dash=3.0)
+    marks = ["safe box"]
     if shielded:
-        _draw_disc(canvas, (second, top + 20), theme.SAFE_FILL, theme.SAFE)
-        canvas.circle((second, top + 40), 3.5, theme.SHIELD)
-    canvas.circle((third, top), 3.5, theme.ESTIMATE)
-    canvas.circle((third, top + 20), 3.5, theme.LATE)
-    canvas.cross((third, top + 40), 3.5, theme.DANGER, 2.0)
-    columns = (
-        (first, ("true state", "estimate", "error bound")),
-        (second, ("safe box", "safe set S", "shield acted") if shielded else ("safe box",)),
-        (third, ("on time", "late", "lost")),
-    )
+        _draw_disc(canvas, (second, rows[1]), theme.SAFE_FILL, theme.SAFE)
+        canvas.circle((second, rows[2]), 3.5, theme.SHIELD)
+        marks += ["safe set S", "shield acted"]
+    if plans:
+        draw_plan(canvas, [(second - 8, rows[3]), (second, rows[3]), (second + 8, rows[3])])
+        marks += ["stored plan"]
+    canvas.circle((third, rows[0]), 3.5, theme.ESTIMATE)
+    canvas.circle((third, rows[1]), 3.5, theme.LATE)
+    canvas.cross((third, rows[2]), 3.5, theme.DANGER, 2.0)
+    columns = (first, ["true state", "estimate", "error bound"]), (second, marks), (third, ["on time", "late", "lost"])
     for x, names in columns:
-        for i, name in enumerate(names):
-            canvas.text(name, (x + 14, top + 20 * i), theme.INK)
+        for name, y in zip(names, rows, strict=False):
+            canvas.text(name, (x + 14, y), theme.INK)
+
+
+def draw_plan(canvas: Canvas, points: list) -> None:
+    """Draws where a stored plan leads as a dotted tail with a dot at each step; nothing without a plan."""
+    if len(points) > 1:
+        canvas.dashed(points, theme.PLAN, 1.5, dash=2.0)
+    for point in points[1:]:
+        canvas.circle(point, 2.5, theme.PLAN)
 
 
 def _draw_shield(canvas: Canvas, frame: FrameRecord, right: float) -> None:

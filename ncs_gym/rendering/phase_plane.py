@@ -8,6 +8,7 @@ from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.episode_record import RECENT_STEPS, FrameRecord
+from ncs_gym.rendering.panel import draw_plan
 
 # The axes reach this far, in units of the limits.
 _AXIS_REACH = 1.5
@@ -68,7 +69,7 @@ class PhasePlane:
         self._draw_axes(canvas)
 
     def draw(self, canvas: Canvas, frame: FrameRecord) -> None:
-        """Draws what moves: the error bound, the path, the estimate and the true state."""
+        """Draws what moves: the error bound, the path, the stored plan, the estimate and the true state."""
         canvas.clip(self._rect)
         pair = list(self._pair)
         ellipse = self.pixels_of(frame.estimate[pair] + self._projection(frame.error_shape))
@@ -76,6 +77,7 @@ class PhasePlane:
         canvas.polygon(ellipse, theme.ERROR_FILL)
         canvas.line([*ellipse, ellipse[0]], theme.LATE, 1.0)
         self._draw_path(canvas, frame)
+        draw_plan(canvas, [self._inside(state) for state in frame.planned_states[:, pair]])
         canvas.circle(self._inside(frame.estimate[pair]), 5.0, theme.ESTIMATE, width=1.5)
         truth = self._inside(frame.state[pair])
         canvas.circle(truth, 4.0, theme.DANGER if frame.violated else theme.INK)

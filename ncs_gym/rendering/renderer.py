@@ -132,7 +132,7 @@ class _Picture:
         self._drawing = _drawing_of(plant)
         rect = theme.PLANE
         self._plane = PhasePlane(plant, self._drawing.pair, rect) if plant.n > 1 else TimePlot(plant, rect)
-        self._backgrounds: dict[tuple[int, theme.Color], tuple[Any, Any]] = {}
+        self._backgrounds: dict[tuple[int, theme.Color, bool], tuple[Any, Any]] = {}
 
     def draw(self, frame: FrameRecord) -> Canvas:
         """Returns the canvas with a frame drawn on it, which the next call overwrites."""
@@ -147,7 +147,8 @@ class _Picture:
         """Returns a snapshot of everything that stays the same as long as the safe set does."""
         annotation, color = frame.annotation, _background_color(frame)
         safe_set = None if annotation is None else annotation.safe_set
-        key = id(safe_set), color
+        stores_plans = annotation is not None and annotation.plan is not None
+        key = id(safe_set), color, stores_plans
         if key not in self._backgrounds:
             if len(self._backgrounds) >= _MAX_BACKGROUNDS:
                 self._backgrounds.clear()
@@ -156,7 +157,7 @@ class _Picture:
             canvas.rect(theme.PLANT_VIEW, color)
             self._drawing.draw_background(canvas)
             self._plane.draw_background(canvas, None if safe_set is None else safe_set.shape)
-            draw_legend(canvas, shielded=safe_set is not None)
+            draw_legend(canvas, shielded=safe_set is not None, plans=stores_plans)
             self._backgrounds[key] = safe_set, canvas.snapshot()  # keeps the set alive, so that its id stays its own
         return self._backgrounds[key][1]
 

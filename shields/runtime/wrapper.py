@@ -16,6 +16,7 @@ from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv, NCSVectorE
 from ncs_gym.envs.env import applied_input, ncs_env
 from ncs_gym.validation import as_number, as_numbers, shown
 from shields.certificate import Certificate
+from shields.runtime.decisions import NO_PLAN
 from shields.runtime.filter import SafetyFilter
 from shields.runtime.guarantee import Report, StartKnown, start_known
 from shields.runtime.guarded_filter import GuardedFilter
@@ -99,7 +100,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         """Starts an episode; see `NCSEnv.reset`."""
         before, self._clock = self._clock, self._clock and INTERRUPTED
         if self._is_drawn:
-            self._annotate(None, 0, intervened=False)
+            self._annotate(None, 0, NO_PLAN, intervened=False)
         try:
             observation, info = self.env.reset(seed=seed, options=options)
         except ValueError:
@@ -131,7 +132,8 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         if decision.intervened and self.filter.mode != "monitor":
             action = (decision.input / self.filter.plant.u_max).astype(np.float32)
         if self._is_drawn:
-            self._annotate(proposed, self._interventions + decision.intervened, intervened=decision.intervened)
+            count = self._interventions + decision.intervened
+            self._annotate(proposed, count, decision.plan, intervened=decision.intervened)
         (episode, step), self._clock = self._clock, INTERRUPTED
         observation, reward, terminated, truncated, info = self.env.step(action)
         clock = self._read_clock()
@@ -152,7 +154,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         inner = ncs_env(self.env)
         return inner.episodes, inner.steps
 
-    def _annotate(self, proposed: np.ndarray | None, interventions: int, *, intervened: bool) -> None:
+    def _annotate(self, proposed: np.ndarray | None, interventions: int, plan: np.ndarray, *, intervened: bool) -> None:
         """Tells the picture of the step that follows what the shield does in it."""
         note = Annotation(
             safe_set=self.certificate.safe_set,
@@ -161,6 +163,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             intervened=intervened,
             interventions=interventions,
             protects=self.filter.mode != "monitor",
+            plan=None if self.filter.lookahead is None else plan.copy(),
         )
         ncs_env(self.env).annotate(note)
 

@@ -5,7 +5,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from agents.agent import Agent, AgentError, Normalization
+from agents.agent import Agent, AgentError, Normalization, _digest
 from agents.control_loop import ControlLoop, ShieldSettings
 from agents.evaluation import evaluate
 from agents.settings import OffPolicySettings, PPOSettings
@@ -75,15 +75,16 @@ def test_shared_folder_has_the_agent_its_shield_and_a_card(agent, certificate, t
     np.testing.assert_array_equal(Agent.load(shared).act(OBSERVATIONS), agent.act(OBSERVATIONS))
 
 
-def test_program_on_the_card_loads_the_agent_and_its_shield(agent, certificate, tmp_path, monkeypatch):
-    agent.save(tmp_path, ShieldSettings(certificate))
+@pytest.mark.parametrize(("mode", "horizon"), [("project", None), ("lookahead", 4)])
+def test_program_on_the_card_loads_the_agent_and_its_shield(agent, certificate, tmp_path, monkeypatch, mode, horizon):
+    agent.save(tmp_path, ShieldSettings(certificate, mode, horizon=horizon))
     monkeypatch.chdir(tmp_path)
     program = (tmp_path / "README.md").read_text().partition("```python\n")[2].partition("```")[0]
     names = {}
     exec(program, names)
     assert names["agent"].checksum == agent.checksum
     loop = names["loop"]
-    assert (loop.env, loop.channel, loop.shield) == (CRUISE, None, ShieldSettings(certificate))
+    assert (loop.env, loop.channel, loop.shield) == (CRUISE, None, ShieldSettings(certificate, mode, horizon=horizon))
 
 
 def test_card_without_a_shield_names_none(folder, agent, certificate):
@@ -98,6 +99,23 @@ def test_certificate_of_another_plant_is_not_saved(agent, tmp_path):
     with pytest.raises(ValueError, match="another plant"):
         agent.save(tmp_path / "x", ShieldSettings(other))
     assert not (tmp_path / "x").exists()
+
+
+def test_saved_agent_keeps_the_shield_it_was_trained_behind(certificate, tmp_path):
+    assert (trained().shield_mode, trained().horizon) == (None, None)
+    loop = ControlLoop(env=CRUISE, shield=ShieldSettings(certificate, "lookahead", horizon=3))
+    result = train(loop, 512, 1, "PPO", SETTINGS["PPO"])
+    assert result.violation_steps == 0 < result.interventions
+    result.agent.save(tmp_path)
+    again = Agent.load(tmp_path)
+    assert (again.shield_mode, again.horizon) == ("lookahead", 3)
+    for wrong in ({"mode": "hope", "horizon": None}, {"mode": "lookahead", "horizon": 0}, {"mode": "lookahead"}):
+        document = json.loads((tmp_path / "agent.json").read_text())
+        document["agent"]["shield"] = wrong
+        document["sha256"] = _digest(document["agent"])
+        (tmp_path / "agent.json").write_text(json.dumps(document))
+        with pytest.raises(AgentError, match="is damaged"):
+            Agent.load(tmp_path)
 
 
 def test_model_file_is_stable_baselines3s(folder, agent):

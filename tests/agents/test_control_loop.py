@@ -16,6 +16,15 @@ def test_it_shields_only_if_asked(certificate):
     assert (shielded.vector(2).penalty, shielded.vector(2).filter.mode) == (0.5, "switch")
 
 
+@pytest.mark.parametrize(("given", "horizon"), [(4, 4), (None, 6)])
+def test_horizon_of_lookahead_reaches_both_kinds_of_environment(certificate, given, horizon):
+    loop = ControlLoop(env=CRUISE, shield=ShieldSettings(certificate, "lookahead", horizon=given))
+    for env in (loop.single(), loop.vector(2), loop.without_penalties.vector(2)):
+        assert (env.filter.mode, env.filter.horizon) == ("lookahead", horizon)
+    with pytest.raises(ValueError, match="horizon"):
+        ControlLoop(env=CRUISE, shield=ShieldSettings(certificate, "project", horizon=4)).single()
+
+
 def test_channel_reaches_both_kinds_of_environment():
     loop = ControlLoop(env=CRUISE, channel=Channel(delay=7))
     assert loop.single().unwrapped.channel.delay == loop.vector(2).unwrapped.channel.delay == 7

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from experiments.attack import monte_carlo_batch
 from experiments.attack.attack_cases import AttackCase, attack_cases
 from experiments.attack.counts_store import CountsStore
 from experiments.attack.gaussian_table import gaussian_table, require_within
@@ -76,6 +77,55 @@ def test_without_the_shield_the_attack_breaks_out_and_is_counted(files):
     assert counts.level > 1.5
     assert counts.unproved > 0
     assert counts.margin < 0.0
+
+
+LOOKAHEAD = replace(CAMPAIGN, mode="lookahead", horizon=6)
+
+
+def test_lookahead_is_attacked_in_and_outside_the_safe_set_and_keeps_the_box(files):
+    batches = [MonteCarloBatch("CartPole-v0, rare", 0), MonteCarloBatch("CartPole-v0, rare", 1)]
+    first = [run_batch(LOOKAHEAD, batch, files[batch.case]) for batch in batches]
+    assert [run_batch(LOOKAHEAD, batch, files[batch.case]) for batch in reversed(batches)] == first[::-1]
+    total = sum(first, SafetyCounts())
+    assert (total.steps, total.episodes) == (2 * 32 * 200, 64)
+    assert (total.violations, total.broken_episodes, total.unproved) == (0, 0, 0)
+    assert 0.98 < total.level <= 1.0
+    assert total.exits > 0.5 * total.steps
+    assert 0 < total.outside_starts < 32
+    assert total.exits < total.planned < total.steps
+    assert total.interventions > 0
+
+
+def test_lookahead_that_leaves_the_box_is_counted(files, monkeypatch):
+    from shields.lookahead.plan_test import PlanTest
+
+    known = PlanTest.tightenings_of
+    monkeypatch.setattr(
+        PlanTest, "tightenings_of", lambda *given: (found := known(*given))._replace(room=np.ones_like(found.room))
+    )
+    monte_carlo_batch._shields.cache_clear()
+    counts = run_batch(LOOKAHEAD, MonteCarloBatch("CartPole-v0, late", 0), files["CartPole-v0, late"])
+    monte_carlo_batch._shields.cache_clear()
+    assert counts.violations > 0
+    assert 0 < counts.broken_episodes <= 32
+    assert counts.level > 1.0
+
+
+def test_nature_pushes_lookahead_to_the_box_and_out_of_the_safe_set_in_turn(files):
+    shields = monte_carlo_batch._shields(LOOKAHEAD, CRUISE, files[CRUISE])
+    sources = {name: shield.unwrapped._process.disturbance for name, shield in shields.items()}
+    assert len(shields) == LOOKAHEAD.kinds_of_batches == 2
+    assert sources["to the box"].M is None
+    np.testing.assert_array_equal(sources["out of S"].M, Certificate.load(files[CRUISE]).M)
+    for shield in shields.values():
+        assert (shield.filter.mode, shield.filter.horizon) == ("lookahead", 6)
+
+
+def test_stored_counts_belong_to_their_mode_and_horizon():
+    keys = [replace(CAMPAIGN, mode=mode, horizon=horizon).key for mode, horizon in
+            ((None, None), ("project", None), ("lookahead", 6), ("lookahead", 7))]  # fmt: skip
+    assert len(set(keys)) == 4
+    assert keys[0] == CAMPAIGN.key
 
 
 def test_nature_attains_every_bound(files):
@@ -211,6 +261,31 @@ def test_a_shield_that_fails_ends_with_an_error(tmp_path, small, monkeypatch, ca
     certify(settings(tmp_path / "watching", unshielded=True))
 
 
+def test_exits_of_lookahead_are_allowed_and_violations_are_not(tmp_path, small, monkeypatch, capsys):
+    counts = {"steps": 3200, "episodes": 16, "exits": 2, "planned": 1600, "outside_starts": 3, "level": 0.75}
+
+    def executed(**more):
+        return lambda campaign, missing, certificates, store, jobs: store.add(
+            MonteCarloBatch(CRUISE, 0), SafetyCounts(**counts, **more)
+        )
+
+    monkeypatch.setattr(command, "_batches", lambda names, count, least: {CRUISE: [MonteCarloBatch(CRUISE, 0)]})
+    monkeypatch.setattr(command, "execute_batches", executed())
+    certify(settings(tmp_path / "kept", mode="lookahead"))
+    row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith(CRUISE))
+    cells = ["3,200", "0.1%", "0", "16", "3", "0", "2.1e-01", "2.5e-01", "50.0%", "0.0%"]
+    assert row.removeprefix(CRUISE).split() == cells
+    assert document(tmp_path / "kept")["settings"]["horizon"] == 6
+    assert document(tmp_path / "kept")["total"]["planned"] == 1600
+    for more, words in (
+        ({"violations": 1}, "1 outside the box, 0 without"),
+        ({"unproved": 4}, "0 outside the box, 4 "),
+    ):
+        monkeypatch.setattr(command, "execute_batches", executed(**more))
+        with pytest.raises(SafetyBroken, match=f"^{words}"):
+            certify(settings(tmp_path / words, mode="lookahead"))
+
+
 def test_damaged_counts_are_refused(tmp_path):
     path = tmp_path / "tallies.jsonl"
     store = CountsStore(path, {"case": "key"})
@@ -254,6 +329,21 @@ def test_counts_add_up_and_bound_the_probability():
 )
 def test_wrong_settings_are_named(changes, flag, tmp_path):
     with pytest.raises(ValueError, match=f"--{flag} must be (at least|between)"):
+        settings(tmp_path, **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"horizon": 0, "mode": "lookahead"}, "--horizon must be at least 1 and at most 50, got 0"),
+        ({"horizon": 51, "mode": "lookahead"}, "--horizon must be at least 1 and at most 50, got 51"),
+        ({"horizon": 6}, "--horizon 6 is for mode lookahead"),
+        ({"horizon": 6, "mode": "project"}, "--horizon 6 is for mode lookahead"),
+        ({"unshielded": True, "mode": "switch"}, "give either --mode switch or --unshielded"),
+    ],
+)
+def test_settings_that_contradict_each_other_are_refused(changes, words, tmp_path):
+    with pytest.raises(ValueError, match=words):
         settings(tmp_path, **changes)
 
 

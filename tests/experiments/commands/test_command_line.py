@@ -198,6 +198,28 @@ def test_one_agent_is_trained(tmp_path):
     assert Agent.load(model).algorithm == "A2C"
 
 
+def test_agent_behind_lookahead_is_trained_and_evaluated_with_its_horizon(tmp_path):
+    out = tmp_path / "one"
+    given = ["--arm", "lookahead", "--horizon", "3", "--ppo.envs", "8", "--steps", "1024", "--episodes", "3"]
+    run = ncs("train", "--env", "ncs_gym/BatchReactor-v0", *given, "--out", out)
+    assert run.returncode == 0, run.stderr
+    assert "from a" in run.stdout
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["arms"]["lookahead"]["train_violation_steps"] == 0
+    assert 0.0 < summary["arms"]["lookahead"]["plan_rate"] < 1.0
+    assert json.loads((out / "settings.json").read_text())["settings"]["horizon"] == 3
+    agent = Agent.load(out / "models" / "lookahead-0")
+    assert (agent.shield_mode, agent.horizon) == ("lookahead", 3)
+    for flags, horizon in ((["lookahead"], 3), (["lookahead", "--horizon", "2"], 2), (["project"], None)):
+        evaluated = ncs("evaluate", out / "models" / "lookahead-0", "--episodes", "3", "--out", tmp_path / "e.json",
+                        "--certificate", out / "certificate.json", "--shield", *flags)  # fmt: skip
+        assert evaluated.returncode == 0, evaluated.stderr
+        document = json.loads((tmp_path / "e.json").read_text())
+        assert document["horizon"] == horizon
+        assert (document["arms"][f"shield: {flags[0]}"]["plan_rate"] > 0.0) is (flags[0] == "lookahead")
+        assert ("from a" in evaluated.stdout) is (flags[0] == "lookahead")
+
+
 def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path):
     out = tmp_path / "sweep"
     grid = ["--losses", "0.5", "--delays", "1", "--burst-lengths", "0", "3", "--episodes", "3", "--steps", "512"]
@@ -283,6 +305,13 @@ def test_every_command_has_help_seed_and_out(command):
         (["sweep", "--engine", "ray", "--cpus-per-run", "0"], "--cpus-per-run must be at least"),
         (["sweep", "--engine", "ray", "--gpus-per-run", "1.5"], "--gpus-per-run must be"),
         (["evaluate", "nowhere", "--episodes", "0"], "--episodes must be at least 1"),
+        (
+            ["evaluate", "nowhere", "--shield", "lookahead", "--horizon", "51"],
+            "--horizon must be at least 1 and at most",
+        ),
+        (["evaluate", "nowhere", "--horizon", "6"], "--horizon 6 is for mode lookahead"),
+        (["render", "--horizon", "6"], "--horizon 6 is for mode lookahead"),
+        (["train", "--horizon", "6"], "--horizon 6 is for mode lookahead"),
     ],
 )
 def test_usage_errors_are_the_parsers(arguments, words):

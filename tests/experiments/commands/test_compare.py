@@ -73,6 +73,43 @@ def test_each_arm_has_its_shield_and_its_penalties(setup):
     assert {name for name, loop in loops.items() if loop.violation_penalty == 2.0} == {"penalized"}
 
 
+def test_lookahead_is_an_arm_by_two_names_and_alone_takes_the_horizon(setup):
+    arms = ("unshielded", "monitor", "shielded", "lookahead", "lookahead+penalty", "shielded:lookahead")
+    loops = {run.arm: run.loop for run in runs_of(setup, arms=arms, seeds=1, horizon=4, intervention_penalty=0.3)}
+    for name in arms[3:]:
+        assert (loops[name].shield.mode, loops[name].shield.horizon) == ("lookahead", 4)
+        assert loops[name].shield.penalty == (0.3 if name.endswith("+penalty") else 0.0)
+    for name in set(loops) - set(arms[3:]):
+        assert loops[name].shield is None or loops[name].shield.horizon is None
+    by_mode = runs_of(setup, arms=("shielded",), seeds=1, mode="lookahead")
+    assert (by_mode[0].loop.shield.mode, by_mode[0].loop.shield.horizon) == ("lookahead", 6)
+    keys = {runs_of(setup, arms=("lookahead",), seeds=1, horizon=horizon)[0].key for horizon in (None, 4, 5)}
+    assert len(keys) == 3
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"horizon": 0, "mode": "lookahead"}, "--horizon must be at least 1 and at most 50, got 0"),
+        ({"horizon": 51, "arms": ("lookahead",)}, "--horizon must be at least 1 and at most 50, got 51"),
+        ({"horizon": 6}, "--horizon 6 is for mode lookahead, which is not asked for"),
+    ],
+)
+def test_horizon_is_refused_where_it_is_of_no_use(change, words):
+    with pytest.raises(ValueError, match=words):
+        CompareSettings(**change)
+
+
+def test_steps_that_live_from_a_plan_have_a_column_where_an_arm_looks_ahead():
+    one = result([1.0] * 10, [0] * 10)
+    one = replace(one, episodes=[replace(each, planned=i % 2) for i, each in enumerate(one.episodes)])
+    summary = summarize_arm([one], fixed_policy=True)
+    assert summary["plan_rate"] == 0.05
+    arms = {"shielded": summary | {"mode": "project"}, "lookahead": summary | {"mode": "lookahead"}}
+    assert [row[-2] for row in _rows(arms)] == ["", "from a", "plan", "-", "5.0 %"]
+    assert "from a" not in _rows({"shielded": arms["shielded"]})[1]
+
+
 @pytest.mark.parametrize("name", ["", "shield", "shielded:", "shielded:hope", "monitor+penalty", "shielded:monitor"])
 def test_unknown_arms_are_refused(name):
     with pytest.raises(ValueError, match="unknown arm"):

@@ -11,7 +11,7 @@ from agents.control_loop import ControlLoop
 from agents.training import untrained
 from experiments.commands.render import render
 from experiments.runs.policies import _greedy_action, policy_by_name
-from experiments.settings.learning import RenderSettings
+from experiments.settings import RenderSettings
 from ncs_gym.rendering import theme
 from shields import SafetyShield
 from tests.command import assert_one_sentence, ncs
@@ -61,6 +61,24 @@ def test_episode_that_ends_early_ends_the_animation(env_id, tmp_path, capsys):
     with Image.open(tmp_path / "a.gif") as image:
         assert 2 < image.n_frames < 100
     assert "1 with a violation" in capsys.readouterr().out
+
+
+def test_lookahead_is_drawn_with_its_plan(tmp_path):
+    for shield in ("project", "lookahead"):
+        render(settings(shield=shield, steps=12, out=tmp_path / f"{shield}.png"))
+    with Image.open(tmp_path / "project.png") as one, Image.open(tmp_path / "lookahead.png") as other:
+        plans = [(np.asarray(each.convert("RGB")) == theme.PLAN).all(axis=2) for each in (one, other)]
+    plane = slice(int(theme.PLANE.y), int(theme.PLANE.bottom)), slice(int(theme.PLANE.x), int(theme.PLANE.right))
+    assert not plans[0].any()
+    assert plans[1][plane].sum() > 20
+    assert plans[1].sum() > plans[1][plane].sum()  # the legend
+
+
+def test_stored_plan_keeps_its_color_in_a_gif(tmp_path):
+    render(settings(shield="lookahead", steps=12, out=tmp_path / "a.gif"))
+    with Image.open(tmp_path / "a.gif") as image:
+        image.seek(image.n_frames - 1)
+        assert (np.asarray(image.convert("RGB")) == theme.PLAN).all(axis=2).sum() > 20
 
 
 def test_last_picture_alone_and_scaling(tmp_path):

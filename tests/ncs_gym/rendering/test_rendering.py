@@ -21,6 +21,7 @@ from ncs_gym.registration import ENTRY_POINTS
 from ncs_gym.rendering import PacketRecord, theme
 from ncs_gym.rendering.episode_record import RECENT_STEPS
 from ncs_gym.rendering.renderer import _Picture
+from shields import SafetyShield
 from tests.plants import random_plant
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -224,6 +225,36 @@ def test_intervention_shows_in_the_header_and_at_the_input(picture):
     assert count(frames[1], theme.SHIELD_FILL, theme.PLANT_VIEW, off=4) > 10_000
     watching = pixels_of(picture, record(step=1, input=np.array([4.0]), annotation=replace(acting, protects=False)))
     assert count(watching, theme.SHIELD_FILL, theme.PLANT_VIEW, off=4) == 0
+
+
+def test_stored_plan_is_drawn_from_the_estimate_and_named_in_the_legend(picture, loaded):
+    note = Annotation(safe_set=SAFE_SET, label="lookahead", plan=np.empty((0, 1)))
+    frames = [record(annotation=replace(note, plan=plan)) for plan in (None, note.plan, np.array([[2.0], [2.0]]))]
+    shown = [pixels_of(picture, frame) for frame in frames]
+    assert [count(each, theme.PLAN, theme.PLANE) > 5 for each in shown] == [False, False, True]
+    assert [count(each, theme.PLAN, theme.PANEL) > 5 for each in shown] == [False, True, True]
+    states = frames[2].planned_states
+    assert states.shape == (3, 2)
+    np.testing.assert_allclose(states[2], loaded.A @ loaded.B[:, 0] * 2.0 + loaded.B[:, 0] * 2.0)
+    for x, y in picture._plane.pixels_of(states[1:]):
+        assert count(shown[2], theme.PLAN, theme.Rect(x - 2, y - 2, 4, 4)) > 4
+    assert len(frames[0].planned_states) == len(frames[1].planned_states) == 0
+
+
+def test_shield_tells_the_picture_what_it_has_in_store(loaded):
+    env = SafetyShield(make(), mode="lookahead", horizon=3)
+    env.reset(seed=0)
+    assert env.unwrapped._renderer.frame_record().annotation.plan.shape[0] == 0
+    lengths = set()
+    for _ in range(30):
+        *_, info = env.step(np.ones(1, np.float32))
+        record = env.unwrapped._renderer.frame_record()
+        assert len(record.annotation.plan) == info["shield_plan_length"]
+        lengths.add(info["shield_plan_length"])
+    assert max(lengths) > 0
+    other = SafetyShield(make())
+    other.reset(seed=0)
+    assert other.unwrapped._renderer.frame_record().annotation.plan is None
 
 
 def test_path_and_interventions_are_drawn(picture):

@@ -1,0 +1,167 @@
+"""What is guaranteed while the rest of a plan is applied, after it ran out, and while the error is not certified."""
+
+from types import SimpleNamespace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from ncs_gym import NCSEnv, NCSVectorEnv, Packet
+from shields import SafeLoop, SafetyShield, VectorSafetyShield
+from shields.runtime.guarantee import LARGE_ERROR, NOT_KNOWN_INSIDE
+from tests.certificates import certificate_of
+from tests.shields.lookahead.adversary import case
+
+NAMES = ("cruise", "cart-pole", "batch reactor")
+CHANNEL = "constant delay"
+# By how much a forged error shape is larger: no error set contains it.
+FORGED = 2500.0
+
+
+class World:
+    """A plant beside its loop, begun outside S with a plan of at least so many inputs; nature pushes outwards."""
+
+    def __init__(self, name, seed, least=1):
+        self.plant, horizon, channel, contract = case(name, CHANNEL if name != "cruise" else "overtaking")
+        self.safe = certificate_of(self.plant, contract).safe_set
+        self.loop = SafeLoop(certificate_of(self.plant, contract), self.plant, channel, "lookahead", horizon=horizon)
+        self.contract, self.rng = contract, np.random.default_rng(seed)
+        self.stored = 0
+        while not (self.stored >= least and self.loop.guaranteed):
+            self.x = self.rng.uniform(-0.95, 0.95, self.plant.n) * self.plant.half_widths
+            if self.safe.gauge(self.x) > 1.0:
+                error = self.plant.initial_noise.bound.sample_boundary(self.rng)
+                self.loop.start(self.x + (1.0 - 1e-9) * error, initial_set=self.x)
+                self.stored = self.loop.plan_length
+
+    def step(self, heard=True):
+        """A step in which the controller fails, so that what is stored is applied; returns the decision."""
+        decision = self.loop.decide(None)
+        nominal = self.plant.A @ self.x + self.plant.B @ decision.input
+        row = self.plant.C[np.argmax(np.abs(self.plant.C @ nominal))]
+        self.x = nominal + self.plant.nominal_disturbance.extreme_point(np.sign(row @ nominal) * row)
+        noise = self.plant.sensor_noise.bound.sample_boundary(self.rng)
+        sample = Packet(self.loop.steps + 1, self.plant.H @ self.x + (1.0 - 1e-9) * noise, self.loop.episode)
+        self.loop.receive([sample] if heard else [])
+        assert np.abs(self.plant.C @ self.x).max() <= 1.0
+        return decision
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_after_its_last_input_the_state_is_in_the_safe_set_and_stays_guaranteed_without_a_plan(name):
+    for seed in range(8):
+        world = World(name, seed)
+        for left in reversed(range(world.stored)):
+            assert world.step().reason == "stored"
+            assert world.loop.plan_length == left
+            assert world.loop.guaranteed
+        assert world.safe.gauge(world.x) <= 1.0
+        for _ in range(12):
+            decision = world.step()
+            assert decision.fallback
+            assert not decision.stored
+            assert world.loop.plan_length == 0
+            assert world.loop.guaranteed, world.loop.reason
+            assert world.safe.gauge(world.x) <= 1.0
+
+
+def test_a_stored_tail_keeps_the_box_in_silence_and_proves_again_once_the_error_is_certified():
+    doubted = recovered = 0
+    for seed in range(6):
+        world = World("cart-pole", seed, least=world_age() + 3)
+        for k in range(world.stored - 1):
+            heard = k > world_age() + 1
+            world.step(heard)
+            too_old = world.loop.measurement_age > world_age()
+            assert world.loop.guaranteed is not too_old
+            assert world.loop.reason == (LARGE_ERROR if too_old else "")
+            doubted += too_old
+            recovered += heard
+        assert world.loop.plan_length == 1
+    assert doubted > 0
+    assert recovered > 0
+
+
+def world_age():
+    """Largest age of a measurement under the contract of the cart-pole."""
+    return case("cart-pole", CHANNEL)[3].max_age
+
+
+def test_a_tail_that_ends_in_silence_ends_in_the_safe_set_and_the_fallback_proves_nothing_more():
+    proved = set()
+    for seed in range(10):
+        world = World("cart-pole", seed, least=world_age() + 1)
+        for _ in range(world.stored):
+            world.step(heard=False)
+        assert world.safe.gauge(world.x) <= 1.0
+        assert world.loop.reason == LARGE_ERROR
+        for _ in range(8):
+            decision, loop = world.step(heard=False), world.loop
+            assert decision.fallback
+            is_known = bool(decision.passed or loop.filter.knows_inside(loop.estimate, loop.error_shape))
+            assert loop.reason == (LARGE_ERROR if is_known else NOT_KNOWN_INSIDE)
+            proved.add(is_known)
+    assert False in proved
+
+
+class Doubt(gym.Wrapper):
+    """Reports far too large an error where it is told to."""
+
+    active = False
+
+    def step(self, action):
+        *rest, info = self.env.step(action)
+        return *rest, info | ({"error_shape": FORGED * info["error_shape"]} if self.active else {})
+
+
+class DoubtfulVectorEnv(NCSVectorEnv):
+    """Reports far too large errors where it is told to."""
+
+    active = False
+
+    @property
+    def error_shapes(self):
+        table, numbers = super().error_shapes
+        return (SimpleNamespace(shapes=FORGED * table.shapes), numbers) if self.active else (table, numbers)
+
+
+def start_with_a_tail(reset, plant, safe, least):
+    """Resets until a start outside S has a stored plan of at least so many inputs; returns the start."""
+    rng = np.random.default_rng(0)
+    for _ in range(500):
+        start = rng.uniform(-0.95, 0.95, plant.n) * plant.half_widths
+        info = reset(start)
+        if safe.gauge(start) > 1.0 and np.min(info["shield_plan_length"]) >= least:
+            assert np.all(info["shield_guaranteed"])
+            return
+    raise AssertionError("no such start")
+
+
+def drive(env, inner, actions, plan_length):
+    """Doubts the error for two steps of a stored tail, then no more; what must hold of every environment."""
+    for step in range(plan_length):
+        inner.active = step in (0, 1)
+        *_, info = env.step(actions)
+        certified = not inner.active
+        assert np.all(np.asarray(info["shield_guaranteed"]) == certified)
+        assert np.all(np.asarray(info["shield_reason"]) == ("" if certified else LARGE_ERROR))
+        assert np.all(np.asarray(info["cost"]) == 0.0)
+        if not certified:  # with such an error nothing passes: the tail goes on
+            yield info["shield_plan_length"]
+
+
+@pytest.mark.parametrize("name", ["cart-pole", "batch reactor"])
+def test_both_wrappers_say_so_while_a_tail_is_stored_and_the_error_is_not_certified(name):
+    plant, horizon, channel, contract = case(name, CHANNEL)
+    certificate, least = certificate_of(plant, contract), 3
+    doubt = Doubt(NCSEnv(plant, channel, contract=contract))
+    env = SafetyShield(doubt, certificate, "lookahead", horizon=horizon)
+    start_with_a_tail(lambda x: env.reset(seed=1, options={"state": x})[1], plant, certificate.safe_set, least)
+    lengths = list(drive(env, doubt, np.ones(plant.m, np.float32), 4))
+    assert lengths[1] == lengths[0] - 1 >= 0
+
+    vector = DoubtfulVectorEnv(3, plant=plant, channel=channel, contract=contract)
+    shield = VectorSafetyShield(vector, certificate, "lookahead", horizon=horizon)
+    start_with_a_tail(lambda x: shield.reset(seed=1, options={"state": x})[1], plant, certificate.safe_set, least)
+    lengths = list(drive(shield, vector, np.ones((3, plant.m), np.float32), 4))
+    assert (lengths[1] == lengths[0] - 1).all()
