@@ -60,17 +60,17 @@ class PlainProgram:
         plant, steps = shield.plant, shield.horizon
         self.plans = shield.lookahead.planner.test
         self.start, self.proposed = cp.Parameter(plant.n), cp.Parameter(plant.m)
-        self.room, self.turn, self.radius = (
+        self.room, self.weighting, self.radius = (
             cp.Parameter((steps, len(plant.C))),
             cp.Parameter((plant.n, plant.n)),
             cp.Parameter(),
         )
         self.u, self.c = cp.Variable((steps, plant.m)), cp.Variable((steps + 1, plant.n))
-        self.turned = cp.Variable(plant.n)
+        self.weighted = cp.Variable(plant.n)
         constraints = [self.c[0] == self.start, cp.abs(self.u) <= np.tile(plant.u_max, (steps, 1))]
         constraints += [self.c[1:] == self.c[:-1] @ plant.A.T + self.u @ plant.B.T]
         constraints += [cp.abs(self.c[1:-1] @ plant.C.T) <= self.room[:-1]] if steps > 1 else []
-        constraints += [self.turned == self.turn @ self.c[-1], cp.norm(self.turned) <= self.radius]
+        constraints += [self.weighted == self.weighting @ self.c[-1], cp.norm(self.weighted) <= self.radius]
         self.problem = cp.Problem(cp.Minimize(cp.sum_squares(self.u[0] - self.proposed)), constraints)
 
     def solve(self, estimate: np.ndarray, shape: np.ndarray, proposed: np.ndarray) -> bool:
@@ -79,7 +79,7 @@ class PlainProgram:
         if not (np.isfinite(radius[0, -1]) and radius[0, -1] > 0.0):
             return False
         self.start.value, self.proposed.value = estimate, proposed
-        self.room.value, self.turn.value, self.radius.value = room[0], known.turn[0, -1], radius[0, -1]
+        self.room.value, self.weighting.value, self.radius.value = room[0], known.weighting[0, -1], radius[0, -1]
         return solved(self.problem)
 
 

@@ -49,9 +49,9 @@ class ConicFilter:
         predicted = outer_sum(test.moved @ error_shape @ test.moved.T, test.D, np.eye(plant.n))
         values, axes = np.linalg.eigh(predicted)
         h = np.sqrt(values[-1])
-        turn = np.sqrt(h * (1.0 - h) / (h - values))[:, None] * axes.T
+        weighting = np.sqrt(h * (1.0 - h) / (h - values))[:, None] * axes.T
         self.proposed.value, self.radius.value = proposed, 1.0 - h
-        self.offset.value, self.effect.value = turn @ test.moved @ estimate, turn @ test.effect
+        self.offset.value, self.effect.value = weighting @ test.moved @ estimate, weighting @ test.effect
         self.problem.solve(solver=cp.CLARABEL)
         usable = self.problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
         return self.u.value if usable else np.clip(self.shield.certificate.K @ estimate, -plant.u_max, plant.u_max)

@@ -3,6 +3,7 @@
 import ast
 import builtins
 import importlib
+import importlib.util
 import os
 import re
 import subprocess
@@ -54,7 +55,7 @@ def resolved(name):
     """The object of a dotted name."""
     parts = name.split(".")
     module, depth = importlib.import_module(parts[0]), 1
-    while depth < len(parts) - 1 and (ROOT / Path(*parts[: depth + 1])).with_suffix(".py").exists():
+    while depth < len(parts) - 1 and importlib.util.find_spec(".".join(parts[: depth + 1])):
         depth += 1
         module = importlib.import_module(".".join(parts[:depth]))
     for part in parts[depth:]:

@@ -77,11 +77,11 @@ class PlanTest:
         centers = self.prediction.centers(estimates, plans)
         steps, n, count, number = centers.shape
         values = self._rows @ centers.reshape(steps, n, -1)
-        turn = tightening.turn.transpose(1, 2, 3, 0)[..., None]
-        turned = turn[:, :, 0] * centers[:, 0, None]
+        weighting = tightening.weighting.transpose(1, 2, 3, 0)[..., None]
+        weighted = weighting[:, :, 0] * centers[:, 0, None]
         for i in range(1, n):
-            turned += turn[:, :, i] * centers[:, i, None]
-        return values.reshape(steps, -1, count, number), turned
+            weighted += weighting[:, :, i] * centers[:, i, None]
+        return values.reshape(steps, -1, count, number), weighted
 
     @np.errstate(all="ignore")
     def certified(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray) -> np.ndarray:
@@ -93,10 +93,10 @@ class PlanTest:
             plans: Inputs, shape (E, P, N, m) [physical units].
         """
         box, radius = self.room(estimates, tightening)
-        values, turned = self.judged(estimates, tightening, plans)
+        values, weighted = self.judged(estimates, tightening, plans)
         inside = np.all(np.abs(values) <= box.transpose(1, 2, 0)[..., None], axis=1)
         allowed = np.all(np.abs(plans) <= self.prediction.plant.u_max, axis=-1).transpose(2, 0, 1)
-        passed = np.asarray(np.sqrt((turned * turned).sum(axis=1)) <= radius.T[..., None])
+        passed = np.asarray(np.sqrt((weighted * weighted).sum(axis=1)) <= radius.T[..., None])
         passed[1:] &= np.logical_and.accumulate(inside[:-1], axis=0)
         return (passed & np.logical_and.accumulate(allowed, axis=0)).transpose(1, 2, 0)
 

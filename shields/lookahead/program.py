@@ -68,19 +68,19 @@ class PlanProgram:
         self._typical = numbered
 
     def solve(
-        self, estimate: np.ndarray, room: np.ndarray, turn: np.ndarray, radius: float, proposed: np.ndarray
+        self, estimate: np.ndarray, room: np.ndarray, weighting: np.ndarray, radius: float, proposed: np.ndarray
     ) -> np.ndarray | None:
         """Returns a plan, shape (N, m) [physical units], of which nothing is known; None if the solver fails.
 
         Args:
             estimate: x_hat, shape (n,).
             room: Largest |c_i c_j| for j = 1..N-1, shape (N-1, k).
-            turn: T G of the last step, shape (n, n).
+            weighting: T G of the last step, shape (n, n).
             radius: Largest |T G c_j| of the last step.
             proposed: Shape (m,).
         """
         try:
-            A, b, q = self._data(estimate, room, turn, radius, proposed)
+            A, b, q = self._data(estimate, room, weighting, radius, proposed)
             if not (np.isfinite(b).all() and np.isfinite(A).all() and np.isfinite(q).all()):
                 return None
             if self._solver is None:
@@ -94,17 +94,17 @@ class PlanProgram:
         return plan.reshape(self._length, self._m) * self._limits if usable else None
 
     def _data(
-        self, estimate: np.ndarray, room: np.ndarray, turn: np.ndarray, radius: float, proposed: np.ndarray
+        self, estimate: np.ndarray, room: np.ndarray, weighting: np.ndarray, radius: float, proposed: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns entries of the matrix, right-hand side and linear cost."""
         centers = self._free @ estimate
         drift, allowed = (centers[:-1] @ self._C.T).ravel(), room.ravel() - self._reserve
         ones = np.ones(2 * self._length * self._m)
-        cone = np.concatenate([[radius - self._end_reserve], turn @ centers[-1]])
+        cone = np.concatenate([[radius - self._end_reserve], weighting @ centers[-1]])
         b = np.concatenate([allowed - drift, allowed + drift, ones, cone])
         q = np.zeros(self._length * self._m)
         q[: self._m] = -2.0 * self._weights * proposed / self._limits
-        self._entries[self._in_cone] = -(turn @ self._end).ravel()
+        self._entries[self._in_cone] = -(weighting @ self._end).ravel()
         return self._entries[self._order], b, q
 
     def _set_up(self) -> Any:

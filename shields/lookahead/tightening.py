@@ -16,13 +16,13 @@ class Tightening(NamedTuple):
     Attributes:
         room: 1 - rho_j(c_i) less the rounding that does not depend on the estimate, shape (E, N, k) for the k rows c_i
             of the box; NaN for an unusable shape.
-        turn: T G, shape (E, N, n, n), with T of `PredictedErrors` after j steps: c_j is far enough inside S if
+        weighting: T G, shape (E, N, n, n), with T of `PredictedErrors` after j steps: c_j is far enough inside S if
             |T G c_j| is at most the radius.
         radius: 1 - h less the rounding that does not depend on the estimate, shape (E, N); NaN for an unusable shape.
     """
 
     room: np.ndarray
-    turn: np.ndarray
+    weighting: np.ndarray
     radius: np.ndarray
 
 
@@ -49,8 +49,8 @@ def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
     errors = [predicted_errors(end, shapes, nothing) for end in prediction.ends]
     radius = np.stack([each.radius for each in errors], axis=1)
     unusable = np.where(np.isnan(radius).any(axis=1), np.nan, 0.0)
-    turns = np.stack([each.turn.transpose(2, 0, 1) for each in errors], axis=1) @ prediction.ends[0].root
-    return Tightening(1.0 - reach - pushed + unusable[:, None, None], turns, radius)
+    weightings = np.stack([each.weighting.transpose(2, 0, 1) for each in errors], axis=1) @ prediction.ends[0].root
+    return Tightening(1.0 - reach - pushed + unusable[:, None, None], weightings, radius)
 
 
 def _supports(rows: np.ndarray, sizes: np.ndarray, shapes: np.ndarray, rounding: np.ndarray) -> np.ndarray:

@@ -52,7 +52,7 @@ class MonitorState(NamedTuple):
     certified: Any
 
 
-class Report(NamedTuple):
+class LoopObservation(NamedTuple):
     """What is observed of one control loop after a step; of N of them, arrays whose last axis is the loop.
 
     Attributes:
@@ -97,7 +97,7 @@ class GuaranteeMonitor:
         self._reach = SIMULATED_REACH * safety_filter.plant.half_widths
         self._has_error_set = safety_filter.certificate.Sigma is not None
 
-    def start(self, known_inside: Any, unmoved: Any, report: Report) -> MonitorState:
+    def start(self, known_inside: Any, unmoved: Any, report: LoopObservation) -> MonitorState:
         """Returns the state at the start of an episode.
 
         Args:
@@ -109,7 +109,7 @@ class GuaranteeMonitor:
         return self._observe(_first(unmoved * 0, unmoved == False, OTHER_STEPS), known_inside, report)  # noqa: E712
 
     def advance(
-        self, state: MonitorState, decision: Decision, moved_once: Any, same_input: Any, report: Report
+        self, state: MonitorState, decision: Decision, moved_once: Any, same_input: Any, report: LoopObservation
     ) -> MonitorState:
         """Returns the state one step later.
 
@@ -134,7 +134,7 @@ class GuaranteeMonitor:
         reason = _first(reason, state.inside == False, NOT_KNOWN_INSIDE)  # noqa: E712
         return _first(reason, state.certified == False, LARGE_ERROR)  # noqa: E712
 
-    def _observe(self, broken: Any, inside: Any, report: Report) -> MonitorState:
+    def _observe(self, broken: Any, inside: Any, report: LoopObservation) -> MonitorState:
         """Takes in the alarm, the running ellipsoid, and what the estimate alone proves."""
         estimate, errors, alarm = report
         size = np.abs(estimate)

@@ -8,7 +8,7 @@ import numpy as np
 
 from shields.runtime.decisions import Decision
 from shields.runtime.filter import MARGIN, SafetyFilter
-from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, MonitorState, Report, StartKnown
+from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, LoopObservation, MonitorState, StartKnown
 from shields.runtime.predicted_errors import PredictedErrors
 
 
@@ -31,13 +31,13 @@ class GuardedFilter:
     def __init__(self, safety_filter: SafetyFilter) -> None:
         self.filter = safety_filter
         self._monitor = GuaranteeMonitor(safety_filter)
-        self.report: Report
+        self.report: LoopObservation
         self._state: MonitorState
         self._decision: Decision
         self.decided: list[float] = []
         self._stored: np.ndarray
 
-    def begin(self, report: Report, known: StartKnown, unmoved: bool = True) -> None:
+    def begin(self, report: LoopObservation, known: StartKnown, unmoved: bool = True) -> None:
         """Begins an episode.
 
         Args:
@@ -56,7 +56,7 @@ class GuardedFilter:
         self.decided = self._decision.input.tolist()  # the caller may write into the array
         return self._decision
 
-    def advance(self, applied: np.ndarray | None, moved_once: bool, report: Report) -> None:
+    def advance(self, applied: np.ndarray | None, moved_once: bool, report: LoopObservation) -> None:
         """Takes in what happened in the step that followed the decision.
 
         Args:
@@ -70,9 +70,9 @@ class GuardedFilter:
         self._state = self._monitor.advance(self._state, self._decision, moved_once, same_input, report)
         self.report = report
 
-    def reported(self, estimate: np.ndarray, error_shape: Any, alarm: bool) -> Report:
+    def reported(self, estimate: np.ndarray, error_shape: Any, alarm: bool) -> LoopObservation:
         """Returns the report of an estimate, shape (n,), that nobody writes into, and of an error shape, (n, n)."""
-        return Report(estimate, self.filter.errors_of(error_shape), alarm)
+        return LoopObservation(estimate, self.filter.errors_of(error_shape), alarm)
 
     @property
     def plan_length(self) -> int:

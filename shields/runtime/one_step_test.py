@@ -86,12 +86,16 @@ class OneStepTest:
             radius[~near] = np.nan
         if np.count_nonzero(small):  # too small for the weights: nothing passes
             radius[small] = np.minimum(radius[small], 0.0)
-        return ReachableSets(self, self.moved @ estimates, errors.turn, radius)
+        return ReachableSets(self, self.moved @ estimates, errors.weighting, radius)
 
     def reachable_alone(self, estimate: np.ndarray, errors: PredictedErrors) -> ReachableSet | None:
         """Returns what `reachable` does for one estimate, shape (n,), and one error shape; None if nothing passes."""
         radius = errors.radius - self.rounding * float(self.columns.dot(np.abs(estimate)))
-        return ReachableSet(self, self.moved.dot(estimate), errors.turn, radius) if radius >= SMALLEST_RADIUS else None
+        return (
+            ReachableSet(self, self.moved.dot(estimate), errors.weighting, radius)
+            if radius >= SMALLEST_RADIUS
+            else None
+        )
 
     @np.errstate(all="ignore")
     def knows_inside(self, estimates: np.ndarray, errors: PredictedErrors, margin: float) -> np.ndarray:
@@ -112,19 +116,19 @@ class ReachableSets(NamedTuple):
     Attributes:
         test: What holds for all of them.
         offset: G A x_hat, shape (n, N).
-        turn: T of `PredictedErrors`, shape (n, n, N).
+        weighting: T of `PredictedErrors`, shape (n, n, N).
         radius: 1 - h less rounding, shape (N,); no input passes if it is not positive. NaN if nothing is known.
     """
 
     test: OneStepTest
     offset: np.ndarray
-    turn: np.ndarray
+    weighting: np.ndarray
     radius: np.ndarray
 
     def some(self, chosen: np.ndarray) -> ReachableSets:
         """Returns the sets of some environments, given by their indices."""
-        offset, turn, radius = (array.take(chosen, axis=-1) for array in self[1:])
-        return ReachableSets(self.test, offset, turn, radius)
+        offset, weighting, radius = (array.take(chosen, axis=-1) for array in self[1:])
+        return ReachableSets(self.test, offset, weighting, radius)
 
     def slack(self, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns slack and margin of inputs u, shape (m, N); each has shape (N,), NaN where nothing is known.
@@ -133,7 +137,7 @@ class ReachableSets(NamedTuple):
         1 - h - |A x_hat + B u|_M less rounding, which is at most the slack.
         """
         center = self.offset + self.test.effect @ inputs
-        return self.radius - norms((self.turn * center).sum(axis=1)), self.radius - norms(center)
+        return self.radius - norms((self.weighting * center).sum(axis=1)), self.radius - norms(center)
 
     def smallest_slack(self) -> np.ndarray:
         """Returns the slack of the worst input within the limits, shape (N,): a vertex, since the norm is convex."""
@@ -142,7 +146,7 @@ class ReachableSets(NamedTuple):
         worst = self.radius
         for some in np.array_split(vertices, pieces, axis=1):
             centers = self.offset[:, None] + (self.test.effect @ some)[:, :, None]
-            farthest = norms((self.turn[:, :, None] * centers).sum(axis=1)).max(axis=0)
+            farthest = norms((self.weighting[:, :, None] * centers).sum(axis=1)).max(axis=0)
             worst = np.minimum(worst, self.radius - farthest)
         return worst
 
@@ -151,8 +155,8 @@ class ReachableSets(NamedTuple):
 
         NaN where there is none.
         """
-        effect = (self.turn[:, :, None] * self.test.effect[:, :, None]).sum(axis=1)
-        offset = (self.turn * self.offset).sum(axis=1)
+        effect = (self.weighting[:, :, None] * self.test.effect[:, :, None]).sum(axis=1)
+        offset = (self.weighting * self.offset).sum(axis=1)
         return closest_admissible(inputs, offset, effect, self.radius - reserve, self.test.plant.u_max)
 
 
@@ -162,24 +166,24 @@ class ReachableSet(NamedTuple):
     Attributes:
         test: What holds for all environments.
         offset: G A x_hat, shape (n,).
-        turn: T of `PredictedErrors`, shape (n, n).
+        weighting: T of `PredictedErrors`, shape (n, n).
         radius: 1 - h less rounding, at least SMALLEST_RADIUS.
     """
 
     test: OneStepTest
     offset: np.ndarray
-    turn: np.ndarray
+    weighting: np.ndarray
     radius: float
 
     def slack(self, u: np.ndarray) -> tuple[float, float]:
         """Returns slack and margin of an input u, shape (m,)."""
         center = self.offset + self.test.effect.dot(u)
-        turned = self.turn.dot(center)
-        return self.radius - float(turned.dot(turned)) ** 0.5, self.radius - float(center.dot(center)) ** 0.5
+        weighted = self.weighting.dot(center)
+        return self.radius - float(weighted.dot(weighted)) ** 0.5, self.radius - float(center.dot(center)) ** 0.5
 
     def closest(self, u: np.ndarray, reserve: float) -> np.ndarray:
         """Returns what `ReachableSets.closest` does for plants with a single input, shape (1,)."""
-        effect, offset = self.turn.dot(self.test.effect[:, 0]), self.turn.dot(self.offset)
+        effect, offset = self.weighting.dot(self.test.effect[:, 0]), self.weighting.dot(self.offset)
         form = (float(effect.dot(effect)), float(effect.dot(offset)), float(offset.dot(offset)))
         return np.array([closest_on_line(u.item(), *form, self.radius - reserve, self.test.limits[0])])
 

@@ -21,7 +21,7 @@ class PredictedErrors(NamedTuple):
     """What follows from error shapes alone; the last axis counts them (no such axis: a single one).
 
     Attributes:
-        turn: T with |T z|^2 = sum_i (1-h) h / (h - p_i) z_i^2 along the axes of Sigma_pred, shape (n, n, k).
+        weighting: T with |T z|^2 = sum_i (1-h) h / (h - p_i) z_i^2 along the axes of Sigma_pred, shape (n, n, k).
         radius: 1 - h less the rounding that does not depend on the estimate, shape (k,); NaN for an unusable shape.
         half_widths: Largest error of each state, shape (n, k); NaN for an unusable shape.
         largest: Bound of the largest error norm, sqrt(lambda_max(M Sigma_k)), shape (k,); NaN for an unusable shape.
@@ -29,7 +29,7 @@ class PredictedErrors(NamedTuple):
         shape: Sigma_k itself, shape (n, n, k).
     """
 
-    turn: np.ndarray
+    weighting: np.ndarray
     radius: Any
     half_widths: np.ndarray
     largest: Any
@@ -42,9 +42,11 @@ class PredictedErrors(NamedTuple):
 
     def single(self) -> PredictedErrors:
         """Returns the first without a last axis."""
-        turn, half_widths, shape = (array[..., 0].copy() for array in (self.turn, self.half_widths, self.shape))
+        weighting, half_widths, shape = (
+            array[..., 0].copy() for array in (self.weighting, self.half_widths, self.shape)
+        )
         radius, largest, certified = (array.item(0) for array in (self.radius, self.largest, self.certified))
-        return PredictedErrors(turn, radius, half_widths, largest, certified, shape)
+        return PredictedErrors(weighting, radius, half_widths, largest, certified, shape)
 
     def batch(self) -> PredictedErrors:
         """Returns a single one as a batch of one."""
@@ -83,13 +85,13 @@ def predicted_errors(test: OneStepTest, shapes: np.ndarray, certified_shapes: np
     h = np.sqrt(squares[:, -1])
     radius = 1.0 - h - test.rounding * (spread + test.pushed)
     weights = np.where(radius[:, None] >= SMALLEST_RADIUS, (h * (1.0 - h))[:, None] / (h[:, None] - squares), 1.0)
-    turn = np.sqrt(weights)[:, :, None] * axes.swapaxes(1, 2)
+    weighting = np.sqrt(weights)[:, :, None] * axes.swapaxes(1, 2)
     own_spread = half_widths @ test.own_columns
     own = _eigh(test.root @ symmetric @ test.root.T)[0][:, -1] + test.rounding * own_spread**2
-    usable &= np.all(np.isfinite(turn), axis=(1, 2)) & np.isfinite(radius) & (h > 0.0)
+    usable &= np.all(np.isfinite(weighting), axis=(1, 2)) & np.isfinite(radius) & (h > 0.0)
     unusable = np.where(usable, 0.0, np.nan)
     return PredictedErrors(
-        turn=np.ascontiguousarray(np.where(usable[:, None, None], turn, 0.0).transpose(1, 2, 0)),
+        weighting=np.ascontiguousarray(np.where(usable[:, None, None], weighting, 0.0).transpose(1, 2, 0)),
         radius=radius + unusable,
         half_widths=np.ascontiguousarray((half_widths + unusable[:, None]).T),
         largest=np.sqrt(np.maximum(own, 0.0)) + unusable,

@@ -15,7 +15,7 @@ from ncs_gym.validation import as_numbers, as_vector, shown
 from shields.certificate import Certificate
 from shields.runtime.decisions import Decision
 from shields.runtime.filter import SafetyFilter
-from shields.runtime.guarantee import Report, start_known
+from shields.runtime.guarantee import LoopObservation, start_known
 from shields.runtime.guarded_filter import GuardedFilter
 
 NOT_STARTED = "no episode is under way: call start"
@@ -208,7 +208,7 @@ class SafeLoop:
             raise RuntimeError("call start: there was none, or an earlier step failed half-way")
         return self._phase
 
-    def _report(self) -> Report:
+    def _report(self) -> LoopObservation:
         """Returns what the estimator says now."""
         estimator = self._estimator
         return self._guarded.reported(estimator.mean, estimator.shape, estimator.alarm)

@@ -19,8 +19,8 @@ from shields.runtime.guarantee import (
     EXPLANATIONS,
     OTHER_STEPS,
     GuaranteeMonitor,
+    LoopObservation,
     MonitorState,
-    Report,
     start_known,
 )
 from shields.runtime.guarded_filter import first_store
@@ -156,7 +156,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         info = info | added | self._info(decided, proposed, self._state, self._interventions)
         return observation, rewards, terminated, truncated, info
 
-    def _observed(self, info: dict[str, Any]) -> Report:
+    def _observed(self, info: dict[str, Any]) -> LoopObservation:
         """Returns what decisions and the guarantee need of an info, as copies: callers may write into theirs."""
         table, numbers = self._inner.error_shapes
         if table is not self._table:
@@ -166,10 +166,17 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             self._known = self._known.followed_by(new)
         estimates = _columns(info.get("estimate"), (self.num_envs, self.filter.plant.n))
         errors = self._known.of(np.array(numbers, np.intp))
-        return Report(np.array(estimates, order="C"), errors, _alarms(info.get("assumption_violated"), self.num_envs))
+        return LoopObservation(
+            np.array(estimates, order="C"), errors, _alarms(info.get("assumption_violated"), self.num_envs)
+        )
 
     def _advanced(
-        self, state: MonitorState, decided: Decision, moved_once: np.ndarray, info: dict[str, Any], report: Report
+        self,
+        state: MonitorState,
+        decided: Decision,
+        moved_once: np.ndarray,
+        info: dict[str, Any],
+        report: LoopObservation,
     ) -> MonitorState:
         """Returns what is known after a step that applied these decisions, as far as the info says so."""
         return self._monitor.advance(state, decided, moved_once, _same_input(info, decided), report)
@@ -199,7 +206,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         ended = {key: np.asarray(final[key])[done] for key in ("estimate", "input", "assumption_violated")}
         errors = self.filter.errors_of_many(np.asarray(final["error_shape"])[done])
         estimates = _columns(ended["estimate"], (len(done), self.filter.plant.n))
-        report = Report(estimates, errors, _alarms(ended["assumption_violated"], len(done)))
+        report = LoopObservation(estimates, errors, _alarms(ended["assumption_violated"], len(done)))
         state = MonitorState(*(array[done] for array in state))
         decided = Decision(*(array[..., done] for array in decided))
         state = self._advanced(state, decided, moved_once[done], ended, report)

@@ -18,7 +18,7 @@ from ncs_gym.validation import as_number, as_numbers, shown
 from shields.certificate import Certificate
 from shields.runtime.decisions import NO_PLAN
 from shields.runtime.filter import SafetyFilter
-from shields.runtime.guarantee import Report, StartKnown, start_known
+from shields.runtime.guarantee import LoopObservation, StartKnown, start_known
 from shields.runtime.guarded_filter import GuardedFilter
 
 T = TypeVar("T")
@@ -143,7 +143,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         info = info | self._info(proposed, decision.input, decision.margin, intervened=decision.intervened)
         return observation, float(reward) - self.penalty * decision.intervened, terminated, truncated, info
 
-    def _observed(self, info: dict[str, Any]) -> Report:
+    def _observed(self, info: dict[str, Any]) -> LoopObservation:
         """Returns what the decision and the guarantee need of an info, as copies: callers may write into theirs."""
         estimate, shape = as_numbers(info["estimate"]), self.filter.test.single[0]
         estimate = np.full(shape, np.nan) if estimate is None or estimate.shape != shape else estimate.copy()

@@ -9,7 +9,7 @@ import numpy as np
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem
 from shields.synthesis.initial_designs import (
     VOLUME_TOLERANCE,
-    Report,
+    ProgressCallback,
     initial_design,
     multiplier_triple,
 )
@@ -24,7 +24,7 @@ _SMALLEST_GAIN = 1e-4
 _FIRST_STEP, _SMALLEST_STEP = 0.3, 0.03
 
 
-def largest_set(problem: DesignProblem, slack: float, report: Report) -> CandidateDesign | None:
+def largest_set(problem: DesignProblem, slack: float, report: ProgressCallback) -> CandidateDesign | None:
     """Returns the design of largest volume that alternation finds; None if no initial design is found.
 
     Args:

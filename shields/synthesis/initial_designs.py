@@ -23,10 +23,12 @@ SUFFICIENT_MARGIN = 1.0 + 1e-5
 VOLUME_TOLERANCE = 2e-4
 
 # Called with the stage that the search is in, and the design of the largest set so far.
-Report = Callable[[str, CandidateDesign | None], None]
+ProgressCallback = Callable[[str, CandidateDesign | None], None]
 
 
-def initial_design(problem: DesignProblem, program: InvariantSetProgram, report: Report) -> CandidateDesign | None:
+def initial_design(
+    problem: DesignProblem, program: InvariantSetProgram, report: ProgressCallback
+) -> CandidateDesign | None:
     """Returns a feasible design, from fixed multipliers if possible and else from a gain; None if none is found."""
     design = _from_fixed_multipliers(problem, program, report) if len(problem.error_shapes) == 1 else None
     return design or _from_max_margin_gain(problem, program, report)
@@ -38,7 +40,7 @@ def multiplier_triple(lx: float, error_fraction: float) -> tuple[float, float, f
 
 
 def _from_fixed_multipliers(
-    problem: DesignProblem, program: InvariantSetProgram, report: Report
+    problem: DesignProblem, program: InvariantSetProgram, report: ProgressCallback
 ) -> CandidateDesign | None:
     """Returns the best design over a few multipliers and two linearizations."""
     Sigma = problem.error_shapes[-1]
@@ -57,7 +59,7 @@ def _from_fixed_multipliers(
 
 
 def _from_max_margin_gain(
-    problem: DesignProblem, program: InvariantSetProgram, report: Report
+    problem: DesignProblem, program: InvariantSetProgram, report: ProgressCallback
 ) -> CandidateDesign | None:
     """Returns a design near the gain of largest margin; None if that margin is below 1."""
     several = len(problem.error_shapes) > 1

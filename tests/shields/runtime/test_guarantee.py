@@ -7,7 +7,7 @@ from ncs_gym.plants.linear_plant import SIMULATED_REACH
 from ncs_gym.uncertainty.ellipsoid import is_inside
 from shields import Decision, SafetyFilter
 from shields.runtime import guarantee as proof
-from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, Report
+from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, LoopObservation
 from tests.certificates import certificate_of
 from tests.shields.attacks.extremes import RANDOM, TRUCKS
 
@@ -84,7 +84,7 @@ def test_proofs_break_and_recover_as_the_reference_says_whatever_is_reported(nam
         drawn = rng.choice(6, count, p=[0.5, 0.3, 0.14, 0.02, 0.02, 0.02])
         sizes = rng.choice([0.3, 1.0, 1.5, 1e7, 1e120, np.nan], count, p=[0.3, 0.3, 0.34, 0.02, 0.02, 0.02])
         estimates = certificate.safe_set.sample_boundary(rng, count) * sizes[:, None]
-        report = Report(estimates.T, known.of(drawn), alarm)
+        report = LoopObservation(estimates.T, known.of(drawn), alarm)
         started = monitor.start(inside, once, report)
         if state is None:
             state = started
@@ -94,7 +94,7 @@ def test_proofs_break_and_recover_as_the_reference_says_whatever_is_reported(nam
         reasons = [EXPLANATIONS[code] for code in monitor.reasons(state)]
         for e, reference in enumerate(references):
             observed = estimates[e], shapes[drawn[e]], bool(alarm[e])
-            alone = Report(estimates[e], shield.errors_of(shapes[drawn[e]]), bool(alarm[e]))
+            alone = LoopObservation(estimates[e], shield.errors_of(shapes[drawn[e]]), bool(alarm[e]))
             if begins[e]:
                 reference.start(bool(inside[e]), bool(once[e]), *observed)
                 states[e] = monitor.start(bool(inside[e]), bool(once[e]), alone)
@@ -113,7 +113,7 @@ def test_a_published_certificate_proves_nothing():
     shield = SafetyFilter(certificate_of(plant), plant)
     monitor = GuaranteeMonitor(shield)
     monitor._has_error_set = False  # as that of a certificate without Sigma
-    report = Report(np.zeros(2), shield.errors_of(0.1 * certificate_of(plant).Sigma), False)
+    report = LoopObservation(np.zeros(2), shield.errors_of(0.1 * certificate_of(plant).Sigma), False)
     state = monitor.start(True, True, report)
     assert EXPLANATIONS[monitor.reasons(state)] == proof.NO_ERROR_SET
     assert EXPLANATIONS[monitor.reasons(state._replace(broken=1))] == EXPLANATIONS[1]
@@ -125,7 +125,7 @@ def watched(certificate, loaded):
     shield = SafetyFilter(certificate, loaded)
 
     def report(estimate=(0.0, 0.0), shape=certificate.Sigma, alarm=False):
-        return Report(np.array(estimate), shield.errors_of(shape), alarm)
+        return LoopObservation(np.array(estimate), shield.errors_of(shape), alarm)
 
     monitor = GuaranteeMonitor(shield)
     return monitor, report, lambda state: EXPLANATIONS[monitor.reasons(state)]

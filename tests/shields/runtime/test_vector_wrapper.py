@@ -9,7 +9,7 @@ from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatist
 from ncs_gym import Channel, ChannelContract, NCSVectorEnv, SphereDisturbance, batch_reactor, truck_trailer
 from shields import CertificateError, Decision, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.runtime.filter import MODES
-from shields.runtime.guarantee import EXPLANATIONS, OTHER_STEPS, GuaranteeMonitor, Report, start_known
+from shields.runtime.guarantee import EXPLANATIONS, OTHER_STEPS, GuaranteeMonitor, LoopObservation, start_known
 from shields.runtime.guarded_filter import first_store
 from shields.runtime.vector_wrapper import Clock, _moved, overridden
 from tests.certificates import certificate_of
@@ -35,7 +35,9 @@ class Watched:
 
     def _seen(self, row):
         self.row = row
-        return Report(row["estimate"], self.shield.errors_of(row["error_shape"]), bool(row["assumption_violated"]))
+        return LoopObservation(
+            row["estimate"], self.shield.errors_of(row["error_shape"]), bool(row["assumption_violated"])
+        )
 
     def decide(self, u):
         return self.shield.decide(self.row["estimate"], self.row["error_shape"], u, self.stored)
