@@ -54,7 +54,10 @@ def resolved(name):
     """The object of a dotted name."""
     parts = name.split(".")
     module, depth = importlib.import_module(parts[0]), 1
-    while depth < len(parts) - 1 and (ROOT / Path(*parts[: depth + 1])).with_suffix(".py").exists():
+    while depth < len(parts) - 1:
+        path = ROOT / Path(*parts[: depth + 1])
+        if not path.is_dir() and not path.with_suffix(".py").exists():
+            break
         depth += 1
         module = importlib.import_module(".".join(parts[:depth]))
     for part in parts[depth:]:
