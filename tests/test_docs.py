@@ -28,11 +28,14 @@ QUICK_PAGES = (
     "docs/constrained_rl.md",
     "docs/vector.md",
 )
-# Their programs train an agent, or synthesize certificates of unstable plants.
+# Their programs train an agent, or synthesize certificates that take seconds.
 SLOW_PAGES = (
     "docs/tutorial.md",
     "docs/constrained_rl.md",
     "docs/contracts.md",
+    "docs/own_plant.md",
+    "docs/deployment.md",
+    "docs/lookahead.md",
     "docs/agents.md",
     "docs/integrations.md",
 )
