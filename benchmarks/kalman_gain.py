@@ -2,7 +2,7 @@
 
 The estimator tries the Kalman gain first and takes it only if the error stays in its certified set; otherwise it takes
 the set-membership gain, or under a contract the certified gain of the estimate's age, or skips the sample
-(docs/shield.md). Counted is every update that it makes, those of replays included.
+(docs/shield_proof.md). Counted is every update that it makes, those of replays included.
 """
 
 from __future__ import annotations

@@ -102,7 +102,7 @@ def _conditional_set(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
 def require_error_set(error_set: ErrorSet, plant: LinearPlant) -> None:
     """Raises unless an error set's conditions hold by more than the rounding of evaluating them.
 
-    Estimators rest on them; (C2) includes room for the rounding of an updated estimate (docs/shield.md, "Rounding").
+    Estimators rest on them; (C2) includes room for the rounding of an updated estimate (docs/shield_proof.md).
 
     Raises:
         ErrorSetError: Naming the condition.

@@ -38,7 +38,7 @@ class ErrorSetsByAge(ReadOnlyArrays):
         (C1) Sigma_{j+1} >= A Sigma_j A'/lam_j + D/(1-lam_j)                             j = 0..h
         (C2) Sigma_0 >= (I-T_j H) Sigma_j (I-T_j H)'/mu_j + T_j N T_j'/(1-mu_j)          j = 1..h+1
 
-    (C2) holds with room for the rounding of an estimate that is updated (docs/shield.md, "Rounding").
+    (C2) holds with room for the rounding of an estimate that is updated (docs/shield_proof.md, "Rounding").
 
     Attributes:
         contract: The promise they rest on.

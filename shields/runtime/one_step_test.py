@@ -27,7 +27,7 @@ FARTHEST = 1e100
 
 
 class OneStepTest:
-    """Whether everything one step can reach lies in S = {x : x'Mx <= 1} = E(L) (docs/shield.md, "One step").
+    """Whether everything one step can reach lies in S = {x : x'Mx <= 1} = E(L) (docs/shield_proof.md, "One step").
 
     x+ lies in {c} + E(Sigma_pred) with c = A x_hat + B u. In coordinates where M = I, with p_i the eigenvalues of
     Sigma_pred, c_i the coordinates of c along their axes and h = sqrt(max p) < 1, that set is inside S if

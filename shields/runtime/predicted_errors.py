@@ -59,7 +59,7 @@ class PredictedErrors(NamedTuple):
 
 @np.errstate(all="ignore")  # what overflows is found below, what underflows does not count
 def predicted_errors(test: OneStepTest, shapes: np.ndarray, certified_shapes: np.ndarray) -> PredictedErrors:
-    """Returns what the test and the guarantee need of error shapes (docs/shield.md, "One step").
+    """Returns what the test and the guarantee need of error shapes (docs/shield_proof.md, "One step").
 
     Sigma_pred is the trace-smallest G (A Sigma_k A'/nu + D/(1-nu)) G', enlarged by the rounding of computing it.
 
