@@ -1,5 +1,7 @@
 """PPO-Lagrangian's price of a violation, and agents that add to a gain."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -90,7 +92,7 @@ def test_residual_agent_is_trained_saved_and_loaded_with_its_gain(tmp_path):
     np.testing.assert_allclose(agent.act(observations), np.clip(part + observations[:, :2] @ GAIN.T, -1, 1), rtol=1e-6)
     agent.save(tmp_path)
     np.testing.assert_array_equal(Agent.load(tmp_path).act(observations), agent.act(observations))
-    wrong = agent.__class__(**{**vars(agent), "residual_gain": np.ones((2, 2))})
+    wrong = replace(agent, residual_gain=np.ones((2, 2)))
     wrong.save(tmp_path)
     with pytest.raises(AgentError, match="residual gain"):
         Agent.load(tmp_path)

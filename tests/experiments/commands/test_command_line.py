@@ -49,7 +49,7 @@ def is_alive(pid):
 @pytest.fixture(scope="module")
 def smoke(made_once):
     def make(folder):
-        run = ncs_process("compare", "--smoke", "--out", folder / "out")
+        run = ncs_process("compare", "--smoke", "--ppo.log-std", "0.0", "--out", folder / "out")
         (folder / "run.json").write_text(json.dumps([run.returncode, run.stdout, run.stderr]))
 
     folder = made_once("smoke", make)
