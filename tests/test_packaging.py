@@ -51,7 +51,7 @@ LAYERS = {
         {"settings", "baselines"},
         {"runs"},
         {"backends", "analysis", "plots"},
-        {"report", "attack", "paper"},
+        {"report", "study", "attack", "paper"},
         {"commands"},
         {"__main__"},
     ),

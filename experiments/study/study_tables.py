@@ -1,0 +1,174 @@
+"""The tables of a study as text, at most 100 columns wide: each is a pure function of the numbers that pages show."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from experiments.analysis.text_table import text_table
+from experiments.study.study_summary import SOUND_ARMS
+
+# Narrow headers of the conditions.
+_CONDITIONS = {
+    "worst-case disturbance": ("worst", "dist."),
+    "worse channel": ("worse", "chan."),
+    "gaussian": ("Gauss", ""),
+}
+# Policies that are simpler than a trained agent behind the shield.
+_SIMPLER = ("zero input", "K x_hat", "random+", "proportional", "lqr", "shield at test")
+# Largest adjusted p-value at which a difference counts.
+LEVEL = 0.05
+
+
+def evaluation_table(env: dict[str, Any]) -> str:
+    """Returns violating episodes [%] under every condition, episodes that left S, overridden steps and the return.
+
+    Args:
+        env: An environment of `page_summary`.
+    """
+    conditions = list(next(iter(env["arms"].values()))["conditions"])
+    narrow = [_CONDITIONS.get(name, (name, "")) for name in conditions]
+    head = [
+        ["", "violating episodes [%]", *("" for _ in narrow), "left S", "over-", "return"],
+        ["", "as trained [95 % CI]", *(first for first, _ in narrow), "[%]", "ridden", "[95 % CI]"],
+    ]
+    rows = [
+        [
+            name,
+            _violating(arm),
+            *(f"{100 * arm['conditions'][each]['eval_violation_rate']:.1f}" for each in conditions),
+            f"{100 * arm['eval_episodes_outside_set'] / arm['eval_episodes']:.1f}",
+            "-" if arm["mode"] is None else f"{100 * arm['intervention_rate']:.1f} %",
+            _return(arm),
+        ]
+        for name, arm in env["arms"].items()
+    ]
+    return text_table([*head, *rows], rules=(len(head), len(head) + len(env["trained"])))
+
+
+def training_table(env: dict[str, Any]) -> str:
+    """Returns how many steps violated while the agents learned."""
+    rows = [["", "violating steps in training", "of all", "fewest and most in a run"]]
+    for name in env["trained"]:
+        arm = env["arms"][name]
+        if arm["train_steps"] == 0:
+            continue
+        by_run = arm["train_violation_steps_by_run"]
+        rows.append(
+            [
+                name,
+                f"{arm['train_violation_steps']:,} of {arm['train_steps']:,}",
+                f"{100 * arm['train_violation_steps'] / arm['train_steps']:.2f} %",
+                f"{min(by_run):,} to {max(by_run):,}",
+            ]
+        )
+    return text_table(rows)
+
+
+def price_table(summary: dict[str, Any]) -> str:
+    """Returns what the error set costs: points of overridden steps and return, arms with it minus arms without it."""
+    rows = [["", "with - without error set", "violating episodes", "overridden [points]", "return"]]
+    rules = []
+    for name, env in summary["environments"].items():
+        rules.append(len(rows))
+        for price in env["prices"]:
+            sound, trusting = (env["arms"][price[key]] for key in ("sound", "trusting"))
+            rows.append(
+                [
+                    name if len(rows) == rules[-1] else "",
+                    f"{price['sound']} - {price['trusting']}",
+                    f"{100 * sound['eval_violation_rate']:.1f} - {100 * trusting['eval_violation_rate']:.1f} %",
+                    _difference(price["overridden"], 100.0),
+                    _difference(price["return"]),
+                ]
+            )
+    return text_table(rows, rules=rules, left_columns=2)
+
+
+def pairs_table(env: dict[str, Any]) -> str:
+    """Returns the differences of every arm to the arms with a proof, adjusted for comparing all pairs."""
+    return _pairs(env, lambda name: True, verdict=False)
+
+
+def simpler_table(summary: dict[str, Any]) -> str:
+    """Returns, for every environment, what simpler policies do beside trained agents with a proof."""
+    parts = [
+        f"{name}\n\n{_pairs(env, lambda other: other.startswith(_SIMPLER), verdict=True)}"
+        for name, env in summary["environments"].items()
+    ]
+    return "\n\n".join(parts)
+
+
+def scores_table(summary: dict[str, Any]) -> str:
+    """Returns the interquartile means of scores over all environments; empty where there are none."""
+    if not summary["scores"]:
+        return ""
+    rows = [["", "score", "[95 % CI]"]]
+    for name, score in summary["scores"].items():
+        interval = score["ci95"]
+        rows.append([name, f"{score['iqm']:.2f}", f"[{interval[0]:.2f}, {interval[1]:.2f}]" if interval else "one run"])
+    return text_table(rows)
+
+
+def _pairs(env: dict[str, Any], wanted: Callable[[str], bool], *, verdict: bool) -> str:
+    """Returns a row per wanted arm and trained arm with a proof: other minus own return, and violating episodes."""
+    differences = {(pair["first"], pair["second"]): pair for pair in env["pairs"]["return"]}
+    safety = {(pair["first"], pair["second"]): pair for pair in env["pairs"]["violating episodes"]}
+    head = ["", "minus", "return [95 % CI]", "p (Holm)", "violating episodes [%]", "p (Holm)"]
+    rows, rules = [[*head, "verdict"] if verdict else head], []
+    for own in (name for name in SOUND_ARMS if name in env["arms"]):
+        rules.append(len(rows))
+        for name in env["arms"]:
+            if name != own and wanted(name):
+                returned, violating = _oriented(differences, name, own), _oriented(safety, name, own)
+                cells = [
+                    name,
+                    own,
+                    _difference(returned),
+                    _p_text(returned["p_holm"]),
+                    _difference(violating, 100.0),
+                    _p_text(violating["p_holm"]),
+                ]
+                rows.append([*cells, _verdict(env["arms"][name], returned)] if verdict else cells)
+    return text_table(rows, rules=rules, left_columns=2)
+
+
+def _oriented(pairs: dict[tuple[str, str], dict[str, Any]], name: str, own: str) -> dict[str, Any]:
+    """Returns the difference name - own, whichever order it is stored in."""
+    if (name, own) in pairs:
+        return pairs[name, own]
+    pair = pairs[own, name]
+    interval = pair["ci95"] and [-pair["ci95"][1], -pair["ci95"][0]]
+    return pair | {"mean": -pair["mean"], "ci95": interval}
+
+
+def _verdict(arm: dict[str, Any], returned: dict[str, Any]) -> str:
+    """Returns what a simpler policy is compared with a trained agent that has a proof."""
+    if arm["eval_violating_episodes"]:
+        return "violates"
+    if returned["p_holm"] is None or returned["p_holm"] > LEVEL:
+        return "no difference found"
+    return "wins" if returned["mean"] > 0.0 else "loses"
+
+
+def _violating(arm: dict[str, Any]) -> str:
+    low, high = (100.0 * end for end in arm["eval_violation_rate_ci95"])
+    return f"{100 * arm['eval_violation_rate']:.1f} [{low:.1f}, {high:.1f}]"
+
+
+def _return(arm: dict[str, Any]) -> str:
+    interval = arm["eval_return_ci95"]
+    half = "[n/a]" if interval is None else f"+-{0.5 * (interval[1] - interval[0]):.1f}"
+    return f"{arm['eval_return_mean']:.1f} {half}"
+
+
+def _difference(difference: dict[str, Any], scale: float = 1.0) -> str:
+    interval = difference["ci95"]
+    text = f" [{scale * interval[0]:+.1f}, {scale * interval[1]:+.1f}]" if interval else ""
+    return f"{scale * difference['mean']:+.1f}{text}"
+
+
+def _p_text(p_value: float | None) -> str:
+    if p_value is None:
+        return "-"
+    return "<0.001" if p_value < 0.001 else f"{p_value:.3f}"
