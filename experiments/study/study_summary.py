@@ -82,10 +82,8 @@ def _prices(arms: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
     prices = []
     for name, arm in arms.items():
         if (sound := sound_counterpart(name)) in arms:
-            overridden, returns = (
-                paired_difference(arms[sound][key], arm[key])
-                for key in ("intervention_rate_by_run", MEASURES["return"])
-            )
+            measures = ("intervention_rate_by_run", MEASURES["return"])
+            overridden, returns = (paired_difference(arms[sound][key], arm[key]) for key in measures)
             prices.append({"trusting": name, "sound": sound, "overridden": overridden, "return": returns})
     return prices
 

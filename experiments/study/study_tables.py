@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import Any
 
 from experiments.analysis.text_table import text_table
-from experiments.study.study_summary import SOUND_ARMS
+from experiments.study.study_summary import MEASURES, SOUND_ARMS
 
 # Narrow headers of the conditions.
 _CONDITIONS = {
     "worst-case disturbance": ("worst", "dist."),
     "worse channel": ("worse", "chan."),
-    "gaussian": ("Gauss", ""),
+    "gaussian": ("Gauss", "noise"),
 }
 # Policies that are simpler than a trained agent behind the shield.
 _SIMPLER = ("zero input", "K x_hat", "random+", "proportional", "lqr", "shield at test")
@@ -29,8 +29,8 @@ def evaluation_table(env: dict[str, Any]) -> str:
     conditions = list(next(iter(env["arms"].values()))["conditions"])
     narrow = [_CONDITIONS.get(name, (name, "")) for name in conditions]
     head = [
-        ["", "violating episodes [%]", *("" for _ in narrow), "left S", "over-", "return"],
-        ["", "as trained [95 % CI]", *(first for first, _ in narrow), "[%]", "ridden", "[95 % CI]"],
+        ["", "violating episodes [%]", *(first for first, _ in narrow), "left S", "over-", "return"],
+        ["", "as trained [95 % CI]", *(second for _, second in narrow), "[%]", "ridden", "[95 % CI]"],
     ]
     rows = [
         [
@@ -67,35 +67,45 @@ def training_table(env: dict[str, Any]) -> str:
 
 def price_table(summary: dict[str, Any]) -> str:
     """Returns what the error set costs: points of overridden steps and return, arms with it minus arms without it."""
-    rows = [["", "with - without error set", "violating episodes", "overridden [points]", "return"]]
-    rules = []
+    head = ["with the error set", "without", "violating", "overridden [points]", "return"]
+    parts = []
     for name, env in summary["environments"].items():
-        rules.append(len(rows))
+        rows = [head]
         for price in env["prices"]:
             sound, trusting = (env["arms"][price[key]] for key in ("sound", "trusting"))
-            rows.append(
-                [
-                    name if len(rows) == rules[-1] else "",
-                    f"{price['sound']} - {price['trusting']}",
-                    f"{100 * sound['eval_violation_rate']:.1f} - {100 * trusting['eval_violation_rate']:.1f} %",
-                    _difference(price["overridden"], 100.0),
-                    _difference(price["return"]),
-                ]
-            )
-    return text_table(rows, rules=rules, left_columns=2)
+            rates = [f"{100 * arm['eval_violation_rate']:.1f}" for arm in (sound, trusting)]
+            names = [price["sound"], price["trusting"].rpartition("+")[2]]
+            differences = [_difference(price["overridden"], 100.0), _difference(price["return"])]
+            rows.append([*names, f"{rates[0]}, not {rates[1]} %", *differences])
+        parts.append(_titled(name, text_table(rows, left_columns=2)))
+    return "\n\n".join(parts)
 
 
 def pairs_table(env: dict[str, Any]) -> str:
     """Returns the differences of every arm to the arms with a proof, adjusted for comparing all pairs."""
-    return _pairs(env, lambda name: True, verdict=False)
+    parts = []
+    for own in (name for name in SOUND_ARMS if name in env["arms"]):
+        rows = [[f"minus {own}:", "return [95 % CI]", "p (Holm)", "violating episodes [%]"]]
+        for name in (each for each in env["arms"] if each != own):
+            returned, violating = (_oriented(env["pairs"][measure], name, own) for measure in MEASURES)
+            cells = [_difference(returned), _p_text(returned["p_holm"]), _difference(violating, 100.0)]
+            rows.append([name, *cells])
+        parts.append(text_table(rows))
+    return "\n\n".join(parts)
 
 
 def simpler_table(summary: dict[str, Any]) -> str:
     """Returns, for every environment, what simpler policies do beside trained agents with a proof."""
-    parts = [
-        f"{name}\n\n{_pairs(env, lambda other: other.startswith(_SIMPLER), verdict=True)}"
-        for name, env in summary["environments"].items()
-    ]
+    parts = []
+    for title, env in summary["environments"].items():
+        for own in (name for name in SOUND_ARMS if name in env["arms"]):
+            rows = [[f"minus {own}:", "return [95 % CI]", "p (Holm)", "violating", "verdict"]]
+            for name in (each for each in env["arms"] if each.startswith(_SIMPLER)):
+                arm, returned = env["arms"][name], _oriented(env["pairs"]["return"], name, own)
+                violating = f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,}"
+                cells = [_difference(returned), _p_text(returned["p_holm"]), violating, _verdict(arm, returned)]
+                rows.append([name, *cells])
+            parts.append(_titled(title, text_table(rows)))
     return "\n\n".join(parts)
 
 
@@ -110,34 +120,15 @@ def scores_table(summary: dict[str, Any]) -> str:
     return text_table(rows)
 
 
-def _pairs(env: dict[str, Any], wanted: Callable[[str], bool], *, verdict: bool) -> str:
-    """Returns a row per wanted arm and trained arm with a proof: other minus own return, and violating episodes."""
-    differences = {(pair["first"], pair["second"]): pair for pair in env["pairs"]["return"]}
-    safety = {(pair["first"], pair["second"]): pair for pair in env["pairs"]["violating episodes"]}
-    head = ["", "minus", "return [95 % CI]", "p (Holm)", "violating episodes [%]", "p (Holm)"]
-    rows, rules = [[*head, "verdict"] if verdict else head], []
-    for own in (name for name in SOUND_ARMS if name in env["arms"]):
-        rules.append(len(rows))
-        for name in env["arms"]:
-            if name != own and wanted(name):
-                returned, violating = _oriented(differences, name, own), _oriented(safety, name, own)
-                cells = [
-                    name,
-                    own,
-                    _difference(returned),
-                    _p_text(returned["p_holm"]),
-                    _difference(violating, 100.0),
-                    _p_text(violating["p_holm"]),
-                ]
-                rows.append([*cells, _verdict(env["arms"][name], returned)] if verdict else cells)
-    return text_table(rows, rules=rules, left_columns=2)
+def _titled(title: str, table: str) -> str:
+    return f"{title}\n{table}"
 
 
-def _oriented(pairs: dict[tuple[str, str], dict[str, Any]], name: str, own: str) -> dict[str, Any]:
+def _oriented(pairs: Sequence[dict[str, Any]], name: str, own: str) -> dict[str, Any]:
     """Returns the difference name - own, whichever order it is stored in."""
-    if (name, own) in pairs:
-        return pairs[name, own]
-    pair = pairs[own, name]
+    pair = next(pair for pair in pairs if {pair["first"], pair["second"]} == {name, own})
+    if pair["first"] == name:
+        return pair
     interval = pair["ci95"] and [-pair["ci95"][1], -pair["ci95"][0]]
     return pair | {"mean": -pair["mean"], "ci95": interval}
 
@@ -147,7 +138,7 @@ def _verdict(arm: dict[str, Any], returned: dict[str, Any]) -> str:
     if arm["eval_violating_episodes"]:
         return "violates"
     if returned["p_holm"] is None or returned["p_holm"] > LEVEL:
-        return "no difference found"
+        return "no difference"
     return "wins" if returned["mean"] > 0.0 else "loses"
 
 
@@ -164,8 +155,12 @@ def _return(arm: dict[str, Any]) -> str:
 
 def _difference(difference: dict[str, Any], scale: float = 1.0) -> str:
     interval = difference["ci95"]
-    text = f" [{scale * interval[0]:+.1f}, {scale * interval[1]:+.1f}]" if interval else ""
-    return f"{scale * difference['mean']:+.1f}{text}"
+    text = f" [{_signed(scale * interval[0])}, {_signed(scale * interval[1])}]" if interval else ""
+    return f"{_signed(scale * difference['mean'])}{text}"
+
+
+def _signed(value: float) -> str:
+    return f"{round(value, 1) + 0.0:+.1f}"  # no negative zero
 
 
 def _p_text(p_value: float | None) -> str:
