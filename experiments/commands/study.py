@@ -79,7 +79,7 @@ def _comparison_settings(settings: StudySettings, env_id: str) -> CompareSetting
         conditions=settings.conditions,
         **backend,
     )
-    return replace(part, steps=math.ceil(settings.budget * part.steps))
+    return replace(part, steps=math.ceil(settings.budget * part.training_steps))
 
 
 def _write(settings: StudySettings, summary: dict[str, Any], comparisons: Mapping[str, dict[str, Any]]) -> None:
