@@ -51,8 +51,9 @@ LAYERS = {
         {"settings", "baselines"},
         {"runs"},
         {"backends", "analysis", "plots"},
-        {"report", "study", "attack", "paper"},
+        {"report", "attack", "paper"},
         {"commands"},
+        {"study"},
         {"__main__"},
     ),
 }

@@ -11,6 +11,9 @@ from scipy.stats import ttest_rel
 
 from experiments.analysis.statistics import mean_interval
 
+# Differences that differ by less than this fraction of the values are equal but for rounding.
+_ROUNDING = 1e-12
+
 
 def paired_difference(first: Sequence[float], second: Sequence[float]) -> dict[str, Any]:
     """Returns mean, Student's 95 % interval and p-value of the differences first - second of paired runs.
@@ -80,6 +83,6 @@ def _p_value(first: Sequence[float], second: Sequence[float], differences: np.nd
     runs = len(differences)
     if runs < 2:
         return None
-    if np.ptp(differences) == 0.0:
-        return 1.0 if differences[0] == 0.0 else 2.0 ** (1 - runs)
+    if np.ptp(differences) <= _ROUNDING * max(np.abs(first).max(), np.abs(second).max()):
+        return 1.0 if np.array_equal(first, second) else 2.0 ** (1 - runs)
     return float(ttest_rel(first, second).pvalue)

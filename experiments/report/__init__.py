@@ -1,7 +1,6 @@
 """The reports of comparisons, sweeps and studies: templates, and what is inserted into them."""
 
 from experiments.report.comparison import comparison_report
-from experiments.report.study import results_page, study_report
 from experiments.report.sweep import sweep_report
 
-__all__ = ["comparison_report", "results_page", "study_report", "sweep_report"]
+__all__ = ["comparison_report", "sweep_report"]

@@ -1,6 +1,5 @@
-"""From comparisons in several environments to one study: its summary, its sweep of channels, tables, figures, pages."""
+"""`ncs study`: comparisons in several environments become one summary, with tables, figures and pages."""
 
-from experiments.study.channel_sweep import channel_sweep
-from experiments.study.study_summary import page_summary, study_summary
+from experiments.study.study import study
 
-__all__ = ["channel_sweep", "page_summary", "study_summary"]
+__all__ = ["study"]

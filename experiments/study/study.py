@@ -11,14 +11,14 @@ from typing import Any
 
 from experiments.analysis.parquet_tables import parquet
 from experiments.commands.compare import compare
-from experiments.report.study import results_page, study_report
 from experiments.runs import prepare_output, versions
 from experiments.runs.experiment_setup import INCIDENTAL_SETTINGS
 from experiments.settings import BackendSettings, CompareSettings, StudySettings, save_settings, settings_json
 from experiments.settings.study import short_name
 from experiments.study.channel_sweep import channel_sweep
-from experiments.study.quoted_tables import quoted, tables_by_name
+from experiments.study.quoted_tables import quoted, require_marks, tables_by_name
 from experiments.study.study_figures import study_figures
+from experiments.study.study_report import results_page, study_report
 from experiments.study.study_summary import page_summary, study_summary
 from shields.atomic_write import write_atomically
 
@@ -40,7 +40,8 @@ def study(settings: StudySettings) -> None:
     """
     if settings.smoke:
         settings = replace(settings, **_SMOKE)
-    pages = {path: path.read_text("utf-8") for path in settings.quote}
+    for path in settings.quote:
+        require_marks(path.read_text("utf-8"))
     prepare_output(settings.out)
     save_settings(settings.out / "settings.json", "study", settings)
     parts = {short_name(env): _comparison_settings(settings, env) for env in settings.envs}
@@ -59,8 +60,8 @@ def study(settings: StudySettings) -> None:
     }
     summary = study_summary(comparisons) | {"channels": channels} | provenance
     _write(settings, summary, comparisons)
-    for path, text in pages.items():
-        write_atomically(path, quoted(text, tables_by_name(page_summary(summary))))
+    for path in settings.quote:
+        write_atomically(path, quoted(path.read_text("utf-8"), tables_by_name(page_summary(summary))))
     print(f"files: {settings.out}")
 
 
