@@ -65,7 +65,7 @@ def all_pairs(values: Mapping[str, Sequence[float]]) -> list[dict[str, Any]]:
     Returns:
         JSON values per pair: first, second, what `paired_difference` returns, and p_holm (None for single runs).
     """
-    pairs = [
+    pairs: list[dict[str, Any]] = [
         {"first": one, "second": other} | paired_difference(values[one], values[other])
         for one, other in combinations(values, 2)
     ]

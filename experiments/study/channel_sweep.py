@@ -12,7 +12,6 @@ from experiments.runs import ExperimentSetup, RunResult, TrainingRun
 from experiments.runs.conditions import AS_TRAINED
 from experiments.runs.environments import registered_env
 from experiments.settings import ChannelSettings, CompareSettings
-from ncs_gym import Channel
 
 # The filters, in pairs without and with the error set: those that keep S, then those that may leave it.
 SWEPT_ARMS = ("lqr+trusting", "lqr+shielded", "lqr+trusting:lookahead", "lqr+lookahead")
@@ -76,7 +75,9 @@ def _points(env_id: str) -> list[_Point]:
 
 def _changed(point: _Point) -> ChannelSettings:
     """Returns the change of the environment's channel at a point."""
-    return ChannelSettings(**{point.side: int(point.value) if point.side == "delay" else point.value})
+    if point.side == "delay":
+        return ChannelSettings(delay=int(point.value))
+    return ChannelSettings(loss=point.value) if point.side == "loss" else ChannelSettings(quantization_step=point.value)
 
 
 def _runs(point: _Point, settings: CompareSettings) -> list[TrainingRun]:
@@ -107,9 +108,3 @@ def _rows(point: _Point, results: Sequence[RunResult]) -> list[dict[str, Any]]:
                 }
             )
     return rows
-
-
-def own_values(channel: Channel) -> dict[str, float]:
-    """Returns the values of a channel on the sides of the grid, where its losses are independent."""
-    loss = {"loss": channel.loss} if isinstance(channel.loss, float) else {}
-    return loss | {"delay": float(channel.delay), "quantization_step": channel.quantization_step}

@@ -81,7 +81,8 @@ def _prices(arms: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
     """Returns, for each arm without the error set beside the same one with it, how much more the latter overrides."""
     prices = []
     for name, arm in arms.items():
-        if (sound := sound_counterpart(name)) in arms:
+        sound = sound_counterpart(name)
+        if sound is not None and sound in arms:
             measures = ("intervention_rate_by_run", MEASURES["return"])
             overridden, returns = (paired_difference(arms[sound][key], arm[key]) for key in measures)
             prices.append({"trusting": name, "sound": sound, "overridden": overridden, "return": returns})
