@@ -108,7 +108,7 @@ def training_figure(summary: dict[str, Any]) -> CaptionedFigure:
                 axis.plot(by_run, [height] * len(by_run), "o", ms=4.0, mfc=style.color, mec="white", mew=0.5)
                 axis.plot(np.mean(by_run), height, ls="none", **style.points)
             axis.set_xscale("symlog", linthresh=1.0)
-            axis.set_xlim(-0.3, None)
+            axis.set_xlim(-0.3, max(1.0, axis.dataLim.x1) * 2.0)
             axis.set_yticks(range(len(names), 0, -1), names)
             label(axis, "violating training steps", "", title)
         return figure

@@ -67,7 +67,7 @@ def training_table(env: dict[str, Any]) -> str:
 
 def price_table(summary: dict[str, Any]) -> str:
     """Returns what the error set costs: points of overridden steps and return, arms with it minus arms without it."""
-    head = ["with the error set", "without", "violating", "overridden [points]", "return"]
+    head = ["with error set", "without", "violating", "overridden [pts]", "return"]
     parts = []
     for name, env in summary["environments"].items():
         rows = [head]
@@ -76,7 +76,7 @@ def price_table(summary: dict[str, Any]) -> str:
             rates = [f"{100 * arm['eval_violation_rate']:.1f}" for arm in (sound, trusting)]
             names = [price["sound"], price["trusting"].rpartition("+")[2]]
             differences = [_difference(price["overridden"], 100.0), _difference(price["return"])]
-            rows.append([*names, f"{rates[0]}, not {rates[1]} %", *differences])
+            rows.append([*names, f"{rates[0]}/{rates[1]} %", *differences])
         parts.append(_titled(name, text_table(rows, left_columns=2)))
     return "\n\n".join(parts)
 

@@ -80,7 +80,7 @@ def test_price_of_soundness_is_with_minus_without_the_error_set():
     assert prices.keys() == {"trusting", "lqr+trusting"}
     assert prices["trusting"]["return"]["mean"] == pytest.approx(-2.0, abs=0.3)
     table = price_table({"environments": {"Plant-v0": env}})
-    assert "0.0, not 50.0 %" in row(table, "shielded")
+    assert "0.0/50.0 %" in row(table, "shielded")
 
 
 def test_scores_are_between_random_and_regulator_behind_the_shield():
