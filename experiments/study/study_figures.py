@@ -7,6 +7,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 
 from experiments.plots.arm_style import ArmStyle
 from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below, thousands
@@ -49,6 +50,7 @@ def sweep_figure(name: str, rows: list[dict[str, Any]]) -> CaptionedFigure:
                     _draw_sweep(axis, [r for r in rows if r["side"] == side and r["arm"] == arm], measure, arm)
                 label(axis, _SIDES[side], title if axis is axes[0] else "")
                 axis.set_ylim(-4.0, 104.0)
+                axis.xaxis.set_major_locator(MaxNLocator(4))
             handles |= {arm: ArmStyle.of(arm).handle(line=False, points=True) for arm in arms}
         legend_below(figure, handles)
         return figure
