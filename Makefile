@@ -13,10 +13,14 @@ AUDIT_INSTALLED := $(VENV)/.installed-audit
 ZOO_INSTALLED := $(VENV)/.installed-rl-zoo
 RAY_INSTALLED := $(VENV)/.installed-ray
 
-.PHONY: compare test coverage coverage-report test-slow lint types benchmark docs audit clean
+.PHONY: compare study test coverage coverage-report test-slow lint types benchmark docs audit clean
 
 compare: $(INSTALLED)
 	$(BIN)/ncs compare --out $(OUT)
+
+# The pages of results: runs that runs/study has already are kept, so that it can be done in parts. STUDY: more options of ncs study.
+study: $(INSTALLED)
+	$(BIN)/ncs study --page docs/results.md --quote README.md docs/when_not.md $(STUDY)
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest -n auto --dist worksteal $(TEST_FLAGS)

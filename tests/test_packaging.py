@@ -53,6 +53,7 @@ LAYERS = {
         {"backends", "analysis", "plots"},
         {"report", "attack", "paper"},
         {"commands"},
+        {"study"},
         {"__main__"},
     ),
 }

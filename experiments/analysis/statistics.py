@@ -62,3 +62,23 @@ def bootstrap_interval(
         rng=np.random.default_rng(0),
     )
     return float(result.confidence_interval.low), float(result.confidence_interval.high)
+
+
+def stratified_interval(
+    strata: Sequence[Sequence[float]], statistic: Callable[..., float] = interquartile_mean
+) -> tuple[float, float] | None:
+    """Returns the percentile bootstrap's 95 % interval of a statistic of all values, each stratum resampled by itself.
+
+    This is how Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice" (2021), resample:
+    the runs within each task. None if a stratum has fewer than two values.
+
+    Args:
+        strata: Values of the runs in each environment.
+        statistic: Function of an array of resampled values and the `axis` over which it is computed.
+    """
+    if not strata or min(map(len, strata)) < 2:
+        return None
+    rng = np.random.default_rng(0)
+    drawn = [rng.choice(np.asarray(values, np.float64), (RESAMPLES, len(values))) for values in strata]
+    low, high = np.quantile(statistic(np.hstack(drawn), axis=1), [0.5 - CONFIDENCE / 2.0, 0.5 + CONFIDENCE / 2.0])
+    return float(low), float(high)

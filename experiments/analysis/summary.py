@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,7 @@ def summarize_arm(results: Sequence[RunResult], *, fixed_policy: bool) -> dict[s
         "runs": len(results),
         "train_steps": train_steps,
         "train_violation_steps": sum(result.train_violation_steps for result in results),
+        "train_violation_steps_by_run": [result.train_violation_steps for result in results],
         "train_intervention_rate": _rate(sum(result.train_interventions for result in results), train_steps),
         **_evaluated([result.episodes for result in results], fixed_policy=fixed_policy),
         "conditions": conditions,
@@ -69,7 +70,10 @@ def _evaluated(runs: Sequence[Sequence[Episode]], *, fixed_policy: bool) -> dict
         "eval_return_iqm_bootstrap_ci95": _listed(bootstrap_interval(values, interquartile_mean)),
         "eval_return_ci95_over": "episodes" if fixed_policy else "runs",
         "eval_return_by_run": means,
-        "intervention_rate": sum(episode.interventions for episode in episodes) / eval_steps,
+        "eval_violation_rate_by_run": [_share(run, lambda episode: episode.violation_steps > 0) for run in runs],
+        "eval_outside_set_rate_by_run": [_share(run, lambda episode: episode.largest_level > 1.0) for run in runs],
+        "intervention_rate_by_run": [_intervention_rate(run) for run in runs],
+        "intervention_rate": _intervention_rate(episodes),
         "plan_rate": sum(episode.planned for episode in episodes) / eval_steps,
         "guaranteed_episodes": sum(episode.guaranteed for episode in episodes),
         "largest_level": max(episode.largest_level for episode in episodes),
@@ -114,6 +118,14 @@ def covered_fraction(summary: dict[str, Any]) -> float | None:
 
 def _mean_return(episodes: Sequence[Episode]) -> float:
     return float(np.mean([episode.episode_return for episode in episodes]))
+
+
+def _intervention_rate(episodes: Sequence[Episode]) -> float:
+    return sum(episode.interventions for episode in episodes) / sum(episode.steps for episode in episodes)
+
+
+def _share(episodes: Sequence[Episode], holds: Callable[[Episode], bool]) -> float:
+    return sum(map(holds, episodes)) / len(episodes)
 
 
 def _violating(result: RunResult) -> int:

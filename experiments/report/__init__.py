@@ -1,4 +1,4 @@
-"""The HTML reports of comparisons and sweeps: templates, and what is inserted into them."""
+"""The reports of comparisons, sweeps and studies: templates, and what is inserted into them."""
 
 from experiments.report.comparison import comparison_report
 from experiments.report.sweep import sweep_report

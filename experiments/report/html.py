@@ -61,10 +61,23 @@ def render_report(
     )
 
 
+def render_page(template: str, figures: dict[str, tuple[str, bytes]], **context: Any) -> str:
+    """Returns a page that is not about a single environment: HTML that contains its figures, or Markdown.
+
+    Args:
+        template: Name of the template; only that of an HTML page escapes what it inserts.
+        figures: Caption and PNG file by name.
+        **context: Further variables of the template.
+    """
+    images = {name: _image(caption, png) for name, (caption, png) in figures.items()}
+    percent = f"{100 * CONFIDENCE:.0f}\N{NO-BREAK SPACE}%"
+    return _environment().get_template(template).render(images=images, percent=percent, resamples=RESAMPLES, **context)
+
+
 def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("experiments.report"),
-        autoescape=True,
+        autoescape=lambda template: not str(template).endswith(".md.j2"),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

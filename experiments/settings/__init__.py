@@ -18,6 +18,7 @@ from experiments.settings.learning import (
 )
 from experiments.settings.rendering import RenderSettings
 from experiments.settings.settings_file import config_defaults, save_settings, settings_json
+from experiments.settings.study import StudySettings
 
 __all__ = [
     "AuditSettings",
@@ -29,6 +30,7 @@ __all__ = [
     "LearningSettings",
     "RenderSettings",
     "ReproduceSettings",
+    "StudySettings",
     "SweepSettings",
     "SynthesizeSettings",
     "TrainSettings",

@@ -2,7 +2,13 @@ import numpy as np
 import pytest
 from scipy.stats import binom, norm
 
-from experiments.analysis.statistics import bootstrap_interval, clopper_pearson, interquartile_mean, mean_interval
+from experiments.analysis.statistics import (
+    bootstrap_interval,
+    clopper_pearson,
+    interquartile_mean,
+    mean_interval,
+    stratified_interval,
+)
 
 
 @pytest.mark.parametrize(("events", "trials"), [(0, 600), (1, 10), (5, 10), (10, 10), (589, 600)])
@@ -54,3 +60,22 @@ def test_interquartile_mean_is_that_of_the_middle_half():
     assert interquartile_mean([100.0, 1.0, 2.0, -50.0]) == 1.5
     assert interquartile_mean([1.0, 2.0, 3.0]) == 2.0
     np.testing.assert_array_equal(interquartile_mean([[0.0, 1.0, 3.0, 9.0], [1.0] * 4], axis=1), [2.0, 1.0])
+
+
+def test_stratified_interval_of_one_stratum_is_that_of_the_bootstrap():
+    values = np.random.default_rng(3).exponential(size=30)
+    stratified, plain = stratified_interval([values]), bootstrap_interval(values, interquartile_mean)
+    assert stratified == pytest.approx(plain, abs=0.03)
+
+
+def test_stratified_interval_keeps_the_share_of_every_stratum():
+    # Resampled together, the mean would vary with how often each stratum is drawn.
+    strata = [[0.0, 0.0, 0.0], [100.0, 100.0, 100.0]]
+    assert stratified_interval(strata, np.mean) == (50.0, 50.0)
+    low, high = bootstrap_interval(np.concatenate(strata))
+    assert high - low > 50.0
+
+
+def test_stratified_interval_needs_two_runs_in_every_stratum():
+    assert stratified_interval([[1.0, 2.0], [1.0]]) is None
+    assert stratified_interval([]) is None

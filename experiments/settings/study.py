@@ -1,0 +1,96 @@
+"""Settings of `ncs study`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from experiments.settings.backend import BackendSettings
+from experiments.settings.learning import Algorithm
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudySettings(BackendSettings):
+    """Compares arms in several environments and under several conditions, with the statistics to judge them by.
+
+    Every environment is a comparison of its own (`ncs compare`) in a folder below the output folder, with the settings
+    of that command; then linear controllers meet worse and better channels, with and without the error set. Leaves
+    report.html, results.md, figures, summary.json and study.parquet. Started again with the same folder, finished runs
+    are kept: a long study can be run in parts.
+
+    Attributes:
+        config: Settings file (settings.json) of an earlier study; its settings hold where none are given here.
+        out: Output folder; created if it does not exist.
+        envs: Ids of the environments; the first one leads the page.
+        seed: Seed of the study, >= 0.
+        seeds: Number of paired training runs per arm and environment.
+        budget: Fraction of the training steps of each environment, in (0, 1].
+        episodes: Evaluation episodes per run and condition.
+        algo: Learning algorithm.
+        arms: Trained arms; see `ncs compare`.
+        references: Arms in which nothing is trained.
+        conditions: What policies are evaluated under besides "as trained".
+        channel_episodes: Episodes per point of the figure about channels; 0 leaves it out.
+        page: Also write the page results.md to this file, its figures into the folder images beside it, and its numbers
+            into the file with the ending .json.
+        quote: Pages in which the marked tables are replaced by those of this study.
+        smoke: Run a short version, whatever else is asked for, to see that everything works.
+    """
+
+    config: Path | None = None
+    out: Path = Path("runs/study")
+    envs: tuple[str, ...] = ("ncs_gym/BatchReactor-v0", "ncs_gym/CartPole-v0", "ncs_gym/TruckTrailerCruise-v0")
+    seed: int = 0
+    seeds: int = 10
+    budget: float = 1.0
+    episodes: int = 100
+    algo: Algorithm = "PPO"
+    arms: tuple[str, ...] = (
+        "unshielded",
+        "penalized:1",
+        "penalized:10",
+        "lagrangian",
+        "psf",
+        "trusting",
+        "trusting:lookahead",
+        "shield at test",
+        "shielded",
+        "lookahead",
+    )
+    references: tuple[str, ...] = (
+        "zero input",
+        "K x_hat",
+        "random+shielded",
+        "proportional",
+        "proportional+trusting",
+        "proportional+shielded",
+        "lqr",
+        "lqr+psf",
+        "lqr+trusting:lookahead",
+        "lqr+shielded",
+        "lqr+lookahead",
+    )
+    conditions: tuple[str, ...] = ("worst-case-disturbance", "worse-channel", "gaussian")
+    channel_episodes: int = 100
+    page: Path | None = None
+    quote: tuple[Path, ...] = ()
+    smoke: bool = False
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        BackendSettings.__post_init__(self)
+        for name in ("seeds", "episodes"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("seed", "channel_episodes"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"--{name.replace('_', '-')} must be >= 0, got {getattr(self, name)}")
+        if not 0.0 < self.budget <= 1.0:
+            raise ValueError(f"--budget must be in (0, 1], got {self.budget}")
+        if not self.envs or len(set(map(short_name, self.envs))) != len(self.envs):
+            raise ValueError(f"--envs must be different ones, at least one, got {' '.join(self.envs) or 'none'}")
+
+
+def short_name(env_id: str) -> str:
+    """Returns an environment's id without its namespace and module, as in names of folders."""
+    return env_id.rpartition(":")[2].rpartition("/")[2]

@@ -1,0 +1,131 @@
+"""`ncs study`: the same arms in several environments and under several conditions, and what can be concluded."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from experiments.analysis.parquet_tables import parquet
+from experiments.commands.compare import compare
+from experiments.runs import prepare_output, versions
+from experiments.runs.experiment_setup import INCIDENTAL_SETTINGS
+from experiments.settings import BackendSettings, CompareSettings, StudySettings, save_settings, settings_json
+from experiments.settings.study import short_name
+from experiments.study.channel_sweep import channel_sweep
+from experiments.study.quoted_tables import quoted, require_marks, tables_by_name
+from experiments.study.study_figures import study_figures
+from experiments.study.study_report import results_page, study_report
+from experiments.study.study_summary import page_summary, study_summary
+from shields.atomic_write import write_atomically
+
+# Budget of `--smoke`: enough to pass through every part.
+_SMOKE = {"seeds": 2, "budget": 0.01, "episodes": 4, "channel_episodes": 4}
+# Folder of the sweep of channels below that of its environment, and settings that say nothing of results.
+_CHANNELS, _INCIDENTAL = "channels", (*INCIDENTAL_SETTINGS, "page", "quote", "smoke")
+
+
+def study(settings: StudySettings) -> None:
+    """Runs `ncs study`: prints the table of every environment and writes the files.
+
+    Raises:
+        ValueError: If a setting is out of range, a page quotes no table, or a stored result is damaged.
+        OSError: If a file cannot be read or written.
+        Infeasible: If no certificate is found.
+        RunError: If a run fails.
+        ClusterError: If a cluster cannot execute the runs.
+    """
+    if settings.smoke:
+        settings = replace(settings, **_SMOKE)
+    for path in settings.quote:
+        require_marks(path.read_text("utf-8"))
+    prepare_output(settings.out)
+    save_settings(settings.out / "settings.json", "study", settings)
+    parts = {short_name(env): _comparison_settings(settings, env) for env in settings.envs}
+    comparisons, channels = {}, {}
+    for name, part in parts.items():
+        compare(part)
+        comparisons[name] = json.loads((part.out / "summary.json").read_bytes())
+        if settings.channel_episodes:
+            sweep = replace(part, out=part.out / _CHANNELS, episodes=settings.channel_episodes)
+            channels[name] = channel_sweep(sweep)
+        print(flush=True)
+    content = settings_json("study", settings)["settings"]
+    provenance = {
+        "settings": {key: value for key, value in content.items() if key not in _INCIDENTAL},
+        "versions": versions(),
+    }
+    summary = study_summary(comparisons) | {"channels": channels} | provenance
+    _write(settings, summary, comparisons)
+    for path in settings.quote:
+        write_atomically(path, quoted(path.read_text("utf-8"), tables_by_name(page_summary(summary))))
+    print(f"files: {settings.out}")
+
+
+def _comparison_settings(settings: StudySettings, env_id: str) -> CompareSettings:
+    """Returns the settings of the comparison in an environment."""
+    backend = {name: getattr(settings, name) for name in BackendSettings.__dataclass_fields__}
+    part = CompareSettings(
+        env=env_id,
+        out=settings.out / short_name(env_id),
+        seed=settings.seed,
+        seeds=settings.seeds,
+        episodes=settings.episodes,
+        algo=settings.algo,
+        arms=settings.arms,
+        references=settings.references,
+        conditions=settings.conditions,
+        **backend,
+    )
+    return replace(part, steps=math.ceil(settings.budget * part.training_steps))
+
+
+def _write(settings: StudySettings, summary: dict[str, Any], comparisons: Mapping[str, dict[str, Any]]) -> None:
+    """Writes every file; summary.json comes last, so that it stands for a complete study."""
+    out, shown = settings.out, page_summary(summary)
+    figures = study_figures(shown)
+    for name, (_, png) in figures.items():
+        write_atomically(out / "figures" / f"{name}.png", png)
+    provenance = {name: summary[name] for name in ("settings", "versions")}
+    write_atomically(out / "study.parquet", parquet(_rows(comparisons), provenance))
+    write_atomically(out / "report.html", study_report(shown, figures))
+    write_atomically(out / "results.md", results_page(shown, figures, "figures/"))
+    if settings.page is not None:
+        _write_page(settings.page, shown, figures)
+    write_atomically(out / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
+
+
+def _write_page(page: Path, shown: dict[str, Any], figures: dict[str, tuple[str, bytes]]) -> None:
+    """Writes the page of the documentation, its figures, and the numbers that it shows."""
+    images = page.parent / "images"
+    images.mkdir(parents=True, exist_ok=True)
+    for name, (_, png) in figures.items():
+        write_atomically(images / f"{page.stem}-{name}.png", png)
+    write_atomically(page.with_suffix(".json"), json.dumps(shown, allow_nan=False) + "\n")
+    write_atomically(page, results_page(shown, figures, f"images/{page.stem}-"))
+
+
+def _rows(comparisons: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
+    """Returns one row per environment, arm, condition and run."""
+    rows = []
+    for name, comparison in comparisons.items():
+        for arm_name, arm in (comparison["arms"] | comparison["references"]).items():
+            for condition, played in {"as trained": arm, **arm["conditions"]}.items():
+                for run in range(arm["runs"]):
+                    rows.append(
+                        {
+                            "environment": name,
+                            "arm": arm_name,
+                            "condition": condition,
+                            "run": run,
+                            "return": played["eval_return_by_run"][run],
+                            "violating_episodes_rate": played["eval_violation_rate_by_run"][run],
+                            "outside_set_rate": played["eval_outside_set_rate_by_run"][run],
+                            "intervention_rate": played["intervention_rate_by_run"][run],
+                            "train_violation_steps": arm["train_violation_steps_by_run"][run],
+                        }
+                    )
+    return rows

@@ -1,0 +1,169 @@
+"""The tables of a study as text, at most 100 columns wide: each is a pure function of the numbers that pages show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from experiments.analysis.text_table import text_table
+from experiments.study.study_summary import MEASURES, SOUND_ARMS
+
+# Narrow headers of the conditions.
+_CONDITIONS = {
+    "worst-case disturbance": ("worst", "dist."),
+    "worse channel": ("worse", "chan."),
+    "gaussian": ("Gauss", "noise"),
+}
+# Policies that are simpler than a trained agent behind the shield.
+_SIMPLER = ("zero input", "K x_hat", "random+", "proportional", "lqr", "shield at test")
+# Largest adjusted p-value at which a difference counts.
+LEVEL = 0.05
+
+
+def evaluation_table(env: dict[str, Any]) -> str:
+    """Returns violating episodes [%] under every condition, episodes that left S, overridden steps and the return.
+
+    Args:
+        env: An environment of `page_summary`.
+    """
+    conditions = list(next(iter(env["arms"].values()))["conditions"])
+    narrow = [_CONDITIONS.get(name, (name, "")) for name in conditions]
+    head = [
+        ["", "violating episodes [%]", *(first for first, _ in narrow), "left S", "over-", "return"],
+        ["", "as trained [95 % CI]", *(second for _, second in narrow), "[%]", "ridden", "[95 % CI]"],
+    ]
+    rows = [
+        [
+            name,
+            _violating(arm),
+            *(f"{100 * arm['conditions'][each]['eval_violation_rate']:.1f}" for each in conditions),
+            f"{100 * arm['eval_episodes_outside_set'] / arm['eval_episodes']:.1f}",
+            "-" if arm["mode"] is None else f"{100 * arm['intervention_rate']:.1f} %",
+            _return(arm),
+        ]
+        for name, arm in env["arms"].items()
+    ]
+    return text_table([*head, *rows], rules=(len(head), len(head) + len(env["trained"])))
+
+
+def training_table(env: dict[str, Any]) -> str:
+    """Returns how many steps violated while the agents learned."""
+    rows = [["", "violating steps in training", "of all", "fewest and most in a run"]]
+    for name in env["trained"]:
+        arm = env["arms"][name]
+        if arm["train_steps"] == 0:
+            continue
+        by_run = arm["train_violation_steps_by_run"]
+        rows.append(
+            [
+                name,
+                f"{arm['train_violation_steps']:,} of {arm['train_steps']:,}",
+                f"{100 * arm['train_violation_steps'] / arm['train_steps']:.2f} %",
+                f"{min(by_run):,} to {max(by_run):,}",
+            ]
+        )
+    return text_table(rows)
+
+
+def price_table(summary: dict[str, Any]) -> str:
+    """Returns what the error set costs: points of overridden steps and return, arms with it minus arms without it."""
+    head = ["with error set", "without", "violating", "overridden [pts]", "return"]
+    parts = []
+    for name, env in summary["environments"].items():
+        rows = [head]
+        for price in env["prices"]:
+            sound, trusting = (env["arms"][price[key]] for key in ("sound", "trusting"))
+            rates = [f"{100 * arm['eval_violation_rate']:.1f}" for arm in (sound, trusting)]
+            names = [price["sound"], price["trusting"].rpartition("+")[2]]
+            differences = [_difference(price["overridden"], 100.0), _difference(price["return"])]
+            rows.append([*names, f"{rates[0]}/{rates[1]} %", *differences])
+        parts.append(_titled(name, text_table(rows, left_columns=2)))
+    return "\n\n".join(parts)
+
+
+def pairs_table(env: dict[str, Any]) -> str:
+    """Returns the differences of every arm to the arms with a proof, adjusted for comparing all pairs."""
+    parts = []
+    for own in (name for name in SOUND_ARMS if name in env["arms"]):
+        rows = [[f"minus {own}:", "return [95 % CI]", "p (Holm)", "violating episodes [%]"]]
+        for name in (each for each in env["arms"] if each != own):
+            returned, violating = (_oriented(env["pairs"][measure], name, own) for measure in MEASURES)
+            cells = [_difference(returned), _p_text(returned["p_holm"]), _difference(violating, 100.0)]
+            rows.append([name, *cells])
+        parts.append(text_table(rows))
+    return "\n\n".join(parts)
+
+
+def simpler_table(summary: dict[str, Any]) -> str:
+    """Returns, for every environment, what simpler policies do beside trained agents with a proof."""
+    parts = []
+    for title, env in summary["environments"].items():
+        for own in (name for name in SOUND_ARMS if name in env["arms"]):
+            rows = [[f"minus {own}:", "return [95 % CI]", "p (Holm)", "violating", "verdict"]]
+            for name in (each for each in env["arms"] if each.startswith(_SIMPLER)):
+                arm, returned = env["arms"][name], _oriented(env["pairs"]["return"], name, own)
+                violating = f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,}"
+                cells = [_difference(returned), _p_text(returned["p_holm"]), violating, _verdict(arm, returned)]
+                rows.append([name, *cells])
+            parts.append(_titled(title, text_table(rows)))
+    return "\n\n".join(parts)
+
+
+def scores_table(summary: dict[str, Any]) -> str:
+    """Returns the interquartile means of scores over all environments; empty where there are none."""
+    if not summary["scores"]:
+        return ""
+    rows = [["", "score", "[95 % CI]"]]
+    for name, score in summary["scores"].items():
+        interval = score["ci95"]
+        rows.append([name, f"{score['iqm']:.2f}", f"[{interval[0]:.2f}, {interval[1]:.2f}]" if interval else "one run"])
+    return text_table(rows)
+
+
+def _titled(title: str, table: str) -> str:
+    return f"{title}\n{table}"
+
+
+def _oriented(pairs: Sequence[dict[str, Any]], name: str, own: str) -> dict[str, Any]:
+    """Returns the difference name - own, whichever order it is stored in."""
+    pair = next(pair for pair in pairs if {pair["first"], pair["second"]} == {name, own})
+    if pair["first"] == name:
+        return pair
+    interval = pair["ci95"] and [-pair["ci95"][1], -pair["ci95"][0]]
+    return pair | {"mean": -pair["mean"], "ci95": interval}
+
+
+def _verdict(arm: dict[str, Any], returned: dict[str, Any]) -> str:
+    """Returns what a simpler policy is compared with a trained agent that has a proof."""
+    if arm["eval_violating_episodes"]:
+        return "violates"
+    if returned["p_holm"] is None or returned["p_holm"] > LEVEL:
+        return "no difference"
+    return "wins" if returned["mean"] > 0.0 else "loses"
+
+
+def _violating(arm: dict[str, Any]) -> str:
+    low, high = (100.0 * end for end in arm["eval_violation_rate_ci95"])
+    return f"{100 * arm['eval_violation_rate']:.1f} [{low:.1f}, {high:.1f}]"
+
+
+def _return(arm: dict[str, Any]) -> str:
+    interval = arm["eval_return_ci95"]
+    half = "[n/a]" if interval is None else f"+-{0.5 * (interval[1] - interval[0]):.1f}"
+    return f"{arm['eval_return_mean']:.1f} {half}"
+
+
+def _difference(difference: dict[str, Any], scale: float = 1.0) -> str:
+    interval = difference["ci95"]
+    text = f" [{_signed(scale * interval[0])}, {_signed(scale * interval[1])}]" if interval else ""
+    return f"{_signed(scale * difference['mean'])}{text}"
+
+
+def _signed(value: float) -> str:
+    return f"{round(value, 1) + 0.0:+.1f}"  # no negative zero
+
+
+def _p_text(p_value: float | None) -> str:
+    if p_value is None:
+        return "-"
+    return "<0.001" if p_value < 0.001 else f"{p_value:.3f}"
