@@ -23,11 +23,8 @@ def settings_json(command: str, settings: Any) -> dict[str, Any]:
     values = json.loads(json.dumps(asdict(settings), default=str))
     if isinstance(values.get("env"), str):
         values["env"] = values["env"].rpartition(":")[2]  # a file names no module to import
-    return {
-        "format": FORMAT,
-        "command": command,
-        "settings": {k: v for k, v in values.items() if k not in _OF_THE_CALL},
-    }
+    kept = {name: value for name, value in values.items() if name not in _OF_THE_CALL}
+    return {"format": FORMAT, "command": command, "settings": kept}
 
 
 def save_settings(path: Path, command: str, settings: Any) -> None:
