@@ -14,9 +14,13 @@ from experiments.settings import save_settings, settings_json
 # Files by which a folder is known to hold something finished.
 _FINISHED = ("summary.json", "certify.json", "units/*.json")
 # Settings that results do not depend on; what "smoke" changes is compared by itself.
-_IGNORED = {*INCIDENTAL_SETTINGS, "smoke", "page", "quote"}
+_IGNORED = {*INCIDENTAL_SETTINGS, "smoke"}
 # Settings that may grow in the same folder, because the results that are there become part of the larger ones.
-_GROWING = {"sweep": ("losses", "delays", "quantization_steps", "burst_lengths"), "certify": ("steps",)}
+_GROWING = {
+    "compare": ("seeds", "arms", "references"),
+    "sweep": ("seeds", "arms", "losses", "delays", "quantization_steps", "burst_lengths"),
+    "certify": ("steps",),
+}
 # Differences that a message lists, and characters of each value.
 _MOST_LISTED, _MOST_CHARACTERS = 3, 40
 
@@ -25,7 +29,7 @@ def claim_folder(command: str, settings: Any) -> None:
     """Creates the output folder of a command and writes `settings.json` in it.
 
     A folder with finished results is taken only if they have the same settings, apart from those that change no result,
-    or if the new ones contain them: a larger grid of `ncs sweep`, more steps of `ncs certify`.
+    or if the new ones contain them: more seeds or arms, a larger grid of `ncs sweep`, more steps of `ncs certify`.
 
     Args:
         command: Name of the command.

@@ -30,7 +30,8 @@ def finished(command, settings, file="summary.json"):
     ("command", "kind", "change", "words"),
     [
         ("compare", CompareSettings, {"seed": 1}, r"\(seed 0, now 1\)"),
-        ("compare", CompareSettings, {"seeds": 4}, r"\(seeds 3, now 4\)"),
+        ("compare", CompareSettings, {"seeds": 2}, r"\(seeds 3, now 2\)"),
+        ("compare", CompareSettings, {"arms": ("shielded",)}, "arms"),
         ("compare", CompareSettings, {"noise": "gaussian"}, "noise"),
         ("compare", CompareSettings, {"channel": ChannelSettings(loss=0.5)}, r"\(channel.loss null, now 0.5\)"),
         ("compare", CompareSettings, {"ppo": PPOOverrides(width=8)}, "ppo.width"),
@@ -60,6 +61,7 @@ def test_folder_with_results_of_other_settings_is_refused(command, kind, change,
     [
         ("compare", CompareSettings, {}),
         ("compare", CompareSettings, {"jobs": 7, "smoke": True}),
+        ("compare", CompareSettings, {"seeds": 4, "arms": (*CompareSettings.arms, "psf")}),
         ("sweep", SweepSettings, {"engine": "ray", "ray_address": "auto", "cpus_per_run": 0.5}),
         ("sweep", SweepSettings, {"losses": (0.9, 0.0, 0.3, 0.6), "burst_lengths": (0.0, 5.0)}),
         ("certify", CertifySettings, {"steps": 1e9, "jobs": 1}),
