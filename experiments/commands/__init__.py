@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 
@@ -29,7 +29,7 @@ def short_version(settings: Any, **budget: Any) -> Any:
     """
     if not settings.smoke:
         return settings
-    default = next(field.default for field in fields(settings) if field.name == "out")
+    default = type(settings).out
     if settings.out is not None and settings.out == default:  # what the whole version leaves there stays
         budget["out"] = default.with_stem(f"{default.stem}-smoke")
     return replace(settings, **budget)
