@@ -13,11 +13,13 @@ from experiments.settings import save_settings, settings_json
 
 # Files by which a folder is known to hold something finished.
 _FINISHED = ("summary.json", "certify.json", "units/*.json")
+_FINISHED_PARTS = {"study": ("*/summary.json",)}
 # Settings that results do not depend on; what "smoke" changes is compared by itself.
-_IGNORED = {*INCIDENTAL_SETTINGS, "smoke"}
+_IGNORED = {*INCIDENTAL_SETTINGS, "smoke", "page", "quote"}
 # Settings that may grow in the same folder, because the results that are there become part of the larger ones.
 _GROWING = {
     "compare": ("seeds", "arms", "references"),
+    "study": ("seeds", "arms", "references", "envs"),
     "sweep": ("seeds", "arms", "losses", "delays", "quantization_steps", "burst_lengths"),
     "certify": ("steps",),
 }
@@ -40,7 +42,8 @@ def claim_folder(command: str, settings: Any) -> None:
         OSError: If the folder cannot be written.
     """
     folder: Path = settings.out
-    if not settings.force and any(file for pattern in _FINISHED for file in folder.glob(pattern)):
+    patterns = (*_FINISHED, *_FINISHED_PARTS.get(command, ()))
+    if not settings.force and any(file for pattern in patterns for file in folder.glob(pattern)):
         _require_same(folder, command, settings)
     folder.mkdir(parents=True, exist_ok=True)
     save_settings(folder / "settings.json", command, settings)

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -12,6 +13,7 @@ from experiments.settings import (
     ChannelSettings,
     CompareSettings,
     ReproduceSettings,
+    StudySettings,
     SweepSettings,
     TrainSettings,
 )
@@ -40,6 +42,8 @@ def finished(command, settings, file="summary.json"):
         ("sweep", SweepSettings, {"losses": (0.0, 0.3)}, "losses"),
         ("sweep", SweepSettings, {"quantization_steps": (0.1,)}, "quantization_steps"),
         ("certify", CertifySettings, {"mode": "switch"}, "mode"),
+        ("study", StudySettings, {"budget": 0.5}, "budget"),
+        ("study", StudySettings, {"channel_episodes": 3}, "channel_episodes"),
         ("certify", CertifySettings, {"steps": 1e7}, "steps"),
         ("reproduce", ReproduceSettings, {"starts": 3}, "starts"),
     ],
@@ -65,6 +69,7 @@ def test_folder_with_results_of_other_settings_is_refused(command, kind, change,
         ("sweep", SweepSettings, {"engine": "ray", "ray_address": "auto", "cpus_per_run": 0.5}),
         ("sweep", SweepSettings, {"losses": (0.9, 0.0, 0.3, 0.6), "burst_lengths": (0.0, 5.0)}),
         ("certify", CertifySettings, {"steps": 1e9, "jobs": 1}),
+        ("study", StudySettings, {"seeds": 20, "page": Path("docs/results.md"), "smoke": True}),
     ],
 )
 def test_what_changes_no_result_or_adds_to_them_is_taken(command, kind, change, tmp_path):
@@ -80,6 +85,14 @@ def test_single_finished_runs_are_kept_and_a_folder_without_any_is_taken(tmp_pat
     (tmp_path / "units" / "shielded-0.json").write_text("{}")
     with pytest.raises(OtherResultsError, match="seed 1, now 2"):
         claim_folder("compare", replace(settings, seed=2))
+
+
+def test_finished_parts_of_a_study_are_kept(tmp_path):
+    settings = StudySettings(out=tmp_path)
+    claim_folder("study", settings)
+    finished("compare", CompareSettings(out=tmp_path / "CartPole-v0"))
+    with pytest.raises(OtherResultsError, match="channel_episodes 100, now 3"):
+        claim_folder("study", replace(settings, channel_episodes=3))
 
 
 def test_results_of_another_command_are_refused(tmp_path):
