@@ -11,6 +11,10 @@ class ResultsError(ValueError):
     """A stored result is missing, damaged or altered."""
 
 
+class OtherResultsError(ValueError):
+    """An output folder holds finished results of other settings, which would be replaced."""
+
+
 class RunError(RuntimeError):
     """A training run failed; the message names the run, the cause is the run's own error."""
 

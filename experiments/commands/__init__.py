@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import replace
+from typing import Any
 
 
 def require_extra(extra: str, *packages: str) -> None:
@@ -16,3 +18,18 @@ def require_extra(extra: str, *packages: str) -> None:
         raise ModuleNotFoundError(
             f"this command needs {', '.join(missing)}: in a clone of ncs-gym, pip install -e '.[{extra}]'"
         )
+
+
+def short_version(settings: Any, **budget: Any) -> Any:
+    """Returns the settings of a command's short version if `--smoke` is given, otherwise the same settings.
+
+    Args:
+        settings: Settings of a command, with the fields `smoke` and `out`.
+        **budget: Settings that the short version changes.
+    """
+    if not settings.smoke:
+        return settings
+    default = type(settings).out
+    if settings.out is not None and settings.out == default:  # what the whole version leaves there stays
+        budget["out"] = default.with_stem(f"{default.stem}-smoke")
+    return replace(settings, **budget)

@@ -19,7 +19,7 @@ from experiments.attack.counts_table import counts_table
 from experiments.attack.gaussian_table import GAUSSIAN_LEGEND, gaussian_table, require_within
 from experiments.attack.monte_carlo_batch import Campaign
 from experiments.errors import SafetyBroken
-from experiments.runs import versions
+from experiments.runs import claim_folder, versions
 from experiments.settings import CertifySettings
 from shields import Certificate
 from shields.atomic_write import write_atomically
@@ -33,6 +33,7 @@ def certify(settings: CertifySettings) -> None:
         SafetyBroken: If a shielded state left S or its box (in mode "lookahead": its box), or a proof did not hold;
             with Gaussian noise, if more episodes did so than the bound on their probability allows.
         ResultsError: If the stored counts are damaged.
+        OtherResultsError: If the output folder holds finished results of other settings.
         ValueError: If there is no environment of the given id.
         CertificateError: If a certificate in the folder is damaged.
         OSError: If the folder cannot be written.
@@ -50,6 +51,7 @@ def certify(settings: CertifySettings) -> None:
     )
     cases = attack_cases(campaign.seed, campaign.random_plants, campaign.env)
     cases = {name: case.with_delta(campaign.delta) for name, case in cases.items()}
+    claim_folder("certify", settings)
     certificates = _certificate_files(cases, settings.out / "certificates")
     keys = {case: f"{campaign.key} {Certificate.load(file).checksum}" for case, file in certificates.items()}
     if campaign.env is not None:  # what a module registers may change

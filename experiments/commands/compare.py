@@ -16,6 +16,7 @@ from experiments.analysis.escapes import escape_sentences, escape_summary
 from experiments.analysis.parquet_tables import write_tables
 from experiments.analysis.summary import arm_summary, covered_fraction, paired_differences
 from experiments.backends.execution import results_of
+from experiments.commands import short_version
 from experiments.plots.comparison_figures import comparison_figures
 from experiments.report.comparison import comparison_report
 from experiments.runs import (
@@ -24,10 +25,11 @@ from experiments.runs import (
     RunResult,
     TrainingRun,
     by_arm,
+    claim_folder,
     prepare_output,
 )
 from experiments.runs.arms import is_shield
-from experiments.settings import CompareSettings, save_settings
+from experiments.settings import CompareSettings
 from ncs_gym import escape_probability
 from ncs_gym.envs.env import ncs_env
 from shields.atomic_write import write_atomically
@@ -42,20 +44,19 @@ def compare(settings: CompareSettings) -> None:
 
     Raises:
         ValueError: If a setting is out of range or a stored result is damaged.
+        OtherResultsError: If the output folder holds finished results of other settings.
         OSError: If the output folder cannot be written.
         CertificateError: If a given certificate does not verify.
         Infeasible: If no certificate is found.
         RunError: If a run fails.
         ClusterError: If a cluster cannot execute the runs.
     """
-    if settings.smoke:
-        settings = replace(settings, **_SMOKE)
-    settings = _with_full_names(settings)
+    settings = _with_full_names(short_version(settings, **_SMOKE))
     setup = ExperimentSetup.of(settings.env, settings.channel, settings.certificate, settings.noise)
+    claim_folder("compare", settings.completed)
     prepare_output(settings.out)
     print(setup.title, settings.agent_line, sep="\n", flush=True)
     settings = settings.completed
-    save_settings(settings.out / "settings.json", "compare", settings)
     runs = _training_runs(settings, setup)
     results = results_of(runs, settings.out, settings)
     summary = _summary(settings, setup, runs, results)

@@ -4,16 +4,26 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from typing import TYPE_CHECKING
 
 from agents import evaluation
 from agents.control_loop import ControlLoop, ShieldSettings
 from experiments.analysis.arm_table import summary_text
 from experiments.analysis.summary import arm_summary
+from experiments.commands import short_version
 from experiments.runs import ExperimentSetup, RunResult, versions
 from experiments.runs.environments import module_and_id, registered_env
+from experiments.runs.policies import agent_folder, certificate_file
 from experiments.settings import EvaluateSettings
+from experiments.settings.horizon import require_horizon
 from ncs_gym.envs.env import ncs_env
 from shields.atomic_write import write_atomically
+
+if TYPE_CHECKING:
+    from agents.agent import Agent
+
+# Budget of `--smoke`.
+_SMOKE = {"episodes": 5}
 
 
 def evaluate(settings: EvaluateSettings) -> None:
@@ -28,17 +38,19 @@ def evaluate(settings: EvaluateSettings) -> None:
     """
     from agents.agent import Agent  # imports torch
 
+    settings = short_version(settings, **_SMOKE)
     if settings.env is not None:
         registered_env(settings.env)
-    agent = Agent.load(settings.model)
+    folder = agent_folder(settings.model)
+    agent = Agent.load(folder)
     env_id = settings.env or agent.env
     if module_and_id(env_id)[1] != agent.env:
-        raise ValueError(f"the agent in {settings.model} was trained in {agent.env}, not in {env_id}")
+        raise ValueError(f"the agent in {folder} was trained in {agent.env}, not in {env_id}")
     own = ncs_env(ControlLoop(env=agent.env, channel=agent.channel).single()).channel
     channel = settings.channel.applied_to(own) or agent.channel
-    setup = ExperimentSetup.of(env_id, channel, settings.certificate)
-    mode = None if settings.shield == "none" else settings.shield
+    mode = _mode(settings, agent)
     horizon = (settings.horizon or agent.horizon) if mode == "lookahead" else None
+    setup = ExperimentSetup.of(env_id, channel, settings.certificate or certificate_file(folder))
     shield = None if mode is None else ShieldSettings(setup.certificate, mode, horizon=horizon)
     evaluated = evaluation.evaluate(
         ControlLoop(env=agent.env, channel=channel, shield=shield),
@@ -47,9 +59,10 @@ def evaluate(settings: EvaluateSettings) -> None:
         settings.seed,
         setup.certificate.M,
     )
-    result = RunResult(settings.shield, 0, 0, 0, 0, [], evaluated.episodes, evaluated.trajectory, {})
-    arms = {f"shield: {settings.shield}": arm_summary([result], mode, fixed_policy=True)}
-    print(f"{agent.algorithm} of {settings.model} in {agent.env}, {settings.episodes:,} episodes", end="\n\n")
+    shield_name = mode or "none"
+    result = RunResult(shield_name, 0, 0, 0, 0, [], evaluated.episodes, evaluated.trajectory, {})
+    arms = {f"shield: {shield_name}": arm_summary([result], mode, fixed_policy=True)}
+    print(f"{agent.algorithm} of {folder} in {agent.env}, {settings.episodes:,} episodes", end="\n\n")
     print(summary_text(arms, {}))
     if settings.out is not None:
         content = {
@@ -59,9 +72,21 @@ def evaluate(settings: EvaluateSettings) -> None:
             "horizon": shield and shield.horizon,
             "episodes": settings.episodes,
             "seed": settings.seed,
-            "model": {"folder": str(settings.model), "sha256": agent.checksum},
+            "model": {"folder": str(folder), "sha256": agent.checksum},
             "plant": setup.plant.fingerprint,
             "certificate": setup.certificate.checksum,
             "versions": versions(),
         }
         write_atomically(settings.out, json.dumps(content, indent=1) + "\n")
+
+
+def _mode(settings: EvaluateSettings, agent: Agent) -> str | None:
+    """Returns the mode of the shield, None for no shield; by default that of the agent's training.
+
+    Raises:
+        ValueError: If a horizon is given and the shield plans nothing.
+    """
+    chosen = agent.shield_mode if settings.shield == "as-trained" else settings.shield
+    mode = None if chosen == "none" else chosen
+    require_horizon(settings.horizon, mode)
+    return mode

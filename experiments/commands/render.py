@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from tqdm import tqdm
 
-from experiments.commands import require_extra
+from experiments.commands import require_extra, short_version
 from experiments.plots.animation import FORMATS, save_animation
 from experiments.runs.environments import module_and_id, registered_env
 from experiments.runs.policies import UNTRAINED_POLICIES, policy_by_name
@@ -18,6 +18,8 @@ from experiments.settings import RenderSettings
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, SafetyShield
 
+# Budget of `--smoke`.
+_SMOKE = {"steps": 5}
 _MAX_FPS = 50
 _MIN_WIDTH = 160
 # Width and gray value of the space between two frames side by side [pixels].
@@ -33,6 +35,7 @@ def render(settings: RenderSettings) -> None:
         OSError: If a file cannot be read or written.
         Infeasible: If a shield is asked for and no certificate is found.
     """
+    settings = short_version(settings, **_SMOKE)
     _check(settings)
     if settings.policy not in UNTRAINED_POLICIES:
         require_extra("train", "stable_baselines3", "torch")

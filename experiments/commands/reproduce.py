@@ -10,6 +10,7 @@ from tqdm import tqdm
 from experiments.analysis.text_table import text_table
 from experiments.paper.reproduction import Outcome, designs, simulate
 from experiments.paper.reproduction_figures import reproduction_figures
+from experiments.runs import claim_folder, prepare_output
 from experiments.settings import ReproduceSettings
 from shields.atomic_write import write_atomically
 
@@ -19,6 +20,7 @@ def reproduce(settings: ReproduceSettings) -> None:
 
     Raises:
         ValueError: If a setting is out of range.
+        OtherResultsError: If the output folder holds finished results of other settings.
         OSError: If the output folder cannot be written.
     """
     for name in ("starts", "steps"):
@@ -26,7 +28,8 @@ def reproduce(settings: ReproduceSettings) -> None:
             raise ValueError(f"--{name} must be at least 1, got {getattr(settings, name)}")
     if settings.seed < 0:
         raise ValueError(f"--seed must be >= 0, got {settings.seed}")
-    (settings.out / "figures").mkdir(parents=True, exist_ok=True)
+    claim_folder("reproduce", settings)
+    prepare_output(settings.out)
     with tqdm(total=3 * settings.starts, unit="start", mininterval=1.0) as bar:
         simulations = [simulate(design, settings, bar) for design in designs()]
     for name, png in reproduction_figures(simulations).items():

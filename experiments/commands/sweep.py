@@ -13,11 +13,16 @@ from experiments.analysis.parquet_tables import parquet
 from experiments.analysis.summary import summarize_arm
 from experiments.analysis.text_table import text_table
 from experiments.backends.execution import results_of
+from experiments.commands import short_version
 from experiments.plots.heatmaps import sweep_figures
 from experiments.report.sweep import sweep_report
-from experiments.runs import Arm, ExperimentSetup, RunResult, by_arm, prepare_output
-from experiments.settings import ChannelSettings, SweepSettings, save_settings
+from experiments.runs import Arm, ExperimentSetup, RunResult, by_arm, claim_folder, prepare_output
+from experiments.settings import ChannelSettings, SweepSettings
 from shields.atomic_write import write_atomically
+
+# Budget of `--smoke`, and the sides of the grid of which it takes the first and the last value.
+_SMOKE = {"steps": 1_024, "episodes": 4, "seeds": 1}
+_SIDES = ("losses", "delays", "quantization_steps", "burst_lengths")
 
 
 @dataclass(frozen=True)
@@ -54,12 +59,15 @@ def sweep(settings: SweepSettings) -> None:
 
     Raises:
         ValueError: If a setting is out of range, a channel impossible, or a stored result damaged.
+        OtherResultsError: If the output folder holds finished results of other settings.
         OSError: If the output folder cannot be written.
         CertificateError: If a given certificate does not verify.
         Infeasible: If no certificate is found.
         RunError: If a run fails.
         ClusterError: If a cluster cannot execute the runs.
     """
+    ends = {name: tuple(dict.fromkeys((side[0], side[-1]))) for name in _SIDES if (side := getattr(settings, name))}
+    settings = short_version(settings, **_SMOKE, **ends)
     points = _grid_points(settings)
     for name in ("loss", "delay", "burst_length"):
         if getattr(settings.channel, name) is not None:
@@ -67,10 +75,10 @@ def sweep(settings: SweepSettings) -> None:
     for name in settings.arms:
         Arm.of(name, settings.mode)
     setups = [ExperimentSetup.of(settings.env, each.channel(settings.channel), settings.certificate) for each in points]
+    claim_folder("sweep", settings.completed)
     prepare_output(settings.out)
     print(settings.agent_line, flush=True)
     settings = settings.completed
-    save_settings(settings.out / "settings.json", "sweep", settings)
     runs = [
         setup.training_run(settings, name, index, grid_point=point.name)
         for point, setup in zip(points, setups, strict=True)

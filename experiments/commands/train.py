@@ -7,9 +7,13 @@ import json
 from experiments.analysis.arm_table import summary_text
 from experiments.analysis.summary import arm_summary
 from experiments.backends.execution import results_of
-from experiments.runs import Arm, ExperimentSetup, prepare_output
-from experiments.settings import BackendSettings, TrainSettings, save_settings
+from experiments.commands import short_version
+from experiments.runs import Arm, ExperimentSetup, claim_folder, prepare_output
+from experiments.settings import BackendSettings, TrainSettings
 from shields.atomic_write import write_atomically
+
+# Budget of `--smoke`.
+_SMOKE = {"steps": 4_096, "episodes": 10}
 
 
 def train(settings: TrainSettings) -> None:
@@ -17,17 +21,19 @@ def train(settings: TrainSettings) -> None:
 
     Raises:
         ValueError: If a setting is out of range or a stored result is damaged.
+        OtherResultsError: If the output folder holds finished results of other settings.
         OSError: If the output folder cannot be written.
         CertificateError: If a given certificate does not verify.
         Infeasible: If no certificate is found.
         RunError: If the run fails.
     """
+    settings = short_version(settings, **_SMOKE)
     Arm.of(settings.arm, settings.mode)
     setup = ExperimentSetup.of(settings.env, settings.channel, settings.certificate)
+    claim_folder("train", settings.completed)
     prepare_output(settings.out)
     print(settings.agent_line, flush=True)
     settings = settings.completed
-    save_settings(settings.out / "settings.json", "train", settings)
     run = setup.training_run(settings, settings.arm, 0)
     results = results_of([run], settings.out, BackendSettings(jobs=1))
     arms = {settings.arm: arm_summary(results, run.mode, fixed_policy=True)}

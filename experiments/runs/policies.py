@@ -10,6 +10,8 @@ import numpy as np
 from ncs_gym import NCSEnv, SetpointTracking, SpeedTracking
 
 UNTRAINED_POLICIES = ("greedy", "zero", "random")
+# Agents that a message names.
+_MOST_LISTED = 4
 
 # Maps an observation, shape (entries,), and its info to an action, shape (m,).
 Policy = Callable[[np.ndarray, dict], np.ndarray]
@@ -19,13 +21,14 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
     """Returns a policy for an environment.
 
     Args:
-        name: "greedy", "zero", "random", or the folder of a trained agent.
+        name: "greedy", "zero", "random", or the folder of a trained agent or of the run that left it.
         env_id: Id of the environment.
         env: The environment.
         seed: Seed of the random policy.
 
     Raises:
         AgentError: If there is no agent for this environment.
+        ValueError: If the folder of a run holds several agents.
     """
     size = env.plant.m
     if name == "zero":
@@ -37,10 +40,38 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
         return lambda observation, info: _greedy_action(env, observation, info["estimate"])
     from agents.agent import Agent, AgentError  # imports torch
 
-    agent = Agent.load(Path(name))
+    agent = Agent.load(agent_folder(Path(name)))
     if agent.env != env_id:
         raise AgentError(f"the agent in {name} was trained in {agent.env}, not in {env_id}")
     return lambda observation, info: agent.act(observation[None])[0]
+
+
+def agent_folder(folder: Path) -> Path:
+    """Returns the folder of the only agent in a run's output; any other folder is returned as it is.
+
+    Raises:
+        ValueError: If the run left several agents.
+    """
+    models = sorted(file.parent for file in folder.glob("models/*/agent.json"))
+    if (folder / "agent.json").exists() or not models:
+        return folder
+    if len(models) > 1:
+        names = ", ".join([*(model.name for model in models[:_MOST_LISTED]), *["..."] * (len(models) > _MOST_LISTED)])
+        raise ValueError(
+            f"{folder} holds {len(models)} agents: give the folder of one, in {folder / 'models'} ({names})"
+        )
+    return models[0]
+
+
+def certificate_file(agent: Path) -> Path | None:
+    """Returns the certificate beside an agent, or of the run that left it in its models; None if there is none.
+
+    Args:
+        agent: Folder of the agent.
+    """
+    agent = agent.resolve()
+    folders = [agent, agent.parent.parent] if agent.parent.name == "models" else [agent]
+    return next((file for folder in folders if (file := folder / "certificate.json").is_file()), None)
 
 
 def _greedy_action(env: NCSEnv, observation: np.ndarray, estimate: np.ndarray) -> np.ndarray:

@@ -98,6 +98,8 @@ class CertifySettings:
         delta: Level at which the certificates' ellipsoids hold for a draw of Gaussian noise, in place of the plants'.
         env: Id of the only environment to attack, behind its own channel and, if it has no contract, every kind of
             channel; module:id first imports the module, which registers one of your own. By default all of the above.
+        force: Replace the finished results of another campaign in the output folder, which otherwise is refused; counts
+            of batches are kept.
         seed: Seed of the campaign, >= 0.
     """
 
@@ -112,6 +114,7 @@ class CertifySettings:
     noise: Literal["truncated", "gaussian"] = "truncated"
     delta: float | None = None
     env: str | None = None
+    force: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -155,10 +158,12 @@ class ReproduceSettings:
         out: Output folder.
         starts: Number of random initial states per design.
         steps: Steps of each simulation.
+        force: Replace finished results of other settings in the output folder, which otherwise is refused.
         seed: Seed of initial states, disturbances and channel, the same for all designs.
     """
 
     out: Path = Path("runs/reproduce")
     starts: int = 100
     steps: int = 200
+    force: bool = False
     seed: int = 0

@@ -51,6 +51,9 @@ class LearningSettings:
         a2c: Settings of A2C.
         off_policy: Settings of SAC, TD3, TQC and CrossQ.
         lagrangian: How the arm "lagrangian" adapts its penalty per violating step.
+        smoke: Run a short version, whatever else is asked for, to see that everything works; if --out is not given, in
+            a folder of its own, with -smoke at the end of its name.
+        force: Replace finished results of other settings in the output folder, which otherwise is refused.
     """
 
     config: Path | None = None
@@ -69,6 +72,8 @@ class LearningSettings:
     a2c: A2COverrides = field(default_factory=A2COverrides)
     off_policy: OffPolicyOverrides = field(default_factory=OffPolicyOverrides)
     lagrangian: LagrangianSettings = field(default_factory=LagrangianSettings)
+    smoke: bool = False
+    force: bool = False
 
     @property
     def evaluated_under(self) -> tuple[str, ...]:
@@ -139,7 +144,6 @@ class CompareSettings(BackendSettings, LearningSettings):
             loss, later packets, within the contract), gaussian (noise without a bound).
         noise: "gaussian" draws noise that the certificate's bounds do not hold for always, and prints next to the
             episodes that left the safe set the bound on their probability.
-        smoke: Run a short version, whatever else is asked for, to see that everything works.
     """
 
     out: Path = Path("runs/compare")
@@ -155,7 +159,6 @@ class CompareSettings(BackendSettings, LearningSettings):
     )
     conditions: tuple[str, ...] = ("as trained",)
     noise: Literal["truncated", "gaussian"] = "truncated"
-    smoke: bool = False
 
     @property
     def evaluated_under(self) -> tuple[str, ...]:
@@ -186,25 +189,29 @@ class EvaluateSettings:
     """Evaluates a trained agent, behind a shield or not, on any channel.
 
     Attributes:
-        model: Folder of a trained agent, such as models/shielded-0 in the output of `ncs compare` or `ncs train`.
+        model: Folder of a trained agent, such as models/shielded-0 in the output of `ncs compare`, or the output of
+            `ncs train`.
         env: Id of the environment the agent was trained in; module:id, to import the module that registers it.
-        shield: Mode of the shield; "monitor" changes nothing and counts what it would have done.
+        shield: Mode of the shield, by default that of the agent's training; "none" for no shield; "monitor" changes
+            nothing and counts what it would have done.
         horizon: Longest plan of mode "lookahead" [steps]; by default that of the agent's training, otherwise 6.
         episodes: Number of evaluation episodes.
         seed: Seed of the episodes.
-        certificate: Certificate file to use instead of synthesizing one.
+        certificate: Certificate file to use instead of that of the training, or of synthesizing one.
         channel: Changes of the channel that the agent was trained with.
+        smoke: Evaluate a few episodes only, to see that everything works.
         out: File for the summary (JSON).
     """
 
     model: tyro.conf.Positional[Path]
     env: str | None = None
-    shield: Literal["none", "monitor", "project", "lookahead", "switch", "boundary"] = "none"
+    shield: Literal["as-trained", "none", "monitor", "project", "lookahead", "switch", "boundary"] = "as-trained"
     horizon: int | None = None
     episodes: int = 200
     seed: int = 0
     certificate: Path | None = None
     channel: ChannelSettings = field(default_factory=ChannelSettings)
+    smoke: bool = False
     out: Path | None = None
 
     def __post_init__(self) -> None:
@@ -213,7 +220,8 @@ class EvaluateSettings:
             raise ValueError(f"--episodes must be at least 1, got {self.episodes}")
         if self.seed < 0:
             raise ValueError(f"--seed must be >= 0, got {self.seed}")
-        require_horizon(self.horizon, self.shield)
+        if self.shield != "as-trained":  # otherwise the agent knows
+            require_horizon(self.horizon, self.shield)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,6 +29,7 @@ class RenderSettings:
         steps: Largest number of steps.
         fps: Frames per second; one frame per step.
         width: Width of the animation [pixels]; by default as drawn.
+        smoke: Draw a few steps only, to see that everything works; if --out is not given, into episode-smoke.gif.
     """
 
     env: str = "ncs_gym/TruckTrailerCruise-v0"
@@ -42,6 +43,7 @@ class RenderSettings:
     steps: int = 200
     fps: int = 10
     width: int | None = None
+    smoke: bool = False
 
     def __post_init__(self) -> None:
         """Raises ValueError if the horizon is wrong."""

@@ -14,6 +14,8 @@ from ncs_gym.validation import MAX_QUOTED_LENGTH, shown
 from shields.atomic_write import write_atomically
 
 FORMAT = "ncs-gym settings 1"
+# Settings of one call, which a file neither keeps nor gives.
+_OF_THE_CALL = ("config", "force")
 
 
 def settings_json(command: str, settings: Any) -> dict[str, Any]:
@@ -21,7 +23,8 @@ def settings_json(command: str, settings: Any) -> dict[str, Any]:
     values = json.loads(json.dumps(asdict(settings), default=str))
     if isinstance(values.get("env"), str):
         values["env"] = values["env"].rpartition(":")[2]  # a file names no module to import
-    return {"format": FORMAT, "command": command, "settings": {k: v for k, v in values.items() if k != "config"}}
+    kept = {name: value for name, value in values.items() if name not in _OF_THE_CALL}
+    return {"format": FORMAT, "command": command, "settings": kept}
 
 
 def save_settings(path: Path, command: str, settings: Any) -> None:
@@ -95,7 +98,7 @@ def _from_json(value: Any, kind: Any, name: str = "") -> Any:
         ValueError: If the value is out of range.
     """
     if is_dataclass(kind) and isinstance(value, dict):
-        fields = {field: hint for field, hint in get_type_hints(kind).items() if field != "config"}
+        fields = {field: hint for field, hint in get_type_hints(kind).items() if field not in _OF_THE_CALL}
         prefix = f"{name}." if name else ""
         return kind(**{key: _from_json(each, fields.get(key), prefix + key) for key, each in value.items()})  # type: ignore[operator]
     origin, parameters = get_origin(kind), get_args(kind)

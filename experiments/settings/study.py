@@ -34,7 +34,9 @@ class StudySettings(BackendSettings):
         page: Also write the page results.md to this file, its figures into the folder images beside it, and its numbers
             into the file with the ending .json.
         quote: Pages in which the marked tables are replaced by those of this study.
-        smoke: Run a short version, whatever else is asked for, to see that everything works.
+        smoke: Run a short version, whatever else is asked for, to see that everything works; if --out is not given, in
+            a folder of its own, with -smoke at the end of its name.
+        force: Replace finished results of other settings in the output folder, which otherwise is refused.
     """
 
     config: Path | None = None
@@ -75,6 +77,7 @@ class StudySettings(BackendSettings):
     page: Path | None = None
     quote: tuple[Path, ...] = ()
     smoke: bool = False
+    force: bool = False
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from experiments.analysis.parquet_tables import parquet
+from experiments.commands import short_version
 from experiments.commands.compare import compare
-from experiments.runs import prepare_output, versions
+from experiments.runs import claim_folder, prepare_output, versions
 from experiments.runs.experiment_setup import INCIDENTAL_SETTINGS
-from experiments.settings import BackendSettings, CompareSettings, StudySettings, save_settings, settings_json
+from experiments.settings import BackendSettings, CompareSettings, StudySettings, settings_json
 from experiments.settings.study import short_name
 from experiments.study.channel_sweep import channel_sweep
 from experiments.study.quoted_tables import quoted, require_marks, tables_by_name
@@ -33,17 +34,17 @@ def study(settings: StudySettings) -> None:
 
     Raises:
         ValueError: If a setting is out of range, a page quotes no table, or a stored result is damaged.
+        OtherResultsError: If the output folder holds finished results of other settings.
         OSError: If a file cannot be read or written.
         Infeasible: If no certificate is found.
         RunError: If a run fails.
         ClusterError: If a cluster cannot execute the runs.
     """
-    if settings.smoke:
-        settings = replace(settings, **_SMOKE)
+    settings = short_version(settings, **_SMOKE)
     for path in settings.quote:
         require_marks(path.read_text("utf-8"))
+    claim_folder("study", settings)
     prepare_output(settings.out)
-    save_settings(settings.out / "settings.json", "study", settings)
     parts = {short_name(env): _comparison_settings(settings, env) for env in settings.envs}
     comparisons, channels = {}, {}
     for name, part in parts.items():
@@ -78,6 +79,7 @@ def _comparison_settings(settings: StudySettings, env_id: str) -> CompareSetting
         arms=settings.arms,
         references=settings.references,
         conditions=settings.conditions,
+        force=settings.force,
         **backend,
     )
     return replace(part, steps=math.ceil(settings.budget * part.training_steps))

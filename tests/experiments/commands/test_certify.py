@@ -14,7 +14,7 @@ from experiments.attack.monte_carlo_batch import Campaign, MonteCarloBatch, run_
 from experiments.attack.safety_counts import SafetyCounts
 from experiments.commands import certify as command
 from experiments.commands.certify import certify
-from experiments.errors import ResultsError, SafetyBroken
+from experiments.errors import OtherResultsError, ResultsError, SafetyBroken
 from experiments.settings.certificates import CertifySettings
 from ncs_gym import truck_trailer
 from ncs_gym.network.contract import contract_of
@@ -229,6 +229,14 @@ def test_results_do_not_depend_on_jobs_and_an_interrupted_campaign_goes_on(tmp_p
     assert "per second" not in capsys.readouterr().out
     certify(settings(tmp_path / "one", steps=6 * 16 * 200 + 1, jobs=1))
     assert document(tmp_path / "one")["total"]["steps"] == 7 * 16 * 200
+    assert len(log.read_bytes().splitlines()) == 7
+    finished = (tmp_path / "one" / "certify.json").read_bytes()
+    for changes in ({"steps": 1}, {"mode": "switch"}):
+        with pytest.raises(OtherResultsError, match=next(iter(changes))):
+            certify(settings(tmp_path / "one", **changes))
+        assert (tmp_path / "one" / "certify.json").read_bytes() == finished
+    certify(settings(tmp_path / "one", jobs=1, force=True))
+    assert document(tmp_path / "one") == document(tmp_path / "two")
     assert len(log.read_bytes().splitlines()) == 7
 
 

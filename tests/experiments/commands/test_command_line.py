@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from agents.agent import Agent
-from shields import Certificate
+from shields import Certificate, certify
 from tests.command import Run, assert_one_sentence, environment, ncs, ncs_process
 from tests.verdicts import verified
 
@@ -173,6 +173,74 @@ def test_finished_run_is_not_run_again_and_damage_is_one_sentence(smoke, tmp_pat
     assert "Traceback" not in run.stderr
 
 
+def digests(folder):
+    """Contents of all files but those of TensorBoard."""
+    files = (path for path in folder.rglob("*") if path.is_file() and "tensorboard" not in path.parts)
+    return {path: path.read_bytes() for path in files}
+
+
+@pytest.mark.parametrize("command", [["compare", "--episodes", 3], ["train", "--steps", 64], ["reproduce"]])
+def test_finished_study_is_not_overwritten(command, smoke):
+    out, before = smoke[0], digests(smoke[0])
+    assert_one_sentence(ncs(*command, "--out", out), f"{out} holds finished results", "give another --out, or --force")
+    assert digests(out) == before
+
+
+def test_finished_study_is_overwritten_by_force(tmp_path):
+    small = ["compare", "--arms", "unshielded", "--references", "--steps", 64, "--ppo.envs", 2, "--ppo.rollout", 16]
+    small += ["--episodes", 2, "--seeds", 1, "--jobs", 1, "--out", tmp_path]
+    assert ncs(*small).returncode == 0
+    kept = (tmp_path / "units" / "unshielded-0.json").read_bytes()
+    assert_one_sentence(ncs(*small, "--seed", 1), "(seed 0, now 1)")
+    assert (tmp_path / "units" / "unshielded-0.json").read_bytes() == kept
+    forced = ncs(*small, "--seed", 1, "--force")
+    assert forced.returncode == 0, forced.stderr
+    assert json.loads((tmp_path / "summary.json").read_text())["settings"]["seed"] == 1
+    assert (tmp_path / "units" / "unshielded-0.json").read_bytes() != kept
+
+
+def test_short_versions_have_a_folder_of_their_own(tmp_path):
+    (tmp_path / "episode.gif").write_text("mine")
+    for command in (["train", "--algo", "A2C"], ["sweep", "--delays", 0, 1, 2, "--losses", 0.3], ["render"]):
+        run = ncs(*command, "--smoke", cwd=tmp_path)
+        assert run.returncode == 0, run.stderr
+    assert {path.name for path in (tmp_path / "runs").iterdir()} == {"train-smoke", "sweep-smoke"}
+    settings = json.loads((tmp_path / "runs" / "train-smoke" / "settings.json").read_text())["settings"]
+    assert (settings["steps"], settings["episodes"]) == (4096, 10)
+    cells = json.loads((tmp_path / "runs" / "sweep-smoke" / "summary.json").read_text())["cells"]
+    assert [(cell["loss"], cell["delay"]) for cell in cells] == [(0.3, 0), (0.3, 2)]
+    assert "episode-smoke.gif" in run.stdout
+    assert "5 steps" in run.stdout
+    assert (tmp_path / "episode.gif").read_text() == "mine"
+    evaluated = ncs("evaluate", tmp_path / "runs" / "train-smoke", "--smoke")
+    assert evaluated.returncode == 0, evaluated.stderr
+    assert ", 5 episodes" in evaluated.stdout
+
+
+def test_folder_of_several_agents_is_refused_with_their_names(smoke):
+    assert_one_sentence(ncs("evaluate", smoke[0]), "holds 8 agents", "models (penalized-0, penalized-1, ")
+
+
+def test_horizon_is_refused_if_the_agents_own_shield_plans_nothing(smoke):
+    model = smoke[0] / "models" / "shielded-0"
+    assert_one_sentence(ncs("evaluate", model, "--horizon", 6), "--horizon 6 is for mode lookahead")
+
+
+def test_evaluation_takes_the_certificate_of_the_training(smoke, certificate, loaded, tmp_path):
+    models = tmp_path / "out" / "models"
+    shutil.copytree(smoke[0] / "models" / "shielded-0", models / "shielded-0")
+    foreign = certify(loaded, certificate.L, 0.99 * certificate.K)
+    assert foreign is not None
+    foreign.save(tmp_path / "out" / "certificate.json")
+    for model in (tmp_path / "out", models / "shielded-0"):
+        run = ncs("evaluate", model, "--smoke", "--out", tmp_path / "e.json")
+        assert run.returncode == 0, run.stderr
+        assert json.loads((tmp_path / "e.json").read_text())["certificate"] == foreign.checksum
+    certificate.save(models / "shielded-0" / "certificate.json")  # as an agent that is shared has it
+    assert ncs("evaluate", models / "shielded-0", "--smoke", "--out", tmp_path / "e.json").returncode == 0
+    assert json.loads((tmp_path / "e.json").read_text())["certificate"] == certificate.checksum
+
+
 def test_saved_agent_is_evaluated(smoke, tmp_path):
     model = smoke[0] / "models" / "unshielded-0"
     run = ncs("evaluate", model, "--shield", "project", "--episodes", "5", "--out", tmp_path / "e.json")
@@ -186,6 +254,7 @@ def test_saved_agent_is_evaluated(smoke, tmp_path):
     worse = json.loads((tmp_path / "f.json").read_text())
     assert worse["channel"]["loss"] == 0.9
     assert worse["channel"]["delay"] == 2
+    assert set(worse["arms"]) == {"shield: none"}
 
 
 def test_one_agent_is_trained(tmp_path):
@@ -210,14 +279,20 @@ def test_agent_behind_lookahead_is_trained_and_evaluated_with_its_horizon(tmp_pa
     assert json.loads((out / "settings.json").read_text())["settings"]["horizon"] == 3
     agent = Agent.load(out / "models" / "lookahead-0")
     assert (agent.shield_mode, agent.horizon) == ("lookahead", 3)
-    for flags, horizon in ((["lookahead"], 3), (["lookahead", "--horizon", "2"], 2), (["project"], None)):
-        evaluated = ncs("evaluate", out / "models" / "lookahead-0", "--episodes", "3", "--out", tmp_path / "e.json",
-                        "--certificate", out / "certificate.json", "--shield", *flags)  # fmt: skip
+    for flags, mode, horizon in (
+        ([], "lookahead", 3),
+        (["--shield", "lookahead", "--horizon", "2"], "lookahead", 2),
+        (["--horizon", "2"], "lookahead", 2),
+        (["--shield", "project"], "project", None),
+        (["--shield", "none"], "none", None),
+    ):
+        evaluated = ncs("evaluate", out, "--episodes", "3", "--out", tmp_path / "e.json", *flags)
         assert evaluated.returncode == 0, evaluated.stderr
         document = json.loads((tmp_path / "e.json").read_text())
         assert document["horizon"] == horizon
-        assert (document["arms"][f"shield: {flags[0]}"]["plan_rate"] > 0.0) is (flags[0] == "lookahead")
-        assert ("from a" in evaluated.stdout) is (flags[0] == "lookahead")
+        assert set(document["arms"]) == {f"shield: {mode}"}
+        assert (document["arms"][f"shield: {mode}"]["plan_rate"] > 0.0) is (mode == "lookahead")
+        assert ("from a" in evaluated.stdout) is (mode == "lookahead")
 
 
 def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path):
@@ -233,6 +308,10 @@ def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path):
     assert {"loss", "delay", "burst_length", "arm", "run", "eval_violating_episodes"} <= set(rows[0])
     assert {path.name for path in (out / "figures").iterdir()} >= {"violations.png", "interventions.png", "return.png"}
     assert "data:image/png;base64," in (out / "report.html").read_text()
+    before = digests(out)
+    fewer = ncs("sweep", "--config", out / "settings.json", "--losses", "0.4")
+    assert_one_sentence(fewer, "of other settings (losses [0.5], now [0.4])", "--force")
+    assert digests(out) == before
     more = ncs("sweep", "--config", out / "settings.json", "--losses", "0.4", "0.5")
     assert more.returncode == 0, more.stderr
     assert "4 of 8 runs were finished before" in more.stderr
@@ -286,6 +365,28 @@ def test_every_command_has_help_seed_and_out(command):
     assert "--out" in run.stdout
 
 
+@pytest.mark.parametrize("command", ["compare", "sweep", "train"])
+def test_help_has_two_levels(command):
+    first, everything = ncs(command, "--help"), ncs(command, "--help-all")
+    assert (first.returncode, everything.returncode) == (0, 0)
+    later = {"--ppo.width", "--a2c.rollout", "--off-policy.noise", "--lagrangian.cost-limit"}
+    later |= set() if command == "train" else {"--ray-address", "--ray-wait", "--cpus-per-run", "--gpus-per-run"}
+    for flag in later:
+        assert flag not in first.stdout
+        assert flag in everything.stdout
+    for flag in ("--env", "--steps", "--mode", "--channel.loss", "--smoke", "--force", "--help"):
+        assert flag in first.stdout
+        assert flag in everything.stdout
+    assert "--help-all" in first.stdout
+
+
+def test_first_level_of_help_shows_what_a_settings_file_gives(smoke):
+    run = ncs("compare", "--config", smoke[0] / "settings.json", "--help")
+    assert run.returncode == 0
+    assert "(default: 4096)" in run.stdout
+    assert "--ppo.width" not in run.stdout
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -309,7 +410,7 @@ def test_every_command_has_help_seed_and_out(command):
             ["evaluate", "nowhere", "--shield", "lookahead", "--horizon", "51"],
             "--horizon must be at least 1 and at most",
         ),
-        (["evaluate", "nowhere", "--horizon", "6"], "--horizon 6 is for mode lookahead"),
+        (["evaluate", "nowhere", "--shield", "project", "--horizon", "6"], "--horizon 6 is for mode lookahead"),
         (["render", "--horizon", "6"], "--horizon 6 is for mode lookahead"),
         (["train", "--horizon", "6"], "--horizon 6 is for mode lookahead"),
     ],

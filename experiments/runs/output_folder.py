@@ -1,0 +1,100 @@
+"""The output folder of a command: finished results in it are not replaced by those of other settings."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from experiments.errors import OtherResultsError
+from experiments.runs.experiment_setup import INCIDENTAL_SETTINGS
+from experiments.settings import save_settings, settings_json
+
+# Files by which a folder is known to hold something finished.
+_FINISHED = ("summary.json", "certify.json", "units/*.json")
+_FINISHED_PARTS = {"study": ("*/summary.json",)}
+# Settings that results do not depend on; what "smoke" changes is compared by itself.
+_IGNORED = {*INCIDENTAL_SETTINGS, "smoke", "page", "quote"}
+# Settings that may grow in the same folder, because the results that are there become part of the larger ones.
+_GROWING = {
+    "compare": ("seeds", "arms", "references"),
+    "study": ("seeds", "arms", "references", "envs"),
+    "sweep": ("seeds", "arms", "losses", "delays", "quantization_steps", "burst_lengths"),
+    "certify": ("steps",),
+}
+# Differences that a message lists, and characters of each value.
+_MOST_LISTED, _MOST_CHARACTERS = 3, 40
+
+
+def claim_folder(command: str, settings: Any) -> None:
+    """Creates the output folder of a command and writes `settings.json` in it.
+
+    A folder with finished results is taken only if they have the same settings, apart from those that change no result,
+    or if the new ones contain them: more seeds or arms, a larger grid of `ncs sweep`, more steps of `ncs certify`.
+
+    Args:
+        command: Name of the command.
+        settings: Its complete settings; with `force` the folder is taken in any case.
+
+    Raises:
+        OtherResultsError: If the folder holds finished results of other settings, or of settings that cannot be read.
+        OSError: If the folder cannot be written.
+    """
+    folder: Path = settings.out
+    patterns = (*_FINISHED, *_FINISHED_PARTS.get(command, ()))
+    if not settings.force and any(file for pattern in patterns for file in folder.glob(pattern)):
+        _require_same(folder, command, settings)
+    folder.mkdir(parents=True, exist_ok=True)
+    save_settings(folder / "settings.json", command, settings)
+
+
+def _require_same(folder: Path, command: str, settings: Any) -> None:
+    """Raises OtherResultsError if the results in a folder are not those of a command with these settings."""
+    advice = "give another --out, or --force to replace them"
+    try:
+        document = json.loads((folder / "settings.json").read_bytes())
+        kept_command, kept = document["command"], dict(document["settings"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise OtherResultsError(
+            f"{folder} holds finished results, and no settings.json that says of what: {advice}"
+        ) from error
+    if kept_command != command:
+        raise OtherResultsError(f"{folder} holds finished results of ncs {kept_command}: {advice}")
+    defaults = settings_json(command, type(settings)())["settings"]
+    before, now = _flat(defaults | kept), _flat(settings_json(command, settings)["settings"])
+    growing = _GROWING.get(command, ())
+    others = [
+        f"{name} {_shown(before.get(name))}, now {_shown(now.get(name))}"
+        for name in before | now
+        if before.get(name) != now.get(name) and not (name in growing and _contains(now.get(name), before.get(name)))
+    ]
+    if others:
+        listed = "; ".join([*others[:_MOST_LISTED], *(["..."] if len(others) > _MOST_LISTED else [])])
+        raise OtherResultsError(f"{folder} holds finished results of other settings ({listed}): {advice}")
+
+
+def _flat(settings: dict[str, Any]) -> dict[str, Any]:
+    """Returns settings that results depend on, those of a group by their dotted names."""
+
+    def entries(values: dict[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+        for name, value in values.items():
+            if isinstance(value, dict):
+                yield from entries(value, f"{prefix}{name}.")
+            else:
+                yield prefix + name, value
+
+    return dict(entries({name: value for name, value in settings.items() if name not in _IGNORED}, ""))
+
+
+def _contains(now: Any, before: Any) -> bool:
+    """Returns whether a list has all values of an earlier, not empty one, or a number is at least the earlier."""
+    if isinstance(before, list) and isinstance(now, list):
+        return bool(before) and all(value in now for value in before)
+    numbers = type(before) in (int, float) and type(now) in (int, float)
+    return numbers and now >= before
+
+
+def _shown(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= _MOST_CHARACTERS else f"{text[: _MOST_CHARACTERS - 3]}..."

@@ -1,0 +1,121 @@
+"""Finished results are not replaced by those of other settings, unless it is asked for."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from experiments.errors import OtherResultsError
+from experiments.runs import claim_folder
+from experiments.settings import (
+    CertifySettings,
+    ChannelSettings,
+    CompareSettings,
+    ReproduceSettings,
+    StudySettings,
+    SweepSettings,
+    TrainSettings,
+)
+from experiments.settings.agent_overrides import PPOOverrides
+
+
+def finished(command, settings, file="summary.json"):
+    """Leaves what a finished command leaves."""
+    claim_folder(command, settings)
+    (settings.out / file).parent.mkdir(exist_ok=True)
+    (settings.out / file).write_text("{}")
+    return settings
+
+
+@pytest.mark.parametrize(
+    ("command", "kind", "change", "words"),
+    [
+        ("compare", CompareSettings, {"seed": 1}, r"\(seed 0, now 1\)"),
+        ("compare", CompareSettings, {"seeds": 2}, r"\(seeds 3, now 2\)"),
+        ("compare", CompareSettings, {"arms": ("shielded",)}, "arms"),
+        ("compare", CompareSettings, {"noise": "gaussian"}, "noise"),
+        ("compare", CompareSettings, {"channel": ChannelSettings(loss=0.5)}, r"\(channel.loss null, now 0.5\)"),
+        ("compare", CompareSettings, {"ppo": PPOOverrides(width=8)}, "ppo.width"),
+        ("compare", CompareSettings, {"seed": 1, "seeds": 1, "steps": 1, "episodes": 1}, r"; \.\.\.\)"),
+        ("train", TrainSettings, {"arm": "unshielded"}, "arm"),
+        ("sweep", SweepSettings, {"losses": (0.0, 0.3)}, "losses"),
+        ("sweep", SweepSettings, {"quantization_steps": (0.1,)}, "quantization_steps"),
+        ("certify", CertifySettings, {"mode": "switch"}, "mode"),
+        ("study", StudySettings, {"budget": 0.5}, "budget"),
+        ("study", StudySettings, {"channel_episodes": 3}, "channel_episodes"),
+        ("certify", CertifySettings, {"steps": 1e7}, "steps"),
+        ("reproduce", ReproduceSettings, {"starts": 3}, "starts"),
+    ],
+)
+def test_folder_with_results_of_other_settings_is_refused(command, kind, change, words, tmp_path):
+    settings = finished(command, kind(out=tmp_path / "out"), "certify.json" if command == "certify" else "summary.json")
+    before = (tmp_path / "out" / "settings.json").read_bytes()
+    with pytest.raises(OtherResultsError, match=f"of other settings.*{words}.*: give another --out, or --force"):
+        claim_folder(command, replace(settings, **change))
+    assert (tmp_path / "out" / "settings.json").read_bytes() == before
+    claim_folder(command, replace(settings, **change, force=True))
+    kept = json.loads((tmp_path / "out" / "settings.json").read_bytes())["settings"]
+    assert "force" not in kept
+    claim_folder(command, replace(settings, **change))
+
+
+@pytest.mark.parametrize(
+    ("command", "kind", "change"),
+    [
+        ("compare", CompareSettings, {}),
+        ("compare", CompareSettings, {"jobs": 7, "smoke": True}),
+        ("compare", CompareSettings, {"seeds": 4, "arms": (*CompareSettings.arms, "psf")}),
+        ("sweep", SweepSettings, {"engine": "ray", "ray_address": "auto", "cpus_per_run": 0.5}),
+        ("sweep", SweepSettings, {"losses": (0.9, 0.0, 0.3, 0.6), "burst_lengths": (0.0, 5.0)}),
+        ("certify", CertifySettings, {"steps": 1e9, "jobs": 1}),
+        ("study", StudySettings, {"seeds": 20, "page": Path("docs/results.md"), "smoke": True}),
+    ],
+)
+def test_what_changes_no_result_or_adds_to_them_is_taken(command, kind, change, tmp_path):
+    settings = finished(command, kind(out=tmp_path), "certify.json" if command == "certify" else "summary.json")
+    claim_folder(command, replace(settings, **change))
+
+
+def test_single_finished_runs_are_kept_and_a_folder_without_any_is_taken(tmp_path):
+    settings = CompareSettings(out=tmp_path)
+    claim_folder("compare", settings)
+    claim_folder("compare", replace(settings, seed=1))
+    (tmp_path / "units").mkdir()
+    (tmp_path / "units" / "shielded-0.json").write_text("{}")
+    with pytest.raises(OtherResultsError, match="seed 1, now 2"):
+        claim_folder("compare", replace(settings, seed=2))
+
+
+def test_finished_parts_of_a_study_are_kept(tmp_path):
+    settings = StudySettings(out=tmp_path)
+    claim_folder("study", settings)
+    finished("compare", CompareSettings(out=tmp_path / "CartPole-v0"))
+    with pytest.raises(OtherResultsError, match="channel_episodes 100, now 3"):
+        claim_folder("study", replace(settings, channel_episodes=3))
+
+
+def test_results_of_another_command_are_refused(tmp_path):
+    finished("compare", CompareSettings(out=tmp_path))
+    with pytest.raises(OtherResultsError, match="holds finished results of ncs compare: give another --out"):
+        claim_folder("train", TrainSettings(out=tmp_path))
+
+
+@pytest.mark.parametrize("content", [None, "{", "[]", "{}", '{"command": "compare", "settings": 3}'])
+def test_results_of_unknown_settings_are_refused(content, tmp_path):
+    (tmp_path / "summary.json").write_text("{}")
+    if content is not None:
+        (tmp_path / "settings.json").write_text(content)
+    with pytest.raises(OtherResultsError, match=r"no settings\.json that says of what"):
+        claim_folder("compare", CompareSettings(out=tmp_path))
+
+
+def test_settings_that_an_earlier_version_did_not_have_are_the_defaults(tmp_path):
+    finished("train", TrainSettings(out=tmp_path))
+    document = json.loads((tmp_path / "settings.json").read_bytes())
+    for name in ("smoke", "horizon", "lagrangian"):
+        del document["settings"][name]
+    (tmp_path / "settings.json").write_text(json.dumps(document))
+    claim_folder("train", TrainSettings(out=tmp_path))
+    with pytest.raises(OtherResultsError, match="horizon null, now 3"):
+        claim_folder("train", TrainSettings(out=tmp_path, arm="lookahead", horizon=3))
