@@ -19,6 +19,8 @@ from shields import Certificate, certify
 from tests.command import Run, assert_one_sentence, environment, ncs, ncs_process
 from tests.verdicts import verified
 
+# A short comparison whose unshielded agents explore enough to violate in training.
+SMOKE = ("compare", "--smoke", "--ppo.log-std", "0.0")
 ARM_KEYS = {
     "train_steps",
     "train_violation_steps",
@@ -49,7 +51,7 @@ def is_alive(pid):
 @pytest.fixture(scope="module")
 def smoke(made_once):
     def make(folder):
-        run = ncs_process("compare", "--smoke", "--ppo.log-std", "0.0", "--out", folder / "out")
+        run = ncs_process(*SMOKE, "--out", folder / "out")
         (folder / "run.json").write_text(json.dumps([run.returncode, run.stdout, run.stderr]))
 
     folder = made_once("smoke", make)
@@ -138,7 +140,7 @@ def test_saved_certificate_verifies(smoke, loaded):
 
 def test_killed_run_goes_on_by_its_settings_file_and_ends_like_an_uninterrupted_one(smoke, tmp_path):
     out, units = tmp_path / "out", tmp_path / "out" / "units"
-    command = [sys.executable, "-m", "experiments", "compare", "--smoke", "--out", str(out)]
+    command = [sys.executable, "-m", "experiments", *SMOKE, "--out", str(out)]
     run = subprocess.Popen(command, env=environment(), stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 200.0
     while len(list(units.glob("*.json"))) < 2:
@@ -162,12 +164,12 @@ def test_killed_run_goes_on_by_its_settings_file_and_ends_like_an_uninterrupted_
 
 def test_finished_run_is_not_run_again_and_damage_is_one_sentence(smoke, tmp_path):
     shutil.copytree(smoke[0], tmp_path / "out")
-    again = ncs("compare", "--smoke", "--out", tmp_path / "out")
+    again = ncs(*SMOKE, "--out", tmp_path / "out")
     assert "20 of 20 runs were finished before" in again.stderr
     assert again.stdout.splitlines()[:-1] == smoke[1].stdout.splitlines()[:-1]
     unit = tmp_path / "out" / "units" / "shielded-1.json"
     unit.write_text(unit.read_text()[:100])
-    run = ncs("compare", "--smoke", "--out", tmp_path / "out")
+    run = ncs(*SMOKE, "--out", tmp_path / "out")
     assert run.returncode == 2
     assert "shielded-1.json is damaged; delete it to repeat the run" in run.stderr
     assert "Traceback" not in run.stderr
