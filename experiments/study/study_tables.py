@@ -138,7 +138,7 @@ def _verdict(arm: dict[str, Any], returned: dict[str, Any]) -> str:
     if arm["eval_violating_episodes"]:
         return "violates"
     if returned["p_holm"] is None or returned["p_holm"] > LEVEL:
-        return "no difference"
+        return "not shown"
     return "wins" if returned["mean"] > 0.0 else "loses"
 
 
