@@ -66,6 +66,8 @@ def applied_input(plant: LinearPlant, action: Any) -> np.ndarray:
     numbers = action if type(action) is np.ndarray and action.dtype.char in "fd" else as_numbers(action)
     if numbers is not None and numbers.shape == (plant.m,):
         values = numbers.tolist()
+        if all([-1.0 <= value <= 1.0 for value in values]):  # the usual case, in half the time
+            return plant.u_max * numbers
         if all(map(isfinite, values)):
             return plant.u_max * np.array([min(max(value, -1.0), 1.0) for value in values])
     raise ValueError(f"the action must be finite with shape ({plant.m},), got {shown(action)}")

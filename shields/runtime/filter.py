@@ -174,7 +174,7 @@ class SafetyFilter(ReadOnlyArrays):
         passed = (judged >= MARGIN) & valid
         fallback, reason = np.zeros(len(passed), np.bool_), np.zeros(len(passed), np.int64)
         plan = np.full((self.horizon or 0, *proposed.shape), np.nan)
-        decided = Decision(proposed.copy(), ~passed, passed, fallback, margin, reason, plan, fallback.copy())
+        decided = Decision(proposed.copy(), ~passed, passed, fallback, margin, reason, plan, np.zeros_like(fallback))
         if self.mode in ("project", "lookahead"):
             self._project(decided, np.flatnonzero(~passed & valid), sets)
         self._fall_back(decided, np.flatnonzero(~decided.passed), sets, estimates, valid)
@@ -204,8 +204,9 @@ class SafetyFilter(ReadOnlyArrays):
         return known
 
     def errors_of_many(self, error_shapes: np.ndarray) -> PredictedErrors:
-        """Returns what is known of error shapes, (k, n, n)."""
-        return predicted_errors(self.test, error_shapes, self.certificate.error_shapes)
+        """Returns what is known of error shapes, (k, n, n); only mode "lookahead" needs the shapes themselves."""
+        known = predicted_errors(self.test, error_shapes, self.certificate.error_shapes)
+        return known if self.lookahead is not None else known._replace(shape=known.shape[:0])
 
     @np.errstate(all="ignore")
     def margin(self, estimate: np.ndarray, error_shape: np.ndarray, u: np.ndarray) -> float:

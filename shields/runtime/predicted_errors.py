@@ -26,7 +26,7 @@ class PredictedErrors(NamedTuple):
         half_widths: Largest error of each state, shape (n, k); NaN for an unusable shape.
         largest: Bound of the largest error norm, sqrt(lambda_max(M Sigma_k)), shape (k,); NaN for an unusable shape.
         certified: Whether E(Sigma_k) lies inside a certified error set, shape (k,).
-        shape: Sigma_k itself, shape (n, n, k).
+        shape: Sigma_k itself, shape (n, n, k); the filter keeps it in mode "lookahead" alone, else (0, n, k).
     """
 
     weighting: np.ndarray
