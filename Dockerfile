@@ -1,6 +1,6 @@
 # The command `ncs` with everything that trains and draws:
 #   docker build -t ncs-gym .
-#   docker run --rm -v "$PWD/runs:/work/runs" ncs-gym compare --smoke --out runs/compare
+#   docker run --rm -v "$PWD/runs:/project/runs" ncs-gym compare --smoke --out runs/compare
 FROM python:3.11-slim
 
 # torch without libraries for graphics cards; empty for pip's own index.
@@ -13,8 +13,8 @@ COPY . .
 RUN pip install --no-cache-dir -c constraints.txt '.[train,contrib,render,verify]'
 
 # Runs as an ordinary user, in a folder of its own.
-RUN useradd --create-home user && install -d -o user /work/runs
+RUN useradd --create-home user && install -d -o user /project/runs
 USER user
-WORKDIR /work
+WORKDIR /project
 ENTRYPOINT ["ncs"]
 CMD ["--help"]
