@@ -33,6 +33,15 @@ CASE_STUDY_CHANNEL = Channel(loss=0.3, quantization_step=0.05, send_period=2, de
 # The disturbance box of Liu et al. Section 5 [m, m/s]; its corner has squared length gamma = 5e-4.
 CASE_STUDY_BOX = BoxDisturbance((0.02, 0.01))
 
+# What dictionaries of fields stand for in the settings that may be given as JSON values.
+_KINDS: dict[str, tuple[type, ...]] = {
+    "channel": (Channel,),
+    "task": TASKS,
+    "disturbance": DISTURBANCES,
+    "initial_set": (Ellipsoid,),
+    "contract": (ChannelContract,),
+}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
@@ -65,53 +74,37 @@ class Scenario:
         """
         return NCSEnv(**self.settings(**settings))
 
-    def settings(
-        self,
-        *,
-        plant: LinearPlant | str | os.PathLike[str] | None = None,
-        channel: Channel | dict[str, Any] | None = None,
-        task: Task | dict[str, Any] | None = None,
-        disturbance: Any = None,
-        initial_set: Ellipsoid | dict[str, Any] | None = None,
-        terminate_on_violation: bool | None = None,
-        allow_assumption_violation: bool = False,
-        contract: ChannelContract | dict[str, Any] | None = None,
-        render_mode: str | None = None,
-        horizon: int = EPISODE_STEPS,
-        noise: str = "truncated",
-    ) -> dict[str, Any]:
-        """Returns the arguments of `NCSEnv`; None stands for the scenario's own value.
+    def settings(self, *, plant: LinearPlant | str | os.PathLike[str] | None = None, **given: Any) -> dict[str, Any]:
+        """Returns the arguments of `NCSEnv`.
 
         Settings may be JSON values, so that an `EnvSpec` may: dictionaries of fields (`Channel(**channel)`), a
         disturbance by its name, a plant by the path of a file that `LinearPlant.save` wrote.
 
+        Args:
+            plant: The plant; None for the scenario's own.
+            given: Other arguments of `NCSEnv`; None stands for the scenario's own value where it has one.
+
         Raises:
             ValueError: If the scenario has no plant of its own and none is given, or a JSON value is wrong.
         """
-        plant, contract = as_plant(plant), from_json(contract, (ChannelContract,), "contract")
+        plant = as_plant(plant)
+        own: dict[str, Any] = {"channel": self.channel, "task": self.task, "terminate_on_violation": self.terminates}
         if plant is None:
             if self.plant is None:
                 raise ValueError(
                     "this environment has no plant of its own: give plant=LinearPlant(...), or register_plant it"
                 )
-            plant, contract = self.plant(), self.contract if contract is None else contract
-        if initial_set is None and self.start is not None and getattr(plant, "n", 0) == 2:
-            initial_set = Ellipsoid(self.start**2 * np.eye(2))
-        return {
-            "plant": plant,
-            "channel": self.channel if channel is None else from_json(channel, (Channel,), "channel"),
-            "task": self.task if task is None else from_json(task, TASKS, "task"),
-            "disturbance": self._disturbance(plant)
-            if disturbance is None
-            else from_json(disturbance, DISTURBANCES, "disturbance"),
-            "initial_set": from_json(initial_set, (Ellipsoid,), "initial_set"),
-            "terminate_on_violation": self.terminates if terminate_on_violation is None else terminate_on_violation,
-            "allow_assumption_violation": allow_assumption_violation,
-            "contract": contract,
-            "render_mode": render_mode,
-            "horizon": horizon,
-            "noise": noise,
-        }
+            plant, own["contract"] = self.plant(), self.contract
+        own |= {"plant": plant, "disturbance": self._disturbance(plant), "horizon": EPISODE_STEPS}
+        if self.start is not None and getattr(plant, "n", 0) == 2:
+            own["initial_set"] = Ellipsoid(self.start**2 * np.eye(2))
+        for name, value in given.items():
+            if name in _KINDS or name == "terminate_on_violation":
+                if value is not None:
+                    own[name] = from_json(value, _KINDS[name], name) if name in _KINDS else value
+            else:
+                own[name] = value
+        return own
 
     def _disturbance(self, plant: Any) -> Any:
         if self.box is None or not isinstance(plant, LinearPlant) or self.box.check(plant) or self.box.excess(plant):
