@@ -80,6 +80,10 @@ def applied_inputs(plant: LinearPlant, actions: Any, count: int) -> np.ndarray:
         ValueError: If one is not finite or the shape is wrong.
     """
     numbers = actions if type(actions) is np.ndarray and actions.dtype.char in "fd" else as_numbers(actions)
-    if numbers is None or numbers.shape != (count, plant.m) or not np.isfinite(np.abs(numbers).max()):
-        raise ValueError(f"the actions must be finite with shape ({count}, {plant.m}), got {shown(actions)}")
-    return plant.u_max[:, None] * np.minimum(np.maximum(numbers.T, -1.0), 1.0)
+    if numbers is not None and numbers.shape == (count, plant.m):
+        farthest = np.abs(numbers).max()
+        if farthest <= 1.0:  # the usual case
+            return plant.u_max[:, None] * numbers.T
+        if np.isfinite(farthest):
+            return plant.u_max[:, None] * np.minimum(np.maximum(numbers.T, -1.0), 1.0)
+    raise ValueError(f"the actions must be finite with shape ({count}, {plant.m}), got {shown(actions)}")

@@ -120,11 +120,13 @@ class GuaranteeMonitor:
             same_input: Whether the input applied is the one decided.
             report: What is observed after the step.
         """
-        # A stored plan was certified for every error that it can meet: it needs no certified error set on its way.
-        carried = state.inside & (state.certified & decision.fallback | decision.stored)
         broken = _first(state.broken, moved_once == False, OTHER_STEPS)  # noqa: E712
         broken = _first(broken, same_input == False, OTHER_INPUT)  # noqa: E712
-        return self._observe(broken, decision.passed | carried, report)
+        inside = decision.passed
+        if not _all(inside):
+            # A stored plan was certified for every error that it can meet: it needs no certified error set on its way.
+            inside = inside | state.inside & (state.certified & decision.fallback | decision.stored)
+        return self._observe(broken, inside, report)
 
     def reasons(self, state: MonitorState) -> Any:
         """Returns why the proof does not hold now, as indices of `EXPLANATIONS`: 0 while it does."""
@@ -139,9 +141,10 @@ class GuaranteeMonitor:
         estimate, errors, alarm = report
         size = np.abs(estimate)
         reach = self._reach if estimate.ndim == 1 else self._reach[:, None]
-        near = _rows_all(size + errors.half_widths <= reach)  # never without a usable estimate and error shape
+        within = size + errors.half_widths <= reach  # never without a usable estimate and error shape
         broken = _first(broken, alarm, ALARM)
-        if not _all(near):
+        if not _all(within):
+            near = _rows_all(within)
             usable = (self._test.columns.dot(size) < FARTHEST) & (errors.radius == errors.radius)
             broken = _first(_first(broken, usable == False, UNUSABLE), near == False, FAR_OUT)  # noqa: E712
         if not _all(inside):

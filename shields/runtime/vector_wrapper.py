@@ -127,7 +127,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         """
         if self._clock is None:
             raise gym.error.ResetNeeded("call reset before the first step")
-        proposed = self._inner.inputs_of(actions).copy()
+        proposed = self._inner.inputs_of(actions)
         decided = self.filter.decide_many(self._report.estimate, self._report.errors, proposed, self._stored)
         if self.filter.mode != "monitor" and np.count_nonzero(decided.intervened):
             actions = overridden(actions, decided, self.filter.plant.u_max)
@@ -248,9 +248,11 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
 
 def _moved(before: Clock, now: Clock) -> tuple[np.ndarray, np.ndarray]:
     """Returns where a new episode began, and which environments moved just one step (to its start, where it began)."""
-    restarted, once = now.episodes != before.episodes, now.ticks == before.ticks + 1
-    to_start = (now.steps == 0) & (now.episodes == before.episodes + 1)
-    return restarted, once & np.where(restarted, to_start, now.steps == before.steps + 1)
+    restarted, once = now.episodes != before.episodes, now.steps == before.steps + 1
+    if np.count_nonzero(restarted):
+        to_start = (now.steps == 0) & (now.episodes == before.episodes + 1)
+        once = np.where(restarted, to_start, once)
+    return restarted, once & (now.ticks == before.ticks + 1)
 
 
 def overridden(actions: Any, decided: Decision, limits: np.ndarray) -> np.ndarray:

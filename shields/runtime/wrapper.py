@@ -13,7 +13,7 @@ from gymnasium.vector import VectorEnv
 from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, StickyAction
 
 from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv, NCSVectorEnv
-from ncs_gym.envs.env import applied_input, ncs_env
+from ncs_gym.envs.env import applied_input
 from ncs_gym.validation import as_number, as_numbers, shown
 from shields.certificate import Certificate
 from shields.runtime.decisions import NO_PLAN
@@ -81,7 +81,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         horizon: int | None = None,
     ) -> None:
         RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty, horizon=horizon)
-        inner = environment_behind(env, gym.Wrapper, (*REFUSED, SafetyShield), NCSEnv, hint_for(env))
+        inner = self._inner = environment_behind(env, gym.Wrapper, (*REFUSED, SafetyShield), NCSEnv, hint_for(env))
         if env.action_space != inner.action_space:
             raise ValueError(f"a wrapper inside the shield changes the action space to {env.action_space}")
         gym.Wrapper.__init__(self, env)
@@ -108,7 +108,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
                 self._clock = before
             raise
         clock, report = self._read_clock(), self._observed(info)
-        start = ncs_env(self.env).start
+        start = self._inner.start
         if start is not self._start:  # decided exactly, which takes longer than a step; starts are read-only
             self._start, self._known = start, start_known(self.filter, start)
         self._guarded.begin(report, self._known, clock[1] == 0)
@@ -151,8 +151,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
 
     def _read_clock(self) -> tuple[int, int]:
         """Returns the number of episodes begun and of steps taken in this one."""
-        inner = ncs_env(self.env)
-        return inner.episodes, inner.steps
+        return self._inner.episodes, self._inner.steps
 
     def _annotate(self, proposed: np.ndarray | None, interventions: int, plan: np.ndarray, *, intervened: bool) -> None:
         """Tells the picture of the step that follows what the shield does in it."""
@@ -165,7 +164,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             protects=self.filter.mode != "monitor",
             plan=None if self.filter.lookahead is None else plan.copy(),
         )
-        ncs_env(self.env).annotate(note)
+        self._inner.annotate(note)
 
     def _info(self, proposed: np.ndarray, applied: np.ndarray, margin: float, *, intervened: bool) -> dict[str, Any]:
         reason = self._guarded.reason
