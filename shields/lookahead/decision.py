@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.validation import as_numbers
-from shields.lookahead.planner import Planner
+from shields.lookahead.planner import Planner, Plans
 from shields.runtime.decisions import INVALID, PLANNED, PROJECTED, SAFE, STORED, Decision
 from shields.runtime.one_step_test import OneStepTest, norms
 from shields.runtime.predicted_errors import PredictedErrors
@@ -16,10 +16,11 @@ from shields.runtime.predicted_errors import PredictedErrors
 class Lookahead:
     """Applies plans and stores what is left of them (docs/lookahead.md).
 
-    Decisions of mode "project" come in. An input that passes the one-step test stays as it is, and nothing is stored
-    any more: x+ is in S. Otherwise, among the projected input and the plans that are found, the input closest to the
-    proposed one is applied and what follows it in its plan is stored. Without any, the next stored input is applied;
-    where nothing is stored, K x_hat.
+    An input that passes the one-step test stays as it is, and nothing is stored any more: x+ is in S. One that begins a
+    certified plan stays as well, and what follows is stored (`keep`). Otherwise the decision of mode "project" is
+    changed (`complete`): among the projected input and the plans that are found, the input closest to the proposed one
+    is applied and what follows it in its plan is stored. Without any, the next stored input is applied; where nothing
+    is stored, K x_hat.
 
     Args:
         test: The one-step test.
@@ -35,6 +36,23 @@ class Lookahead:
         self._test, self._margin = test, margin
         self.planner = Planner(test, gain, horizon, margin)
 
+    def keep(
+        self, decided: Decision, some: np.ndarray, estimates: np.ndarray, errors: PredictedErrors, stored: np.ndarray
+    ) -> None:
+        """Lets proposed inputs pass where a certified plan begins with them; changes these decisions in place.
+
+        Args:
+            decided: Decisions whose `input` is the proposed one and whose `plan` is all NaN.
+            some: Numbers of those whose input failed the one-step test.
+            estimates: x_hat, shape (n, N).
+            errors: What is known of the Sigma_k of each.
+            stored: Plans still stored, shape (horizon, m, N), NaN beyond their ends.
+        """
+        if some.size:
+            known = self._rows(some, estimates, errors, decided.input, stored)
+            begun = self._begin(decided, some, self.planner.beginning_with(*known))
+            decided.intervened[some[begun]] = False
+
     def complete(
         self,
         decided: Decision,
@@ -43,16 +61,16 @@ class Lookahead:
         proposed: np.ndarray,
         stored: np.ndarray,
     ) -> None:
-        """Changes the decisions of mode "project" about N proposals to those of mode "lookahead", in place.
+        """Changes decisions of mode "project" about proposals that were not let pass, in place; for more see `keep`.
 
         Args:
-            decided: Decisions whose `plan` is all NaN.
+            decided: Decisions about N proposals.
             estimates: x_hat, shape (n, N).
             errors: What is known of the Sigma_k of each.
             proposed: Shape (m, N) [physical units].
-            stored: Plans still stored, shape (horizon, m, N), NaN beyond their ends.
+            stored: Plans still stored.
         """
-        some = np.flatnonzero(decided.reason != SAFE)
+        some = np.flatnonzero((decided.reason != SAFE) & (decided.reason != PLANNED))
         if not some.size:
             return
         changed = np.zeros(some.shape, np.bool_)
@@ -87,14 +105,22 @@ class Lookahead:
         """
         projected = decided.reason[some] == PROJECTED
         closest = np.where(projected, decided.input[:, some], np.nan)
-        found = self.planner.find(
-            np.ascontiguousarray(estimates[:, some].T),
-            errors.shape[..., some].transpose(2, 0, 1),
-            proposed[:, some].T,
-            closest.T,
-            stored[..., some].transpose(2, 0, 1),
-        )
-        begun = (found.lengths > 0) & ~(projected & (found.distances >= norms(closest - proposed[:, some])))
+        x_hat, shapes, wanted, plans = self._rows(some, estimates, errors, proposed, stored)
+        found = self.planner.find(x_hat, shapes, wanted, closest.T, plans)
+        farther = projected & (found.distances >= norms(closest - proposed[:, some]))
+        found.lengths[farther] = 0
+        return self._begin(decided, some, found)
+
+    def _rows(
+        self, some: np.ndarray, estimates: np.ndarray, errors: PredictedErrors, inputs: np.ndarray, stored: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Returns estimates, error shapes, inputs and stored plans of some environments, which are the first axis."""
+        x_hat, shapes = np.ascontiguousarray(estimates[:, some].T), errors.shape[..., some].transpose(2, 0, 1)
+        return x_hat, shapes, inputs[:, some].T, stored[..., some].transpose(2, 0, 1)
+
+    def _begin(self, decided: Decision, some: np.ndarray, found: Plans) -> np.ndarray:
+        """Begins the plans found for some environments, and returns where there are any, shape (len(some),)."""
+        begun = found.lengths > 0
         inputs, lengths, _ = found.some(begun)
         kept = np.arange(1, self.planner.horizon) < lengths[:, None]
         some = some[begun]

@@ -59,8 +59,21 @@ class Planner:
         self.test, self.horizon = PlanTest(Prediction(first, horizon), margin), horizon
         self._plant = first.plant
         braking = regulator(first.plant)
-        self._gain, self._braking = gain, gain if braking is None else braking
+        self._gains = np.array([gain, gain if braking is None else braking])
         self._program = PlanProgram(self.test.prediction)
+
+    def beginning_with(
+        self, estimates: np.ndarray, shapes: np.ndarray, proposed: np.ndarray, stored: np.ndarray
+    ) -> Plans:
+        """Returns certified plans of E environments whose first inputs are the proposed ones; for arguments see `find`.
+
+        After the proposal comes what is stored for later, or a saturated gain; the solver is not asked.
+        """
+        beginnings = np.full((len(estimates), 3, self.horizon, self._plant.m), np.nan)
+        beginnings[:, :, 0] = proposed[:, None]
+        beginnings[:, 0, 1:] = stored[:, 1:]
+        candidates = completed(self._plant, estimates, beginnings, self._gains[[0, 0, 1]])
+        return self._best(estimates, self.test.tightenings_of(shapes), candidates, proposed)
 
     def find(
         self,
@@ -72,6 +85,8 @@ class Planner:
     ) -> Plans:
         """Returns certified plans of E environments whose first inputs are close to the proposed ones.
 
+        Candidates are the projected input and then the regulator, what is stored, and either gain from the start.
+
         Args:
             estimates: x_hat, shape (E, n).
             shapes: Sigma_k, shape (E, n, n).
@@ -80,7 +95,9 @@ class Planner:
             stored: Plans still stored, shape (E, N, m), NaN beyond their ends.
         """
         tightening = self.test.tightenings_of(shapes)
-        candidates = self._candidates(estimates, proposed, projected, stored)
+        beginnings = np.full((len(estimates), 4, self.horizon, self._plant.m), np.nan)
+        beginnings[:, 0, 0], beginnings[:, 1] = projected, stored
+        candidates = completed(self._plant, estimates, beginnings, self._gains[[1, 0, 1, 0]])
         plans = self._best(estimates, tightening, candidates, proposed)
         if self.horizon > 1:
             needed = (plans.lengths == 0) | np.isnan(stored[:, 0, 0])
@@ -89,20 +106,6 @@ class Planner:
                 known = Tightening(*(part[left] for part in tightening))
                 plans.improve(left, self._solved(estimates[left], known, proposed[left]))
         return plans
-
-    def _candidates(
-        self, estimates: np.ndarray, proposed: np.ndarray, projected: np.ndarray, stored: np.ndarray
-    ) -> np.ndarray:
-        """Returns the plans tried first, shape (E, 7, N, m)."""
-        K, braking = self._gain, self._braking
-        beginnings = np.full((len(estimates), 7, self.horizon, self._plant.m), np.nan)
-        beginnings[:, :3, 0] = proposed[:, None]  # the proposal and then the regulator,
-        beginnings[:, 1, 1:] = stored[:, 1:]  # what is stored for later,
-        gains = [braking, K, K]  # or K;
-        beginnings[:, 3] = stored  # what is stored;
-        beginnings[:, 4, 0] = projected  # the projected input and then the regulator;
-        gains += [K, braking, K, braking]  # either gain from the start
-        return completed(self._plant, estimates, beginnings, np.array(gains))
 
     def _best(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray, proposed: np.ndarray) -> Plans:
         """Returns of P plans, shape (E, P, N, m), the certified one that begins closest, of equal ones the shortest."""
