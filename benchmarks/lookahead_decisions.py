@@ -71,9 +71,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=100)
     steps = parser.parse_args().steps
-    print(
-        "                                  us per decision: one by one           in batches of 64            cvxpy / median of"
-    )
+    print(" " * 34 + "us per decision: one by one           in batches of 64            cvxpy / median of")
     print(
         "environment            N searched    median    99% searched    median    99%   cvxpy  one by one  in batches"
     )
