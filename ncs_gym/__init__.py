@@ -1,4 +1,4 @@
-"""Linear plants behind imperfect networks as Gymnasium environments; importing registers the ids."""
+"""Plants behind imperfect networks as Gymnasium environments; importing registers the ids."""
 
 from ncs_gym.envs.env import NCSEnv
 from ncs_gym.envs.vector_env import NCSVectorEnv
@@ -13,6 +13,7 @@ from ncs_gym.plants.cart_pole import cart_pole
 from ncs_gym.plants.description import NoNoiseWarning
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.truck_trailer import truck_trailer
+from ncs_gym.processes import FunctionProcess, GymProcess, LinearProcess, Process
 from ncs_gym.registration import register_all
 from ncs_gym.rendering import Annotation
 from ncs_gym.tasks.regulation import Regulation
@@ -23,6 +24,7 @@ from ncs_gym.uncertainty.bounded_disturbances import BallDisturbance, BoxDisturb
 from ncs_gym.uncertainty.disturbance import Disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.extremal_disturbances import AdversarialDisturbance, SphereDisturbance
+from ncs_gym.uncertainty.remainder import Remainder
 
 register_all()
 
@@ -38,13 +40,18 @@ __all__ = [
     "ErrorSet",
     "ErrorSetError",
     "Estimator",
+    "FunctionProcess",
     "GilbertElliott",
+    "GymProcess",
     "LinearPlant",
+    "LinearProcess",
     "NCSEnv",
     "NCSVectorEnv",
     "NoNoiseWarning",
     "Packet",
+    "Process",
     "Regulation",
+    "Remainder",
     "SetpointTracking",
     "SinusoidDisturbance",
     "SpeedTracking",

@@ -23,7 +23,7 @@ LAYERS = {
     "ncs_gym": (
         {"validation"},
         {"uncertainty", "plants"},
-        {"network", "tasks"},
+        {"network", "tasks", "processes"},
         {"estimation", "rendering"},
         {"envs"},
         {"json_settings"},

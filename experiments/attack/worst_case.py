@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ncs_gym import AdversarialDisturbance, Disturbance, Ellipsoid, LinearPlant, NCSVectorEnv
-from ncs_gym.plants.process import BlockSampler
+from ncs_gym.processes.simulation import BlockSampler
 from shields import Certificate
 
 # Points on a boundary are pulled in by rounding.

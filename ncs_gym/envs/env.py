@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -10,24 +10,22 @@ from gymnasium.spaces import Box
 
 from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.reset_options import start_option
+from ncs_gym.envs.settings import assumed_contract, expect
 from ncs_gym.envs.spaces import applied_input, default_initial_set, observation_space
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
-from ncs_gym.estimation.error_bound import UnstablePlantError
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel
-from ncs_gym.network.contract import ChannelContract, contract_of
+from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.transmission import ChannelState
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.process import LinearProcess
+from ncs_gym.processes.process import LinearProcess, Process
 from ncs_gym.rendering import Annotation, Renderer
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.tasks.task import Task
 from ncs_gym.uncertainty.disturbance_settings import as_disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.gaussian_noise import as_noise
-from ncs_gym.validation import as_count, as_flag, read_only, shown
-
-T = TypeVar("T")
+from ncs_gym.validation import as_count, as_flag, shown
 
 # Keeps the rounding of a sampled start inside the initial set.
 SAMPLE_ROUNDING = 1e-9
@@ -42,7 +40,7 @@ class RenderModeError(ValueError, TypeError):
 
 
 class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
-    """A linear plant behind an imperfect network; the controller sees a Kalman estimate.
+    """A plant behind an imperfect network; the controller sees a Kalman estimate.
 
     ## Action space
     `Box(-1, 1, (m,), float32)`: the input in units of its limit, u = u_max * action [physical units].
@@ -69,7 +67,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     (truncated unless `noise` says otherwise) and a uniform draw from the plant's `initial_bound`.
 
     ## Episode end
-    Terminates on a violation of the safe box only with `terminate_on_violation`. Truncation is `TimeLimit`'s.
+    Terminates on a violation of the safe box only with `terminate_on_violation`, or with an environment that is the
+    process. Truncation is `TimeLimit`'s, or that environment's.
 
     ## Info (the same keys from reset and step, every array a fresh copy)
     | key | meaning |
@@ -82,7 +81,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     | `cost` | 1.0 if the true state violates the box now, else 0.0 |
     | `measurement_age` | steps since the newest sample used was taken (the first estimate is step 0's) |
     | `packet_arrived` | whether a packet arrived at this step |
-    | `assumption_violated` | latched alarm of the estimator's innovation monitor |
+    | `assumption_violated` | latched alarm of the estimator's innovation monitor, or of a process that left E(D) |
     | `episode_violations` | running sum of `cost` in this episode |
     | `is_success` | 1.0 while there was none |
     | `contract_broken` | whether the newest sample used is older now than the channel's contract allows |
@@ -103,6 +102,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         horizon: Steps the observation space is sized for.
         noise: "truncated", or "gaussian" for process noise, sensor noise and first errors without a bound: what is
             proved then holds with the probability that `escape_probability` leaves (docs/shield.md).
+        process: What really moves (docs/beyond_linear.md); the plant's own equations by default.
 
     Attributes:
         steps: Steps taken in this episode.
@@ -132,15 +132,16 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         render_mode: str | None = None,
         horizon: int = 200,
         noise: str = "truncated",
+        process: Process | None = None,
     ) -> None:
-        self.plant = _expect(plant, LinearPlant, "plant")
-        self.channel = Channel() if channel is None else _expect(channel, Channel, "channel")
-        self.task = Regulation() if task is None else _expect(task, Task, "task")
+        self.plant = expect(plant, LinearPlant, "plant")
+        self.channel = Channel() if channel is None else expect(channel, Channel, "channel")
+        self.task = Regulation() if task is None else expect(task, Task, "task")
         self.terminate_on_violation = as_flag(terminate_on_violation, "terminate_on_violation")
         self.allow_assumption_violation = as_flag(allow_assumption_violation, "allow_assumption_violation")
         self.disturbance = as_disturbance(disturbance, plant, self.allow_assumption_violation)
         self.initial_set = default_initial_set(plant) if initial_set is None else initial_set
-        _expect(self.initial_set, Ellipsoid, "initial_set")
+        expect(self.initial_set, Ellipsoid, "initial_set")
         if self.initial_set.dim != plant.n:
             raise ValueError(f"initial_set must have dimension {plant.n}, got {self.initial_set.dim}")
         if problem := self.task.check(plant):
@@ -149,13 +150,15 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             raise RenderModeError(f"render_mode must be None or one of {RENDER_MODES}, got {shown(render_mode)}")
         self.render_mode = render_mode
         self._renderer = None if render_mode is None else Renderer(plant, self.task, render_mode, RENDER_FPS)
-        self.contract = _contract(plant, self.channel, contract)
+        self.contract = assumed_contract(plant, self.channel, contract)
         patterns = arrival_patterns(plant, self.channel, self.contract)
         self.error_set = patterns.recursion.error_set
         self.estimator = Estimator(plant, self.channel, patterns=patterns)
         self.noise = as_noise(noise, plant)
         truncated = self.noise == "truncated"
-        self._process = LinearProcess(plant, self.disturbance, self.allow_assumption_violation, truncated=truncated)
+        self.process = LinearProcess() if process is None else expect(process, Process, "process")
+        allowed = self.allow_assumption_violation
+        self._process = self.process.simulation(plant, self.disturbance, allowed, truncated=truncated)
         self.horizon = as_count(horizon, "horizon", low=1, high=LONGEST_HORIZON)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)
         self.observation_space = observation_space(plant, self.task, self.error_set, self.initial_set, self.horizon)
@@ -182,8 +185,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         if seed is not None:
             self._process.forget()
         rng = self.np_random
-        self.start = self.initial_set if start is None else read_only(start)
-        self._state = (1.0 - SAMPLE_ROUNDING) * self.initial_set.sample(rng) if start is None else start
+        initial, first = (None, start) if start is not None else (self.initial_set, self._drawn_start(rng))
+        self._state, self.start = self._process.start(rng, first, initial)
         self._task_state = self.task.begin(rng, self.plant)
         self._disturbance_memory = self._process.begin(rng)
         self._channel_state = ChannelState(self.channel, rng)
@@ -218,11 +221,11 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self.estimator.advance(u, packets)
         reward = float(self.task.reward(self.plant, self._task_state, self._state, u))
         info = self._info(u, arrived=bool(packets))
-        terminated = self.terminate_on_violation and info["cost"] > 0.0
+        terminated = self._process.terminated or (self.terminate_on_violation and info["cost"] > 0.0)
         self._consistent = True
         if self._renderer is not None:
             self._renderer.record(info, self._task_state, self._channel_state, packets)
-        return self._observation(), reward, terminated, False, info
+        return self._observation(), reward, terminated, self._process.truncated, info
 
     def render(self) -> np.ndarray | None:
         """Returns an image, shape (height, width, 3), uint8; None in mode "human", which shows every step by itself.
@@ -244,9 +247,13 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             self._renderer.annotate(annotation)
 
     def close(self) -> None:
-        """Closes the window."""
+        """Closes the window and the process."""
+        self._process.close()
         if self._renderer is not None:
             self._renderer.close()
+
+    def _drawn_start(self, rng: np.random.Generator) -> np.ndarray:
+        return (1.0 - SAMPLE_ROUNDING) * self.initial_set.sample(rng)
 
     def _observation(self) -> np.ndarray:
         entries = np.concatenate([self.estimator.mean, self.task.observe(self._task_state)])
@@ -258,28 +265,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._violations += cost
         constraints = values, cost, self._violations
         shape = self.estimator.shape.copy()
-        return loop_info(self.estimator, self.contract, self._state, u, shape, arrived, constraints)
-
-
-def _contract(plant: LinearPlant, channel: Channel, contract: ChannelContract | None) -> ChannelContract | None:
-    """Returns the contract that the estimator's error sets rest on.
-
-    Raises:
-        UnstablePlantError: If an unstable plant has neither a contract nor a channel that keeps one.
-        ValueError: If the channel rounds more coarsely than the contract allows.
-    """
-    if contract is None and plant.spectral_radius >= 1.0:
-        contract = contract_of(channel)
-        if contract is None:
-            raise UnstablePlantError(
-                f"the plant is unstable (spectral radius {plant.spectral_radius:.6g}), the channel promises nothing: "
-                "give it max_consecutive_losses, or the environment contract=ChannelContract(max_age=...)"
-            )
-    if contract is not None and not _expect(contract, ChannelContract, "contract").is_fine_enough_for(channel):
-        raise ValueError(
-            f"the channel rounds to {channel.quantization_step}, the contract allows {contract.quantization_step}"
-        )
-    return contract
+        alarm = self.estimator.alarm or self._process.alarm
+        return loop_info(self.estimator, self.contract, self._state, u, shape, arrived, constraints, alarm)
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:
@@ -292,9 +279,3 @@ def ncs_env(env: gym.Env) -> NCSEnv:
     if not isinstance(inner, NCSEnv):
         raise ValueError(f"expected an NCSEnv inside, got {type(inner).__name__}")
     return inner
-
-
-def _expect(value: Any, kind: type[T], name: str) -> T:
-    if not isinstance(value, kind):
-        raise ValueError(f"{name} must be of type {kind.__name__}, got {type(value).__name__}")
-    return value

@@ -19,21 +19,22 @@ def loop_info(
     error_shape: np.ndarray,
     arrived: Any,
     constraints: tuple[np.ndarray, Any, Any],
+    alarm: Any,
 ) -> dict[str, Any]:
     """Returns `info`, every array a fresh copy; the environment is the first axis of what it holds for many.
 
     Args:
-        estimator: Gives estimate, age and alarm.
+        estimator: Gives estimate and age.
         contract: What the channel guarantees, if anything.
         state: x, shape (n,) or (n, N).
         u: Applied input, shape (m,) or (m, N).
         error_shape: Sigma_k as a fresh array, shape (n, n) or (N, n, n).
         arrived: Whether a packet arrived at this step, a bool or a fresh array of shape (N,).
         constraints: Constraint values, shape (k,) or (k, N), the cost, and the sum of costs in the episode.
+        alarm: Whether an assumption was seen to be violated, a bool or a fresh array of shape (N,).
     """
     values, cost, violations = constraints
     age: Any = estimator.age
-    alarm: Any = estimator.alarm
     many = state.ndim > 1
     broken = age > contract.max_age if contract is not None else np.zeros(age.shape, np.bool_) if many else False
     return {
@@ -46,7 +47,7 @@ def loop_info(
         "cost": cost,
         "measurement_age": age.copy() if many else age,
         "packet_arrived": arrived,
-        "assumption_violated": alarm.copy() if many else alarm,
+        "assumption_violated": alarm,
         "episode_violations": violations,
         "is_success": (violations == 0.0) * 1.0,
         "contract_broken": broken,

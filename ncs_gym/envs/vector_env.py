@@ -17,7 +17,6 @@ from ncs_gym.estimation.arrival_patterns import arrival_patterns
 from ncs_gym.estimation.statistics_table import StatisticsTable
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.transmission import VectorChannelState
-from ncs_gym.plants.process import LinearProcess
 from ncs_gym.validation import as_count, shown
 
 
@@ -39,7 +38,7 @@ class NCSVectorEnv(VectorEnv):
         single: The scalar environment with these settings; never stepped.
         steps: Steps taken in each episode, shape (N,).
         episodes: Episodes begun in each environment, shape (N,).
-        starts: States that episodes were started at by an option, NaN where not, shape (N, n).
+        starts: States that episodes were started at by an option or outside the initial set, NaN elsewhere, (N, n).
         ticks: Steps of the whole vector since it was made.
 
     Raises:
@@ -71,7 +70,8 @@ class NCSVectorEnv(VectorEnv):
         bounds = single.observation_space.low, single.observation_space.high
         self._low, self._high = (np.asarray(bound, dtype=np.float64)[:, None] for bound in bounds)
         allowed, truncated = single.allow_assumption_violation, single.noise == "truncated"
-        self._process = LinearProcess(self.plant, single.disturbance, allowed, self.num_envs, truncated=truncated)
+        simulation = single.process.simulation
+        self._process = simulation(self.plant, single.disturbance, allowed, self.num_envs, truncated=truncated)
         patterns = arrival_patterns(self.plant, self.channel, self.contract)
         self._estimator = VectorEstimator(self.plant, patterns, self.num_envs)
         self._state = np.zeros((self.plant.n, self.num_envs))
@@ -144,6 +144,11 @@ class NCSVectorEnv(VectorEnv):
         self._consistent = True
         return observation, reward, terminated, truncated, info
 
+    def close_extras(self, **kwargs: Any) -> None:
+        """Closes the process."""
+        self._process.close()
+        self.single.close()
+
     def inputs_of(self, actions: np.ndarray) -> np.ndarray:
         """Returns the float64 inputs, shape (m, N), that actions (N, m) stand for.
 
@@ -177,10 +182,11 @@ class NCSVectorEnv(VectorEnv):
     def _ends(self, cost: np.ndarray, restarted: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Returns which episodes are terminated and which truncated, shape (N,) each; those that just began are not."""
         terminated, truncated = np.zeros((2, self.num_envs), np.bool_)
+        terminated, truncated = terminated | self._process.terminated, truncated | self._process.truncated
         if self.single.terminate_on_violation:
-            terminated = cost > 0.0
+            terminated |= cost > 0.0
         if self.max_episode_steps is not None:
-            truncated = self.steps >= self.max_episode_steps
+            truncated |= self.steps >= self.max_episode_steps
         if restarted is not None:
             terminated, truncated = terminated & ~restarted, truncated & ~restarted
         return terminated, truncated
@@ -189,7 +195,8 @@ class NCSVectorEnv(VectorEnv):
         """Starts episodes where `mask` (N,) says so, at `starts` (N, n) or drawn from the initial set."""
         rng, count = self.np_random, int(np.count_nonzero(mask))
         first_states, first_errors = self._first(count)
-        states = first_states if starts is None else starts[mask].T
+        initial, states = (self.single.initial_set, first_states) if starts is None else (None, starts[mask].T)
+        states, known = self._process.start_many(rng, states, initial, mask)
         task_state, memory = self.task.begin_many(rng, self.plant, count), self._process.begin(rng, count)
         if count == self.num_envs:
             self._task_state, self._disturbance_memory = task_state, memory
@@ -201,7 +208,7 @@ class NCSVectorEnv(VectorEnv):
         self._estimator.begin(mask, states + first_errors)
         self.steps[mask], self._violations[mask], self._done[mask] = 0, 0.0, False
         self.episodes[mask] += 1
-        self.starts[mask] = np.nan if starts is None else states.T
+        self.starts[mask] = known
 
     def _first(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns states that episodes start at, and the errors of their first estimates, shape (n, count) each."""
@@ -224,7 +231,8 @@ class NCSVectorEnv(VectorEnv):
         table, numbers = self.error_shapes
         shapes = table.shapes.take(numbers, axis=0)
         constraints = values, cost, self._violations.copy()
-        return loop_info(self._estimator, self.contract, self._state, u, shapes, arrived, constraints)
+        alarm = self._estimator.alarm | self._process.alarm
+        return loop_info(self._estimator, self.contract, self._state, u, shapes, arrived, constraints, alarm)
 
     def _restarted(self, observation: np.ndarray, info: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
         """Returns the first of new episodes where old ones ended, whose last go to final_obs and final_info."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, outer_sum
+from ncs_gym.uncertainty.remainder import Remainder, as_remainder
 from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_KEPT, TruncatedGaussian, chi2_quantile
 from ncs_gym.validation import ReadOnlyArrays, as_covariance, as_number, read_only
 
@@ -42,6 +43,7 @@ class HardBounds(ReadOnlyArrays):
     disturbance_bound: Ellipsoid | None
     sensor_bound: Ellipsoid | None
     initial_bound: Ellipsoid | None
+    remainder: Remainder | None
 
     def _check_declared(self) -> tuple[bool, bool, bool]:
         """Checks what is declared of disturbances, sensor noise and first estimate; returns for which anything is."""
@@ -60,7 +62,8 @@ class HardBounds(ReadOnlyArrays):
             )
             if (value := getattr(self, bound)) is not None:
                 object.__setattr__(self, bound, as_bound(value, size, bound))
-        return is_given[0] or self.gamma > 0.0, is_given[1], is_given[2]
+        object.__setattr__(self, "remainder", as_remainder(self.remainder, self.n))
+        return is_given[0] or self.gamma > 0.0 or self.remainder is not None, is_given[1], is_given[2]
 
     @property
     def n(self) -> int:
@@ -110,7 +113,7 @@ class HardBounds(ReadOnlyArrays):
 
     @cached_property
     def disturbance(self) -> Ellipsoid:
-        """D, shape (n, n): holds every declared disturbance, the truncated process noise and a simulation's rounding.
+        """D, shape (n, n): holds declared disturbances, truncated process noise, remainder, rounding of a simulation.
 
         It is larger than `allowed_disturbance` by what holds that plus E(F), F = n diag(r^2), with r the rounding of
         A x + B u + d for x up to SIMULATED_REACH half-widths out: (1+s/4) allowed + (1+4/s) F, s the inflation.
@@ -137,7 +140,9 @@ class HardBounds(ReadOnlyArrays):
         """D before inflation: where extremal disturbances are drawn, so that their rounding stays inside E(D)."""
         ball = Ellipsoid(self.gamma * np.eye(self.n))
         noisy = _sum_or_other(ball, self.process_noise.bound, self.relative_weight)
-        return _with_declared(noisy, self.disturbance_bound, self.relative_weight)
+        declared = _with_declared(noisy, self.disturbance_bound, self.relative_weight)
+        left_out = None if self.remainder is None else self.remainder.bound
+        return _with_declared(declared, left_out, self.relative_weight)
 
     @cached_property
     def nominal_sensor_error(self) -> Ellipsoid:
@@ -187,6 +192,8 @@ class HardBounds(ReadOnlyArrays):
         R, P0 = self.measurement_noise_cov, self.initial_cov
         if self.disturbance_bound is not None:
             Q = Q + self.disturbance_bound.shape
+        if self.remainder is not None:
+            Q = Q + self.remainder.bound.shape
         if self.sensor_bound is not None:
             R = R + self.sensor_bound.shape / (self.p + 2)
         if self.initial_bound is not None:

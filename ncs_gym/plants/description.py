@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
+from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.validation import as_setting, shown
 
 if TYPE_CHECKING:
@@ -62,6 +63,8 @@ def assumptions_of(plant: LinearPlant) -> tuple[str, ...]:
     if truncated:
         kept = f"{100.0 * (1.0 - plant.delta):.6g} % (delta = {plant.delta:g})"
         assumed.append(f"Gaussian noise is truncated: the bounds hold {kept} of {', '.join(truncated)}, not the rest.")
+    if plant.remainder is not None:
+        assumed.append(plant.remainder.sentence)
     return tuple(assumed)
 
 
@@ -115,6 +118,10 @@ def fingerprint_of(plant: LinearPlant) -> str:
         array = value.shape if isinstance(value, Ellipsoid) else value
         if array is not None and np.any(array):  # a plant without them keeps the fingerprint it always had
             digest.update(name.encode() + array.astype("<f8").tobytes())
+    if plant.remainder is not None:
+        digest.update(
+            f"remainder{plant.remainder.sentence}".encode() + plant.remainder.bound.shape.astype("<f8").tobytes()
+        )
     return digest.hexdigest()
 
 
@@ -162,12 +169,14 @@ def _as_json(value: Any) -> Any:
     """Returns a field of a plant as a JSON value."""
     if isinstance(value, Ellipsoid):
         return {"shape": value.shape.tolist()}
+    if isinstance(value, Remainder):
+        return {entry.name: _as_json(getattr(value, entry.name)) for entry in fields(value)}
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 def _from_json(value: Any) -> Any:
     """Returns an argument of `LinearPlant` given as a JSON value; an object is an ellipsoid's shape."""
-    if not isinstance(value, dict):
+    if not isinstance(value, dict) or "proved" in value:  # a remainder's
         return value
     if set(value) != {"shape"}:
         raise ValueError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self
 
@@ -13,6 +13,7 @@ import numpy as np
 from ncs_gym.plants import description, limits, statespace
 from ncs_gym.plants.bounds import FLAT_INFLATION, INFLATION, SIMULATED_REACH, SMALLEST_DELTA, HardBounds
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
+from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.validation import (
     FILLED_IN_LATER,
     SMALLEST_NUMBER,
@@ -62,6 +63,8 @@ class LinearPlant(HardBounds, limits.OperatingPoint):
         disturbance_bound: Of further disturbances d; kept as an `Ellipsoid`.
         sensor_bound: Of further sensor noise v; kept as an `Ellipsoid`.
         initial_bound: Of a further error of the first estimate; kept as an `Ellipsoid`.
+        remainder: What the model leaves out of the process that really moves, part of d (`ncs_gym.linear_model`); None
+            if nothing.
         error_gain: The gain, shape (m, n), whose answers to an estimation error make it costly when error sets by age
             are chosen (docs/contracts.md), a certificate's K in round numbers; a regulator's by default.
         operating_state: State that deviations are counted from, shape (n,); for conversion and text.
@@ -86,6 +89,7 @@ class LinearPlant(HardBounds, limits.OperatingPoint):
     disturbance_bound: Ellipsoid | None = None
     sensor_bound: Ellipsoid | None = None
     initial_bound: Ellipsoid | None = None
+    remainder: Remainder | None = None
     error_gain: np.ndarray | None = None
     operating_state: np.ndarray = FILLED_IN_LATER
     operating_input: np.ndarray = FILLED_IN_LATER
@@ -113,6 +117,7 @@ class LinearPlant(HardBounds, limits.OperatingPoint):
             disturbance_bound: Bound | None = None,
             sensor_bound: Bound | None = None,
             initial_bound: Bound | None = None,
+            remainder: Remainder | None = None,
             error_gain: ArrayLike | None = None,
             operating_state: ArrayLike | None = None,
             operating_input: ArrayLike | None = None,
@@ -192,6 +197,11 @@ class LinearPlant(HardBounds, limits.OperatingPoint):
     def assumptions(self) -> tuple[str, ...]:
         """What a certificate takes for granted beyond the numbers of the bounds, in sentences."""
         return description.assumptions_of(self)
+
+    @cached_property
+    def without_remainder(self) -> LinearPlant:
+        """The same plant without its remainder: what is declared beside it."""
+        return self if self.remainder is None else replace(self, remainder=None)
 
     @cached_property
     def C(self) -> np.ndarray:

@@ -17,7 +17,7 @@ from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.estimation import VectorEstimator
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
 from ncs_gym.network.transmission import VectorChannelState
-from ncs_gym.plants.process import LinearProcess
+from ncs_gym.processes.simulation import PlantSimulation
 from ncs_gym.registration import CASE_STUDY_CHANNEL
 
 # As in Section 5, with several seeds.
@@ -78,7 +78,7 @@ def largest_error(
     if noise_variance is not None:
         plant = replace(plant, measurement_noise_cov=noise_variance * np.eye(2))
     state = Ellipsoid(example.L).sample(rng, _STARTS).T
-    process = LinearProcess(plant, example.disturbance, False, _STARTS)
+    process = PlantSimulation(plant, example.disturbance, False, _STARTS)
     memory, network = process.begin(rng, _STARTS), VectorChannelState(channel, rng, _STARTS)
     estimator = make_filter(example, plant, state + plant.sample_initial_error(rng, _STARTS).T)
     gain, limit, largest = plant.B @ example.K, plant.u_max[:, None], 0.0

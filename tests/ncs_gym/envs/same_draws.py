@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 from ncs_gym import LinearPlant, NCSEnv, NCSVectorEnv
 from ncs_gym.network.transmission import ChannelState, LossState
 from ncs_gym.plants.lqr import regulator_gain
-from ncs_gym.plants.process import LinearProcess
+from ncs_gym.processes.simulation import PlantSimulation
 
 
 class RecordingGenerator:
@@ -42,7 +42,7 @@ class ScriptedGenerator:
         return number
 
 
-class RecordedProcess(LinearProcess):
+class RecordedProcess(PlantSimulation):
     """The process of a vector, which notes noise and disturbances; those do not count among the uniform numbers."""
 
     def draw_disturbance(self, rng: Any, nominal: np.ndarray, steps: Any, memory: Any) -> np.ndarray:
@@ -55,7 +55,7 @@ class RecordedProcess(LinearProcess):
         return measured
 
 
-class ScriptedProcess(LinearProcess):
+class ScriptedProcess(PlantSimulation):
     """The process of a scalar environment with the noise and the disturbances of one environment of a vector."""
 
     def draw_disturbance(self, rng: Any, nominal: np.ndarray, steps: Any, memory: Any) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What really moves: the plant's own equations with noise and disturbances, for one environment or for many."""
+"""The plant's own equations with noise and disturbances, simulated for one environment or for many."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import numpy as np
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.disturbance import Disturbance, checked, checked_many
 from ncs_gym.uncertainty.disturbance_settings import stays_inside
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
+from ncs_gym.validation import read_only
 
 # Noise is drawn for about this many environment steps at once, for this many steps of one environment at most.
 BLOCK_SIZE, LONGEST_BLOCK = 4096, 256
@@ -41,7 +43,7 @@ class BlockSampler:
         self._left = []
 
 
-class LinearProcess:
+class PlantSimulation:
     """x+ = A x + B u + d and y = H x + v, simulated; the last axis of every array is the environment.
 
     Args:
@@ -50,7 +52,15 @@ class LinearProcess:
         allow_assumption_violation: Let disturbances outside the certified bound pass instead of raising.
         size: Number of environments; None for one without that axis.
         truncated: Whether process noise, sensor noise and first errors are truncated; False draws Gaussian ones.
+
+    Attributes:
+        terminated, truncated: Whether the process ended the episode by itself, which these equations never do.
+        alarm: Whether the process moved in a way that the model excludes, which these equations never do.
     """
+
+    terminated: Any = False
+    truncated: Any = False
+    alarm: Any = False
 
     def __init__(
         self,
@@ -127,6 +137,29 @@ class LinearProcess:
         self.sensor_noise.forget()
         self.process_noise.forget()
 
+    def start(
+        self, rng: np.random.Generator, state: np.ndarray, initial: Ellipsoid | None
+    ) -> tuple[np.ndarray, Ellipsoid | np.ndarray]:
+        """Starts an episode; returns its first state, shape (n,), and what that is known to lie in.
+
+        Args:
+            rng: Source of randomness.
+            state: Where it is to start, shape (n,).
+            initial: The set that this was drawn from; None for a given state.
+        """
+        return state, read_only(state) if initial is None else initial
+
+    def start_many(
+        self, rng: np.random.Generator, states: np.ndarray, initial: Ellipsoid | None, mask: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Starts the k episodes that a mask, shape (size,), chooses.
+
+        Returns:
+            The first states, shape (n, k), and what is known of them, shape (k, n): a row of NaN for a state in the
+            initial set, the state itself for another one.
+        """
+        return states, np.full(states.T.shape, np.nan) if initial is not None else states.T
+
     def begin(self, rng: np.random.Generator, count: int | None = None) -> Any:
         """Returns what the disturbance keeps for an episode, or for `count` of them along the last axis."""
         if count is None:
@@ -158,6 +191,9 @@ class LinearProcess:
         draw = source.draw if self.size is None else source.draw_many
         d = draw(rng, self.plant, nominal, steps, memory)
         return self._sum(d, None if source.replaces_process_noise else self.process_noise.next(rng), self.size)
+
+    def close(self) -> None:
+        """Closes what the process opened: nothing here."""
 
     def measure(self, rng: np.random.Generator, state: np.ndarray) -> np.ndarray:
         """Returns y = H x + v, shape (p,) or (p, size)."""

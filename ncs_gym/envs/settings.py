@@ -1,0 +1,44 @@
+"""Settings of the control loop: what they must be, and the contract that they amount to."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+from ncs_gym.estimation.error_bound import UnstablePlantError
+from ncs_gym.network.channel import Channel
+from ncs_gym.network.contract import ChannelContract, contract_of
+from ncs_gym.plants.linear_plant import LinearPlant
+
+T = TypeVar("T")
+
+
+def assumed_contract(plant: LinearPlant, channel: Channel, contract: ChannelContract | None) -> ChannelContract | None:
+    """Returns the contract that the estimator's error sets rest on.
+
+    Raises:
+        UnstablePlantError: If an unstable plant has neither a contract nor a channel that keeps one.
+        ValueError: If the channel rounds more coarsely than the contract allows.
+    """
+    if contract is None and plant.spectral_radius >= 1.0:
+        contract = contract_of(channel)
+        if contract is None:
+            raise UnstablePlantError(
+                f"the plant is unstable (spectral radius {plant.spectral_radius:.6g}), the channel promises nothing: "
+                "give it max_consecutive_losses, or the environment contract=ChannelContract(max_age=...)"
+            )
+    if contract is not None and not expect(contract, ChannelContract, "contract").is_fine_enough_for(channel):
+        raise ValueError(
+            f"the channel rounds to {channel.quantization_step}, the contract allows {contract.quantization_step}"
+        )
+    return contract
+
+
+def expect(value: Any, kind: type[T], name: str) -> T:
+    """Returns a setting that is of the right kind.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    if not isinstance(value, kind):
+        raise ValueError(f"{name} must be of type {kind.__name__}, got {type(value).__name__}")
+    return value

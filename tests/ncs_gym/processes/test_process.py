@@ -1,0 +1,306 @@
+"""What really moves: the plant's equations, a function, or another Gymnasium environment."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Discrete
+
+from ncs_gym import (
+    Channel,
+    Ellipsoid,
+    FunctionProcess,
+    GymProcess,
+    LinearPlant,
+    LinearProcess,
+    NCSEnv,
+    NCSVectorEnv,
+    Remainder,
+)
+
+QUIET = {"sensor_bound": 0.0, "initial_bound": 0.0}
+A, B = np.array([[0.9, 0.1], [0.0, 0.8]]), np.array([[0.0], [0.1]])
+
+
+def plant(**changes):
+    settings = {"A": A, "B": B, "box": [1.0, 1.0], "u_max": 1.0, "dt": 0.1, "disturbance_bound": 0.01} | QUIET
+    return LinearPlant(**settings | changes)
+
+
+def linear(state, u):
+    return A @ state + B @ u
+
+
+class Inner(gym.Env):
+    """The same equations as another environment, which ends its episode far out and is cut off after ten steps."""
+
+    observation_space = Box(-np.inf, np.inf, (2,))
+    action_space = Box(-1.0, 1.0, (1,))
+
+    def __init__(self, gain=1.0):
+        self.gain, self.closed, self.seeds = gain, False, []
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.seeds.append(seed)
+        self.state, self.steps = self.np_random.uniform(-0.05, 0.05, 2), 0
+        return self.state.astype(np.float32), {}
+
+    def step(self, action):
+        assert action.dtype == np.float32
+        self.state, self.steps = A @ self.state + self.gain * B @ action.astype(np.float64), self.steps + 1
+        return self.state.astype(np.float32), 0.0, bool(abs(self.state[0]) > 0.5), self.steps >= 10, {}
+
+    def close(self):
+        self.closed = True
+
+
+def read(env):
+    return env.state
+
+
+def write(env, state):
+    env.state = state
+
+
+INNER = GymProcess(Inner, read_state=read, write_state=write)
+
+
+def rollout(env, steps=30, seed=5):
+    """What a random agent sees and is told, as numbers."""
+    rng, rows = np.random.default_rng(0), []
+    observation, info = env.reset(seed=seed)
+    for _ in range(steps):
+        rows.append(np.concatenate([observation.ravel(), info["state"].ravel(), np.ravel(info["assumption_violated"])]))
+        shape = env.action_space.shape
+        observation, *_, info = env.step(rng.uniform(-1.0, 1.0, shape).astype(np.float32))
+    return np.array(rows)
+
+
+def test_linear_process_is_the_default():
+    channel = Channel(loss=0.3)
+    for kind in (NCSEnv, lambda *given, **named: NCSVectorEnv(3, plant=given[0], channel=given[1], **named)):
+        np.testing.assert_array_equal(
+            rollout(kind(plant(), channel)), rollout(kind(plant(), channel, process=LinearProcess()))
+        )
+
+
+@pytest.mark.parametrize("vectorized", [False, True])
+def test_function_with_the_plants_equations_moves_like_the_plant(vectorized):
+    process = FunctionProcess(linear, vectorized)
+    np.testing.assert_allclose(rollout(NCSEnv(plant(), process=process)), rollout(NCSEnv(plant())), atol=1e-12)
+    many, own = NCSVectorEnv(3, plant=plant(), process=process), NCSVectorEnv(3, plant=plant())
+    np.testing.assert_allclose(rollout(many), rollout(own), atol=1e-12)
+
+
+def test_inner_environment_is_started_where_the_loop_says():
+    env = NCSEnv(plant(disturbance_bound=0.0), process=INNER, initial_set=Ellipsoid(0.09 * np.eye(2)))
+    _, info = env.reset(seed=1)
+    inner = env._process._body.env
+    np.testing.assert_array_equal(inner.state, info["state"])
+    assert np.abs(info["state"]).max() > 0.05  # further than its own resets
+    assert env.start is env.initial_set
+    _, info = env.reset(options={"state": [0.25, -0.5]})
+    np.testing.assert_array_equal(inner.state, [0.25, -0.5])
+    np.testing.assert_array_equal(env.start, [0.25, -0.5])
+    _, _, _, _, info = env.step(np.array([1.0]))
+    np.testing.assert_allclose(info["state"], linear(np.array([0.25, -0.5]), np.ones(1)))
+    env.close()
+    assert inner.closed
+
+
+def test_inner_seeds_come_from_the_seed_of_the_loop():
+    def seeds(seed):
+        env = NCSEnv(plant(), process=INNER)
+        env.reset(seed=seed)
+        env.reset()
+        return env._process._body.env.seeds
+
+    assert seeds(3) == seeds(3) != seeds(4)
+    assert len(set(seeds(3))) == 2
+
+
+def test_without_write_state_episodes_start_where_the_inner_reset_leaves_it():
+    process = GymProcess(Inner, read_state=read)
+    env = NCSEnv(plant(), process=process, initial_set=Ellipsoid(1e-4 * np.eye(2)))
+    known = set()
+    for seed in range(20):
+        _, info = env.reset(seed=seed)
+        np.testing.assert_array_equal(env._process._body.env.state, info["state"])
+        inside = env.initial_set.contains(info["state"])
+        known.add(inside)
+        assert (env.start is env.initial_set) == inside
+        assert inside or np.array_equal(env.start, info["state"])
+    assert known == {True, False}
+    with pytest.raises(ValueError, match="cannot start at a given state: give its GymProcess write_state"):
+        env.reset(options={"state": [0.0, 0.0]})
+    many = NCSVectorEnv(20, plant=plant(), process=process, initial_set=Ellipsoid(1e-4 * np.eye(2)))
+    _, info = many.reset(seed=0)
+    inside = many.single.initial_set.gauge(info["state"]) <= 1.0
+    np.testing.assert_array_equal(np.isnan(many.starts[:, 0]), inside)
+    np.testing.assert_array_equal(many.starts[~inside], info["state"][~inside])
+
+
+def test_inner_end_of_an_episode_is_that_of_the_loop():
+    env = NCSEnv(plant(disturbance_bound=0.0), process=INNER)
+    env.reset(seed=0, options={"state": [0.0, 0.0]})
+    ends = [env.step(np.zeros(1))[2:4] for _ in range(10)]
+    assert ends == [(False, False)] * 9 + [(False, True)]
+    with pytest.raises(gym.error.ResetNeeded, match="the process inside has ended"):
+        env.step(np.zeros(1))
+    env.reset(options={"state": [0.9, 0.9]})
+    assert env.step(np.zeros(1))[2:4] == (True, False)
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_inner_ends_in_a_vector_restart_that_environment_alone(mode):
+    many = NCSVectorEnv(2, plant=plant(disturbance_bound=0.0), process=INNER, autoreset_mode=mode)
+    many.reset(seed=0, options={"state": np.array([[0.0, 0.0], [0.9, 0.9]])})
+    *_, terminated, truncated, info = many.step(np.zeros((2, 1)))
+    assert terminated.tolist() == [False, True]
+    assert not truncated.any()
+    if mode == "NextStep":
+        *_, terminated, _, info = many.step(np.zeros((2, 1)))
+        assert not terminated.any()
+    assert many.episodes.tolist() == [1, 2]
+    assert np.abs(info["state"]).max() < 0.2
+    assert not info["assumption_violated"].any()
+    inner = many._process._bodies if hasattr(many._process, "_bodies") else many._process._body._bodies
+    many.close()
+    assert all(body.env.closed for body in inner)
+
+
+def test_vector_of_inner_environments_moves_like_single_ones():
+    many = NCSVectorEnv(3, plant=plant(disturbance_bound=0.0), process=INNER)
+    starts = 0.2 * np.random.default_rng(1).standard_normal((3, 2))
+    many.reset(seed=0, options={"state": starts})
+    rng, states = np.random.default_rng(2), starts
+    for _ in range(9):
+        actions = rng.uniform(-1.0, 1.0, (3, 1)).astype(np.float32)
+        *_, info = many.step(actions)
+        states = np.array([linear(x, u.astype(np.float64)) for x, u in zip(states, actions, strict=True)])
+        np.testing.assert_allclose(info["state"], states, atol=1e-12)
+
+
+def test_disturbances_act_on_what_is_written_and_only_there():
+    still = np.zeros(1, np.float32)
+    for process, moves in ((INNER, True), (GymProcess(Inner, read_state=read), False)):
+        env = NCSEnv(plant(), process=process)
+        _, info = env.reset(seed=0)
+        before = info["state"]
+        *_, info = env.step(still)
+        assert (np.abs(info["state"] - linear(before, np.zeros(1))).max() > 1e-6) == moves
+        np.testing.assert_array_equal(env._process._body.env.state, info["state"])
+
+
+def test_remainder_is_left_to_the_process():
+    """The linear plant may be disturbed by all of E(D); beside a process only what is declared beside the remainder."""
+    left_out = Remainder(Ellipsoid(0.01 * np.eye(2)), True, "an example")
+    whole = plant(disturbance_bound=0.0, remainder=left_out)
+    np.testing.assert_allclose(whole.disturbance.shape, 0.01 * np.eye(2), rtol=1e-6)
+    for process, moves in ((LinearProcess(), True), (FunctionProcess(linear), False)):
+        env = NCSEnv(whole, process=process, disturbance="sphere")
+        _, info = env.reset(seed=0)
+        before = info["state"]
+        *_, info = env.step(np.zeros(1))
+        assert (np.abs(info["state"] - A @ before).max() > 1e-6) == moves
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_step_outside_the_model_raises_the_alarm_until_the_next_episode(many):
+    strong = GymProcess(lambda: Inner(gain=1.5), read_state=read, write_state=write)
+    settings = {"plant": plant(), "process": strong}
+    env = NCSVectorEnv(2, **settings, autoreset_mode="Disabled") if many else NCSEnv(**settings)
+    full = np.array([[1.0], [0.0]], np.float32) if many else np.ones(1, np.float32)
+    env.reset(seed=0, options={"state": np.zeros(2)})
+    *_, info = env.step(0.0 * full)
+    assert not np.any(info["assumption_violated"])
+    for action in (full, 0.0 * full):  # it is latched
+        *_, info = env.step(action)
+        np.testing.assert_array_equal(info["assumption_violated"], [True, False] if many else True)
+    _, info = env.reset()
+    assert not np.any(info["assumption_violated"])
+
+
+class Counted(Inner):
+    action_space = Discrete(2)
+
+
+class Wide(Inner):
+    action_space = Box(-1.0, 1.0, (3,))
+
+
+WRONG = [
+    (GymProcess(Counted, read_state=read), "needs an environment with a Box of actions, got Discrete: wrap it in"),
+    (GymProcess(Wide, read_state=read), r"the plant has 1 inputs, actions have shape \(3,\): give GymProcess write_ac"),
+    (GymProcess(lambda: 3, read_state=read), "make must return a gymnasium.Env, got 3"),
+]
+
+
+@pytest.mark.parametrize(("process", "message"), WRONG)
+def test_inner_environment_that_does_not_fit_is_refused(process, message):
+    with pytest.raises(ValueError, match=message):
+        NCSEnv(plant(), process=process)
+
+
+def test_input_beyond_the_actions_is_refused():
+    with pytest.raises(ValueError, match="goes beyond the actions"):
+        NCSEnv(plant(u_max=1.5), process=INNER)
+
+
+@pytest.mark.parametrize(
+    ("reader", "message"),
+    [
+        (lambda env: env.position, r"must return the state, .* it raised AttributeError"),
+        (lambda env: [1.0, 2.0, 3.0], "must return the 2 finite numbers of the state"),
+        (lambda env: [1.0, np.nan], "must return the 2 finite numbers of the state"),
+        (lambda env: env.state + 1.0, "where write_state wrote .* they must agree"),
+    ],
+)
+def test_state_that_cannot_be_read_is_refused(reader, message):
+    env = NCSEnv(plant(), process=GymProcess(Inner, read_state=reader, write_state=write))
+    with pytest.raises(ValueError, match=message):
+        env.reset(seed=0)
+
+
+def test_what_is_no_process_is_refused():
+    with pytest.raises(ValueError, match="process must be of type Process, got str"):
+        NCSEnv(plant(), process="pendulum")
+    with pytest.raises(ValueError, match="GymProcess: read_state must be a function, got 3"):
+        GymProcess(Inner, read_state=3)
+    with pytest.raises(ValueError, match="the process must be a function"):
+        FunctionProcess(3)
+    with pytest.raises(ValueError, match="disturbance of your own can act only on a process with write_state"):
+        NCSEnv(plant(), process=GymProcess(Inner, read_state=read), disturbance=lambda rng, plant, x: 0.0 * x)
+
+
+@pytest.mark.parametrize("value", [np.ones(3), [1.0, np.inf], "x"])
+def test_function_that_returns_no_state_is_refused(value):
+    env = NCSEnv(plant(), process=FunctionProcess(lambda x, u: value))
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"must return a finite next state of shape \(2,\)"):
+        env.step(np.zeros(1))
+
+
+def test_what_is_no_remainder_is_refused():
+    with pytest.raises(ValueError, match="remainder must be a Remainder"):
+        plant(remainder=0.1)
+    with pytest.raises(ValueError, match="dimension 2"):
+        plant(remainder=Remainder(Ellipsoid(np.eye(3)), True, "an example"))
+    with pytest.raises(ValueError, match="bound of a remainder must be an Ellipsoid"):
+        Remainder(0.1, True, "an example")
+    with pytest.raises(ValueError, match="proved must be"):
+        Remainder(Ellipsoid(np.eye(2)), "yes", "an example")
+    with pytest.raises(ValueError, match="basis of a remainder must be text"):
+        Remainder(Ellipsoid(np.eye(2)), True, 3)
+
+
+def test_file_of_a_plant_keeps_its_remainder(tmp_path):
+    whole = plant(remainder=Remainder(Ellipsoid(0.01 * np.eye(2)), False, "an example"))
+    whole.save(tmp_path / "plant.json")
+    twin = LinearPlant.load(tmp_path / "plant.json")
+    assert twin.fingerprint == whole.fingerprint != whole.without_remainder.fingerprint
+    assert twin.assumptions == whole.assumptions
+    assert any(
+        "is assumed to lie in its bound while the state is in the box: an example" in s for s in twin.assumptions
+    )
+    assert whole.without_remainder.fingerprint == plant().fingerprint
