@@ -61,7 +61,7 @@ benchmark: $(INSTALLED) $(RAY_INSTALLED)
 	$(BIN)/python benchmarks/ppo_settings.py
 	$(BIN)/python benchmarks/ray_overhead.py
 
-# Fails on a broken link, anchor or reference. Look at it: python -m http.server -d site (from a file the search is missing).
+# Fails on a broken link, anchor, reference or formula; makes a page per registered environment. Look at it: python -m http.server -d site (from a file the search is missing).
 docs: $(DOCS_INSTALLED)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 

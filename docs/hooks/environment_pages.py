@@ -1,0 +1,61 @@
+"""A page of every registered environment, made when the site is built: a new id gets its page by itself."""
+
+import contextlib
+import io
+import tempfile
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from environment_page import environment_page
+from mkdocs.structure.files import File
+
+from experiments.commands.render import render
+from experiments.settings import RenderSettings
+from ncs_gym.registration import registered_ids
+
+# Steps of the episode whose last picture a page shows.
+STEPS = 12
+# Comment on the page of all environments that a list of the pages takes the place of.
+MARK = "<!-- a page per environment -->"
+
+
+def on_config(config: Any) -> Any:
+    """Adds the pages to the navigation, below the page of all environments."""
+    for section in config.nav:
+        for entries in section.values():
+            places = [index for index, entry in enumerate(entries) if entry == {"Environments": "ncs_gym.md"}]
+            for index in places:
+                pages = [{_name(env_id): f"environments/{_name(env_id)}.md"} for env_id in registered_ids()]
+                entries[index] = {"Environments": ["ncs_gym.md", *pages]}
+    return config
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Adds the pages and their pictures to the files of the site."""
+    for env_id in registered_ids():
+        name = _name(env_id)
+        text, picture = _made(env_id)
+        files.append(File.generated(config, f"environments/{name}.md", content=text))
+        files.append(File.generated(config, f"environments/{name}.png", content=picture))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Puts a list of the pages on the page of all environments."""
+    pages = [f"[{_name(env_id)}](environments/{_name(env_id)}.md)" for env_id in registered_ids()]
+    return markdown.replace(MARK, f"Each has a page of its own: {', '.join(pages)}.")
+
+
+@lru_cache
+def _made(env_id: str) -> tuple[str, bytes]:
+    """Returns the page of an environment, and its picture."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "picture.png"
+        with contextlib.redirect_stdout(io.StringIO()):
+            render(RenderSettings(env=env_id, out=file, steps=STEPS))
+        return environment_page(env_id, f"{_name(env_id)}.png"), file.read_bytes()
+
+
+def _name(env_id: str) -> str:
+    return env_id.rpartition("/")[2].rpartition("-v")[0]

@@ -1,0 +1,107 @@
+"""The page of an environment says what the environment is."""
+
+import importlib.util
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+
+from ncs_gym import Channel, LinearPlant, register_plant
+from ncs_gym.registration import registered_ids
+from shields import SafetyShield
+
+ROOT = Path(__file__).resolve().parent.parent
+SECTIONS = (
+    "Description",
+    "Action space",
+    "Observation space",
+    "Rewards",
+    "Starting state",
+    "Episode end",
+    "Arguments",
+    "Channel and contract",
+    "Certificate",
+    "Version history",
+)
+
+
+@pytest.fixture(scope="module")
+def pages():
+    """The module that writes the pages, which is part of no package."""
+    spec = importlib.util.spec_from_file_location("environment_page", ROOT / "docs" / "hooks" / "environment_page.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def section(page, title):
+    """Text of a section."""
+    return page.partition(f"\n## {title}\n")[2].partition("\n## ")[0]
+
+
+def words(text):
+    """Text without its line breaks."""
+    return " ".join(str(text).split())
+
+
+@pytest.mark.parametrize("env_id", registered_ids())
+def test_every_environment_has_a_page_with_its_own_figures(pages, env_id):
+    page, env = pages.environment_page(env_id, "picture.png"), gym.make(env_id)
+    assert [line[3:] for line in page.splitlines() if line.startswith("## ")] == list(SECTIONS)
+    assert all(section(page, title).strip() for title in SECTIONS)
+    assert "](picture.png)" in page.partition("\n## ")[0]
+    inner = env.unwrapped
+    assert words(inner.plant) in words(section(page, "Description"))
+    assert section(page, "Observation space").count("\n| ") == 1 + env.observation_space.shape[0]
+    assert words(SafetyShield(env).certificate) in words(section(page, "Certificate"))
+    assert "hold in exact arithmetic" in section(page, "Certificate")
+    ends = "ends the episode" if inner.terminate_on_violation else "does not end the episode"
+    assert ends in section(page, "Episode end")
+
+
+def test_plant_that_is_registered_gets_a_page(pages):
+    plant = LinearPlant(
+        A=[[0.9]],
+        B=[[0.1]],
+        box=[1.0],
+        u_max=2.0,
+        dt=1.0,
+        disturbance_bound=0.01,
+        sensor_bound=0.01,
+        initial_bound=0.01,
+    )
+    register_plant("Pages/Tank-v0", plant, channel=Channel(loss=0.25, delay=3), max_episode_steps=77)
+    try:
+        page = pages.environment_page("Pages/Tank-v0")
+    finally:
+        del gym.registry["Pages/Tank-v0"]
+    assert page.startswith("# Tank\n")
+    assert "](picture.png)" not in page
+    assert "lost with probability 0.25. What is not lost arrives 3 steps late." in section(page, "Channel and contract")
+    assert "truncated after 77 steps" in section(page, "Episode end")
+    assert "| 0 | u1 | 2 |" in section(page, "Action space")
+
+
+@pytest.mark.parametrize(
+    ("channel", "sentence"),
+    [
+        (
+            Channel(),
+            "sent every step, not quantized. A packet is lost with probability 0. What is not lost arrives at once.",
+        ),
+        (Channel(send_period=3, quantization_step=0.5), "sent every 3 steps, quantized with step 0.5."),
+        (Channel(delay=1, jitter=2), "arrives 1 to 3 steps late."),
+        (Channel(delay=1), "arrives 1 step late."),
+        (Channel(loss=0.5, max_consecutive_losses=4), "probability 0.5, but never more than 4 in a row."),
+        (Channel(loss={"p_good_to_bad": 0.1, "p_bad_to_good": 0.2}), "Losses come in bursts"),
+    ],
+)
+def test_channel_is_said_in_words(pages, channel, sentence):
+    assert sentence in pages.channel_in_words(channel)
+
+
+def test_environment_of_another_package_has_no_page(pages):
+    with pytest.raises(ValueError, match="not an environment of this package"):
+        pages.environment_page("CartPole-v1")
