@@ -192,8 +192,8 @@ def _certificate(env: NCSEnv, certificate: Certificate) -> str:
     report = verify(certificate, env.plant)
     count = len(report.conditions)
     verified = f"`verify` finds that all {count} conditions hold in exact arithmetic." if report.valid else str(report)
-    made = "on a certificate that is synthesized when it is first asked for:"
-    return f"The [shield](../shield.md) of this environment rests {made}\n\n```\n{_wrapped(str(certificate), 14)}\n```\n\n{verified}"
+    text = "The [shield](../shield.md) here rests on a certificate that is synthesized when it is first asked for:"
+    return f"{text}\n\n```\n{_wrapped(str(certificate), 14)}\n```\n\n{verified}"
 
 
 def _versions(spec: Any) -> str:
