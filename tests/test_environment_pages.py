@@ -2,6 +2,7 @@
 
 import importlib.util
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import pytest
@@ -100,6 +101,14 @@ def test_plant_that_is_registered_gets_a_page(pages):
 )
 def test_channel_is_said_in_words(pages, channel, sentence):
     assert sentence in pages.channel_in_words(channel)
+
+
+def test_downlink_is_said_in_words(pages):
+    env = SimpleNamespace(channel=Channel(), contract=None, downlink=SimpleNamespace(channel=Channel(loss=0.1), lead=2))
+    text = pages._channel(env)
+    assert "Between controller and actuator is a network as well: `Channel(loss=0.1," in text
+    assert "An action takes effect 2 steps later." in text
+    assert "actuator" not in pages._channel(SimpleNamespace(channel=Channel(), contract=None))
 
 
 def test_environment_of_another_package_has_no_page(pages):

@@ -152,9 +152,11 @@ def _arguments(env: NCSEnv, spec: Any) -> str:
 def _channel(env: NCSEnv) -> str:
     texts = [channel_in_words(env.channel), _contract(env.contract, env.channel)]
     downlink = getattr(env, "downlink", None)
-    downlink = downlink if isinstance(downlink, Channel) else getattr(downlink, "channel", None)
-    if isinstance(downlink, Channel):
-        texts.append("Between controller and actuator is a network as well. " + _settings(downlink))
+    if downlink is not None:
+        texts.append(
+            f"Between controller and actuator is a network as well: `{downlink.channel}`. "
+            f"An action takes effect {_steps(downlink.lead)} later."
+        )
     return "\n\n".join(texts)
 
 
@@ -192,8 +194,9 @@ def _certificate(env: NCSEnv, certificate: Certificate) -> str:
     report = verify(certificate, env.plant)
     count = len(report.conditions)
     verified = f"`verify` finds that all {count} conditions hold in exact arithmetic." if report.valid else str(report)
+    unbroken = str(certificate).replace("\n" + 14 * " ", " ")
     text = "The [shield](../shield.md) here rests on a certificate that is synthesized when it is first asked for:"
-    return f"{text}\n\n```\n{_wrapped(str(certificate), 14)}\n```\n\n{verified}"
+    return f"{text}\n\n```\n{_wrapped(unbroken, 14)}\n```\n\n{verified}"
 
 
 def _versions(spec: Any) -> str:

@@ -26,16 +26,15 @@ def on_config(config: Any) -> Any:
         for entries in section.values():
             places = [index for index, entry in enumerate(entries) if entry == {"Environments": "ncs_gym.md"}]
             for index in places:
-                pages = [{_name(env_id): f"environments/{_name(env_id)}.md"} for env_id in registered_ids()]
+                pages = [{name: f"environments/{name}.md"} for name in _ids_by_name()]
                 entries[index] = {"Environments": ["ncs_gym.md", *pages]}
     return config
 
 
 def on_files(files: Any, config: Any) -> Any:
     """Adds the pages and their pictures to the files of the site."""
-    for env_id in registered_ids():
-        name = _name(env_id)
-        text, picture = _made(env_id)
+    for name, env_id in _ids_by_name().items():
+        text, picture = _made(name, env_id)
         files.append(File.generated(config, f"environments/{name}.md", content=text))
         files.append(File.generated(config, f"environments/{name}.png", content=picture))
     return files
@@ -43,19 +42,20 @@ def on_files(files: Any, config: Any) -> Any:
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Puts a list of the pages on the page of all environments."""
-    pages = [f"[{_name(env_id)}](environments/{_name(env_id)}.md)" for env_id in registered_ids()]
-    return markdown.replace(MARK, f"Each has a page of its own: {', '.join(pages)}.")
+    pages = [f"[{name}](environments/{name}.md)" for name in _ids_by_name()]
+    return markdown.replace(MARK, f"Each that has a plant of its own has a page: {', '.join(pages)}.")
 
 
 @lru_cache
-def _made(env_id: str) -> tuple[str, bytes]:
+def _made(name: str, env_id: str) -> tuple[str, bytes]:
     """Returns the page of an environment, and its picture."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "picture.png"
         with contextlib.redirect_stdout(io.StringIO()):
             render(RenderSettings(env=env_id, out=file, steps=STEPS))
-        return environment_page(env_id, f"{_name(env_id)}.png"), file.read_bytes()
+        return environment_page(env_id, f"{name}.png"), file.read_bytes()
 
 
-def _name(env_id: str) -> str:
-    return env_id.rpartition("/")[2].rpartition("-v")[0]
+def _ids_by_name() -> dict[str, str]:
+    """Returns the ids by their names; of several versions the one registered last."""
+    return {env_id.rpartition("/")[2].rpartition("-v")[0]: env_id for env_id in registered_ids()}
