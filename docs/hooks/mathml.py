@@ -35,5 +35,6 @@ def on_page_content(content: str, **_: Any) -> str:
 
 
 def _mathml(found: re.Match[str]) -> str:
-    formula = html.unescape(found[2]).strip()
-    return CONVERTER.convert_with_local_state(formula, displaystyle=found[1] == "div")
+    is_block = found[1] == "div"
+    formula = CONVERTER.convert_with_local_state(html.unescape(found[2]).strip(), displaystyle=is_block)
+    return f'<div class="formula">{formula}</div>' if is_block else formula
