@@ -1,0 +1,57 @@
+"""Formulas of the pages: as the site and GitHub read them."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = sorted((ROOT / "docs").glob("*.md"))
+FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+# Backslashes before punctuation are Markdown's on GitHub, signs of order look like HTML, and what is broken over two
+# lines is no formula everywhere.
+NOT_INLINE = re.compile(r"\\[^A-Za-z]|[<>\n]")
+
+
+def formulas(page):
+    """Formulas in the lines of a page, and those in blocks of their own."""
+    text = page.read_text()
+    blocks = [content for language, content in FENCED.findall(text) if language == "math"]
+    parts = re.sub(r"`[^`]*`", "", FENCED.sub("", text)).split("$")
+    assert len(parts) % 2 == 1, f"a dollar without a second one in {page.name}"
+    return parts[1::2], blocks
+
+
+def test_theory_and_proofs_have_formulas():
+    for name in ("theory.md", "shield_proof.md", "lookahead.md", "contracts.md"):
+        lines, blocks = formulas(ROOT / "docs" / name)
+        assert len(lines) > 20, name
+        assert blocks, name
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_formulas_in_a_line_are_left_alone_by_markdown(page):
+    for formula in formulas(page)[0]:
+        assert formula == formula.strip() != "", formula
+        assert not NOT_INLINE.search(formula), formula
+        assert formula.count("{") == formula.count("}"), formula
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_formulas_become_mathml(page):
+    pytest.importorskip("math_core", reason="the extra [docs] is not installed")
+    spec = importlib.util.spec_from_file_location("mathml", ROOT / "docs" / "hooks" / "mathml.py")
+    assert spec is not None
+    assert spec.loader is not None
+    hook = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(hook)
+    lines, blocks = formulas(page)
+    text = hook.on_page_markdown("".join(f"```math\n{block}```\n" for block in blocks))
+    assert text.count("$$") == 2 * len(blocks)
+    content = "".join(f'<span class="arithmatex">\\({each}\\)</span>' for each in lines)
+    content += "".join(f'<div class="arithmatex">\\[\n{each}\\]</div>' for each in blocks)
+    made = hook.on_page_content(content)
+    assert made.count("<math") == len(lines) + len(blocks)
+    assert made.count('<div class="formula">') == len(blocks)
+    assert "arithmatex" not in made
