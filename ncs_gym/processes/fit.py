@@ -9,8 +9,12 @@ ROUNDS = 60
 # The ellipsoid around the samples is at most this much larger than the smallest one, in squared radii.
 EXCESS = 0.01
 MOST_UPDATES = 10_000
-# Directions in which nothing is left out get this fraction of the largest extent.
-THINNEST = 1e-9
+# Directions in which less than this fraction of the largest extent is left out, mostly by rounding, get that much.
+THINNEST = 1e-4
+# No sample loses all of its weight.
+SMALLEST_WEIGHT = 1e-9
+# Results keep this many digits, so that other machines find the same numbers.
+DIGITS = 9
 
 
 def fitted_matrices(
@@ -35,11 +39,11 @@ def fitted_matrices(
         sizes = np.linalg.norm(targets - regressors @ matrix, axis=1)
         if sizes.max() < smallest:
             best, smallest = matrix, sizes.max()
-        weights = weights * (sizes + THINNEST * sizes.max() + np.finfo(float).tiny)
+        weights = weights * (sizes + SMALLEST_WEIGHT * sizes.max() + np.finfo(float).tiny)
         weights /= weights.sum()
     if best is None:
         raise ValueError("the sampled steps are not finite: no linear model fits them")
-    fitted = (best * widths).T
+    fitted = np.round(best * widths, DIGITS).T
     return fitted[:, : len(states)], fitted[:, len(states) :]
 
 
@@ -73,5 +77,14 @@ def surrounding_shape(points: np.ndarray, widths: np.ndarray) -> np.ndarray:
     moments = whitened.T @ (weights[:, None] * whitened)
     sizes = np.einsum("ij,jk,ik->i", whitened, np.linalg.inv(moments), whitened)
     factor = widths[:, None] * axes.T * extents
-    shape = sizes.max() * factor @ moments @ factor.T
-    return 0.5 * (shape + shape.T)
+    return _rounded_up(sizes.max() * factor @ moments @ factor.T)
+
+
+def _rounded_up(shape: np.ndarray) -> np.ndarray:
+    """Returns a slightly larger ellipsoid in round numbers: the diagonal added to exceeds what rounding takes away."""
+    scale = np.sqrt(np.diag(shape))
+    unit = 10.0 ** (np.floor(np.log10(scale)) - DIGITS // 2)
+    scale = np.ceil(scale / unit) * unit
+    ratios = np.round(shape / np.outer(scale, scale), DIGITS) + len(shape) * 10.0**-DIGITS * np.eye(len(shape))
+    larger = ratios * np.outer(scale, scale)
+    return 0.5 * (larger + larger.T)

@@ -6,7 +6,7 @@ import pytest
 
 from ncs_gym import Ellipsoid, GymProcess, LinearProcess, linear_model
 from ncs_gym.processes.fit import surrounding_shape
-from ncs_gym.processes.pendulum import PendulumProcess, pendulum
+from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
 
 QUIET = {"disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
 BOX, TORQUE, STEP = [0.25, 1.5], 2.0, 0.05
@@ -55,7 +55,7 @@ def test_sampled_bound_is_tight_and_grows_with_the_safety_factor():
     np.testing.assert_allclose(twice.remainder.bound.shape, 4.0 * once.remainder.bound.shape)
     assert gauges(once, swing, 2_000).max() > 0.9
     # One direction alone, (dt, 1): the other one is as thin as rounding.
-    assert np.linalg.eigvalsh(once.remainder.bound.shape)[0] < 1e-12 * np.trace(once.remainder.bound.shape)
+    assert np.linalg.eigvalsh(once.remainder.bound.shape)[0] < 1e-7 * np.trace(once.remainder.bound.shape)
 
 
 def test_fitted_slope_leaves_less_out_than_the_slope_at_rest():
@@ -125,8 +125,11 @@ def test_ellipsoid_around_points_holds_them_and_is_nearly_the_smallest():
             {"jacobian_bounds": (JACOBIAN[1], JACOBIAN[1])},
             "a fresh sample of the remainder is .* correct the jacobian_b",
         ),
-        ({"jacobian_bounds": JACOBIAN, "A": np.eye(2), "B": np.ones((2, 1))}, "give either A and B or jacobian_bounds"),
-        ({"A": np.eye(2)}, "A and B go together, got A alone"),
+        (
+            {"jacobian_bounds": JACOBIAN, "A": np.eye(2), "B": np.ones((2, 1))},
+            "give A and B together, or jacobian_bounds",
+        ),
+        ({"A": np.eye(2)}, "give A and B together, or jacobian_bounds"),
         (
             {"process": GymProcess(lambda: gym.make("Pendulum-v1"), lambda env: env.unwrapped.state)},
             "give GymProcess wri",

@@ -68,48 +68,58 @@ def linear_model(
         ValueError: If the remainder is larger than the box can bear, fresh samples contradict the bound, the process
             cannot be put into a state, or an argument is wrong.
     """
-    widths, limits = as_vector(box, None, "box"), np.atleast_1d(np.asarray(u_max, dtype=np.float64))
-    n, m = len(widths), len(limits)
-    samples = as_count(samples, "samples", low=100)
-    safety_factor = as_number(safety_factor, "safety_factor", low=1.0)
     if isinstance(process, LinearProcess):
         raise ValueError("the linear process is its own model: give what really moves")
-    if not isinstance(process, Process):
-        process = FunctionProcess(process)
-    given = {
-        name: as_matrix(settings.pop(name), (n, size), name) for name, size in (("A", n), ("B", m)) if name in settings
-    }
-    if len(given) == 1:
-        raise ValueError(f"A and B go together, got {', '.join(given)} alone")
-    if given and jacobian_bounds is not None:
-        raise ValueError("give either A and B or jacobian_bounds: A and B are the middle of these")
+    moving = process if isinstance(process, Process) else FunctionProcess(process)
+    widths, limits = as_vector(box, None, "box"), np.atleast_1d(np.asarray(u_max, dtype=np.float64))
     common = {"box": widths, "u_max": limits, "dt": dt}
-    frame = LinearPlant(
-        A=np.zeros((n, n)), B=np.zeros((n, m)), disturbance_bound=0.0, sensor_bound=0.0, initial_bound=0.0, **common
-    )
-    body, rng = process.body(frame, None), np.random.default_rng(seed)
+    shapes = {"A": (len(widths), len(widths)), "B": (len(widths), len(limits))}
+    given = {name: as_matrix(settings.pop(name), shape, name) for name, shape in shapes.items() if name in settings}
+    if len(given) == 1 or (given and jacobian_bounds is not None):
+        raise ValueError("give A and B together, or jacobian_bounds, whose middle they are, or neither")
+    rng = np.random.default_rng(as_count(seed, "seed", low=0))
+    drawn, fresh, origin = _steps_of(moving, common, as_count(samples, "samples", low=100), rng)
+    if jacobian_bounds is not None:
+        A, B, bound = _from_jacobians(jacobian_bounds, widths, limits, origin)
+        basis = "from bounds on its Jacobian"
+    else:
+        A, B = (given["A"], given["B"]) if given else fitted_matrices(*drawn, widths)
+        factor = as_number(safety_factor, "safety_factor", low=1.0)
+        bound = Ellipsoid(factor**2 * surrounding_shape(_left_out(A, B, drawn), widths))
+        basis = f"from {samples:,} samples with safety factor {factor:g}"
+    largest, count = _confirmed(bound, _left_out(A, B, fresh), widths), fresh.states.shape[1]
+    basis = f"{basis}, with at most {largest:.0%} of the bound in {count:,} fresh samples"
+    remainder = Remainder(bound, jacobian_bounds is not None, basis)
+    return LinearPlant(A=A, B=B, remainder=_bearable(remainder, widths), **common, **settings)
+
+
+def _steps_of(
+    process: Process, common: dict[str, Any], count: int, rng: np.random.Generator
+) -> tuple[_Steps, _Steps, np.ndarray]:
+    """Returns sampled steps, fewer fresh ones, and f(0, 0), shape (n,).
+
+    Args:
+        process: What moves.
+        common: Box, input limits and step of the plant.
+        count: Number of steps.
+        rng: Source of randomness.
+
+    Raises:
+        ValueError: If the process cannot be put into a state.
+    """
+    n, m = len(common["box"]), len(common["u_max"])
+    quiet = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.0)
+    frame = LinearPlant(A=np.zeros((n, n)), B=np.zeros((n, m)), **common, **quiet)
+    body = process.body(frame, None)
     try:
         if not body.is_written:
             raise ValueError("a linear model needs steps from chosen states: give GymProcess write_state")
-        drawn = _sampled(body, frame, samples, rng)
-        fresh = _sampled(body, frame, max(int(HELD_OUT * samples), 100), rng)
         origin = body.step(body.write(np.zeros(n)), np.zeros(m))
+        drawn = _sampled(body, frame, count, rng)
+        fresh = _sampled(body, frame, max(int(HELD_OUT * count), 100), rng)
+        return drawn, fresh, origin
     finally:
         body.close()
-    if jacobian_bounds is not None:
-        A, B, bound = _from_jacobians(jacobian_bounds, widths, limits, origin)
-    else:
-        A, B = (given["A"], given["B"]) if given else fitted_matrices(*drawn, widths)
-        bound = Ellipsoid(safety_factor**2 * surrounding_shape(_left_out(A, B, drawn), widths))
-    held_out = _confirmed(bound, _left_out(A, B, fresh), widths)
-    basis = (
-        f"from bounds on its Jacobian, {held_out:.0%} of the bound at most in {fresh.states.shape[1]:,} samples"
-        if jacobian_bounds is not None
-        else f"from {samples:,} samples with safety factor {safety_factor:g}, {held_out:.0%} of the bound at most in "
-        f"{fresh.states.shape[1]:,} others"
-    )
-    remainder = Remainder(bound, jacobian_bounds is not None, basis)
-    return LinearPlant(A=A, B=B, remainder=_bearable(remainder, widths), **common, **settings)
 
 
 def _sampled(body: Body, frame: LinearPlant, count: int, rng: np.random.Generator) -> _Steps:
@@ -119,6 +129,8 @@ def _sampled(body: Body, frame: LinearPlant, count: int, rng: np.random.Generato
     at_end = rng.random(points.shape) < np.where(np.arange(count) % 2 == 0, 0.0, rng.random(count))
     points = widths * np.where(at_end, np.sign(points), points)
     states, inputs = points[: frame.n], points[frame.n :]
+    if body.is_vectorized:
+        return _Steps(states, inputs, body.step(states, inputs))
     moved = np.empty_like(states)
     for each in range(count):
         if body.terminated or body.truncated:
