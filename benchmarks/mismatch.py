@@ -84,7 +84,7 @@ def main() -> None:
     columns = (options.field, "outside the model", "left S", "left box", "alarm", "before box", "simulation's alarm")
     print("  ".join(columns))
     for value in options.values:
-        process = type(env.process)(**{options.field: value})
+        process = ncs_env(gym.make(options.env, process={options.field: value})).process
         outside = largest_step_outside(env.plant, process, np.random.default_rng(options.seed))
         first = attacked(env, process, certificate, options.episodes, options.seed)
         left, warned = np.isfinite(first["box"]), first["alarm"] <= first["box"]

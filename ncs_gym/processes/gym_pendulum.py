@@ -20,8 +20,8 @@ from ncs_gym.validation import as_number
 GRAVITY, MASS, LENGTH, STEP, TORQUE = 10.0, 1.0, 1.0, 0.05, 2.0
 # Safe box around upright: angle [rad] and angular rate [rad/s].
 ANGLE, RATE = 0.25, 1.5
-# Relative room for the rounding of the environment's own arithmetic.
-ROUNDING = 1e-9
+# Relative room for the rounding of the environment's own arithmetic, and that of a torque to float32.
+ROUNDING, TORQUE_ROUNDING = 1e-9, 2.0**-24
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +69,7 @@ def pendulum(gravity: float = GRAVITY, mass: float = MASS, length: float = LENGT
     The environment computes rate+ = rate + dt (a sin(angle) + b u) and angle+ = angle + dt rate+ with a = 3 g / (2 l)
     and b = 3 / (m l^2). For |angle| <= c the ratio sin(angle) / angle lies between s = sin(c) / c and 1; with its
     middle (1 + s) / 2 as the slope, what is left out of rate+ is at most dt a c (1 - s) / 2, and dt times that of
-    angle+: a multiple of (dt, 1). That is proved.
+    angle+: a multiple of (dt, 1). That is proved; the rounding of a torque to float32 is added.
 
     Args:
         gravity: [m/s^2].
@@ -80,7 +80,7 @@ def pendulum(gravity: float = GRAVITY, mass: float = MASS, length: float = LENGT
     pull, gain = 3.0 * gravity / (2.0 * length), 3.0 / (mass * length**2)
     ratio = np.sin(ANGLE) / ANGLE
     slope = STEP * pull * 0.5 * (1.0 + ratio)
-    left_out = STEP * pull * ANGLE * 0.5 * (1.0 - ratio) * (1.0 + ROUNDING)
+    left_out = STEP * (pull * ANGLE * 0.5 * (1.0 - ratio) + gain * TORQUE * TORQUE_ROUNDING) * (1.0 + ROUNDING)
     direction = np.array([[STEP], [1.0]])
     settings = {
         "A": np.array([[1.0, STEP], [0.0, 1.0]]) + slope * direction @ np.array([[1.0, 0.0]]),

@@ -44,10 +44,12 @@ class InvertedPendulumProcess(Process):
         """Returns the opened environments.
 
         Raises:
-            ImportError: If MuJoCo is missing.
+            ModuleNotFoundError: If MuJoCo is missing.
         """
         if find_spec("mujoco") is None:
-            raise ImportError('InvertedPendulum-v5 needs MuJoCo: pip install "ncs-gym[mujoco]"')
+            raise ModuleNotFoundError(
+                "InvertedPendulum-v5 needs MuJoCo: in a clone of ncs-gym, pip install -e '.[mujoco]'"
+            )
         return GymProcess(self._make, read_state=_read, write_state=_write).body(plant, size)
 
     def _make(self) -> gym.Env:
@@ -84,6 +86,6 @@ def inverted_pendulum() -> LinearPlant:
     """Returns the linear model of `InvertedPendulum-v5` with a remainder bounded by sampling: an assumption.
 
     Raises:
-        ImportError: If MuJoCo is missing.
+        ModuleNotFoundError: If MuJoCo is missing.
     """
     return _own_model()
