@@ -84,7 +84,7 @@ def test_pendulum_is_proved_by_another_route():
     assert plant.remainder.proved
     slope = plant.A[1, 0] / PULL
     angles = np.array([0.25, np.arccos(slope)])
-    largest = PULL * np.abs(np.sin(angles) - slope * angles).max()
+    largest = PULL * np.abs(np.sin(angles) - slope * angles).max() + 0.15 * TORQUE * 2.0**-24  # a torque rounds
     np.testing.assert_allclose(plant.remainder.bound.support(np.array([[0.0, 1.0]])), largest, rtol=1e-6)
     env = gym.make("Pendulum-v1").unwrapped
 
