@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Self
 
 import numpy as np
 
@@ -46,6 +47,10 @@ class CartPoleProcess(Process):
     def __post_init__(self) -> None:
         for name in ("cart_mass", "pole_mass", "length"):
             object.__setattr__(self, name, as_number(getattr(self, name), name, low=0.0, low_open=True))
+
+    def with_mass(self, factor: float) -> Self:
+        """Returns the process with another mass."""
+        return replace(self, pole_mass=factor * self.pole_mass)
 
     def body(self, plant: LinearPlant, size: int | None) -> Body:
         """Returns the integrator of the equations over the plant's step.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import gymnasium as gym
 import numpy as np
@@ -44,6 +44,10 @@ class PendulumProcess(Process):
     def __post_init__(self) -> None:
         for name in ("gravity", "mass", "length"):
             object.__setattr__(self, name, as_number(getattr(self, name), name, low=0.0, low_open=True))
+
+    def with_mass(self, factor: float) -> Self:
+        """Returns the process with another mass."""
+        return replace(self, mass=factor * self.mass)
 
     def body(self, plant: LinearPlant, size: int | None) -> Body:
         """Returns the opened environments."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, Self
 
 import gymnasium as gym
 import numpy as np
@@ -39,6 +39,10 @@ class InvertedPendulumProcess(Process):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "mass_factor", as_number(self.mass_factor, "mass_factor", low=0.0, low_open=True))
+
+    def with_mass(self, factor: float) -> Self:
+        """Returns the process with another mass."""
+        return replace(self, mass_factor=factor * self.mass_factor)
 
     def body(self, plant: LinearPlant, size: int | None) -> Body:
         """Returns the opened environments.
