@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, NCSEnv, NCSVectorEnv, Remainder
-from shields import Infeasible, SafetyShield, VectorSafetyShield, synthesize
+from shields import Infeasible, SafetyShield, VectorSafetyShield, synthesize, verify
 from shields.runtime.guarantee import LEFT_MODEL, NOT_KNOWN_INSIDE
 from tests.certificates import certificate_of
 
@@ -56,6 +56,32 @@ def test_certificate_says_what_it_assumes_of_the_remainder():
     assert any("is assumed to lie in its bound while the state is in the box: an example" in each for each in assumed)
     assert "an example" in str(certificate_of(LOCAL))
     assert "remainder" not in str(certificate_of(EXACT))
+
+
+@pytest.mark.parametrize("engine", ["rational", "flint"])
+def test_disturbance_set_without_the_remainder_does_not_verify(engine):
+    if engine == "flint":
+        pytest.importorskip("flint")
+    certificate, smaller = certificate_of(LOCAL), LinearPlant(**COMMON, disturbance_bound=1e-4).disturbance
+    assert verify(certificate, LOCAL, engine=engine).valid
+    forged = LinearPlant(**COMMON, disturbance_bound=0.0, remainder=LEFT_OUT)
+    forged.__dict__["disturbance"] = smaller  # what is declared is kept, what is derived from it is not
+    broken = [each.name for each in verify(certificate, forged, engine=engine).conditions if not each.holds]
+    assert "D: the plant's holds the disturbance and the process noise" in broken
+
+
+def test_published_method_knows_no_remainder():
+    with pytest.raises(ValueError, match="remainder_bound"):
+        synthesize(LOCAL, method="paper")
+
+
+def test_remainder_acts_on_the_state_alone_where_inputs_are_under_way():
+    settings = {"box": [1.0, 1.0], "u_max": 1.0, "disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
+    model = (COMMON["A"], COMMON["B"], np.eye(2), np.zeros((2, 1)), 0.1)
+    plant = LinearPlant.from_statespace(model, input_delay=2, remainder=LEFT_OUT, **settings)
+    np.testing.assert_array_equal(plant.remainder_bound.shape, np.pad(BOUND.shape, (0, 2)))
+    np.testing.assert_allclose(plant.disturbance.shape[:2, :2], BOUND.shape, rtol=1e-6)
+    assert plant.remainder.sentence == LEFT_OUT.sentence
 
 
 def test_remainder_that_the_box_cannot_bear_is_named():
