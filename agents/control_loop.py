@@ -57,6 +57,7 @@ class ControlLoop:
             environments, which agents are trained in.
         noise: "truncated", or "gaussian" for noise without a bound, which environments of this package can have.
         disturbance: Replaces the disturbance of the id; None keeps it.
+        process: Fields of the id's process that replace its own, a JSON value; None keeps it.
         filter: Puts another safety filter around vector environments, in place of a shield.
         lagrangian: How the violation penalty is adapted in training, instead of a fixed one.
         residual_gain: Normalized gain, shape (m, n), to whose action an agent in training adds its own.
@@ -68,6 +69,7 @@ class ControlLoop:
     violation_penalty: float = 0.0
     noise: str = "truncated"
     disturbance: Any = None
+    process: dict[str, Any] | None = None
     filter: Callable[[VectorEnv], VectorEnv] | None = None
     lagrangian: LagrangianSettings | None = None
     residual_gain: np.ndarray | None = None
@@ -105,4 +107,6 @@ class ControlLoop:
             own["noise"] = self.noise
         if self.disturbance is not None:
             own["disturbance"] = self.disturbance
+        if self.process is not None:
+            own["process"] = self.process
         return own | settings

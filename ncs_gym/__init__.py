@@ -13,7 +13,7 @@ from ncs_gym.plants.cart_pole import cart_pole
 from ncs_gym.plants.description import NoNoiseWarning
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.truck_trailer import truck_trailer
-from ncs_gym.processes import FunctionProcess, GymProcess, LinearProcess, Process
+from ncs_gym.processes import FunctionProcess, GymProcess, LinearProcess, Process, linear_model
 from ncs_gym.registration import register_all
 from ncs_gym.rendering import Annotation
 from ncs_gym.tasks.regulation import Regulation
@@ -63,6 +63,7 @@ __all__ = [
     "certified_error_set",
     "contract_of",
     "escape_probability",
+    "linear_model",
     "register_plant",
     "truck_trailer",
 ]

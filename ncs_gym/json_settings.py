@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.processes import CartPoleProcess, InvertedPendulumProcess, PendulumProcess
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.tasks.setpoint_tracking import SetpointTracking
 from ncs_gym.tasks.speed_tracking import SpeedTracking
@@ -17,6 +18,7 @@ from ncs_gym.validation import shown
 # What a dictionary can stand for where the class is not known: told apart by the names of their fields.
 TASKS: tuple[type, ...] = (Regulation, SpeedTracking, SetpointTracking)
 DISTURBANCES: tuple[type, ...] = (BoxDisturbance, SinusoidDisturbance)
+PROCESSES: tuple[type, ...] = (CartPoleProcess, PendulumProcess, InvertedPendulumProcess)
 
 
 def from_json(value: Any, kinds: tuple[type, ...], name: str) -> Any:

@@ -57,8 +57,8 @@ def register_plant(
         task: The reward; `Regulation` by default.
         contract: What the channel promises; by default that of the channel if the plant is unstable, else none.
         max_episode_steps: Steps after which an episode is truncated.
-        settings: Other keywords of `NCSEnv`: `disturbance`, `noise`, `initial_set`, `terminate_on_violation`
-            and `allow_assumption_violation`.
+        settings: Other keywords of `NCSEnv`: `process`, `disturbance`, `noise`, `initial_set`,
+            `terminate_on_violation` and `allow_assumption_violation`.
 
     Raises:
         UnstablePlantError: If the plant is not Schur stable and there is no contract.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -12,13 +13,22 @@ import numpy as np
 
 from ncs_gym.envs.env import NCSEnv
 from ncs_gym.envs.vector_env import NCSVectorEnv
-from ncs_gym.json_settings import DISTURBANCES, TASKS, as_plant, from_json
+from ncs_gym.json_settings import DISTURBANCES, PROCESSES, TASKS, as_plant, from_json
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.truck_trailer import truck_trailer
+from ncs_gym.processes import (
+    CartPoleProcess,
+    InvertedPendulumProcess,
+    PendulumProcess,
+    Process,
+    inverted_pendulum,
+    nonlinear_cart_pole,
+    pendulum,
+)
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.tasks.setpoint_tracking import SetpointTracking
 from ncs_gym.tasks.speed_tracking import SpeedTracking
@@ -40,6 +50,7 @@ _KINDS: dict[str, tuple[type, ...]] = {
     "disturbance": DISTURBANCES,
     "initial_set": (Ellipsoid,),
     "contract": (ChannelContract,),
+    "process": PROCESSES,
 }
 
 
@@ -55,6 +66,8 @@ class Scenario:
         contract: What the default channel promises; for the scenario's own plant only.
         terminates: Whether a violation ends the episode by default: an unstable plant does not come back.
         start: Radius of the disc of starts, for plants of two states; None and elsewhere: `NCSEnv`'s default.
+        process: What really moves, whose fields a dictionary may hold; None for the plant's own equations.
+        extra: Extra that installs the module of this name, which the process needs; empty for none.
     """
 
     plant: Callable[[], LinearPlant] | None
@@ -64,6 +77,8 @@ class Scenario:
     contract: ChannelContract | None = None
     terminates: bool = False
     start: float | None = None
+    process: Process | None = None
+    extra: str = ""
     metadata: ClassVar[dict[str, Any]] = NCSEnv.metadata
 
     def __call__(self, **settings: Any) -> NCSEnv:
@@ -89,6 +104,8 @@ class Scenario:
         """
         plant = as_plant(plant)
         own: dict[str, Any] = {"channel": self.channel, "task": self.task, "terminate_on_violation": self.terminates}
+        kinds = _KINDS if self.process is None else _KINDS | {"process": (type(self.process),)}
+        own |= {} if self.process is None else {"process": self.process}
         if plant is None:
             if self.plant is None:
                 raise ValueError(
@@ -99,12 +116,17 @@ class Scenario:
         if self.start is not None and getattr(plant, "n", 0) == 2:
             own["initial_set"] = Ellipsoid(self.start**2 * np.eye(2))
         for name, value in given.items():
-            if name in _KINDS or name == "terminate_on_violation":
+            if name in kinds or name == "terminate_on_violation":
                 if value is not None:
-                    own[name] = from_json(value, _KINDS[name], name) if name in _KINDS else value
+                    own[name] = from_json(value, kinds[name], name) if name in kinds else value
             else:
                 own[name] = value
         return own
+
+    @property
+    def is_installed(self) -> bool:
+        """Whether what the process needs is installed."""
+        return not self.extra or find_spec(self.extra) is not None
 
     def _disturbance(self, plant: Any) -> Any:
         if self.box is None or not isinstance(plant, LinearPlant) or self.box.check(plant) or self.box.excess(plant):
@@ -154,12 +176,47 @@ BATCH_REACTOR = Scenario(
     terminates=True,
 )
 
+# Gymnasium's `Pendulum-v1` inside. A sample per step; 30 % are lost, never more than two in a row.
+PENDULUM_CHANNEL = Channel(loss=0.3, max_consecutive_losses=2)
+PENDULUM = Scenario(
+    plant=pendulum,
+    channel=PENDULUM_CHANNEL,
+    task=SetpointTracking(output=np.array([1.0, 0.0]), reach=0.15, width=0.15, change_probability=0.02),
+    contract=contract_of(PENDULUM_CHANNEL),
+    terminates=True,
+    process=PendulumProcess(),
+)
+
+# Gymnasium's MuJoCo environment `InvertedPendulum-v5` inside, behind the same channel.
+INVERTED_PENDULUM = Scenario(
+    plant=inverted_pendulum,
+    channel=PENDULUM_CHANNEL,
+    task=SetpointTracking(output=np.array([1.0, 0.0, 0.0, 0.0]), reach=0.6, width=0.6, change_probability=0.02),
+    contract=contract_of(PENDULUM_CHANNEL),
+    terminates=True,
+    process=InvertedPendulumProcess(),
+    extra="mujoco",
+)
+
+# The nonlinear equations of the cart-pole behind the channel of CART_POLE, with its task, box and limits.
+CART_POLE_NONLINEAR = Scenario(
+    plant=nonlinear_cart_pole,
+    channel=CART_POLE_CHANNEL,
+    task=CART_POLE.task,
+    contract=contract_of(CART_POLE_CHANNEL),
+    terminates=True,
+    process=CartPoleProcess(),
+)
+
 ENTRY_POINTS = {
     "ncs_gym/TruckTrailer-v0": "TRUCK_TRAILER",
     "ncs_gym/TruckTrailerCruise-v0": "TRUCK_TRAILER_CRUISE",
     "ncs_gym/LinearNCS-v0": "LINEAR_NCS",
     "ncs_gym/CartPole-v0": "CART_POLE",
     "ncs_gym/BatchReactor-v0": "BATCH_REACTOR",
+    "ncs_gym/Pendulum-v0": "PENDULUM",
+    "ncs_gym/InvertedPendulum-v0": "INVERTED_PENDULUM",
+    "ncs_gym/CartPoleNonlinear-v0": "CART_POLE_NONLINEAR",
 }
 
 
@@ -196,6 +253,9 @@ TRUCK_TRAILER_CRUISE_VECTOR = VectorScenario(TRUCK_TRAILER_CRUISE)
 LINEAR_NCS_VECTOR = VectorScenario(LINEAR_NCS)
 CART_POLE_VECTOR = VectorScenario(CART_POLE)
 BATCH_REACTOR_VECTOR = VectorScenario(BATCH_REACTOR)
+PENDULUM_VECTOR = VectorScenario(PENDULUM)
+INVERTED_PENDULUM_VECTOR = VectorScenario(INVERTED_PENDULUM)
+CART_POLE_NONLINEAR_VECTOR = VectorScenario(CART_POLE_NONLINEAR)
 
 
 def register_all() -> None:
@@ -206,10 +266,19 @@ def register_all() -> None:
 
 
 def registered_ids() -> list[str]:
-    """Returns the ids of the environments that have a plant of their own: this module's, and those of users' plants."""
-    own = [env_id for env_id, name in ENTRY_POINTS.items() if globals()[name].plant is not None]
+    """Returns the ids of the environments that have a plant of their own: this module's, and those of users' plants.
+
+    An environment whose extra is not installed is not among them.
+    """
+    scenarios = {env_id: globals()[name] for env_id, name in ENTRY_POINTS.items()}
+    own = [env_id for env_id, each in scenarios.items() if each.plant is not None and each.is_installed]
     entry_point = entry_points_of("LINEAR_NCS")["entry_point"]
     return own + [spec.id for spec in gym.registry.values() if spec.entry_point == entry_point and spec.kwargs]
+
+
+def needing_extras() -> list[str]:
+    """Returns the ids of this module's environments whose extra is not installed: `gym.make` says which one."""
+    return [env_id for env_id, name in ENTRY_POINTS.items() if not globals()[name].is_installed]
 
 
 def entry_points_of(name: str) -> dict[str, Any]:

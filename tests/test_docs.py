@@ -38,6 +38,7 @@ SLOW_PAGES = (
     "docs/lookahead.md",
     "docs/agents.md",
     "docs/integrations.md",
+    "docs/beyond_linear.md",
 )
 PAGE_RUNS = [
     *((page, False) for page in QUICK_PAGES),

@@ -58,9 +58,20 @@ RUNS = {
         [],
         ["oldest sample in use: 4 steps, allowed: 4", r"closest to the limit: 0\.\d+", "proved: 5000 of 5000 steps"],
     ),
+    "your_gym_env.py": (
+        ["--steps", "4096"],
+        ["assumed to lie in its bound", rf"episodes without a violation: 16 of 16; mean return {NUMBER}"],
+    ),
     "write_a_task.py": ([], [rf"return of doing nothing: {NUMBER}"]),
 }
-TRAINING = {"own_plant.py", "recurrent_ppo.py", "sb3_processes.py", "sb3_ten_lines.py", "single_file_sac.py"}
+TRAINING = {
+    "own_plant.py",
+    "recurrent_ppo.py",
+    "sb3_processes.py",
+    "sb3_ten_lines.py",
+    "single_file_sac.py",
+    "your_gym_env.py",
+}
 # Packages that no extra installs, and the versions that the examples were tried with (docs/integrations.md).
 FOREIGN = {
     "minari_dataset.py": {"minari": "0.5.4", "jax": None},

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import gymnasium as gym
 import numpy as np
 
 from experiments.runs.environments import module_and_id, registered_env
-from ncs_gym import Channel, ChannelContract, GilbertElliott, LinearPlant, NCSEnv, escape_probability, truck_trailer
+from ncs_gym import (
+    Channel,
+    ChannelContract,
+    GilbertElliott,
+    LinearPlant,
+    LinearProcess,
+    NCSEnv,
+    Process,
+    escape_probability,
+    truck_trailer,
+)
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.registration import ENTRY_POINTS, EPISODE_STEPS, loaded_truck_trailer
 from shields import Certificate
@@ -22,6 +32,9 @@ _CHANNELS = {
     "bursts": Channel(loss=GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.1), send_period=2, quantization_step=0.01),
     "overtaking": Channel(loss=0.2, quantization_step=0.01, send_period=2, delay=1, jitter=3),
 }
+# Scenarios left out unless one is asked for: the first has no plant of its own, other environments are stepped one by
+# one in the others.
+_LEFT_OUT = ("LINEAR_NCS", "PENDULUM", "INVERTED_PENDULUM")
 # Numbers of states, inputs and measurements of the random plants, in turn.
 _SIZES = ((2, 1, 2), (2, 2, 1), (3, 2, 3), (4, 1, 4))
 
@@ -34,11 +47,13 @@ class AttackCase:
         plant: The plant.
         channel: The channel between sensor and estimator.
         contract: Channel contract that the certificate assumes; None for a stable plant.
+        process: What really moves.
     """
 
     plant: LinearPlant
     channel: Channel
     contract: ChannelContract | None = None
+    process: Process = field(default_factory=LinearProcess)
 
     def with_delta(self, delta: float | None) -> AttackCase:
         """Returns the case with a plant whose bounds hold for Gaussian noise at another level; None keeps it."""
@@ -56,7 +71,7 @@ class AttackCase:
 
 @cache
 def attack_cases(seed: int, random_plants: int, env_id: str | None = None) -> dict[str, AttackCase]:
-    """Returns the cases by name: every registered environment, and all kinds of channels for it and for random plants.
+    """Returns the cases by name: registered environments, and all kinds of channels for some and random plants.
 
     Args:
         seed: Seed of the random plants.
@@ -71,7 +86,7 @@ def attack_cases(seed: int, random_plants: int, env_id: str | None = None) -> di
         return _env_cases(module_and_id(env_id)[1], env, all_channels=env.contract is None)
     found = {}
     for registered, name in ENTRY_POINTS.items():
-        if name != "LINEAR_NCS":  # which has no plant of its own
+        if name not in _LEFT_OUT:
             found |= _env_cases(registered.removeprefix("ncs_gym/"), ncs_env(gym.make(registered)))
     plants = {"TruckTrailer-v0": truck_trailer(), "TruckTrailerCruise-v0": loaded_truck_trailer()}
     plants |= {f"random plant {index}": _random_plant(seed, index) for index in range(random_plants)}
@@ -84,7 +99,10 @@ def _env_cases(name: str, env: NCSEnv, *, all_channels: bool = False) -> dict[st
     """Returns the cases of an environment: its own channel, those that use its contract up, and all kinds if asked."""
     channels = {"its channel": env.channel} | ({} if env.contract is None else _extremes(env.contract))
     channels |= _CHANNELS if all_channels else {}
-    return {f"{name}, {kind}": AttackCase(env.plant, channel, env.contract) for kind, channel in channels.items()}
+    return {
+        f"{name}, {kind}": AttackCase(env.plant, channel, env.contract, env.process)
+        for kind, channel in channels.items()
+    }
 
 
 def _extremes(contract: ChannelContract) -> dict[str, Channel]:

@@ -169,7 +169,7 @@ def _shields(campaign: Campaign, case: str, certificate: Path) -> dict[str, Vect
     """
     cases = attack_cases(campaign.seed, campaign.random_plants, campaign.env)
     chosen, loaded = cases[case].with_delta(campaign.delta), Certificate.load(certificate)
-    settings = {"plant": chosen.plant, "channel": chosen.channel, "contract": chosen.contract}
+    settings = {name: getattr(chosen, name) for name in ("plant", "channel", "contract", "process")}
     kind = GaussianVectorEnv if campaign.gaussian else WorstCaseVectorEnv
     env = kind(campaign.envs, loaded, **settings)
     if campaign.looks_ahead:

@@ -1,4 +1,4 @@
-"""`ncs sweep`: the same comparison over a grid of channels."""
+"""`ncs sweep`: the same comparison over a grid of channels, and of masses that differ from the model's."""
 
 from __future__ import annotations
 
@@ -22,30 +22,33 @@ from shields.atomic_write import write_atomically
 
 # Budget of `--smoke`, and the sides of the grid of which it takes the first and the last value.
 _SMOKE = {"steps": 1_024, "episodes": 4, "seeds": 1}
-_SIDES = ("losses", "delays", "quantization_steps", "burst_lengths")
+_SIDES = ("losses", "delays", "quantization_steps", "burst_lengths", "mass_factors")
 
 
 @dataclass(frozen=True)
 class _GridPoint:
-    """One channel of the grid.
+    """One channel of the grid, and one mass.
 
     Attributes:
         loss: Probability that a packet is lost.
         delay: Delay of every packet [steps].
         quantization_step: Quantization step of the measurements; None for the environment's own.
         burst_length: Mean number of packets lost in a row; 0 for independent losses.
+        mass_factor: Of the mass in the process; None for the environment's own.
     """
 
     loss: float
     delay: int
     quantization_step: float | None
     burst_length: float
+    mass_factor: float | None = None
 
     @property
     def name(self) -> str:
         """Name of the point in file names."""
         quantization = "" if self.quantization_step is None else f"-q{self.quantization_step}"
-        return f"loss{self.loss}-delay{self.delay}{quantization}-burst{self.burst_length}"
+        mass = "" if self.mass_factor is None else f"-mass{self.mass_factor}"
+        return f"loss{self.loss}-delay{self.delay}{quantization}-burst{self.burst_length}{mass}"
 
     def channel(self, base: ChannelSettings) -> ChannelSettings:
         """Returns the changes of the environment's channel that make this point's channel."""
@@ -74,7 +77,12 @@ def sweep(settings: SweepSettings) -> None:
             raise ValueError(f"--channel.{name.replace('_', '-')} is a side of the grid: give its values there")
     for name in settings.arms:
         Arm.of(name, settings.mode)
-    setups = [ExperimentSetup.of(settings.env, each.channel(settings.channel), settings.certificate) for each in points]
+    setups = [
+        ExperimentSetup.of(
+            settings.env, each.channel(settings.channel), settings.certificate, mass_factor=each.mass_factor
+        )
+        for each in points
+    ]
     claim_folder("sweep", settings.completed)
     prepare_output(settings.out)
     print(settings.agent_line, flush=True)
@@ -110,6 +118,7 @@ def _grid_points(settings: SweepSettings) -> list[_GridPoint]:
         "delays": settings.delays,
         "quantization_steps": settings.quantization_steps or (None,),
         "burst_lengths": settings.burst_lengths,
+        "mass_factors": settings.mass_factors or (None,),
         "arms": settings.arms,
     }
     for name, side in sides.items():
@@ -133,7 +142,17 @@ def _write(settings: SweepSettings, summary: dict[str, Any], rows: list[dict], s
 
 def _text(summary: dict[str, Any]) -> str:
     """Returns the table for a terminal: a row per channel and arm."""
-    head = ["loss", "delay", "quantization", "burst", "arm", "violating episodes", "training steps", "overridden"]
+    head = [
+        "loss",
+        "delay",
+        "quantization",
+        "burst",
+        "mass",
+        "arm",
+        "violating episodes",
+        "training steps",
+        "overridden",
+    ]
     rows = [[*head, "return"]]
     for cell in summary["cells"]:
         channel = [
@@ -141,6 +160,7 @@ def _text(summary: dict[str, Any]) -> str:
             str(cell["delay"]),
             "own" if cell["quantization_step"] is None else f"{cell['quantization_step']:g}",
             f"{cell['burst_length']:g}" if cell["burst_length"] else "none",
+            "own" if cell["mass_factor"] is None else f"{cell['mass_factor']:g}",
         ]
         for name, arm in cell["arms"].items():
             outcome = [

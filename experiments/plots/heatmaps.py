@@ -22,6 +22,8 @@ _MIN_HEIGHT = 2.8
 # Fields whose relative luminance is smaller than this have light numbers; weights of red, green and blue.
 _DARK = 0.45
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+# Quantization step, mean burst length, and factor of the mass.
+_OtherSides = tuple[float | None, float, float | None]
 
 
 @dataclass(frozen=True)
@@ -107,9 +109,9 @@ def _caption(quantity: _Quantity, cells: Sequence[dict[str, Any]], arms: Sequenc
 
 
 def _heatmap(cells: Sequence[dict[str, Any]], arms: Sequence[str], quantity: _Quantity) -> CaptionedFigure:
-    """Returns one quantity: a panel per arm, a block of them per combination of quantization step and burst length."""
+    """Returns one quantity: a panel per arm, a block of them per combination of the grid's other sides."""
     losses, delays = (sorted({cell[side] for cell in cells}) for side in ("loss", "delay"))
-    others = list(dict.fromkeys((cell["quantization_step"], cell["burst_length"]) for cell in cells))
+    others = list(dict.fromkeys(_other_sides(cell) for cell in cells))
     fields = {(arm, other): _field(cells, arm, other, quantity, losses, delays) for other in others for arm in arms}
     norm = _norm(list(fields.values()), quantity)
     block = -(-len(arms) // _COLUMNS)
@@ -139,7 +141,7 @@ def _heatmap(cells: Sequence[dict[str, Any]], arms: Sequence[str], quantity: _Qu
 def _field(
     cells: Sequence[dict[str, Any]],
     arm: str,
-    other: tuple[float | None, float],
+    other: _OtherSides,
     quantity: _Quantity,
     losses: list[float],
     delays: list[int],
@@ -147,7 +149,7 @@ def _field(
     """Returns the values of a panel, shape (delays, losses)."""
     values = np.full((len(delays), len(losses)), np.nan)
     for cell in cells:
-        if (cell["quantization_step"], cell["burst_length"]) == other:
+        if _other_sides(cell) == other:
             at = delays.index(cell["delay"]), losses.index(cell["loss"])
             values[at] = quantity.factor * cell["arms"][arm][quantity.key]
     return values
@@ -181,9 +183,15 @@ def _name_axes(axis: Axes, losses: list[float], delays: list[int], left: bool, l
     label(axis, "loss probability" if lowest else "", "delay [steps]" if left else "", axis.get_title())
 
 
-def _title(arm: str, other: tuple[float | None, float], several: bool) -> str:
-    quantization, burst = other
+def _title(arm: str, other: _OtherSides, several: bool) -> str:
+    quantization, burst, mass = other
     if not several:
         return arm
     losses = f"bursts of {burst:g}" if burst else "independent losses"
-    return f"{arm}\n{'' if quantization is None else f'quantization {quantization:g}, '}{losses}"
+    factor = "" if mass is None else f", {mass:g} times the mass"
+    return f"{arm}\n{'' if quantization is None else f'quantization {quantization:g}, '}{losses}{factor}"
+
+
+def _other_sides(cell: dict[str, Any]) -> _OtherSides:
+    """Returns the quantization step, the burst length and the factor of the mass of a point of the grid."""
+    return cell["quantization_step"], cell["burst_length"], cell.get("mass_factor")

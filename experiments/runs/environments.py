@@ -12,7 +12,7 @@ import gymnasium as gym
 
 from ncs_gym import NCSEnv
 from ncs_gym.envs.env import ncs_env
-from ncs_gym.registration import registered_ids
+from ncs_gym.registration import needing_extras, registered_ids
 
 
 def registered_env(env_id: str) -> NCSEnv:
@@ -29,7 +29,7 @@ def registered_env(env_id: str) -> NCSEnv:
         import_module(module)
         if name not in gym.registry:
             raise ValueError(f"module {module!r} registers no environment {name!r}")
-    elif name not in registered_ids():
+    elif name not in registered_ids() and name not in needing_extras():
         raise ValueError(
             f"unknown environment {env_id!r}; known are {', '.join(registered_ids())}, and --env module:id imports the "
             "module that registers one of your own"

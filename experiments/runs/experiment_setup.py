@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,7 @@ class ExperimentSetup:
         verification: Exact verification of the certificate.
         module: Module of the user's that registers the environment; empty for one of this package.
         noise: "truncated", or "gaussian" for noise without a bound.
+        process: Fields of the process that replace the environment's own, JSON values; None keeps it.
     """
 
     env: str
@@ -46,6 +47,7 @@ class ExperimentSetup:
     verification: Report
     module: str = ""
     noise: str = "truncated"
+    process: dict[str, Any] | None = None
 
     @classmethod
     def of(
@@ -54,6 +56,7 @@ class ExperimentSetup:
         channel: ChannelSettings | Channel | None,
         certificate_file: Path | None = None,
         noise: str = "truncated",
+        mass_factor: float | None = None,
     ) -> ExperimentSetup:
         """Returns the setup of a registered environment, with another channel or with changes of its own channel.
 
@@ -62,10 +65,11 @@ class ExperimentSetup:
             channel: Replaces or changes the environment's own channel; None keeps it.
             certificate_file: File of the certificate; by default one is synthesized.
             noise: "truncated", or "gaussian" for noise without a bound.
+            mass_factor: Of the mass in the process, the model being what it was; None keeps the mass.
 
         Raises:
-            ValueError: If the environment is unknown or has no plant of its own, or it cannot have the channel or the
-                noise.
+            ValueError: If the environment is unknown or has no plant of its own, or it cannot have the channel, the
+                noise or another mass.
             CertificateError: If a given certificate is damaged or does not verify for the plant.
             Infeasible: If no certificate is found.
         """
@@ -80,7 +84,8 @@ class ExperimentSetup:
         else:
             certificate = Certificate.load(certificate_file)
             require_valid(certificate, env.plant)
-        return cls(name, channel, env.plant, certificate, verify(certificate, env.plant), module, noise)
+        process = None if mass_factor is None else asdict(env.process.with_mass(mass_factor))  # pyright: ignore
+        return cls(name, channel, env.plant, certificate, verify(certificate, env.plant), module, noise, process)
 
     @property
     def title(self) -> str:
@@ -105,6 +110,7 @@ class ExperimentSetup:
             module=self.module,
             channel=self.channel,
             noise=self.noise,
+            process=self.process,
             seed=settings.seed,
             index=index,
             steps=settings.training_steps,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -42,6 +42,7 @@ class TrainingRun:
         module: Module of the user's that registers it, imported where the run is executed; empty for none.
         channel: Channel that replaces the environment's own; None keeps it.
         noise: "truncated", or "gaussian" for noise without a bound.
+        process: Fields of the process that replace the environment's own, JSON values; None keeps it.
         seed: Seed of the experiment.
         index: Number of the run within its arm; runs with equal index are paired across arms.
         steps: Training steps.
@@ -66,6 +67,7 @@ class TrainingRun:
     module: str = ""
     channel: Channel | None = None
     noise: str = "truncated"
+    process: dict[str, Any] | None = None
     seed: int
     index: int
     steps: int
@@ -104,6 +106,7 @@ class TrainingRun:
             filter=wrapper,
             violation_penalty=self.violation_penalty,
             noise=self.noise,
+            process=self.process,
             lagrangian=self.lagrangian,
         )
 

@@ -78,7 +78,8 @@ def _refuse_both(env: str | None, plant: Path | None) -> None:
 class CertifySettings:
     """Attacks shielded control loops within the assumptions, and counts the states that leave the safe set or box.
 
-    The plants are those of the registered environments and random ones, behind every kind of channel. Disturbances push
+    The plants are those of the registered environments (--env attacks those with other environments inside) and random
+    ones, behind every kind of channel. Disturbances push
     the next state farthest out, initial states and first estimation errors lie on the boundaries of their sets, sensor
     noise has full size in random directions, and agents are random or hostile.
 

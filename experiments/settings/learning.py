@@ -242,6 +242,8 @@ class SweepSettings(BackendSettings, LearningSettings):
         delays: Delays of the grid [steps].
         quantization_steps: Quantization steps of the grid; the environment's own if none is given.
         burst_lengths: Mean numbers of packets lost in a row; 0 stands for independent losses.
+        mass_factors: Factors of the mass in the environment's process, the certificate being that of the model (factor
+            1); for environments whose process has a mass.
     """
 
     out: Path = Path("runs/sweep")
@@ -253,6 +255,7 @@ class SweepSettings(BackendSettings, LearningSettings):
     delays: tuple[int, ...] = (0, 2, 4)
     quantization_steps: tuple[float, ...] = ()
     burst_lengths: tuple[float, ...] = (0.0,)
+    mass_factors: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""

@@ -66,6 +66,11 @@ class HardBounds(ReadOnlyArrays):
         return is_given[0] or self.gamma > 0.0 or self.remainder is not None, is_given[1], is_given[2]
 
     @property
+    def remainder_bound(self) -> Ellipsoid | None:
+        """What holds the remainder of a model, shape (n, n); None if there is none."""
+        return None if self.remainder is None else self.remainder.bound
+
+    @property
     def n(self) -> int:
         """Number of states."""
         return self.A.shape[0]
@@ -141,8 +146,7 @@ class HardBounds(ReadOnlyArrays):
         ball = Ellipsoid(self.gamma * np.eye(self.n))
         noisy = _sum_or_other(ball, self.process_noise.bound, self.relative_weight)
         declared = _with_declared(noisy, self.disturbance_bound, self.relative_weight)
-        left_out = None if self.remainder is None else self.remainder.bound
-        return _with_declared(declared, left_out, self.relative_weight)
+        return _with_declared(declared, self.remainder_bound, self.relative_weight)
 
     @cached_property
     def nominal_sensor_error(self) -> Ellipsoid:

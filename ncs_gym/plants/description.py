@@ -120,7 +120,7 @@ def fingerprint_of(plant: LinearPlant) -> str:
             digest.update(name.encode() + array.astype("<f8").tobytes())
     if plant.remainder is not None:
         digest.update(
-            f"remainder{plant.remainder.sentence}".encode() + plant.remainder.bound.shape.astype("<f8").tobytes()
+            f"remainder{plant.remainder.proved}".encode() + plant.remainder.bound.shape.astype("<f8").tobytes()
         )
     return digest.hexdigest()
 

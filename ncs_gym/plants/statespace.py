@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, outer_sum
+from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.uncertainty.truncated_gaussian import chi2_quantile
 from ncs_gym.validation import as_count, as_matrix, as_number, shown
 
@@ -150,6 +152,7 @@ def delayed_arguments(plant: LinearPlant, input_delay: int) -> dict[str, Any]:
         "initial_cov": np.zeros((n + stored, n + stored)),
         "delta": plant.delta,
         "disturbance_bound": _padded(_unknown_disturbance(plant), stored),
+        "remainder": _padded_remainder(plant.remainder, stored),
         "sensor_bound": plant.sensor_bound,
         "initial_bound": _padded(plant.initial_bound, stored),
         "error_gain": None if plant.error_gain is None else np.pad(plant.error_gain, ((0, 0), (0, stored))),
@@ -202,6 +205,13 @@ def _unknown_disturbance(plant: LinearPlant) -> Ellipsoid | None:
     if declared is None or not np.any(ball):
         return declared if not np.any(ball) else Ellipsoid(ball)
     return Ellipsoid(outer_sum(ball, declared.shape, plant.relative_weight))
+
+
+def _padded_remainder(remainder: Remainder | None, zeros: int) -> Remainder | None:
+    """Returns the remainder of a model whose further states move as they should: inputs under way keep their limits."""
+    if remainder is None:
+        return None
+    return replace(remainder, bound=Ellipsoid(np.pad(remainder.bound.shape, (0, zeros))))
 
 
 def _padded(bound: Ellipsoid | None, zeros: int) -> Ellipsoid | None:

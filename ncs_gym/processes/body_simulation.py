@@ -19,10 +19,12 @@ class Body:
     Attributes:
         is_written: Whether it can be put into a state, so that episodes start where the environment says and
             disturbances of the plant can act.
+        is_vectorized: Whether `step` takes any number of states and inputs at once.
         terminated, truncated: Whether it ended the episode by itself; arrays (N,) for many environments.
     """
 
     is_written: bool = True
+    is_vectorized: bool = False
     terminated: Any = False
     truncated: Any = False
 

@@ -35,7 +35,7 @@ class FunctionProcess(Process):
 
     def body(self, plant: LinearPlant, size: int | None) -> Body:
         """Returns what calls the function."""
-        return FunctionBody(self.function, loops=size is not None and not self.vectorized)
+        return FunctionBody(self.function, self.vectorized)
 
 
 class FunctionBody(Body):
@@ -43,14 +43,14 @@ class FunctionBody(Body):
 
     Args:
         function: Returns x+, given x and u.
-        loops: Whether it takes one environment only.
+        vectorized: Whether it takes many environments at once.
     """
 
-    def __init__(self, function: Callable[[np.ndarray, np.ndarray], np.ndarray], *, loops: bool) -> None:
-        self._function, self._loops = function, loops
+    def __init__(self, function: Callable[[np.ndarray, np.ndarray], np.ndarray], vectorized: bool) -> None:
+        self._function, self.is_vectorized = function, vectorized
 
     def step(self, state: np.ndarray, u: np.ndarray) -> np.ndarray:  # noqa: D102
-        if self._loops:
+        if state.ndim > 1 and not self.is_vectorized:
             columns = [self._checked(x, v) for x, v in zip(state.T.copy(), u.T.copy(), strict=True)]
             return np.array(columns).T
         return self._checked(state.copy(), u.copy())

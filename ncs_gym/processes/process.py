@@ -28,6 +28,17 @@ class Process(ABC):
             ValueError: If the process does not fit the plant.
         """
 
+    def with_mass(self, factor: float) -> Process:
+        """Returns the process with another mass, for experiments in which the model is wrong.
+
+        Args:
+            factor: Of the pendulum's or the pole's mass.
+
+        Raises:
+            ValueError: If it has none.
+        """
+        raise ValueError(f"a {type(self).__name__} has no mass to change")
+
     def simulation(
         self,
         plant: LinearPlant,

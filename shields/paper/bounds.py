@@ -122,7 +122,8 @@ class PaperBounds:
 
 def unknown_bounds(plant: LinearPlant) -> list[str]:
     """Returns the declared bounds of a plant of which the paper's theorems know nothing."""
-    declared = {name: getattr(plant, name) for name in ("disturbance_bound", "sensor_bound", "initial_bound")}
+    names = ("disturbance_bound", "remainder_bound", "sensor_bound", "initial_bound")
+    declared = {name: getattr(plant, name) for name in names}
     return [name for name, bound in declared.items() if bound is not None and np.any(bound.shape)]
 
 

@@ -30,9 +30,11 @@ FAR_OUT = "the estimate is so far out of the safe box that rounding counts"
 UNUSABLE = "there is no usable estimate or error shape"
 NO_ERROR_SET = "a certificate of the published method carries no error set"
 NOT_KNOWN_INSIDE = "the state is not known to be in the safe set"
+LEFT_MODEL = "the state is not known to have stayed where the bound of the linear model's remainder holds"
 # Codes of `GuaranteeMonitor.reasons`; 0 while the proof holds.
 EXPLANATIONS = (
     "", ALARM, OTHER_INPUT, OTHER_STEPS, LARGE_ERROR, FAR_OUT, UNUSABLE, NO_ERROR_SET, NOT_KNOWN_INSIDE,
+    LEFT_MODEL,
 )  # fmt: skip
 CODES = {explanation: code for code, explanation in enumerate(EXPLANATIONS)}
 
@@ -87,7 +89,8 @@ class GuaranteeMonitor:
     An alarm of the innovation monitor, an input other than the decided one, a step that is not one step and an estimate
     so far out that rounding counts break the error bound for the rest of the episode. The others are recoverable: a
     passed test proves the next state in S without x in S, and a running ellipsoid outside E(Sigma) is still a bound,
-    only K x_hat is not proved safe with it.
+    only K x_hat is not proved safe with it. Of a plant with a remainder nothing is recoverable: its error bound holds
+    only while every state so far is proved to be in the box (docs/beyond_linear.md).
 
     Methods are functions of a state and of what happened, truth values for one loop and arrays (N,) for many.
     """
@@ -96,6 +99,7 @@ class GuaranteeMonitor:
         self._test = safety_filter.test
         self._reach = SIMULATED_REACH * safety_filter.plant.half_widths
         self._has_error_set = safety_filter.certificate.Sigma is not None
+        self._is_local = safety_filter.plant.remainder is not None
 
     def start(self, known_inside: Any, unmoved: Any, report: LoopObservation) -> MonitorState:
         """Returns the state at the start of an episode.
@@ -149,6 +153,8 @@ class GuaranteeMonitor:
             broken = _first(_first(broken, usable == False, UNUSABLE), near == False, FAR_OUT)  # noqa: E712
         if not _all(inside):
             inside = inside | self._test.knows_inside(estimate, errors, MARGIN)
+            if self._is_local:
+                broken = _first(broken, inside == False, LEFT_MODEL)  # noqa: E712
         return MonitorState(broken, inside, errors.certified)
 
 

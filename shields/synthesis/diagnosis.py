@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ncs_gym import ChannelContract, Ellipsoid, LinearPlant
+from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, Remainder
 from shields.errors import Infeasible
 from shields.synthesis.design_problem import DesignProblem, design_problem
 from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
@@ -23,6 +23,7 @@ _BOUNDS = (
     "process_noise_cov",
     "measurement_noise_cov",
     "initial_cov",
+    "remainder",
 )
 _SMALLEST_FACTOR, _FACTOR_PRECISION = 1e-6, 1.02
 
@@ -83,6 +84,7 @@ def with_feasible_bounds(
 def _is_declared(plant: LinearPlant, name: str) -> bool:
     """Returns whether the plant declares an uncertainty by this name that is not zero."""
     value = getattr(plant, name)
+    value = value.bound if isinstance(value, Remainder) else value
     return value is not None and bool(np.any(value.shape if isinstance(value, Ellipsoid) else value))
 
 
@@ -90,6 +92,8 @@ def _hint(plant: LinearPlant, name: str, factor: float | None) -> str:
     """Returns the largest feasible value of a bound in words, given its fraction of the declared one."""
     if factor is None:
         return f"no smaller {name} works"
+    if name == "remainder":
+        return f"{factor:.3g} times the given remainder is the largest that works (shrink the box or the input limits)"
     largest = f"gamma = {factor * plant.gamma:.3g}" if name == "gamma" else f"{factor:.3g} times the given {name}"
     given = f" (given: {plant.gamma:g})" if name == "gamma" else ""
     return f"{largest} is the largest that works{given}"
@@ -103,7 +107,10 @@ def _figure(plant: LinearPlant, name: str, factor: float) -> dict[str, float]:
 def _with_scaled(plant: LinearPlant, name: str, factor: float) -> LinearPlant:
     """Returns the plant with one of its bounds multiplied: lengths of an ellipsoid, entries of anything else."""
     value = getattr(plant, name)
-    scaled = Ellipsoid(factor**2 * value.shape) if isinstance(value, Ellipsoid) else factor * value
+    if isinstance(value, Remainder):
+        scaled = replace(value, bound=Ellipsoid(factor**2 * value.bound.shape))
+    else:
+        scaled = Ellipsoid(factor**2 * value.shape) if isinstance(value, Ellipsoid) else factor * value
     return replace(plant, **{name: scaled})
 
 

@@ -78,6 +78,7 @@ def _bound_conditions(proof: CertifiedProof, plant: LinearPlant) -> Iterator[Con
     noise = scale(Fraction(plant.process_noise.energy), rational(plant.process_noise_cov))
     weight = rational(plant.relative_weight)
     required = _with_declared(_sum_bound(ball, noise, weight), plant.disturbance_bound, weight)
+    required = _with_declared(required, plant.remainder_bound, weight)
     bound = rational(plant.disturbance.shape)
     yield matrix_condition("D: the plant's holds the disturbance and the process noise", subtract(bound, required))
     yield matrix_condition("D: the certificate's holds the plant's", subtract(rational(proof.D), bound))

@@ -7,10 +7,10 @@ import pytest
 from agents import tuned_settings, tuned_steps
 from agents.settings import PPOSettings
 from agents.tuned.entries import _entries
-from ncs_gym.registration import ENTRY_POINTS, registered_ids
+from ncs_gym.registration import ENTRY_POINTS, needing_extras, registered_ids
 
 FILE = Path(__file__).resolve().parents[2] / "agents" / "tuned" / "ppo.json"
-OWN = [env_id for env_id in ENTRY_POINTS if env_id in registered_ids()]
+OWN = [env_id for env_id in ENTRY_POINTS if env_id in {*registered_ids(), *needing_extras()}]
 
 
 @pytest.mark.parametrize("env_id", OWN)
@@ -25,7 +25,7 @@ def test_registered_environment_has_tuned_settings(env_id):
 
 def test_file_names_registered_environments_only():
     assert set(_entries("PPO")) == set(OWN)
-    assert len(OWN) == 4
+    assert len(OWN) == 7
 
 
 @pytest.mark.parametrize("env_id", ["ncs_gym/LinearNCS-v0", "Plants/Tanks-v0", "ncs_gym:ncs_gym/CartPole-v0"])

@@ -43,7 +43,8 @@ def bound_conditions(D: Any, ages: ContractProof | None, plant: LinearPlant) -> 
     weight, quantizer = plant.relative_weight, np.eye(plant.p)
     own = matrix(plant.disturbance.shape)
     ball = Part(number(plant.gamma) * identity(plant.n), _size(plant.gamma * np.eye(plant.n), weight))
-    disturbed = [ball, _noise(plant.process_noise, weight), _declared(plant.disturbance_bound, weight)]
+    declared = [_declared(bound, weight) for bound in (plant.disturbance_bound, plant.remainder_bound)]
+    disturbed = [ball, _noise(plant.process_noise, weight), *declared]
     yield _holds_sum("D: the plant's holds the disturbance and the process noise", own, disturbed)
     yield definite("D: the certificate's holds the plant's", D - own)
     sensed = [_noise(plant.sensor_noise, quantizer), _declared(plant.sensor_bound, quantizer)]

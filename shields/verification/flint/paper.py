@@ -34,7 +34,7 @@ def paper_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[C
     yield is_so("shapes: L (n, n), K (m, n)", fits)
     if not fits:
         return
-    for bound in (plant.disturbance_bound, plant.sensor_bound, plant.initial_bound):
+    for bound in (plant.disturbance_bound, plant.remainder_bound, plant.sensor_bound, plant.initial_bound):
         if bound is not None and np.any(bound.shape):
             yield is_so("bounds: the paper's theorems know gamma and covariances alone", False)
             return

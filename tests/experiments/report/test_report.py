@@ -58,11 +58,9 @@ def swept(*names, seeds=1, mode="project", change=None, **settings):
     arms = summary_of({name: [run(name, i, **(change or {})) for i in range(seeds)] for name in names})["arms"]
     for arm in arms.values():
         del arm["mode"], arm["shielded"]  # a sweep's summary has none
-    channels = [(0.0, 0, None, 1.0), (0.6, 4, 0.05, 2.0)]
-    cells = [
-        {"loss": loss, "delay": delay, "quantization_step": rounding, "burst_length": burst, "arms": arms}
-        for loss, delay, rounding, burst in channels
-    ]
+    channels = [(0.0, 0, None, 1.0, None), (0.6, 4, 0.05, 2.0, 1.5)]
+    sides = ("loss", "delay", "quantization_step", "burst_length", "mass_factor")
+    cells = [dict(zip(sides, channel, strict=True)) | {"arms": arms} for channel in channels]
     own = provenance(arms=list(names), seeds=seeds, mode=mode, **settings)
     return sweep_report({"cells": cells} | own, VERIFIED, {"Violations. Of all.": PNG})
 
@@ -257,13 +255,13 @@ def test_page_says_how_to_run_it_again(report, command):
 
 def test_sweep_has_a_row_per_channel_and_arm():
     rows = Reader(swept("unshielded", "monitor", "shielded")).tables["Every channel and arm"]
-    assert [row[:5] for row in rows[1:4]] == [
-        [arm, "0", "0", "own", "1"] for arm in ("unshielded", "monitor", "shielded")
+    assert [row[:6] for row in rows[1:4]] == [
+        [arm, "0", "0", "own", "1", "own"] for arm in ("unshielded", "monitor", "shielded")
     ]
-    assert rows[4][:5] == ["unshielded", "0.6", "4", "0.05", "2"]
-    assert [row[7] for row in rows[1:4]] == ["\N{EN DASH}", "(10.0 %)", "10.0 %"]
-    assert "0 of 20 %, at most 84.19 %" in rows[1][6]
-    assert "none: one run" in rows[1][8]
+    assert rows[4][:6] == ["unshielded", "0.6", "4", "0.05", "2", "1.5 times"]
+    assert [row[8] for row in rows[1:4]] == ["\N{EN DASH}", "(10.0 %)", "10.0 %"]
+    assert "0 of 20 %, at most 84.19 %" in rows[1][7]
+    assert "none: one run" in rows[1][9]
     assert "over 3 runs" in swept("shielded", seeds=3)
 
 

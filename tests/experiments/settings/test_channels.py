@@ -2,10 +2,14 @@ import numpy as np
 import pytest
 
 from experiments.commands.sweep import _grid_points
+from experiments.runs import ExperimentSetup
 from experiments.settings.channel import ChannelSettings, _bursts
 from experiments.settings.learning import SweepSettings
-from ncs_gym import Channel, GilbertElliott
+from ncs_gym import Channel, ChannelContract, GilbertElliott
+from ncs_gym.envs.env import ncs_env
 from ncs_gym.network.transmission import ChannelState
+from ncs_gym.processes import PendulumProcess
+from shields.runtime.wrapper import certificate_for
 
 OWN = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
 
@@ -66,6 +70,19 @@ def test_grid_is_the_product_of_its_sides():
     assert last.channel(ChannelSettings()) == ChannelSettings(
         loss=0.5, delay=1, quantization_step=0.2, burst_length=3.0
     )
+
+
+def test_masses_are_a_side_of_the_grid():
+    settings = SweepSettings(losses=(0.3,), delays=(0,), mass_factors=(0.9, 1.0, 1.1))
+    points = _grid_points(settings)
+    assert [point.mass_factor for point in points] == [0.9, 1.0, 1.1]
+    assert len({point.name for point in points}) == 3
+    setup = ExperimentSetup.of("ncs_gym/Pendulum-v0", points[0].channel(ChannelSettings()), mass_factor=0.9)
+    run = setup.training_run(settings.completed, "shielded", 0)
+    assert ncs_env(run.loop.single()).process == PendulumProcess(mass=0.9)
+    assert run.certificate.checksum == certificate_for(setup.plant, ChannelContract(2)).checksum  # the model's
+    with pytest.raises(ValueError, match="a LinearProcess has no mass to change"):
+        ExperimentSetup.of("ncs_gym/TruckTrailer-v0", None, mass_factor=0.9)
 
 
 @pytest.mark.parametrize("change", [{"losses": ()}, {"delays": (1, 1)}, {"arms": ("shielded", "shielded")}])

@@ -1,0 +1,96 @@
+"""The nonlinear cart-pole, whose linearization is `ncs_gym.cart_pole`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Self
+
+import numpy as np
+
+from ncs_gym.plants.cart_pole import GRAVITY, cart_pole
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.processes.body_simulation import Body
+from ncs_gym.processes.function_process import FunctionBody
+from ncs_gym.processes.linearization import linear_model
+from ncs_gym.processes.process import Process
+from ncs_gym.validation import as_number
+
+# Steps of the integrator in one control step: at 0.01 s its error is far below the rounding of an action.
+SUBSTEPS = 2
+# Bounds on a disturbance beside the remainder, on sensor noise and on the first error, as fractions of the half-widths.
+NOISE = 1e-4
+SAMPLES = 8_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class CartPoleProcess(Process):
+    """The equations of motion of a cart with a pole, a point mass on a light rod, without friction.
+
+    With position p, angle a from upright and force u, M the cart's mass, m the pole's and l its length:
+    p'' = (u + m sin(a) (l a'^2 - g cos(a))) / (M + m sin(a)^2) and a'' = (g sin(a) - cos(a) p'') / l; integrated by the
+    classical Runge-Kutta method. x = (p, p', a, a') as in `ncs_gym.cart_pole`.
+
+    Attributes:
+        cart_mass: M [kg].
+        pole_mass: m [kg].
+        length: l [m].
+
+    Raises:
+        ValueError: If one is not positive.
+    """
+
+    cart_mass: float = 1.0
+    pole_mass: float = 0.1
+    length: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name in ("cart_mass", "pole_mass", "length"):
+            object.__setattr__(self, name, as_number(getattr(self, name), name, low=0.0, low_open=True))
+
+    def with_mass(self, factor: float) -> Self:
+        """Returns the process with another mass."""
+        return replace(self, pole_mass=factor * self.pole_mass)
+
+    def body(self, plant: LinearPlant, size: int | None) -> Body:
+        """Returns the integrator of the equations over the plant's step.
+
+        Raises:
+            ValueError: If the plant does not have the cart-pole's four states and one input.
+        """
+        if (plant.n, plant.m) != (4, 1):
+            raise ValueError(f"the cart-pole has 4 states and 1 input, the plant {plant.n} and {plant.m}")
+        return FunctionBody(lambda state, u: self._advanced(state, u, plant.dt), vectorized=True)
+
+    def _advanced(self, state: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+        """Returns the state a step later, shape (4,) or (4, N)."""
+        h = dt / SUBSTEPS
+        for _ in range(SUBSTEPS):
+            first = self._rate(state, u)
+            second = self._rate(state + 0.5 * h * first, u)
+            third = self._rate(state + 0.5 * h * second, u)
+            fourth = self._rate(state + h * third, u)
+            state = state + h / 6.0 * (first + 2.0 * (second + third) + fourth)
+        return state
+
+    def _rate(self, state: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Returns the time derivative of the state."""
+        _, speed, angle, rate = state
+        sine, cosine = np.sin(angle), np.cos(angle)
+        push = u[0] + self.pole_mass * sine * (self.length * rate**2 - GRAVITY * cosine)
+        acceleration = push / (self.cart_mass + self.pole_mass * sine**2)
+        return np.array([speed, acceleration, rate, (GRAVITY * sine - cosine * acceleration) / self.length])
+
+
+@lru_cache(maxsize=1)
+def nonlinear_cart_pole() -> LinearPlant:
+    """Returns the linear model of `CartPoleProcess()` over the box and the limits of `ncs_gym.cart_pole`.
+
+    Its remainder is bounded by sampling: an assumption. It is found once per process of the operating system.
+    """
+    tangent = cart_pole()
+    names = ("state_names", "state_units", "input_names", "input_units")
+    bounds = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), NOISE * tangent.half_widths)
+    same = {name: getattr(tangent, name) for name in names}
+    half_widths, limits = np.round(tangent.half_widths, 9), tangent.u_max
+    return linear_model(CartPoleProcess(), half_widths, limits, tangent.dt, samples=SAMPLES, **bounds, **same)

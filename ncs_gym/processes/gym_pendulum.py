@@ -1,0 +1,108 @@
+"""Gymnasium's `Pendulum-v1` near upright: the process, and its linear model with a proved remainder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import gymnasium as gym
+import numpy as np
+
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.processes.body_simulation import Body
+from ncs_gym.processes.gym_process import GymProcess
+from ncs_gym.processes.process import Process
+from ncs_gym.uncertainty.declared_bound import as_bound
+from ncs_gym.uncertainty.remainder import Remainder
+from ncs_gym.validation import as_number
+
+# What `Pendulum-v1` has: gravity [m/s^2], mass [kg], length [m], step [s] and largest torque [N m].
+GRAVITY, MASS, LENGTH, STEP, TORQUE = 10.0, 1.0, 1.0, 0.05, 2.0
+# Safe box around upright: angle [rad] and angular rate [rad/s].
+ANGLE, RATE = 0.25, 1.5
+# Relative room for the rounding of the environment's own arithmetic, and that of a torque to float32.
+ROUNDING, TORQUE_ROUNDING = 1e-9, 2.0**-24
+
+
+@dataclass(frozen=True, kw_only=True)
+class PendulumProcess(Process):
+    """Gymnasium's `Pendulum-v1`, x = (angle from upright [rad], angular rate [rad/s]), u the torque [N m].
+
+    Attributes:
+        gravity: [m/s^2].
+        mass: [kg].
+        length: [m].
+
+    Raises:
+        ValueError: If one is not positive.
+    """
+
+    gravity: float = GRAVITY
+    mass: float = MASS
+    length: float = LENGTH
+
+    def __post_init__(self) -> None:
+        for name in ("gravity", "mass", "length"):
+            object.__setattr__(self, name, as_number(getattr(self, name), name, low=0.0, low_open=True))
+
+    def with_mass(self, factor: float) -> Self:
+        """Returns the process with another mass."""
+        return replace(self, mass=factor * self.mass)
+
+    def body(self, plant: LinearPlant, size: int | None) -> Body:
+        """Returns the opened environments."""
+        return GymProcess(self._make, read_state=_read, write_state=_write).body(plant, size)
+
+    def _make(self) -> gym.Env:
+        env: Any = gym.make("Pendulum-v1", g=self.gravity, disable_env_checker=True).unwrapped
+        env.m, env.l = self.mass, self.length
+        return env
+
+
+def _read(env: Any) -> np.ndarray:
+    return env.state
+
+
+def _write(env: Any, state: np.ndarray) -> None:
+    env.state = state
+
+
+def pendulum(gravity: float = GRAVITY, mass: float = MASS, length: float = LENGTH, **bounds: Any) -> LinearPlant:
+    """Returns the linear model of `Pendulum-v1` for |angle| <= 0.25 rad and |rate| <= 1.5 rad/s, |u| <= 2 N m.
+
+    The environment computes rate+ = rate + dt (a sin(angle) + b u) and angle+ = angle + dt rate+ with a = 3 g / (2 l)
+    and b = 3 / (m l^2). For |angle| <= c the ratio sin(angle) / angle lies between s = sin(c) / c and 1; with its
+    middle (1 + s) / 2 as the slope, what is left out of rate+ is at most dt a c (1 - s) / 2, and dt times that of
+    angle+: a multiple of (dt, 1). That is proved; the rounding of a torque to float32 is added.
+
+    Args:
+        gravity: [m/s^2].
+        mass: [kg].
+        length: [m].
+        bounds: Other arguments of `LinearPlant`.
+    """
+    pull, gain = 3.0 * gravity / (2.0 * length), 3.0 / (mass * length**2)
+    ratio = np.sin(ANGLE) / ANGLE
+    slope = STEP * pull * 0.5 * (1.0 + ratio)
+    left_out = STEP * (pull * ANGLE * 0.5 * (1.0 - ratio) + gain * TORQUE * TORQUE_ROUNDING) * (1.0 + ROUNDING)
+    direction = np.array([[STEP], [1.0]])
+    settings = {
+        "A": np.array([[1.0, STEP], [0.0, 1.0]]) + slope * direction @ np.array([[1.0, 0.0]]),
+        "B": STEP * gain * direction,
+        "box": [ANGLE, RATE],
+        "u_max": TORQUE,
+        "dt": STEP,
+        "disturbance_bound": 0.0,
+        "sensor_bound": [0.002, 0.01],
+        "initial_bound": [0.005, 0.03],
+        "remainder": Remainder(
+            as_bound((direction, left_out), 2, "the remainder"),
+            proved=True,
+            basis=f"sin(angle) / angle lies between {ratio:.6f} and 1 for angles up to {ANGLE} rad",
+        ),
+        "state_names": ("angle", "angular rate"),
+        "state_units": ("rad", "rad/s"),
+        "input_names": ("torque",),
+        "input_units": ("N m",),
+    }
+    return LinearPlant(**settings | bounds)

@@ -1,0 +1,196 @@
+"""The linear plant that models a process, with a bound on what it leaves out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.processes.body_simulation import Body
+from ncs_gym.processes.fit import fitted_matrices, surrounding_shape
+from ncs_gym.processes.function_process import FunctionProcess
+from ncs_gym.processes.process import LinearProcess, Process
+from ncs_gym.uncertainty.declared_bound import as_bound
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
+from ncs_gym.uncertainty.remainder import Remainder
+from ncs_gym.validation import as_count, as_matrix, as_number, as_vector, shown
+
+# Fresh samples that check a bound, as a fraction of those that it was found with.
+HELD_OUT = 0.25
+# Room for the rounding of samples and of sums, relative to a bound.
+ROUNDING = 1e-9
+
+
+class _Steps(NamedTuple):
+    """Steps of a process: states (n, N) in the box, inputs (m, N) within their limits, next states (n, N)."""
+
+    states: np.ndarray
+    inputs: np.ndarray
+    moved: np.ndarray
+
+
+def linear_model(
+    process: Process | Callable[[np.ndarray, np.ndarray], np.ndarray],
+    box: Any,
+    u_max: Any,
+    dt: float,
+    *,
+    jacobian_bounds: tuple[Any, Any] | None = None,
+    samples: int = 20_000,
+    safety_factor: float = 1.25,
+    seed: int = 0,
+    **settings: Any,
+) -> LinearPlant:
+    """Returns x+ = A x + B u + r + d as a plant, r in a bound on what A x + B u leaves out over box x limits.
+
+    `plant.remainder` says how the bound is known. By sampling, A and B make the largest remainder of the samples small,
+    and the smallest ellipsoid around these remainders, `safety_factor` times as large, is an *assumption*. From bounds
+    on the Jacobian it is *proved* by the mean value theorem: A and B are the middle of the interval, and
+    |r_i| <= |f_i(0, 0)| + sum_j (half-width of the interval of J_ij) (half-width of z_j), z = (x, u). Either way fresh
+    samples must confirm it (docs/beyond_linear.md).
+
+    Args:
+        process: What really moves, or a step function (x, u) -> x+; in deviations from the operating point, near which
+            f(0, 0) = 0.
+        box: Half-widths of the safe box, shape (n,).
+        u_max: Input limits, a number for one input or shape (m,).
+        dt: Duration of a step [s].
+        jacobian_bounds: Smallest and largest values of [df/dx, df/du] over box x limits, two arrays (n, n + m).
+        samples: Number of steps that are sampled.
+        safety_factor: Of a sampled bound, >= 1.
+        seed: Seed of the samples.
+        settings: Other arguments of `LinearPlant`. A and B, given together, are taken in place of fitted ones; a
+            disturbance is declared beside the remainder.
+
+    Raises:
+        ValueError: If the remainder is larger than the box can bear, fresh samples contradict the bound, the process
+            cannot be put into a state, or an argument is wrong.
+    """
+    if isinstance(process, LinearProcess):
+        raise ValueError("the linear process is its own model: give what really moves")
+    moving = process if isinstance(process, Process) else FunctionProcess(process)
+    widths, limits = as_vector(box, None, "box"), np.atleast_1d(np.asarray(u_max, dtype=np.float64))
+    common = {"box": widths, "u_max": limits, "dt": dt}
+    shapes = {"A": (len(widths), len(widths)), "B": (len(widths), len(limits))}
+    given = {name: as_matrix(settings.pop(name), shape, name) for name, shape in shapes.items() if name in settings}
+    if len(given) == 1 or (given and jacobian_bounds is not None):
+        raise ValueError("give A and B together, or jacobian_bounds, whose middle they are, or neither")
+    rng = np.random.default_rng(as_count(seed, "seed", low=0))
+    drawn, fresh, origin = _steps_of(moving, common, as_count(samples, "samples", low=100), rng)
+    if jacobian_bounds is not None:
+        A, B, bound = _from_jacobians(jacobian_bounds, widths, limits, origin)
+        basis = "from bounds on its Jacobian"
+    else:
+        A, B = (given["A"], given["B"]) if given else fitted_matrices(*drawn, widths)
+        factor = as_number(safety_factor, "safety_factor", low=1.0)
+        bound = Ellipsoid(factor**2 * surrounding_shape(_left_out(A, B, drawn), widths))
+        basis = f"from {samples:,} samples with safety factor {factor:g}"
+    largest, count = _confirmed(bound, _left_out(A, B, fresh), widths), fresh.states.shape[1]
+    basis = f"{basis}, with at most {largest:.0%} of the bound in {count:,} fresh samples"
+    remainder = Remainder(bound, jacobian_bounds is not None, basis)
+    return LinearPlant(A=A, B=B, remainder=_bearable(remainder, widths), **common, **settings)
+
+
+def _steps_of(
+    process: Process, common: dict[str, Any], count: int, rng: np.random.Generator
+) -> tuple[_Steps, _Steps, np.ndarray]:
+    """Returns sampled steps, fewer fresh ones, and f(0, 0), shape (n,).
+
+    Args:
+        process: What moves.
+        common: Box, input limits and step of the plant.
+        count: Number of steps.
+        rng: Source of randomness.
+
+    Raises:
+        ValueError: If the process cannot be put into a state.
+    """
+    n, m = len(common["box"]), len(common["u_max"])
+    quiet = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.0)
+    frame = LinearPlant(A=np.zeros((n, n)), B=np.zeros((n, m)), **common, **quiet)
+    body = process.body(frame, None)
+    try:
+        if not body.is_written:
+            raise ValueError("a linear model needs steps from chosen states: give GymProcess write_state")
+        origin = body.step(body.write(np.zeros(n)), np.zeros(m))
+        drawn = _sampled(body, frame, count, rng)
+        fresh = _sampled(body, frame, max(int(HELD_OUT * count), 100), rng)
+        return drawn, fresh, origin
+    finally:
+        body.close()
+
+
+def _sampled(body: Body, frame: LinearPlant, count: int, rng: np.random.Generator) -> _Steps:
+    """Returns steps from random points of box x limits; half of them have coordinates on the boundary."""
+    widths = np.concatenate([frame.half_widths, frame.u_max])[:, None]
+    points = rng.uniform(-1.0, 1.0, (len(widths), count))
+    at_end = rng.random(points.shape) < np.where(np.arange(count) % 2 == 0, 0.0, rng.random(count))
+    points = widths * np.where(at_end, np.sign(points), points)
+    states, inputs = points[: frame.n], points[frame.n :]
+    if body.is_vectorized:
+        return _Steps(states, inputs, body.step(states, inputs))
+    moved = np.empty_like(states)
+    for each in range(count):
+        if body.terminated or body.truncated:
+            body.start(rng, states[:, each], None)
+        moved[:, each] = body.step(body.write(states[:, each]), inputs[:, each])
+    return _Steps(states, inputs, moved)
+
+
+def _left_out(A: np.ndarray, B: np.ndarray, steps: _Steps) -> np.ndarray:
+    """Returns what a linear model leaves out, shape (N, n)."""
+    return (steps.moved - A @ steps.states - B @ steps.inputs).T
+
+
+def _from_jacobians(
+    bounds: tuple[Any, Any], widths: np.ndarray, limits: np.ndarray, origin: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, Ellipsoid]:
+    """Returns A, B and the proved bound.
+
+    Raises:
+        ValueError: If the bounds are no two matrices, the first below the second.
+    """
+    n, size = len(widths), len(widths) + len(limits)
+    if not isinstance(bounds, (tuple, list)) or len(bounds) != 2:
+        raise ValueError(f"jacobian_bounds must be two arrays of shape ({n}, {size}), got {shown(bounds)}")
+    low, high = (as_matrix(bound, (n, size), "jacobian_bounds") for bound in bounds)
+    if (low > high).any():
+        raise ValueError("jacobian_bounds must be the smallest values, then the largest")
+    middle = 0.5 * (low + high)
+    sizes = np.abs(origin) + np.maximum(high - middle, middle - low) @ np.concatenate([widths, limits])
+    sizes = np.where(sizes > 0.0, sizes * (1.0 + ROUNDING), 0.0)
+    return middle[:, :n], middle[:, n:], as_bound(sizes, n, "the remainder")
+
+
+def _confirmed(bound: Ellipsoid, remainders: np.ndarray, widths: np.ndarray) -> float:
+    """Returns the largest size of fresh remainders, shape (N, n), in units of their bound.
+
+    Raises:
+        ValueError: If one lies outside it.
+    """
+    padded = Ellipsoid(bound.shape + np.diag((ROUNDING * widths) ** 2))
+    largest = float(padded.gauge(remainders).max())
+    if largest > 1.0:
+        raise ValueError(
+            f"a fresh sample of the remainder is {largest:.3g} times as large as its bound: use more samples, a larger "
+            "safety_factor, or correct the jacobian_bounds"
+        )
+    return largest
+
+
+def _bearable(remainder: Remainder, widths: np.ndarray) -> Remainder:
+    """Returns a remainder that a step from the middle of the box survives.
+
+    Raises:
+        ValueError: If it does not.
+    """
+    reached = np.sqrt(np.diag(remainder.bound.shape)) / widths
+    worst = int(reached.argmax())
+    if reached[worst] >= 1.0:
+        raise ValueError(
+            f"the remainder of the linear model alone moves state {worst + 1} by {reached[worst]:.3g} half-widths of "
+            "the box in one step: shrink the box, the input limits or dt"
+        )
+    return remainder

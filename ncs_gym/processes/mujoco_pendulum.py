@@ -1,0 +1,95 @@
+"""Gymnasium's MuJoCo environment `InvertedPendulum-v5`: the process, and its linear model from samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from importlib.util import find_spec
+from typing import Any, Self
+
+import gymnasium as gym
+import numpy as np
+
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.processes.body_simulation import Body
+from ncs_gym.processes.gym_process import GymProcess
+from ncs_gym.processes.linearization import linear_model
+from ncs_gym.processes.process import Process
+from ncs_gym.validation import as_number
+
+# Safe box: position [m], angle [rad], speed [m/s], angular rate [rad/s]. The rail ends at 1 m; beyond 0.2 rad the
+# environment ends its episodes.
+BOX = (0.8, 0.15, 1.5, 1.5)
+# Largest action, in units of 100 N, and duration of a step [s], of the environment.
+LARGEST, STEP = 3.0, 0.04
+
+
+@dataclass(frozen=True, kw_only=True)
+class InvertedPendulumProcess(Process):
+    """Gymnasium's `InvertedPendulum-v5`: x = (position [m], angle [rad], speed [m/s], angular rate [rad/s]).
+
+    Attributes:
+        mass_factor: Factor of the pole's mass and inertia.
+
+    Raises:
+        ValueError: If it is not positive.
+    """
+
+    mass_factor: float = 1.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "mass_factor", as_number(self.mass_factor, "mass_factor", low=0.0, low_open=True))
+
+    def with_mass(self, factor: float) -> Self:
+        """Returns the process with another mass."""
+        return replace(self, mass_factor=factor * self.mass_factor)
+
+    def body(self, plant: LinearPlant, size: int | None) -> Body:
+        """Returns the opened environments.
+
+        Raises:
+            ModuleNotFoundError: If MuJoCo is missing.
+        """
+        if find_spec("mujoco") is None:
+            raise ModuleNotFoundError(
+                "InvertedPendulum-v5 needs MuJoCo: in a clone of ncs-gym, pip install -e '.[mujoco]'"
+            )
+        return GymProcess(self._make, read_state=_read, write_state=_write).body(plant, size)
+
+    def _make(self) -> gym.Env:
+        env: Any = gym.make("InvertedPendulum-v5", disable_env_checker=True).unwrapped
+        pole = env.model.body("pole").id
+        env.model.body_mass[pole] *= self.mass_factor
+        env.model.body_inertia[pole] *= self.mass_factor
+        return env
+
+
+def _read(env: Any) -> np.ndarray:
+    return np.concatenate([env.data.qpos, env.data.qvel])
+
+
+def _write(env: Any, state: np.ndarray) -> None:
+    env.set_state(state[:2], state[2:])
+
+
+@lru_cache(maxsize=1)
+def _own_model() -> LinearPlant:
+    """Returns the model of the environment as it is, sampled once per process of the operating system."""
+    names = {
+        "state_names": ("position", "angle", "speed", "angular rate"),
+        "state_units": ("m", "rad", "m/s", "rad/s"),
+        "input_names": ("force",),
+        "input_units": ("100 N",),
+    }
+    half_widths = np.array(BOX)
+    bounds = {"disturbance_bound": 0.0, "sensor_bound": 5e-4 * half_widths, "initial_bound": 5e-4 * half_widths}
+    return linear_model(InvertedPendulumProcess(), BOX, LARGEST, STEP, **bounds, **names)
+
+
+def inverted_pendulum() -> LinearPlant:
+    """Returns the linear model of `InvertedPendulum-v5` with a remainder bounded by sampling: an assumption.
+
+    Raises:
+        ModuleNotFoundError: If MuJoCo is missing.
+    """
+    return _own_model()

@@ -1,0 +1,167 @@
+"""Linear models of processes: the fit, the bound on the remainder, and how it is known."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from ncs_gym import Ellipsoid, GymProcess, LinearProcess, linear_model
+from ncs_gym.processes.fit import surrounding_shape
+from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
+
+QUIET = {"disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
+BOX, TORQUE, STEP = [0.25, 1.5], 2.0, 0.05
+PULL = STEP * 15.0
+JACOBIAN = (
+    [[1.0 + STEP * PULL * np.cos(0.25), STEP, 0.0075], [PULL * np.cos(0.25), 1.0, 0.15]],
+    [[1.0 + STEP * PULL, STEP, 0.0075], [PULL, 1.0, 0.15]],
+)
+
+
+def swing(state, u):
+    """The equations of `Pendulum-v1`, written down from its documentation."""
+    rate = state[1] + STEP * (15.0 * np.sin(state[0]) + 3.0 * u[0])
+    return np.array([state[0] + STEP * rate, rate])
+
+
+def model(process=swing, **changes):
+    settings = {"samples": 2_000} | QUIET | changes
+    return linear_model(process, BOX, TORQUE, STEP, **settings)
+
+
+def points(count, seed=7):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-1.0, 1.0, (count, 2)) * BOX, rng.uniform(-1.0, 1.0, (count, 1)) * TORQUE
+
+
+def gauges(plant, step, count=500):
+    """Sizes of remainders in units of D, which has room for rounding next to the bound."""
+    left_out = [step(x, u) - plant.A @ x - plant.B @ u for x, u in zip(*points(count), strict=True)]
+    return plant.disturbance.gauge(np.array(left_out))
+
+
+@pytest.mark.parametrize("jacobian_bounds", [None, JACOBIAN])
+def test_remainder_lies_in_its_bound_and_says_how_that_is_known(jacobian_bounds):
+    plant = model(jacobian_bounds=jacobian_bounds)
+    assert gauges(plant, swing).max() <= 1.0
+    assert plant.remainder.proved == (jacobian_bounds is not None)
+    words = "is bounded by proof" if plant.remainder.proved else "is assumed to lie in its bound"
+    (sentence,) = (each for each in plant.assumptions if "linear model" in each)
+    assert words in sentence
+    assert ("bounds on its Jacobian" if plant.remainder.proved else "safety factor 1.25") in sentence
+
+
+def test_sampled_bound_is_tight_and_grows_with_the_safety_factor():
+    once, twice = model(safety_factor=1.02), model(safety_factor=2.04)
+    np.testing.assert_allclose(twice.remainder.bound.shape, 4.0 * once.remainder.bound.shape)
+    assert gauges(once, swing, 2_000).max() > 0.9
+    # One direction alone, (dt, 1): the other one is as thin as rounding.
+    assert np.linalg.eigvalsh(once.remainder.bound.shape)[0] < 1e-7 * np.trace(once.remainder.bound.shape)
+
+
+def test_fitted_slope_leaves_less_out_than_the_slope_at_rest():
+    """The best slope of a sine leaves out a third of what the tangent does, or less."""
+    best = model(safety_factor=1.0 + 1e-3)
+    tangent = model(safety_factor=1.0 + 1e-3, A=[[1.0 + STEP * PULL, STEP], [PULL, 1.0]], B=[[0.0075], [0.15]])
+    assert np.trace(best.remainder.bound.shape) < np.trace(tangent.remainder.bound.shape) / 9.0
+
+
+def test_linear_process_leaves_nothing_out():
+    plant = linear_model(lambda x, u: np.array([[0.5, 0.1], [0.0, 0.7]]) @ x + u, [1.0, 2.0], [1.0, 3.0], 0.1, **QUIET)
+    np.testing.assert_allclose(plant.A, [[0.5, 0.1], [0.0, 0.7]], atol=1e-9)
+    np.testing.assert_allclose(plant.B, np.eye(2), atol=1e-9)
+    assert np.sqrt(plant.remainder.bound.shape.max()) < 1e-9
+
+
+def test_inner_environment_is_modeled_like_its_equations():
+    inner, own = model(PendulumProcess()), model()
+    np.testing.assert_allclose(inner.A, own.A, atol=1e-8)
+    np.testing.assert_allclose(inner.remainder.bound.shape, own.remainder.bound.shape, rtol=1e-3, atol=1e-12)
+
+
+def test_pendulum_is_proved_by_another_route():
+    """Not sin(angle) / angle but the extremes of the remainder, which lie at the ends or where the slope is its own."""
+    plant = pendulum()
+    assert plant.remainder.proved
+    slope = plant.A[1, 0] / PULL
+    angles = np.array([0.25, np.arccos(slope)])
+    largest = PULL * np.abs(np.sin(angles) - slope * angles).max() + 0.15 * TORQUE * 2.0**-24  # a torque rounds
+    np.testing.assert_allclose(plant.remainder.bound.support(np.array([[0.0, 1.0]])), largest, rtol=1e-6)
+    env = gym.make("Pendulum-v1").unwrapped
+
+    def step(state, u):
+        env.reset(seed=0)
+        env.state = state
+        env.step(u.astype(np.float32))
+        return env.state
+
+    def exact(state, u):
+        return step(state, u.astype(np.float32).astype(np.float64))
+
+    states, inputs = points(300)
+    left_out = [exact(x, u) - plant.A @ x - plant.B @ u.astype(np.float32) for x, u in zip(states, inputs, strict=True)]
+    assert plant.disturbance.gauge(np.array(left_out)).max() <= 1.0
+    corner = exact(np.array([0.25, 1.5]), np.array([2.0])) - plant.A @ [0.25, 1.5] - plant.B @ [2.0]
+    assert 0.999 < plant.disturbance.gauge(corner) <= 1.0
+
+
+def test_ellipsoid_around_points_holds_them_and_is_nearly_the_smallest():
+    rng = np.random.default_rng(3)
+    root = rng.standard_normal((3, 3))
+    directions = rng.standard_normal((4_000, 3))
+    cloud = directions / np.linalg.norm(directions, axis=1)[:, None] @ root.T
+    shape = surrounding_shape(cloud, np.array([1.0, 10.0, 0.1]))
+    assert Ellipsoid(shape).gauge(cloud).max() <= 1.0 + 1e-9
+    assert np.linalg.det(shape) < 1.05 * np.linalg.det(root @ root.T)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"process": lambda x, u: swing(x, u) + 3.0 * np.abs(x)}, "shrink the box, the input limits or dt"),
+        ({"jacobian_bounds": (JACOBIAN[1], JACOBIAN[0])}, "must be the smallest values, then the largest"),
+        ({"jacobian_bounds": JACOBIAN[0]}, r"jacobian_bounds must be two arrays|jacobian_bounds must"),
+        ({"jacobian_bounds": 3}, r"jacobian_bounds must be two arrays of shape \(2, 3\)"),
+        (
+            {"jacobian_bounds": (JACOBIAN[1], JACOBIAN[1])},
+            "a fresh sample of the remainder is .* correct the jacobian_b",
+        ),
+        (
+            {"jacobian_bounds": JACOBIAN, "A": np.eye(2), "B": np.ones((2, 1))},
+            "give A and B together, or jacobian_bounds",
+        ),
+        ({"A": np.eye(2)}, "give A and B together, or jacobian_bounds"),
+        (
+            {"process": GymProcess(lambda: gym.make("Pendulum-v1"), lambda env: env.unwrapped.state)},
+            "give GymProcess wri",
+        ),
+        (
+            {"process": GymProcess(lambda: gym.make("CartPole-v1"), lambda env: np.zeros(2))},
+            "Box of actions, got Discre",
+        ),
+        ({"process": 3}, "must be a function"),
+        ({"process": LinearProcess()}, "the linear process is its own model"),
+        ({"samples": 5}, "samples must be"),
+        ({"safety_factor": 0.9}, "safety_factor must be"),
+    ],
+)
+def test_wrong_argument_is_refused_in_one_sentence(changes, message):
+    with pytest.raises(ValueError, match=message):
+        model(**changes)
+
+
+def test_sample_that_a_bound_does_not_explain_is_refused():
+    """A kink that the first samples miss."""
+    calls = []
+
+    def step(state, u):
+        calls.append(0)
+        return swing(state, u) + (1e-3 if len(calls) > 2_000 else 0.0)
+
+    with pytest.raises(ValueError, match=r"a fresh sample of the remainder is .* use more samples, a larger"):
+        model(step)
+
+
+@pytest.mark.parametrize("name", ["gravity", "mass", "length"])
+def test_pendulum_without_a_length_is_refused(name):
+    with pytest.raises(ValueError, match=f"{name} must be"):
+        PendulumProcess(**{name: 0.0})

@@ -1,0 +1,142 @@
+"""The registered environments whose process is not linear."""
+
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+
+import ncs_gym
+from ncs_gym.processes import CartPoleProcess, InvertedPendulumProcess, PendulumProcess, inverted_pendulum
+from ncs_gym.registration import needing_extras, registered_ids
+
+IDS = ("ncs_gym/Pendulum-v0", "ncs_gym/CartPoleNonlinear-v0", "ncs_gym/InvertedPendulum-v0")
+
+
+def made(env_id, **settings):
+    if env_id in needing_extras():
+        pytest.skip("the extra of this environment is not installed")
+    return gym.make(env_id, **settings)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_checkers_pass_without_a_warning(env_id):
+    env = made(env_id)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_nothing_leaves_its_bound_inside_the_box(env_id):
+    env = made(env_id)
+    plant = env.unwrapped.plant
+    rng = np.random.default_rng(0)
+    for seed in range(20):
+        state = rng.uniform(-0.9, 0.9, plant.n) * plant.half_widths
+        env.reset(seed=seed, options={"state": state})
+        *_, info = env.step(rng.uniform(-1.0, 1.0, plant.m).astype(np.float32))
+        assert not info["assumption_violated"]
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_vectors_move_like_single_environments(env_id):
+    made(env_id).close()
+    many, rng = gym.make_vec(env_id, num_envs=3), np.random.default_rng(1)
+    env = gym.make(env_id)
+    plant = env.unwrapped.plant
+    action = rng.uniform(-1.0, 1.0, (3, plant.m)).astype(np.float32)
+    _, info = many.reset(seed=0)
+    *_, after = many.step(action)
+    for e in range(3):
+        env.reset(seed=0, options={"state": info["state"][e]})
+        *_, single = env.step(action[e])
+        room = np.sqrt(np.diag(plant.without_remainder.disturbance.shape))  # of two disturbances
+        assert (np.abs(single["state"] - after["state"][e]) <= 2.0 * room).all()
+    many.close()
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_linear_model_is_that_of_the_process_and_spec_is_json(env_id):
+    env = made(env_id)
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.plant.fingerprint == env.unwrapped.plant.fingerprint
+    assert env.unwrapped.plant.remainder.proved == (env_id == "ncs_gym/Pendulum-v0")
+
+
+@pytest.mark.parametrize(
+    ("env_id", "fields", "expected"),
+    [
+        (IDS[0], {"mass": 1.2}, PendulumProcess(mass=1.2)),
+        (IDS[1], {"pole_mass": 0.2}, CartPoleProcess(pole_mass=0.2)),
+        (IDS[2], {"mass_factor": 0.5}, InvertedPendulumProcess(mass_factor=0.5)),
+        ("ncs_gym/CartPole-v0", {"cart_mass": 1.1}, CartPoleProcess(cart_mass=1.1)),
+    ],
+)
+def test_process_may_be_a_json_value(env_id, fields, expected):
+    env = made(env_id, process=fields)
+    assert env.unwrapped.process == expected
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.process == expected
+    env.reset(seed=0)
+    env.step(np.ones(1, np.float32))
+
+
+@pytest.mark.parametrize(("fields", "message"), [({"mess": 2.0}, "process must be the settings of a PendulumProcess")])
+def test_wrong_json_value_is_refused(fields, message):
+    with pytest.raises(ValueError, match=message):
+        gym.make(IDS[0], process=fields)
+
+
+def test_missing_extra_is_named_in_one_sentence(monkeypatch):
+    inverted = IDS[2]
+    monkeypatch.setattr("ncs_gym.processes.mujoco_pendulum.find_spec", lambda name: None)
+    monkeypatch.setattr("ncs_gym.registration.find_spec", lambda name: None)
+    from ncs_gym.processes.mujoco_pendulum import _own_model
+
+    _own_model.cache_clear()
+    assert inverted in gym.registry
+    assert inverted not in registered_ids()
+    assert needing_extras() == [inverted]
+    for make in (lambda: gym.make(inverted), lambda: gym.make_vec(inverted, num_envs=2), inverted_pendulum):
+        with pytest.raises(ModuleNotFoundError, match=r"needs MuJoCo: .* pip install -e '.\[mujoco\]'$"):
+            make()
+
+
+def test_cart_pole_has_the_linear_one_as_its_tangent():
+    plant, body = ncs_gym.cart_pole(), CartPoleProcess().body(ncs_gym.cart_pole(), None)
+    step = 1e-6
+    for column, direction in enumerate(np.eye(4)):
+        slope = (body.step(step * direction, np.zeros(1)) - body.step(-step * direction, np.zeros(1))) / (2.0 * step)
+        np.testing.assert_allclose(slope, plant.A[:, column], atol=1e-8)
+    slope = (body.step(np.zeros(4), np.full(1, step)) - body.step(np.zeros(4), np.full(1, -step))) / (2.0 * step)
+    np.testing.assert_allclose(slope, plant.B[:, 0], atol=1e-8)
+
+
+def test_cart_pole_keeps_its_energy_without_a_force():
+    process = CartPoleProcess()
+    body = process.body(ncs_gym.cart_pole(), None)
+
+    def energy(state):
+        _, speed, angle, rate = state
+        m, length, g = process.pole_mass, process.length, 9.81
+        across, up = speed + length * rate * np.cos(angle), -length * rate * np.sin(angle)
+        return 0.5 * process.cart_mass * speed**2 + 0.5 * m * (across**2 + up**2) + m * g * length * np.cos(angle)
+
+    state = np.array([0.0, 0.3, 0.2, -1.0])
+    before = energy(state)
+    for _ in range(100):
+        state = body.step(state, np.zeros(1))
+    assert abs(state[2]) > 1.0  # it has fallen
+    np.testing.assert_allclose(energy(state), before, rtol=1e-5)
+
+
+def test_cart_pole_of_another_size_is_refused():
+    with pytest.raises(ValueError, match="the cart-pole has 4 states and 1 input, the plant 2 and 1"):
+        gym.make("ncs_gym/TruckTrailer-v0", process={"pole_mass": 0.1})
+    with pytest.raises(ValueError, match="pole_mass must be"):
+        CartPoleProcess(pole_mass=-1.0)
+    with pytest.raises(ValueError, match="mass_factor must be"):
+        InvertedPendulumProcess(mass_factor=0.0)

@@ -1,0 +1,100 @@
+"""A plant with a remainder: what its certificate says, and when its guarantee ends."""
+
+import numpy as np
+import pytest
+
+from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, NCSEnv, NCSVectorEnv, Remainder
+from shields import Infeasible, SafetyShield, VectorSafetyShield, synthesize, verify
+from shields.runtime.guarantee import LEFT_MODEL, NOT_KNOWN_INSIDE
+from tests.certificates import certificate_of
+
+COMMON = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.3]], "box": [1.0, 1.0], "u_max": 1.0, "dt": 0.1}
+COMMON |= {"sensor_bound": 0.001, "initial_bound": 0.001}
+BOUND = Ellipsoid(1e-4 * np.eye(2))
+EXACT = LinearPlant(**COMMON, disturbance_bound=BOUND)
+LEFT_OUT = Remainder(BOUND, False, "an example")
+LOCAL = LinearPlant(**COMMON, disturbance_bound=0.0, remainder=LEFT_OUT)
+
+
+def reasons(plant, start, mode="monitor", many=False):
+    """Why the proof does not hold, step by step, while the state decays."""
+    kind, shield = (NCSVectorEnv, VectorSafetyShield) if many else (NCSEnv, SafetyShield)
+    inner = kind(2, plant=plant, max_episode_steps=None) if many else kind(plant)
+    env = shield(inner, certificate_of(plant), mode)
+    _, info = env.reset(seed=0, options={"state": np.asarray(start)})
+    seen = [info["shield_reason"]]
+    for _ in range(40):
+        *_, info = env.step(np.zeros((2, 1) if many else 1, np.float32))
+        seen.append(info["shield_reason"])
+    _, info = env.reset(seed=0)
+    return [*seen, info["shield_reason"]]
+
+
+def test_both_plants_have_the_same_bounds_but_not_the_same_name():
+    np.testing.assert_array_equal(EXACT.disturbance.shape, LOCAL.disturbance.shape)
+    assert EXACT.fingerprint != LOCAL.fingerprint
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_guarantee_does_not_come_back_after_a_state_that_may_be_outside(many):
+    start = [0.99, 0.99]  # in the box, not in S
+    first = (lambda values: [str(value[0]) for value in values]) if many else list
+    exact, local = first(reasons(EXACT, start, many=many)), first(reasons(LOCAL, start, many=many))
+    assert exact[0] == NOT_KNOWN_INSIDE
+    assert exact[-2:] == ["", ""]  # back in S, and the next episode
+    assert set(local[:-1]) == {LEFT_MODEL}
+    assert local[-1] == ""
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_guarantee_holds_for_a_start_inside(many):
+    assert all(np.all(np.asarray(reason) == "") for reason in reasons(LOCAL, [0.3, 0.3], "project", many))
+
+
+def test_certificate_says_what_it_assumes_of_the_remainder():
+    assumed = certificate_of(LOCAL).provenance["assumptions"]
+    assert any("is assumed to lie in its bound while the state is in the box: an example" in each for each in assumed)
+    assert "an example" in str(certificate_of(LOCAL))
+    assert "remainder" not in str(certificate_of(EXACT))
+
+
+@pytest.mark.parametrize("engine", ["rational", "flint"])
+def test_disturbance_set_without_the_remainder_does_not_verify(engine):
+    if engine == "flint":
+        pytest.importorskip("flint")
+    certificate, smaller = certificate_of(LOCAL), LinearPlant(**COMMON, disturbance_bound=1e-4).disturbance
+    assert verify(certificate, LOCAL, engine=engine).valid
+    forged = LinearPlant(**COMMON, disturbance_bound=0.0, remainder=LEFT_OUT)
+    forged.__dict__["disturbance"] = smaller  # what is declared is kept, what is derived from it is not
+    broken = [each.name for each in verify(certificate, forged, engine=engine).conditions if not each.holds]
+    assert "D: the plant's holds the disturbance and the process noise" in broken
+
+
+def test_published_method_knows_no_remainder():
+    with pytest.raises(ValueError, match="remainder_bound"):
+        synthesize(LOCAL, method="paper")
+
+
+def test_remainder_acts_on_the_state_alone_where_inputs_are_under_way():
+    settings = {"box": [1.0, 1.0], "u_max": 1.0, "disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
+    model = (COMMON["A"], COMMON["B"], np.eye(2), np.zeros((2, 1)), 0.1)
+    plant = LinearPlant.from_statespace(model, input_delay=2, remainder=LEFT_OUT, **settings)
+    np.testing.assert_array_equal(plant.remainder_bound.shape, np.pad(BOUND.shape, (0, 2)))
+    np.testing.assert_allclose(plant.disturbance.shape[:2, :2], BOUND.shape, rtol=1e-6)
+    assert plant.remainder.sentence == LEFT_OUT.sentence
+
+
+def test_remainder_that_the_box_cannot_bear_is_named():
+    plant = LinearPlant(
+        A=[[1.2]],
+        B=[[1.0]],
+        box=[1.0],
+        u_max=0.3,
+        dt=0.1,
+        disturbance_bound=0.0,
+        sensor_bound=0.001,
+        initial_bound=0.001,
+        remainder=Remainder(Ellipsoid([[0.25]]), True, "an example"),
+    )
+    with pytest.raises(Infeasible, match=r"times the given remainder is the largest that works \(shrink the box"):
+        synthesize(plant, contract=ChannelContract(0))
