@@ -28,7 +28,7 @@ from experiments.runs import (
     claim_folder,
     prepare_output,
 )
-from experiments.runs.arms import Arm, is_shield
+from experiments.runs.arms import is_shield
 from experiments.settings import CompareSettings
 from ncs_gym import escape_probability
 from ncs_gym.envs.env import ncs_env
@@ -144,8 +144,8 @@ def _escapes(
 def _findings(summary: dict[str, Any]) -> list[str]:
     """Returns what to read from the table, in sentences computed from it."""
     findings = [
-        f"{name}: a penalty is not enough. It was learned by {arm['train_violation_steps']:,} violating steps, "
-        f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,} evaluation episodes violate, nothing is proved."
+        f"{name}: a penalty is not enough; it took {arm['train_violation_steps']:,} violating steps to learn, "
+        f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,} evaluation episodes violate."
         for name, arm in summary["arms"].items()
         if Arm.of(name).penalizes_violations and arm["train_violation_steps"] + arm["eval_violating_episodes"]
     ]

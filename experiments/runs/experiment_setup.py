@@ -93,7 +93,7 @@ class ExperimentSetup:
     def described(self) -> dict[str, str]:
         """The plant with its bounds, and the channel that is in effect, in words."""
         channel = registered_env(self.env).channel if self.channel is None else self.channel
-        return {"plant": self.plant.describe(), "channel": channel.describe()}
+        return {"plant": str(self.plant), "channel": channel.description}
 
     def training_run(self, settings: LearningSettings, arm_name: str, index: int, grid_point: str = "") -> TrainingRun:
         """Returns one training run of an arm, or the run of an arm in which nothing is trained.

@@ -112,8 +112,9 @@ class Channel:
         """The largest number of steps between a sample and its arrival."""
         return self.delay + self.jitter
 
-    def describe(self) -> str:
-        """Returns what the channel does to samples, in sentences."""
+    @property
+    def description(self) -> str:
+        """What the channel does to samples, in sentences."""
         every = "every step" if self.send_period == 1 else f"every {_steps(self.send_period)}"
         rounded = f"quantized with step {self.quantization_step:g}" if self.quantization_step else "not quantized"
         lost = f"A packet is lost with probability {self.loss:g}"
