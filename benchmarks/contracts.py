@@ -12,10 +12,12 @@ from __future__ import annotations
 import argparse
 import time
 from dataclasses import replace
+from pathlib import Path
 
-import matplotlib.pyplot as plt
+import matplotlib
 import numpy as np
 
+from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below
 from ncs_gym import ChannelContract, LinearPlant, batch_reactor, cart_pole
 from ncs_gym.uncertainty.truncated_gaussian import chi2_quantile
 from shields import Infeasible, synthesize
@@ -28,6 +30,8 @@ PLANTS = {
     "cart-pole, position and angle": cart_pole(full_state=False),
     "batch reactor, two outputs": batch_reactor(),
 }
+# Colors of the plants in the figure, apart for color-blind readers (Okabe and Ito).
+COLORS = ("#0072b2", "#e69f00", "#009e73")
 PRECISION = 1.01
 # Relative tightening of the semidefinite program, the smallest one that the synthesis tries.
 SLACK = 1e-6
@@ -67,7 +71,7 @@ def main() -> None:
     parser.add_argument("--out", default=None, help="file for a figure of it")
     options = parser.parse_args()
     print(f"{'plant':32s}{'max_age':>8s}{'radius / box':>14s}{'vol/ellipsoid':>14s}{'synthesis [s]':>15s}", flush=True)
-    figure, axes = plt.subplots(figsize=(8.0, 4.0), layout="constrained")
+    radii_of: dict[str, np.ndarray] = {}
     for name, plant in PLANTS.items():
         radii = []
         for age in options.ages:
@@ -78,15 +82,28 @@ def main() -> None:
             seconds = time.perf_counter() - start
             volume = certificate.provenance["volume_of_box_ellipsoid"]
             print(f"{name:32s}{age:8d}{radii[-1]:14.3%}{volume:14.2f}{seconds:15.1f}", flush=True)
-        axes.semilogy(options.ages, 100.0 * np.array(radii), marker="o", label=name)
-    axes.set_xlabel("max_age of the contract [steps]")
-    axes.set_ylabel("largest disturbance radius [% of the box]")
-    axes.set_xticks(options.ages)
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.grid(alpha=0.3)
-    figure.legend(loc="outside upper center", ncols=len(PLANTS), frameon=False)
+        radii_of[name] = 100.0 * np.array(radii)
     if options.out is not None:
-        figure.savefig(options.out, dpi=150)
+        Path(options.out).write_bytes(drawn(options.ages, radii_of).png)
+
+
+def drawn(ages: list[int], radii_of: dict[str, np.ndarray]) -> CaptionedFigure:
+    """The largest radius against the contract's age, for every plant."""
+    with matplotlib.rc_context(STYLE):
+        figure = CaptionedFigure((8.0, 3.8))
+        axes, handles = figure.subplots(), {}
+        for (name, radii), color, marker in zip(radii_of.items(), COLORS, "os^", strict=False):
+            (handles[name],) = axes.semilogy(ages, radii, marker=marker, color=color, lw=1.5)
+        label(
+            axes,
+            "largest age of the newest sample that the contract allows [steps]",
+            "largest disturbance [% of the box]",
+        )
+        axes.set_xticks(ages)
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.minorticks_off()
+        legend_below(figure, handles)
+        return figure
 
 
 if __name__ == "__main__":

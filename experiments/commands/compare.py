@@ -143,7 +143,12 @@ def _escapes(
 
 def _findings(summary: dict[str, Any]) -> list[str]:
     """Returns what to read from the table, in sentences computed from it."""
-    findings = []
+    findings = [
+        f"{name}: a penalty is not enough; it took {arm['train_violation_steps']:,} violating steps to learn, "
+        f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,} evaluation episodes violate."
+        for name, arm in summary["arms"].items()
+        if Arm.of(name).penalizes_violations and arm["train_violation_steps"] + arm["eval_violating_episodes"]
+    ]
     for name, arm in summary["arms"].items():
         if not arm["shielded"]:
             continue

@@ -16,7 +16,7 @@ from shields import Certificate
 def comparison_figures(
     plant: LinearPlant, certificate: Certificate, summary: dict[str, Any], results: ResultsByArm
 ) -> dict[str, tuple[str, bytes]]:
-    """Returns caption and PNG file of every figure by name.
+    """Returns caption and PNG file of every figure by name, what the findings are about first.
 
     Args:
         plant: Plant of the environment.
@@ -26,10 +26,10 @@ def comparison_figures(
     """
     arms = {name: results[name] for name in summary["arms"]}
     trained = {name: runs for name, runs in arms.items() if runs[0].history}
-    figures = ({"training": training_figure(trained)} if trained else {}) | {
-        "scatter": scatter_figure(summary["arms"], arms),
-        "episode": episode_figure(plant, arms),
-    }
+    figures = {"scatter": scatter_figure(summary["arms"], arms)}
+    if trained:
+        figures["training"] = training_figure(trained)
+    figures["episode"] = episode_figure(plant, arms)
     if plant.n > 1:  # a single state has no phase plane
         figures["phase"] = phase_figure(plant, certificate, arms)
     return {name: (figure.caption, figure.png) for name, figure in figures.items()}

@@ -22,7 +22,7 @@ STYLE: dict[Any, Any] = {
     "axes.titlesize": 10.5,
     "grid.color": "#e4e4e4",
     "legend.frameon": False,
-    "figure.dpi": 130,
+    "figure.dpi": 200,
 }
 # Mean width of a letter and of a handle in a legend [inches].
 _LETTER, _HANDLE = 0.085, 0.6

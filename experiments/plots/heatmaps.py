@@ -19,6 +19,8 @@ from experiments.runs.arms import Arm
 _COLUMNS = 4
 # Height at which the longest label of a color scale fits [inches].
 _MIN_HEIGHT = 2.8
+# A color scale without a fixed start spans at least this fraction of the largest value: near ones look alike.
+_SMALLEST_SPAN = 0.1
 # Fields whose relative luminance is smaller than this have light numbers; weights of red, green and blue.
 _DARK = 0.45
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -159,7 +161,9 @@ def _norm(fields: Sequence[np.ndarray], quantity: _Quantity) -> Normalize:
     """Returns one color scale for all panels."""
     low = np.nanmin(fields) if quantity.low is None else quantity.low
     high = np.nanmax(fields) if quantity.high is None else max(quantity.high, np.nanmax(fields))
-    # Where all values are alike the scale still has a length.
+    if quantity.low is None and (missing := _SMALLEST_SPAN * max(abs(low), abs(high)) - (high - low)) > 0.0:
+        low, high = low - missing / 2, high + missing / 2
+    # Where all values are zero the scale still has a length.
     return Normalize(low, high if high > low else low + 1.0)
 
 

@@ -19,7 +19,7 @@ from shields import Certificate
 # Largest number of panels side by side.
 _COLUMNS = 4
 # The view is the projection of box and safe set, enlarged by this factor; states farther away are left out.
-_VIEW = 1.75
+_VIEW = 3.0
 _INK = "#222222"
 
 

@@ -13,7 +13,7 @@ from experiments.runs.arms import Arm
 from shields import Report
 
 # Pixels of a figure per pixel of the page: the widest figures then fill it, and letters have the same size in all.
-_PIXEL_RATIO = 1.36
+_PIXEL_RATIO = 2.1
 # Bytes of a PNG file that hold the width of the image.
 _PNG_WIDTH = slice(16, 20)
 # Group of settings that an algorithm takes; all others take "off_policy".

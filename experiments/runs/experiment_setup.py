@@ -94,6 +94,12 @@ class ExperimentSetup:
         conditions = f"certificate: {len(self.verification.conditions)} conditions hold in exact arithmetic"
         return f"{conditions} ({size})" if size else conditions
 
+    @property
+    def described(self) -> dict[str, str]:
+        """The plant with its bounds, and the channel that is in effect, in words."""
+        channel = registered_env(self.env).channel if self.channel is None else self.channel
+        return {"plant": str(self.plant), "channel": channel.description}
+
     def training_run(self, settings: LearningSettings, arm_name: str, index: int, grid_point: str = "") -> TrainingRun:
         """Returns one training run of an arm, or the run of an arm in which nothing is trained.
 
@@ -135,6 +141,7 @@ class ExperimentSetup:
         return {
             "settings": {name: value for name, value in content.items() if name not in INCIDENTAL_SETTINGS},
             "plant": {"fingerprint": self.plant.fingerprint, "spectral_radius": self.plant.spectral_radius},
+            "described": self.described,
             "certificate": self.certificate.checksum,
             "certificate_file": self.certificate.document,
             "versions": versions(),

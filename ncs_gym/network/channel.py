@@ -112,10 +112,28 @@ class Channel:
         """The largest number of steps between a sample and its arrival."""
         return self.delay + self.jitter
 
+    @property
+    def description(self) -> str:
+        """What the channel does to samples, in sentences."""
+        every = "every step" if self.send_period == 1 else f"every {_steps(self.send_period)}"
+        rounded = f"quantized with step {self.quantization_step:g}" if self.quantization_step else "not quantized"
+        lost = f"A packet is lost with probability {self.loss:g}"
+        if isinstance(self.loss, GilbertElliott):
+            lost = f"Losses come in bursts ({self.loss})"
+        if self.max_consecutive_losses is not None:
+            lost += f", never more than {self.max_consecutive_losses} in a row"
+        late = f"{self.delay} to {self.longest_delay} steps" if self.jitter else _steps(self.delay)
+        arrives = f"What is not lost arrives {late} late" if self.longest_delay else "What is not lost arrives at once"
+        return f"A sample is taken and sent {every}, {rounded}. {lost}. {arrives}."
+
     def quantize(self, measurement: np.ndarray) -> np.ndarray:
         """Returns the measurement, of any shape, rounded to multiples of the quantization step."""
         q = self.quantization_step
         return np.rint(measurement / q) * q if q > 0.0 else measurement
+
+
+def _steps(number: int) -> str:
+    return "1 step" if number == 1 else f"{number} steps"
 
 
 def _bursts(loss: dict[str, Any]) -> GilbertElliott:

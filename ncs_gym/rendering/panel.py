@@ -51,27 +51,30 @@ def draw_legend(canvas: Canvas, *, shielded: bool, plans: bool) -> None:
         shielded: Whether there is a safe set.
         plans: Whether the shield stores plans.
     """
-    rows = [theme.PANEL.bottom - 8 - (17 if plans else 20) * i for i in reversed(range(4 if plans else 3))]
-    first, second, third = (theme.PANEL.x + offset for offset in (7.0, 112.0, 229.0))
+    rows = [theme.PANEL.bottom - 8 - 17 * i for i in reversed(range(4))]
+    first, second, third = (theme.PANEL.x + offset for offset in (7.0, 115.0, 221.0))
     canvas.circle((first, rows[0]), 4.0, theme.INK)
     canvas.circle((first, rows[1]), 5.0, theme.ESTIMATE, width=1.5)
     _draw_disc(canvas, (first, rows[2]), theme.ERROR_FILL, theme.LATE)
+    states = ["true state", "estimate", "error bound"]
     canvas.dashed([(second - 7, rows[0]), (second + 8, rows[0])], theme.DANGER, 1.5, dash=3.0)
     marks = ["safe box"]
+    if plans:
+        draw_plan(canvas, [(first - 8, rows[3]), (first, rows[3]), (first + 8, rows[3])])
+        states += ["stored plan"]
     if shielded:
         _draw_disc(canvas, (second, rows[1]), theme.SAFE_FILL, theme.SAFE)
         canvas.circle((second, rows[2]), 3.5, theme.SHIELD)
-        marks += ["safe set S", "shield acted"]
-    if plans:
-        draw_plan(canvas, [(second - 8, rows[3]), (second, rows[3]), (second + 8, rows[3])])
-        marks += ["stored plan"]
+        _draw_correction(canvas, second + 4.0, second - 12.0, rows[3])
+        marks += ["safe set S", "shield acted", "overridden"]
     canvas.circle((third, rows[0]), 3.5, theme.ESTIMATE)
     canvas.circle((third, rows[1]), 3.5, theme.LATE)
-    canvas.cross((third, rows[2]), 3.5, theme.DANGER, 2.0)
-    columns = (first, ["true state", "estimate", "error bound"]), (second, marks), (third, ["on time", "late", "lost"])
+    canvas.circle((third, rows[2]), 3.5, theme.LATE, width=1.5)
+    canvas.cross((third, rows[3]), 3.5, theme.DANGER, 2.0)
+    columns = (first, states), (second, marks), (third, ["on time", "late", "on the way", "lost"])
     for x, names in columns:
         for name, y in zip(names, rows, strict=False):
-            canvas.text(name, (x + 14, y), theme.INK)
+            canvas.text(name, (x + 12, y), theme.INK)
 
 
 def draw_plan(canvas: Canvas, points: list) -> None:

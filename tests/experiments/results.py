@@ -80,6 +80,7 @@ def provenance(**settings: Any) -> dict[str, Any]:
     return {
         "settings": own | settings,
         "plant": {"fingerprint": "f" * 64, "spectral_radius": 0.9},
+        "described": {"plant": "linear plant    1 state", "channel": "A sample is taken and sent every step."},
         "certificate": "c" * 64,
         "versions": {"python": "3.11.9", "numpy": "2.1.0"},
     }

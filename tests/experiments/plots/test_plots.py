@@ -302,20 +302,19 @@ def test_a_monitor_only_would_override():
 def test_scatter_has_a_point_per_run_and_the_mean_with_its_intervals():
     shown = {"unshielded": [run("unshielded", i, violations=(4, 0)) for i in range(3)]}
     summary = summary_of(shown)["arms"]
-    steps, episodes = scatter_figure(summary, shown).axes
-    for axis, cost in ((steps, 2.0), (episodes, 50.0)):
-        (dots,) = [line for line in axis.get_lines() if len(line.get_xdata()) == 3]
-        assert list(zip(dots.get_xdata(), dots.get_ydata(), strict=True)) == [(cost, -2.0), (cost, -3.0), (cost, -4.0)]
-        (mean,) = [line for line in axis.get_lines() if len(line.get_xdata()) == 1]
-        assert (mean.get_xdata()[0], mean.get_ydata()[0]) == (cost, -3.0)
-        vertical = [line for line in axis.get_lines() if line.get_marker() == "_"]
-        np.testing.assert_allclose(vertical[0].get_ydata(), summary["unshielded"]["eval_return_ci95"])
+    (axis,) = scatter_figure(summary, shown).axes
+    (dots,) = [line for line in axis.get_lines() if len(line.get_xdata()) == 3]
+    assert list(zip(dots.get_xdata(), dots.get_ydata(), strict=True)) == [(50.0, -2.0), (50.0, -3.0), (50.0, -4.0)]
+    (mean,) = [line for line in axis.get_lines() if len(line.get_xdata()) == 1]
+    assert (mean.get_xdata()[0], mean.get_ydata()[0]) == (50.0, -3.0)
+    vertical = [line for line in axis.get_lines() if line.get_marker() == "_"]
+    np.testing.assert_allclose(vertical[0].get_ydata(), summary["unshielded"]["eval_return_ci95"])
 
 
 def test_after_no_violation_the_scatter_still_shows_what_the_probability_is_at_most():
     shown = arms("shielded")
     summary = summary_of(shown)["arms"]
-    (bar,) = [line for line in scatter_figure(summary, shown).axes[1].get_lines() if line.get_marker() == "|"]
+    (bar,) = [line for line in scatter_figure(summary, shown).axes[0].get_lines() if line.get_marker() == "|"]
     upper = 100.0 * summary["shielded"]["eval_violation_rate_ci95"][1]
     np.testing.assert_allclose(bar.get_xdata(), [0.0, upper])
     assert upper > 50.0

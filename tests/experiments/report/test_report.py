@@ -157,7 +157,7 @@ def test_figures_are_embedded_with_their_captions():
     reader = Reader(comparison("shielded", figures={"First. Of all.": PNG, "Second. Too.": b"other"}))
     images = [attributes for tag, attributes in reader.tags if tag == "img"]
     assert [image["alt"] for image in images] == ["First", "Second"]
-    assert images[0]["width"] == "1000"
+    assert images[0]["width"] == "648"
     assert base64.b64decode(images[0]["src"].partition(",")[2]) == PNG
     assert "Second. Too." in reader.text
 

@@ -119,7 +119,7 @@ def test_oblique_limits_are_drawn_as_they_are():
 
 
 def test_coupling_turns_red_near_its_limit(picture):
-    band = theme.Rect(340, 150, 60, 35)
+    band = theme.Rect(195, 150, 60, 35)
     red = [count(pixels_of(picture, record((stretch, 0.0))), theme.DANGER, band) for stretch in (0.0, 1.0, 1.95, -1.95)]
     mark = 20  # pixels of the limit's dashed mark at most
     assert red[0] < mark
@@ -130,17 +130,17 @@ def test_coupling_turns_red_near_its_limit(picture):
 def test_coupling_stretches(picture):
     fronts = []
     for stretch in (-1.0, 0.0, 1.0):
-        row = pixels_of(picture, record((stretch, 0.0)))[130, :400].astype(int)
-        fronts.append(np.flatnonzero(np.abs(row - np.array(theme.CARGO)).max(axis=-1) < 24).max())
-    assert fronts[0] - fronts[1] == pytest.approx(fronts[1] - fronts[2], abs=1)
-    assert fronts[0] - fronts[1] == pytest.approx(31, abs=1)
+        row = pixels_of(picture, record((stretch, 0.0)))[150].astype(int)
+        fronts.append(np.flatnonzero(np.abs(row - np.array(theme.BODYWORK)).max(axis=-1) < 24).max())
+    assert fronts[1] - fronts[0] == pytest.approx(fronts[2] - fronts[1], abs=1)
+    assert fronts[1] - fronts[0] == pytest.approx(31, abs=1)
 
 
 def test_dashed_outline_stands_where_the_estimate_is(picture):
     right, off = record(), record(estimate=np.array([1.0, 0.0]))
-    left = theme.Rect(0, 110, 140, 70)
-    assert count(pixels_of(picture, right), theme.ESTIMATE, left) == 0
-    assert count(pixels_of(picture, off), theme.ESTIMATE, left) > 50
+    beyond = theme.Rect(485, 100, 60, 85)
+    assert count(pixels_of(picture, right), theme.ESTIMATE, beyond) == 0
+    assert count(pixels_of(picture, off), theme.ESTIMATE, beyond) > 50
 
 
 def test_error_ellipse_has_the_size_of_the_bound(picture):
