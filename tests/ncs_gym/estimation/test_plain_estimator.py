@@ -139,7 +139,7 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_estimator_equals_the_plain_one_for_long(name):
     plant, channel, contract = CASES[name]
-    ages, _ = compare(plant, channel, certified_error_set(plant, contract), 0, 800)
+    ages, _ = compare(plant, channel, certified_error_set(plant, contract), 0, 400)
     assert min(ages) <= channel.delay  # samples are used as soon as they can be
     assert max(ages) > 10
 
@@ -230,7 +230,7 @@ def test_vector_estimator_equals_the_plain_ones(name, most, monkeypatch):
     recursion = ErrorRecursion(plant, channel.quantization_step, error_set)
     plains = [PlainEstimator(plant, channel, recursion) for _ in range(count)]
     history = []
-    for step in range(1, 200):
+    for step in range(1, 120):
         if step % 50 == 0:  # some episodes end, others go on
             chosen = rng.random(count) < 0.5
             first = plant.initial_noise.sample(rng, int(chosen.sum())).T
