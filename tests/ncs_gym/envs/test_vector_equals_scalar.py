@@ -25,6 +25,7 @@ from ncs_gym import (
     truck_trailer,
 )
 from ncs_gym.estimation import arrival_patterns
+from tests import arrays
 from tests.ncs_gym.envs.same_draws import compare
 from tests.plants import random_plant
 
@@ -140,7 +141,7 @@ def steps_of(env, count, seed=0):
 def assert_equal(some, others):
     for one, other in zip(some, others, strict=True):
         for value, wanted in zip(one, other, strict=True):
-            np.testing.assert_array_equal(value, wanted)
+            arrays.assert_equal(value, wanted)
 
 
 KINDS = {
