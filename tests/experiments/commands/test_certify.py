@@ -169,7 +169,9 @@ def test_gaussian_nature_attains_what_is_bounded_and_draws_the_rest(tmp_path):
     assert levels[0].min() >= levels[1].max() * (1.0 - 1e-9)
 
 
-def test_counts_of_gaussian_noise_lie_within_the_bound_and_do_not_end_with_an_error(tmp_path, small, capsys, without_workers):
+def test_counts_of_gaussian_noise_lie_within_the_bound_and_do_not_end_with_an_error(
+    tmp_path, small, capsys, without_workers
+):
     certify(settings(tmp_path, noise="gaussian", delta=1e-4))
     printed = capsys.readouterr().out
     rows = [line for line in printed.partition("interval")[2].splitlines() if line.startswith("TruckTrailer")]

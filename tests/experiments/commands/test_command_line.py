@@ -262,7 +262,7 @@ def test_saved_agent_is_evaluated(smoke, tmp_path):
 
 
 def test_one_agent_is_trained(tmp_path, without_workers):
-    run = ncs("train", "--algo", "A2C", "--steps", "1024", "--episodes", "3", "--out", tmp_path / "one")
+    run = ncs("train", "--algo", "A2C", "--steps", "256", "--episodes", "3", "--out", tmp_path / "one")
     assert run.returncode == 0, run.stderr
     model = tmp_path / "one" / "models" / "shielded-0"
     assert f"agent: {model}" in run.stdout
@@ -273,7 +273,8 @@ def test_one_agent_is_trained(tmp_path, without_workers):
 
 def test_agent_behind_lookahead_is_trained_and_evaluated_with_its_horizon(tmp_path, without_workers):
     out = tmp_path / "one"
-    given = ["--arm", "lookahead", "--horizon", "3", "--ppo.envs", "8", "--steps", "1024", "--episodes", "3"]
+    given = ["--arm", "lookahead", "--horizon", "3", "--ppo.envs", "8", "--ppo.rollout", "64", "--steps", "512"]
+    given += ["--episodes", "3"]
     run = ncs("train", "--env", "ncs_gym/BatchReactor-v0", *given, "--out", out)
     assert run.returncode == 0, run.stderr
     assert "from a" in run.stdout
@@ -302,7 +303,7 @@ def test_agent_behind_lookahead_is_trained_and_evaluated_with_its_horizon(tmp_pa
 def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path, without_workers):
     out = tmp_path / "sweep"
     grid = ["--losses", "0.5", "--delays", "1", "--burst-lengths", "0", "3", "--episodes", "3", "--steps", "512"]
-    run = ncs("sweep", *grid, "--ppo.envs", "4", "--out", out)
+    run = ncs("sweep", *grid, "--ppo.envs", "4", "--ppo.rollout", "128", "--out", out)
     assert run.returncode == 0, run.stderr
     summary = json.loads((out / "summary.json").read_text())
     assert [(cell["loss"], cell["burst_length"]) for cell in summary["cells"]] == [(0.5, 0), (0.5, 3)]
