@@ -70,7 +70,7 @@ def test_shielded_training_has_no_violation_and_counts_interventions(shielded):
 
 def test_monitored_training_is_the_unshielded_one_and_counts_what_the_shield_would_do(certificate):
     monitored = ControlLoop(env=CRUISE.env, shield=ShieldSettings(certificate, "monitor"))
-    one, other = train(monitored, 2048, 0, settings=TINY), train(CRUISE, 2048, 0, settings=TINY)
+    one, other = train(monitored, 1024, 0, settings=TINY), train(CRUISE, 1024, 0, settings=TINY)
     observations = np.random.default_rng(0).standard_normal((20, 3))
     np.testing.assert_array_equal(one.agent.act(observations), other.agent.act(observations))
     assert one.violation_steps == other.violation_steps > 0
@@ -79,7 +79,7 @@ def test_monitored_training_is_the_unshielded_one_and_counts_what_the_shield_wou
 
 def test_violation_penalty_changes_what_is_learned():
     penalized = ControlLoop(env=CRUISE.env, violation_penalty=5.0)
-    one, other = train(penalized, 2048, 0, settings=TINY), train(CRUISE, 2048, 0, settings=TINY)
+    one, other = train(penalized, 1024, 0, settings=TINY), train(CRUISE, 1024, 0, settings=TINY)
     observations = np.random.default_rng(0).standard_normal((20, 3))
     assert (one.agent.act(observations) != other.agent.act(observations)).any()
 

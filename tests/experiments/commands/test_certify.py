@@ -56,7 +56,7 @@ def test_contracts_are_used_up():
             assert contract_of(case.channel) == case.contract
 
 
-def test_a_block_is_the_same_after_any_other(files):
+def test_batch_has_the_same_counts_after_any_other(files):
     batches = [MonteCarloBatch(CRUISE, 0), MonteCarloBatch(CRUISE, 1), MonteCarloBatch("CartPole-v0, rare", 2)]
     first = [run_batch(CAMPAIGN, batch, files[batch.case]) for batch in batches]
     again = [run_batch(CAMPAIGN, batch, files[batch.case]) for batch in reversed(batches)]

@@ -195,7 +195,7 @@ def test_threads_share_a_graph(most, monkeypatch):
     interval = sys.getswitchinterval()
     try:
         sys.setswitchinterval(1e-6)
-        for _ in range(4):
+        for _ in range(2):
             monkeypatch.setattr(arrival_patterns, "_shared", {})
             threads = [threading.Thread(target=run, args=(seed, together)) for seed in range(4)]
             for thread in threads:

@@ -122,7 +122,7 @@ def test_loop_decides_and_proves_what_the_wrapper_does_with_the_same_packets(nam
     certificate, rng, seen, intervened = certificate_of(plant, contract), np.random.default_rng(0), set(), []
     for seed, act in enumerate(("random", "outwards")):
         env = SafetyShield(NCSEnv(plant, channel, disturbance="adversarial", contract=contract), certificate, mode=mode)
-        reasons, overridden = follow(env, loop_of(name, mode), policy(act, env, rng), 150, seed)
+        reasons, overridden = follow(env, loop_of(name, mode), policy(act, env, rng), 80, seed)
         seen |= reasons
         intervened += overridden
     assert (sum(intervened) > 0) is (mode != "lookahead" or name != "n=3 m=2 p=1")  # there a plan saves every proposal
