@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from ncs_gym import Channel, ChannelContract, ErrorSetError, NCSVectorEnv, cart_pole
 from ncs_gym.envs.env import NCSEnv
-from tests.fuzz import examples, plants, environment_settings
+from tests.fuzz import environment_settings, examples, plants
 
 # A plant so strongly coupled that float64 holds no error set is refused by name.
 REFUSED = (ErrorSetError,)
