@@ -14,12 +14,14 @@ from threading import Event
 from typing import Any
 from unittest import mock
 
+from experiments.attack import monte_carlo_batch
+
 
 class _Executor(Executor):
     """Executes at once what is submitted; arguments and results are pickled as on their way to a process and back."""
 
     def __init__(self, *arguments: Any, **settings: Any) -> None:
-        pass
+        monte_carlo_batch._shields.cache_clear()  # a new process has prepared none
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any) -> Future:
         future: Future = Future()
