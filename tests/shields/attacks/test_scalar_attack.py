@@ -17,21 +17,18 @@ from tests.shields.attacks.extremes import (
     attack,
     harmful,
 )
-from tests.shields.attacks.test_vector_attack import vector_attack_steps
 
 MODES = ("project", "switch", "boundary")
 RANDOM_POLICIES = ("random", "outwards", "searching")
 # Steps per episode in the ordinary suite and in the slow one.
-TRUCK_STEPS, RANDOM_STEPS = (200, 2700), (60, 2400)
+TRUCK_STEPS, RANDOM_STEPS = (270, 2700), (240, 2400)
 
 
-@pytest.mark.parametrize(("suite", "scalar", "all_together"), [(0, 50_000, 250_000), (1, 1_000_000, 10_000_000)])
-def test_the_attacks_take_as_many_steps_as_we_say(suite, scalar, all_together):
+@pytest.mark.parametrize(("suite", "total"), [(0, 100_000), (1, 1_000_000)])
+def test_the_attacks_take_as_many_steps_as_we_say(suite, total):
     trucks = len(TRUCKS) * len(POLICIES) * TRUCK_STEPS[suite]
     others = len(RANDOM) * len(RANDOM_POLICIES) * RANDOM_STEPS[suite]
-    steps = len(CHANNELS) * len(MODES) * (trucks + others)
-    assert steps > scalar
-    assert steps + vector_attack_steps(suite) > all_together
+    assert len(CHANNELS) * len(MODES) * (trucks + others) > total
 
 
 def slow_second(values):
