@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ import pytest
 from ncs_gym import LinearPlant, truck_trailer
 from shields import Certificate
 from tests.certificates import certificate_of
+from tests.workers import no_worker_processes
 
 # Gymnasium's checker tries every render mode: no windows while tests run.
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
@@ -62,6 +63,13 @@ def loaded() -> LinearPlant:
 def certificate(loaded: LinearPlant) -> Certificate:
     """A certificate for the cruise."""
     return certificate_of(loaded)
+
+
+@pytest.fixture
+def without_workers() -> Iterator[None]:
+    """Commands start no worker processes, which would have to import everything."""
+    with no_worker_processes():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -97,7 +97,7 @@ def tasks(draw, plant: LinearPlant) -> Any:
 
 
 @st.composite
-def worlds(draw, **limits: Any) -> dict[str, Any]:
+def environment_settings(draw, **limits: Any) -> dict[str, Any]:
     """Settings of an environment: a plant, a channel, a task and a disturbance that fit each other."""
     plant = draw(plants(**limits))
     names = ["ball", "box", "sinusoid", "sphere", "adversarial"]

@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from tests.programs import output_of
+
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("ncs_gym", "shields", "agents", "experiments")
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -28,10 +30,9 @@ QUICK_PAGES = (
     "docs/constrained_rl.md",
     "docs/vector.md",
 )
-# Their programs train an agent, or synthesize certificates that take seconds.
+# Their programs run in a process of their own; some train an agent, or synthesize certificates that take seconds.
 SLOW_PAGES = (
-    "docs/tutorial.md",
-    "docs/constrained_rl.md",
+    *QUICK_PAGES,
     "docs/contracts.md",
     "docs/own_plant.md",
     "docs/deployment.md",
@@ -40,10 +41,6 @@ SLOW_PAGES = (
     "docs/integrations.md",
     "docs/beyond_linear.md",
 )
-PAGE_RUNS = [
-    *((page, False) for page in QUICK_PAGES),
-    *(pytest.param(page, True, marks=pytest.mark.slow) for page in SLOW_PAGES),
-]
 MODULE = re.compile(rf"\b(?:{'|'.join(PACKAGES)}|tests|benchmarks)/[\w/]+\.py\b")
 
 
@@ -161,19 +158,39 @@ def test_functions_that_architecture_names_exist():
         assert re.search(rf"^\s*(?:def|class) {name}\b", (ROOT / path).read_text(), re.MULTILINE), (name, path)
 
 
-@pytest.mark.parametrize(("page", "training"), PAGE_RUNS)
-def test_programs_of_a_page_print_what_follows_them(page, training):
+@pytest.mark.parametrize("page", QUICK_PAGES)
+def test_programs_of_a_page_that_train_nothing_print_what_follows_them(page):
+    programs = [
+        each
+        for each in PROGRAM.findall((ROOT / page).read_text())
+        if not re.search(r"stable_baselines3|^from agents import", each[0], re.MULTILINE)
+    ]
+    assert_printed(programs, output_of(in_one(programs)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", SLOW_PAGES)
+def test_programs_of_a_page_print_what_follows_them_in_a_process_of_their_own(page):
     programs = PROGRAM.findall((ROOT / page).read_text())
-    if not training:
-        programs = [
-            each for each in programs if not re.search(r"stable_baselines3|^from agents import", each[0], re.MULTILINE)
-        ]
-    assert programs
-    source = "print('---')\n".join(program for program, _ in programs)
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-    environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
-    run = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, env=environment, timeout=600)
+    run = subprocess.run(
+        [sys.executable, "-c", in_one(programs)],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
+        timeout=600,
+    )
     assert run.returncode == 0, run.stderr
-    printed = run.stdout.split("---\n")
+    assert_printed(programs, run.stdout)
+
+
+def in_one(programs):
+    """The programs of a page one after the other: later ones use what earlier ones define."""
+    assert programs
+    return "print('---')\n".join(program for program, _ in programs)
+
+
+def assert_printed(programs, printed):
     expected = [text for _, text in programs]
-    assert [text for text, wanted in zip(printed, expected, strict=True) if wanted] == list(filter(None, expected))
+    shown = zip(printed.split("---\n"), expected, strict=True)
+    assert [text for text, wanted in shown if wanted] == list(filter(None, expected))

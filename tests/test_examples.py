@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.programs import output_of_file
+
 ROOT = Path(__file__).resolve().parent.parent
 NUMBER = r"-?[\d.,]+"
-SLOW = pytest.mark.slow
 
 # Arguments of a tiny run, and what has to stand in its output.
 RUNS = {
@@ -105,18 +106,25 @@ def test_versions_of_foreign_packages_are_those_that_the_page_names():
         assert all(version in row for version in packages.values() if version)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[SLOW] if name in TRAINING | FOREIGN.keys() else []) for name in sorted(RUNS)]
-)
-def test_example_runs_and_prints_what_it_is_about(name, tmp_path):
+@pytest.mark.parametrize("name", sorted(RUNS.keys() - TRAINING - FOREIGN.keys()))
+def test_example_prints_what_it_is_about(name):
+    assert_expected(name, output_of_file(ROOT / "examples" / name, *RUNS[name][0]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(RUNS))
+def test_example_runs_in_a_process_of_its_own_and_prints_what_it_is_about(name, tmp_path):
     missing = [package for package in FOREIGN.get(name, ()) if importlib.util.find_spec(package) is None]
     if missing:
         pytest.skip(f"{', '.join(missing)} not installed: a virtual environment of its own (docs/integrations.md)")
-    arguments, expected = RUNS[name]
-    run = run_example(name, *arguments, MINARI_DATASETS_PATH=str(tmp_path))
+    run = run_example(name, *RUNS[name][0], MINARI_DATASETS_PATH=str(tmp_path))
     assert run.returncode == 0, run.stderr
-    for pattern in expected:
-        assert re.search(pattern, run.stdout), f"{pattern!r} is not in {run.stdout!r}"
+    assert_expected(name, run.stdout)
+
+
+def assert_expected(name, printed):
+    for pattern in RUNS[name][1]:
+        assert re.search(pattern, printed), f"{pattern!r} is not in {printed!r}"
 
 
 @pytest.mark.slow

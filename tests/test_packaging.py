@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tomllib
 import zipfile
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -83,6 +84,7 @@ def name_of(path: Path) -> str:
 NAMES = {name_of(path) for path in MODULES}
 
 
+@cache
 def imports(path: Path, *, later: bool = True) -> set[str]:
     """Dotted names of everything a module imports; what functions and type checkers import as well, if `later`."""
     names, waiting = set(), [ast.parse(path.read_text())]

@@ -118,8 +118,8 @@ def _require_large_node(settings: BackendSettings) -> None:
 
 def _finished(references: list[Any]) -> list[Any]:
     """Returns all references that are finished; after a while it also returns none."""
-    some, _ = ray.wait(references, timeout=_WAITING_PERIOD, fetch_local=False)
-    return ray.wait(references, num_returns=len(references), timeout=0, fetch_local=False)[0] if some else []
+    finished, _ = ray.wait(references, timeout=_WAITING_PERIOD, fetch_local=False)
+    return ray.wait(references, num_returns=len(references), timeout=0, fetch_local=False)[0] if finished else []
 
 
 def _result(run: TrainingRun, reference: Any) -> RunResult:

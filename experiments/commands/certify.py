@@ -58,11 +58,11 @@ def certify(settings: CertifySettings) -> None:
         keys = {case: f"{key} {cases[case].channel}" for case, key in keys.items()}
     store = CountsStore(settings.out / "tallies.jsonl", keys)
     batches = _batches(list(cases), settings.steps / campaign.batch_steps, campaign.kinds_of_batches)
-    missing = {case: deque(each for each in some if each not in store.counts) for case, some in batches.items()}
+    missing = {case: deque(each for each in planned if each not in store.counts) for case, planned in batches.items()}
     start, steps = time.perf_counter(), campaign.batch_steps * sum(map(len, missing.values()))
     execute_batches(campaign, missing, certificates, store, settings.jobs)
     seconds = time.perf_counter() - start
-    counts = {case: sum((store.counts[each] for each in some), SafetyCounts()) for case, some in batches.items()}
+    counts = {case: sum((store.counts[each] for each in planned), SafetyCounts()) for case, planned in batches.items()}
     total = sum(counts.values(), SafetyCounts())
     print(counts_table(counts | {"all": total}, looks_ahead=campaign.looks_ahead))
     limits = {name: case.escape_probability() for name, case in cases.items()} if campaign.gaussian else {}

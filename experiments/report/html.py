@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from functools import cache
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -74,6 +75,7 @@ def render_page(template: str, figures: dict[str, tuple[str, bytes]], **context:
     return _environment().get_template(template).render(images=images, percent=percent, resamples=RESAMPLES, **context)
 
 
+@cache
 def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("experiments.report"),

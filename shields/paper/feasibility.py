@@ -22,6 +22,10 @@ _REDUCTION, _ATTEMPTS = 0.99, 20
 # Points of the scan that are tried with the communication error in the input limit.
 _CONFIRMED_POINTS = 100
 
+# Scans of the last few plants by their dynamics, since one takes seconds: who changes bounds asks for them again.
+_known_scans: dict[tuple, list[tuple[float, float, float]]] = {}
+_MAX_KNOWN_SCANS = 4
+
 
 @dataclass(frozen=True)
 class Feasibility:
@@ -50,17 +54,12 @@ class FeasibilityScan:
     """
 
     def __init__(self, plant: LinearPlant) -> None:
-        problem = ReducedProblem(plant)
-        self._points: list[tuple[float, float, float]] = []
-        for kappa in _KAPPAS.tolist():
-            for fraction in _RHO_FRACTIONS.tolist():
-                rho = 1.0 + (1.0 / kappa - 1.0) * fraction
-                if kappa * rho > 1.0 - SMALLEST_GAP:
-                    continue
-                bounds = PaperBounds(kappa, rho, np.nan, np.nan, np.nan)
-                eigenvalue = problem.largest_eigenvalue(bounds, with_error=False)
-                if eigenvalue > 0.0:
-                    self._points.append((kappa, rho, eigenvalue))
+        key = tuple((array.shape, array.tobytes()) for array in (plant.A, plant.B, plant.C, plant.u_max))
+        if key not in _known_scans:
+            if len(_known_scans) == _MAX_KNOWN_SCANS:
+                del _known_scans[next(iter(_known_scans))]
+            _known_scans[key] = _scanned(ReducedProblem(plant))
+        self._points = _known_scans[key]
 
     def best(self, plant: LinearPlant, model: PaperModel | None = None) -> Feasibility:
         """Returns the point of largest ratio for a plant with the scanned dynamics and bounds of its own.
@@ -118,6 +117,21 @@ class FeasibilityScan:
                 return low
             low *= _REDUCTION
         return 0.0
+
+
+def _scanned(problem: ReducedProblem) -> list[tuple[float, float, float]]:
+    """Returns the points (kappa, rho) at which (C1) has a solution, each with its largest lambda_min(L)."""
+    points = []
+    for kappa in _KAPPAS.tolist():
+        for fraction in _RHO_FRACTIONS.tolist():
+            rho = 1.0 + (1.0 / kappa - 1.0) * fraction
+            if kappa * rho > 1.0 - SMALLEST_GAP:
+                continue
+            bounds = PaperBounds(kappa, rho, np.nan, np.nan, np.nan)
+            eigenvalue = problem.largest_eigenvalue(bounds, with_error=False)
+            if eigenvalue > 0.0:
+                points.append((kappa, rho, eigenvalue))
+    return points
 
 
 def largest_gamma(scan: FeasibilityScan, plant: LinearPlant) -> float:

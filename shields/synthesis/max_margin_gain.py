@@ -84,6 +84,7 @@ class _GainSearch:
 
     def __init__(self, problem: DesignProblem, Sigma: np.ndarray, input_limits: bool) -> None:
         self._problem, self._Sigma, self._input_limits = problem, Sigma, input_limits
+        self._last_point, self._last_uses = b"", (np.empty(0), np.empty((0, 0)))
 
     def largest_use(self, point: np.ndarray) -> float:
         """Returns the logarithm of the squared use of the most used limit; at most 0 if every limit is respected."""
@@ -125,12 +126,19 @@ class _GainSearch:
         BK = problem.B @ K
         source = BK @ self._Sigma @ BK.T / ((1.0 - lx) * fraction) + problem.D_u / ((1.0 - lx) * (1.0 - fraction))
         F = (problem.A + BK) / np.sqrt(lx)
-        factors = lu_factor(np.eye(n * n) - np.kron(F, F), check_finite=False)
+        kronecker = (F[:, None, :, None] * F[None, :, None, :]).reshape(n * n, n * n)
+        factors = lu_factor(np.eye(n * n) - kronecker, check_finite=False)
         L = lu_solve(factors, source.ravel(), check_finite=False).reshape(n, n)
         return 0.5 * (L + L.T), F, factors
 
     def _uses(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the logarithms of c_i L c_i' and of (|K_i|_L + |K_i|_Sigma)^2, and their derivatives.
+        """Returns the logarithms of c_i L c_i' and of (|K_i|_L + |K_i|_Sigma)^2, and their derivatives."""
+        if point.tobytes() != self._last_point:  # the search asks for values and derivatives in turn
+            self._last_uses, self._last_point = self._computed_uses(point), point.tobytes()
+        return self._last_uses
+
+    def _computed_uses(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns what `_uses` does for a new point.
 
         A functional tr(Z L) changes by tr(Y dS) + 2 tr(Y dF L F') with the adjoint Y = F'YF + Z.
         """

@@ -28,9 +28,11 @@ def best_multipliers(
         initial: Multipliers from which the minimization starts.
     """
     inverse_factor = np.linalg.inv(np.linalg.cholesky(L))
-    closed_loop, gain = inverse_factor @ (problem.A + problem.B @ K), inverse_factor @ problem.B @ K
-    state, disturbance = closed_loop @ L @ closed_loop.T, inverse_factor @ problem.D_u @ inverse_factor.T
-    errors = gain @ error_shapes @ gain.T
+    # Shapes of what state, errors and disturbance each add to the successors, in coordinates in which E(L) is a ball.
+    closed_loop, from_errors = inverse_factor @ (problem.A + problem.B @ K), inverse_factor @ problem.B @ K
+    state_shape = closed_loop @ L @ closed_loop.T
+    moved_error_shapes = from_errors @ error_shapes @ from_errors.T
+    disturbance_shape = inverse_factor @ problem.D_u @ inverse_factor.T
 
     def multipliers_of(logits: np.ndarray) -> np.ndarray:
         weights = np.exp(np.clip(np.append(logits, 0.0), -30.0, 30.0))
@@ -38,7 +40,8 @@ def best_multipliers(
 
     def largest_eigenvalue(logits: np.ndarray) -> float:
         lx, le, ld = multipliers_of(logits)
-        return float(np.linalg.eigvalsh(state / lx + errors / le + disturbance / ld)[:, -1].max())
+        successors = state_shape / lx + moved_error_shapes / le + disturbance_shape / ld
+        return float(np.linalg.eigvalsh(successors)[:, -1].max())
 
     logits = np.log(np.array(initial[:2]) / initial[2])
     options = {"xatol": 1e-7, "fatol": 1e-12, "maxiter": 400}
@@ -48,7 +51,15 @@ def best_multipliers(
 
 
 def best_input_multipliers(error_shapes: np.ndarray, L: np.ndarray, K: np.ndarray) -> np.ndarray:
-    """Returns mu_i = a / (a + b), a = sqrt(K_i L K_i'), b = max sqrt(K_i Sigma K_i'), shape (m,), inside (0, 1)."""
-    a = np.sqrt(np.maximum(((K @ L) * K).sum(axis=1), 0.0))
-    b = np.sqrt(np.maximum(((K @ error_shapes) * K).sum(axis=-1), 0.0)).max(axis=0)
-    return np.clip(a / np.maximum(a + b, 1e-300), 1e-6, 1.0 - 1e-6)
+    """Returns the multipliers mu_i of (U), shape (m,): the fraction of the largest input that is due to the state.
+
+    mu_i = a / (a + b), a = sqrt(K_i L K_i') due to the state, b = max sqrt(K_i Sigma K_i') due to the error.
+
+    Args:
+        error_shapes: Shapes of the error sets, scaled, (k, n, n).
+        L: Shape of the set, scaled, (n, n).
+        K: Gain, scaled, shape (m, n).
+    """
+    by_state = np.sqrt(np.maximum(((K @ L) * K).sum(axis=1), 0.0))
+    by_error = np.sqrt(np.maximum(((K @ error_shapes) * K).sum(axis=-1), 0.0)).max(axis=0)
+    return np.clip(by_state / np.maximum(by_state + by_error, 1e-300), 1e-6, 1.0 - 1e-6)

@@ -70,7 +70,7 @@ def test_shielded_training_has_no_violation_and_counts_interventions(shielded):
 
 def test_monitored_training_is_the_unshielded_one_and_counts_what_the_shield_would_do(certificate):
     monitored = ControlLoop(env=CRUISE.env, shield=ShieldSettings(certificate, "monitor"))
-    one, other = train(monitored, 2048, 0, settings=TINY), train(CRUISE, 2048, 0, settings=TINY)
+    one, other = train(monitored, 1024, 0, settings=TINY), train(CRUISE, 1024, 0, settings=TINY)
     observations = np.random.default_rng(0).standard_normal((20, 3))
     np.testing.assert_array_equal(one.agent.act(observations), other.agent.act(observations))
     assert one.violation_steps == other.violation_steps > 0
@@ -79,7 +79,7 @@ def test_monitored_training_is_the_unshielded_one_and_counts_what_the_shield_wou
 
 def test_violation_penalty_changes_what_is_learned():
     penalized = ControlLoop(env=CRUISE.env, violation_penalty=5.0)
-    one, other = train(penalized, 2048, 0, settings=TINY), train(CRUISE, 2048, 0, settings=TINY)
+    one, other = train(penalized, 1024, 0, settings=TINY), train(CRUISE, 1024, 0, settings=TINY)
     observations = np.random.default_rng(0).standard_normal((20, 3))
     assert (one.agent.act(observations) != other.agent.act(observations)).any()
 
@@ -89,8 +89,8 @@ def test_violation_penalty_changes_what_is_learned():
     [("A2C", TINY_A2C), ("TRPO", TINY), *((name, TINY_REPLAY) for name in ("SAC", "TD3", "TQC", "CrossQ"))],
 )
 def test_every_algorithm_trains_counts_and_repeats_itself(algorithm, settings, shielded):
-    first, second = (train(shielded, 512, 3, algorithm, settings) for _ in range(2))
-    assert first.steps == second.steps >= 512
+    first, second = (train(shielded, 320, 3, algorithm, settings) for _ in range(2))
+    assert first.steps == second.steps >= 320
     assert first.violation_steps == 0
     assert first.interventions == second.interventions > 0
     assert [point.steps for point in first.history] == sorted({point.steps for point in first.history})
@@ -188,7 +188,7 @@ def test_mean_correction_is_that_of_every_step(certificate):
 
 @pytest.mark.parametrize(("algorithm", "settings"), [("PPO", TINY), ("SAC", TINY_REPLAY)])
 def test_evaluations_on_the_way_change_nothing(algorithm, settings, tmp_path):
-    plain, logged = (train(CRUISE, 1024, 3, algorithm, settings, log_folder=log) for log in (None, tmp_path))
+    plain, logged = (train(CRUISE, 512, 3, algorithm, settings, log_folder=log) for log in (None, tmp_path))
     assert plain.agent.checksum == logged.agent.checksum
     np.testing.assert_array_equal([astuple(one) for one in plain.history], [astuple(one) for one in logged.history])
 
@@ -227,10 +227,10 @@ def test_callback_counts_alike_on_stable_baselines3s_own_vector_environment(cert
     env = make_vec_env(lambda: SafetyShield(gym.make(CRUISE.env), certificate), n_envs=2, seed=0)
     for model in (A2C("MlpPolicy", env, seed=0), SAC("MlpPolicy", env, learning_starts=50, seed=0)):
         callback = SafetyCallback()
-        model.learn(400, callback=callback)
+        model.learn(200, callback=callback)
         assert callback.violation_steps == 0
         assert callback.interventions == callback.history[-1].interventions > 0
-        assert callback.history[-1].steps == 400
+        assert callback.history[-1].steps == 200
 
 
 def test_eval_callback_reports_success_on_both_kinds_of_environment(certificate, tmp_path):

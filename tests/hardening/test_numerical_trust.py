@@ -13,7 +13,7 @@ from tests.fuzz import examples, plants
 from tests.verdicts import verified
 
 
-@pytest.mark.parametrize(("n", "m", "seeds"), [(1, 1, 3), (2, 1, 3), (3, 2, 2), (4, 2, 1)])
+@pytest.mark.parametrize(("n", "m", "seeds"), [(1, 1, 2), (2, 1, 2), (3, 2, 1), (4, 2, 1)])
 @pytest.mark.parametrize("radius", [0.99, 0.9999])
 def test_units_do_not_decide_whether_there_is_a_certificate(n, m, seeds, radius):
     found = [[outcome(badly_scaled_plant(seed, n, m, decades, radius)) for decades in (0, 6)] for seed in range(seeds)]

@@ -4,6 +4,6 @@ It states every condition anew, with denominators multiplied out, decides defini
 polynomials and chi-square quantiles in ball arithmetic; with the first it shares the reading of certificates alone.
 """
 
-from shields.verification.flint.judge import flint_conditions
+from shields.verification.flint.flint_conditions import flint_conditions
 
 __all__ = ["flint_conditions"]

@@ -21,6 +21,7 @@ from ncs_gym.network.contract import contract_of
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from shields import Certificate
 from shields import certify as smaller_set
+from tests.workers import no_worker_processes
 
 CAMPAIGN = Campaign(seed=0, random_plants=1, envs=32, shielded=True)
 CRUISE = "TruckTrailerCruise-v0, overtaking"
@@ -57,7 +58,7 @@ def test_contracts_are_used_up():
             assert contract_of(case.channel) == case.contract
 
 
-def test_a_block_is_the_same_after_any_other(files):
+def test_batch_has_the_same_counts_after_any_other(files):
     batches = [MonteCarloBatch(CRUISE, 0), MonteCarloBatch(CRUISE, 1), MonteCarloBatch("CartPole-v0, rare", 2)]
     first = [run_batch(CAMPAIGN, batch, files[batch.case]) for batch in batches]
     again = [run_batch(CAMPAIGN, batch, files[batch.case]) for batch in reversed(batches)]
@@ -170,8 +171,10 @@ def test_gaussian_nature_attains_what_is_bounded_and_draws_the_rest(tmp_path):
     assert levels[0].min() >= levels[1].max() * (1.0 - 1e-9)
 
 
-def test_counts_of_gaussian_noise_lie_within_the_bound_and_do_not_end_with_an_error(tmp_path, small, capsys):
-    certify(settings(tmp_path, jobs=1, noise="gaussian", delta=1e-4))
+def test_counts_of_gaussian_noise_lie_within_the_bound_and_do_not_end_with_an_error(
+    tmp_path, small, capsys, without_workers
+):
+    certify(settings(tmp_path, noise="gaussian", delta=1e-4))
     printed = capsys.readouterr().out
     rows = [line for line in printed.partition("interval")[2].splitlines() if line.startswith("TruckTrailer")]
     assert [row.split()[-1] for row in rows] == ["0.031", "0.041"]
@@ -206,50 +209,56 @@ def small(monkeypatch):
 
 
 def settings(out, **changes):
-    return CertifySettings(**{"steps": 1, "out": out, "random_plants": 1, "envs": 16, "jobs": 2, **changes})
+    return CertifySettings(**{"steps": 1, "out": out, "random_plants": 1, "envs": 16, **changes})
 
 
 def document(folder):
     return json.loads((folder / "certify.json").read_text())
 
 
-def test_results_do_not_depend_on_jobs_and_an_interrupted_campaign_goes_on(tmp_path, small, capsys):
-    certify(settings(tmp_path / "two"))
+def test_results_do_not_depend_on_worker_processes(tmp_path, small, capsys):
+    certify(settings(tmp_path / "two", jobs=2))
     table = capsys.readouterr().out
     assert any(line.startswith("all  ") for line in table.splitlines())
-    certify(settings(tmp_path / "one", jobs=1))
-    assert document(tmp_path / "one") == document(tmp_path / "two")
-    assert document(tmp_path / "one")["total"]["steps"] == 6 * 16 * 200
-    log = tmp_path / "one" / "tallies.jsonl"
+    with no_worker_processes():
+        certify(settings(tmp_path / "none"))
+    assert document(tmp_path / "none") == document(tmp_path / "two")
+    assert document(tmp_path / "none")["total"]["steps"] == 6 * 16 * 200
+
+
+def test_interrupted_campaign_goes_on(tmp_path, small, capsys, without_workers):
+    certify(settings(tmp_path))
+    whole = document(tmp_path)
+    log = tmp_path / "tallies.jsonl"
     lines = log.read_bytes().splitlines(keepends=True)
     log.write_bytes(b"".join(lines[:2]) + lines[2][:40])  # killed while it wrote the third
-    certify(settings(tmp_path / "one", jobs=1))
-    assert document(tmp_path / "one") == document(tmp_path / "two")
+    certify(settings(tmp_path))
+    assert document(tmp_path) == whole
     assert len(log.read_bytes().splitlines()) == 6
     capsys.readouterr()
-    certify(settings(tmp_path / "one", jobs=1))  # all there
+    certify(settings(tmp_path))  # all there
     assert "per second" not in capsys.readouterr().out
-    certify(settings(tmp_path / "one", steps=6 * 16 * 200 + 1, jobs=1))
-    assert document(tmp_path / "one")["total"]["steps"] == 7 * 16 * 200
+    certify(settings(tmp_path, steps=6 * 16 * 200 + 1))
+    assert document(tmp_path)["total"]["steps"] == 7 * 16 * 200
     assert len(log.read_bytes().splitlines()) == 7
-    finished = (tmp_path / "one" / "certify.json").read_bytes()
+    finished = (tmp_path / "certify.json").read_bytes()
     for changes in ({"steps": 1}, {"mode": "switch"}):
         with pytest.raises(OtherResultsError, match=next(iter(changes))):
-            certify(settings(tmp_path / "one", **changes))
-        assert (tmp_path / "one" / "certify.json").read_bytes() == finished
-    certify(settings(tmp_path / "one", jobs=1, force=True))
-    assert document(tmp_path / "one") == document(tmp_path / "two")
+            certify(settings(tmp_path, **changes))
+        assert (tmp_path / "certify.json").read_bytes() == finished
+    certify(settings(tmp_path, force=True))
+    assert document(tmp_path) == whole
     assert len(log.read_bytes().splitlines()) == 7
 
 
-def test_another_certificate_makes_stored_counts_void(tmp_path, small, capsys):
-    certify(settings(tmp_path, jobs=1))
+def test_another_certificate_makes_stored_counts_void(tmp_path, small, without_workers):
+    certify(settings(tmp_path))
     first = document(tmp_path)["cases"]
     for file in (tmp_path / "certificates").iterdir():
         certificate = Certificate.load(file)
         if certificate.fingerprint == truck_trailer().fingerprint:
             smaller_set(truck_trailer(), 0.95 * certificate.L, certificate.K).save(file)
-    certify(settings(tmp_path, jobs=1))
+    certify(settings(tmp_path))
     assert len((tmp_path / "tallies.jsonl").read_bytes().splitlines()) == 9
     second = document(tmp_path)["cases"]
     assert second[CRUISE] == first[CRUISE]

@@ -18,6 +18,7 @@ from agents.agent import Agent
 from shields import Certificate, certify
 from tests.command import Run, assert_one_sentence, environment, ncs, ncs_process
 from tests.verdicts import verified
+from tests.workers import no_worker_processes
 
 # A short comparison whose unshielded agents explore enough to violate in training.
 SMOKE = ("compare", "--smoke", "--ppo.log-std", "0.0")
@@ -156,7 +157,8 @@ def test_killed_run_goes_on_by_its_settings_file_and_ends_like_an_uninterrupted_
         time.sleep(0.1)
     assert not (out / "summary.json").exists()
     finished = len(list(units.glob("*.json")))
-    again = ncs("compare", "--config", smoke[0] / "settings.json", "--out", out, "--jobs", 1)
+    with no_worker_processes():
+        again = ncs("compare", "--config", smoke[0] / "settings.json", "--out", out)
     assert again.returncode == 0, again.stderr
     assert f"{finished} of 20 runs were finished before" in again.stderr
     assert (out / "summary.json").read_bytes() == (smoke[0] / "summary.json").read_bytes()
@@ -188,9 +190,9 @@ def test_finished_study_is_not_overwritten(command, smoke):
     assert digests(out) == before
 
 
-def test_finished_study_is_overwritten_by_force(tmp_path):
+def test_finished_study_is_overwritten_by_force(tmp_path, without_workers):
     small = ["compare", "--arms", "unshielded", "--references", "--steps", 64, "--ppo.envs", 2, "--ppo.rollout", 16]
-    small += ["--episodes", 2, "--seeds", 1, "--jobs", 1, "--out", tmp_path]
+    small += ["--episodes", 2, "--seeds", 1, "--out", tmp_path]
     assert ncs(*small).returncode == 0
     kept = (tmp_path / "units" / "unshielded-0.json").read_bytes()
     assert_one_sentence(ncs(*small, "--seed", 1), "(seed 0, now 1)")
@@ -201,7 +203,7 @@ def test_finished_study_is_overwritten_by_force(tmp_path):
     assert (tmp_path / "units" / "unshielded-0.json").read_bytes() != kept
 
 
-def test_short_versions_have_a_folder_of_their_own(tmp_path):
+def test_short_versions_have_a_folder_of_their_own(tmp_path, without_workers):
     (tmp_path / "episode.gif").write_text("mine")
     for command in (["train", "--algo", "A2C"], ["sweep", "--delays", 0, 1, 2, "--losses", 0.3], ["render"]):
         run = ncs(*command, "--smoke", cwd=tmp_path)
@@ -259,8 +261,8 @@ def test_saved_agent_is_evaluated(smoke, tmp_path):
     assert set(worse["arms"]) == {"shield: none"}
 
 
-def test_one_agent_is_trained(tmp_path):
-    run = ncs("train", "--algo", "A2C", "--steps", "1024", "--episodes", "3", "--out", tmp_path / "one")
+def test_one_agent_is_trained(tmp_path, without_workers):
+    run = ncs("train", "--algo", "A2C", "--steps", "256", "--episodes", "3", "--out", tmp_path / "one")
     assert run.returncode == 0, run.stderr
     model = tmp_path / "one" / "models" / "shielded-0"
     assert f"agent: {model}" in run.stdout
@@ -269,9 +271,10 @@ def test_one_agent_is_trained(tmp_path):
     assert Agent.load(model).algorithm == "A2C"
 
 
-def test_agent_behind_lookahead_is_trained_and_evaluated_with_its_horizon(tmp_path):
+def test_agent_behind_lookahead_is_trained_and_evaluated_with_its_horizon(tmp_path, without_workers):
     out = tmp_path / "one"
-    given = ["--arm", "lookahead", "--horizon", "3", "--ppo.envs", "8", "--steps", "1024", "--episodes", "3"]
+    given = ["--arm", "lookahead", "--horizon", "3", "--ppo.envs", "8", "--ppo.rollout", "64", "--steps", "512"]
+    given += ["--episodes", "3"]
     run = ncs("train", "--env", "ncs_gym/BatchReactor-v0", *given, "--out", out)
     assert run.returncode == 0, run.stderr
     assert "from a" in run.stdout
@@ -297,10 +300,10 @@ def test_agent_behind_lookahead_is_trained_and_evaluated_with_its_horizon(tmp_pa
         assert ("from a" in evaluated.stdout) is (mode == "lookahead")
 
 
-def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path):
+def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path, without_workers):
     out = tmp_path / "sweep"
     grid = ["--losses", "0.5", "--delays", "1", "--burst-lengths", "0", "3", "--episodes", "3", "--steps", "512"]
-    run = ncs("sweep", *grid, "--ppo.envs", "4", "--out", out, "--jobs", 1)
+    run = ncs("sweep", *grid, "--ppo.envs", "4", "--ppo.rollout", "128", "--out", out)
     assert run.returncode == 0, run.stderr
     summary = json.loads((out / "summary.json").read_text())
     assert [(cell["loss"], cell["burst_length"]) for cell in summary["cells"]] == [(0.5, 0), (0.5, 3)]

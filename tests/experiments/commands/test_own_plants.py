@@ -49,8 +49,8 @@ def test_certificate_for_a_registered_plant_is_made_and_verified(folder):
     assert_one_sentence(ncs("verify", "certificate.json", "--env", "ncs_gym/TruckTrailer-v0", cwd=folder), "verify")
 
 
-def test_own_plant_is_attacked_behind_every_kind_of_channel(folder):
-    run = ncs("certify", *ENV, "--steps", 1, "--envs", 8, "--jobs", 1, "--out", "c", cwd=folder)
+def test_own_plant_is_attacked_behind_every_kind_of_channel(folder, without_workers):
+    run = ncs("certify", *ENV, "--steps", 1, "--envs", 8, "--out", "c", cwd=folder)
     assert run.returncode == 0, run.stderr
     document = json.loads((folder / "c" / "certify.json").read_text())
     kinds = ("its channel", "perfect", "blackout", "bursts", "overtaking")
@@ -61,7 +61,7 @@ def test_own_plant_is_attacked_behind_every_kind_of_channel(folder):
     assert_one_sentence(ncs("certify", "--env", "own_plants:Plants/Other-v0", cwd=folder), "Plants/Other-v0")
 
 
-def test_own_plant_is_trained_in_and_evaluated_by_its_id(folder):
+def test_own_plant_is_trained_in_and_evaluated_by_its_id(folder, without_workers):
     run = ncs(
         "train", *ENV, "--steps", 64, "--episodes", 2, "--ppo.rollout", 16, "--ppo.envs", 2, "--out", "r", cwd=folder
     )

@@ -10,7 +10,7 @@ ENV = "ncs_gym/TruckTrailer-v0"
 SMALL = ("--steps", 64, "--episodes", 2, "--ppo.envs", 2, "--ppo.rollout", 16)
 
 
-def test_command_trains_with_tuned_settings_and_records_all_of_them(tmp_path):
+def test_command_trains_with_tuned_settings_and_records_all_of_them(tmp_path, without_workers):
     run = ncs("train", "--env", ENV, *SMALL, "--ppo.width", 8, "--out", tmp_path / "r")
     assert run.returncode == 0, run.stderr
     assert f"PPO, settings tuned for {ENV}, as given envs, rollout, width:" in run.stdout

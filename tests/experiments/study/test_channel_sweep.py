@@ -1,4 +1,5 @@
 from dataclasses import replace
+from unittest import mock
 
 import pytest
 
@@ -8,6 +9,7 @@ from experiments.study.channel_sweep import _changed as changed
 from experiments.study.channel_sweep import _points as points_of
 from experiments.study.study_figures import sweep_figure
 from ncs_gym.envs.env import ncs_env
+from tests.workers import no_worker_processes
 
 CRUISE, REACTOR = "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/BatchReactor-v0"
 
@@ -15,7 +17,9 @@ CRUISE, REACTOR = "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/BatchReactor-v0"
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory):
     settings = CompareSettings(env=CRUISE, episodes=3, jobs=1, out=tmp_path_factory.mktemp("sweep"))
-    return channel_sweep(settings), channel_sweep(settings)
+    few = {"_LOSSES": (0.0, 0.9), "_DELAYS": (1, 4), "_QUANTIZATION": (1.0, 4.0)}
+    with no_worker_processes(), mock.patch.multiple("experiments.study.channel_sweep", **few):
+        return channel_sweep(settings), channel_sweep(settings)
 
 
 def test_with_the_error_set_nothing_leaves_and_without_it_the_worst_disturbance_drives_the_state_out(rows):

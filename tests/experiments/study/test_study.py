@@ -5,6 +5,7 @@ import pytest
 
 from experiments.settings import StudySettings
 from experiments.study.study import study
+from tests.workers import no_worker_processes
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 MARKED = "# A page\n\n<!-- ncs study: lead -->\n<!-- end -->\n"
@@ -28,7 +29,8 @@ def finished(tmp_path_factory):
         references=("random+shielded", "lqr+trusting", "lqr+shielded"),
         conditions=("worst-case-disturbance",),
     )
-    study(settings)
+    with no_worker_processes():
+        study(settings)
     return settings
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pytest
 from gymnasium.vector import AutoresetMode
 
 from ncs_gym import LinearPlant, NCSEnv, NCSVectorEnv
 from ncs_gym.network.transmission import ChannelState, LossState
 from ncs_gym.plants.lqr import regulator_gain
 from ncs_gym.processes.simulation import PlantSimulation
+from tests import arrays
 
 
 class RecordingGenerator:
@@ -158,15 +158,15 @@ def compare(many: NCSVectorEnv, steps: int) -> int:
                 single.follow(many, index)
                 continue
             observation, reward, done, _, info = single.replay(actions[index])
-            np.testing.assert_allclose(last[0][index], observation, rtol=1e-6, atol=1e-10)
-            assert rewards[index] == pytest.approx(reward, rel=1e-10, abs=1e-10)
+            arrays.assert_close(last[0][index], observation, rtol=1e-6, atol=1e-10)
+            arrays.assert_close(rewards[index], reward, rtol=1e-10, atol=1e-10)
             assert terminated[index] == done
             assert_same(number, info, last[1], index)
             if begun:
                 single.follow(many, index)
                 continue
             statistics = many._estimator.patterns.table.statistics[many._estimator.statistics[index]]
-            np.testing.assert_allclose(statistics.covariance, single.estimator.belief.covariance, rtol=1e-10)
+            arrays.assert_close(statistics.covariance, single.estimator.belief.covariance, rtol=1e-10)
             if gain.any():  # an unstable plant makes 1e-17 of rounding 1e-10 in an episode
                 single._state = infos["state"][index].copy()
         estimates = infos["estimate"]
@@ -176,5 +176,5 @@ def compare(many: NCSVectorEnv, steps: int) -> int:
 
 def assert_same(number: int, single: dict[str, Any], many: dict[str, Any], index: int) -> None:
     for key, value in single.items():
-        np.testing.assert_allclose(many[key][index], value, rtol=1e-10, atol=1e-10, err_msg=f"step {number}: {key}")
+        arrays.assert_close(many[key][index], value, rtol=1e-10, atol=1e-10, where=(number, key))
         assert np.asarray(value).dtype.kind == many[key].dtype.kind, key

@@ -74,16 +74,19 @@ def test_no_search_over_state_error_disturbance_and_proposal_leaves_the_safe_set
     shield = SafetyFilter(certificate, plant, mode)
     inside = [certificate.safe_set.factor, certificate.error_set.factor, plant.disturbance.factor]
 
-    def level(numbers):
-        balls = numbers[: 3 * n].reshape(3, n)
-        balls = balls / np.maximum(np.linalg.norm(balls, axis=1), 1.0)[:, None]
+    def levels(numbers):  # of many candidates, one per column
+        balls = numbers[: 3 * n].reshape(3, n, -1)
+        balls = balls / np.maximum(np.linalg.norm(balls, axis=1, keepdims=True), 1.0)
         size = numbers[-1]
         x, e, d = (factor @ ball for factor, ball in zip(inside, balls, strict=True))
-        u = shield.decide(x + size * e, size**2 * certificate.Sigma, plant.u_max * numbers[3 * n : -1]).input
-        return -certificate.safe_set.gauge(plant.A @ x + plant.B @ u + d)
+        errors = shield.errors_of_many(size[:, None, None] ** 2 * certificate.Sigma)
+        u = shield.decide_many(x + size * e, errors, plant.u_max[:, None] * numbers[3 * n : -1]).input
+        reached = plant.A @ x + plant.B @ u + d
+        return -np.sqrt(np.einsum("ik,ij,jk->k", reached, certificate.M, reached))
 
     bounds = [(-1.0, 1.0)] * (3 * n + plant.m) + [(1e-3, 1.0)]
-    found = differential_evolution(level, bounds, maxiter=generations, popsize=8, rng=0, polish=False, tol=0.0)
+    settings = {"maxiter": generations, "popsize": 8, "rng": 0, "polish": False, "tol": 0.0}
+    found = differential_evolution(levels, bounds, vectorized=True, updating="deferred", **settings)
     assert -found.fun <= 1.0
     assert -found.fun > (0.5 if mode == "boundary" else 0.9)  # the search does come close
 

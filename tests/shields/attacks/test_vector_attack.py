@@ -21,8 +21,8 @@ EDGES = {
     "longest gap each time": Channel(loss=1.0, max_consecutive_losses=3),
     "overtaking": Channel(loss=0.4, max_consecutive_losses=1, jitter=2),
 }
-# 10 plants by 4 channels and 3 by 3; 3 policies each. Slow: 40 * 3 * 68,000 + 9 * 3 * 68,000 = 1.0e7 steps.
-SLOW_ENVS, SLOW_STEPS = 680, 100
+# Environments and steps of each attack in the ordinary suite and in the slow one.
+SIZES = (40, 40), (680, 100)
 
 
 class ExtremalVectorNoise(NCSVectorEnv):
@@ -86,8 +86,14 @@ def assert_safe(results):
 POLICIES = {"random": "boundary", "outwards": "project", "gain turned round": "switch"}
 
 
+def vector_attack_steps(suite):
+    """Steps of all attacks in the ordinary suite (0) or in the slow one (1)."""
+    count, steps = SIZES[suite]
+    return (len(PLANTS) * len(CHANNELS) + len(UNSTABLE) * len(EDGES)) * len(POLICIES) * count * steps
+
+
 @pytest.mark.parametrize(
-    ("count", "steps"), [(40, 40), pytest.param(SLOW_ENVS, SLOW_STEPS, marks=pytest.mark.slow)], ids=["some", "many"]
+    ("count", "steps"), [SIZES[0], pytest.param(*SIZES[1], marks=pytest.mark.slow)], ids=["some", "many"]
 )
 @pytest.mark.parametrize("channel", CHANNELS)
 @pytest.mark.parametrize("name", PLANTS)
@@ -100,7 +106,7 @@ def test_no_environment_leaves_its_safe_set(name, channel, count, steps):
 
 
 @pytest.mark.parametrize(
-    ("count", "steps"), [(40, 40), pytest.param(SLOW_ENVS, SLOW_STEPS, marks=pytest.mark.slow)], ids=["some", "many"]
+    ("count", "steps"), [SIZES[0], pytest.param(*SIZES[1], marks=pytest.mark.slow)], ids=["some", "many"]
 )
 @pytest.mark.parametrize("channel", EDGES)
 @pytest.mark.parametrize("name", UNSTABLE)

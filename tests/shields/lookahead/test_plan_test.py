@@ -93,7 +93,7 @@ def farthest(plant, certificate, x_hat, shape, plan, step, rng):
 def test_certified_plans_keep_every_possible_state_in_the_box_and_end_in_the_safe_set(case):
     plant, certificate, test = case
     rng = np.random.default_rng(1)
-    estimates, shapes, plans = beliefs(plant, certificate, rng, 60)
+    estimates, shapes, plans = beliefs(plant, certificate, rng, 40)
     certified = test.certified(estimates, test.tightenings_of(shapes), plans)[:, 0]
     lengths, levels = 0, []
     for x_hat, shape, (plan,), passed in zip(estimates, shapes, plans, certified, strict=True):

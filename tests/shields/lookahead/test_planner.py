@@ -75,7 +75,7 @@ def best_distance(shield, x_hat, shape, proposed, length):
 def test_input_applied_is_as_close_to_the_proposal_as_an_independent_solver_gets(name):
     shield, rng = shield_of(name), np.random.default_rng(0)
     reasons, apart = [], []
-    for x_hat, shape, proposed in zip(*beliefs(shield, rng, 60), strict=True):
+    for x_hat, shape, proposed in zip(*beliefs(shield, rng, 30), strict=True):
         decision = shield.decide(x_hat, shape, proposed)
         reasons.append(decision.reason)
         best = min(best_distance(shield, x_hat, shape, proposed, length) for length in (1, shield.horizon))

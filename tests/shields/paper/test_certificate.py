@@ -155,18 +155,25 @@ def test_units_of_the_state_change_nothing(unit, paper):
     np.testing.assert_allclose(certificate.L / unit**2, paper.L, rtol=1e-4)
 
 
+@pytest.fixture
+def coarse_scan(monkeypatch):
+    """A scan of the domain that is enough to name the constraint that binds."""
+    monkeypatch.setattr("shields.paper.feasibility._KAPPAS", np.linspace(0.01, 0.995, 40))
+    monkeypatch.setattr("shields.paper.feasibility._RHO_FRACTIONS", np.linspace(0.0, 1.0, 14) ** 2)
+
+
 def one_state(A, B, u_max, gamma, Q, P0):
     return LinearPlant(
         A=[[A]], B=[[B]], box=[[1.0]], u_max=u_max, dt=0.1, gamma=gamma, process_noise_cov=[[Q]], initial_cov=[[P0]]
     )
 
 
-def test_a_plant_no_gain_can_contract_is_infeasible_not_falsely_certified():
+def test_a_plant_no_gain_can_contract_is_infeasible_not_falsely_certified(coarse_scan):
     with pytest.raises(Infeasible):
         synthesize(one_state(0.999, 1e-6, 1.0, 1e-12, 1e-13, 1e-12), method="paper")
 
 
-def test_an_input_limit_that_binds_is_named():
+def test_an_input_limit_that_binds_is_named(coarse_scan):
     with pytest.raises(Infeasible, match="input limit") as caught:
         synthesize(one_state(1.5, 1.0, 0.4, 9.985e-4, 9.985e-4, 9.985e-4), method="paper")
     assert caught.value.binding == "C5"

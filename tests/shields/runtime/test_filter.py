@@ -24,17 +24,20 @@ def many(shield, estimates, shapes, inputs):
 
 def worst_next_level(certificate, plant, estimate, shape, u, rng, tries=20):
     """Largest x+' M x+ over the states the estimate allows and all disturbances, by ascent from many starts."""
-    M, errors = certificate.M, Ellipsoid(shape)
+    M, D = certificate.M, plant.disturbance.shape
     center = plant.A @ estimate + plant.B @ u
-    worst = 0.0
-    for _ in range(tries):
-        e, d = errors.sample_boundary(rng), plant.disturbance.sample_boundary(rng)
-        for _ in range(40):
-            slope = M @ (center - plant.A @ e + d)
-            e, d = errors.extreme_point(-plant.A.T @ slope), plant.disturbance.extreme_point(slope)
-        end = center - plant.A @ e + d
-        worst = max(worst, float(end @ M @ end))
-    return worst
+    e, d = Ellipsoid(shape).sample_boundary(rng, tries), plant.disturbance.sample_boundary(rng, tries)
+    for _ in range(40):
+        slopes = (center - e @ plant.A.T + d) @ M
+        e, d = farthest(shape, -slopes @ plant.A), farthest(D, slopes)
+    ends = center - e @ plant.A.T + d
+    return float(np.einsum("ki,ij,kj->k", ends, M, ends).max())
+
+
+def farthest(shape, directions):
+    """The points of E(shape) farthest in each direction, rows of shape (k, n)."""
+    images = directions @ shape
+    return images / np.sqrt(np.einsum("ki,ki->k", directions, images))[:, None]
 
 
 @pytest.fixture(scope="module", params=[(2, 1), (3, 2), (4, 3)], ids=str)

@@ -54,7 +54,7 @@ def test_shield_goes_on_when_draws_leave_their_ellipsoids(name, mode):
     _, infos = many.reset(seed=0)
     _, info = one.reset(seed=0)
     escaped, alarms, reasons = False, 0, set()
-    for _ in range(150):
+    for _ in range(80):
         *_, infos = many.step(rng.uniform(-1.0, 1.0, many.action_space.shape).astype(np.float32))
         *_, info = one.step(rng.uniform(-1.0, 1.0, plant.m).astype(np.float32))
         for each in (infos, info):

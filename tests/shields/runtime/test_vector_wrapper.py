@@ -12,6 +12,7 @@ from shields.runtime.filter import MODES
 from shields.runtime.guarantee import EXPLANATIONS, OTHER_STEPS, GuaranteeMonitor, LoopObservation, start_known
 from shields.runtime.guarded_filter import first_store
 from shields.runtime.vector_wrapper import Clock, _moved, overridden
+from tests import arrays
 from tests.certificates import certificate_of
 from tests.shields.attacks.extremes import CHANNELS, TRUCKS, harmful
 
@@ -86,14 +87,14 @@ def drive(env, steps, policy):
                 assert row["shield_correction"] == 0.0
                 assert row["shield_margin"] == pytest.approx(one.margin(np.zeros(inner.plant.m)), abs=1e-12)
             else:
-                np.testing.assert_allclose(row["input"], decision.input, rtol=3e-7, atol=1e-9)
+                arrays.assert_close(row["input"], decision.input, rtol=3e-7, atol=1e-9)
                 one.step(decision._replace(input=row["input"]), row)
                 plans.append(len(one.stored))
                 counts[e] += decision.intervened
                 assert row["shield_intervened"] == decision.intervened
-                assert row["shield_margin"] == pytest.approx(decision.margin, abs=1e-6)
+                arrays.assert_close(row["shield_margin"], decision.margin, rtol=1e-6, atol=1e-6)
                 correction = np.linalg.norm(row["input"] - row["input_proposed"])
-                assert row["shield_correction"] == pytest.approx(correction, abs=1e-12)
+                arrays.assert_close(row["shield_correction"], correction, rtol=1e-6, atol=1e-12)
             assert row.get("shield_plan_length", 0) == len(one.stored)
             assert row["shield_reason"] == one.reason
             assert row["shield_guaranteed"] == (not one.reason)
@@ -162,7 +163,7 @@ def test_error_shapes_that_the_environment_forgets_and_meets_again_change_nothin
         runs.append(infos)
     for one, other in zip(*runs, strict=True):
         for key, value in one.items():
-            np.testing.assert_array_equal(value, other[key])
+            arrays.assert_equal(value, other[key])
 
 
 def test_start_on_the_boundary_of_the_safe_set_is_known_in_batches_too():

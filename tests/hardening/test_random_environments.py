@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from ncs_gym import Channel, ChannelContract, ErrorSetError, NCSVectorEnv, cart_pole
 from ncs_gym.envs.env import NCSEnv
-from tests.fuzz import examples, plants, worlds
+from tests.fuzz import environment_settings, examples, plants
 
 # A plant so strongly coupled that float64 holds no error set is refused by name.
 REFUSED = (ErrorSetError,)
@@ -75,21 +75,21 @@ def run_vector(settings, seed, steps, mode):
         assert (terminated | truncated).any() or mode == "SameStep" or "final_info" not in info
 
 
-@given(settings=worlds(), seed=st.integers(0, 1000))
+@given(settings=environment_settings(), seed=st.integers(0, 1000))
 @examples(60)
-def test_random_worlds_run(settings, seed):
+def test_random_environments_run(settings, seed):
     run_scalar(settings, seed, 25)
 
 
-@given(settings=worlds(), seed=st.integers(0, 1000), mode=st.sampled_from(["NextStep", "SameStep"]))
+@given(settings=environment_settings(), seed=st.integers(0, 1000), mode=st.sampled_from(["NextStep", "SameStep"]))
 @examples(40)
-def test_random_worlds_run_many_at_once(settings, seed, mode):
+def test_random_vector_environments_run(settings, seed, mode):
     run_vector(settings, seed, 16, mode)
 
 
-@given(settings=worlds(most_states=3, units=3.0), seed=st.integers(0, 1000))
+@given(settings=environment_settings(most_states=3, units=3.0), seed=st.integers(0, 1000))
 @examples(8)
-def test_random_worlds_pass_the_checks_of_gymnasium(settings, seed):
+def test_random_environments_pass_the_checks_of_gymnasium(settings, seed):
     env = made(NCSEnv, **settings)
     if env is not None:
         with warnings.catch_warnings():
@@ -98,9 +98,9 @@ def test_random_worlds_pass_the_checks_of_gymnasium(settings, seed):
 
 
 @pytest.mark.slow
-@given(settings=worlds(), seed=st.integers(0, 10**6), mode=st.sampled_from(["NextStep", "SameStep"]))
+@given(settings=environment_settings(), seed=st.integers(0, 10**6), mode=st.sampled_from(["NextStep", "SameStep"]))
 @examples(1500, same=False)
-def test_many_random_worlds_run(settings, seed, mode):
+def test_many_random_environments_run(settings, seed, mode):
     run_scalar(settings, seed, 100)
     run_vector(settings, seed, 60, mode)
 

@@ -1,0 +1,62 @@
+"""Worker processes that are none: what a command gives them runs in this process, which has imported everything.
+
+For tests of what a command does; that results do not depend on the process is tested where worker processes are.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import pickle
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
+from queue import Queue
+from threading import Event
+from typing import Any
+from unittest import mock
+
+from experiments.attack import monte_carlo_batch
+
+
+class _Executor(Executor):
+    """Executes at once what is submitted; arguments and results are pickled as on their way to a process and back."""
+
+    def __init__(self, *arguments: Any, **settings: Any) -> None:
+        monte_carlo_batch._shields.cache_clear()  # a new process has prepared none
+
+    def submit(self, function: Callable[..., Any], /, *arguments: Any) -> Future:
+        future: Future = Future()
+        sent = [each if isinstance(each, Queue | Event) else pickle.loads(pickle.dumps(each)) for each in arguments]
+        try:
+            future.set_result(pickle.loads(pickle.dumps(function(*sent))))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+class _Manager:
+    """Makes queues and events of this process."""
+
+    Queue, Event = Queue, Event
+
+    def __init__(self, **settings: Any) -> None:
+        pass
+
+    def start(self, initializer: Callable[[], None]) -> None:
+        pass
+
+    def __enter__(self) -> _Manager:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+
+@contextlib.contextmanager
+def no_worker_processes() -> Iterator[None]:
+    """Commands execute their training runs and batches in this process."""
+    with (
+        mock.patch("experiments.backends.processes.ProcessPoolExecutor", _Executor),
+        mock.patch("experiments.backends.processes.SyncManager", _Manager),
+        mock.patch("experiments.attack.campaign_execution.ProcessPoolExecutor", _Executor),
+    ):
+        yield
