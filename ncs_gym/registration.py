@@ -40,6 +40,8 @@ _KINDS: dict[str, tuple[type, ...]] = {
     "disturbance": DISTURBANCES,
     "initial_set": (Ellipsoid,),
     "contract": (ChannelContract,),
+    "downlink": (Channel,),
+    "downlink_contract": (ChannelContract,),
 }
 
 
@@ -55,6 +57,7 @@ class Scenario:
         contract: What the default channel promises; for the scenario's own plant only.
         terminates: Whether a violation ends the episode by default: an unstable plant does not come back.
         start: Radius of the disc of starts, for plants of two states; None and elsewhere: `NCSEnv`'s default.
+        downlink: Default downlink; None for an ideal one.
     """
 
     plant: Callable[[], LinearPlant] | None
@@ -64,6 +67,7 @@ class Scenario:
     contract: ChannelContract | None = None
     terminates: bool = False
     start: float | None = None
+    downlink: Channel | None = None
     metadata: ClassVar[dict[str, Any]] = NCSEnv.metadata
 
     def __call__(self, **settings: Any) -> NCSEnv:
@@ -89,6 +93,7 @@ class Scenario:
         """
         plant = as_plant(plant)
         own: dict[str, Any] = {"channel": self.channel, "task": self.task, "terminate_on_violation": self.terminates}
+        own["downlink"] = self.downlink
         if plant is None:
             if self.plant is None:
                 raise ValueError(

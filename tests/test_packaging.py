@@ -25,6 +25,7 @@ LAYERS = {
         {"uncertainty", "plants"},
         {"network", "tasks", "processes"},
         {"estimation", "rendering"},
+        {"downlink"},
         {"envs"},
         {"json_settings"},
         {"registration"},
