@@ -37,7 +37,7 @@ LAYERS = {
         {"certificate_file", "certificate_text"},
         {"certificate"},
         {"verification", "paper", "synthesis"},
-        {"runtime"},
+        {"runtime", "downlink"},
         {"lookahead"},
     ),
     "agents": (

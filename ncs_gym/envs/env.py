@@ -263,6 +263,10 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         if self._renderer is not None:
             self._renderer.annotate(annotation)
 
+    def beliefs(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Returns estimate and error shape of now and of every step until the next decision takes effect."""
+        return self._downlink.beliefs()
+
     def close(self) -> None:
         """Closes the window and the process."""
         self._process.close()

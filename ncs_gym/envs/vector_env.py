@@ -93,6 +93,10 @@ class NCSVectorEnv(VectorEnv):
         """
         return self._estimator.patterns.table, self._belief[1]
 
+    def beliefs(self, chosen: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Returns what `NCSEnv.beliefs` does for some environments, by index: estimates (n, k), `error_shapes`."""
+        return self._downlink.beliefs(chosen)
+
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
