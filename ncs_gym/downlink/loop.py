@@ -86,13 +86,13 @@ class CommittedDownlink(IdealDownlink):
         self.in_flight: ChannelState
 
     def begin(self, rng: np.random.Generator) -> None:  # noqa: D102
-        self.in_flight = ChannelState(self._channel, rng)
-        self._actuator.start(self._estimator.episode)
+        self.in_flight, self._episode = ChannelState(self._channel, rng), self._estimator.episode
+        self._actuator.start(self._episode)
         self._inputs.start()
 
     def exchange(self, rng: np.random.Generator, step: int, u: np.ndarray) -> Inputs:  # noqa: D102
         self._inputs.commit(u)
-        arrived: list[Command] = self.in_flight.carry(rng, step, self._inputs.command(step, self._estimator.episode))
+        arrived: list[Command] = self.in_flight.carry(rng, step, self._inputs.command(step, self._episode))
         self._actuator.receive(arrived)
         self._inputs.pop()
         return Inputs(self._actuator.apply(step), u, self._actuator.missing)

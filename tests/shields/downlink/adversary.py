@@ -57,7 +57,9 @@ class Case:
         ages = self.contract.max_age + contract_of(self.downlink).max_age
         return certificate_of(self.plant, ChannelContract(ages))
 
-    def env(self, count: int, policy: str, start: float = 0.3, kind: type = ExtremalVectorNoise, **settings: Any) -> Any:
+    def env(
+        self, count: int, policy: str, start: float = 0.3, kind: type = ExtremalVectorNoise, **settings: Any
+    ) -> Any:
         """Environments whose starts, first errors, noise and disturbances lie on the boundaries of their sets."""
         certificate = self.certificate
         contract = None if certificate.ages is None else certificate.ages.sets.contract
