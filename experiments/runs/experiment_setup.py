@@ -76,7 +76,7 @@ class ExperimentSetup:
         env = ncs_env(ControlLoop(env=name, channel=channel, noise=noise).single()) if changed else own
         if certificate_file is None:
             with synthesis_status() as show:
-                certificate = certificate_for(env.plant, env.contract, show)
+                certificate = certificate_for(env.plant, env.certificate_contract, show)
         else:
             certificate = Certificate.load(certificate_file)
             require_valid(certificate, env.plant)
