@@ -111,7 +111,8 @@ def main() -> None:
         picture(options.picture)
         return
     print(
-        f"{'environment':24s}{'c':>3s}{'max_age':>9s}{'S in box':>10s}{'overridden':>12s}{'return':>10s}{'violations':>12s}"
+        f"{'environment':24s}{'c':>3s}{'max_age':>9s}{'S in box':>10s}"
+        f"{'overridden':>12s}{'return':>10s}{'violations':>12s}"
     )
     for env_id in options.envs:
         for lead in options.leads:

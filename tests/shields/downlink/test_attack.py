@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
+from shields import VectorSafetyShield
+from tests.shields.attacks.test_vector_attack import ExtremalVectorNoise
 from tests.shields.downlink.adversary import PLANTS, POLICIES, Case, attack, edges
+from tests.shields.lookahead.adversary import box_ellipsoid
 
 # 3 downlinks by 3 policies per plant: 9 * 1,112 * 100 = 1.0e6 steps each.
 SLOW_ENVS, SLOW_STEPS = 1112, 100
@@ -61,3 +64,39 @@ def test_runs_of_losses_are_exactly_as_long_as_promised():
         newest.append(env.steps - 1 - env._downlink._newest)
     assert np.max(newest[4:]) == 3  # with one loss more nothing in the buffer would be for now
     assert set(np.ravel(newest[4:])) == {0, 1, 2, 3}
+
+
+@pytest.mark.parametrize(
+    ("count", "steps"), [(10, 40), pytest.param(1000, 1000, marks=pytest.mark.slow)], ids=["some", "many"]
+)
+@pytest.mark.parametrize(("name", "horizon"), [("cruise", 3), ("cart-pole", 12), ("batch reactor", 6)])
+def test_lookahead_keeps_guaranteed_states_in_the_box(name, horizon, count, steps):
+    attacked = case(name, "runs")
+    env = ExtremalVectorNoise(
+        count,
+        plant=attacked.plant,
+        channel=attacked.uplink,
+        contract=attacked.contract,
+        downlink=attacked.downlink,
+        disturbance="adversarial",  # pushes the row with the least room
+        initial_set=box_ellipsoid(attacked.plant, 0.6),
+        max_episode_steps=37,
+    )
+    shield = VectorSafetyShield(env, attacked.certificate, "lookahead", horizon=horizon)
+    rng = np.random.default_rng(0)
+    _, info = shield.reset(seed=0)
+    held, episodes, guaranteed, outside, planned = info["shield_guaranteed"], env.episodes.copy(), 0.0, 0, 0
+    for _ in range(steps):
+        push = np.sign(info["estimate"] @ env.plant.A.T @ env.plant.weight @ env.plant.B)
+        actions = np.where(rng.random((count, 1)) < 0.5, push, rng.uniform(-1, 1, (count, env.plant.m)))
+        *_, info = shield.step(actions)
+        went_on, episodes = env.episodes == episodes, env.episodes.copy()
+        assert not (held & went_on & ~info["shield_guaranteed"]).any(), set(info["shield_reason"])
+        held = info["shield_guaranteed"]
+        assert (info["constraint_values"][held] <= 0.0).all()
+        guaranteed += held.mean() / steps
+        planned += np.count_nonzero(info["shield_plan_length"])
+        outside += np.count_nonzero(held & (attacked.certificate.safe_set.gauge(info["state"]) > 1.0))
+    assert guaranteed > 0.3
+    assert planned > 0
+    assert outside > 0
