@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from ncs_gym.downlink.committed_inputs import CommittedInputs
 from ncs_gym.downlink.protocol import DownlinkProtocol
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.transmission import ChannelState
+from ncs_gym.tasks.task import Task
 
 
 class Inputs(NamedTuple):
@@ -26,6 +26,13 @@ class Inputs(NamedTuple):
     applied: np.ndarray
     committed: np.ndarray
     missing: np.ndarray | bool
+
+
+def no_inputs(inputs: int, size: int | None = None) -> Inputs:
+    """Returns the inputs at a reset: zeros, shape (m,), or (m, N) for a size."""
+    if size is None:
+        return Inputs(np.zeros(inputs), np.zeros(inputs), False)
+    return Inputs(np.zeros((inputs, size)), np.zeros((inputs, size)), np.zeros(size, np.bool_))
 
 
 class IdealDownlink:
@@ -52,10 +59,9 @@ class IdealDownlink:
         """Takes the input decided at a step, shape (m,), and returns what is applied then."""
         return Inputs(u, u, False)
 
-    @property
-    def pending(self) -> Sequence[np.ndarray]:
-        """The committed inputs of the next c steps, shape (m,) each."""
-        return ()
+    def predicted(self, task: Task, task_state: Any) -> Any:
+        """Returns what is known of the task's state at the time at which the next decision takes effect."""
+        return task_state
 
     def belief(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimate, (n,), and error shape, (n, n), of the time at which the next decision takes effect."""
@@ -97,9 +103,10 @@ class CommittedDownlink(IdealDownlink):
         self._inputs.pop()
         return Inputs(self._actuator.apply(step), u, self._actuator.missing)
 
-    @property
-    def pending(self) -> Sequence[np.ndarray]:  # noqa: D102
-        return self._inputs.pending
+    def predicted(self, task: Task, task_state: Any) -> Any:  # noqa: D102
+        for u in self._inputs.pending:
+            task_state = task.predict(self._estimator.plant, task_state, u)
+        return task_state
 
     def belief(self) -> tuple[np.ndarray, np.ndarray]:  # noqa: D102
         return self._estimator.predicted(self._inputs.pending)

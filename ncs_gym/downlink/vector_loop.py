@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from ncs_gym.downlink.prediction import PredictedStatistics
 from ncs_gym.downlink.protocol import DownlinkProtocol
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.transmission import VectorChannelState
+from ncs_gym.tasks.task import Task
 
 # Stamp of the newest command where none has arrived.
 NEVER = -(2**31)
@@ -42,10 +42,9 @@ class VectorIdealDownlink:
         """Takes the inputs decided at steps (N,) of the episodes, shape (m, N), and returns what is applied then."""
         return Inputs(u, u, self._on_time)
 
-    @property
-    def pending(self) -> Sequence[np.ndarray]:
-        """The committed inputs of the next c steps, shape (m, N) each."""
-        return ()
+    def predicted(self, task: Task, task_state: np.ndarray) -> np.ndarray:
+        """Returns what is known of the task's states at the time at which the next decisions take effect."""
+        return task_state
 
     def belief(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimates, (n, N), and numbers of error statistics, (N,), of the time of the next effect."""
@@ -95,9 +94,10 @@ class VectorCommittedDownlink(VectorIdealDownlink):
         missing = (self._newest < steps - self.lead) & (steps >= self.lead)
         return Inputs(np.where(missing, 0.0, scheduled), u, missing)
 
-    @property
-    def pending(self) -> Sequence[np.ndarray]:  # noqa: D102
-        return self._inputs
+    def predicted(self, task: Task, task_state: np.ndarray) -> np.ndarray:  # noqa: D102
+        for u in self._inputs:
+            task_state = task.predict_many(self._estimator.plant, task_state, u)
+        return task_state
 
     def belief(self) -> tuple[np.ndarray, np.ndarray]:  # noqa: D102
         estimator = self._estimator

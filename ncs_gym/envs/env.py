@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
-from ncs_gym.downlink.loop import Inputs, downlink_of
+from ncs_gym.downlink.loop import Inputs, downlink_of, no_inputs
 from ncs_gym.envs.contracts import loop_contracts
 from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.reset_options import start_option
@@ -90,8 +90,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     | `contract_broken` | whether the newest sample used is older now than the channel's contract allows |
     | `downlink_broken` | whether zero is applied now because the input committed for now has not arrived |
 
-    Behind a downlink an action takes effect c steps later (docs/contracts.md, "Both directions"): `estimate`,
-    `error_shape` and the observation belong to that time, everything else to the present.
+    Behind a downlink `estimate`, `error_shape` and observation belong to the time at which the next action acts.
 
     Args:
         plant: The plant with its bounds.
@@ -110,8 +109,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         noise: "truncated", or "gaussian" for process noise, sensor noise and first errors without a bound: what is
             proved then holds with the probability that `escape_probability` leaves (docs/shield.md).
         process: What really moves (docs/beyond_linear.md); the plant's own equations by default.
-        downlink: The network between controller and actuator (loss, delay, jitter and max_consecutive_losses); ideal
-            by default.
+        downlink: The network between controller and actuator (docs/contracts.md); ideal by default.
         downlink_contract: What is assumed of it, which it may then break; by default what its settings guarantee.
 
     Attributes:
@@ -209,8 +207,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self.episodes += 1
         self._violations = 0.0
         self._consistent = True
-        nothing = np.zeros(self.plant.m)
-        info = self._info(Inputs(nothing, nothing, False), arrived=False)
+        info = self._info(no_inputs(self.plant.m), arrived=False)
         if self._renderer is not None:
             self._renderer.begin(info, self._task_state)
         return self._observation(), info
@@ -277,9 +274,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         return (1.0 - SAMPLE_ROUNDING) * self.initial_set.sample(rng)
 
     def _observation(self) -> np.ndarray:
-        task_state = self._task_state
-        for u in self._downlink.pending:
-            task_state = self.task.predict(self.plant, task_state, u)
+        task_state = self._downlink.predicted(self.task, self._task_state)
         entries = np.concatenate([self._belief[0], self.task.observe(task_state)])
         return np.minimum(np.maximum(entries, self._low), self._high).astype(np.float32)
 
@@ -288,10 +283,9 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         cost = 1.0 if max(values.tolist()) > 0.0 else 0.0
         self._violations += cost
         constraints = values, cost, self._violations
-        mean, shape = self._belief = self._downlink.belief()
-        belief = mean, shape.copy()
+        self._belief = self._downlink.belief()
         alarm = self.estimator.alarm or self._process.alarm
-        return loop_info(self.estimator, belief, self.contract, self._state, inputs, arrived, constraints, alarm)
+        return loop_info(self.estimator, self._belief, self.contract, self._state, inputs, arrived, constraints, alarm)
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:

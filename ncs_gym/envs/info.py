@@ -26,7 +26,7 @@ def loop_info(
 
     Args:
         estimator: Gives the present estimate, and age.
-        belief: Estimate, shape (n,) or (n, N), and error shape as a fresh array, (n, n) or (N, n, n), of the time at
+        belief: Estimate, shape (n,) or (n, N), and error shape, (n, n) or as a fresh array (N, n, n), of the time at
             which the next input takes effect.
         contract: What the channel guarantees, if anything.
         state: x, shape (n,) or (n, N).
@@ -45,7 +45,7 @@ def loop_info(
         "state": state.copy().T,
         "estimate": estimate.copy().T,
         "estimation_error": (estimator.mean - state).T,
-        "error_shape": error_shape,
+        "error_shape": error_shape if many else error_shape.copy(),
         "input": applied.copy().T,
         "input_committed": committed.copy().T,
         "constraint_values": values.T,

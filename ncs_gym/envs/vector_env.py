@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from ncs_gym.downlink.loop import Inputs
+from ncs_gym.downlink.loop import Inputs, no_inputs
 from ncs_gym.downlink.vector_loop import vector_downlink_of
 from ncs_gym.envs.env import SAMPLE_ROUNDING, NCSEnv, RenderModeError
 from ncs_gym.envs.info import loop_info
@@ -120,7 +120,7 @@ class NCSVectorEnv(VectorEnv):
             raise gym.error.ResetNeeded("reset all environments first")
         self._consistent = False
         self._begin(mask, starts)
-        info = self._info(self._no_inputs(), np.zeros(self.num_envs, np.bool_), mask)
+        info = self._info(no_inputs(self.plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), mask)
         self._consistent = True
         return self._observation(), info
 
@@ -232,18 +232,11 @@ class NCSVectorEnv(VectorEnv):
 
     def _observation(self) -> np.ndarray:
         """Returns the observations, shape (N, n + extra)."""
-        task_state = self._task_state
-        for u in self._downlink.pending:
-            task_state = self.task.predict_many(self.plant, task_state, u)
+        task_state = self._downlink.predicted(self.task, self._task_state)
         entries = np.concatenate([self._belief[0], self.task.observe_many(task_state)])
         observation = np.empty(entries.shape, np.float32)
         np.minimum(np.maximum(entries, self._low), self._high, out=observation, casting="same_kind")
         return observation.T
-
-    def _no_inputs(self) -> Inputs:
-        """Returns the inputs of a reset, which are zero."""
-        nothing = np.zeros((self.plant.m, self.num_envs))
-        return Inputs(nothing, nothing, np.zeros(self.num_envs, np.bool_))
 
     def _info(self, inputs: Inputs, arrived: np.ndarray, counted: np.ndarray | None) -> dict[str, Any]:
         """Returns the infos; the costs of environments that are not `counted`, shape (N,), do not count once more."""
@@ -264,7 +257,7 @@ class NCSVectorEnv(VectorEnv):
         final |= {f"_{key}": done.copy() for key in info}
         final_observation = _where(done, observation, np.zeros_like(observation))
         self._begin(done, None)
-        fresh = self._info(self._no_inputs(), np.zeros(self.num_envs, np.bool_), done)
+        fresh = self._info(no_inputs(self.plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), done)
         merged = {key: _where(done, fresh[key], value) for key, value in info.items()}
         return _where(done, self._observation(), observation), merged | {
             "final_obs": final_observation,
