@@ -42,13 +42,13 @@ def loop_info(
     many = state.ndim > 1
     broken = age > contract.max_age if contract is not None else np.zeros(age.shape, np.bool_) if many else False
     return {
-        "state": state.copy().T,
-        "estimate": estimate.copy().T,
-        "estimation_error": (estimator.mean - state).T,
+        "state": state.copy().T if many else state.copy(),
+        "estimate": estimate.copy().T if many else estimate.copy(),
+        "estimation_error": (estimator.mean - state).T if many else estimator.mean - state,
         "error_shape": error_shape if many else error_shape.copy(),
-        "input": applied.copy().T,
-        "input_committed": committed.copy().T,
-        "constraint_values": values.T,
+        "input": applied.copy().T if many else applied.copy(),
+        "input_committed": committed.copy().T if many else committed.copy(),
+        "constraint_values": values.T if many else values,
         "cost": cost,
         "measurement_age": age.copy() if many else age,
         "packet_arrived": arrived,
@@ -56,5 +56,5 @@ def loop_info(
         "episode_violations": violations,
         "is_success": (violations == 0.0) * 1.0,
         "contract_broken": broken,
-        "downlink_broken": missing.copy() if isinstance(missing, np.ndarray) else missing,
+        "downlink_broken": np.copy(missing) if many else missing,
     }
