@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from experiments.runs.provenance import versions
 from experiments.runs.synthesis_status import synthesis_status
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings, ChannelSettings, LearningSettings, settings_json
-from ncs_gym import Channel, LinearPlant
+from ncs_gym import Channel, LinearPlant, NCSEnv
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, Report, verify
 from shields.certificate_text import size_of
@@ -37,6 +37,7 @@ class ExperimentSetup:
         verification: Exact verification of the certificate.
         module: Module of the user's that registers the environment; empty for one of this package.
         noise: "truncated", or "gaussian" for noise without a bound.
+        downlink: Channel that replaces the environment's own downlink; None keeps it.
     """
 
     env: str
@@ -46,6 +47,7 @@ class ExperimentSetup:
     verification: Report
     module: str = ""
     noise: str = "truncated"
+    downlink: Channel | None = None
 
     @classmethod
     def of(
@@ -54,6 +56,7 @@ class ExperimentSetup:
         channel: ChannelSettings | Channel | None,
         certificate_file: Path | None = None,
         noise: str = "truncated",
+        downlink_loss: float | None = None,
     ) -> ExperimentSetup:
         """Returns the setup of a registered environment, with another channel or with changes of its own channel.
 
@@ -62,25 +65,28 @@ class ExperimentSetup:
             channel: Replaces or changes the environment's own channel; None keeps it.
             certificate_file: File of the certificate; by default one is synthesized.
             noise: "truncated", or "gaussian" for noise without a bound.
+            downlink_loss: Loss probability of the environment's own downlink in place of its own; None keeps it.
 
         Raises:
-            ValueError: If the environment is unknown or has no plant of its own, or it cannot have the channel or the
-                noise.
+            ValueError: If the environment is unknown or has no plant of its own, has no downlink although one is to be
+                changed, or cannot have the channel or the noise.
             CertificateError: If a given certificate is damaged or does not verify for the plant.
             Infeasible: If no certificate is found.
         """
         own, (module, name) = registered_env(env_id), module_and_id(env_id)
         if isinstance(channel, ChannelSettings):
             channel = channel.applied_to(own.channel)
-        changed = channel is not None or noise != "truncated"
-        env = ncs_env(ControlLoop(env=name, channel=channel, noise=noise).single()) if changed else own
+        downlink = None if downlink_loss is None else replace(_downlink_of(own, env_id), loss=downlink_loss)
+        loop = ControlLoop(env=name, channel=channel, downlink=downlink, noise=noise)
+        changed = channel is not None or downlink is not None or noise != "truncated"
+        env = ncs_env(loop.single()) if changed else own
         if certificate_file is None:
             with synthesis_status() as show:
                 certificate = certificate_for(env.plant, env.certificate_contract, show)
         else:
             certificate = Certificate.load(certificate_file)
             require_valid(certificate, env.plant)
-        return cls(name, channel, env.plant, certificate, verify(certificate, env.plant), module, noise)
+        return cls(name, channel, env.plant, certificate, verify(certificate, env.plant), module, noise, downlink)
 
     @property
     def title(self) -> str:
@@ -104,6 +110,7 @@ class ExperimentSetup:
             env=self.env,
             module=self.module,
             channel=self.channel,
+            downlink=self.downlink,
             noise=self.noise,
             seed=settings.seed,
             index=index,
@@ -133,3 +140,14 @@ class ExperimentSetup:
             "certificate_file": self.certificate.document,
             "versions": versions(),
         }
+
+
+def _downlink_of(env: NCSEnv, env_id: str) -> Channel:
+    """Returns an environment's own downlink.
+
+    Raises:
+        ValueError: If it has none.
+    """
+    if env.downlink is None:
+        raise ValueError(f"{env_id} has an ideal downlink, which loses nothing: choose an environment with a downlink")
+    return env.downlink.channel

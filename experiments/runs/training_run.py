@@ -41,6 +41,7 @@ class TrainingRun:
         env: Id of a registered environment.
         module: Module of the user's that registers it, imported where the run is executed; empty for none.
         channel: Channel that replaces the environment's own; None keeps it.
+        downlink: Channel that replaces the environment's own downlink; None keeps it.
         noise: "truncated", or "gaussian" for noise without a bound.
         seed: Seed of the experiment.
         index: Number of the run within its arm; runs with equal index are paired across arms.
@@ -65,6 +66,7 @@ class TrainingRun:
     env: str
     module: str = ""
     channel: Channel | None = None
+    downlink: Channel | None = None
     noise: str = "truncated"
     seed: int
     index: int
@@ -100,6 +102,7 @@ class TrainingRun:
         return ControlLoop(
             env=self.env,
             channel=self.channel,
+            downlink=self.downlink,
             shield=shield,
             filter=wrapper,
             violation_penalty=self.violation_penalty,
@@ -134,6 +137,7 @@ class TrainingRun:
             "module": module_digest(self.module),
             "certificate": self.certificate.checksum,
             "channel": self.channel and asdict(self.channel),
+            "downlink": self.downlink and asdict(self.downlink),
             "lagrangian": self.lagrangian and asdict(self.lagrangian),
         }
         return json_digest(content | {"settings": asdict(self.settings), "versions": versions()})

@@ -242,6 +242,9 @@ class SweepSettings(BackendSettings, LearningSettings):
         delays: Delays of the grid [steps].
         quantization_steps: Quantization steps of the grid; the environment's own if none is given.
         burst_lengths: Mean numbers of packets lost in a row; 0 stands for independent losses.
+        downlink_losses: Loss probabilities of commands, for environments with a downlink; the environment's own if none
+            is given. The heatmaps then show losses of samples against losses of commands. Where none are lost, inputs
+            are committed for the delay only.
     """
 
     out: Path = Path("runs/sweep")
@@ -253,6 +256,7 @@ class SweepSettings(BackendSettings, LearningSettings):
     delays: tuple[int, ...] = (0, 2, 4)
     quantization_steps: tuple[float, ...] = ()
     burst_lengths: tuple[float, ...] = (0.0,)
+    downlink_losses: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
