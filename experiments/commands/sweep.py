@@ -143,12 +143,14 @@ def _write(settings: SweepSettings, summary: dict[str, Any], rows: list[dict], s
 
 def _text(summary: dict[str, Any]) -> str:
     """Returns the table for a terminal: a row per channel and arm."""
-    head = ["loss", "of commands", "delay", "quantization", "burst", "arm", "violating episodes", "training steps"]
-    rows = [[*head, "overridden", "return"]]
+    both = any(cell["downlink_loss"] is not None for cell in summary["cells"])
+    sides = ["loss", "of commands"] if both else ["loss"]
+    head = ["delay", "quantization", "burst", "arm", "violating episodes", "training steps", "overridden", "return"]
+    rows = [[*sides, *head]]
     for cell in summary["cells"]:
         channel = [
             f"{cell['loss']:g}",
-            "own" if cell["downlink_loss"] is None else f"{cell['downlink_loss']:g}",
+            *([f"{cell['downlink_loss']:g}"] if both else []),
             str(cell["delay"]),
             "own" if cell["quantization_step"] is None else f"{cell['quantization_step']:g}",
             f"{cell['burst_length']:g}" if cell["burst_length"] else "none",
