@@ -25,9 +25,6 @@ class CommittedInputs:
         """Starts an episode: the inputs of its first c steps are zero."""
         self._queue: deque[np.ndarray] = deque(np.zeros(self._inputs) for _ in range(self._lead))
 
-    def __len__(self) -> int:
-        return len(self._queue)
-
     def commit(self, u: np.ndarray) -> None:
         """Adds the input decided now, shape (m,), behind those committed."""
         self._queue.append(np.array(u, dtype=np.float64))

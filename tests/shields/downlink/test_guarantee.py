@@ -4,7 +4,17 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Actuator, Channel, ChannelContract, Ellipsoid, NCSEnv, NCSVectorEnv, Packet, truck_trailer
+from ncs_gym import (
+    Actuator,
+    Channel,
+    ChannelContract,
+    Ellipsoid,
+    FunctionProcess,
+    NCSEnv,
+    NCSVectorEnv,
+    Packet,
+    truck_trailer,
+)
 from ncs_gym.network.transmission import ChannelState
 from shields import SafeLoop, SafetyShield, VectorSafetyShield
 from shields.downlink import Schedule, starts_known
@@ -304,3 +314,16 @@ def test_a_schedule_hands_out_what_was_decided_c_steps_ago():
     schedule.start()
     assert schedule.due([9.0]) == [0.0]
     assert LATE_INPUT in EXPLANATIONS
+
+
+def test_another_process_than_the_plants_equations_may_move_behind_a_downlink():
+    process = FunctionProcess(lambda x, u: PLANT.A @ x + PLANT.B @ u)
+    shield = shielded(process=process, disturbance="adversarial")
+    _, info = shield.reset(seed=0)
+    assert info["shield_guaranteed"]
+    rng, worst = np.random.default_rng(0), 0.0
+    for _ in range(200):
+        *_, info = shield.step(rng.uniform(-1, 1, 1))
+        assert info["shield_guaranteed"], info["shield_reason"]
+        worst = max(worst, levels(shield, info))
+    assert 0.5 < worst <= 1.0
