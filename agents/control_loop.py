@@ -52,6 +52,7 @@ class ControlLoop:
     Attributes:
         env: A registered environment id.
         channel: Replaces the channel of the id; None keeps it.
+        downlink: Replaces the channel between controller and actuator; None keeps it.
         shield: Settings of the shield; None applies the agent's actions as they are.
         violation_penalty: Subtracted from the reward of every step whose true state violates the safe box, in vector
             environments, which agents are trained in.
@@ -65,6 +66,7 @@ class ControlLoop:
 
     env: str
     channel: Channel | None = None
+    downlink: Channel | None = None
     shield: ShieldSettings | None = None
     violation_penalty: float = 0.0
     noise: str = "truncated"
@@ -103,6 +105,8 @@ class ControlLoop:
 
     def _settings(self, settings: dict[str, Any]) -> dict[str, Any]:
         own: dict[str, Any] = {} if self.channel is None else {"channel": self.channel}
+        if self.downlink is not None:
+            own["downlink"] = self.downlink
         if self.noise != "truncated":
             own["noise"] = self.noise
         if self.disturbance is not None:

@@ -133,7 +133,7 @@ def timed(decide, beliefs: list[tuple[np.ndarray, ...]]) -> np.ndarray:
 
 def report(name: str, horizon: int, count: int) -> str:
     env = gym.make(f"ncs_gym/{name}-v0")
-    plant, certificate = env.unwrapped.plant, certificate_for(env.unwrapped.plant, env.unwrapped.contract)
+    plant, certificate = env.unwrapped.plant, certificate_for(env.unwrapped.plant, env.unwrapped.certificate_contract)
     shield = SafetyFilter(certificate, plant, "lookahead", horizon)
     project = SafetyFilter(certificate, plant)
     beliefs = drawn(env, count)

@@ -79,7 +79,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     env = ncs_env(gym.make(options.env))
-    certificate = certificate_for(env.plant, env.contract)
+    certificate = certificate_for(env.plant, env.certificate_contract)
     print(f"{options.env}, {options.episodes} shielded episodes of {EPISODE_STEPS} steps for each {options.field}\n")
     columns = (options.field, "outside the model", "left S", "left box", "alarm", "before box", "simulation's alarm")
     print("  ".join(columns))

@@ -53,7 +53,7 @@ SPACE: dict[str, tuple[Any, ...]] = {
 def shielded_loop(env_id: str) -> ControlLoop:
     """The environment behind the shield of a synthesized certificate."""
     env = ncs_env(gym.make(env_id))
-    return ControlLoop(env=env_id, shield=ShieldSettings(certificate_for(env.plant, env.contract)))
+    return ControlLoop(env=env_id, shield=ShieldSettings(certificate_for(env.plant, env.certificate_contract)))
 
 
 def steps_of(env_id: str) -> int:

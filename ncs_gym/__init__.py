@@ -1,5 +1,6 @@
 """Plants behind imperfect networks as Gymnasium environments; importing registers the ids."""
 
+from ncs_gym.downlink import Actuator, Command
 from ncs_gym.envs.env import NCSEnv
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlantError, certified_error_set
@@ -29,12 +30,14 @@ from ncs_gym.uncertainty.remainder import Remainder
 register_all()
 
 __all__ = [
+    "Actuator",
     "AdversarialDisturbance",
     "Annotation",
     "BallDisturbance",
     "BoxDisturbance",
     "Channel",
     "ChannelContract",
+    "Command",
     "Disturbance",
     "Ellipsoid",
     "ErrorSet",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import Any, ClassVar
 
@@ -51,6 +51,8 @@ _KINDS: dict[str, tuple[type, ...]] = {
     "initial_set": (Ellipsoid,),
     "contract": (ChannelContract,),
     "process": PROCESSES,
+    "downlink": (Channel,),
+    "downlink_contract": (ChannelContract,),
 }
 
 
@@ -68,6 +70,7 @@ class Scenario:
         start: Radius of the disc of starts, for plants of two states; None and elsewhere: `NCSEnv`'s default.
         process: What really moves, whose fields a dictionary may hold; None for the plant's own equations.
         extra: Extra that installs the module of this name, which the process needs; empty for none.
+        downlink: Default downlink; None for an ideal one.
     """
 
     plant: Callable[[], LinearPlant] | None
@@ -79,6 +82,7 @@ class Scenario:
     start: float | None = None
     process: Process | None = None
     extra: str = ""
+    downlink: Channel | None = None
     metadata: ClassVar[dict[str, Any]] = NCSEnv.metadata
 
     def __call__(self, **settings: Any) -> NCSEnv:
@@ -105,7 +109,7 @@ class Scenario:
         plant = as_plant(plant)
         own: dict[str, Any] = {"channel": self.channel, "task": self.task, "terminate_on_violation": self.terminates}
         kinds = _KINDS if self.process is None else _KINDS | {"process": (type(self.process),)}
-        own |= {} if self.process is None else {"process": self.process}
+        own |= {"downlink": self.downlink} | ({} if self.process is None else {"process": self.process})
         if plant is None:
             if self.plant is None:
                 raise ValueError(
@@ -152,6 +156,12 @@ TRUCK_TRAILER_CRUISE = Scenario(
     plant=loaded_truck_trailer, channel=CASE_STUDY_CHANNEL, task=SpeedTracking(), box=CASE_STUDY_BOX, start=0.2
 )
 
+# The same truck with its controller elsewhere: throttle commands go over a mobile network, too. They are one step late
+# (0.5 s, what a busy one takes at worst) and as lossy as samples, but never more than two in a row are lost. Inputs are
+# committed 3 steps ahead.
+CRUISE_DOWNLINK = Channel(loss=0.3, delay=1, max_consecutive_losses=2)
+TRUCK_TRAILER_CRUISE_TWO_WAY = replace(TRUCK_TRAILER_CRUISE, downlink=CRUISE_DOWNLINK)
+
 # Any plant of the user's, behind a perfect channel unless given.
 LINEAR_NCS = Scenario(plant=None, channel=Channel(), task=Regulation())
 
@@ -165,6 +175,11 @@ CART_POLE = Scenario(
     contract=contract_of(CART_POLE_CHANNEL),
     terminates=True,
 )
+
+# Motor commands go back over the same radio as the samples: 1 to 2 steps late (20 to 40 ms, a wireless network shared
+# with others), 20 % lost, never more than two in a row. Inputs are committed 4 steps ahead.
+CART_POLE_DOWNLINK = replace(CART_POLE_CHANNEL, quantization_step=0.0)
+CART_POLE_TWO_WAY = replace(CART_POLE, downlink=CART_POLE_DOWNLINK)
 
 # A sample per step, one step late; 20 % are lost, never more than two in a row: none in use is older than 3 steps.
 BATCH_REACTOR_CHANNEL = Channel(loss=0.2, delay=1, max_consecutive_losses=2, quantization_step=1e-3)
@@ -211,8 +226,10 @@ CART_POLE_NONLINEAR = Scenario(
 ENTRY_POINTS = {
     "ncs_gym/TruckTrailer-v0": "TRUCK_TRAILER",
     "ncs_gym/TruckTrailerCruise-v0": "TRUCK_TRAILER_CRUISE",
+    "ncs_gym/TruckTrailerCruiseTwoWay-v0": "TRUCK_TRAILER_CRUISE_TWO_WAY",
     "ncs_gym/LinearNCS-v0": "LINEAR_NCS",
     "ncs_gym/CartPole-v0": "CART_POLE",
+    "ncs_gym/CartPoleTwoWay-v0": "CART_POLE_TWO_WAY",
     "ncs_gym/BatchReactor-v0": "BATCH_REACTOR",
     "ncs_gym/Pendulum-v0": "PENDULUM",
     "ncs_gym/InvertedPendulum-v0": "INVERTED_PENDULUM",
@@ -250,8 +267,10 @@ class VectorScenario:
 
 TRUCK_TRAILER_VECTOR = VectorScenario(TRUCK_TRAILER)
 TRUCK_TRAILER_CRUISE_VECTOR = VectorScenario(TRUCK_TRAILER_CRUISE)
+TRUCK_TRAILER_CRUISE_TWO_WAY_VECTOR = VectorScenario(TRUCK_TRAILER_CRUISE_TWO_WAY)
 LINEAR_NCS_VECTOR = VectorScenario(LINEAR_NCS)
 CART_POLE_VECTOR = VectorScenario(CART_POLE)
+CART_POLE_TWO_WAY_VECTOR = VectorScenario(CART_POLE_TWO_WAY)
 BATCH_REACTOR_VECTOR = VectorScenario(BATCH_REACTOR)
 PENDULUM_VECTOR = VectorScenario(PENDULUM)
 INVERTED_PENDULUM_VECTOR = VectorScenario(INVERTED_PENDULUM)

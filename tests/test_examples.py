@@ -17,6 +17,14 @@ NUMBER = r"-?[\d.,]+"
 
 # Arguments of a tiny run, and what has to stand in its output.
 RUNS = {
+    "both_directions.py": (
+        [],
+        [
+            "decided 3 steps ahead; applied as decided: 3000 of 3000",
+            r"closest to the limit: 0\.\d+",
+            "proved: 3000 of 3000 steps",
+        ],
+    ),
     "change_the_channel.py": ([], [rf"{re.escape('30 % lost, 2 steps late')} +root mean square error {NUMBER}"]),
     "lost_hour.py": (
         [],

@@ -26,6 +26,7 @@ LAYERS = {
         {"uncertainty", "plants"},
         {"network", "tasks", "processes"},
         {"estimation", "rendering"},
+        {"downlink"},
         {"envs"},
         {"json_settings"},
         {"registration"},
@@ -37,7 +38,7 @@ LAYERS = {
         {"certificate_file", "certificate_text"},
         {"certificate"},
         {"verification", "paper", "synthesis"},
-        {"runtime"},
+        {"runtime", "downlink"},
         {"lookahead"},
     ),
     "agents": (

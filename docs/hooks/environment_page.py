@@ -150,7 +150,7 @@ def _arguments(env: NCSEnv, spec: Any) -> str:
 
 
 def _channel(env: NCSEnv) -> str:
-    texts = [channel_in_words(env.channel), _contract(env.contract, env.channel)]
+    texts = [env.channel.description, _contract(env.contract, env.channel)]
     downlink = getattr(env, "downlink", None)
     if downlink is not None:
         texts.append(
@@ -158,22 +158,6 @@ def _channel(env: NCSEnv) -> str:
             f"An action takes effect {_steps(downlink.lead)} later."
         )
     return "\n\n".join(texts)
-
-
-def channel_in_words(channel: Channel) -> str:
-    """Returns what a channel does to the samples, in sentences."""
-    period, step = channel.send_period, channel.quantization_step
-    every = "every step" if period == 1 else f"every {period} steps"
-    rounded = f"quantized with step {step:g}" if step else "not quantized"
-    if isinstance(channel.loss, GilbertElliott):
-        lost = f"Losses come in bursts (`{channel.loss}`)"
-    else:
-        lost = f"A packet is lost with probability {channel.loss:g}"
-    if channel.max_consecutive_losses is not None:
-        lost += f", but never more than {channel.max_consecutive_losses} in a row"
-    late = f"{channel.delay} to {channel.longest_delay} steps" if channel.jitter else _steps(channel.delay)
-    arrives = f"What is not lost arrives {late} late" if channel.longest_delay else "What is not lost arrives at once"
-    return f"A sample is taken and sent {every}, {rounded}. {lost}. {arrives}."
 
 
 def _steps(number: int) -> str:

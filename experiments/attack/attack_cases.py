@@ -20,6 +20,7 @@ from ncs_gym import (
     escape_probability,
     truck_trailer,
 )
+from ncs_gym.downlink import downlink_protocol
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.registration import ENTRY_POINTS, EPISODE_STEPS, loaded_truck_trailer
 from shields import Certificate
@@ -46,14 +47,16 @@ class AttackCase:
     Attributes:
         plant: The plant.
         channel: The channel between sensor and estimator.
-        contract: Channel contract that the certificate assumes; None for a stable plant.
+        contract: Channel contract that the estimator assumes; None for a stable plant.
         process: What really moves.
+        downlink: The channel between controller and actuator; None for an ideal one.
     """
 
     plant: LinearPlant
     channel: Channel
     contract: ChannelContract | None = None
     process: Process = field(default_factory=LinearProcess)
+    downlink: Channel | None = None
 
     def with_delta(self, delta: float | None) -> AttackCase:
         """Returns the case with a plant whose bounds hold for Gaussian noise at another level; None keeps it."""
@@ -64,9 +67,15 @@ class AttackCase:
         return escape_probability(self.plant, self.channel, EPISODE_STEPS)
 
     @property
+    def certificate_contract(self) -> ChannelContract | None:
+        """Contract that the certificate rests on, which counts the steps of both channels; None for a stable plant."""
+        protocol = downlink_protocol(self.downlink, None)
+        return self.contract if protocol is None else protocol.behind(self.contract)
+
+    @property
     def certificate(self) -> Certificate:
         """A certificate for the plant under the contract, synthesized once per process."""
-        return certificate_for(self.plant, self.contract)
+        return certificate_for(self.plant, self.certificate_contract)
 
 
 @cache
@@ -99,10 +108,11 @@ def _env_cases(name: str, env: NCSEnv, *, all_channels: bool = False) -> dict[st
     """Returns the cases of an environment: its own channel, those that use its contract up, and all kinds if asked."""
     channels = {"its channel": env.channel} | ({} if env.contract is None else _extremes(env.contract))
     channels |= _CHANNELS if all_channels else {}
-    return {
-        f"{name}, {kind}": AttackCase(env.plant, channel, env.contract, env.process)
-        for kind, channel in channels.items()
+    downlink = None if env.downlink is None else env.downlink.channel
+    cases = {
+        kind: AttackCase(env.plant, channel, env.contract, env.process, downlink) for kind, channel in channels.items()
     }
+    return {f"{name}, {kind}": case for kind, case in cases.items()}
 
 
 def _extremes(contract: ChannelContract) -> dict[str, Channel]:

@@ -14,6 +14,7 @@ from experiments.attack.attack_cases import attack_cases
 from experiments.attack.safety_counts import SafetyCounts
 from experiments.attack.worst_case import GaussianVectorEnv, HostileAgents, WorstCaseVectorEnv, starts_in_box
 from experiments.runs.provenance import json_digest, versions
+from ncs_gym import NCSVectorEnv
 from ncs_gym.registration import EPISODE_STEPS
 from shields import Certificate, VectorSafetyShield
 
@@ -141,14 +142,16 @@ def _begin(campaign: Campaign, shield: VectorSafetyShield, seed: int, rng: np.ra
     """Starts the episodes of a batch and returns their infos.
 
     In mode "lookahead" half of the starts are drawn from the box; those for which no first plan is certified, of which
-    nothing is claimed, are replaced by others on the boundary of S.
+    nothing is claimed, are replaced by others on the boundary of the set that episodes start in.
     """
     if not campaign.looks_ahead:
         return shield.reset(seed=seed)[1]
     plant, certificate, count = shield.filter.plant, shield.certificate, campaign.envs
     _, info = shield.reset(seed=seed, options={"state": starts_in_box(rng, plant, certificate, count)})
     if not info["shield_guaranteed"].all():
-        states = (1.0 - 1e-9) * certificate.safe_set.sample_boundary(rng, count)
+        env = shield.env.unwrapped
+        assert isinstance(env, NCSVectorEnv)
+        states = (1.0 - 1e-9) * env.single.initial_set.sample_boundary(rng, count)
         _, info = shield.reset(options={"state": states, "reset_mask": ~info["shield_guaranteed"]})
     return info
 
@@ -169,7 +172,7 @@ def _shields(campaign: Campaign, case: str, certificate: Path) -> dict[str, Vect
     """
     cases = attack_cases(campaign.seed, campaign.random_plants, campaign.env)
     chosen, loaded = cases[case].with_delta(campaign.delta), Certificate.load(certificate)
-    settings = {name: getattr(chosen, name) for name in ("plant", "channel", "contract", "process")}
+    settings = {name: getattr(chosen, name) for name in ("plant", "channel", "contract", "process", "downlink")}
     kind = GaussianVectorEnv if campaign.gaussian else WorstCaseVectorEnv
     env = kind(campaign.envs, loaded, **settings)
     if campaign.looks_ahead:

@@ -13,6 +13,13 @@ from shields import Certificate
 
 # Points on a boundary are pulled in by rounding.
 INWARD = 1.0 - 1e-12
+# Behind a downlink the first inputs of an episode are zero: starts on the boundary of S would leave it.
+START_BEHIND_DOWNLINK = 0.3
+
+
+def start_set(certificate: Certificate, downlink: Any) -> Ellipsoid:
+    """Returns the set on whose boundary episodes start: S, behind a downlink a part of it."""
+    return certificate.safe_set if downlink is None else Ellipsoid(START_BEHIND_DOWNLINK**2 * certificate.L)
 
 
 class WorstCaseVectorEnv(NCSVectorEnv):
@@ -29,7 +36,8 @@ class WorstCaseVectorEnv(NCSVectorEnv):
         self, num_envs: int, certificate: Certificate, *, pushes_to_box: bool = False, **settings: Any
     ) -> None:
         push = AdversarialDisturbance(None if pushes_to_box else certificate.M)
-        super().__init__(num_envs, disturbance=push, initial_set=certificate.safe_set, **settings)
+        initial_set = start_set(certificate, settings.get("downlink"))
+        super().__init__(num_envs, disturbance=push, initial_set=initial_set, **settings)
         self._process.sensor_noise = BlockSampler(self._extreme_noise, num_envs)
 
     def _extreme_noise(self, rng: np.random.Generator, count: int) -> np.ndarray:
@@ -37,7 +45,7 @@ class WorstCaseVectorEnv(NCSVectorEnv):
         return INWARD * self.plant.nominal_sensor_error.sample_boundary(rng, count).T
 
     def _first(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns states on the boundary of S and first errors on the boundary of theirs, shape (n, count) each."""
+        """Returns starts and first errors on the boundaries of their sets, shape (n, count) each."""
         states = self.single.initial_set.sample_boundary(self.np_random, count)
         errors = self.plant.nominal_initial_error.sample_boundary(self.np_random, count)
         return (1.0 - 1e-9) * states.T, INWARD * errors.T
@@ -76,10 +84,10 @@ class GaussianVectorEnv(NCSVectorEnv):
 
     def __init__(self, num_envs: int, certificate: Certificate, **settings: Any) -> None:
         settings |= {"noise": "gaussian", "disturbance": BoundedPush(certificate.M)}
-        super().__init__(num_envs, initial_set=certificate.safe_set, **settings)
+        super().__init__(num_envs, initial_set=start_set(certificate, settings.get("downlink")), **settings)
 
     def _first(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns states on the boundary of S and Gaussian first errors, shape (n, count) each."""
+        """Returns starts on the boundary of their set and Gaussian first errors, shape (n, count) each."""
         states = self.single.initial_set.sample_boundary(self.np_random, count)
         return (1.0 - 1e-9) * states.T, self._process.first_error(self.np_random, count)
 

@@ -100,8 +100,9 @@ def _certificate_files(cases: dict[str, AttackCase], folder: Path) -> dict[str, 
     folder.mkdir(parents=True, exist_ok=True)
     files = {}
     for name, case in tqdm(cases.items(), desc="certificates", leave=False, disable=None):
-        contract = "" if case.contract is None else f"-{case.contract.max_age}-{case.contract.quantization_step:g}"
-        files[name] = folder / f"{case.plant.fingerprint[:16]}{contract}.json"
+        contract = case.certificate_contract
+        suffix = "" if contract is None else f"-{contract.max_age}-{contract.quantization_step:g}"
+        files[name] = folder / f"{case.plant.fingerprint[:16]}{suffix}.json"
         if not files[name].exists():
             case.certificate.save(files[name])
     return files

@@ -32,8 +32,9 @@ from experiments.runs.arms import is_shield
 from experiments.settings import CompareSettings
 from ncs_gym import escape_probability
 from ncs_gym.envs.env import ncs_env
+from shields import SafetyFilter
 from shields.atomic_write import write_atomically
-from shields.runtime.guarantee import starts_inside
+from shields.downlink import starts_known
 
 # Budget of `--smoke`: enough to pass through every part.
 _SMOKE = {"steps": 4_096, "episodes": 10, "seeds": 2}
@@ -129,12 +130,16 @@ def _escapes(
 ) -> dict[str, Any]:
     """Returns the bound on the probability that an episode leaves the safe set, and how often shielded arms did.
 
-    The bound is about episodes that begin in the safe set; where not all do, it is 1. Mode "lookahead" may leave that
+    The bound is about episodes that begin in the safe set, and behind a downlink stay there until the first decision
+    takes effect; where not all do, it is 1. Mode "lookahead" may leave that
     set on purpose and is not listed.
     """
     env = ncs_env(ControlLoop(env=setup.env, channel=setup.channel, noise=setup.noise).single())
     steps = gym.spec(setup.env).max_episode_steps or 1
-    begins_inside = starts_inside(setup.certificate, env.initial_set)
+    downlink = env.downlink
+    lead, is_promised = (0, True) if downlink is None else (downlink.lead, downlink.contract is not None)
+    known = starts_known(SafetyFilter(setup.certificate, env.plant), env.initial_set, lead)
+    begins_inside = is_promised and all(each.in_safe_set for each in known)
     bound = escape_probability(env.plant, env.channel, steps) if begins_inside else 1.0
     shielded = [name for name, mode in modes.items() if is_shield(mode) and mode != "lookahead"]
     episodes = {name: [each for result in results_by_arm[name] for each in result.episodes] for name in shielded}

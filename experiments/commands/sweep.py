@@ -22,7 +22,7 @@ from shields.atomic_write import write_atomically
 
 # Budget of `--smoke`, and the sides of the grid of which it takes the first and the last value.
 _SMOKE = {"steps": 1_024, "episodes": 4, "seeds": 1}
-_SIDES = ("losses", "delays", "quantization_steps", "burst_lengths", "mass_factors")
+_SIDES = ("losses", "delays", "quantization_steps", "burst_lengths", "mass_factors", "downlink_losses")
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,7 @@ class _GridPoint:
         quantization_step: Quantization step of the measurements; None for the environment's own.
         burst_length: Mean number of packets lost in a row; 0 for independent losses.
         mass_factor: Of the mass in the process; None for the environment's own.
+        downlink_loss: Probability that a command is lost; None for the environment's own downlink.
     """
 
     loss: float
@@ -42,13 +43,15 @@ class _GridPoint:
     quantization_step: float | None
     burst_length: float
     mass_factor: float | None = None
+    downlink_loss: float | None = None
 
     @property
     def name(self) -> str:
         """Name of the point in file names."""
         quantization = "" if self.quantization_step is None else f"-q{self.quantization_step}"
         mass = "" if self.mass_factor is None else f"-mass{self.mass_factor}"
-        return f"loss{self.loss}-delay{self.delay}{quantization}-burst{self.burst_length}{mass}"
+        downlink = "" if self.downlink_loss is None else f"-down{self.downlink_loss}"
+        return f"loss{self.loss}-delay{self.delay}{quantization}-burst{self.burst_length}{mass}{downlink}"
 
     def channel(self, base: ChannelSettings) -> ChannelSettings:
         """Returns the changes of the environment's channel that make this point's channel."""
@@ -77,12 +80,7 @@ def sweep(settings: SweepSettings) -> None:
             raise ValueError(f"--channel.{name.replace('_', '-')} is a side of the grid: give its values there")
     for name in settings.arms:
         Arm.of(name, settings.mode)
-    setups = [
-        ExperimentSetup.of(
-            settings.env, each.channel(settings.channel), settings.certificate, mass_factor=each.mass_factor
-        )
-        for each in points
-    ]
+    setups = [_setup(settings, each) for each in points]
     claim_folder("sweep", settings.completed)
     prepare_output(settings.out)
     print(settings.agent_line, flush=True)
@@ -107,6 +105,17 @@ def sweep(settings: SweepSettings) -> None:
     print(f"{settings.env}: {count} per arm and channel\n", _text(summary), f"files: {settings.out}", sep="\n")
 
 
+def _setup(settings: SweepSettings, point: _GridPoint) -> ExperimentSetup:
+    """Returns the environment with the channels of a point, and a certificate for it."""
+    return ExperimentSetup.of(
+        settings.env,
+        point.channel(settings.channel),
+        settings.certificate,
+        mass_factor=point.mass_factor,
+        downlink_loss=point.downlink_loss,
+    )
+
+
 def _grid_points(settings: SweepSettings) -> list[_GridPoint]:
     """Returns the points of the grid.
 
@@ -119,6 +128,7 @@ def _grid_points(settings: SweepSettings) -> list[_GridPoint]:
         "quantization_steps": settings.quantization_steps or (None,),
         "burst_lengths": settings.burst_lengths,
         "mass_factors": settings.mass_factors or (None,),
+        "downlink_losses": settings.downlink_losses or (None,),
         "arms": settings.arms,
     }
     for name, side in sides.items():
@@ -142,21 +152,14 @@ def _write(settings: SweepSettings, summary: dict[str, Any], rows: list[dict], s
 
 def _text(summary: dict[str, Any]) -> str:
     """Returns the table for a terminal: a row per channel and arm."""
-    head = [
-        "loss",
-        "delay",
-        "quantization",
-        "burst",
-        "mass",
-        "arm",
-        "violating episodes",
-        "training steps",
-        "overridden",
-    ]
-    rows = [[*head, "return"]]
+    both = any(cell["downlink_loss"] is not None for cell in summary["cells"])
+    sides = ["loss", "of commands"] if both else ["loss"]
+    outcomes = ["violating episodes", "training steps", "overridden", "return"]
+    rows = [[*sides, "delay", "quantization", "burst", "mass", "arm", *outcomes]]
     for cell in summary["cells"]:
         channel = [
             f"{cell['loss']:g}",
+            *([f"{cell['downlink_loss']:g}"] if both else []),
             str(cell["delay"]),
             "own" if cell["quantization_step"] is None else f"{cell['quantization_step']:g}",
             f"{cell['burst_length']:g}" if cell["burst_length"] else "none",

@@ -46,7 +46,7 @@ def _plant_and_contract(settings: SynthesizeSettings) -> tuple[LinearPlant, Chan
     """Returns the plant of a file or an environment, and the contract of the environment with the changes asked for."""
     if settings.plant is None:
         env = registered_env(settings.env or _DEFAULT_ENV)
-        plant, contract = env.plant, env.contract
+        plant, contract = env.plant, env.certificate_contract
     else:
         plant, contract = LinearPlant.load(settings.plant), None
     if settings.max_age is None and settings.quantization_step is None:

@@ -1,4 +1,4 @@
-"""Heatmaps of a sweep: a panel per arm, losses against delays."""
+"""Heatmaps of a sweep: a panel per arm, losses against delays, or against losses of commands."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ from matplotlib.colors import Normalize
 from experiments.plots.figure_style import STYLE, CaptionedFigure, label, thousands, with_unit
 from experiments.runs.arms import Arm
 
+# What the axes of a panel do not show; see `_other`.
+_Other = tuple[float | None, float, float | None, int | None]
+_SIDE_LABELS = {"delay": "delay [steps]", "downlink_loss": "loss of commands"}
 # Largest number of panels side by side.
 _COLUMNS = 4
 # Height at which the longest label of a color scale fits [inches].
@@ -24,8 +27,6 @@ _SMALLEST_SPAN = 0.1
 # Fields whose relative luminance is smaller than this have light numbers; weights of red, green and blue.
 _DARK = 0.45
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-# Quantization step, mean burst length, and factor of the mass.
-_OtherSides = tuple[float | None, float, float | None]
 
 
 @dataclass(frozen=True)
@@ -111,14 +112,15 @@ def _caption(quantity: _Quantity, cells: Sequence[dict[str, Any]], arms: Sequenc
 
 
 def _heatmap(cells: Sequence[dict[str, Any]], arms: Sequence[str], quantity: _Quantity) -> CaptionedFigure:
-    """Returns one quantity: a panel per arm, a block of them per combination of the grid's other sides."""
-    losses, delays = (sorted({cell[side] for cell in cells}) for side in ("loss", "delay"))
-    others = list(dict.fromkeys(_other_sides(cell) for cell in cells))
-    fields = {(arm, other): _field(cells, arm, other, quantity, losses, delays) for other in others for arm in arms}
+    """Returns one quantity: a panel per arm, a block of them per combination of what its axes do not show."""
+    side = "delay" if all(cell.get("downlink_loss") is None for cell in cells) else "downlink_loss"
+    losses, values = (sorted({cell[each] for cell in cells}) for each in ("loss", side))
+    others = list(dict.fromkeys(_other(cell, side) for cell in cells))
+    fields = {(arm, other): _field(cells, arm, other, quantity, losses, side) for other in others for arm in arms}
     norm = _norm(list(fields.values()), quantity)
     block = -(-len(arms) // _COLUMNS)
     columns, rows = -(-len(arms) // block), block * len(others)
-    height = 0.5 * len(delays) + (0.65 if len(others) > 1 else 0.45)
+    height = 0.5 * len(values) + (0.65 if len(others) > 1 else 0.45)
     with matplotlib.rc_context(STYLE), matplotlib.rc_context({"axes.grid": False}):
         width = 1.8 + max(0.68 * len(losses) + 0.15, 1.7) * columns
         size = (width, max(0.7 + max(height, 1.3) * rows, _MIN_HEIGHT))
@@ -134,25 +136,32 @@ def _heatmap(cells: Sequence[dict[str, Any]], arms: Sequence[str], quantity: _Qu
             _draw(panel, fields[arm, other], quantity.colors, norm)
             panel.set_title(_title(arm, other, len(others) > 1))
             below = row + 1 < rows and (row % block + 1 == block or arm_at + columns < len(arms))
-            _name_axes(panel, losses, delays, left=column == 0, lowest=not below)
+            _name_axes(panel, losses, values, _SIDE_LABELS[side] if column == 0 else "", lowest=not below)
         mappable = ScalarMappable(norm, quantity.colors)
         figure.colorbar(mappable, ax=panels, label=with_unit(quantity.title, quantity.unit), format=thousands)
         return figure
 
 
+def _other(cell: dict[str, Any], side: str) -> _Other:
+    """Returns what the axes do not show: quantization step, burst length, factor of the mass, and perhaps the delay."""
+    delay = None if side == "delay" else cell["delay"]
+    return cell["quantization_step"], cell["burst_length"], cell.get("mass_factor"), delay
+
+
 def _field(
     cells: Sequence[dict[str, Any]],
     arm: str,
-    other: _OtherSides,
+    other: _Other,
     quantity: _Quantity,
     losses: list[float],
-    delays: list[int],
+    side: str,
 ) -> np.ndarray:
-    """Returns the values of a panel, shape (delays, losses)."""
-    values = np.full((len(delays), len(losses)), np.nan)
+    """Returns the values of a panel, shape (values of the side, losses)."""
+    rows = sorted({cell[side] for cell in cells})
+    values = np.full((len(rows), len(losses)), np.nan)
     for cell in cells:
-        if _other_sides(cell) == other:
-            at = delays.index(cell["delay"]), losses.index(cell["loss"])
+        if _other(cell, side) == other:
+            at = rows.index(cell[side]), losses.index(cell["loss"])
             values[at] = quantity.factor * cell["arms"][arm][quantity.key]
     return values
 
@@ -178,24 +187,20 @@ def _draw(axis: Axes, values: np.ndarray, colors: str, norm: Normalize) -> None:
             axis.text(j, i, text, ha="center", va="center", fontsize=9, color="white" if dark else "#222222")
 
 
-def _name_axes(axis: Axes, losses: list[float], delays: list[int], left: bool, lowest: bool) -> None:
+def _name_axes(axis: Axes, losses: list[float], values: list[float], left: str, lowest: bool) -> None:
     """Labels the outer axes of the panels."""
     axis.set_xticks(range(len(losses)), [f"{loss:g}" for loss in losses])
-    axis.set_yticks(range(len(delays)), [str(delay) for delay in delays])
-    axis.tick_params(length=0, labelbottom=lowest, labelleft=left)
+    axis.set_yticks(range(len(values)), [f"{value:g}" for value in values])
+    axis.tick_params(length=0, labelbottom=lowest, labelleft=bool(left))
     axis.spines[:].set_visible(False)
-    label(axis, "loss probability" if lowest else "", "delay [steps]" if left else "", axis.get_title())
+    label(axis, "loss probability" if lowest else "", left, axis.get_title())
 
 
-def _title(arm: str, other: _OtherSides, several: bool) -> str:
-    quantization, burst, mass = other
+def _title(arm: str, other: _Other, several: bool) -> str:
+    quantization, burst, mass, delay = other
     if not several:
         return arm
     losses = f"bursts of {burst:g}" if burst else "independent losses"
+    late = "" if delay is None else f"delay {delay}, "
     factor = "" if mass is None else f", {mass:g} times the mass"
-    return f"{arm}\n{'' if quantization is None else f'quantization {quantization:g}, '}{losses}{factor}"
-
-
-def _other_sides(cell: dict[str, Any]) -> _OtherSides:
-    """Returns the quantization step, the burst length and the factor of the mass of a point of the grid."""
-    return cell["quantization_step"], cell["burst_length"], cell.get("mass_factor")
+    return f"{arm}\n{late}{'' if quantization is None else f'quantization {quantization:g}, '}{losses}{factor}"

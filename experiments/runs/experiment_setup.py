@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from experiments.runs.provenance import versions
 from experiments.runs.synthesis_status import synthesis_status
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings, ChannelSettings, LearningSettings, settings_json
-from ncs_gym import Channel, LinearPlant
+from ncs_gym import Channel, LinearPlant, NCSEnv
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, Report, verify
 from shields.certificate_text import size_of
@@ -38,6 +38,7 @@ class ExperimentSetup:
         module: Module of the user's that registers the environment; empty for one of this package.
         noise: "truncated", or "gaussian" for noise without a bound.
         process: Fields of the process that replace the environment's own, JSON values; None keeps it.
+        downlink: Channel that replaces the environment's own downlink; None keeps it.
     """
 
     env: str
@@ -48,6 +49,7 @@ class ExperimentSetup:
     module: str = ""
     noise: str = "truncated"
     process: dict[str, Any] | None = None
+    downlink: Channel | None = None
 
     @classmethod
     def of(
@@ -57,6 +59,7 @@ class ExperimentSetup:
         certificate_file: Path | None = None,
         noise: str = "truncated",
         mass_factor: float | None = None,
+        downlink_loss: float | None = None,
     ) -> ExperimentSetup:
         """Returns the setup of a registered environment, with another channel or with changes of its own channel.
 
@@ -66,26 +69,30 @@ class ExperimentSetup:
             certificate_file: File of the certificate; by default one is synthesized.
             noise: "truncated", or "gaussian" for noise without a bound.
             mass_factor: Of the mass in the process, the model being what it was; None keeps the mass.
+            downlink_loss: Loss probability of the environment's own downlink in place of its own; None keeps it.
 
         Raises:
-            ValueError: If the environment is unknown or has no plant of its own, or it cannot have the channel, the
-                noise or another mass.
+            ValueError: If the environment is unknown or has no plant of its own, has no downlink although one is to be
+                changed, or cannot have the channel, the noise or another mass.
             CertificateError: If a given certificate is damaged or does not verify for the plant.
             Infeasible: If no certificate is found.
         """
         own, (module, name) = registered_env(env_id), module_and_id(env_id)
         if isinstance(channel, ChannelSettings):
             channel = channel.applied_to(own.channel)
-        changed = channel is not None or noise != "truncated"
-        env = ncs_env(ControlLoop(env=name, channel=channel, noise=noise).single()) if changed else own
+        downlink = None if downlink_loss is None else replace(_downlink_of(own, env_id), loss=downlink_loss)
+        loop = ControlLoop(env=name, channel=channel, downlink=downlink, noise=noise)
+        changed = channel is not None or downlink is not None or noise != "truncated"
+        env = ncs_env(loop.single()) if changed else own
         if certificate_file is None:
             with synthesis_status() as show:
-                certificate = certificate_for(env.plant, env.contract, show)
+                certificate = certificate_for(env.plant, env.certificate_contract, show)
         else:
             certificate = Certificate.load(certificate_file)
             require_valid(certificate, env.plant)
         process = None if mass_factor is None else asdict(env.process.with_mass(mass_factor))  # pyright: ignore
-        return cls(name, channel, env.plant, certificate, verify(certificate, env.plant), module, noise, process)
+        verification = verify(certificate, env.plant)
+        return cls(name, channel, env.plant, certificate, verification, module, noise, process, downlink)
 
     @property
     def title(self) -> str:
@@ -96,9 +103,12 @@ class ExperimentSetup:
 
     @property
     def described(self) -> dict[str, str]:
-        """The plant with its bounds, and the channel that is in effect, in words."""
-        channel = registered_env(self.env).channel if self.channel is None else self.channel
-        return {"plant": str(self.plant), "channel": channel.description}
+        """The plant with its bounds, and the channels that are in effect, in words."""
+        own = registered_env(self.env)
+        text = (own.channel if self.channel is None else self.channel).description
+        if own.downlink is not None:
+            text += f" Commands: {(self.downlink or own.downlink.channel).description}"
+        return {"plant": str(self.plant), "channel": text}
 
     def training_run(self, settings: LearningSettings, arm_name: str, index: int, grid_point: str = "") -> TrainingRun:
         """Returns one training run of an arm, or the run of an arm in which nothing is trained.
@@ -115,6 +125,7 @@ class ExperimentSetup:
             env=self.env,
             module=self.module,
             channel=self.channel,
+            downlink=self.downlink,
             noise=self.noise,
             process=self.process,
             seed=settings.seed,
@@ -146,3 +157,14 @@ class ExperimentSetup:
             "certificate_file": self.certificate.document,
             "versions": versions(),
         }
+
+
+def _downlink_of(env: NCSEnv, env_id: str) -> Channel:
+    """Returns an environment's own downlink.
+
+    Raises:
+        ValueError: If it has none.
+    """
+    if env.downlink is None:
+        raise ValueError(f"{env_id} has an ideal downlink, which loses nothing: choose an environment with a downlink")
+    return env.downlink.channel

@@ -20,7 +20,7 @@ _IGNORED = {*INCIDENTAL_SETTINGS, "smoke", "page", "quote"}
 _GROWING = {
     "compare": ("seeds", "arms", "references"),
     "study": ("seeds", "arms", "references", "envs"),
-    "sweep": ("seeds", "arms", "losses", "delays", "quantization_steps", "burst_lengths"),
+    "sweep": ("seeds", "arms", "losses", "delays", "quantization_steps", "burst_lengths", "downlink_losses"),
     "certify": ("steps",),
 }
 # Differences that a message lists, and characters of each value.

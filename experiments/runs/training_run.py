@@ -41,6 +41,7 @@ class TrainingRun:
         env: Id of a registered environment.
         module: Module of the user's that registers it, imported where the run is executed; empty for none.
         channel: Channel that replaces the environment's own; None keeps it.
+        downlink: Channel that replaces the environment's own downlink; None keeps it.
         noise: "truncated", or "gaussian" for noise without a bound.
         process: Fields of the process that replace the environment's own, JSON values; None keeps it.
         seed: Seed of the experiment.
@@ -66,6 +67,7 @@ class TrainingRun:
     env: str
     module: str = ""
     channel: Channel | None = None
+    downlink: Channel | None = None
     noise: str = "truncated"
     process: dict[str, Any] | None = None
     seed: int
@@ -102,6 +104,7 @@ class TrainingRun:
         return ControlLoop(
             env=self.env,
             channel=self.channel,
+            downlink=self.downlink,
             shield=shield,
             filter=wrapper,
             violation_penalty=self.violation_penalty,
@@ -137,6 +140,7 @@ class TrainingRun:
             "module": module_digest(self.module),
             "certificate": self.certificate.checksum,
             "channel": self.channel and asdict(self.channel),
+            "downlink": self.downlink and asdict(self.downlink),
             "lagrangian": self.lagrangian and asdict(self.lagrangian),
         }
         return json_digest(content | {"settings": asdict(self.settings), "versions": versions()})

@@ -244,6 +244,9 @@ class SweepSettings(BackendSettings, LearningSettings):
         burst_lengths: Mean numbers of packets lost in a row; 0 stands for independent losses.
         mass_factors: Factors of the mass in the environment's process, the certificate being that of the model (factor
             1); for environments whose process has a mass.
+        downlink_losses: Loss probabilities of commands, for environments with a downlink; the environment's own if none
+            is given. The heatmaps then show losses of samples against losses of commands. Where none are lost, inputs
+            are committed for the delay only.
     """
 
     out: Path = Path("runs/sweep")
@@ -256,6 +259,7 @@ class SweepSettings(BackendSettings, LearningSettings):
     quantization_steps: tuple[float, ...] = ()
     burst_lengths: tuple[float, ...] = (0.0,)
     mass_factors: tuple[float, ...] = ()
+    downlink_losses: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""

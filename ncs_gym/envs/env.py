@@ -8,10 +8,12 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
+from ncs_gym.downlink.loop import Inputs, downlink_of, no_inputs
+from ncs_gym.envs.contracts import loop_contracts
 from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.reset_options import start_option
-from ncs_gym.envs.settings import assumed_contract, expect
-from ncs_gym.envs.spaces import applied_input, default_initial_set, observation_space
+from ncs_gym.envs.settings import expect, require_suitable, starting_set
+from ncs_gym.envs.spaces import applied_input, observation_space
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel
@@ -76,7 +78,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     | `state`, `estimate` | x and x_hat, float64, shape (n,) |
     | `estimation_error` | estimate - state |
     | `error_shape` | running Sigma_k, shape (n, n): the error lies in E(Sigma_k) |
-    | `input` | applied input, shape (m,) [physical units]; zeros at reset |
+    | `input` | input applied now, shape (m,) [physical units]; zeros at reset |
+    | `input_committed` | input decided now; without a downlink it is applied at once |
     | `constraint_values` | abs(c_j x) - 1 per row of the safe box; positive is violated |
     | `cost` | 1.0 if the true state violates the box now, else 0.0 |
     | `measurement_age` | steps since the newest sample used was taken (the first estimate is step 0's) |
@@ -85,6 +88,9 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     | `episode_violations` | running sum of `cost` in this episode |
     | `is_success` | 1.0 while there was none |
     | `contract_broken` | whether the newest sample used is older now than the channel's contract allows |
+    | `downlink_broken` | whether zero is applied now because the input committed for now has not arrived |
+
+    Behind a downlink `estimate`, `error_shape` and observation belong to the time at which the next action acts.
 
     Args:
         plant: The plant with its bounds.
@@ -103,8 +109,12 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         noise: "truncated", or "gaussian" for process noise, sensor noise and first errors without a bound: what is
             proved then holds with the probability that `escape_probability` leaves (docs/shield.md).
         process: What really moves (docs/beyond_linear.md); the plant's own equations by default.
+        downlink: The network between controller and actuator (docs/contracts.md); ideal by default.
+        downlink_contract: What is assumed of it, which it may then break; by default what its settings guarantee.
 
     Attributes:
+        downlink: How commands are sent, with c as its `lead`; None for an ideal downlink.
+        certificate_contract: Contract that a certificate for this environment rests on: `contract` with c steps added.
         steps: Steps taken in this episode.
         episodes: Episodes begun.
         start: What the start of this episode is known to lie in: `initial_set`, or the state given as an option.
@@ -133,6 +143,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         horizon: int = 200,
         noise: str = "truncated",
         process: Process | None = None,
+        downlink: Channel | None = None,
+        downlink_contract: ChannelContract | None = None,
     ) -> None:
         self.plant = expect(plant, LinearPlant, "plant")
         self.channel = Channel() if channel is None else expect(channel, Channel, "channel")
@@ -140,20 +152,18 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self.terminate_on_violation = as_flag(terminate_on_violation, "terminate_on_violation")
         self.allow_assumption_violation = as_flag(allow_assumption_violation, "allow_assumption_violation")
         self.disturbance = as_disturbance(disturbance, plant, self.allow_assumption_violation)
-        self.initial_set = default_initial_set(plant) if initial_set is None else initial_set
-        expect(self.initial_set, Ellipsoid, "initial_set")
-        if self.initial_set.dim != plant.n:
-            raise ValueError(f"initial_set must have dimension {plant.n}, got {self.initial_set.dim}")
-        if problem := self.task.check(plant):
-            raise ValueError(f"{type(self.task).__name__}: {problem}")
+        self.initial_set = starting_set(initial_set, plant)
+        require_suitable(self.task, plant)
         if render_mode is not None and not (isinstance(render_mode, str) and render_mode in RENDER_MODES):
             raise RenderModeError(f"render_mode must be None or one of {RENDER_MODES}, got {shown(render_mode)}")
         self.render_mode = render_mode
         self._renderer = None if render_mode is None else Renderer(plant, self.task, render_mode, RENDER_FPS)
-        self.contract = assumed_contract(plant, self.channel, contract)
-        patterns = arrival_patterns(plant, self.channel, self.contract)
+        contracts = loop_contracts(plant, self.channel, contract, downlink, downlink_contract)
+        self.contract, self.downlink, self.certificate_contract = contracts
+        patterns = arrival_patterns(plant, self.channel, self.certificate_contract)
         self.error_set = patterns.recursion.error_set
         self.estimator = Estimator(plant, self.channel, patterns=patterns)
+        self._downlink = downlink_of(self.downlink, self.estimator)
         self.noise = as_noise(noise, plant)
         truncated = self.noise == "truncated"
         self.process = LinearProcess() if process is None else expect(process, Process, "process")
@@ -161,7 +171,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._process = self.process.simulation(plant, self.disturbance, allowed, truncated=truncated)
         self.horizon = as_count(horizon, "horizon", low=1, high=LONGEST_HORIZON)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)
-        self.observation_space = observation_space(plant, self.task, self.error_set, self.initial_set, self.horizon)
+        steps = self.horizon + self._downlink.lead
+        self.observation_space = observation_space(plant, self.task, self.error_set, self.initial_set, steps)
         self._low, self._high = self.observation_space.low, self.observation_space.high
         self.steps = self.episodes = 0
         self.start: Ellipsoid | np.ndarray = self.initial_set
@@ -191,11 +202,12 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._disturbance_memory = self._process.begin(rng)
         self._channel_state = ChannelState(self.channel, rng)
         self.estimator.reset(self._state + self._process.first_error(rng))
+        self._downlink.begin(rng)
         self.steps = 0
         self.episodes += 1
         self._violations = 0.0
         self._consistent = True
-        info = self._info(np.zeros(self.plant.m), arrived=False)
+        info = self._info(no_inputs(self.plant.m), arrived=False)
         if self._renderer is not None:
             self._renderer.begin(info, self._task_state)
         return self._observation(), info
@@ -207,11 +219,13 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             ValueError: If the action is not finite or wrongly shaped; nothing has moved then.
             gymnasium.error.ResetNeeded: If there was no reset, or an earlier step failed half-way.
         """
-        u = applied_input(self.plant, action)
+        decided = applied_input(self.plant, action)
         if not self._consistent:
             raise gym.error.ResetNeeded("call reset: there was none, or an earlier step failed half-way")
         self._consistent = False
         rng = self.np_random
+        inputs = self._downlink.exchange(rng, self.steps, decided)
+        u = inputs.applied
         self._state = self._process.advance(rng, self._state, u, self.steps, self._disturbance_memory)
         self._task_state = self.task.advance(rng, self.plant, self._task_state, u)
         self.steps += 1
@@ -220,7 +234,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         packets = self._channel_state.exchange(rng, self.steps, sample, self.estimator.episode)
         self.estimator.advance(u, packets)
         reward = float(self.task.reward(self.plant, self._task_state, self._state, u))
-        info = self._info(u, arrived=bool(packets))
+        info = self._info(inputs, arrived=bool(packets))
         terminated = self._process.terminated or (self.terminate_on_violation and info["cost"] > 0.0)
         self._consistent = True
         if self._renderer is not None:
@@ -246,6 +260,10 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         if self._renderer is not None:
             self._renderer.annotate(annotation)
 
+    def beliefs(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Returns estimate and error shape of now and of every step until the next decision takes effect."""
+        return self._downlink.beliefs()
+
     def close(self) -> None:
         """Closes the window and the process."""
         self._process.close()
@@ -256,17 +274,18 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         return (1.0 - SAMPLE_ROUNDING) * self.initial_set.sample(rng)
 
     def _observation(self) -> np.ndarray:
-        entries = np.concatenate([self.estimator.mean, self.task.observe(self._task_state)])
+        task_state = self._downlink.predicted(self.task, self._task_state)
+        entries = np.concatenate([self._belief[0], self.task.observe(task_state)])
         return np.minimum(np.maximum(entries, self._low), self._high).astype(np.float32)
 
-    def _info(self, u: np.ndarray, *, arrived: bool) -> dict[str, Any]:
+    def _info(self, inputs: Inputs, *, arrived: bool) -> dict[str, Any]:
         values = self.plant.constraint_values(self._state)
         cost = 1.0 if max(values.tolist()) > 0.0 else 0.0
         self._violations += cost
         constraints = values, cost, self._violations
-        shape = self.estimator.shape.copy()
+        self._belief = self._downlink.belief()
         alarm = self.estimator.alarm or self._process.alarm
-        return loop_info(self.estimator, self.contract, self._state, u, shape, arrived, constraints, alarm)
+        return loop_info(self.estimator, self._belief, self.contract, self._state, inputs, arrived, constraints, alarm)
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ncs_gym.downlink.loop import Inputs
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.contract import ChannelContract
@@ -13,10 +14,10 @@ from ncs_gym.network.contract import ChannelContract
 
 def loop_info(
     estimator: Estimator | VectorEstimator,
+    belief: tuple[np.ndarray, np.ndarray],
     contract: ChannelContract | None,
     state: np.ndarray,
-    u: np.ndarray,
-    error_shape: np.ndarray,
+    inputs: Inputs,
     arrived: Any,
     constraints: tuple[np.ndarray, Any, Any],
     alarm: Any,
@@ -24,26 +25,30 @@ def loop_info(
     """Returns `info`, every array a fresh copy; the environment is the first axis of what it holds for many.
 
     Args:
-        estimator: Gives estimate and age.
+        estimator: Gives the present estimate, and age.
+        belief: Estimate, shape (n,) or (n, N), and error shape, (n, n) or as a fresh array (N, n, n), of the time at
+            which the next input takes effect.
         contract: What the channel guarantees, if anything.
         state: x, shape (n,) or (n, N).
-        u: Applied input, shape (m,) or (m, N).
-        error_shape: Sigma_k as a fresh array, shape (n, n) or (N, n, n).
+        inputs: What was applied and what was committed in the step.
         arrived: Whether a packet arrived at this step, a bool or a fresh array of shape (N,).
         constraints: Constraint values, shape (k,) or (k, N), the cost, and the sum of costs in the episode.
         alarm: Whether an assumption was seen to be violated, a bool or a fresh array of shape (N,).
     """
     values, cost, violations = constraints
     age: Any = estimator.age
+    applied, committed, missing = inputs
+    estimate, error_shape = belief
     many = state.ndim > 1
     broken = age > contract.max_age if contract is not None else np.zeros(age.shape, np.bool_) if many else False
     return {
-        "state": state.copy().T,
-        "estimate": estimator.mean.copy().T,
-        "estimation_error": (estimator.mean - state).T,
-        "error_shape": error_shape,
-        "input": u.copy().T,
-        "constraint_values": values.T,
+        "state": state.copy().T if many else state.copy(),
+        "estimate": estimate.copy().T if many else estimate.copy(),
+        "estimation_error": (estimator.mean - state).T if many else estimator.mean - state,
+        "error_shape": error_shape if many else error_shape.copy(),
+        "input": applied.copy().T if many else applied.copy(),
+        "input_committed": committed.copy().T if many else committed.copy(),
+        "constraint_values": values.T if many else values,
         "cost": cost,
         "measurement_age": age.copy() if many else age,
         "packet_arrived": arrived,
@@ -51,4 +56,5 @@ def loop_info(
         "episode_violations": violations,
         "is_success": (violations == 0.0) * 1.0,
         "contract_broken": broken,
+        "downlink_broken": np.copy(missing) if many else missing,
     }

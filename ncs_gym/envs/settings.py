@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import Any, TypeVar
 
+from ncs_gym.envs.spaces import default_initial_set
 from ncs_gym.estimation.error_bound import UnstablePlantError
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.tasks.task import Task
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 
 T = TypeVar("T")
 
@@ -31,6 +34,24 @@ def assumed_contract(plant: LinearPlant, channel: Channel, contract: ChannelCont
             f"the channel rounds to {channel.quantization_step}, the contract allows {contract.quantization_step}"
         )
     return contract
+
+
+def starting_set(initial_set: Ellipsoid | None, plant: LinearPlant) -> Ellipsoid:
+    """Returns the ellipsoid that states start in, the default one for None.
+
+    Raises:
+        ValueError: If it is none, or of another dimension than the plant.
+    """
+    chosen = default_initial_set(plant) if initial_set is None else expect(initial_set, Ellipsoid, "initial_set")
+    if chosen.dim != plant.n:
+        raise ValueError(f"initial_set must have dimension {plant.n}, got {chosen.dim}")
+    return chosen
+
+
+def require_suitable(task: Task, plant: LinearPlant) -> None:
+    """Raises ValueError unless a task suits the plant."""
+    if problem := task.check(plant):
+        raise ValueError(f"{type(task).__name__}: {problem}")
 
 
 def expect(value: Any, kind: type[T], name: str) -> T:

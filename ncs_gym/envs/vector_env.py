@@ -9,6 +9,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from ncs_gym.downlink.loop import Inputs, no_inputs
+from ncs_gym.downlink.vector_loop import vector_downlink_of
 from ncs_gym.envs.env import SAMPLE_ROUNDING, NCSEnv, RenderModeError
 from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.reset_options import vector_reset_options
@@ -72,8 +74,11 @@ class NCSVectorEnv(VectorEnv):
         allowed, truncated = single.allow_assumption_violation, single.noise == "truncated"
         simulation = single.process.simulation
         self._process = simulation(self.plant, single.disturbance, allowed, self.num_envs, truncated=truncated)
-        patterns = arrival_patterns(self.plant, self.channel, self.contract)
+        self.downlink, self.certificate_contract = single.downlink, single.certificate_contract
+        patterns = arrival_patterns(self.plant, self.channel, self.certificate_contract)
         self._estimator = VectorEstimator(self.plant, patterns, self.num_envs)
+        self._downlink = vector_downlink_of(self.downlink, self._estimator, self.num_envs)
+        self._belief = self._downlink.belief()
         self._state = np.zeros((self.plant.n, self.num_envs))
         self._violations, self._done = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
         self.steps, self.episodes = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, np.int64)
@@ -82,11 +87,15 @@ class NCSVectorEnv(VectorEnv):
 
     @property
     def error_shapes(self) -> tuple[StatisticsTable, np.ndarray]:
-        """A table whose `shapes` (k, n, n) are the distinct error shapes so far, and each environment's number there.
+        """A table whose `shapes` (k, n, n) are the distinct error shapes so far, and the number there of each one now.
 
         The table grows; it is another object after shapes were forgotten.
         """
-        return self._estimator.patterns.table, self._estimator.statistics
+        return self._estimator.patterns.table, self._belief[1]
+
+    def beliefs(self, chosen: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Returns what `NCSEnv.beliefs` does for some environments, by index: estimates (n, k), `error_shapes`."""
+        return self._downlink.beliefs(chosen)
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
@@ -111,7 +120,7 @@ class NCSVectorEnv(VectorEnv):
             raise gym.error.ResetNeeded("reset all environments first")
         self._consistent = False
         self._begin(mask, starts)
-        info = self._info(np.zeros((self.plant.m, self.num_envs)), np.zeros(self.num_envs, np.bool_), mask)
+        info = self._info(no_inputs(self.plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), mask)
         self._consistent = True
         return self._observation(), info
 
@@ -129,13 +138,17 @@ class NCSVectorEnv(VectorEnv):
         if some_done and self.autoreset_mode is AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded("some episodes are over: reset them with options={'reset_mask': ...}")
         self._consistent = False
-        arrived = self._advance(u)
-        reward = self.task.reward_many(self.plant, self._task_state, self._state, u)
+        inputs = self._downlink.exchange(self.np_random, self.steps, u)
+        applied, committed, missing = inputs
+        arrived = self._advance(applied)
+        reward = self.task.reward_many(self.plant, self._task_state, self._state, applied)
         restarted = self._done.copy() if some_done else None
         if restarted is not None:  # NEXT_STEP: the last step ended these episodes
             self._begin(restarted, None)
-            u[:, restarted], reward[restarted], arrived[restarted] = 0.0, 0.0, False
-        info = self._info(u, arrived, None)
+            applied, committed = (np.where(restarted, 0.0, each) for each in (applied, committed))
+            reward[restarted], arrived[restarted] = 0.0, False
+            inputs = Inputs(applied, committed, missing & ~restarted)
+        info = self._info(inputs, arrived, None)
         terminated, truncated = self._ends(info["cost"], restarted)
         self._done = terminated | truncated
         observation = self._observation()
@@ -206,6 +219,7 @@ class NCSVectorEnv(VectorEnv):
             self._channel_state.begin(rng, mask)
         self._state[:, mask] = states
         self._estimator.begin(mask, states + first_errors)
+        self._downlink.begin(rng, mask)
         self.steps[mask], self._violations[mask], self._done[mask] = 0, 0.0, False
         self.episodes[mask] += 1
         self.starts[mask] = known
@@ -218,21 +232,23 @@ class NCSVectorEnv(VectorEnv):
 
     def _observation(self) -> np.ndarray:
         """Returns the observations, shape (N, n + extra)."""
-        entries = np.concatenate([self._estimator.mean, self.task.observe_many(self._task_state)])
+        task_state = self._downlink.predicted(self.task, self._task_state)
+        entries = np.concatenate([self._belief[0], self.task.observe_many(task_state)])
         observation = np.empty(entries.shape, np.float32)
         np.minimum(np.maximum(entries, self._low), self._high, out=observation, casting="same_kind")
         return observation.T
 
-    def _info(self, u: np.ndarray, arrived: np.ndarray, counted: np.ndarray | None) -> dict[str, Any]:
+    def _info(self, inputs: Inputs, arrived: np.ndarray, counted: np.ndarray | None) -> dict[str, Any]:
         """Returns the infos; the costs of environments that are not `counted`, shape (N,), do not count once more."""
         values = self.plant.constraint_values(self._state)
         cost = (np.maximum.reduce(values) > 0.0).astype(np.float64)
         self._violations = self._violations + (cost if counted is None else cost * counted)
+        self._belief = self._downlink.belief()
         table, numbers = self.error_shapes
-        shapes = table.shapes.take(numbers, axis=0)
+        belief = self._belief[0], table.shapes.take(numbers, axis=0)
         constraints = values, cost, self._violations.copy()
         alarm = self._estimator.alarm | self._process.alarm
-        return loop_info(self._estimator, self.contract, self._state, u, shapes, arrived, constraints, alarm)
+        return loop_info(self._estimator, belief, self.contract, self._state, inputs, arrived, constraints, alarm)
 
     def _restarted(self, observation: np.ndarray, info: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
         """Returns the first of new episodes where old ones ended, whose last go to final_obs and final_info."""
@@ -241,7 +257,7 @@ class NCSVectorEnv(VectorEnv):
         final |= {f"_{key}": done.copy() for key in info}
         final_observation = _where(done, observation, np.zeros_like(observation))
         self._begin(done, None)
-        fresh = self._info(np.zeros((self.plant.m, self.num_envs)), np.zeros(self.num_envs, np.bool_), done)
+        fresh = self._info(no_inputs(self.plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), done)
         merged = {key: _where(done, fresh[key], value) for key, value in info.items()}
         return _where(done, self._observation(), observation), merged | {
             "final_obs": final_observation,

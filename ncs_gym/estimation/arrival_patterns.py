@@ -167,6 +167,17 @@ class ArrivalPatterns:
                 found = self.table.update(statistics)
         return found
 
+    def predicted(self, statistics: int, steps: int) -> int:
+        """Returns the number of what some steps without a sample make of statistics, by their number."""
+        with self._lock:
+            for _ in range(steps):
+                statistics = self.table.predicted(statistics)
+        return statistics
+
+    def statistics_of(self, pattern: int) -> int:
+        """Returns the number of the statistics of the present estimate."""
+        return self._patterns[pattern].present
+
     def keeping(self, patterns: np.ndarray) -> tuple[ArrivalPatterns, np.ndarray]:
         """Returns a graph with some patterns, shape (k,), only, and their numbers there."""
         with self._lock:

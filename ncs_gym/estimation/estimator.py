@@ -134,6 +134,19 @@ class Estimator:
         if self._patterns.is_full:
             self._patterns, (self._pattern,) = self._patterns.keeping(np.array([self._pattern]))
 
+    def predicted(self, inputs: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Returns estimate, shape (n,), and error shape, (n, n), after the next steps, given their inputs, (m,) each.
+
+        It is what `advance` makes of the present belief with these inputs and without packets: the error then lies in
+        that ellipsoid, whatever packets arrive later.
+        """
+        mean = self.mean
+        for u in inputs:
+            mean = self._predicted(mean, u)
+        patterns = self._patterns
+        number = patterns.predicted(patterns.statistics_of(self._pattern), len(inputs))
+        return mean, patterns.table.statistics[number].shape
+
     def _take_in(self, packet: Packet, pattern: int) -> int:
         """Returns the pattern with one more packet, and keeps its sample."""
         if packet.episode != self.episode:

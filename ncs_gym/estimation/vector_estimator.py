@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
@@ -74,6 +74,12 @@ class VectorEstimator:
             self.pattern = self._follow(self.pattern, "arrival", partial(patterns.after_arrival, age=age), arrives, age)
         if arrivals:
             self._replay()
+
+    def predicted(self, mean: np.ndarray, inputs: Iterable[np.ndarray]) -> np.ndarray:
+        """Returns what the next steps make of estimates, shape (n, N), given their inputs, shape (m, N) each."""
+        for u in inputs:
+            mean = self._predicted(mean, u)
+        return mean
 
     def _follow(
         self,

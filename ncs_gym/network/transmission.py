@@ -75,7 +75,7 @@ class ChannelState:
 
     def __init__(self, channel: Channel, rng: np.random.Generator) -> None:
         self.channel = channel
-        self.in_flight: dict[int, list[Packet]] = {}
+        self.in_flight: dict[int, list[Any]] = {}
         self._loss_state = first_loss_state(channel, rng)
 
     def sends_at(self, step: int) -> bool:
@@ -99,6 +99,13 @@ class ChannelState:
         self._loss_state, delay = transmit(self.channel, rng, self._loss_state, measurement is not None)
         if delay >= 0 and measurement is not None:
             packet = Packet(step, self.channel.quantize(measurement), episode)
+            self.in_flight.setdefault(step + int(delay), []).append(packet)
+        return self.in_flight.pop(step, [])
+
+    def carry(self, rng: np.random.Generator, step: int, packet: Any) -> list[Any]:
+        """Puts a packet of any kind on the channel as it is, and returns those that arrive at this step."""
+        self._loss_state, delay = transmit(self.channel, rng, self._loss_state, sends=True)
+        if delay >= 0:
             self.in_flight.setdefault(step + int(delay), []).append(packet)
         return self.in_flight.pop(step, [])
 

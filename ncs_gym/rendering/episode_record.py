@@ -88,9 +88,12 @@ class FrameRecord:
         estimate: The estimate x_hat, shape (n,).
         error_shape: Shape Sigma_k of the set that holds the estimation error, shape (n, n).
         input: The input applied in the step that led here, shape (m,); None at reset.
+        committed: The input decided in that step, shape (m,); behind a downlink it is applied later. None at reset.
         violations: Number of steps of this episode with a violation.
         violated: Whether the true state violates the safe box now.
         measurement_age: Steps since the newest measurement used was taken.
+        missing_inputs: Number of steps of this episode in which the downlink broke and zero was applied.
+        input_missing: Whether that was so in the step that led here.
         path: The recent states, oldest first, shape (T, n).
         interventions: Whether the shield replaced the input that led to each of these states, shape (T,).
         packets: The recent packets, oldest first.
@@ -105,9 +108,12 @@ class FrameRecord:
     estimate: np.ndarray
     error_shape: np.ndarray
     input: np.ndarray | None
+    committed: np.ndarray | None
     violations: int
     violated: bool
     measurement_age: int
+    missing_inputs: int
+    input_missing: bool
     path: np.ndarray
     interventions: np.ndarray
     packets: tuple[PacketRecord, ...]
@@ -151,11 +157,12 @@ class EpisodeRecord:
 
     def begin(self, info: Mapping[str, Any], task_state: Any) -> None:
         """Starts an episode, with the info of its reset."""
-        self._step, self._distance = 0, 0.0
+        self._step, self._distance, self._missing_inputs = 0, 0.0, 0
         self._path: deque[np.ndarray] = deque(maxlen=RECENT_STEPS)
         self._interventions = deque([False], maxlen=RECENT_STEPS)
         self._packets: deque[PacketRecord] = deque(maxlen=RECENT_STEPS)
         self._input: np.ndarray | None = None
+        self._committed: np.ndarray | None = None
         self._store(info, task_state)
 
     def add(self, info: Mapping[str, Any], task_state: Any, network: ChannelState, arrived: list[Packet]) -> None:
@@ -170,7 +177,7 @@ class EpisodeRecord:
         self._step += 1
         if isinstance(self._task, SpeedTracking):
             self._distance += self._plant.dt * float(task_state[0])
-        self._input = info["input"].copy()
+        self._input, self._committed = info["input"].copy(), info["input_committed"].copy()
         self._store(info, task_state)
         self._interventions.append(self._annotation is not None and self._annotation.intervened)
         if network.sends_at(self._step):
@@ -187,9 +194,12 @@ class EpisodeRecord:
             estimate=self._estimate,
             error_shape=self._error_shape,
             input=self._input,
+            committed=self._committed,
             violations=self._violations,
             violated=self._violated,
             measurement_age=self._measurement_age,
+            missing_inputs=self._missing_inputs,
+            input_missing=self._input_missing,
             path=np.array(self._path),
             interventions=np.array(self._interventions),
             packets=tuple(self._packets),
@@ -205,6 +215,8 @@ class EpisodeRecord:
         self._estimate, self._error_shape = info["estimate"].copy(), info["error_shape"].copy()
         self._violations, self._violated = int(info["episode_violations"]), bool(info["cost"] > 0.0)
         self._measurement_age = int(info["measurement_age"])
+        self._input_missing = bool(info["downlink_broken"])
+        self._missing_inputs += self._input_missing
         self._task_state = task_state
 
 

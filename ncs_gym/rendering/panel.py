@@ -27,6 +27,9 @@ def draw_header(canvas: Canvas, frame: FrameRecord) -> None:
     color, fill = (theme.DANGER, theme.DANGER_FILL) if count else (theme.SAFE, theme.SAFE_FILL)
     left = _draw_label(canvas, theme.WIDTH - 16, text, color, fill, filled=frame.violated)
     _draw_shield(canvas, frame, left - 10)
+    if frame.missing_inputs:
+        text = f"downlink broken {frame.missing_inputs}\N{MULTIPLICATION SIGN}: zero applied"
+        canvas.text(text, (16, theme.HEADER.h + 13), theme.DANGER, theme.BODY, bold=frame.input_missing)
 
 
 def draw_panel(canvas: Canvas, frame: FrameRecord) -> None:
@@ -145,7 +148,8 @@ def _draw_input(canvas: Canvas, frame: FrameRecord, index: int, y: float) -> Non
     canvas.line([(middle, bar.y - 2), (middle, bar.bottom + 2)], theme.MUTED, 1.0)
     annotation = frame.annotation
     if annotation is not None and annotation.intervened and annotation.proposed is not None:
-        _draw_correction(canvas, x_of(float(annotation.proposed[index])), x, bar.y + bar.h / 2)
+        decided = x if frame.committed is None else x_of(float(frame.committed[index]))
+        _draw_correction(canvas, x_of(float(annotation.proposed[index])), decided, bar.y + bar.h / 2)
 
 
 def _draw_correction(canvas: Canvas, start: float, end: float, y: float) -> None:

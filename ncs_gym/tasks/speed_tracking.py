@@ -60,6 +60,10 @@ class SpeedTracking(Task):
         target = target + (chance < p) * (drawn - target)
         return np.array([speed + plant.dt * u[self.input_index], target])
 
+    def predict(self, plant, task_state, u):  # noqa: D102
+        speed, target = task_state
+        return np.array([speed + plant.dt * u[self.input_index], target])
+
     def observe(self, task_state):  # noqa: D102
         return task_state[1:] - task_state[:1]
 

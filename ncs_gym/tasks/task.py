@@ -37,6 +37,14 @@ class Task(ReadOnlyArrays, ABC):
         """Returns the task's state after input u, shape (m,) or (m, N), was applied for one step."""
         return task_state
 
+    def predict(self, plant: LinearPlant, task_state: Any, u: np.ndarray) -> Any:
+        """Returns what is known of the task's state after an input that is already decided, (m,) or (m, N), is applied.
+
+        Behind a downlink observations belong to the time at which the next input takes effect. What chance does by then
+        is not known: unchanged by default.
+        """
+        return task_state
+
     def observe(self, task_state: Any) -> np.ndarray:
         """Returns the extra observation entries, shape (extra,) or (extra, N)."""
         return np.zeros((0, *np.shape(task_state)[1:]))
@@ -75,6 +83,15 @@ class Task(ReadOnlyArrays, ABC):
         for episode, (each, own) in enumerate(zip(task_state, u.T, strict=True)):
             moved[episode] = self.advance(rng, plant, each, own)
         return moved
+
+    def predict_many(self, plant: LinearPlant, task_state: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Returns what `predict` does for inputs (m, N) of N environments."""
+        if self.vectorized:
+            return self.predict(plant, task_state, u)
+        predicted = np.empty_like(task_state)
+        for episode, (each, own) in enumerate(zip(task_state, u.T, strict=True)):
+            predicted[episode] = self.predict(plant, each, own)
+        return predicted
 
     def observe_many(self, task_state: np.ndarray) -> np.ndarray:
         """Returns the extra observation entries of N environments, shape (extra, N)."""

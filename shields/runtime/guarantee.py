@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ncs_gym import Ellipsoid, LinearPlant
+from ncs_gym.downlink import DownlinkProtocol
 from ncs_gym.plants.linear_plant import SIMULATED_REACH
 from shields.certificate import Certificate
 from shields.runtime.decisions import Decision
@@ -31,10 +33,12 @@ UNUSABLE = "there is no usable estimate or error shape"
 NO_ERROR_SET = "a certificate of the published method carries no error set"
 NOT_KNOWN_INSIDE = "the state is not known to be in the safe set"
 LEFT_MODEL = "the state is not known to have stayed where the bound of the linear model's remainder holds"
+LATE_INPUT = "the downlink broke its contract: an input decided earlier was not applied"
+NO_DOWNLINK_CONTRACT = "the downlink has no contract: nothing says that inputs arrive in time"
 # Codes of `GuaranteeMonitor.reasons`; 0 while the proof holds.
 EXPLANATIONS = (
     "", ALARM, OTHER_INPUT, OTHER_STEPS, LARGE_ERROR, FAR_OUT, UNUSABLE, NO_ERROR_SET, NOT_KNOWN_INSIDE,
-    LEFT_MODEL,
+    LEFT_MODEL, LATE_INPUT, NO_DOWNLINK_CONTRACT,
 )  # fmt: skip
 CODES = {explanation: code for code, explanation in enumerate(EXPLANATIONS)}
 
@@ -47,11 +51,14 @@ class MonitorState(NamedTuple):
         inside: Whether x in S is proved, up to what broke; in mode "lookahead" also if x is proved in the box and the
             inputs stored are what is left of a certified plan.
         certified: Whether the error ellipsoid lies inside a certified one.
+        wait: Behind a downlink, number of steps until x in S is proved now, if `inside` stays true: that is about the
+            time at which the next input takes effect. 0 without one.
     """
 
     broken: Any
     inside: Any
     certified: Any
+    wait: Any = 0
 
 
 class LoopObservation(NamedTuple):
@@ -92,12 +99,22 @@ class GuaranteeMonitor:
     only K x_hat is not proved safe with it. Of a plant with a remainder nothing is recoverable: its error bound holds
     only while every state so far is proved to be in the box (docs/beyond_linear.md).
 
+    Behind a downlink what is observed belongs to the time at which the next input takes effect, and so does `inside`.
+    It is proved for the present as soon as it was proved for this time, c steps ago.
+
     Methods are functions of a state and of what happened, truth values for one loop and arrays (N,) for many.
+
+    Args:
+        safety_filter: Makes the decisions.
+        downlink: How commands are sent; None for an ideal downlink.
     """
 
-    def __init__(self, safety_filter: SafetyFilter) -> None:
+    def __init__(self, safety_filter: SafetyFilter, downlink: DownlinkProtocol | None = None) -> None:
+        self._lead = 0 if downlink is None else downlink.lead
+        self._is_promised = downlink is None or downlink.contract is not None
         self._test = safety_filter.test
-        self._reach = SIMULATED_REACH * safety_filter.plant.half_widths
+        # The present estimate, which is not observed then, is near where what was predicted of it is nearer still.
+        self._reach = SIMULATED_REACH * safety_filter.plant.half_widths / (2.0 if self._lead else 1.0)
         self._has_error_set = safety_filter.certificate.Sigma is not None
         self._is_local = safety_filter.plant.remainder is not None
 
@@ -110,10 +127,30 @@ class GuaranteeMonitor:
             unmoved: Whether the environment has not moved since.
             report: What is observed.
         """
-        return self._observe(_first(unmoved * 0, unmoved == False, OTHER_STEPS), known_inside, report)  # noqa: E712
+        return self._observe(_first(unmoved * 0, unmoved == False, OTHER_STEPS), known_inside, report, 0)  # noqa: E712
+
+    def cover(self, state: MonitorState, earlier: Iterable[tuple[Any, LoopObservation]]) -> MonitorState:
+        """Returns the state at the start with what is known of the steps before the first decision takes effect.
+
+        Args:
+            state: What `start` returned.
+            earlier: Of x_0 .. x_{c-1}, whether it is known to be in S, or in the box in mode "lookahead", and what is
+                observed of it.
+        """
+        broken, wait = state.broken, state.wait
+        for ahead, (inside, report) in enumerate(earlier):
+            seen = self._observe(broken, inside, report, 0)
+            broken, wait = seen.broken, np.maximum(wait, (seen.inside == False) * (ahead + 1))  # noqa: E712
+        return state._replace(broken=broken, wait=wait)
 
     def advance(
-        self, state: MonitorState, decision: Decision, moved_once: Any, same_input: Any, report: LoopObservation
+        self,
+        state: MonitorState,
+        decision: Decision,
+        moved_once: Any,
+        same_input: Any,
+        report: LoopObservation,
+        on_time: Any = True,
     ) -> MonitorState:
         """Returns the state one step later.
 
@@ -123,24 +160,31 @@ class GuaranteeMonitor:
             moved_once: Whether the environment moved exactly one step.
             same_input: Whether the input applied is the one decided.
             report: What is observed after the step.
+            on_time: Behind a downlink, whether the input applied is the one decided for this step.
         """
         broken = _first(state.broken, moved_once == False, OTHER_STEPS)  # noqa: E712
         broken = _first(broken, same_input == False, OTHER_INPUT)  # noqa: E712
+        if on_time is not True:
+            broken = _first(broken, on_time == False, LATE_INPUT)  # noqa: E712
         inside = decision.passed
         if not _all(inside):
             # A stored plan was certified for every error that it can meet: it needs no certified error set on its way.
             inside = inside | state.inside & (state.certified & decision.fallback | decision.stored)
-        return self._observe(broken, inside, report)
+        return self._observe(broken, inside, report, state.wait)
 
     def reasons(self, state: MonitorState) -> Any:
         """Returns why the proof does not hold now, as indices of `EXPLANATIONS`: 0 while it does."""
         reason = state.broken
         if not self._has_error_set:
             reason = _first(reason, True, NO_ERROR_SET)
+        if not self._is_promised:
+            reason = _first(reason, True, NO_DOWNLINK_CONTRACT)
         reason = _first(reason, state.inside == False, NOT_KNOWN_INSIDE)  # noqa: E712
+        if self._lead:
+            reason = _first(reason, state.wait > 0, NOT_KNOWN_INSIDE)
         return _first(reason, state.certified == False, LARGE_ERROR)  # noqa: E712
 
-    def _observe(self, broken: Any, inside: Any, report: LoopObservation) -> MonitorState:
+    def _observe(self, broken: Any, inside: Any, report: LoopObservation, wait: Any) -> MonitorState:
         """Takes in the alarm, the running ellipsoid, and what the estimate alone proves."""
         estimate, errors, alarm = report
         size = np.abs(estimate)
@@ -155,7 +199,9 @@ class GuaranteeMonitor:
             inside = inside | self._test.knows_inside(estimate, errors, MARGIN)
             if self._is_local:
                 broken = _first(broken, inside == False, LEFT_MODEL)  # noqa: E712
-        return MonitorState(broken, inside, errors.certified)
+        if self._lead:
+            wait = (inside & (wait > 1)) * (wait - 1) + (inside == False) * (self._lead + 1)  # noqa: E712
+        return MonitorState(broken, inside, errors.certified, wait)
 
 
 def _rows_all(conditions: np.ndarray) -> Any:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from ncs_gym.downlink import DownlinkProtocol
+from shields.downlink.first_steps import known_inside
+from shields.downlink.schedule import Schedule
 from shields.runtime.decisions import Decision
 from shields.runtime.filter import MARGIN, SafetyFilter
 from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, LoopObservation, MonitorState, StartKnown
@@ -21,33 +25,51 @@ class GuardedFilter:
 
     Args:
         safety_filter: Makes the decisions.
+        downlink: How commands are sent; None for an ideal downlink. What is observed then belongs to the time at which
+            the next input takes effect.
 
     Attributes:
         filter: The same.
+        lead: c, the number of steps from a decision to its effect.
         report: What was observed last.
         decided: Entries of the input decided last, [physical units].
     """
 
-    def __init__(self, safety_filter: SafetyFilter) -> None:
+    def __init__(self, safety_filter: SafetyFilter, downlink: DownlinkProtocol | None = None) -> None:
         self.filter = safety_filter
-        self._monitor = GuaranteeMonitor(safety_filter)
+        self.lead = 0 if downlink is None else downlink.lead
+        self._monitor = GuaranteeMonitor(safety_filter, downlink)
+        self._schedule = None if downlink is None else Schedule(self.lead, safety_filter.plant.m)
         self.report: LoopObservation
         self._state: MonitorState
         self._decision: Decision
         self.decided: list[float] = []
         self._stored: np.ndarray
 
-    def begin(self, report: LoopObservation, known: StartKnown, unmoved: bool = True) -> None:
+    def begin(
+        self,
+        report: LoopObservation,
+        known: Sequence[StartKnown],
+        unmoved: bool = True,
+        beliefs: Sequence[tuple[np.ndarray, np.ndarray]] = (),
+    ) -> None:
         """Begins an episode.
 
         Args:
             report: What is observed.
-            known: What is known of the start.
+            known: What is known of x_0 .. x_c (`starts_known`).
             unmoved: Whether the plant has not moved since.
+            beliefs: Estimates and error shapes of x_0 .. x_{c-1}, before the first decision takes effect.
         """
         self.report = report
-        self._stored, is_safe = first_store(self.filter, report.estimate, report.errors, known)
+        self._stored, is_safe = first_store(self.filter, report.estimate, report.errors, known[-1])
         self._state = self._monitor.start(is_safe, unmoved, report)
+        if self._schedule is not None:
+            self._schedule.start()
+            reports = [self.reported(mean.copy(), shape, alarm=False) for mean, shape in beliefs]
+            pairs = zip(known[:-1], reports, strict=True)
+            inside = [known_inside(self.filter, start, each.estimate, each.errors) for start, each in pairs]
+            self._state = self._monitor.cover(self._state, zip(inside, reports, strict=True))
 
     def decide(self, proposed: np.ndarray) -> Decision:
         """Returns the decision about a proposed input, shape (m,), at the estimate reported last; never raises."""
@@ -56,18 +78,29 @@ class GuardedFilter:
         self.decided = self._decision.input.tolist()  # the caller may write into the array
         return self._decision
 
-    def advance(self, applied: np.ndarray | None, moved_once: bool, report: LoopObservation) -> None:
+    def advance(
+        self,
+        applied: np.ndarray | None,
+        moved_once: bool,
+        report: LoopObservation,
+        committed: np.ndarray | None = None,
+    ) -> None:
         """Takes in what happened in the step that followed the decision.
 
         Args:
             applied: The input applied, shape (m,); None if it is not known.
             moved_once: Whether the plant moved exactly one step.
             report: What is observed after the step.
+            committed: Behind a downlink, the input that was committed, shape (m,); None if it is not known.
         """
-        same_input = applied is not None and applied.tolist() == self.decided
-        if not (moved_once and same_input):  # what is stored was certified for other states
+        on_time, taken = True, applied
+        if self._schedule is not None:
+            due, taken = self._schedule.due(self.decided), committed
+            on_time = applied is not None and applied.tolist() == due
+        same_input = taken is not None and taken.tolist() == self.decided
+        if not (moved_once and same_input and on_time):  # what is stored was certified for other states
             self._stored = self._stored[:0]
-        self._state = self._monitor.advance(self._state, self._decision, moved_once, same_input, report)
+        self._state = self._monitor.advance(self._state, self._decision, moved_once, same_input, report, on_time)
         self.report = report
 
     def reported(self, estimate: np.ndarray, error_shape: Any, alarm: bool) -> LoopObservation:
@@ -88,7 +121,9 @@ class GuardedFilter:
 def first_store(
     safety_filter: SafetyFilter, estimate: np.ndarray, errors: PredictedErrors, known: StartKnown
 ) -> tuple[np.ndarray, bool]:
-    """Returns what is stored before the first decision, shape (k, m), and whether the start is proved safe.
+    """Returns what is stored before the first decision, shape (k, m), and whether the state is proved safe.
+
+    The state is that at which the first decision takes effect, without a downlink the start.
 
     It is where it is known to be in S; in mode "lookahead" also where it is known to be in the box, by what starts are
     possible or by the estimate, and a first plan is certified.

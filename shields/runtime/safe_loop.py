@@ -9,13 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym import Channel, Ellipsoid, Estimator, LinearPlant, Packet
+from ncs_gym import Channel, ChannelContract, Ellipsoid, Estimator, LinearPlant, Packet
+from ncs_gym.downlink import Command, CommittedInputs, downlink_protocol
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
 from ncs_gym.validation import as_numbers, as_vector, shown
 from shields.certificate import Certificate
+from shields.downlink.first_steps import starts_known
 from shields.runtime.decisions import Decision
 from shields.runtime.filter import SafetyFilter
-from shields.runtime.guarantee import LoopObservation, start_known
+from shields.runtime.guarantee import LoopObservation
 from shields.runtime.guarded_filter import GuardedFilter
 
 NOT_STARTED = "no episode is under way: call start"
@@ -51,16 +53,24 @@ class SafeLoop:
     that the actuator applies something else (unless it is told), or that packets carry wrong stamps. A certificate
     under a channel contract brings its error sets along. Not for use by several threads at once.
 
+    Behind a downlink that is late or loses commands, send `command` after each `decide` instead, and let an
+    `ncs_gym.Actuator` apply what it holds (docs/contracts.md, "Both directions"). What is decided takes effect `lead`
+    steps later; estimate and error shape belong to that time.
+
     Args:
         certificate: Verified exactly here.
         plant: The plant it was made for.
         channel: Its longest delay (older packets are discarded) and quantization step count, its losses do not.
         mode: "project", "lookahead", "switch", "boundary" or "monitor"; see `SafetyFilter`.
         horizon: Longest plan of mode "lookahead", in steps; see `SafetyFilter`.
+        downlink: The channel from here to the actuator; None if what is decided is applied at once.
+        downlink_contract: What is assumed of it; by default what its settings guarantee.
 
     Attributes:
         filter: Makes the decisions.
-        contract: Channel contract of the certificate; None without one.
+        contract: Channel contract of the certificate; None without one. Behind a downlink it counts c steps more than
+            that of the channel.
+        lead: c, the number of steps from a decision to its effect; 0 without a downlink.
 
     Raises:
         CertificateError: If the certificate does not verify for the plant.
@@ -75,13 +85,18 @@ class SafeLoop:
         channel: Channel,
         mode: str = "project",
         horizon: int | None = None,
+        downlink: Channel | None = None,
+        downlink_contract: ChannelContract | None = None,
     ) -> None:
         self.filter = SafetyFilter(certificate, plant, mode, horizon)
         if not isinstance(channel, Channel):
             raise ValueError(f"channel must be a Channel (its contract is the certificate's), got {shown(channel)}")
         self.contract = None if certificate.ages is None else certificate.ages.sets.contract
         self._estimator = Estimator(plant, channel, patterns=arrival_patterns(plant, channel, self.contract))
-        self._guarded = GuardedFilter(self.filter)
+        protocol = downlink_protocol(downlink, downlink_contract)
+        self._guarded = GuardedFilter(self.filter, protocol)
+        self.lead = self._guarded.lead
+        self._inputs = CommittedInputs(self.lead, plant.m)
         self._phase = _Phase.STOPPED
 
     def start(self, x_hat0: Any, initial_set: Ellipsoid | np.ndarray | None = None) -> None:
@@ -103,23 +118,27 @@ class SafeLoop:
             initial_set = as_vector(initial_set, n, "initial_set")
         if isinstance(initial_set, Ellipsoid) and initial_set.dim != n:
             raise ValueError(f"initial_set must have dimension {n}, got {initial_set.dim}")
-        known = start_known(self.filter, initial_set)
+        known = starts_known(self.filter, initial_set, self.lead)
         self._phase = _Phase.STOPPED
         self._estimator.reset(mean)
-        self._guarded.begin(self._report(), known)
+        self._inputs.start()
+        earlier = [self._estimator.predicted(self._inputs.pending[:ahead]) for ahead in range(self.lead)]
+        self._guarded.begin(self._report(), known, beliefs=earlier)
         self._phase = _Phase.STARTED
 
     def receive(self, packets: Iterable[Packet] = (), applied: Any = None) -> np.ndarray:
         """Returns the estimate at this control step, shape (n,): that of the last one moved on, then corrected.
+
+        Behind a downlink it is that of the time at which the input decided next takes effect.
 
         At step 0 it is the first estimate: packets from before the first step are of no use.
 
         Args:
             packets: What arrived since the last call, in any order; duplicates, late ones and those of another episode
                 are sorted out.
-            applied: What the actuator applied since the last decision, shape (m,), if that may be something else. If it
-                is, the estimate follows it and the guarantee ends; if it is no finite input, the estimate follows the
-                decision.
+            applied: What the actuator applied since the last decision, shape (m,), if that may be something else than
+                was decided for this time. If it is, the estimate follows it and the guarantee ends; if it is no finite
+                input, the estimate follows the decision.
 
         Raises:
             RuntimeError: If `start` was not called, or nothing was decided since the last call.
@@ -135,12 +154,12 @@ class SafeLoop:
             raise RuntimeError("receive was called twice in a step: hand over all packets of a step in one call")
         if phase is _Phase.DECIDED:
             self._phase = _Phase.STOPPED  # if something is raised in between, what is known is not consistent
-            decided = np.array(self._guarded.decided)
-            told = decided if applied is None else _as_input(applied, decided.shape)
-            self._estimator.advance(decided if told is None else told, arrived)
-            self._guarded.advance(told, True, self._report())
+            decided, due = np.array(self._guarded.decided), self._inputs.pop()
+            told = due if applied is None else _as_input(applied, due.shape)
+            self._estimator.advance(due if told is None else told, arrived)
+            self._guarded.advance(told, True, self._report(), decided)
         self._phase = _Phase.RECEIVED
-        return self._estimator.mean.copy()
+        return self.estimate
 
     def decide(self, proposed: Any) -> Decision:
         """Returns what to apply from now until the next step, and why.
@@ -155,8 +174,19 @@ class SafeLoop:
         if self._require_started() is _Phase.DECIDED:
             raise RuntimeError("decide was called twice in a step: call receive in between, with the packets that came")
         decision = self._guarded.decide(self._clipped(proposed))
+        self._inputs.commit(decision.input)
         self._phase = _Phase.DECIDED
         return decision
+
+    def command(self) -> Command:
+        """Returns what to send to the actuator after a decision: the committed inputs of this step and the next c.
+
+        Raises:
+            RuntimeError: If nothing was decided at this step.
+        """
+        if self._phase is not _Phase.DECIDED:
+            raise RuntimeError("call decide before command: it sends what was decided at this step")
+        return self._inputs.command(self.steps, self.episode)
 
     def step(self, proposed: Any, packets: Iterable[Packet] = (), applied: Any = None) -> Decision:
         """Returns the decision at this control step: `receive`, then `decide`."""
@@ -180,13 +210,13 @@ class SafeLoop:
 
     @property
     def estimate(self) -> np.ndarray:
-        """x_hat at this control step, shape (n,)."""
-        return self._estimator.mean.copy()
+        """x_hat at this control step, shape (n,); behind a downlink of the time of the next effect."""
+        return self._belief()[0].copy()
 
     @property
     def error_shape(self) -> np.ndarray:
-        """Sigma_k, shape (n, n): x_hat - x lies in E(Sigma_k)."""
-        return self._estimator.shape.copy()
+        """Sigma_k, shape (n, n): x_hat - x lies in E(Sigma_k), at the time of the estimate."""
+        return self._belief()[1].copy()
 
     @property
     def steps(self) -> int:
@@ -210,8 +240,11 @@ class SafeLoop:
 
     def _report(self) -> LoopObservation:
         """Returns what the estimator says now."""
-        estimator = self._estimator
-        return self._guarded.reported(estimator.mean, estimator.shape, estimator.alarm)
+        return self._guarded.reported(*self._belief(), self._estimator.alarm)
+
+    def _belief(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns estimate and error shape of the time at which the next input takes effect."""
+        return self._estimator.predicted(self._inputs.pending[: self.lead])
 
     def _clipped(self, proposed: Any) -> np.ndarray:
         """Returns the proposal within the limits, shape (m,); as it is, or empty, where it is no finite input."""

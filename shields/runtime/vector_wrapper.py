@@ -10,8 +10,10 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 
 from ncs_gym.envs.vector_env import NCSVectorEnv
-from ncs_gym.validation import as_number, as_numbers, shown
+from ncs_gym.validation import as_number, shown
 from shields.certificate import Certificate
+from shields.downlink.first_steps import first_observations, starts_known
+from shields.downlink.schedule import VectorSchedule, as_decided, columns
 from shields.runtime.decisions import Decision
 from shields.runtime.filter import SafetyFilter
 from shields.runtime.guarantee import (
@@ -21,10 +23,11 @@ from shields.runtime.guarantee import (
     GuaranteeMonitor,
     LoopObservation,
     MonitorState,
-    start_known,
+    StartKnown,
 )
 from shields.runtime.guarded_filter import first_store
 from shields.runtime.one_step_test import norms
+from shields.runtime.predicted_errors import PredictedErrors
 from shields.runtime.wrapper import certificate_for, environment_behind, hint_for
 
 REASONS = np.array(EXPLANATIONS, dtype=object)
@@ -76,12 +79,16 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         self.penalty = as_number(penalty, "penalty", low=0.0)
         if certificate is not None and not isinstance(certificate, Certificate):
             raise ValueError(f"certificate must be a Certificate or None, got {shown(certificate)}")
-        self.certificate = certificate_for(inner.plant, inner.contract) if certificate is None else certificate
+        self.certificate = (
+            certificate_for(inner.plant, inner.certificate_contract) if certificate is None else certificate
+        )
         self.filter = SafetyFilter(self.certificate, inner.plant, mode, horizon)
-        self._monitor = GuaranteeMonitor(self.filter)
-        self._start_known = start_known(self.filter, inner.single.initial_set)
+        self._monitor = GuaranteeMonitor(self.filter, inner.downlink)
+        self._lead = 0 if inner.downlink is None else inner.downlink.lead
+        self._start_known = starts_known(self.filter, inner.single.initial_set, self._lead)
         count, nothing = self.num_envs, np.zeros(self.num_envs, np.bool_)
-        self._state = MonitorState(np.full(count, CODES[OTHER_STEPS]), nothing, nothing)
+        self._schedule = None if inner.downlink is None else VectorSchedule(self._lead, inner.plant.m, count)
+        self._state = MonitorState(np.full(count, CODES[OTHER_STEPS]), nothing, nothing, np.zeros(count, np.int64))
         self._interventions = np.zeros(count, np.int64)
         # Plans stored in mode "lookahead", NaN beyond their ends.
         self._stored = np.full((self.filter.horizon or 0, inner.plant.m, count), np.nan)
@@ -111,7 +118,8 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         nothing, none = np.zeros((self.filter.plant.m, self.num_envs)), np.zeros(self.num_envs, np.bool_)
         idle = Decision(nothing, none, none, none, self._idle_margins(np.arange(self.num_envs)), none)
         kept = idle._replace(passed=self._state.inside)  # environments left alone keep what is proved of them
-        self._state = self._monitor.advance(self._state, kept, unmoved, ~none, self._report)
+        kept_state = self._monitor.advance(self._state, kept, unmoved, ~none, self._report)
+        self._state = kept_state._replace(wait=np.maximum(kept_state.wait, self._state.wait))  # no step has passed
         self._stored[..., ~unmoved] = np.nan
         self._start(restarted, now.steps == 0)
         self._clock = now
@@ -136,15 +144,17 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         now, state = self._read_clock(), self._state
         restarted, moved_once = _moved(before, now)
         self._report = self._observed(info)
-        self._state = self._advanced(state, decided, moved_once, info, self._report)
+        due = None if self._schedule is None else self._schedule.due(decided.input)
+        same_input, on_time = as_decided(info, decided.input, due)
+        self._state = self._monitor.advance(state, decided, moved_once, same_input, self._report, on_time)
         self._interventions = self._interventions + decided.intervened
         added, charged, self._stored = {}, decided.intervened, decided.plan.copy()
         if len(self._stored):  # what is stored was certified for the states that follow
-            self._stored[..., ~(moved_once & _same_input(info, decided))] = np.nan
+            self._stored[..., ~(moved_once & same_input & on_time)] = np.nan
         if np.count_nonzero(restarted):
             charged = charged & ~restarted
             if "final_info" in info:  # SAME_STEP: the step ended an episode before it began the next
-                added["final_info"] = self._final_info(info, state, decided, proposed, moved_once)
+                added["final_info"] = self._final_info(info, state, decided, proposed, moved_once, due)
                 charged = decided.intervened.copy()
             self._start(restarted, moved_once)
             decided.input[:, restarted], proposed[:, restarted], decided.intervened[restarted] = 0.0, 0.0, False
@@ -158,58 +168,70 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
 
     def _observed(self, info: dict[str, Any]) -> LoopObservation:
         """Returns what decisions and the guarantee need of an info, as copies: callers may write into theirs."""
-        table, numbers = self._inner.error_shapes
+        estimates = columns(info.get("estimate"), (self.num_envs, self.filter.plant.n))
+        errors = self._errors_of(self._inner.error_shapes[1])
+        return LoopObservation(
+            np.array(estimates, order="C"), errors, _alarms(info.get("assumption_violated"), self.num_envs)
+        )
+
+    def _errors_of(self, numbers: np.ndarray) -> PredictedErrors:
+        """Returns what is known of the error shapes with these numbers in the environment's table."""
+        table = self._inner.error_shapes[0]
         if table is not self._table:
             self._table, self._known = table, self.filter.errors_of_many(table.shapes[:0])
         if len(table.shapes) > len(self._known.radius):
             new = self.filter.errors_of_many(table.shapes[len(self._known.radius) :])
             self._known = self._known.followed_by(new)
-        estimates = _columns(info.get("estimate"), (self.num_envs, self.filter.plant.n))
-        errors = self._known.of(np.array(numbers, np.intp))
-        return LoopObservation(
-            np.array(estimates, order="C"), errors, _alarms(info.get("assumption_violated"), self.num_envs)
-        )
-
-    def _advanced(
-        self,
-        state: MonitorState,
-        decided: Decision,
-        moved_once: np.ndarray,
-        info: dict[str, Any],
-        report: LoopObservation,
-    ) -> MonitorState:
-        """Returns what is known after a step that applied these decisions, as far as the info says so."""
-        return self._monitor.advance(state, decided, moved_once, _same_input(info, decided), report)
+        return self._known.of(np.array(numbers, np.intp))
 
     def _start(self, restarted: np.ndarray, begun: np.ndarray) -> None:
         """Begins anew where episodes began, `begun` where nothing has moved since; shape (N,) each."""
         known, starts = [self._start_known] * self.num_envs, self._inner.starts
         for e in np.flatnonzero(restarted & ~np.isnan(starts[:, 0])).tolist():
-            known[e] = start_known(self.filter, starts[e])
-        is_safe = np.array([each.in_safe_set for each in known])
+            known[e] = starts_known(self.filter, starts[e], self._lead)
+        is_safe = np.array([each[-1].in_safe_set for each in known])
         if len(self._stored):
             self._stored[..., restarted] = np.nan
             for e in np.flatnonzero(restarted & ~is_safe).tolist():
                 estimate, errors = self._report.estimate[:, e].copy(), self._report.errors.of(np.array([e])).single()
-                plan, is_safe[e] = first_store(self.filter, estimate, errors, known[e])
+                plan, is_safe[e] = first_store(self.filter, estimate, errors, known[e][-1])
                 self._stored[: len(plan), :, e] = plan
         started = self._monitor.start(is_safe, begun, self._report)
         both = zip(started, self._state, strict=True)
         self._state = MonitorState(*(np.where(restarted, new, old) for new, old in both))
+        if self._schedule is not None:
+            self._schedule.start(restarted)
+            self._cover(np.flatnonzero(restarted), known)
         self._interventions = np.where(restarted, 0, self._interventions)
 
+    def _cover(self, chosen: np.ndarray, known: list[tuple[StartKnown, ...]]) -> None:
+        """Takes in what is known of the steps before the first decisions take effect, where episodes began."""
+        beliefs = [(mean, self._errors_of(numbers)) for mean, numbers in self._inner.beliefs(chosen)[:-1]]
+        earlier = first_observations(self.filter, [known[e] for e in chosen.tolist()], beliefs)
+        covered = self._monitor.cover(MonitorState(*(array[chosen] for array in self._state)), earlier)
+        for kept, new in zip(self._state, covered, strict=True):
+            kept[chosen] = new
+
     def _final_info(
-        self, info: dict[str, Any], state: MonitorState, decided: Decision, proposed: np.ndarray, moved_once: np.ndarray
+        self,
+        info: dict[str, Any],
+        state: MonitorState,
+        decided: Decision,
+        proposed: np.ndarray,
+        moved_once: np.ndarray,
+        due: np.ndarray | None,
     ) -> dict[str, Any]:
         """Returns final_info with the shield's keys of the last steps of episodes that ended (SAME_STEP)."""
         final, done = dict(info["final_info"]), np.flatnonzero(info["_final_info"])
-        ended = {key: np.asarray(final[key])[done] for key in ("estimate", "input", "assumption_violated")}
+        keys = "estimate", "input", "input_committed", "assumption_violated"
+        ended = {key: np.asarray(final[key])[done] for key in keys}
         errors = self.filter.errors_of_many(np.asarray(final["error_shape"])[done])
-        estimates = _columns(ended["estimate"], (len(done), self.filter.plant.n))
+        estimates = columns(ended["estimate"], (len(done), self.filter.plant.n))
         report = LoopObservation(estimates, errors, _alarms(ended["assumption_violated"], len(done)))
         state = MonitorState(*(array[done] for array in state))
         decided = Decision(*(array[..., done] for array in decided))
-        state = self._advanced(state, decided, moved_once[done], ended, report)
+        same_input, on_time = as_decided(ended, decided.input, None if due is None else due[:, done])
+        state = self._monitor.advance(state, decided, moved_once[done], same_input, report, on_time)
         for key, value in self._info(decided, proposed[:, done], state, self._interventions[done]).items():
             final[key] = np.full((self.num_envs, *value.shape[1:]), "" if value.dtype == object else 0, value.dtype)
             final[key][done], final[f"_{key}"] = value, info["_final_info"].copy()
@@ -264,20 +286,8 @@ def overridden(actions: Any, decided: Decision, limits: np.ndarray) -> np.ndarra
     return numbers
 
 
-def _columns(value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Returns rows as columns, the transpose of `shape`; NaN for what has another shape or is no numbers."""
-    numbers = as_numbers(value)
-    return np.full(shape[::-1], np.nan) if numbers is None or numbers.shape != shape else numbers.T
-
-
-def _same_input(info: dict[str, Any], decided: Decision) -> np.ndarray:
-    """Returns where the input applied is the one decided, shape (N,), as far as the info says so."""
-    applied = _columns(info.get("input"), decided.input.T.shape)
-    return (applied == decided.input).all(axis=0)
-
-
 def _alarms(value: Any, count: int) -> np.ndarray:
     """Returns which alarms are reported, shape (N,); all of them if the shape or kind is wrong."""
     if type(value) is np.ndarray and value.dtype == np.bool_ and value.shape == (count,):
         return value
-    return ~(_columns(value, (count,)) == 0.0)
+    return ~(columns(value, (count,)) == 0.0)

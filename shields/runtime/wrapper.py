@@ -16,9 +16,10 @@ from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv, NCSVectorE
 from ncs_gym.envs.env import applied_input
 from ncs_gym.validation import as_number, as_numbers, shown
 from shields.certificate import Certificate
+from shields.downlink.first_steps import starts_known
 from shields.runtime.decisions import NO_PLAN
 from shields.runtime.filter import SafetyFilter
-from shields.runtime.guarantee import LoopObservation, StartKnown, start_known
+from shields.runtime.guarantee import LoopObservation, StartKnown
 from shields.runtime.guarded_filter import GuardedFilter
 
 T = TypeVar("T")
@@ -91,12 +92,14 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         self.penalty = as_number(penalty, "penalty", low=0.0)
         if certificate is not None and not isinstance(certificate, Certificate):
             raise ValueError(f"certificate must be a Certificate or None, got {shown(certificate)}")
-        self.certificate = certificate_for(inner.plant, inner.contract) if certificate is None else certificate
+        self.certificate = (
+            certificate_for(inner.plant, inner.certificate_contract) if certificate is None else certificate
+        )
         self.filter = SafetyFilter(self.certificate, inner.plant, mode, horizon)
-        self._guarded = GuardedFilter(self.filter)
+        self._guarded = GuardedFilter(self.filter, inner.downlink)
         self._clock: tuple[int, int] | None = None
         self._start: Any = None
-        self._known = StartKnown(False, False)
+        self._known: tuple[StartKnown, ...] = ()
         self._is_drawn = env.unwrapped.render_mode is not None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -113,8 +116,8 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         clock, report = self._read_clock(), self._observed(info)
         start = self._inner.start
         if start is not self._start:  # decided exactly, which takes longer than a step; starts are read-only
-            self._start, self._known = start, start_known(self.filter, start)
-        self._guarded.begin(report, self._known, clock[1] == 0)
+            self._start, self._known = start, starts_known(self.filter, start, self._guarded.lead)
+        self._guarded.begin(report, self._known, clock[1] == 0, self._inner.beliefs()[:-1])
         self._interventions = 0
         u = np.zeros(self.filter.plant.m)
         margin = self.filter.margin(report.estimate, info["error_shape"], u)
@@ -140,7 +143,9 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         (episode, step), self._clock = self._clock, INTERRUPTED
         observation, reward, terminated, truncated, info = self.env.step(action)
         clock = self._read_clock()
-        self._guarded.advance(as_numbers(info["input"]), clock == (episode, step + 1), self._observed(info))
+        committed = None if self._inner.downlink is None else as_numbers(info["input_committed"])
+        moved_once = clock == (episode, step + 1)
+        self._guarded.advance(as_numbers(info["input"]), moved_once, self._observed(info), committed)
         self._interventions += decision.intervened
         self._clock = clock
         info = info | self._info(proposed, decision.input, decision.margin, intervened=decision.intervened)

@@ -25,7 +25,7 @@ def test_registered_environment_has_tuned_settings(env_id):
 
 def test_file_names_registered_environments_only():
     assert set(_entries("PPO")) == set(OWN)
-    assert len(OWN) == 7
+    assert len(OWN) == 9
 
 
 @pytest.mark.parametrize("env_id", ["ncs_gym/LinearNCS-v0", "Plants/Tanks-v0", "ncs_gym:ncs_gym/CartPole-v0"])

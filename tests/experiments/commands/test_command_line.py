@@ -439,6 +439,7 @@ def test_usage_errors_are_the_parsers(arguments, words):
         (["train", "--arm", "hope"], ["unknown arm 'hope'"]),
         (["evaluate", "nowhere"], ["no agent in nowhere"]),
         (["sweep", "--losses", "0.1", "0.1"], ["--losses must be different"]),
+        (["sweep", "--downlink-losses", "0.1"], ["has an ideal downlink, which loses nothing"]),
         (["sweep", "--losses", "0.9", "--burst-lengths", "2"], ["bursts of mean length 2"]),
         (["sweep", "--channel.loss", "0.5"], ["--channel.loss is a side of the grid"]),
         (

@@ -106,3 +106,20 @@ def test_captions_say_over_how_many_runs_and_what_a_monitor_counts():
     assert "2 runs per field" in _heatmap(grid, ["monitor"], _QUANTITIES["violations"]).caption
     assert "would have overridden" in _heatmap(grid, ["monitor"], _QUANTITIES["interventions"]).caption
     assert "would have" not in _heatmap(cells(["shielded"]), ["shielded"], _QUANTITIES["interventions"]).caption
+
+
+def test_losses_of_commands_stand_against_losses_of_samples():
+    grid = [cell | {"downlink_loss": loss} for loss in (0.0, 0.4) for cell in cells(["shielded"], delays=(2,))]
+    figure = _heatmap(grid, ["shielded"], _QUANTITIES["violations"])
+    (axis,) = panels(figure)
+    np.testing.assert_allclose(axis.images[0].get_array(), [[0.0, 1.0, 2.0]] * 2)
+    assert [tick.get_text() for tick in axis.get_yticklabels()] == ["0", "0.4"]
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("loss probability", "loss of commands")
+
+
+def test_delays_have_panels_of_their_own_beside_losses_of_commands():
+    grid = [cell | {"downlink_loss": loss} for loss in (0.0, 0.4) for cell in cells(["shielded"])]
+    titles = [axis.get_title() for axis in panels(_heatmap(grid, ["shielded"], _QUANTITIES["violations"]))]
+    assert len(titles) == 2
+    assert "delay 0" in titles[0]
+    assert "delay 4" in titles[1]

@@ -83,6 +83,10 @@ class ScriptedEnv(NCSEnv):
         self._disturbance_memory = np.copy(many._disturbance_memory[..., index])[()]
         self._channel_state = ChannelState(self.channel, np.random.default_rng(0))
         self._channel_state._loss_state = LossState(*(kept[index] for kept in many._channel_state._loss_state))
+        self._downlink.begin(np.random.default_rng(0))
+        if self.downlink is not None:
+            states = many._downlink._channel_state._loss_state
+            self._downlink.in_flight._loss_state = LossState(*(kept[index] for kept in states))
         self.np_random = ScriptedGenerator()
 
     def replay(self, action: np.ndarray) -> tuple:
@@ -125,6 +129,8 @@ def scalar_versions(many: NCSVectorEnv) -> list[ScriptedEnv]:
     )
     settings = {name: getattr(single, name) for name in names}
     settings["allow_assumption_violation"] = single.allow_assumption_violation
+    if single.downlink is not None:
+        settings |= {"downlink": single.downlink.channel, "downlink_contract": single.downlink.contract}
     singles = [ScriptedEnv(**settings) for _ in range(many.num_envs)]
     for index, each in enumerate(singles):
         each.follow(many, index)

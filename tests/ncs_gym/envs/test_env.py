@@ -23,6 +23,7 @@ KEYS = {
     "estimation_error": np.ndarray,
     "error_shape": np.ndarray,
     "input": np.ndarray,
+    "input_committed": np.ndarray,
     "constraint_values": np.ndarray,
     "cost": float,
     "measurement_age": int,
@@ -31,6 +32,7 @@ KEYS = {
     "episode_violations": float,
     "is_success": float,
     "contract_broken": bool,
+    "downlink_broken": bool,
 }
 
 

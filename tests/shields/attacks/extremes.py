@@ -72,8 +72,9 @@ class ExtremalNoise(NCSEnv):
         start = (1 - 1e-12) * self.initial_set.sample_boundary(self.np_random)
         _, info = super().reset(options={"state": start})
         self.estimator.reset(start + self.plant.initial_noise.bound.sample_boundary(self.np_random))
-        info["estimate"] = self.estimator.belief.mean.copy()
-        info["estimation_error"] = info["estimate"] - start
+        self._belief = self._downlink.belief()
+        info["estimate"] = self._belief[0].copy()
+        info["estimation_error"] = self.estimator.belief.mean - start
         return self._observation(), info
 
 

@@ -1,0 +1,11 @@
+"""A control loop with another downlink than its environment's own."""
+
+from agents.control_loop import ControlLoop
+from ncs_gym import Channel
+
+
+def test_control_loop_replaces_the_downlink():
+    env = "ncs_gym/TruckTrailerCruiseTwoWay-v0"
+    assert ControlLoop(env=env).single().unwrapped.downlink.lead == 3
+    loop = ControlLoop(env=env, downlink=Channel(delay=1))
+    assert loop.single().unwrapped.downlink.lead == loop.vector(2).unwrapped.downlink.lead == 1

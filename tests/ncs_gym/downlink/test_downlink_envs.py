@@ -1,0 +1,143 @@
+"""Environments whose commands are late or lost: scalar ones, vectors, and that both are the same."""
+
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from ncs_gym import Channel, ChannelContract, GilbertElliott, NCSEnv, NCSVectorEnv, SpeedTracking, truck_trailer
+from tests.ncs_gym.envs.same_draws import compare
+
+BURSTS = GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.3, loss_good=0.05, loss_bad=0.9)
+DOWNLINKS = {
+    "one late": Channel(delay=1),
+    "losses": Channel(loss=0.5, max_consecutive_losses=2),
+    "overtaking": Channel(loss=0.3, delay=1, jitter=3, max_consecutive_losses=1),
+    "bursts": Channel(loss=BURSTS, delay=1, max_consecutive_losses=3),
+    "no contract": Channel(loss=BURSTS, jitter=2),
+}
+CRUISE = {"plant": truck_trailer(mass=4000.0), "task": SpeedTracking(change_probability=0.2)}
+UPLINK = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
+
+
+@pytest.mark.parametrize("name", DOWNLINKS)
+def test_vector_equals_scalar_environment(name):
+    compare(NCSVectorEnv(3, channel=UPLINK, downlink=DOWNLINKS[name], **CRUISE), 100)
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_vector_episodes_that_begin_anew_equal_scalar_ones(mode):
+    channel = Channel(loss=0.2, quantization_step=0.02, delay=1, jitter=4)
+    settings = CRUISE | {"channel": channel, "downlink": DOWNLINKS["bursts"], "terminate_on_violation": True}
+    env = NCSVectorEnv(4, max_episode_steps=41, autoreset_mode=mode, **settings)
+    compare(env, 150)
+    assert env.episodes.min() >= 3
+
+
+def test_vector_equals_scalar_environment_of_an_unstable_plant():
+    settings = {"downlink": DOWNLINKS["overtaking"], "terminate_on_violation": False, "max_episode_steps": None}
+    compare(gym.make_vec("ncs_gym/CartPole-v0", num_envs=3, **settings).unwrapped, 100)
+
+
+@pytest.mark.parametrize("name", DOWNLINKS)
+def test_actuator_applies_what_was_committed_and_zero_only_when_the_downlink_is_broken(name):
+    env = NCSEnv(downlink=DOWNLINKS[name], **CRUISE)
+    lead = env.downlink.lead
+    _, info = env.reset(seed=0)
+    committed, missing = [], 0
+    rng = np.random.default_rng(0)
+    for k in range(300):
+        *_, info = env.step(rng.uniform(-1, 1, 1))
+        committed.append(info["input_committed"])
+        scheduled = committed[k - lead] if k >= lead else np.zeros(1)
+        missing += info["downlink_broken"]
+        np.testing.assert_array_equal(info["input"], 0.0 if info["downlink_broken"] else scheduled)
+    assert (missing > 0) == (env.downlink.contract is None)
+
+
+def test_estimate_is_the_prediction_with_the_committed_inputs_and_its_error_stays_in_its_shape():
+    env = NCSEnv(channel=UPLINK, downlink=DOWNLINKS["overtaking"], disturbance="sphere", **CRUISE)
+    lead, plant = env.downlink.lead, env.plant
+    _, info = env.reset(seed=0)
+    rng, infos, committed, worst = np.random.default_rng(1), [info], [np.zeros(1)] * lead, 0.0
+    for _ in range(400):
+        info = env.step(rng.uniform(-1, 1, 1))[4]
+        infos.append(info)
+        committed.append(info["input_committed"])
+    for k, info in enumerate(infos[: len(infos) - lead]):
+        predicted = info["state"] + info["estimation_error"]
+        for u in committed[k : k + lead]:
+            predicted = plant.A @ predicted + plant.B @ u
+        np.testing.assert_allclose(info["estimate"], predicted, atol=1e-12)
+        error = info["estimate"] - infos[k + lead]["state"]
+        worst = max(worst, error @ np.linalg.solve(info["error_shape"], error))
+    assert 0.3 < worst <= 1.0
+
+
+def test_observation_holds_the_prediction_and_what_is_known_of_the_task_by_then():
+    env = NCSEnv(downlink=Channel(delay=2), **(CRUISE | {"task": SpeedTracking(change_probability=0.0)}))
+    env.reset(seed=0)
+    errors, observed = [], []
+    for action in (1.0, -0.5, 0.25, 0.75, 0.0, 0.0):
+        observation, *_, info = env.step(np.array([action]))
+        speed, target = env._task_state
+        errors.append(target - speed)
+        observed.append(observation[2])
+        np.testing.assert_allclose(observation[:2], info["estimate"], rtol=1e-6)
+    np.testing.assert_allclose(observed[:-2], errors[2:], rtol=1e-6)
+
+
+def test_a_perfect_downlink_changes_nothing_but_the_draws():
+    one, other = (NCSVectorEnv(3, downlink=each, **CRUISE) for each in (None, Channel()))
+    for env in (one, other):
+        env.reset(seed=0)
+    assert other.downlink.lead == 0
+    action = np.full((3, 1), 0.5, np.float32)
+    for env in (one, other):
+        *_, info = env.step(action)
+        np.testing.assert_array_equal(info["input"], info["input_committed"])
+        np.testing.assert_allclose(info["estimate"] - info["estimation_error"], info["state"])
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"downlink": Channel(quantization_step=0.1)}, "a downlink carries inputs as they are, without quantization"),
+        ({"downlink": Channel(send_period=2)}, "a downlink sends a command at every step: leave out send_period"),
+        ({"downlink": 0.3}, "downlink must be of type Channel, got 0.3"),
+        ({"downlink_contract": ChannelContract(2)}, "downlink_contract is about a downlink"),
+        ({"downlink": Channel(delay=3), "downlink_contract": ChannelContract(2)}, "delays commands by up to 3 steps"),
+        ({"downlink": Channel(), "downlink_contract": 2}, "downlink_contract must be of type ChannelContract"),
+        (
+            {"downlink": Channel(delay=900), "contract": ChannelContract(200)},
+            "contracts of uplink and downlink add up to 1100 steps, more than 1000",
+        ),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(settings, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        NCSEnv(**CRUISE, **settings)
+
+
+def test_certificates_rest_on_both_contracts():
+    env = gym.make("ncs_gym/CartPole-v0", downlink=Channel(loss=0.2, delay=1, max_consecutive_losses=1)).unwrapped
+    assert env.contract == ChannelContract(4, 1e-4)
+    assert env.downlink.contract == ChannelContract(2)
+    assert env.certificate_contract == env.error_set.ages.contract == ChannelContract(6, 1e-4)
+    assert NCSEnv(downlink=Channel(delay=2), **CRUISE).certificate_contract is None
+
+
+def test_a_contract_that_the_downlink_may_break_is_kept_until_it_does():
+    env = NCSEnv(downlink=Channel(loss=0.5), downlink_contract=ChannelContract(2), **CRUISE)
+    assert env.downlink.lead == 2
+    env.reset(seed=0)
+    broken = [env.step(np.ones(1))[4]["downlink_broken"] for _ in range(200)]
+    assert 5 < sum(broken) < 60  # three losses in a row: an eighth of the steps
+
+
+def test_downlink_is_json():
+    env = gym.make("ncs_gym/TruckTrailerCruise-v0", downlink=DOWNLINKS["bursts"], downlink_contract=ChannelContract(5))
+    copied = gym.make(gym.envs.registration.EnvSpec.from_json(json.dumps(json.loads(env.spec.to_json()))))
+    assert copied.unwrapped.downlink == env.unwrapped.downlink
+    assert copied.unwrapped.downlink.lead == 5

@@ -1,0 +1,329 @@
+"""When a guarantee behind a downlink holds, when it ends and why; the first steps; the loop without Gymnasium."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from ncs_gym import (
+    Actuator,
+    Channel,
+    ChannelContract,
+    Ellipsoid,
+    FunctionProcess,
+    NCSEnv,
+    NCSVectorEnv,
+    Packet,
+    truck_trailer,
+)
+from ncs_gym.network.transmission import ChannelState
+from shields import SafeLoop, SafetyShield, VectorSafetyShield
+from shields.downlink import Schedule, starts_known
+from shields.runtime.guarantee import (
+    EXPLANATIONS,
+    LATE_INPUT,
+    NO_DOWNLINK_CONTRACT,
+    NOT_KNOWN_INSIDE,
+    OTHER_INPUT,
+)
+from tests.certificates import certificate_of
+from tests.shields.attacks.extremes import ExtremalNoise
+from tests.shields.downlink.adversary import Case, edges
+from tests.shields.lookahead.adversary import box_ellipsoid
+
+PLANT = truck_trailer(mass=4000.0)
+UPLINK = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
+KEPT = Channel(loss=0.4, delay=1, max_consecutive_losses=1)
+
+
+def shielded(mode="project", start=0.3, kind=NCSEnv, **settings):
+    certificate = certificate_of(PLANT)
+    env = kind(PLANT, UPLINK, initial_set=Ellipsoid(start**2 * certificate.L), **({"downlink": KEPT} | settings))
+    return SafetyShield(env, certificate, mode=mode)
+
+
+def levels(shield, info):
+    return shield.certificate.safe_set.gauge(info["state"])
+
+
+@pytest.mark.parametrize("mode", ["project", "switch", "boundary", "lookahead"])
+def test_every_mode_keeps_its_guarantee(mode):
+    shield = shielded(mode, kind=ExtremalNoise, disturbance="adversarial")
+    _, info = shield.reset(seed=0)
+    rng = np.random.default_rng(0)
+    interventions = 0
+    for _ in range(300):
+        *_, info = shield.step(rng.uniform(-1, 1, 1).astype(np.float32))
+        assert info["shield_guaranteed"], info["shield_reason"]
+        assert info["constraint_values"].max() <= 0.0 if mode == "lookahead" else levels(shield, info) <= 1.0
+        interventions += info["shield_intervened"]
+    assert 0 < interventions < 300
+
+
+def test_lookahead_keeps_guaranteed_states_in_the_box_under_attack():
+    plan_lengths, outside = 0, 0
+    for downlink in edges(2).values():
+        shield = shielded("lookahead", kind=ExtremalNoise, disturbance="adversarial", downlink=downlink)
+        shield.unwrapped.initial_set = box_ellipsoid(PLANT, 0.95)
+        for seed in range(4):
+            _, info = shield.reset(seed=seed)
+            held, rng = info["shield_guaranteed"], np.random.default_rng(seed)
+            for _ in range(60):
+                push = np.sign(PLANT.B.T @ PLANT.weight @ PLANT.A @ info["estimate"])
+                action = push if rng.random() < 0.5 else rng.uniform(-1, 1, 1)
+                *_, info = shield.step(action.astype(np.float32))
+                assert info["shield_guaranteed"] or not held, info["shield_reason"]
+                held = info["shield_guaranteed"]
+                plan_lengths += info["shield_plan_length"]
+                outside += held and levels(shield, info) > 1.0
+                assert not held or info["constraint_values"].max() <= 0.0
+    assert plan_lengths > 0
+    assert outside > 0
+
+
+def test_a_broken_downlink_ends_the_guarantee_in_the_step_in_which_zero_is_applied():
+    shield = shielded(downlink=Channel(loss=0.4, delay=1), downlink_contract=ChannelContract(3))
+    ended = 0
+    for seed in range(6):
+        _, info = shield.reset(seed=seed)
+        assert info["shield_guaranteed"]
+        broken = False
+        for _ in range(100):
+            *_, info = shield.step(np.array([0.3]))
+            broken |= info["downlink_broken"]
+            assert info["shield_guaranteed"] == (not broken)
+            assert info["shield_reason"] == (LATE_INPUT if broken else "")
+            assert not info["downlink_broken"] or not info["input"].any()
+        ended += broken
+    assert ended >= 3  # three losses in a row within 100 steps
+
+
+def test_a_downlink_without_a_contract_is_simulated_and_never_guaranteed():
+    shield = shielded(downlink=Channel(loss=0.1))
+    _, info = shield.reset(seed=0)
+    assert info["shield_reason"] == NO_DOWNLINK_CONTRACT
+    for _ in range(50):
+        *_, info = shield.step(np.array([0.3]))
+        assert info["shield_reason"] in (NO_DOWNLINK_CONTRACT, LATE_INPUT)
+    vector = VectorSafetyShield(NCSVectorEnv(3, plant=PLANT, downlink=Channel(loss=0.1)), certificate_of(PLANT))
+    assert not vector.reset(seed=0)[1]["shield_guaranteed"].any()
+    assert not vector.step(np.zeros((3, 1)))[4]["shield_guaranteed"].any()
+
+
+def test_no_state_outside_is_guaranteed_wherever_an_episode_starts():
+    """Starts all over the box: some are not covered, and a guarantee that begins later begins for the present."""
+    certificate, late, never = certificate_of(PLANT), 0, 0
+    for downlink in (Channel(delay=3), KEPT):
+        env = NCSVectorEnv(
+            40, plant=PLANT, channel=UPLINK, downlink=downlink, disturbance="adversarial", max_episode_steps=30
+        )
+        shield = VectorSafetyShield(env, certificate)
+        rng = np.random.default_rng(0)
+        for seed in range(5):
+            starts = rng.uniform(-1, 1, (40, 2)) * PLANT.half_widths
+            _, info = shield.reset(seed=seed, options={"state": starts})
+            first = info["shield_guaranteed"]
+            for step in range(25):
+                outside = certificate.safe_set.gauge(info["state"]) > 1.0
+                assert not (outside & info["shield_guaranteed"]).any()
+                late += np.count_nonzero(~first & info["shield_guaranteed"]) * (step == 24)
+                *_, info = shield.step(rng.uniform(-1, 1, (40, 1)))
+            never += np.count_nonzero(~first)
+    assert never > 0
+    assert late > 0
+
+
+@pytest.mark.parametrize("lead", [1, 3])
+def test_a_guarantee_that_is_regained_is_one_about_the_present_only_after_c_steps(lead):
+    shield = shielded(downlink=Channel(delay=lead), disturbance="sphere", start=1e-3)
+    # Just outside S, drifting back in: known from the estimate of step c on, c steps later for the present.
+    direction = np.array([1.0, 0.0]) / np.sqrt(shield.certificate.M[0, 0])
+    _, info = shield.reset(seed=0, options={"state": 1.001 * direction})
+    assert info["shield_reason"] == NOT_KNOWN_INSIDE
+    guarded = shield._guarded
+    waited = []
+    for _ in range(30):
+        waited.append((bool(guarded._state.inside), int(guarded._state.wait), info["shield_guaranteed"]))
+        *_, info = shield.step(np.zeros(1))
+    begins = next(k for k, (inside, _, _) in enumerate(waited) if inside)
+    first = next(k for k, (_, _, guaranteed) in enumerate(waited) if guaranteed)
+    assert all(guaranteed == (wait == 0) for _, wait, guaranteed in waited)
+    assert first <= begins + lead
+    assert first > 0
+
+
+def test_first_steps_are_known_exactly_where_they_can_leave_the_safe_set():
+    shield, lead = shielded().filter, 3
+    small, large = (Ellipsoid(scale**2 * shield.certificate.L) for scale in (0.3, 0.999999))
+    assert all(known.in_safe_set for known in starts_known(shield, small, lead))
+    known = starts_known(shield, large, lead)
+    assert known[0].in_safe_set
+    assert not all(each.in_safe_set for each in known)
+    assert [each.in_safe_set for each in starts_known(shield, None, lead)] == [False] * 4
+    rng = np.random.default_rng(0)
+    for scale in (0.5, 0.9, 0.97):
+        start = large.sample_boundary(rng) * scale
+        found = starts_known(shield, start, lead)
+        states = np.tile(start, (200, 1))
+        for each in found:
+            gauges = shield.certificate.safe_set.gauge(states)
+            assert not each.in_safe_set or gauges.max() <= 1.0
+            states = states @ PLANT.A.T + PLANT.disturbance.sample_boundary(rng, 200)
+
+
+class Meddling(gym.Wrapper):
+    """Reports other inputs than were committed or applied."""
+
+    def __init__(self, env, key):
+        super().__init__(env)
+        self.key, self.active = key, False
+
+    def step(self, action):
+        *result, info = self.env.step(action)
+        return *result, info | ({self.key: info[self.key] + 1e-12} if self.active else {})
+
+
+@pytest.mark.parametrize(("key", "reason"), [("input_committed", OTHER_INPUT), ("input", LATE_INPUT)])
+def test_other_inputs_than_decided_end_the_guarantee(key, reason):
+    certificate = certificate_of(PLANT)
+    inner = NCSEnv(PLANT, UPLINK, initial_set=Ellipsoid(0.09 * certificate.L), downlink=KEPT)
+    env = Meddling(inner, key)
+    shield = SafetyShield(env, certificate)
+    shield.reset(seed=0)
+    for _ in range(5):
+        assert shield.step(np.array([0.2]))[4]["shield_guaranteed"]
+    env.active = True
+    assert shield.step(np.array([0.2]))[4]["shield_reason"] == reason
+    env.active = False
+    assert shield.step(np.array([0.2]))[4]["shield_reason"] == reason  # for the rest of the episode
+    shield.reset()
+    assert shield.step(np.array([0.2]))[4]["shield_guaranteed"]
+
+
+@pytest.mark.parametrize("mode", ["project", "lookahead"])
+@pytest.mark.parametrize("autoreset", ["NextStep", "SameStep"])
+def test_vector_shield_keeps_its_guarantee_through_resets(mode, autoreset):
+    case = Case(PLANT, UPLINK, KEPT)
+    env = case.env(12, "outwards", max_episode_steps=9, autoreset_mode=autoreset)
+    shield = VectorSafetyShield(env, case.certificate, mode)
+    _, info = shield.reset(seed=0)
+    assert info["shield_guaranteed"].all()
+    rng = np.random.default_rng(0)
+    for step in range(60):
+        if step == 31:
+            _, info = shield.reset(options={"reset_mask": np.arange(12) % 3 == 0})
+            assert info["shield_guaranteed"].all(), set(info["shield_reason"])
+        *_, truncated, info = shield.step(rng.uniform(-1, 1, (12, 1)))
+        assert info["shield_guaranteed"].all(), set(info["shield_reason"])
+        if autoreset == "SameStep" and truncated.any():
+            assert info["final_info"]["shield_guaranteed"][truncated].all()
+    assert env.episodes.min() > 5
+
+
+def test_resetting_some_environments_makes_no_other_wait_less():
+    env = NCSVectorEnv(2, plant=PLANT, downlink=Channel(delay=3), max_episode_steps=50)
+    shield = VectorSafetyShield(env, certificate_of(PLANT))
+    shield.reset(seed=0, options={"state": np.array([[1.99, 1.0], [0.0, 0.0]])})
+    waits = [int(shield._state.wait[0])]
+    for _ in range(3):
+        shield.reset(options={"reset_mask": np.array([False, True]), "state": np.zeros((2, 2))})
+        waits.append(int(shield._state.wait[0]))
+    assert waits[0] > 0
+    assert len(set(waits)) == 1
+
+
+def run_safe_loop(downlink, steps, contract=None, report=True):
+    """A plain loop with an actuator; returns reasons, levels and inputs applied next to those decided c steps ago."""
+    certificate, rng = certificate_of(PLANT), np.random.default_rng(0)
+    settings = {"downlink": downlink, "downlink_contract": contract}
+    loop = SafeLoop(certificate, PLANT, UPLINK, **settings)
+    actuator = Actuator(loop.lead, PLANT.m)
+    up, down = ChannelState(UPLINK, rng), ChannelState(downlink, rng)
+    state = 0.2 * Ellipsoid(certificate.L).sample_boundary(rng)
+    loop.start(state + PLANT.sample_initial_error(rng))
+    actuator.start(loop.episode)
+    packets, applied, reasons, found, decided, given = [], None, [], [], [], []
+    for step in range(steps):
+        loop.receive(packets, applied if report else None)
+        reasons.append(loop.reason)
+        found.append(certificate.safe_set.gauge(state))
+        decided.append(loop.decide(rng.uniform(-4, 4, 1)).input)
+        command = loop.command()
+        assert command.inputs.shape == (loop.lead + 1, 1)
+        actuator.receive(down.carry(rng, step, command))
+        applied = actuator.apply(step)
+        given.append(applied)
+        state = PLANT.A @ state + PLANT.B @ applied + PLANT.disturbance.sample_boundary(rng)
+        sample = PLANT.H @ state + PLANT.sample_sensor_noise(rng) if up.sends_at(step + 1) else None
+        packets = up.exchange(rng, step + 1, sample, loop.episode)
+    return reasons, np.array(found), np.array(given), np.array([np.zeros(1)] * loop.lead + decided)[:steps]
+
+
+@pytest.mark.parametrize("downlink", [Channel(delay=2), KEPT, Channel(loss=0.5, jitter=3, max_consecutive_losses=2)])
+def test_safe_loop_speaks_the_protocol(downlink):
+    reasons, found, given, scheduled = run_safe_loop(downlink, 300)
+    assert set(reasons) == {""}
+    assert 0.8 < found.max() <= 1.0
+    np.testing.assert_array_equal(given, scheduled)
+
+
+def test_safe_loop_ends_its_guarantee_when_the_actuator_says_that_nothing_arrived():
+    reasons, _, given, scheduled = run_safe_loop(Channel(loss=0.4), 100, ChannelContract(2))
+    missed = np.flatnonzero((given != scheduled).any(axis=1))
+    assert missed.size
+    assert reasons[: missed[0] + 1] == [""] * (missed[0] + 1)
+    assert set(reasons[missed[0] + 1 :]) == {LATE_INPUT}
+
+
+def test_safe_loop_sends_only_what_was_decided_and_is_never_guaranteed_without_a_contract():
+    loop = SafeLoop(certificate_of(PLANT), PLANT, UPLINK, downlink=Channel(loss=0.4))
+    loop.start(np.zeros(2))
+    with pytest.raises(RuntimeError, match="call decide before command"):
+        loop.command()
+    assert loop.reason == NO_DOWNLINK_CONTRACT
+    loop.step(0.1)
+    assert loop.command().stamp == 0
+    loop.receive([Packet(1, np.zeros(2))])
+    assert not loop.guaranteed
+
+
+def test_actuator_takes_the_newest_command_of_its_episode_and_repeats_nothing():
+    actuator = Actuator(2, 1)
+    plain = SafeLoop(certificate_of(PLANT), PLANT, UPLINK, downlink=Channel(delay=2))
+    plain.start(np.zeros(2))
+    commands = []
+    for _ in range(4):
+        plain.step(1.0)
+        commands.append(plain.command())
+    actuator.start(episode=0)
+    actuator.receive([commands[3], commands[1], commands[1]])
+    np.testing.assert_array_equal(actuator.apply(3), commands[1].inputs[2])
+    np.testing.assert_array_equal(actuator.apply(5), commands[3].inputs[2])
+    np.testing.assert_array_equal(actuator.apply(6), 0.0)
+    assert actuator.missing
+    np.testing.assert_array_equal(actuator.apply(1), 0.0)
+    assert not actuator.missing
+    actuator.start(episode=1)
+    actuator.receive(commands)
+    np.testing.assert_array_equal(actuator.apply(4), 0.0)
+    assert actuator.missing
+
+
+def test_a_schedule_hands_out_what_was_decided_c_steps_ago():
+    schedule = Schedule(2, 1)
+    assert [schedule.due([float(k)]) for k in range(1, 5)] == [[0.0], [0.0], [1.0], [2.0]]
+    schedule.start()
+    assert schedule.due([9.0]) == [0.0]
+    assert LATE_INPUT in EXPLANATIONS
+
+
+def test_another_process_than_the_plants_equations_may_move_behind_a_downlink():
+    process = FunctionProcess(lambda x, u: PLANT.A @ x + PLANT.B @ u)
+    shield = shielded(process=process, disturbance="adversarial")
+    _, info = shield.reset(seed=0)
+    assert info["shield_guaranteed"]
+    rng, worst = np.random.default_rng(0), 0.0
+    for _ in range(200):
+        *_, info = shield.step(rng.uniform(-1, 1, 1))
+        assert info["shield_guaranteed"], info["shield_reason"]
+        worst = max(worst, levels(shield, info))
+    assert 0.5 < worst <= 1.0
