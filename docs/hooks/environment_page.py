@@ -16,7 +16,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
 
-from ncs_gym import Channel, ChannelContract, Ellipsoid, GilbertElliott, LinearPlant, NCSEnv
+from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearPlant, NCSEnv
 from shields import Certificate, SafetyShield, verify
 
 # Characters in a line of a block that fit the page.

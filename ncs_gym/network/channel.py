@@ -117,9 +117,10 @@ class Channel:
         """What the channel does to samples, in sentences."""
         every = "every step" if self.send_period == 1 else f"every {_steps(self.send_period)}"
         rounded = f"quantized with step {self.quantization_step:g}" if self.quantization_step else "not quantized"
-        lost = f"A packet is lost with probability {self.loss:g}"
         if isinstance(self.loss, GilbertElliott):
             lost = f"Losses come in bursts ({self.loss})"
+        else:
+            lost = f"A packet is lost with probability {self.loss:g}"
         if self.max_consecutive_losses is not None:
             lost += f", never more than {self.max_consecutive_losses} in a row"
         late = f"{self.delay} to {self.longest_delay} steps" if self.jitter else _steps(self.delay)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, NCSEnv, NCSVectorEnv, Remainder
+from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearPlant, NCSEnv, NCSVectorEnv, Remainder
 from shields import Infeasible, SafetyShield, VectorSafetyShield, synthesize, verify
 from shields.runtime.guarantee import LEFT_MODEL, NOT_KNOWN_INSIDE
 from tests.certificates import certificate_of
@@ -16,10 +16,10 @@ LEFT_OUT = Remainder(BOUND, False, "an example")
 LOCAL = LinearPlant(**COMMON, disturbance_bound=0.0, remainder=LEFT_OUT)
 
 
-def reasons(plant, start, mode="monitor", many=False):
+def reasons(plant, start, mode="monitor", many=False, **settings):
     """Why the proof does not hold, step by step, while the state decays."""
     kind, shield = (NCSVectorEnv, VectorSafetyShield) if many else (NCSEnv, SafetyShield)
-    inner = kind(2, plant=plant, max_episode_steps=None) if many else kind(plant)
+    inner = kind(2, plant=plant, max_episode_steps=None, **settings) if many else kind(plant, **settings)
     env = shield(inner, certificate_of(plant), mode)
     _, info = env.reset(seed=0, options={"state": np.asarray(start)})
     seen = [info["shield_reason"]]
@@ -49,6 +49,19 @@ def test_guarantee_does_not_come_back_after_a_state_that_may_be_outside(many):
 @pytest.mark.parametrize("many", [False, True])
 def test_guarantee_holds_for_a_start_inside(many):
     assert all(np.all(np.asarray(reason) == "") for reason in reasons(LOCAL, [0.3, 0.3], "project", many))
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_behind_a_downlink_every_state_from_the_first_on_must_be_proved_inside(many):
+    downlink = {"downlink": Channel(loss=0.3, delay=2, max_consecutive_losses=1)}
+    first = (lambda values: [str(value[0]) for value in values]) if many else list
+    exact = first(reasons(EXACT, [0.99, 0.99], many=many, **downlink))
+    local = first(reasons(LOCAL, [0.99, 0.99], many=many, **downlink))
+    assert NOT_KNOWN_INSIDE in exact
+    assert exact[-2:] == ["", ""]
+    assert set(local[:-1]) == {LEFT_MODEL}
+    assert local[-1] == ""
+    assert all(np.all(np.asarray(reason) == "") for reason in reasons(LOCAL, [0.3, 0.3], "project", many, **downlink))
 
 
 def test_certificate_says_what_it_assumes_of_the_remainder():
