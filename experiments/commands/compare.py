@@ -149,8 +149,8 @@ def _escapes(
 def _findings(summary: dict[str, Any]) -> list[str]:
     """Returns what to read from the table, in sentences computed from it."""
     findings = [
-        f"{name}: a penalty is not enough; it took {arm['train_violation_steps']:,} violating steps to learn, "
-        f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,} evaluation episodes violate."
+        f"{name} is not enough: {arm['train_violation_steps']:,} violating steps in training, "
+        f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,} episodes in evaluation."
         for name, arm in summary["arms"].items()
         if Arm.of(name).penalizes_violations and arm["train_violation_steps"] + arm["eval_violating_episodes"]
     ]
