@@ -29,6 +29,7 @@ LAYERS = {
         {"downlink"},
         {"envs"},
         {"json_settings"},
+        {"scenario"},
         {"registration"},
         {"plant_registration"},
     ),
