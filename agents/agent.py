@@ -22,10 +22,10 @@ from agents.loop_wrappers import with_gain
 from agents.results import Evaluation
 from agents.sb3_vec_env import SB3VecEnv
 from agents.settings import AgentSettings
-from agents.sharing.card import card_text
+from agents.sharing.model_card import card_text
 from ncs_gym import Channel, GilbertElliott
 from shields.atomic_write import write_atomically
-from shields.runtime.filter import LONGEST_HORIZON, MODES
+from shields.runtime.safety_filter import LONGEST_HORIZON, MODES
 
 _FORMAT = "ncs-gym agent 1"
 

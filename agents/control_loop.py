@@ -15,7 +15,7 @@ from agents.loop_wrappers import CostPenalty, ResidualActions
 from agents.settings import LagrangianSettings
 from ncs_gym import Channel
 from shields import Certificate, SafetyShield, VectorSafetyShield
-from shields.runtime.filter import DEFAULT_HORIZON
+from shields.runtime.safety_filter import DEFAULT_HORIZON
 
 
 @dataclass(frozen=True)

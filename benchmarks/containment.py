@@ -18,7 +18,7 @@ from scipy.optimize import minimize_scalar
 
 from ncs_gym.uncertainty.ellipsoid import outer_sum
 from shields import SafetyFilter, SafetyShield, synthesize
-from shields.runtime.filter import MARGIN
+from shields.runtime.safety_filter import MARGIN
 
 STEPS = 200
 

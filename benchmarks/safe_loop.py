@@ -16,7 +16,7 @@ import time
 import numpy as np
 
 from ncs_gym import Channel, ChannelContract, LinearPlant, batch_reactor, cart_pole, truck_trailer
-from ncs_gym.network.transmission import ChannelState
+from ncs_gym.network.packet_transmission import ChannelState
 from shields import SafeLoop, synthesize
 
 CASES = {

@@ -23,7 +23,7 @@ import numpy as np
 from ncs_gym import Channel, LinearPlant, NCSEnv
 from ncs_gym.uncertainty.ellipsoid import outer_sum
 from shields import SafetyFilter, SafetyShield, VectorSafetyShield, synthesize
-from shields.runtime.filter import MARGIN
+from shields.runtime.safety_filter import MARGIN
 
 CHANNEL = Channel(loss=0.3, quantization_step=0.01, send_period=2, delay=2)
 REPEATS = 20

@@ -6,7 +6,7 @@ import numpy as np
 
 from ncs_gym import LinearPlant
 from shields import Certificate
-from shields.runtime.filter import SafetyFilter
+from shields.runtime.safety_filter import SafetyFilter
 
 
 class TrustingFilter:

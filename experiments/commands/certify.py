@@ -23,7 +23,7 @@ from experiments.runs import claim_folder, versions
 from experiments.settings import CertifySettings
 from shields import Certificate
 from shields.atomic_write import write_atomically
-from shields.runtime.filter import DEFAULT_HORIZON
+from shields.runtime.safety_filter import DEFAULT_HORIZON
 
 
 def certify(settings: CertifySettings) -> None:

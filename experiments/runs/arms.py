@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from experiments.baselines import CONTROLLERS, FILTERS
 from experiments.runs.training_run import PolicyKind, RunResult
-from shields.runtime.filter import MODES
+from shields.runtime.safety_filter import MODES
 
 _SHIELD_MODES = tuple(mode for mode in MODES if mode != "monitor")
 PENALTY_SUFFIX, RESIDUAL_SUFFIX, TEST_SUFFIX = "+penalty", "+residual", " at test"

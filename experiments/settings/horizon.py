@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from shields.runtime.filter import LONGEST_HORIZON
+from shields.runtime.safety_filter import LONGEST_HORIZON
 
 
 def require_horizon(horizon: int | None, *modes: str | None) -> None:

@@ -10,7 +10,7 @@ from ncs_gym.downlink.actuator import Actuator, Command
 from ncs_gym.downlink.committed_inputs import CommittedInputs
 from ncs_gym.downlink.protocol import DownlinkProtocol
 from ncs_gym.estimation.estimator import Estimator
-from ncs_gym.network.transmission import ChannelState
+from ncs_gym.network.packet_transmission import ChannelState
 from ncs_gym.tasks.task import Task
 
 

@@ -10,7 +10,7 @@ from ncs_gym.downlink.loop import Inputs
 from ncs_gym.downlink.prediction import PredictedStatistics
 from ncs_gym.downlink.protocol import DownlinkProtocol
 from ncs_gym.estimation.vector_estimator import VectorEstimator
-from ncs_gym.network.transmission import VectorChannelState
+from ncs_gym.network.packet_transmission import VectorChannelState
 from ncs_gym.tasks.task import Task
 
 # Stamp of the newest command where none has arrived.

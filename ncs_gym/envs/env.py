@@ -18,7 +18,7 @@ from ncs_gym.estimation.arrival_patterns import arrival_patterns
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
-from ncs_gym.network.transmission import ChannelState
+from ncs_gym.network.packet_transmission import ChannelState
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import LinearProcess, Process
 from ncs_gym.rendering import Annotation, Renderer

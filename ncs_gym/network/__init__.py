@@ -8,7 +8,7 @@ happens to packets during an episode, `contract` what a channel guarantees about
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet
 from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.network.escape_probability import escape_probability
-from ncs_gym.network.transmission import ChannelState
+from ncs_gym.network.packet_transmission import ChannelState
 
 __all__ = [
     "Channel",

@@ -9,8 +9,8 @@ import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.body_simulation import Body
-from ncs_gym.processes.fit import fitted_matrices, surrounding_shape
 from ncs_gym.processes.function_process import FunctionProcess
+from ncs_gym.processes.linear_fit import fitted_matrices, surrounding_shape
 from ncs_gym.processes.process import LinearProcess, Process
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym.network.channel import Packet
-from ncs_gym.network.transmission import ChannelState
+from ncs_gym.network.packet_transmission import ChannelState
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.tasks.setpoint_tracking import SetpointTracking
 from ncs_gym.tasks.speed_tracking import SpeedTracking

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ncs_gym.network.channel import Packet
-from ncs_gym.network.transmission import ChannelState
+from ncs_gym.network.packet_transmission import ChannelState
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas, Window

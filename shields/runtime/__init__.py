@@ -7,9 +7,9 @@ it into a real loop, `wrapper` and `vector_wrapper` around Gymnasium environment
 """
 
 from shields.runtime.decisions import Decision
-from shields.runtime.filter import SafetyFilter
 from shields.runtime.guarantee import GuaranteeMonitor, MonitorState
 from shields.runtime.safe_loop import SafeLoop
+from shields.runtime.safety_filter import SafetyFilter
 from shields.runtime.vector_wrapper import VectorSafetyShield
 from shields.runtime.wrapper import SafetyShield
 

@@ -12,9 +12,9 @@ from ncs_gym.downlink import DownlinkProtocol
 from ncs_gym.plants.linear_plant import SIMULATED_REACH
 from shields.certificate import Certificate
 from shields.runtime.decisions import Decision
-from shields.runtime.filter import MARGIN, SafetyFilter
 from shields.runtime.one_step_test import FARTHEST
 from shields.runtime.predicted_errors import PredictedErrors
+from shields.runtime.safety_filter import MARGIN, SafetyFilter
 from shields.verification.rational_matrix import (
     is_positive_semidefinite,
     multiply,

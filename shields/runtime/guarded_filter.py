@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.downlink import DownlinkProtocol
-from shields.downlink.first_steps import known_inside
 from shields.downlink.schedule import Schedule
+from shields.downlink.start_under_zero_input import known_inside
 from shields.runtime.decisions import Decision
-from shields.runtime.filter import MARGIN, SafetyFilter
 from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, LoopObservation, MonitorState, StartKnown
 from shields.runtime.predicted_errors import PredictedErrors
+from shields.runtime.safety_filter import MARGIN, SafetyFilter
 
 
 class GuardedFilter:

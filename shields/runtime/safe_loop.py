@@ -14,11 +14,11 @@ from ncs_gym.downlink import Command, CommittedInputs, downlink_protocol
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
 from ncs_gym.validation import as_numbers, as_vector, shown
 from shields.certificate import Certificate
-from shields.downlink.first_steps import starts_known
+from shields.downlink.start_under_zero_input import starts_known
 from shields.runtime.decisions import Decision
-from shields.runtime.filter import SafetyFilter
 from shields.runtime.guarantee import LoopObservation
 from shields.runtime.guarded_filter import GuardedFilter
+from shields.runtime.safety_filter import SafetyFilter
 
 NOT_STARTED = "no episode is under way: call start"
 

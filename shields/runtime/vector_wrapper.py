@@ -12,10 +12,9 @@ from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.validation import as_number, shown
 from shields.certificate import Certificate
-from shields.downlink.first_steps import first_observations, starts_known
 from shields.downlink.schedule import VectorSchedule, as_decided, columns
+from shields.downlink.start_under_zero_input import first_observations, starts_known
 from shields.runtime.decisions import Decision
-from shields.runtime.filter import SafetyFilter
 from shields.runtime.guarantee import (
     CODES,
     EXPLANATIONS,
@@ -28,6 +27,7 @@ from shields.runtime.guarantee import (
 from shields.runtime.guarded_filter import first_store
 from shields.runtime.one_step_test import norms
 from shields.runtime.predicted_errors import PredictedErrors
+from shields.runtime.safety_filter import SafetyFilter
 from shields.runtime.wrapper import certificate_for, environment_behind, hint_for
 
 REASONS = np.array(EXPLANATIONS, dtype=object)

@@ -16,11 +16,11 @@ from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv, NCSVectorE
 from ncs_gym.envs.env import applied_input
 from ncs_gym.validation import as_number, as_numbers, shown
 from shields.certificate import Certificate
-from shields.downlink.first_steps import starts_known
+from shields.downlink.start_under_zero_input import starts_known
 from shields.runtime.decisions import NO_PLAN
-from shields.runtime.filter import SafetyFilter
 from shields.runtime.guarantee import LoopObservation, StartKnown
 from shields.runtime.guarded_filter import GuardedFilter
+from shields.runtime.safety_filter import SafetyFilter
 
 T = TypeVar("T")
 

@@ -17,7 +17,7 @@ from shields.certificate import Certificate
 from shields.certificate_text import size_of
 from shields.errors import Infeasible, SynthesisInterrupted
 from shields.proof_data import ContractProof, Multipliers
-from shields.synthesis.alternation import largest_set, with_best_gain, with_best_multipliers
+from shields.synthesis.alternating_optimization import largest_set, with_best_gain, with_best_multipliers
 from shields.synthesis.design_problem import INFLATION, CandidateDesign, DesignProblem, design_problem
 from shields.synthesis.diagnosis import infeasibility, with_feasible_bounds
 from shields.synthesis.max_margin_gain import max_margin_gain

@@ -27,7 +27,7 @@ from ncs_gym import (
 )
 from ncs_gym.envs.env import NCSEnv
 from shields import SafetyShield, VectorSafetyShield, synthesize, verify
-from shields.runtime.filter import SafetyFilter
+from shields.runtime.safety_filter import SafetyFilter
 from tests.fuzz import NOTHING_USABLE, WRONG_NUMBERS, examples
 
 PLANT = truck_trailer()

@@ -16,7 +16,7 @@ from experiments.paper.paper_example import PaperExample
 from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.estimation import VectorEstimator
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
-from ncs_gym.network.transmission import VectorChannelState
+from ncs_gym.network.packet_transmission import VectorChannelState
 from ncs_gym.processes.simulation import PlantSimulation
 from ncs_gym.registration import CASE_STUDY_CHANNEL
 

@@ -7,7 +7,7 @@ from experiments.settings.channel import ChannelSettings, _bursts
 from experiments.settings.learning import SweepSettings
 from ncs_gym import Channel, ChannelContract, GilbertElliott
 from ncs_gym.envs.env import ncs_env
-from ncs_gym.network.transmission import ChannelState
+from ncs_gym.network.packet_transmission import ChannelState
 from ncs_gym.processes import PendulumProcess
 from shields.runtime.wrapper import certificate_for
 

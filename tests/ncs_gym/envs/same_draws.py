@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from ncs_gym import LinearPlant, NCSEnv, NCSVectorEnv
-from ncs_gym.network.transmission import ChannelState, LossState
+from ncs_gym.network.packet_transmission import ChannelState, LossState
 from ncs_gym.plants.lqr import regulator_gain
 from ncs_gym.processes.simulation import PlantSimulation
 from tests import arrays

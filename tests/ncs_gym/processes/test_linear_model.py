@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid, GymProcess, LinearProcess, linear_model
-from ncs_gym.processes.fit import surrounding_shape
 from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
+from ncs_gym.processes.linear_fit import surrounding_shape
 
 QUIET = {"disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
 BOX, TORQUE, STEP = [0.25, 1.5], 2.0, 0.05

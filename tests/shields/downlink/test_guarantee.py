@@ -15,7 +15,7 @@ from ncs_gym import (
     Packet,
     truck_trailer,
 )
-from ncs_gym.network.transmission import ChannelState
+from ncs_gym.network.packet_transmission import ChannelState
 from shields import SafeLoop, SafetyShield, VectorSafetyShield
 from shields.downlink import Schedule, starts_known
 from shields.runtime.guarantee import (

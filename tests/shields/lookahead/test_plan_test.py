@@ -11,8 +11,8 @@ from ncs_gym.network.contract import ChannelContract
 from shields import SafetyFilter
 from shields.lookahead import PlanTest, Prediction
 from shields.lookahead.tightening import Tightening
-from shields.runtime.filter import MARGIN
 from shields.runtime.one_step_test import OneStepTest
+from shields.runtime.safety_filter import MARGIN
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 

@@ -15,8 +15,8 @@ from ncs_gym import (
     truck_trailer,
 )
 from shields import SafetyShield, VectorSafetyShield
-from shields.runtime.filter import MODES
 from shields.runtime.guarantee import ALARM
+from shields.runtime.safety_filter import MODES
 from tests.certificates import certificate_of
 
 # So large a delta that draws leave their ellipsoids all the time.

@@ -9,10 +9,10 @@ import pytest
 
 from ncs_gym import Channel, LinearPlant, NCSEnv
 from shields import CertificateError, Infeasible, SafetyFilter, SafetyShield, synthesize
-from shields.runtime.filter import require_computable
 from shields.runtime.guarantee import FAR_OUT, NOT_KNOWN_INSIDE
 from shields.runtime.one_step_test import OneStepTest, certified_root
 from shields.runtime.predicted_errors import predicted_errors
+from shields.runtime.safety_filter import require_computable
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, multiply, rational, subtract
 from tests.certificates import certificate_of
 
@@ -154,7 +154,7 @@ def test_safe_set_too_thin_for_float64_is_refused():
 
 def test_gain_too_large_for_float64_is_refused(monkeypatch, certificate, loaded):
     # Such a gain cannot verify with these limits; a fault in the verifier must not be enough.
-    monkeypatch.setattr("shields.runtime.filter.require_valid", lambda *_: None)
+    monkeypatch.setattr("shields.runtime.safety_filter.require_valid", lambda *_: None)
     with pytest.raises(CertificateError, match="gain is too large"):
         SafetyFilter(replace(certificate, K=1e9 * np.array([[1.0, -1.0]])), loaded)
 

@@ -19,11 +19,11 @@ from ncs_gym import (
     certified_error_set,
     truck_trailer,
 )
-from ncs_gym.network.transmission import ChannelState
+from ncs_gym.network.packet_transmission import ChannelState
 from shields import CertificateError, SafeLoop, SafetyShield, VectorSafetyShield
-from shields.runtime.filter import MODES
 from shields.runtime.guarantee import ALARM, LARGE_ERROR, NOT_KNOWN_INSIDE, OTHER_INPUT
 from shields.runtime.safe_loop import NOT_STARTED
+from shields.runtime.safety_filter import MODES
 from tests import arrays
 from tests.certificates import certificate_of
 from tests.ncs_gym.estimation.adversary import Traffic

@@ -24,7 +24,6 @@ from stable_baselines3.common.monitor import Monitor
 
 from ncs_gym import AdversarialDisturbance, Channel, Ellipsoid, NCSEnv
 from shields import Certificate, CertificateError, SafetyShield, synthesize
-from shields.runtime.filter import SafetyFilter
 from shields.runtime.guarantee import (
     ALARM,
     FAR_OUT,
@@ -33,6 +32,7 @@ from shields.runtime.guarantee import (
     OTHER_INPUT,
     OTHER_STEPS,
 )
+from shields.runtime.safety_filter import SafetyFilter
 from tests.plants import random_plant
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"

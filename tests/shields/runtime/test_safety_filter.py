@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from ncs_gym import Ellipsoid, truck_trailer
 from ncs_gym.uncertainty.ellipsoid import outer_sum
 from shields import CertificateError, SafetyFilter
-from shields.runtime.filter import MARGIN, MODES, REASONS
+from shields.runtime.safety_filter import MARGIN, MODES, REASONS
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 
@@ -486,7 +486,7 @@ def test_single_decisions_take_off_as_much_for_rounding_as_batches_do(states, mo
 def test_remembered_error_shapes_are_forgotten_in_time(monkeypatch):
     plant = TWO_STATES
     shield, Sigma = SafetyFilter(certificate_of(plant), plant), certificate_of(plant).Sigma
-    monkeypatch.setattr("shields.runtime.filter.MOST_REMEMBERED", 5)
+    monkeypatch.setattr("shields.runtime.safety_filter.MOST_REMEMBERED", 5)
     for _ in range(2):
         for size in np.linspace(0.1, 1.0, 12):
             errors = shield.errors_of(size * Sigma)
