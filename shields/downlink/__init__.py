@@ -1,7 +1,7 @@
 """What a shield adds where its inputs take effect some steps later (docs/contracts.md, "Both directions").
 
-`start_under_zero_input` shows the states before the first decision takes effect to be safe, `schedule` checks that what was
-decided is applied when its step comes.
+`start_under_zero_input` shows the states before the first decision takes effect to be safe, `schedule` checks that what
+was decided is applied when its step comes.
 """
 
 from shields.downlink.schedule import Schedule, VectorSchedule, as_decided
