@@ -42,6 +42,8 @@ SECTIONS = ("beliefs", "loop", "training")
 MODES = ("project", "lookahead")
 # Steps of 64 environments that are measured, and before that.
 ENVS, MEASURED, WARM = 64, 150, 50
+# Seed of sections "loop" and "training"; the rule was chosen on seed 0.
+SEED = 1
 
 
 class Beliefs(NamedTuple):
@@ -177,7 +179,7 @@ def shielded(name: str, mode: str, horizon: int, **settings) -> VectorSafetyShie
 
 def driven(env, act, steps: int) -> tuple[float, ...]:
     """Microseconds per frame, share of inputs overridden, mean correction and reward per frame."""
-    observation, info = env.reset(seed=0)
+    observation, info = env.reset(seed=SEED)
     sums, start = np.zeros(3), 0.0
     for step in range(WARM + steps):
         if step == WARM:
@@ -193,7 +195,7 @@ def loop() -> None:
         for actions, mean, spread in (("random", 0.0, None), ("pushed", 0.8, 0.5)):
             results = []
             for mode in MODES:
-                env, rng = shielded(name, mode, horizon), np.random.default_rng(0)
+                env, rng = shielded(name, mode, horizon), np.random.default_rng(SEED)
                 shape = env.action_space.shape
 
                 def act(_, rng=rng, shape=shape, mean=mean, spread=spread):
@@ -216,7 +218,7 @@ def training(steps: int) -> None:
         for mode in MODES:
             env = SB3VecEnv(shielded(name, mode, horizon, autoreset_mode="SameStep"))
             normalized = VecNormalize(env, gamma=settings.discount)
-            model, start = build_model("PPO", normalized, settings, 0), time.process_time()
+            model, start = build_model("PPO", normalized, settings, SEED), time.process_time()
             model.learn(count)
             rates[mode] = model.num_timesteps / (time.process_time() - start)
             agents[mode] = model, normalized
