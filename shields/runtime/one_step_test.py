@@ -181,11 +181,11 @@ class ReachableSet(NamedTuple):
         weighted = self.weighting.dot(center)
         return self.radius - float(weighted.dot(weighted)) ** 0.5, self.radius - float(center.dot(center)) ** 0.5
 
-    def closest(self, u: np.ndarray, reserve: float) -> np.ndarray:
-        """Returns what `ReachableSets.closest` does for plants with a single input, shape (1,)."""
+    def closest(self, u: float, reserve: float) -> float:
+        """Returns what `ReachableSets.closest` does for plants with a single input."""
         effect, offset = self.weighting.dot(self.test.effect[:, 0]), self.weighting.dot(self.offset)
         form = (float(effect.dot(effect)), float(effect.dot(offset)), float(offset.dot(offset)))
-        return np.array([closest_on_line(u.item(), *form, self.radius - reserve, self.test.limits[0])])
+        return closest_on_line(u, *form, self.radius - reserve, self.test.limits[0])
 
 
 def norms(vectors: np.ndarray) -> np.ndarray:

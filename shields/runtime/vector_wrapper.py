@@ -182,7 +182,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         if len(table.shapes) > len(self._known.radius):
             new = self.filter.errors_of_many(table.shapes[len(self._known.radius) :])
             self._known = self._known.followed_by(new)
-        return self._known.of(np.array(numbers, np.intp))
+        return self._known.of(np.asarray(numbers, np.intp))
 
     def _start(self, restarted: np.ndarray, begun: np.ndarray) -> None:
         """Begins anew where episodes began, `begun` where nothing has moved since; shape (N,) each."""
