@@ -140,7 +140,8 @@ class BodySimulation(PlantSimulation):
             moved = np.minimum(np.maximum(moved, -self._limit), self._limit)
         if self._is_disturbed:
             moved = self._body.write(moved)
-        self.alarm = self.alarm | (self._model.disturbance.gauge((moved - linear).T) > 1.0)
+        gauge = self._model.disturbance.gauge((moved - linear).T)  # NaN where it overflows
+        self.alarm = self.alarm | ((gauge <= 1.0) == False)  # noqa: E712
         return moved
 
     def close(self) -> None:

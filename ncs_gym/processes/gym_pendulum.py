@@ -16,12 +16,15 @@ from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.validation import as_number
 
-# What `Pendulum-v1` has: gravity [m/s^2], mass [kg], length [m], step [s] and largest torque [N m].
-GRAVITY, MASS, LENGTH, STEP, TORQUE = 10.0, 1.0, 1.0, 0.05, 2.0
+# What `Pendulum-v1` has: gravity [m/s^2], mass [kg], length [m], step [s], largest torque [N m] and rate [rad/s].
+GRAVITY, MASS, LENGTH, STEP, TORQUE, FASTEST = 10.0, 1.0, 1.0, 0.05, 2.0, 8.0
 # Safe box around upright: angle [rad] and angular rate [rad/s].
 ANGLE, RATE = 0.25, 1.5
-# Relative room for the rounding of the environment's own arithmetic, and that of a torque to float32.
-ROUNDING, TORQUE_ROUNDING = 1e-9, 2.0**-24
+# Relative room for the rounding of the environment's own arithmetic in float64, and for what it rounds to float32: the
+# torque, 3 / (m l^2), and the product of both (a float32 scalar times a Python number is a float32).
+ROUNDING, TORQUE_ROUNDING = 1e-9, 3.0 * 2.0**-24
+# What the proof is about.
+PROVED_FOR = ("A", "B", "box", "u_max", "dt", "remainder")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,16 +76,30 @@ def pendulum(gravity: float = GRAVITY, mass: float = MASS, length: float = LENGT
     The environment computes rate+ = rate + dt (a sin(angle) + b u) and angle+ = angle + dt rate+ with a = 3 g / (2 l)
     and b = 3 / (m l^2). For |angle| <= c the ratio sin(angle) / angle lies between s = sin(c) / c and 1; with its
     middle (1 + s) / 2 as the slope, what is left out of rate+ is at most dt a c (1 - s) / 2, and dt times that of
-    angle+: a multiple of (dt, 1). That is proved; the rounding of a torque to float32 is added.
+    angle+: a multiple of (dt, 1). That is proved; what the environment rounds to float32 is added.
 
     Args:
         gravity: [m/s^2].
         mass: [kg].
         length: [m].
-        bounds: Other arguments of `LinearPlant`.
+        bounds: Other arguments of `LinearPlant`, beside those that the proof is about.
+
+    Raises:
+        ValueError: If an argument is one of these, or the environment would clip a rate.
     """
+    if changed := sorted(set(PROVED_FOR) & set(bounds)):
+        raise ValueError(
+            f"the remainder of pendulum() is proved for its own {', '.join(PROVED_FOR[:-1])}, which "
+            f"{', '.join(changed)} would replace: ncs_gym.linear_model finds the model of another box"
+        )
     pull, gain = 3.0 * gravity / (2.0 * length), 3.0 / (mass * length**2)
     ratio = np.sin(ANGLE) / ANGLE
+    fastest = RATE + STEP * (pull * np.sin(ANGLE) + gain * TORQUE)
+    if not fastest < FASTEST:
+        raise ValueError(
+            f"a step from the box reaches {fastest:.3g} rad/s, which Pendulum-v1 clips to {FASTEST:g}: no linear model "
+            "with the proved remainder; use a larger mass or length, or ncs_gym.linear_model"
+        )
     slope = STEP * pull * 0.5 * (1.0 + ratio)
     left_out = STEP * (pull * ANGLE * 0.5 * (1.0 - ratio) + gain * TORQUE * TORQUE_ROUNDING) * (1.0 + ROUNDING)
     direction = np.array([[STEP], [1.0]])

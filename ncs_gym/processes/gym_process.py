@@ -58,10 +58,19 @@ class GymProcess(Process):
                 raise ValueError(f"GymProcess: {name} must be a function, got {shown(value)}")
 
     def body(self, plant: LinearPlant, size: int | None) -> Body:
-        """Returns the opened environments."""
+        """Returns the opened environments.
+
+        Raises:
+            ValueError: If they do not fit the plant, or `make` returns the same one again.
+        """
         if size is None:
             return GymBody(self, plant)
-        return _GymBodies([GymBody(self, plant) for _ in range(size)])
+        bodies = [GymBody(self, plant) for _ in range(size)]
+        if len({id(each.env.unwrapped) for each in bodies}) < size:
+            raise ValueError(
+                "GymProcess: make must return a fresh environment at every call, not one that it returned before"
+            )
+        return _GymBodies(bodies)
 
 
 class GymBody(Body):

@@ -21,6 +21,8 @@ from ncs_gym.validation import as_count, as_matrix, as_number, as_vector, shown
 HELD_OUT = 0.25
 # Room for the rounding of samples and of sums, relative to a bound.
 ROUNDING = 1e-9
+# Steps that are taken twice before a bound counts as proved.
+REPEATED = 50
 
 
 class _Steps(NamedTuple):
@@ -66,7 +68,8 @@ def linear_model(
 
     Raises:
         ValueError: If the remainder is larger than the box can bear, fresh samples contradict the bound, the process
-            cannot be put into a state, or an argument is wrong.
+            cannot be put into a state, a proof is asked for of a process that repeated steps show to be no function of
+            state and input, or an argument is wrong.
     """
     if isinstance(process, LinearProcess):
         raise ValueError("the linear process is its own model: give what really moves")
@@ -78,8 +81,13 @@ def linear_model(
     if len(given) == 1 or (given and jacobian_bounds is not None):
         raise ValueError("give A and B together, or jacobian_bounds, whose middle they are, or neither")
     rng = np.random.default_rng(as_count(seed, "seed", low=0))
-    drawn, fresh, origin = _steps_of(moving, common, as_count(samples, "samples", low=100), rng)
+    drawn, fresh, origin, spread = _steps_of(moving, common, as_count(samples, "samples", low=100), rng)
     if jacobian_bounds is not None:
+        if spread > ROUNDING:
+            raise ValueError(
+                f"steps from the same state with the same input differ by {spread:.3g} half-widths of the box: noise, "
+                "or memory beyond the state, of which bounds on a Jacobian prove nothing"
+            )
         A, B, bound = _from_jacobians(jacobian_bounds, widths, limits, origin)
         basis = "from bounds on its Jacobian"
     else:
@@ -95,8 +103,8 @@ def linear_model(
 
 def _steps_of(
     process: Process, common: dict[str, Any], count: int, rng: np.random.Generator
-) -> tuple[_Steps, _Steps, np.ndarray]:
-    """Returns sampled steps, fewer fresh ones, and f(0, 0), shape (n,).
+) -> tuple[_Steps, _Steps, np.ndarray, float]:
+    """Returns sampled steps, fewer fresh ones, f(0, 0), shape (n,), and by how many half-widths repeated steps differ.
 
     Args:
         process: What moves.
@@ -117,7 +125,9 @@ def _steps_of(
         origin = body.step(body.write(np.zeros(n)), np.zeros(m))
         drawn = _sampled(body, frame, count, rng)
         fresh = _sampled(body, frame, max(int(HELD_OUT * count), 100), rng)
-        return drawn, fresh, origin
+        again = _moved(body, drawn.states[:, :REPEATED], drawn.inputs[:, :REPEATED], rng)
+        spread = float(np.max(np.abs(again - drawn.moved[:, :REPEATED]) / frame.half_widths[:, None]))
+        return drawn, fresh, origin, spread
     finally:
         body.close()
 
@@ -129,14 +139,19 @@ def _sampled(body: Body, frame: LinearPlant, count: int, rng: np.random.Generato
     at_end = rng.random(points.shape) < np.where(np.arange(count) % 2 == 0, 0.0, rng.random(count))
     points = widths * np.where(at_end, np.sign(points), points)
     states, inputs = points[: frame.n], points[frame.n :]
+    return _Steps(states, inputs, _moved(body, states, inputs, rng))
+
+
+def _moved(body: Body, states: np.ndarray, inputs: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Returns the next states, shape (n, N), after states (n, N) with inputs (m, N)."""
     if body.is_vectorized:
-        return _Steps(states, inputs, body.step(states, inputs))
+        return body.step(states, inputs)
     moved = np.empty_like(states)
-    for each in range(count):
+    for each in range(states.shape[1]):
         if body.terminated or body.truncated:
             body.start(rng, states[:, each], None)
         moved[:, each] = body.step(body.write(states[:, each]), inputs[:, each])
-    return _Steps(states, inputs, moved)
+    return moved
 
 
 def _left_out(A: np.ndarray, B: np.ndarray, steps: _Steps) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.downlink import DownlinkProtocol
 from ncs_gym.plants.linear_plant import SIMULATED_REACH
+from ncs_gym.plants.statespace import inputs_under_way
 from shields.certificate import Certificate
 from shields.runtime.decisions import Decision
 from shields.runtime.one_step_test import FARTHEST
@@ -116,7 +117,11 @@ class GuaranteeMonitor:
         # The present estimate, which is not observed then, is near where what was predicted of it is nearer still.
         self._reach = SIMULATED_REACH * safety_filter.plant.half_widths / (2.0 if self._lead else 1.0)
         self._has_error_set = safety_filter.certificate.Sigma is not None
-        self._is_local = safety_filter.plant.remainder is not None
+        plant = safety_filter.plant
+        self._is_local = plant.remainder is not None
+        # S holds inputs under way beyond their limits, where a remainder has no bound; only a start can have them.
+        self._under_way = inputs_under_way(plant) if self._is_local else 0
+        self._limits = np.tile(plant.u_max, self._under_way // plant.m)
 
     def start(self, known_inside: Any, unmoved: Any, report: LoopObservation) -> MonitorState:
         """Returns the state at the start of an episode.
@@ -127,7 +132,8 @@ class GuaranteeMonitor:
             unmoved: Whether the environment has not moved since.
             report: What is observed.
         """
-        return self._observe(_first(unmoved * 0, unmoved == False, OTHER_STEPS), known_inside, report, 0)  # noqa: E712
+        broken = _first(unmoved * 0, unmoved == False, OTHER_STEPS)  # noqa: E712
+        return self._observe(self._within_limits(broken, report), known_inside, report, 0)
 
     def cover(self, state: MonitorState, earlier: Iterable[tuple[Any, LoopObservation]]) -> MonitorState:
         """Returns the state at the start with what is known of the steps before the first decision takes effect.
@@ -139,7 +145,7 @@ class GuaranteeMonitor:
         """
         broken, wait = state.broken, state.wait
         for ahead, (inside, report) in enumerate(earlier):
-            seen = self._observe(broken, inside, report, 0)
+            seen = self._observe(self._within_limits(broken, report), inside, report, 0)
             broken, wait = seen.broken, np.maximum(wait, (seen.inside == False) * (ahead + 1))  # noqa: E712
         return state._replace(broken=broken, wait=wait)
 
@@ -183,6 +189,14 @@ class GuaranteeMonitor:
         if self._lead:
             reason = _first(reason, state.wait > 0, NOT_KNOWN_INSIDE)
         return _first(reason, state.certified == False, LARGE_ERROR)  # noqa: E712
+
+    def _within_limits(self, broken: Any, report: LoopObservation) -> Any:
+        """Returns what broke, with inputs under way at a start that are not known to lie within their limits."""
+        if not self._under_way:
+            return broken
+        sizes = (np.abs(report.estimate) + report.errors.half_widths)[-self._under_way :]
+        limits = self._limits if sizes.ndim == 1 else self._limits[:, None]
+        return _first(broken, _rows_all(sizes <= limits) == False, LEFT_MODEL)  # noqa: E712
 
     def _observe(self, broken: Any, inside: Any, report: LoopObservation, wait: Any) -> MonitorState:
         """Takes in the alarm, the running ellipsoid, and what the estimate alone proves."""

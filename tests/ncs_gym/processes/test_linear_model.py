@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Ellipsoid, GymProcess, LinearProcess, linear_model
+from ncs_gym import Ellipsoid, FunctionProcess, GymProcess, LinearProcess, linear_model
 from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
 from ncs_gym.processes.linear_fit import surrounding_shape
 
@@ -84,7 +84,7 @@ def test_pendulum_is_proved_by_another_route():
     assert plant.remainder.proved
     slope = plant.A[1, 0] / PULL
     angles = np.array([0.25, np.arccos(slope)])
-    largest = PULL * np.abs(np.sin(angles) - slope * angles).max() + 0.15 * TORQUE * 2.0**-24  # a torque rounds
+    largest = PULL * np.abs(np.sin(angles) - slope * angles).max() + 0.15 * TORQUE * 3.0 * 2.0**-24  # what rounds
     np.testing.assert_allclose(plant.remainder.bound.support(np.array([[0.0, 1.0]])), largest, rtol=1e-6)
     env = gym.make("Pendulum-v1").unwrapped
 
@@ -165,3 +165,45 @@ def test_sample_that_a_bound_does_not_explain_is_refused():
 def test_pendulum_without_a_length_is_refused(name):
     with pytest.raises(ValueError, match=f"{name} must be"):
         PendulumProcess(**{name: 0.0})
+
+
+@pytest.mark.parametrize("mass", [1.0, 0.7, 1.4634146])
+def test_proved_bound_holds_what_the_environment_rounds_to_float32(mass):
+    """A float32 torque times 3 / (m l^2) is a float32: gain, torque and product round at the edge of the box."""
+    plant, body = pendulum(mass=mass), PendulumProcess(mass=mass).body(pendulum(mass=mass), None)
+    rng, largest = np.random.default_rng(0), 0.0
+    for u in rng.uniform(1.0, TORQUE, 3_000):
+        state = np.array([-0.25, 0.0])
+        for torque in (u, -u):
+            left_out = body.step(body.write(state), np.array([torque])) - plant.A @ state - plant.B[:, 0] * torque
+            largest = max(largest, plant.disturbance.gauge(left_out))
+    body.close()
+    assert 0.999 < largest <= 1.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"box": [0.6, 3.0]}, r"proved for its own .*, which box would replace"),
+        ({"u_max": 4.0, "dt": 0.1}, "which dt, u_max would replace"),
+        ({"mass": 0.04}, "which Pendulum-v1 clips to 8"),
+    ],
+)
+def test_pendulum_that_the_proof_is_not_about_is_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        pendulum(**settings)
+
+
+@pytest.mark.parametrize("vectorized", [False, True])
+def test_proof_about_a_process_with_noise_is_refused(vectorized):
+    rng = np.random.default_rng(0)
+
+    def noisy(state, u):
+        return swing(state, u) + 1e-4 * rng.uniform(-1.0, 1.0, np.shape(state))
+
+    process = FunctionProcess(noisy, vectorized)
+    assert not model(process).remainder.proved
+    with pytest.raises(
+        ValueError, match=r"same state with the same input differ .* bounds on a Jacobian prove nothing"
+    ):
+        model(process, jacobian_bounds=JACOBIAN)

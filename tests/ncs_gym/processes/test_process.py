@@ -304,3 +304,21 @@ def test_file_of_a_plant_keeps_its_remainder(tmp_path):
         "is assumed to lie in its bound while the state is in the box: an example" in s for s in twin.assumptions
     )
     assert whole.without_remainder.fingerprint == plant().fingerprint
+
+
+def test_environments_of_a_vector_may_not_be_the_same_one():
+    one = gym.make("Pendulum-v1")
+    process = GymProcess(lambda: one, lambda env: env.unwrapped.state)
+    with pytest.raises(ValueError, match="make must return a fresh environment at every call"):
+        NCSVectorEnv(2, plant=plant(), process=process)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("many", [False, True])
+def test_a_step_too_large_for_float64_is_an_alarm(many):
+    process = FunctionProcess(lambda state, u: np.array([1e308, -1e308]))
+    settings = {"plant": plant(), "process": process, "channel": Channel(delay=3)}
+    env = NCSVectorEnv(2, **settings) if many else NCSEnv(**settings)
+    env.reset(seed=0)
+    *_, info = env.step(np.zeros((2, 1) if many else 1, np.float32))
+    assert np.all(info["assumption_violated"])

@@ -97,6 +97,22 @@ def test_remainder_acts_on_the_state_alone_where_inputs_are_under_way():
     assert plant.remainder.sentence == LEFT_OUT.sentence
 
 
+@pytest.mark.parametrize("many", [False, True])
+@pytest.mark.parametrize("downlink", [{}, {"downlink": Channel(delay=1)}])
+def test_inputs_under_way_beyond_their_limits_are_outside_the_model(many, downlink):
+    """S reaches to four times the limits in their direction, the bound of the remainder only to the limits."""
+    settings = {"box": [1.0, 1.0], "u_max": 1.0, "disturbance_bound": 0.0, "sensor_bound": 1e-3, "initial_bound": 1e-3}
+    model = (COMMON["A"], COMMON["B"], np.eye(2), np.zeros((2, 1)), 0.1)
+    plants = [
+        LinearPlant.from_statespace(model, input_delay=1, remainder=each, **settings) for each in (LEFT_OUT, None)
+    ]
+    first = (lambda values: [str(value[0]) for value in values]) if many else list
+    start = [0.0, 0.0, 1.3]
+    assert set(first(reasons(plants[0], start, many=many, **downlink))[:-1]) == {LEFT_MODEL}
+    assert set(first(reasons(plants[0], [0.0, 0.0, 0.9], many=many, **downlink))) == {""}
+    assert set(first(reasons(plants[1], start, many=many, **downlink))) == {""}
+
+
 def test_remainder_that_the_box_cannot_bear_is_named():
     plant = LinearPlant(
         A=[[1.2]],
