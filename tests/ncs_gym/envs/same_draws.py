@@ -91,17 +91,21 @@ class ScriptedEnv(NCSEnv):
 
     def replay(self, action: np.ndarray) -> tuple:
         """Steps with what the vector drew at its last step."""
-        process, rng = self.many._process, self.many.np_random
-        self._process.disturbance_now = process.disturbance_now[:, self.index]
-        self._process.noise_now = process.noise_now[:, self.index]
-        self.np_random.numbers = [drawn[..., self.index] for drawn in rng.drawn]
-        sends = self._channel_state.sends_at(self.steps + 1)
+        sends = self.hear()
         result = self.step(action)
         assert not (sends and self.np_random.numbers)  # where nothing is sent, less is drawn
         return result
 
+    def hear(self) -> bool:
+        """Takes over what the vector drew at its last step; returns whether the sensor sends at the next one here."""
+        process, rng = self.many._process, self.many.np_random
+        self._process.disturbance_now = process.disturbance_now[:, self.index]
+        self._process.noise_now = process.noise_now[:, self.index]
+        self.np_random.numbers = [drawn[..., self.index] for drawn in rng.drawn]
+        return self._channel_state.sends_at(self.steps + 1)
 
-def scalar_versions(many: NCSVectorEnv) -> list[ScriptedEnv]:
+
+def scalar_versions(many: NCSVectorEnv, kind: type[ScriptedEnv] = ScriptedEnv) -> list[Any]:
     """Scalar environments that follow each environment of a vector, which is made to record."""
     single = many.single
     allowed, truncated = single.allow_assumption_violation, single.noise == "truncated"
@@ -131,7 +135,7 @@ def scalar_versions(many: NCSVectorEnv) -> list[ScriptedEnv]:
     settings["allow_assumption_violation"] = single.allow_assumption_violation
     if single.downlink is not None:
         settings |= {"downlink": single.downlink.channel, "downlink_contract": single.downlink.contract}
-    singles = [ScriptedEnv(**settings) for _ in range(many.num_envs)]
+    singles = [kind(**settings) for _ in range(many.num_envs)]
     for index, each in enumerate(singles):
         each.follow(many, index)
     return singles

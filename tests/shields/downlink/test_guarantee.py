@@ -160,7 +160,7 @@ def test_first_steps_are_known_exactly_where_they_can_leave_the_safe_set():
     assert not all(each.in_safe_set for each in known)
     assert [each.in_safe_set for each in starts_known(shield, None, lead)] == [False] * 4
     rng = np.random.default_rng(0)
-    for scale in (0.5, 0.9, 0.97):
+    for scale in (0.5, 0.9, *np.linspace(0.95, 0.999, 40)):
         start = large.sample_boundary(rng) * scale
         found = starts_known(shield, start, lead)
         states = np.tile(start, (200, 1))
@@ -168,6 +168,23 @@ def test_first_steps_are_known_exactly_where_they_can_leave_the_safe_set():
             gauges = shield.certificate.safe_set.gauge(states)
             assert not each.in_safe_set or gauges.max() <= 1.0
             states = states @ PLANT.A.T + PLANT.disturbance.sample_boundary(rng, 200)
+
+
+def test_a_start_outside_the_box_is_not_guaranteed_although_a_plan_is_certified_once_inputs_take_effect():
+    shield = shielded("lookahead", downlink=Channel(delay=3))
+    # Just outside, drifting back in.
+    drifting = np.array([[1.001, -0.2], [-1.001, 0.2]]) * PLANT.half_widths
+    vector = VectorSafetyShield(
+        NCSVectorEnv(2, plant=PLANT, channel=UPLINK, downlink=Channel(delay=3)), certificate_of(PLANT), "lookahead"
+    )
+    for seed, start in enumerate(drifting):
+        _, info = shield.reset(seed=seed, options={"state": start})
+        assert shield._guarded._state.inside  # that of step 3 is
+        assert info["cost"] == 1.0
+        assert info["shield_reason"] == NOT_KNOWN_INSIDE
+    infos = vector.reset(seed=0, options={"state": drifting})[1]
+    assert vector._state.inside.all()
+    assert not infos["shield_guaranteed"].any()
 
 
 class Meddling(gym.Wrapper):
@@ -272,6 +289,22 @@ def test_safe_loop_ends_its_guarantee_when_the_actuator_says_that_nothing_arrive
     assert missed.size
     assert reasons[: missed[0] + 1] == [""] * (missed[0] + 1)
     assert set(reasons[missed[0] + 1 :]) == {LATE_INPUT}
+
+
+def test_safe_loop_estimates_with_what_the_actuator_says_it_applied():
+    for told in (None, np.zeros(1)):
+        loop = SafeLoop(
+            certificate_of(PLANT), PLANT, UPLINK, downlink=Channel(loss=0.4), downlink_contract=ChannelContract(1)
+        )
+        loop.start(np.zeros(2))
+        for applied in (None, None, told):
+            loop.receive(applied=applied)
+            loop.decide(1.0)
+        expected = np.zeros(2)
+        for u in (0.0, 1.0 if told is None else 0.0, 1.0):
+            expected = PLANT.A @ expected + PLANT.B @ [u]
+        np.testing.assert_allclose(loop.estimate, expected, atol=1e-12)
+        assert loop.guaranteed == (told is None)
 
 
 def test_safe_loop_sends_only_what_was_decided_and_is_never_guaranteed_without_a_contract():
