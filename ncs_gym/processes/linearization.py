@@ -83,11 +83,7 @@ def linear_model(
     rng = np.random.default_rng(as_count(seed, "seed", low=0))
     drawn, fresh, origin, spread = _steps_of(moving, common, as_count(samples, "samples", low=100), rng)
     if jacobian_bounds is not None:
-        if spread > ROUNDING:
-            raise ValueError(
-                f"steps from the same state with the same input differ by {spread:.3g} half-widths of the box: noise, "
-                "or memory beyond the state, of which bounds on a Jacobian prove nothing"
-            )
+        _require_function(spread)
         A, B, bound = _from_jacobians(jacobian_bounds, widths, limits, origin)
         basis = "from bounds on its Jacobian"
     else:
@@ -157,6 +153,15 @@ def _moved(body: Body, states: np.ndarray, inputs: np.ndarray, rng: np.random.Ge
 def _left_out(A: np.ndarray, B: np.ndarray, steps: _Steps) -> np.ndarray:
     """Returns what a linear model leaves out, shape (N, n)."""
     return (steps.moved - A @ steps.states - B @ steps.inputs).T
+
+
+def _require_function(spread: float) -> None:
+    """Raises ValueError if repeated steps differ, by `spread` half-widths of the box."""
+    if spread > ROUNDING:
+        raise ValueError(
+            f"steps from the same state with the same input differ by {spread:.3g} half-widths of the box: noise, "
+            "or memory beyond the state, of which bounds on a Jacobian prove nothing"
+        )
 
 
 def _from_jacobians(
