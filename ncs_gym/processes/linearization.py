@@ -68,8 +68,7 @@ def linear_model(
 
     Raises:
         ValueError: If the remainder is larger than the box can bear, fresh samples contradict the bound, the process
-            cannot be put into a state, a proof is asked for of a process that repeated steps show to be no function of
-            state and input, or an argument is wrong.
+            cannot be put into a state, it is no function of its state and a proof is asked for, or an argument is wrong.
     """
     if isinstance(process, LinearProcess):
         raise ValueError("the linear process is its own model: give what really moves")
