@@ -50,8 +50,7 @@ def linear_model(
     `plant.remainder` says how the bound is known. By sampling, A and B make the largest remainder of the samples small,
     and the smallest ellipsoid around these remainders, `safety_factor` times as large, is an *assumption*. From bounds
     on the Jacobian it is *proved* by the mean value theorem: A and B are the middle of the interval, and
-    |r_i| <= |f_i(0, 0)| + sum_j (half-width of the interval of J_ij) (half-width of z_j), z = (x, u). Either way fresh
-    samples must confirm it (docs/beyond_linear.md).
+    |r_i| <= |f_i(0, 0)| + sum_j (half-width of J_ij) (half-width of z_j), z = (x, u). Fresh samples must confirm either.
 
     Args:
         process: What really moves, or a step function (x, u) -> x+; in deviations from the operating point, near which
@@ -68,7 +67,7 @@ def linear_model(
 
     Raises:
         ValueError: If the remainder is larger than the box can bear, fresh samples contradict the bound, the process
-            cannot be put into a state, it is no function of its state and a proof is asked for, or an argument is wrong.
+            cannot be put into a state, is no function of it although a proof is asked for, or an argument is wrong.
     """
     if isinstance(process, LinearProcess):
         raise ValueError("the linear process is its own model: give what really moves")
