@@ -50,7 +50,7 @@ def linear_model(
     `plant.remainder` says how the bound is known. By sampling, A and B make the largest remainder of the samples small,
     and the smallest ellipsoid around these remainders, `safety_factor` times as large, is an *assumption*. From bounds
     on the Jacobian it is *proved* by the mean value theorem: A and B are the middle of the interval, and
-    |r_i| <= |f_i(0, 0)| + sum_j (half-width of J_ij) (half-width of z_j), z = (x, u). Fresh samples must confirm either.
+    |r_i| <= |f_i(0, 0)| + sum_j (half-width of J_ij) (half-width of z_j), z = (x, u). Fresh samples confirm either.
 
     Args:
         process: What really moves, or a step function (x, u) -> x+; in deviations from the operating point, near which
