@@ -81,6 +81,7 @@ def test_broken_contract_ends_the_guarantee_in_time_and_newer_samples_restore_it
         certificate_of(whole.unwrapped.plant, whole.unwrapped.contract),
     )
     env.reset(seed=0)
+    env.action_space.seed(0)
     outside = guaranteed_outside = 0
     reasons = set()
     for _ in range(80):
