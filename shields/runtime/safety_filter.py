@@ -170,7 +170,8 @@ class SafetyFilter(ReadOnlyArrays):
         sets = self.test.reachable(estimates, errors)
         slack, margin = sets.slack(proposed)
         judged = sets.smallest_slack() if self.mode == "boundary" else slack
-        valid = np.all(np.abs(proposed) <= self.plant.u_max[:, None], axis=0)
+        within: np.ndarray = np.abs(proposed) <= self.plant.u_max[:, None]
+        valid: np.ndarray = within[0] if len(within) == 1 else np.all(within, axis=0)
         passed = (judged >= MARGIN) & valid
         fallback, reason = np.zeros(len(passed), np.bool_), np.zeros(len(passed), np.int64)
         plan = np.full((self.horizon or 0, *proposed.shape), np.nan)
