@@ -56,5 +56,5 @@ def loop_info(
         "episode_violations": violations,
         "is_success": (violations == 0.0) * 1.0,
         "contract_broken": broken,
-        "downlink_broken": missing.copy() if many else missing,
+        "downlink_broken": np.array(missing) if many else missing,
     }

@@ -195,7 +195,8 @@ class NCSVectorEnv(VectorEnv):
     def _ends(self, cost: np.ndarray, restarted: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Returns which episodes are terminated and which truncated, shape (N,) each; those that just began are not."""
         terminated, truncated = np.zeros((2, self.num_envs), np.bool_)
-        terminated, truncated = terminated | self._process.terminated, truncated | self._process.truncated
+        if self._process.terminated is not False:  # other people's environments may end
+            terminated, truncated = terminated | self._process.terminated, truncated | self._process.truncated
         if self.single.terminate_on_violation:
             terminated |= cost > 0.0
         if self.max_episode_steps is not None:
