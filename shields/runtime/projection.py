@@ -57,12 +57,17 @@ def closest_admissible(
 def _branched(
     problem: np.ndarray, held: np.ndarray, signs: np.ndarray, broken: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the candidates, each once, that hold one more of the limits broken, at the sign it is broken with."""
+    """Returns the candidates that hold one more of the limits broken, at the sign it is broken with.
+
+    Each comes once; of two inputs perhaps twice, which costs less than to look for it.
+    """
     which, parent = np.nonzero(broken)
     if not parent.size:
         return parent, held[:, parent]
     branches = held[:, parent]
     branches[which, np.arange(len(parent))] = signs[which, parent]
+    if len(held) == 2:
+        return problem[parent], branches
     candidates = np.unique(np.vstack([problem[parent], branches]), axis=1)
     return candidates[0].astype(np.int64), candidates[1:]
 
