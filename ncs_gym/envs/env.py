@@ -9,10 +9,9 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from ncs_gym.downlink.loop import Inputs, downlink_of, no_inputs
-from ncs_gym.envs.contracts import loop_contracts
 from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.reset_options import start_option
-from ncs_gym.envs.settings import expect, require_suitable, starting_set
+from ncs_gym.envs.settings import expect, loop_contracts, require_suitable, starting_set
 from ncs_gym.envs.spaces import applied_input, observation_space
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
 from ncs_gym.estimation.estimator import Estimator

@@ -1,9 +1,10 @@
-"""Settings of the control loop: what they must be, and the contract that they amount to."""
+"""Settings of the control loop: what they must be, and the contracts of its two channels that they amount to."""
 
 from __future__ import annotations
 
 from typing import Any, TypeVar
 
+from ncs_gym.downlink.protocol import DownlinkProtocol, downlink_protocol
 from ncs_gym.envs.spaces import default_initial_set
 from ncs_gym.estimation.error_bound import UnstablePlantError
 from ncs_gym.network.channel import Channel
@@ -15,7 +16,7 @@ from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 T = TypeVar("T")
 
 
-def assumed_contract(plant: LinearPlant, channel: Channel, contract: ChannelContract | None) -> ChannelContract | None:
+def _assumed_contract(plant: LinearPlant, channel: Channel, contract: ChannelContract | None) -> ChannelContract | None:
     """Returns the contract that the estimator's error sets rest on.
 
     Raises:
@@ -34,6 +35,22 @@ def assumed_contract(plant: LinearPlant, channel: Channel, contract: ChannelCont
             f"the channel rounds to {channel.quantization_step}, the contract allows {contract.quantization_step}"
         )
     return contract
+
+
+def loop_contracts(
+    plant: LinearPlant, channel: Channel, contract: Any, downlink: Any, downlink_contract: Any
+) -> tuple[ChannelContract | None, DownlinkProtocol | None, ChannelContract | None]:
+    """Returns the contract of the uplink, the protocol of the downlink and the contract of a certificate for both.
+
+    The certificate's also counts the steps between a decision and its effect.
+
+    Raises:
+        UnstablePlantError: If an unstable plant has neither a contract nor a channel that keeps one.
+        ValueError: If the channel rounds more coarsely than the contract allows, or a setting is wrong.
+    """
+    assumed = _assumed_contract(plant, channel, contract)
+    protocol = downlink_protocol(downlink, downlink_contract)
+    return assumed, protocol, assumed if protocol is None else protocol.behind(assumed)
 
 
 def starting_set(initial_set: Ellipsoid | None, plant: LinearPlant) -> Ellipsoid:

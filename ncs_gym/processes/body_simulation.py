@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from ncs_gym.uncertainty.disturbance_settings import stays_inside
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 
 
-class Body:
+class Body(ABC):
     """What moves, at run time, in one environment or in many of them; the last axis of every array is the environment.
 
     Attributes:
@@ -38,15 +39,15 @@ class Body:
         """
         return state
 
+    @abstractmethod
     def step(self, state: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Returns the next state without disturbance, shape (n,) or (n, N), for inputs (m,) or (m, N)."""
-        raise NotImplementedError
 
     def write(self, state: np.ndarray) -> np.ndarray:
         """Puts everything that has not ended into a state, shape (n,) or (n, N), and returns what is read back."""
         return state
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 - most have nothing to close
         """Closes what was opened."""
 
 
