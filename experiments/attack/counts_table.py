@@ -8,30 +8,30 @@ from experiments.analysis.text_table import text_table
 from experiments.attack.monte_carlo_batch import SETTLING_STEPS
 from experiments.attack.safety_counts import SafetyCounts
 
-# Text of a column by its header.
-_Columns = dict[str, Callable[[SafetyCounts], str]]
+# Text of a column by the two lines of its header.
+_Columns = dict[tuple[str, str], Callable[[SafetyCounts], str]]
 
 _SET_COLUMNS: _Columns = {
-    "steps": lambda counts: f"{counts.steps:,}",
-    "outside S": lambda counts: f"{counts.exits:,}",
-    "outside box": lambda counts: f"{counts.violations:,}",
-    "episodes": lambda counts: f"{counts.episodes:,}",
-    "failed": lambda counts: f"{counts.broken_episodes:,}",
-    "p <": lambda counts: f"{counts.bound:.1e}",
-    "margin": lambda counts: f"{counts.margin:.1e}",
-    "overridden": lambda counts: f"{counts.interventions / counts.steps:.1%}",
+    ("", "steps"): lambda counts: f"{counts.steps:,}",
+    ("outside", "S"): lambda counts: f"{counts.exits:,}",
+    ("outside", "box"): lambda counts: f"{counts.violations:,}",
+    ("", "episodes"): lambda counts: f"{counts.episodes:,}",
+    ("", "failed"): lambda counts: f"{counts.broken_episodes:,}",
+    ("", "p <"): lambda counts: f"{counts.bound:.1e}",
+    ("", "margin"): lambda counts: f"{counts.margin:.1e}",
+    ("over-", "ridden"): lambda counts: f"{counts.interventions / counts.steps:.1%}",
 }
 _BOX_COLUMNS: _Columns = {
-    "steps": _SET_COLUMNS["steps"],
-    "outside S": lambda counts: f"{counts.exits / counts.steps:.1%}",
-    "outside box": _SET_COLUMNS["outside box"],
-    "episodes": _SET_COLUMNS["episodes"],
-    "from outside S": lambda counts: f"{counts.outside_starts:,}",
-    "failed": _SET_COLUMNS["failed"],
-    "p <": _SET_COLUMNS["p <"],
-    "margin": _SET_COLUMNS["margin"],
-    "planned": lambda counts: f"{counts.planned / counts.steps:.1%}",
-    "overridden": _SET_COLUMNS["overridden"],
+    ("", "steps"): _SET_COLUMNS[("", "steps")],
+    ("outside", "S"): lambda counts: f"{counts.exits / counts.steps:.1%}",
+    ("outside", "box"): _SET_COLUMNS[("outside", "box")],
+    ("", "episodes"): _SET_COLUMNS[("", "episodes")],
+    ("from", "outside S"): lambda counts: f"{counts.outside_starts:,}",
+    ("", "failed"): _SET_COLUMNS[("", "failed")],
+    ("", "p <"): _SET_COLUMNS[("", "p <")],
+    ("", "margin"): _SET_COLUMNS[("", "margin")],
+    ("", "planned"): lambda counts: f"{counts.planned / counts.steps:.1%}",
+    ("over-", "ridden"): _SET_COLUMNS[("over-", "ridden")],
 }
 _SET_LEGEND = f"""\
 failed: episodes that left S or the box; p <: upper end of the exact 95 % interval of their probability;
@@ -52,6 +52,6 @@ def counts_table(counts: Mapping[str, SafetyCounts], *, looks_ahead: bool) -> st
         looks_ahead: Whether the shield was that of mode "lookahead".
     """
     columns, legend = (_BOX_COLUMNS, _BOX_LEGEND) if looks_ahead else (_SET_COLUMNS, _SET_LEGEND)
-    rows = [["case", *columns]]
+    rows = [list(line) for line in zip(("", "case"), *columns, strict=True)]
     rows += [[name, *(text_of(case) for text_of in columns.values())] for name, case in counts.items()]
-    return f"{text_table(rows, rules=(1, len(rows) - 1))}\n{legend}"
+    return f"{text_table(rows, rules=(2, len(rows) - 1))}\n{legend}"
