@@ -62,6 +62,9 @@ class ControlLoop:
         filter: Puts another safety filter around vector environments, in place of a shield.
         lagrangian: How the violation penalty is adapted in training, instead of a fixed one.
         residual_gain: Normalized gain, shape (m, n), to whose action an agent in training adds its own.
+
+    Raises:
+        ValueError: If the shield is something else than its settings.
     """
 
     env: str
@@ -75,6 +78,11 @@ class ControlLoop:
     filter: Callable[[VectorEnv], VectorEnv] | None = None
     lagrangian: LagrangianSettings | None = None
     residual_gain: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        """Refuses what is not the settings of a shield, a bare certificate say, before anything is trained with it."""
+        if self.shield is not None and not isinstance(self.shield, ShieldSettings):
+            raise ValueError(f"shield must be ShieldSettings(certificate), got {type(self.shield).__name__}")
 
     @property
     def without_penalties(self) -> ControlLoop:

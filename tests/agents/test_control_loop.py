@@ -25,6 +25,11 @@ def test_horizon_of_lookahead_reaches_both_kinds_of_environment(certificate, giv
         ControlLoop(env=CRUISE, shield=ShieldSettings(certificate, "project", horizon=4)).single()
 
 
+def test_bare_certificate_is_refused_before_training(certificate):
+    with pytest.raises(ValueError, match=r"^shield must be ShieldSettings\(certificate\), got Certificate$"):
+        ControlLoop(env="ncs_gym/TruckTrailerCruise-v0", shield=certificate)
+
+
 def test_channel_reaches_both_kinds_of_environment():
     loop = ControlLoop(env=CRUISE, channel=Channel(delay=7))
     assert loop.single().unwrapped.channel.delay == loop.vector(2).unwrapped.channel.delay == 7
