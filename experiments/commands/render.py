@@ -21,6 +21,7 @@ from shields import Certificate, SafetyShield
 # Budget of `--smoke`.
 _SMOKE = {"steps": 5}
 _MAX_FPS = 50
+_MAX_SCALE = 4
 _MIN_WIDTH = 160
 # Width and gray value of the space between two frames side by side [pixels].
 _GAP = 8
@@ -66,7 +67,10 @@ class _EpisodeRenderer:
         certificate = None if settings.certificate is None else Certificate.load(settings.certificate)
         _, env_id = module_and_id(settings.env)  # `_check` has imported the module
         self._env: gym.Env = gym.make(env_id, render_mode="rgb_array")
-        self._policy = policy_by_name(settings.policy, env_id, ncs_env(self._env), settings.seed)
+        inner = ncs_env(self._env)
+        assert inner.renderer is not None
+        inner.renderer.scale = settings.scale or (1 if settings.out.suffix == ".gif" else 2)
+        self._policy = policy_by_name(settings.policy, env_id, inner, settings.seed)
         if mode != "none":
             self._env = SafetyShield(self._env, certificate, mode=mode, horizon=settings.horizon)
         self._observation, self._info = self._env.reset(seed=settings.seed)
@@ -127,7 +131,8 @@ def _check(settings: RenderSettings) -> None:
     registered_env(settings.env)
     if settings.out.suffix not in FORMATS:
         raise ValueError(f"--out must end in one of {', '.join(FORMATS)}, got {settings.out}")
-    for name, low, high in (("seed", 0, None), ("steps", 1, None), ("fps", 1, _MAX_FPS), ("width", _MIN_WIDTH, None)):
+    limits_of = {"seed": (0, None), "steps": (1, None), "fps": (1, _MAX_FPS), "scale": (1, _MAX_SCALE)}
+    for name, (low, high) in (limits_of | {"width": (_MIN_WIDTH, None)}).items():
         value = getattr(settings, name)
         if value is not None and (value < low or (high is not None and value > high)):
             limits = f"at least {low}" + (f" and at most {high}" if high is not None else "")

@@ -156,7 +156,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         if render_mode is not None and not (isinstance(render_mode, str) and render_mode in RENDER_MODES):
             raise RenderModeError(f"render_mode must be None or one of {RENDER_MODES}, got {shown(render_mode)}")
         self.render_mode = render_mode
-        self._renderer = None if render_mode is None else Renderer(plant, self.task, render_mode, RENDER_FPS)
+        self.renderer = None if render_mode is None else Renderer(plant, self.task, render_mode, RENDER_FPS)
         contracts = loop_contracts(plant, self.channel, contract, downlink, downlink_contract)
         self.contract, self.downlink, self.certificate_contract = contracts
         patterns = arrival_patterns(plant, self.channel, self.certificate_contract)
@@ -207,8 +207,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._violations = 0.0
         self._consistent = True
         info = self._info(no_inputs(self.plant.m), arrived=False)
-        if self._renderer is not None:
-            self._renderer.begin(info, self._task_state)
+        if self.renderer is not None:
+            self.renderer.begin(info, self._task_state)
         return self._observation(), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -236,8 +236,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         info = self._info(inputs, arrived=bool(packets))
         terminated = self._process.terminated or (self.terminate_on_violation and info["cost"] > 0.0)
         self._consistent = True
-        if self._renderer is not None:
-            self._renderer.record(info, self._task_state, self._channel_state, packets)
+        if self.renderer is not None:
+            self.renderer.record(info, self._task_state, self._channel_state, packets)
         return self._observation(), reward, terminated, self._process.truncated, info
 
     def render(self) -> np.ndarray | None:
@@ -247,17 +247,17 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             gymnasium.error.DependencyNotInstalled: If pygame is missing.
             gymnasium.error.ResetNeeded: If there was no reset.
         """
-        if self._renderer is None:
+        if self.renderer is None:
             gym.logger.warn('render() draws nothing without a render mode: gym.make(..., render_mode="rgb_array")')
             return None
         if not self._consistent:
             raise gym.error.ResetNeeded("call reset before render")
-        return self._renderer.render()
+        return self.renderer.render()
 
     def annotate(self, annotation: Annotation) -> None:
         """Shows what a shield knows in the picture of the next step or reset; nothing where nothing is drawn."""
-        if self._renderer is not None:
-            self._renderer.annotate(annotation)
+        if self.renderer is not None:
+            self.renderer.annotate(annotation)
 
     def beliefs(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Returns estimate and error shape of now and of every step until the next decision takes effect."""
@@ -266,8 +266,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     def close(self) -> None:
         """Closes the window and the process."""
         self._process.close()
-        if self._renderer is not None:
-            self._renderer.close()
+        if self.renderer is not None:
+            self.renderer.close()
 
     def _drawn_start(self, rng: np.random.Generator) -> np.ndarray:
         return (1.0 - SAMPLE_ROUNDING) * self.initial_set.sample(rng)

@@ -37,21 +37,22 @@ def _require_pygame() -> Any:
 
 
 class Canvas:
-    """A surface on which shapes and text are drawn in pixels of the finished frame; it needs no display.
+    """A surface on which shapes and text are placed in units of the layout; it needs no display.
 
     Args:
-        width, height: Size of the finished frame [pixels].
+        width, height: Size of the layout.
+        scale: Pixels of the finished frame per unit of the layout.
 
     Raises:
         gymnasium.error.DependencyNotInstalled: If pygame is missing.
     """
 
-    def __init__(self, width: int, height: int) -> None:
+    def __init__(self, width: int, height: int, scale: int) -> None:
         self._pygame = _require_pygame()
         self._pygame.font.init()
-        self._size = width, height
-        self._surface = self._pygame.Surface((width * _OVERSAMPLING, height * _OVERSAMPLING), depth=32)
-        self._frame = self._pygame.Surface((width, height), depth=32)
+        self._size, self._factor = (width * scale, height * scale), _OVERSAMPLING * scale
+        self._surface = self._pygame.Surface((width * self._factor, height * self._factor), depth=32)
+        self._frame = self._pygame.Surface(self._size, depth=32)
         self._fonts: dict[tuple[int, bool], Any] = {}
         self._texts: dict[tuple[str, int, bool, Color, bool], Any] = {}
 
@@ -81,18 +82,18 @@ class Canvas:
 
     def clip(self, rect: Rect | None) -> None:
         """Restricts all following shapes to a rectangle; None lifts the restriction."""
-        self._surface.set_clip(None if rect is None else [round(_OVERSAMPLING * value) for value in rect])
+        self._surface.set_clip(None if rect is None else [round(self._factor * value) for value in rect])
 
     def rect(self, rect: Rect, color: Color, *, radius: float = 0.0, width: float = 0.0) -> None:
         """Draws a rectangle, filled unless a line width is given, with corners rounded by a radius."""
-        box = [round(_OVERSAMPLING * value) for value in rect]
-        corner = round(_OVERSAMPLING * radius)
-        self._pygame.draw.rect(self._surface, color, box, round(_OVERSAMPLING * width), border_radius=corner)
+        box = [round(self._factor * value) for value in rect]
+        corner = round(self._factor * radius)
+        self._pygame.draw.rect(self._surface, color, box, round(self._factor * width), border_radius=corner)
 
     def line(self, points: Sequence[_Point] | np.ndarray, color: Color, width: float = 1.0) -> None:
         """Draws a line through points with round joints."""
-        places = [(_OVERSAMPLING * x, _OVERSAMPLING * y) for x, y in points]
-        thick = max(1, round(_OVERSAMPLING * width))
+        places = [(self._factor * x, self._factor * y) for x, y in points]
+        thick = max(1, round(self._factor * width))
         self._pygame.draw.lines(self._surface, color, False, places, thick)
         if thick > 3:
             for place in places:
@@ -112,12 +113,12 @@ class Canvas:
 
     def polygon(self, points: Sequence[_Point] | np.ndarray, color: Color) -> None:
         """Fills a polygon."""
-        self._pygame.draw.polygon(self._surface, color, [(_OVERSAMPLING * x, _OVERSAMPLING * y) for x, y in points])
+        self._pygame.draw.polygon(self._surface, color, [(self._factor * x, self._factor * y) for x, y in points])
 
     def circle(self, center: _Point, radius: float, color: Color, *, width: float = 0.0) -> None:
         """Draws a circle, filled unless a line width is given."""
-        place = _OVERSAMPLING * center[0], _OVERSAMPLING * center[1]
-        self._pygame.draw.circle(self._surface, color, place, _OVERSAMPLING * radius, round(_OVERSAMPLING * width))
+        place = self._factor * center[0], self._factor * center[1]
+        self._pygame.draw.circle(self._surface, color, place, self._factor * radius, round(self._factor * width))
 
     def cross(self, center: _Point, radius: float, color: Color, width: float = 2.0) -> None:
         """Draws a diagonal cross."""
@@ -157,13 +158,13 @@ class Canvas:
         image = self._text(text, size, bold, color, upright)
         width, height = image.get_size()
         anchor = 0.5 if upright else align
-        corner = _OVERSAMPLING * place[0] - anchor * width, _OVERSAMPLING * place[1] - 0.5 * height
+        corner = self._factor * place[0] - anchor * width, self._factor * place[1] - 0.5 * height
         self._surface.blit(image, (round(corner[0]), round(corner[1])))
-        return width / _OVERSAMPLING
+        return width / self._factor
 
     def text_width(self, text: str, size: int = SMALL, *, bold: bool = False) -> float:
         """Returns the width of a line of text [pixels]."""
-        return self._font(size, bold).size(text)[0] / _OVERSAMPLING
+        return self._font(size, bold).size(text)[0] / self._factor
 
     def _text(self, text: str, size: int, bold: bool, color: Color, upright: bool) -> Any:
         key = text, size, bold, color, upright
@@ -176,7 +177,7 @@ class Canvas:
 
     def _font(self, size: int, bold: bool) -> Any:
         if (size, bold) not in self._fonts:
-            self._fonts[size, bold] = self._pygame.font.Font(_font_file(bold), _OVERSAMPLING * size)
+            self._fonts[size, bold] = self._pygame.font.Font(_font_file(bold), self._factor * size)
         return self._fonts[size, bold]
 
 

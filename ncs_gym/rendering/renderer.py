@@ -45,6 +45,16 @@ class Renderer:
         self._episode = EpisodeRecord(plant, task)
         self._picture: _Picture | None = None
         self._window: Window | None = None
+        self._scale = 1
+
+    @property
+    def scale(self) -> int:
+        """Pixels of a frame per unit of its layout of 640 by 480; 2 is sharp on dense screens."""
+        return self._scale
+
+    @scale.setter
+    def scale(self, scale: int) -> None:
+        self._scale, self._picture = scale, None
 
     def begin(self, info: Mapping[str, Any], task_state: Any) -> None:
         """Starts an episode.
@@ -109,7 +119,7 @@ class Renderer:
 
     def _draw(self) -> Canvas:
         if self._picture is None:
-            self._picture = _Picture(self._plant)
+            self._picture = _Picture(self._plant, self._scale)
         return self._picture.draw(self.frame_record())
 
     def __getstate__(self) -> dict[str, Any]:
@@ -122,13 +132,14 @@ class _Picture:
     Args:
         plant: The plant. The names of its states decide whether it is drawn as truck and trailer, as cart and pole, or
             with a bar for every constraint.
+        scale: Pixels of a frame per unit of its layout.
 
     Raises:
         gymnasium.error.DependencyNotInstalled: If pygame is missing.
     """
 
-    def __init__(self, plant: LinearPlant) -> None:
-        self._canvas = Canvas(theme.WIDTH, theme.HEIGHT)
+    def __init__(self, plant: LinearPlant, scale: int) -> None:
+        self._canvas = Canvas(theme.WIDTH, theme.HEIGHT, scale)
         self._drawing = _drawing_of(plant)
         rect = theme.PLANE
         self._plane = PhasePlane(plant, self._drawing.pair, rect) if plant.n > 1 else TimePlot(plant, rect)

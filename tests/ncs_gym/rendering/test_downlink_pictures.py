@@ -16,7 +16,7 @@ def test_picture_says_that_the_downlink_broke():
     settings = {"downlink": Channel(loss=0.5), "downlink_contract": ChannelContract(1), "render_mode": "rgb_array"}
     env = gym.make("ncs_gym/TruckTrailerCruiseTwoWay-v0", **settings)
     env.reset(seed=0)
-    renderer, missing = env.unwrapped._renderer, 0
+    renderer, missing = env.unwrapped.renderer, 0
     for _ in range(30):
         *_, info = env.step(np.array([0.5], np.float32))
         missing += info["downlink_broken"]

@@ -41,7 +41,7 @@ def resting_record():
     """The truck at rest, before its first step."""
     env = make().unwrapped
     env.reset(seed=0, options={"state": np.zeros(2)})
-    return replace(env._renderer.frame_record(), estimate=np.zeros(2), error_shape=1e-6 * np.eye(2))
+    return replace(env.renderer.frame_record(), estimate=np.zeros(2), error_shape=1e-6 * np.eye(2))
 
 
 def record(state=(0.0, 0.0), **changes):
@@ -55,7 +55,7 @@ def record(state=(0.0, 0.0), **changes):
 
 @pytest.fixture(scope="module")
 def picture(loaded):
-    return _Picture(loaded)
+    return _Picture(loaded, scale=1)
 
 
 def pixels_of(picture, frame):
@@ -112,7 +112,7 @@ def test_oblique_limits_are_drawn_as_they_are():
     plant = LinearPlant(box=np.array([[1.0, 1.0], [1.0, -1.0]]), **common)
     env = make("ncs_gym/LinearNCS-v0", plant=plant).unwrapped
     env.reset(seed=0)
-    frame, plane = env.render(), env._renderer._picture._plane
+    frame, plane = env.render(), env.renderer._picture._plane
     points = np.array([(0.85, 0.1), (-0.1, -0.85), (0.6, 0.6), (-0.6, 0.55)])  # inside, inside, outside, outside
     colors = [tuple(frame[round(y), round(x)]) for x, y in plane.pixels_of(points)]
     assert colors == [theme.PAPER, theme.PAPER, theme.DANGER_FILL, theme.DANGER_FILL]
@@ -185,7 +185,7 @@ def test_packets_are_lost_and_late_as_the_channel_says():
         env.reset(seed=0)
         for _ in range(steps):
             env.step(np.zeros(1, np.float32))
-        return list(env._renderer.frame_record().packets)
+        return list(env.renderer.frame_record().packets)
 
     assert packets(Channel(send_period=3)) == [PacketRecord(k, k) for k in (3, 6, 9, 12)]
     assert packets(Channel(delay=2)) == [PacketRecord(k, k + 2) for k in range(1, 13)]
@@ -199,7 +199,7 @@ def test_arrivals_are_those_of_the_infos():
     env = make(channel=Channel(loss=0.4, delay=1, jitter=2))
     env.reset(seed=3)
     arrived = [k for k in range(1, 31) if env.step(np.zeros(1, np.float32))[4]["packet_arrived"]]
-    packets = env.unwrapped._renderer.frame_record().packets
+    packets = env.unwrapped.renderer.frame_record().packets
     assert sorted({each.arrival for each in packets if each.arrival is not None and each.arrival <= 30}) == arrived
 
 
@@ -245,17 +245,17 @@ def test_stored_plan_is_drawn_from_the_estimate_and_named_in_the_legend(picture,
 def test_shield_tells_the_picture_what_it_has_in_store(loaded):
     env = SafetyShield(make(), mode="lookahead", horizon=3)
     env.reset(seed=0)
-    assert env.unwrapped._renderer.frame_record().annotation.plan.shape[0] == 0
+    assert env.unwrapped.renderer.frame_record().annotation.plan.shape[0] == 0
     lengths = set()
     for _ in range(30):
         *_, info = env.step(np.ones(1, np.float32))
-        record = env.unwrapped._renderer.frame_record()
+        record = env.unwrapped.renderer.frame_record()
         assert len(record.annotation.plan) == info["shield_plan_length"]
         lengths.add(info["shield_plan_length"])
     assert max(lengths) > 0
     other = SafetyShield(make())
     other.reset(seed=0)
-    assert other.unwrapped._renderer.frame_record().annotation.plan is None
+    assert other.unwrapped.renderer.frame_record().annotation.plan is None
 
 
 def test_path_and_interventions_are_drawn(picture):
@@ -284,13 +284,13 @@ def test_annotation_lasts_one_step():
     note = Annotation(safe_set=SAFE_SET, label="project")
     env.annotate(note)
     env.reset(seed=0)
-    assert env._renderer.frame_record().annotation is note
+    assert env.renderer.frame_record().annotation is note
     env.step(np.zeros(1, np.float32))
-    assert env._renderer.frame_record().annotation is None
+    assert env.renderer.frame_record().annotation is None
     env.annotate(note)
     for expected in (note, None):
         env.step(np.zeros(1, np.float32))
-        assert env._renderer.frame_record().annotation is expected
+        assert env.renderer.frame_record().annotation is expected
 
 
 def test_frame_shows_the_recent_steps_of_this_episode_only():
@@ -298,10 +298,10 @@ def test_frame_shows_the_recent_steps_of_this_episode_only():
     env.reset(seed=0)
     for _ in range(2 * RECENT_STEPS):
         env.step(np.zeros(1, np.float32))
-    assert len(env.unwrapped._renderer.frame_record().path) == RECENT_STEPS
+    assert len(env.unwrapped.renderer.frame_record().path) == RECENT_STEPS
     env.reset()
-    assert len(env.unwrapped._renderer.frame_record().path) == 1
-    assert not env.unwrapped._renderer.frame_record().packets
+    assert len(env.unwrapped.renderer.frame_record().path) == 1
+    assert not env.unwrapped.renderer.frame_record().packets
 
 
 def test_drawing_does_not_change_the_episode():

@@ -59,7 +59,7 @@ def test_the_picture_shows_the_inputs_and_the_count_of_the_info(certificate):
     env = shielded(certificate)
     for _ in range(5):
         info = env.step(FULL_THROTTLE)[4]
-        frame = env.unwrapped._renderer.frame_record()
+        frame = env.unwrapped.renderer.frame_record()
         note = frame.annotation
         np.testing.assert_array_equal(note.proposed, info["input_proposed"])
         np.testing.assert_array_equal(frame.input, info["input"])
@@ -104,4 +104,4 @@ def test_a_shield_that_is_not_drawn_tells_nothing(certificate, monkeypatch):
     env = shielded(certificate, render_mode=None)
     monkeypatch.setattr(type(env.unwrapped), "annotate", None)
     env.step(FULL_THROTTLE)
-    assert env.unwrapped._renderer is None
+    assert env.unwrapped.renderer is None
