@@ -28,7 +28,7 @@ class RenderSettings:
         seed: Seed of the episode (of both, side by side) and of the random policy.
         steps: Largest number of steps.
         fps: Frames per second; one frame per step.
-        scale: Pixels of a frame per unit of its layout of 640 by 480; by default 2, which is sharp on dense screens, and
+        scale: Pixels of a frame per unit of its layout of 640 by 480; by default 2, sharp on dense screens, and
             1 for a .gif, whose file would be several times as large.
         width: Width of the animation [pixels]; by default as drawn.
         smoke: Draw a few steps only, to see that everything works; if --out is not given, into episode-smoke.gif.
