@@ -54,7 +54,7 @@ def has_initial_design(plant: LinearPlant, contract: ChannelContract) -> bool:
         problem, _ = design_problem(plant, contract)
     except Infeasible:
         return False
-    return initial_design(problem, InvariantSetProgram(problem, SLACK), lambda line: None) is not None
+    return initial_design(problem, InvariantSetProgram(problem, SLACK), lambda stage, share: None) is not None
 
 
 def largest_radius(plant: LinearPlant, contract: ChannelContract) -> float:
