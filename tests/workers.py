@@ -55,8 +55,8 @@ class _Manager:
 def no_worker_processes() -> Iterator[None]:
     """Commands execute their training runs and batches in this process."""
     with (
-        mock.patch("experiments.backends.processes.ProcessPoolExecutor", _Executor),
-        mock.patch("experiments.backends.processes.SyncManager", _Manager),
+        mock.patch("experiments.backends.worker_processes.ProcessPoolExecutor", _Executor),
+        mock.patch("experiments.backends.worker_processes.SyncManager", _Manager),
         mock.patch("experiments.attack.campaign_execution.ProcessPoolExecutor", _Executor),
     ):
         yield

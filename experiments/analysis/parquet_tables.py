@@ -12,7 +12,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from experiments.runs.conditions import AS_TRAINED
+from experiments.runs.evaluation_conditions import AS_TRAINED
 from experiments.runs.training_run import RunResult
 from shields.atomic_write import write_atomically
 

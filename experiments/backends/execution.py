@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from experiments.backends import processes
+from experiments.backends import worker_processes
 from experiments.runs import RunResult, RunStore, TrainingRun
 from experiments.settings import BackendSettings
 
@@ -53,7 +53,7 @@ def results_of(runs: Sequence[TrainingRun], folder: Path, settings: BackendSetti
             ray_backend.execute_all(missing, settings, keep, bar.update)
         else:
             jobs = min(settings.jobs, len(missing))
-            processes.execute_all(missing, jobs, keep, bar.update, folder / "tensorboard")
+            worker_processes.execute_all(missing, jobs, keep, bar.update, folder / "tensorboard")
     return [results[run.name] for run in runs]
 
 

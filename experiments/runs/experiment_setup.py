@@ -8,8 +8,8 @@ from typing import Any
 
 from agents.control_loop import ControlLoop
 from experiments.runs.arms import Arm
-from experiments.runs.conditions import other_conditions
 from experiments.runs.environments import module_and_id, registered_env
+from experiments.runs.evaluation_conditions import other_conditions
 from experiments.runs.provenance import versions
 from experiments.runs.synthesis_status import synthesis_status
 from experiments.runs.training_run import TrainingRun

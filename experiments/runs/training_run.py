@@ -17,8 +17,8 @@ from agents.evaluation import Policy, evaluate
 from agents.results import Episode, TrainingPoint, Trajectory
 from agents.settings import AgentSettings, LagrangianSettings, OffPolicySettings
 from experiments.baselines import FILTERS, controller, filtered
-from experiments.runs.conditions import AS_TRAINED, under
 from experiments.runs.environments import import_module, module_digest
+from experiments.runs.evaluation_conditions import AS_TRAINED, under
 from experiments.runs.provenance import json_digest, versions
 from ncs_gym import Channel
 from ncs_gym.envs.env import ncs_env

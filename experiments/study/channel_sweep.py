@@ -9,8 +9,8 @@ from typing import Any
 from experiments.analysis.statistics import clopper_pearson
 from experiments.backends.execution import results_of
 from experiments.runs import ExperimentSetup, RunResult, TrainingRun
-from experiments.runs.conditions import AS_TRAINED
 from experiments.runs.environments import registered_env
+from experiments.runs.evaluation_conditions import AS_TRAINED
 from experiments.settings import ChannelSettings, CompareSettings
 
 # The filters, in pairs without and with the error set: those that keep S, then those that may leave it.

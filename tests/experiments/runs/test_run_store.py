@@ -128,7 +128,7 @@ def test_finished_runs_are_not_run_again(store, run, result, tmp_path, monkeypat
             ran.append(one.name)
             on_result(one, replace(result, index=one.index))
 
-    monkeypatch.setattr("experiments.backends.processes.execute_all", record)
+    monkeypatch.setattr("experiments.backends.worker_processes.execute_all", record)
     missing = replace(run, index=2)
     results = results_of([run, missing], tmp_path, BackendSettings(jobs=1))
     assert ran == [missing.name]

@@ -11,7 +11,7 @@ from agents.control_loop import ControlLoop
 from experiments.analysis.arm_table import condition_text, summary_text
 from experiments.analysis.summary import arm_summary
 from experiments.runs import ExperimentSetup, RunStore, execute_run
-from experiments.runs.conditions import condition_named, other_conditions, under, worse_channel
+from experiments.runs.evaluation_conditions import condition_named, other_conditions, under, worse_channel
 from experiments.settings import CompareSettings
 from ncs_gym import AdversarialDisturbance, Channel, ChannelContract, GilbertElliott
 from ncs_gym.envs.env import ncs_env

@@ -8,7 +8,7 @@ from queue import Queue
 import pytest
 
 from agents.settings import PPOSettings
-from experiments.backends.processes import _execute, execute_all
+from experiments.backends.worker_processes import _execute, execute_all
 from experiments.errors import RunStopped
 from experiments.runs.training_run import TrainingRun
 
