@@ -16,7 +16,7 @@ import numpy as np
 from ncs_gym import Estimator, LinearPlant
 from ncs_gym.envs.env import NCSEnv, ncs_env
 from ncs_gym.estimation.arrival_patterns import ArrivalPatterns
-from ncs_gym.estimation.statistics_table import NumberedUpdate
+from ncs_gym.estimation.error_statistics_table import NumberedUpdate
 from ncs_gym.registration import registered_ids
 
 KINDS = ("Kalman", "set-membership", "certified", "skipped")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ncs_gym.estimation.arrival_patterns import ArrivalPatterns
-from ncs_gym.estimation.statistics_table import UNKNOWN
+from ncs_gym.estimation.error_statistics_table import UNKNOWN
 
 
 class PredictedStatistics:

@@ -16,7 +16,7 @@ from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.reset_options import vector_reset_options
 from ncs_gym.envs.spaces import applied_inputs
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
-from ncs_gym.estimation.statistics_table import StatisticsTable
+from ncs_gym.estimation.error_statistics_table import StatisticsTable
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.packet_transmission import VectorChannelState
 from ncs_gym.validation import as_count, shown

@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym.estimation.error_bound import ErrorSet, certified_error_set
+from ncs_gym.estimation.error_statistics_table import NO_SAMPLE, UNKNOWN, NumberedUpdate, StatisticsTable
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
 from ncs_gym.estimation.pattern_arrays import PatternArrays
-from ncs_gym.estimation.statistics_table import NO_SAMPLE, UNKNOWN, NumberedUpdate, StatisticsTable
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant

@@ -10,7 +10,7 @@ import numpy as np
 
 from ncs_gym.estimation.arrival_patterns import ArrivalPatterns, arrival_patterns, patterns_of
 from ncs_gym.estimation.error_bound import ErrorSet, require_error_set
-from ncs_gym.estimation.statistics_table import NO_SAMPLE, UNKNOWN
+from ncs_gym.estimation.error_statistics_table import NO_SAMPLE, UNKNOWN
 from ncs_gym.network.channel import Channel, Packet
 from ncs_gym.plants.linear_plant import LinearPlant
 

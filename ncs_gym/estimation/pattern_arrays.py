@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ncs_gym.estimation.statistics_table import UNKNOWN
+from ncs_gym.estimation.error_statistics_table import UNKNOWN
 from ncs_gym.network.channel import Channel
 
 if TYPE_CHECKING:

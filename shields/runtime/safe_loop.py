@@ -17,7 +17,7 @@ from shields.certificate import Certificate
 from shields.downlink.start_under_zero_input import starts_known
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import LoopObservation
-from shields.runtime.guarded_filter import GuardedFilter
+from shields.runtime.monitored_filter import MonitoredFilter
 from shields.runtime.safety_filter import SafetyFilter
 
 NOT_STARTED = "no episode is under way: call start"
@@ -94,7 +94,7 @@ class SafeLoop:
         self.contract = None if certificate.ages is None else certificate.ages.sets.contract
         self._estimator = Estimator(plant, channel, patterns=arrival_patterns(plant, channel, self.contract))
         protocol = downlink_protocol(downlink, downlink_contract)
-        self._guarded = GuardedFilter(self.filter, protocol)
+        self._guarded = MonitoredFilter(self.filter, protocol)
         self.lead = self._guarded.lead
         self._inputs = CommittedInputs(self.lead, plant.m)
         self._phase = _Phase.STOPPED

@@ -24,7 +24,7 @@ from shields.runtime.guarantee import (
     MonitorState,
     StartKnown,
 )
-from shields.runtime.guarded_filter import first_store
+from shields.runtime.monitored_filter import first_store
 from shields.runtime.one_step_test import norms
 from shields.runtime.predicted_errors import PredictedErrors
 from shields.runtime.safety_filter import SafetyFilter

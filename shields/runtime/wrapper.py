@@ -19,7 +19,7 @@ from shields.certificate import Certificate
 from shields.downlink.start_under_zero_input import starts_known
 from shields.runtime.decisions import NO_PLAN
 from shields.runtime.guarantee import LoopObservation, StartKnown
-from shields.runtime.guarded_filter import GuardedFilter
+from shields.runtime.monitored_filter import MonitoredFilter
 from shields.runtime.safety_filter import SafetyFilter
 
 T = TypeVar("T")
@@ -96,7 +96,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             certificate_for(inner.plant, inner.certificate_contract) if certificate is None else certificate
         )
         self.filter = SafetyFilter(self.certificate, inner.plant, mode, horizon)
-        self._guarded = GuardedFilter(self.filter, inner.downlink)
+        self._guarded = MonitoredFilter(self.filter, inner.downlink)
         self._clock: tuple[int, int] | None = None
         self._start: Any = None
         self._known: tuple[StartKnown, ...] = ()

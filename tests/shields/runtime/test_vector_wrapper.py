@@ -9,7 +9,7 @@ from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatist
 from ncs_gym import Channel, ChannelContract, NCSVectorEnv, SphereDisturbance, batch_reactor, truck_trailer
 from shields import CertificateError, Decision, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import EXPLANATIONS, OTHER_STEPS, GuaranteeMonitor, LoopObservation, start_known
-from shields.runtime.guarded_filter import first_store
+from shields.runtime.monitored_filter import first_store
 from shields.runtime.safety_filter import MODES
 from shields.runtime.vector_wrapper import Clock, _moved, overridden
 from tests import arrays

@@ -16,7 +16,7 @@ from shields.runtime.predicted_errors import PredictedErrors
 from shields.runtime.safety_filter import MARGIN, SafetyFilter
 
 
-class GuardedFilter:
+class MonitoredFilter:
     """Decides the inputs of one control loop and follows whether they prove that its state stays in S, or in the box.
 
     In mode "lookahead" the stored plan is kept here from decision to decision.
