@@ -1,9 +1,9 @@
 """The shield at run time: which inputs keep the next state safe, what is applied instead, and what is proved.
 
 `predicted_errors` and `one_step_test` decide whether an input passes, `projection` finds the closest one that does,
-`filter` makes the decision (`decisions`: what it says), and `guarantee` follows whether the proof of safety holds:
-written for arrays whose last axis counts environments. `monitored_filter` is both for one control loop. `safe_loop` puts
-it into a real loop, `wrapper` and `vector_wrapper` around Gymnasium environments.
+`safety_filter` makes the decision (`decisions`: what it says), and `guarantee` follows whether the proof of safety
+holds: written for arrays whose last axis counts environments. `monitored_filter` is both for one control loop.
+`safe_loop` puts it into a real loop, `wrapper` and `vector_wrapper` around Gymnasium environments.
 """
 
 from shields.runtime.decisions import Decision
