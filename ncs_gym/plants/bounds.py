@@ -123,12 +123,12 @@ class HardBounds(ReadOnlyArrays):
         It is larger than `allowed_disturbance` by what holds that plus E(F), F = n diag(r^2), with r the rounding of
         A x + B u + d for x up to SIMULATED_REACH half-widths out: (1+s/4) allowed + (1+4/s) F, s the inflation.
         """
-        return Ellipsoid(_inflated(self.nominal_disturbance.shape) + self._rounding_room)
+        return Ellipsoid(inflated(self.nominal_disturbance.shape) + self._rounding_room)
 
     @cached_property
     def allowed_disturbance(self) -> Ellipsoid:
         """What a disturbance may use of D: the rest is for the rounding of a simulation, shape (n, n)."""
-        inflated = 0.5 * (self.nominal_disturbance.shape + _inflated(self.nominal_disturbance.shape))
+        inflated = 0.5 * (self.nominal_disturbance.shape + inflated(self.nominal_disturbance.shape))
         return Ellipsoid(inflated + 0.5 * self._rounding_room)
 
     @cached_property
@@ -156,12 +156,12 @@ class HardBounds(ReadOnlyArrays):
     @cached_property
     def sensor_error(self) -> Ellipsoid:
         """Holds the sensor noise v, shape (p, p), without the channel's quantizer (see `sensor_error_with`)."""
-        return Ellipsoid(_inflated(self.nominal_sensor_error.shape))
+        return Ellipsoid(inflated(self.nominal_sensor_error.shape))
 
     def sensor_error_with(self, quantization_step: float) -> Ellipsoid:
         """Returns N, shape (p, p): sensor noise plus the ball of squared radius p q^2/4 around a quantizer's box."""
         ball = Ellipsoid(self.p * quantization_step**2 / 4.0 * np.eye(self.p))
-        return Ellipsoid(_inflated(_sum_or_other(ball, self.nominal_sensor_error, np.eye(self.p)).shape))
+        return Ellipsoid(inflated(_sum_or_other(ball, self.nominal_sensor_error, np.eye(self.p)).shape))
 
     @cached_property
     def initial_radius_squared(self) -> float:
@@ -224,8 +224,8 @@ def _plus_uniform(
     return samples if bound is None or not np.any(bound.shape) else samples + bound.sample(rng, count)
 
 
-def _inflated(shape: np.ndarray) -> np.ndarray:
-    """Returns a bound with room for the rounding of sampling it."""
+def inflated(shape: np.ndarray) -> np.ndarray:
+    """Returns a slightly larger bound, also in directions in which it is flat: room for the rounding of its entries."""
     return INFLATION * shape + FLAT_INFLATION * np.diag(np.diag(shape))
 
 

@@ -12,13 +12,14 @@ import numpy as np
 
 from ncs_gym import ErrorSet, LinearPlant
 from ncs_gym.network.contract import ChannelContract
+from ncs_gym.plants.bounds import inflated
 from ncs_gym.validation import shown
 from shields.certificate import Certificate
 from shields.certificate_text import size_of
 from shields.errors import Infeasible, SynthesisInterrupted
 from shields.proof_data import ContractProof, Multipliers
 from shields.synthesis.alternating_optimization import largest_set, with_best_gain, with_best_multipliers
-from shields.synthesis.design_problem import INFLATION, CandidateDesign, DesignProblem, design_problem
+from shields.synthesis.design_problem import CandidateDesign, DesignProblem, design_problem
 from shields.synthesis.diagnosis import infeasibility, with_feasible_bounds
 from shields.synthesis.max_margin_gain import max_margin_gain
 from shields.synthesis.multipliers import best_input_multipliers, best_multipliers
@@ -208,7 +209,7 @@ def _certificate(
         L=L,
         K=K,
         Sigma=errors.Sigma,
-        D=INFLATION * plant.disturbance.shape,
+        D=inflated(plant.disturbance.shape),
         multipliers=_multipliers(problem, design, errors.rate),
         ages=ages,
         method="certified",

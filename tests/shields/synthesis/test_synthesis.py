@@ -44,6 +44,18 @@ def test_random_stable_plants_get_a_certificate_that_verifies(seed, n, m):
     assert 0.3 < area_fraction(certificate, plant) <= 1.0
 
 
+@pytest.mark.parametrize("rank", [1, 2])
+def test_flat_disturbances_get_a_certificate_whatever_their_direction(rank):
+    # A torque moves the state along a line or a plane: such a D is singular, and oblique to the axes of the state.
+    rng = np.random.default_rng(rank)
+    for _ in range(5):
+        declared = random_plant(rank, 3, 1)
+        torque = (0.02 * rng.standard_normal((3, rank)), 1.0)
+        plant = replace(declared, gamma=0.0, process_noise_cov=None, disturbance_bound=torque)
+        certificate = synthesize(plant)
+        assert verified(certificate, plant).valid
+
+
 def test_closed_loop_stays_inside_for_the_worst_state_error_and_disturbance():
     # By another route than the condition: projected ascent over (x, e, d) on x+' M x+.
     plant = random_plant(3, 2, 1)
