@@ -10,15 +10,17 @@ import numpy as np
 from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov
 from scipy.optimize import minimize_scalar
 
-from ncs_gym.estimation.error_bounds_by_age import ErrorSetsByAge, error_sets_by_age
+from ncs_gym.estimation.error_bounds_by_age import ErrorSetsByAge, congruence_sum, error_sets_by_age
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.validation import ReadOnlyArrays
 
 # Growth c of the optimal set: gives (E1) slack that an exact check can see, and updates room (theory.md section 3).
 GROWTH = 1.1
-# Beyond this many roundings of its largest entry a checked inequality is taken to hold.
+# Beyond this many roundings of the largest entry a checked inequality is taken to hold.
 ROUNDINGS = 100.0
+# Smaller singular values, and smaller distances from the unit circle, count as zero in the test of detectability.
+UNDETECTABLE = 1e-8
 # Flat disturbances are thickened by this fraction of their mean extent, so that (E1) has slack in every direction.
 THICKENING = 1e-9
 # No set is thinner than this, in half-widths of the safe box (a perfectly known plant has no error at all).
@@ -91,12 +93,30 @@ def _conditional_set(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
     """Returns the error sets by age under a contract; see `error_sets_by_age`."""
     sets = error_sets_by_age(plant, contract)
     if sets is None:
+        if (unseen := _unseen_state(plant)) is not None:
+            raise ErrorSetError(f"no error set exists: the outputs do not show {unseen}, whose errors never decay")
         raise ErrorSetError(
             f"no error set was found under a contract of max_age = {contract.max_age}: promise less age"
         )
     error_set = ErrorSet(Sigma=sets.shapes[contract.max_age], rate=float(sets.rates[-1]), ages=sets)
     require_error_set(error_set, plant)
     return error_set
+
+
+def _unseen_state(plant: LinearPlant) -> str | None:
+    """Returns the state with the largest part in a mode that neither decays nor shows in the outputs; None without one.
+
+    The test of Popov, Belevitch and Hautus for detectability, in units of the safe box.
+    """
+    widths = plant.half_widths
+    A, H = plant.A * widths / widths[:, None], plant.H * widths
+    H = H / np.maximum(np.abs(H).max(axis=1, keepdims=True), np.finfo(float).tiny)
+    for value in np.linalg.eigvals(A):
+        if abs(value) >= 1.0 - UNDETECTABLE:
+            _, sizes, modes = np.linalg.svd(np.vstack([A - value * np.eye(plant.n), H]))
+            if sizes[-1] <= UNDETECTABLE * sizes[0]:
+                return plant.state_names[int(np.argmax(np.abs(modes[-1])))]
+    return None
 
 
 def require_error_set(error_set: ErrorSet, plant: LinearPlant) -> None:
@@ -109,19 +129,34 @@ def require_error_set(error_set: ErrorSet, plant: LinearPlant) -> None:
     """
     Sigma, rate, ages = error_set.Sigma, error_set.rate, error_set.ages
     if ages is None:
-        grown = plant.A @ Sigma @ plant.A.T / rate + plant.disturbance.shape / (1.0 - rate)
-        needs = {"(E0)": [(Sigma, plant.initial_error.shape)], "(E1)": [(Sigma, grown)]}
+        identity = np.eye(plant.n)
+        first = congruence_sum((identity, plant.initial_error.shape, 1.0))
+        grown = congruence_sum((plant.A, Sigma, 1.0 / rate), (identity, plant.disturbance.shape, 1.0 / (1.0 - rate)))
+        needs = {"(E0)": [(Sigma, *first)], "(E1)": [(Sigma, *grown)]}
     else:
         needs = ages.needs(plant)
-    inverse = np.linalg.inv(np.linalg.cholesky(np.linalg.inv(plant.weight)))
-    for name, pairs in needs.items():
-        for outer, inner in pairs:
-            gap = inverse @ (outer - inner) @ inverse.T
-            rounding = ROUNDINGS * plant.n * np.finfo(float).eps * np.abs(inverse @ outer @ inverse.T).max()
-            if not (np.isfinite(gap).all() and np.linalg.eigvalsh(gap)[0] > rounding):
-                raise ErrorSetError(
-                    f"no error set found: the plant is too ill-conditioned for {name} to hold in float64"
-                )
+    for name, triples in needs.items():
+        if not all(_holds(*triple) for triple in triples):
+            raise ErrorSetError(f"no error set found: the plant is too ill-conditioned for {name} to hold in float64")
+
+
+def _holds(outer: np.ndarray, inner: np.ndarray, size: np.ndarray) -> bool:
+    """Returns whether outer - inner is positive definite by more than rounding, each state in units of the outer set.
+
+    In those units a state that is known exactly, such as an input under way, counts as much as the others do.
+
+    Args:
+        outer: Shape of the set that must be larger, (n, n).
+        inner: Shape of the other one, (n, n).
+        size: Entry by entry, what the rounding of `inner` grows with, shape (n, n).
+    """
+    with np.errstate(all="ignore"):
+        scale = 1.0 / np.sqrt(np.diag(outer))
+        units = np.outer(scale, scale)
+        gap, rounded = units * (outer - inner), units * (np.abs(outer) + size)
+        if not (np.isfinite(gap).all() and np.isfinite(rounded).all()):
+            return False
+        return bool(np.linalg.eigvalsh(gap)[0] > ROUNDINGS * len(outer) * np.finfo(float).eps * rounded.max())
 
 
 def _unconditional_set(plant: LinearPlant) -> ErrorSet:

@@ -21,6 +21,8 @@ SMALLEST_GROWTH, DOUBLING = 1e-6, 50.0
 # Multipliers mu that gains are chosen from: fine sensors want it close to 1.
 MULTIPLIERS = np.concatenate([np.linspace(0.01, 0.99, 99), 1.0 - np.logspace(-2.1, -4.0, 20)])
 ITERATIONS = 1000
+# No set is thinner than this in any direction, in units of the weight: an input under way is known exactly.
+THINNEST = 1e-5
 # The regulator whose answer to an error counts, in units of the box and of the input limits, and how much it counts:
 # of a few tried, the one that leaves the unstable plants of benchmarks/contracts.py the largest disturbances.
 EFFORT, DECAY, ANSWER = 10.0, 0.75, 10.0
@@ -59,26 +61,38 @@ class ErrorSetsByAge(ReadOnlyArrays):
     def __post_init__(self) -> None:
         self._make_arrays_read_only()
 
-    def needs(self, plant: LinearPlant) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
-        """Returns, per condition, pairs (outer, inner) of shapes of which each outer must hold the inner one.
+    def needs(self, plant: LinearPlant) -> dict[str, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
+        """Returns, per condition, triples (outer, inner, size): each outer must hold the inner one, computed to `size`.
 
         In (C2) the inner one includes the rounding of the updated estimate, as `SetMembership.updated` does.
         """
-        D, first = plant.disturbance.shape, plant.initial_error.shape
-        identity = np.eye(plant.n)
+        D, identity = plant.disturbance.shape, np.eye(plant.n)
+        first = congruence_sum((identity, plant.initial_error.shape, 1.0))
         grown = [
-            plant.A @ shape @ plant.A.T / rate + D / (1.0 - rate)
-            for shape, rate in zip(self.shapes, self.rates, strict=False)
+            congruence_sum((plant.A, self.shapes[j], 1.0 / rate), (identity, D, 1.0 / (1.0 - rate)))
+            for j, rate in enumerate(self.rates)
         ]
+        kept = [identity - gain @ plant.H for gain in self.gains]
         updated = [
-            (kept := identity - gain @ plant.H) @ shape @ kept.T / mu + gain @ self.noise @ gain.T / (1.0 - mu)
-            for shape, gain, mu in zip(self.shapes[1:], self.gains, self.multipliers, strict=True)
+            congruence_sum(
+                (kept[j], self.shapes[j + 1], INFLATION / self.multipliers[j]),
+                (self.gains[j], self.noise, INFLATION / (1.0 - self.multipliers[j])),
+                (identity, plant.estimate_rounding, 1.0),
+            )
+            for j in range(len(self.gains))
         ]
         return {
-            "(C0)": [(self.shapes[0], first)],
-            "(C1)": list(zip(self.shapes[1:], grown, strict=True)),
-            "(C2)": [(self.shapes[0], INFLATION * update + plant.estimate_rounding) for update in updated],
+            "(C0)": [(self.shapes[0], *first)],
+            "(C1)": [(self.shapes[j + 1], *inner) for j, inner in enumerate(grown)],
+            "(C2)": [(self.shapes[0], *inner) for inner in updated],
         }
+
+
+def congruence_sum(*terms: tuple[np.ndarray, np.ndarray, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the sum of w F P F' over terms (F, P, w), and that of w |F| |P| |F|', with which its rounding grows."""
+    total = sum(weight * factor @ shape @ factor.T for factor, shape, weight in terms)
+    size = sum(weight * np.abs(factor) @ np.abs(shape) @ np.abs(factor).T for factor, shape, weight in terms)
+    return np.asarray(total), np.asarray(size)
 
 
 def error_sets_by_age(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsByAge | None:
@@ -107,7 +121,7 @@ def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsBy
     A, H = inverse @ plant.A @ T, plant.H @ T
     D = inverse @ plant.disturbance.shape @ inverse.T
     D = D + 1e-9 * float(np.trace(D)) / plant.n * np.eye(plant.n)
-    first = inverse @ plant.initial_error.shape @ inverse.T + 1e-12 * np.eye(plant.n)
+    first = inverse @ plant.initial_error.shape @ inverse.T + THINNEST**2 * np.eye(plant.n)
     rounding = inverse @ plant.estimate_rounding @ inverse.T
     exact = plant.sensor_error_with(contract.quantization_step).shape
     noise = NOISE_MARGIN * exact + 1e-12 * np.diag(np.diag(H @ H.T)) * float(np.trace(D)) / plant.n
@@ -177,9 +191,9 @@ def _update(shape: np.ndarray, H: np.ndarray, noise: np.ndarray) -> tuple[np.nda
     sizes = (axes * axes).sum(axis=0)
     traces = (sizes / (MULTIPLIERS[:, None] + (1.0 - MULTIPLIERS[:, None]) * gains)).sum(axis=1)
     mu = float(MULTIPLIERS[int(np.argmin(traces))])
-    updated = (axes / (mu + (1.0 - mu) * gains)) @ axes.T
     spread = shape @ H.T / mu
     gain = np.linalg.solve(H @ spread + noise / (1.0 - mu), spread.T).T
+    updated, _ = congruence_sum((np.eye(len(shape)) - gain @ H, shape, 1.0 / mu), (gain, noise, 1.0 / (1.0 - mu)))
     return gain, mu, _symmetric(updated)
 
 

@@ -128,8 +128,8 @@ class HardBounds(ReadOnlyArrays):
     @cached_property
     def allowed_disturbance(self) -> Ellipsoid:
         """What a disturbance may use of D: the rest is for the rounding of a simulation, shape (n, n)."""
-        inflated = 0.5 * (self.nominal_disturbance.shape + inflated(self.nominal_disturbance.shape))
-        return Ellipsoid(inflated + 0.5 * self._rounding_room)
+        nominal = self.nominal_disturbance.shape
+        return Ellipsoid(0.5 * (nominal + inflated(nominal)) + 0.5 * self._rounding_room)
 
     @cached_property
     def _rounding_room(self) -> np.ndarray:

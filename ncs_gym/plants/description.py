@@ -83,7 +83,7 @@ def describe(plant: LinearPlant) -> str:
     lines = {
         "linear plant": [f"{sizes}, a step every {plant.dt:g} s"],
         "dynamics": [stable if plant.spectral_radius < 1.0 else unstable],
-        "safe box": [_row_limit(plant, row) for row in plant.C],
+        "safe box": [row_limit(plant, row) for row in plant.C],
         "input limits": [
             _between(name, limit, center, unit)
             for name, limit, center, unit in zip(
@@ -207,7 +207,7 @@ def _between(name: str, limit: float, center: float, unit: str) -> str:
     return f"{center - limit:.6g} <= {name} <= {_sized(center + limit, unit)} (operating point {center:.6g})"
 
 
-def _row_limit(plant: LinearPlant, row: np.ndarray) -> str:
+def row_limit(plant: LinearPlant, row: np.ndarray) -> str:
     """Returns what a row of the safe box limits."""
     limited = np.flatnonzero(row).tolist()
     if len(limited) == 1:

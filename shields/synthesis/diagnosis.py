@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, Remainder
+from ncs_gym.plants.description import row_limit
 from shields.errors import Infeasible
 from shields.synthesis.design_problem import DesignProblem, design_problem
 from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
@@ -37,7 +38,7 @@ def infeasibility(problem: DesignProblem) -> Infeasible:
     binding = "U" if _margin(problem, input_limits=False) >= 1.0 else "I"
     what = "(U) the input limits are too tight" if binding == "U" else "(I) no invariant ellipsoid in the box was found"
     return Infeasible(
-        f"{what}: one is found once disturbance and error radii shrink to {fraction:.1%} of those given",
+        f"{what}: one is found once disturbance and error radii shrink to {100.0 * fraction:.3g}% of those given",
         binding,
         1.0 - fraction,
         {"share_of_radii": fraction},
@@ -64,21 +65,40 @@ def with_feasible_bounds(
     without_contract = contract is None and infeasible.binding == "E1"
     if without_contract or infeasible.binding == "S" or infeasible.details.get("share_of_radii") == 0.0:
         return infeasible
-    hints, details = [], dict(infeasible.details)
+    hints, useless, details = [], [], dict(infeasible.details)
     if contract is not None and contract.max_age > 0:
         progress("no certificate: searching for a max_age that has one")
         age = _largest_age(plant, contract)
-        hints.append("no smaller max_age works" if age is None else f"max_age = {age} is the largest that works")
-        details |= {} if age is None else {"max_age": age}
+        if age is None:
+            useless.append("max_age")
+        else:
+            hints.append(f"max_age = {age} is the largest that works")
+            details["max_age"] = age
     for name in _BOUNDS:
         if _is_declared(plant, name):
             progress(f"no certificate: searching for a {name} that has one")
             factor = _largest_factor(plant, name, contract)
-            hints.append(_hint(plant, name, factor))
-            details |= {} if factor is None else _figure(plant, name, factor)
+            if factor is None:
+                useless.append(name)
+            else:
+                hints.append(_hint(plant, name, factor))
+                details |= _figure(plant, name, factor)
+    if useless:
+        hints.append(f"a smaller {' or '.join(useless)} is not enough")
     changed = f"; each changed alone: {'; '.join(hints)}" if hints else ""
     asked = "" if contract is None else f" (asked: max_age = {contract.max_age})"
-    return Infeasible(f"{infeasible}{changed}{asked}", infeasible.binding, infeasible.shortfall, details)
+    text = f"{infeasible}{_limits_exceeded(plant)}{changed}{asked}"
+    return Infeasible(text, infeasible.binding, infeasible.shortfall, details)
+
+
+def _limits_exceeded(plant: LinearPlant) -> str:
+    """Returns which limits of the safe box the disturbance of a single step exceeds, as the rest of a sentence."""
+    reached = np.sqrt(np.einsum("ji,ik,jk->j", plant.C, plant.nominal_disturbance.shape, plant.C))
+    return "".join(
+        f"; the disturbance of one step alone reaches {size:.3g} times the limit {row_limit(plant, row)}"
+        for row, size in zip(plant.C, reached, strict=True)
+        if size >= 1.0
+    )
 
 
 def _is_declared(plant: LinearPlant, name: str) -> bool:
@@ -88,10 +108,8 @@ def _is_declared(plant: LinearPlant, name: str) -> bool:
     return value is not None and bool(np.any(value.shape if isinstance(value, Ellipsoid) else value))
 
 
-def _hint(plant: LinearPlant, name: str, factor: float | None) -> str:
+def _hint(plant: LinearPlant, name: str, factor: float) -> str:
     """Returns the largest feasible value of a bound in words, given its fraction of the declared one."""
-    if factor is None:
-        return f"no smaller {name} works"
     if name == "remainder":
         return f"{factor:.3g} times the given remainder is the largest that works (shrink the box or the input limits)"
     largest = f"gamma = {factor * plant.gamma:.3g}" if name == "gamma" else f"{factor:.3g} times the given {name}"

@@ -98,6 +98,6 @@ def test_sets_that_are_found_have_the_room():
         )
         error_set = certified_error_set(plant, ChannelContract(2))
         assert Estimator(plant, Channel(), error_set).error_set is error_set
-        outer, inner = zip(*error_set.ages.needs(plant)["(C2)"], strict=True)
+        outer, inner, _ = zip(*error_set.ages.needs(plant)["(C2)"], strict=True)
         for held, needed in zip(outer, inner, strict=True):
             assert is_inside(needed, held)

@@ -56,6 +56,27 @@ def test_flat_disturbances_get_a_certificate_whatever_their_direction(rank):
         assert verified(certificate, plant).valid
 
 
+CART = {"dt": 0.1, "box": [1.0, 2.0], "u_max": 2.0, "initial_bound": [0.005, 0.02]}
+CART |= {"disturbance_bound": [0.001, 0.005], "sensor_bound": 0.002}
+
+
+@pytest.mark.parametrize("delay", [1, 2, 3])
+def test_inputs_under_way_are_known_exactly_under_every_contract(delay):
+    # Their errors are zero: error sets are flat in their directions, which float64 has to bear.
+    system = ([[0.0, 1.0], [0.0, -0.5]], [[0.0], [1.0]], [[1.0, 0.0]], [[0.0]])
+    plant = LinearPlant.from_statespace(system, **CART, input_delay=delay)
+    for age in (0, 1, 3):
+        certificate = synthesize(plant, contract=ChannelContract(age))
+        assert verified(certificate, plant).valid
+
+
+def test_state_that_no_output_shows_is_named():
+    system = ([[0.0, 1.0], [0.0, -0.5]], [[0.0], [1.0]], [[0.0, 1.0]], [[0.0]])
+    plant = LinearPlant.from_statespace(system, **CART, state_names=("place", "speed"))
+    with pytest.raises(Infeasible, match="no error set exists: the outputs do not show place, whose errors"):
+        synthesize(plant, contract=ChannelContract(0))
+
+
 def test_closed_loop_stays_inside_for_the_worst_state_error_and_disturbance():
     # By another route than the condition: projected ascent over (x, e, d) on x+' M x+.
     plant = random_plant(3, 2, 1)
