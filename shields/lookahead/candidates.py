@@ -27,6 +27,15 @@ def expressible(inputs: np.ndarray, limits: np.ndarray) -> np.ndarray:
     return limits * np.minimum(np.maximum(inputs / limits, -1.0), 1.0).astype(np.float32)
 
 
+def closed_loop(plant: LinearPlant, gain: np.ndarray, steps: int) -> np.ndarray:
+    """Returns the matrix, shape (steps m, n + m), that takes (x_hat, u_0) to u_0, u_1 = K c_1, u_2 = K c_2, ..."""
+    center, inputs = np.hstack([plant.A, plant.B]), [np.eye(plant.n + plant.m)[plant.n :]]
+    for _ in range(steps - 1):
+        inputs.append(gain @ center)
+        center = (plant.A + plant.B @ gain) @ center
+    return np.concatenate(inputs)
+
+
 @np.errstate(all="ignore")  # what is not finite passes no test
 def completed(plant: LinearPlant, estimates: np.ndarray, beginnings: np.ndarray, gains: np.ndarray) -> np.ndarray:
     """Returns plans that go on with u_j = gain c_j, saturated and expressible, where a beginning is NaN.

@@ -8,7 +8,7 @@ import numpy as np
 
 from ncs_gym.validation import as_numbers
 from shields.lookahead.planner import Planner, Plans
-from shields.runtime.decisions import INVALID, PLANNED, PROJECTED, SAFE, STORED, Decision
+from shields.runtime.decisions import INVALID, PLANNED, PROJECTED, REASONS, SAFE, STORED, Decision
 from shields.runtime.one_step_test import OneStepTest, norms
 from shields.runtime.predicted_errors import PredictedErrors
 
@@ -35,6 +35,22 @@ class Lookahead:
     def __init__(self, test: OneStepTest, gain: np.ndarray, horizon: int, margin: float) -> None:
         self._test, self._margin = test, margin
         self.planner = Planner(test, gain, horizon, margin)
+
+    def keep_alone(
+        self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray, margin: float
+    ) -> Decision | None:
+        """Returns the decision to let one proposal pass if a certified plan begins with it, which `keep` tries first.
+
+        Args:
+            estimate: x_hat, shape (n,).
+            errors: What is known of Sigma_k.
+            proposed: Shape (m,); failed the one-step test.
+            margin: Of the proposal.
+        """
+        plan = self.planner.beginning_alone(estimate, errors.shape, proposed)
+        if plan is None:
+            return None
+        return Decision(plan[0], False, True, False, margin, REASONS[PLANNED], plan[1:])
 
     def keep(
         self, decided: Decision, some: np.ndarray, estimates: np.ndarray, errors: PredictedErrors, stored: np.ndarray

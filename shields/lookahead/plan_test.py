@@ -38,7 +38,7 @@ class PlanTest:
         self._columns = np.array([end.columns for end in ends])
         # Where in the table the tightenings of a shape are.
         self._remembered: dict[bytes, int] = {}
-        self._table: Tightening | None = None
+        self._table = tightenings(prediction, np.empty((0, plant.n, plant.n)))
 
     def tightenings_of(self, shapes: np.ndarray) -> Tightening:
         """Returns the tightenings of error shapes Sigma_k, shape (E, n, n); remembered, since shapes recur."""
@@ -50,15 +50,25 @@ class PlanTest:
             new = {key: e for e, key in enumerate(keys)}
         if new:
             found = tightenings(self.prediction, shapes[list(new.values())])
-            known = [part[: len(self._remembered)] for part in self._table or found]
+            known = [part[: len(self._remembered)] for part in self._table]
             self._table = Tightening(*(np.concatenate(pair) for pair in zip(known, found, strict=True)))
             self._remembered |= {key: len(self._remembered) + e for e, key in enumerate(new)}
         numbers = [self._remembered[key] for key in keys]
-        return Tightening(*(part[numbers] for part in self._table or tightenings(self.prediction, shapes)))
+        return Tightening(*(part[numbers] for part in self._table))
+
+    def tightening_alone(self, shape: np.ndarray) -> Tightening:
+        """Returns what `tightenings_of` does for a single error shape, (n, n)."""
+        number = self._remembered.get(shape.tobytes())
+        if number is None:
+            return Tightening(*(part[0] for part in self.tightenings_of(shape[None])))
+        return Tightening(*(part[number] for part in self._table))
 
     @np.errstate(all="ignore")  # what is not finite is not certified
     def room(self, estimates: np.ndarray, tightening: Tightening) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the largest |c_i c_j|, shape (E, N, k), and |T G c_j|, shape (E, N), that pass; NaN for no usable."""
+        """Returns the largest |c_i c_j|, shape (E, N, k), and |T G c_j|, shape (E, N), that pass; NaN for no usable.
+
+        Of a single estimate, shape (n,), and a single tightening, without the first axis.
+        """
         size = np.abs(estimates)
         rounding = (size @ self._row_rounding).reshape(tightening.room.shape)
         box = tightening.room - rounding - self._margin
@@ -99,6 +109,24 @@ class PlanTest:
         passed = np.asarray(np.sqrt((weighted * weighted).sum(axis=1)) <= radius.T[..., None])
         passed[1:] &= np.logical_and.accumulate(inside[:-1], axis=0)
         return (passed & np.logical_and.accumulate(allowed, axis=0)).transpose(1, 2, 0)
+
+    @np.errstate(all="ignore")
+    def certified_length(self, estimate: np.ndarray, tightening: Tightening, plan: np.ndarray) -> int:
+        """Returns the length of the shortest certified part of a single plan, 0 for none, in a fourth of the time.
+
+        Args:
+            estimate: x_hat, shape (n,).
+            tightening: Of a single error shape.
+            plan: Inputs, shape (N, m) [physical units].
+        """
+        box, radius = self.room(estimate, tightening)
+        centers = self.prediction.centers_alone(estimate, plan)
+        weighted = (tightening.weighting @ centers[:, :, None])[:, :, 0]
+        ends = np.sqrt((weighted * weighted).sum(axis=1)) <= radius
+        end = int(ends.argmax())
+        inside = np.abs(centers[:end] @ self._rows.T) <= box[:end]
+        allowed = np.abs(plan[: end + 1]) <= self.prediction.plant.u_max
+        return end + 1 if ends[end] and inside.all() and allowed.all() else 0
 
     @np.errstate(all="ignore")
     def knows_in_box(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:

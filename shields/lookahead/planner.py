@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shields.lookahead.candidates import completed, expressible, regulator
+from shields.lookahead.candidates import closed_loop, completed, expressible, regulator
 from shields.lookahead.plan_test import PlanTest
 from shields.lookahead.prediction import Prediction
 from shields.lookahead.program import PlanProgram
@@ -60,18 +60,36 @@ class Planner:
         self._plant = first.plant
         braking = regulator(first.plant)
         self._gains = np.array([gain, gain if braking is None else braking])
+        self._continued = closed_loop(first.plant, gain, horizon)
         self._program = PlanProgram(self.test.prediction)
+
+    @np.errstate(all="ignore")  # what is not finite passes no test
+    def beginning_alone(self, estimate: np.ndarray, shape: np.ndarray, proposed: np.ndarray) -> np.ndarray | None:
+        """Returns the first candidate of `beginning_with`, shape (j, m), if a part of j inputs is certified, else None.
+
+        Args:
+            estimate: x_hat, shape (n,).
+            shape: Sigma_k, shape (n, n).
+            proposed: Shape (m,).
+        """
+        inputs = self._continued.dot(np.concatenate([estimate, proposed])).reshape(self.horizon, -1)
+        plan = expressible(inputs, self._plant.u_max)
+        plan[0] = proposed
+        length = self.test.certified_length(estimate, self.test.tightening_alone(shape), plan)
+        return plan[:length] if length else None
 
     def beginning_with(
         self, estimates: np.ndarray, shapes: np.ndarray, proposed: np.ndarray, stored: np.ndarray
     ) -> Plans:
         """Returns certified plans of E environments whose first inputs are the proposed ones; for arguments see `find`.
 
-        After the proposal comes what is stored for later, or a saturated gain; the solver is not asked.
+        After the proposal comes K c_j, what is stored for later, or the regulator; the solver is not asked.
         """
+        inputs = np.concatenate([estimates, proposed], axis=1) @ self._continued.T
         beginnings = np.full((len(estimates), 3, self.horizon, self._plant.m), np.nan)
+        beginnings[:, 0] = expressible(inputs.reshape(len(estimates), self.horizon, -1), self._plant.u_max)
         beginnings[:, :, 0] = proposed[:, None]
-        beginnings[:, 0, 1:] = stored[:, 1:]
+        beginnings[:, 1, 1:] = stored[:, 1:]
         candidates = completed(self._plant, estimates, beginnings, self._gains[[0, 0, 1]])
         return self._best(estimates, self.test.tightenings_of(shapes), candidates, proposed)
 
@@ -108,15 +126,13 @@ class Planner:
         return plans
 
     def _best(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray, proposed: np.ndarray) -> Plans:
-        """Returns of P plans, shape (E, P, N, m), the certified one that begins closest, of equal ones the shortest."""
+        """Returns of P plans, shape (E, P, N, m), the certified one that begins closest, of equal ones the first."""
         certified = self.test.certified(estimates, tightening, plans)
         any_length = certified.any(axis=-1)
         lengths = np.where(any_length, certified.argmax(axis=-1) + 1, 0)
         distances = np.sqrt(np.square(plans[:, :, 0] - proposed[:, None]).sum(axis=-1))
         distances = np.where(any_length, distances, np.inf)
-        tied = distances == distances.min(axis=1, keepdims=True)
-        best = np.where(tied, lengths, self.horizon + 1).argmin(axis=1)
-        rows = np.arange(len(plans))
+        best, rows = distances.argmin(axis=1), np.arange(len(plans))
         return Plans(plans[rows, best], lengths[rows, best], distances[rows, best])
 
     def _solved(self, estimates: np.ndarray, tightening: Tightening, proposed: np.ndarray) -> Plans:

@@ -62,6 +62,10 @@ class Prediction:
         moved = (self._free @ estimates.T)[..., None] + pushed
         return moved.reshape(self.steps, self.plant.n, count, number)
 
+    def centers_alone(self, estimate: np.ndarray, plan: np.ndarray) -> np.ndarray:
+        """Returns what `centers` does for one estimate, shape (n,), and one plan, (N, m): c_1..c_N, shape (N, n)."""
+        return (self._free.dot(estimate) + self._forced.dot(plan.ravel())).reshape(self.steps, -1)
+
 
 class EndTest(OneStepTest):
     """The one-step test of the plant that takes j+1 steps at once: A^{j+1}, and what disturbances add up to.

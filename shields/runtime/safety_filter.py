@@ -139,7 +139,7 @@ class SafetyFilter(ReadOnlyArrays):
         return one._replace(input=np.array(one.input), reason=REASONS[one.reason], plan=plan)
 
     def _decide_single(self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray) -> Decision | None:
-        """Returns the decision in the common cases: an input that passes, and a single input that is projected."""
+        """Returns the decision in the common cases: one that passes or begins a plan, and a projected single input."""
         alone = self.test.reachable_alone(estimate, errors)
         pairs = zip(proposed.tolist(), self.test.limits, strict=True)
         if alone is None or not all([-limit <= u <= limit for u, limit in pairs]):
@@ -147,6 +147,8 @@ class SafetyFilter(ReadOnlyArrays):
         slack, margin = alone.slack(proposed)
         if slack >= MARGIN:
             return Decision(proposed.copy(), False, True, False, margin, REASONS[SAFE], self._no_plan)
+        if self.lookahead is not None:
+            return self.lookahead.keep_alone(estimate, errors, proposed, margin)
         if self.mode != "project" or self.plant.m > 1:
             return None
         closest = np.array([_expressible_number(alone.closest(proposed.item(), self.reserve), self.test.limits[0])])
