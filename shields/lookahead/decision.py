@@ -9,7 +9,7 @@ import numpy as np
 from ncs_gym.validation import as_numbers
 from shields.lookahead.planner import Planner, Plans
 from shields.runtime.decisions import INVALID, PLANNED, PROJECTED, REASONS, SAFE, STORED, Decision
-from shields.runtime.one_step_test import OneStepTest, norms
+from shields.runtime.one_step_test import OneStepTest, ReachableSets, norms
 from shields.runtime.predicted_errors import PredictedErrors
 
 
@@ -72,6 +72,7 @@ class Lookahead:
     def complete(
         self,
         decided: Decision,
+        sets: ReachableSets,
         estimates: np.ndarray,
         errors: PredictedErrors,
         proposed: np.ndarray,
@@ -81,6 +82,7 @@ class Lookahead:
 
         Args:
             decided: Decisions about N proposals.
+            sets: Where next states lie.
             estimates: x_hat, shape (n, N).
             errors: What is known of the Sigma_k of each.
             proposed: Shape (m, N) [physical units].
@@ -100,9 +102,7 @@ class Lookahead:
         some = some[changed | left]
         if some.size:
             decided.intervened[some] = (decided.input[:, some] != proposed[:, some]).any(axis=0)
-            slack, decided.margin[some] = self._test.reachable(estimates[:, some], errors.of(some)).slack(
-                decided.input[:, some]
-            )
+            slack, decided.margin[some] = sets.some(some).slack(decided.input[:, some])
             decided.passed[some] = (slack >= self._margin) | (decided.reason[some] == PLANNED)
 
     def _plan(
@@ -137,6 +137,8 @@ class Lookahead:
     def _begin(self, decided: Decision, some: np.ndarray, found: Plans) -> np.ndarray:
         """Begins the plans found for some environments, and returns where there are any, shape (len(some),)."""
         begun = found.lengths > 0
+        if not np.count_nonzero(begun):
+            return begun
         inputs, lengths, _ = found.some(begun)
         kept = np.arange(1, self.planner.horizon) < lengths[:, None]
         some = some[begun]

@@ -185,7 +185,7 @@ class SafetyFilter(ReadOnlyArrays):
             self._project(decided, np.flatnonzero(~decided.passed & valid), sets)
         self._fall_back(decided, np.flatnonzero(~decided.passed), sets, estimates, valid)
         if self.lookahead is not None and stored is not None:
-            self.lookahead.complete(decided, estimates, errors, proposed, stored)
+            self.lookahead.complete(decided, sets, estimates, errors, proposed, stored)
         return decided
 
     def first_plan(self, estimate: np.ndarray, errors: PredictedErrors) -> np.ndarray:
