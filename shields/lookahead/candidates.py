@@ -1,4 +1,4 @@
-"""Plans that cost no solver: a given beginning, and then a saturated gain at the predicted centers."""
+"""Plans that cost no solver: a given beginning, and then a gain at the predicted centers, limited or saturated."""
 
 from __future__ import annotations
 
@@ -28,12 +28,15 @@ def expressible(inputs: np.ndarray, limits: np.ndarray) -> np.ndarray:
 
 
 def closed_loop(plant: LinearPlant, gain: np.ndarray, steps: int) -> np.ndarray:
-    """Returns the matrix, shape (steps m, n + m), that takes (x_hat, u_0) to u_0, u_1 = K c_1, u_2 = K c_2, ..."""
+    """Returns the matrix, shape (n + m, steps m), that takes a row (x_hat, u_0) to u_0, u_1 = gain c_1, gain c_2, ...
+
+    The centers are those of the inputs without limits.
+    """
     center, inputs = np.hstack([plant.A, plant.B]), [np.eye(plant.n + plant.m)[plant.n :]]
     for _ in range(steps - 1):
         inputs.append(gain @ center)
         center = (plant.A + plant.B @ gain) @ center
-    return np.concatenate(inputs)
+    return np.ascontiguousarray(np.concatenate(inputs).T)
 
 
 @np.errstate(all="ignore")  # what is not finite passes no test

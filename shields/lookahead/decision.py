@@ -39,7 +39,7 @@ class Lookahead:
     def keep_alone(
         self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray, margin: float
     ) -> Decision | None:
-        """Returns the decision to let one proposal pass if a certified plan begins with it, which `keep` tries first.
+        """Returns the decision of `keep` about one proposal if its first candidates are enough, None if they are not.
 
         Args:
             estimate: x_hat, shape (n,).

@@ -6,7 +6,6 @@ import numpy as np
 
 from shields.lookahead.prediction import Prediction
 from shields.lookahead.tightening import Tightening, tightenings
-from shields.runtime.one_step_test import FARTHEST
 from shields.runtime.predicted_errors import SMALLEST_RADIUS
 
 # Error shapes whose tightenings are remembered; they recur, since they depend only on what arrived when.
@@ -34,8 +33,7 @@ class PlanTest:
         self._rows = plant.C
         sizes = np.abs(plant.C) @ prediction.size_free
         self._row_rounding = (prediction.rounding[:, None, None] * sizes).reshape(-1, plant.n).T
-        self._end_rounding = np.array([end.rounding * end.columns for end in ends])
-        self._columns = np.array([end.columns for end in ends])
+        self._end_rounding = np.array([end.rounding * end.columns for end in ends]).T
         # Where in the table the tightenings of a shape are.
         self._remembered: dict[bytes, int] = {}
         self._table = tightenings(prediction, np.empty((0, plant.n, plant.n)))
@@ -72,9 +70,8 @@ class PlanTest:
         size = np.abs(estimates)
         rounding = (size @ self._row_rounding).reshape(tightening.room.shape)
         box = tightening.room - rounding - self._margin
-        radius = tightening.radius - size @ self._end_rounding.T
-        far = ~(size @ self._columns.T < FARTHEST) | ~(radius >= SMALLEST_RADIUS)
-        return box, np.where(far, np.nan, radius - self._margin)
+        radius = tightening.radius - size @ self._end_rounding  # far below zero for estimates that are too far out
+        return box, np.where(radius >= SMALLEST_RADIUS, radius - self._margin, np.nan)
 
     def judged(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns c_i c_j, shape (N, k, E, P), and T G c_j, shape (N, n, E, P): sums over long last axes are fast.
@@ -104,29 +101,21 @@ class PlanTest:
         """
         box, radius = self.room(estimates, tightening)
         values, weighted = self.judged(estimates, tightening, plans)
-        inside = np.all(np.abs(values) <= box.transpose(1, 2, 0)[..., None], axis=1)
-        allowed = np.all(np.abs(plans) <= self.prediction.plant.u_max, axis=-1).transpose(2, 0, 1)
-        passed = np.asarray(np.sqrt((weighted * weighted).sum(axis=1)) <= radius.T[..., None])
-        passed[1:] &= np.logical_and.accumulate(inside[:-1], axis=0)
-        return (passed & np.logical_and.accumulate(allowed, axis=0)).transpose(1, 2, 0)
+        kept = _kept(values, weighted, box.transpose(1, 2, 0)[..., None], radius.T[..., None])
+        return kept.transpose(1, 2, 0) & self._within_limits(plans)
 
     @np.errstate(all="ignore")
-    def certified_length(self, estimate: np.ndarray, tightening: Tightening, plan: np.ndarray) -> int:
-        """Returns the length of the shortest certified part of a single plan, 0 for none, in a fourth of the time.
-
-        Args:
-            estimate: x_hat, shape (n,).
-            tightening: Of a single error shape.
-            plan: Inputs, shape (N, m) [physical units].
-        """
+    def certified_alone(self, estimate: np.ndarray, tightening: Tightening, plans: np.ndarray) -> np.ndarray:
+        """Returns what `certified` does for one estimate, shape (n,), and its plans, (P, N, m): shape (P, N)."""
         box, radius = self.room(estimate, tightening)
-        centers = self.prediction.centers_alone(estimate, plan)
-        weighted = (tightening.weighting @ centers[:, :, None])[:, :, 0]
-        ends = np.sqrt((weighted * weighted).sum(axis=1)) <= radius
-        end = int(ends.argmax())
-        inside = np.abs(centers[:end] @ self._rows.T) <= box[:end]
-        allowed = np.abs(plan[: end + 1]) <= self.prediction.plant.u_max
-        return end + 1 if ends[end] and inside.all() and allowed.all() else 0
+        centers = self.prediction.centers_alone(estimate, plans)
+        kept = _kept(self._rows @ centers, tightening.weighting @ centers, box[..., None], radius[:, None])
+        return kept.T & self._within_limits(plans)
+
+    def _within_limits(self, plans: np.ndarray) -> np.ndarray:
+        """Returns whether the first j inputs of plans, shape (..., N, m), are within the limits, shape (..., N)."""
+        allowed = np.all(np.abs(plans) <= self.prediction.plant.u_max, axis=-1)
+        return np.logical_and.accumulate(allowed, axis=-1)
 
     @np.errstate(all="ignore")
     def knows_in_box(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
@@ -137,3 +126,18 @@ class PlanTest:
         reach = np.sqrt(np.maximum(((rows @ error_shape) * rows).sum(axis=1), 0.0) + rounding * size**2)
         reach = reach + np.abs(rows @ estimate) + rounding * (np.abs(rows) @ np.abs(estimate))
         return bool((reach <= 1.0 - self._margin).all())
+
+
+def _kept(values: np.ndarray, weighted: np.ndarray, box: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Returns whether centers c_1..c_{j-1} are far enough inside the box, and c_j inside S, shape (N, ...).
+
+    Args:
+        values: c_i c_j, shape (N, k, ...) with axes of estimates and plans last, as in all others.
+        weighted: T G c_j, shape (N, n, ...).
+        box: Largest |c_i c_j|, shape (N, k, ...).
+        radius: Largest |T G c_j|, shape (N, ...).
+    """
+    inside = np.all(np.abs(values) <= box, axis=1)
+    kept = np.asarray(np.sqrt((weighted * weighted).sum(axis=1)) <= radius)
+    kept[1:] &= np.logical_and.accumulate(inside[:-1], axis=0)
+    return kept

@@ -59,39 +59,49 @@ class Planner:
         self.test, self.horizon = PlanTest(Prediction(first, horizon), margin), horizon
         self._plant = first.plant
         braking = regulator(first.plant)
-        self._gains = np.array([gain, gain if braking is None else braking])
-        self._continued = closed_loop(first.plant, gain, horizon)
+        self._gains = np.array([gain if braking is None else braking, gain])
+        self._loops = np.concatenate([closed_loop(first.plant, each, horizon) for each in self._gains], axis=1)
         self._program = PlanProgram(self.test.prediction)
 
-    @np.errstate(all="ignore")  # what is not finite passes no test
     def beginning_alone(self, estimate: np.ndarray, shape: np.ndarray, proposed: np.ndarray) -> np.ndarray | None:
-        """Returns the first candidate of `beginning_with`, shape (j, m), if a part of j inputs is certified, else None.
+        """Returns what `beginning_with` does if its first candidates are enough, shape (j, m); None if they are not.
 
         Args:
             estimate: x_hat, shape (n,).
             shape: Sigma_k, shape (n, n).
             proposed: Shape (m,).
         """
-        inputs = self._continued.dot(np.concatenate([estimate, proposed])).reshape(self.horizon, -1)
-        plan = expressible(inputs, self._plant.u_max)
-        plan[0] = proposed
-        length = self.test.certified_length(estimate, self.test.tightening_alone(shape), plan)
-        return plan[:length] if length else None
+        plans = self._continued(estimate, proposed)
+        certified = self.test.certified_alone(estimate, self.test.tightening_alone(shape), plans)
+        which = int(certified.any(axis=1).argmax())
+        length = int(certified[which].argmax()) + 1
+        return plans[which, :length] if certified[which, length - 1] else None
 
     def beginning_with(
         self, estimates: np.ndarray, shapes: np.ndarray, proposed: np.ndarray, stored: np.ndarray
     ) -> Plans:
         """Returns certified plans of E environments whose first inputs are the proposed ones; for arguments see `find`.
 
-        After the proposal comes K c_j, what is stored for later, or the regulator; the solver is not asked.
+        After the proposal comes the regulator or K in a prediction that knows no limits, what is stored for later and
+        then K, or the saturated regulator. The first candidate that is certified counts; the solver is not asked.
         """
-        inputs = np.concatenate([estimates, proposed], axis=1) @ self._continued.T
-        beginnings = np.full((len(estimates), 3, self.horizon, self._plant.m), np.nan)
-        beginnings[:, 0] = expressible(inputs.reshape(len(estimates), self.horizon, -1), self._plant.u_max)
-        beginnings[:, :, 0] = proposed[:, None]
-        beginnings[:, 1, 1:] = stored[:, 1:]
-        candidates = completed(self._plant, estimates, beginnings, self._gains[[0, 0, 1]])
+        beginnings = np.full((len(estimates), 4, self.horizon, self._plant.m), np.nan)
+        beginnings[:, :2] = self._continued(estimates, proposed)
+        beginnings[:, 2:, 0] = proposed[:, None]
+        beginnings[:, 2, 1:] = stored[:, 1:]
+        candidates = completed(self._plant, estimates, beginnings, self._gains[[0, 1, 1, 0]])
         return self._best(estimates, self.test.tightenings_of(shapes), candidates, proposed)
+
+    @np.errstate(all="ignore")  # what is not finite passes no test
+    def _continued(self, estimates: np.ndarray, proposed: np.ndarray) -> np.ndarray:
+        """Returns proposals followed by either gain, (E, 2, N, m), limited after the prediction: one product for all.
+
+        Of a single estimate, shape (n,), and proposal, (m,), without the first axis.
+        """
+        inputs = np.concatenate([estimates, proposed], axis=-1) @ self._loops
+        plans = expressible(inputs.reshape(*inputs.shape[:-1], 2, self.horizon, -1), self._plant.u_max)
+        plans[..., 0, :] = proposed[..., None, :]
+        return plans
 
     def find(
         self,
@@ -115,7 +125,7 @@ class Planner:
         tightening = self.test.tightenings_of(shapes)
         beginnings = np.full((len(estimates), 4, self.horizon, self._plant.m), np.nan)
         beginnings[:, 0, 0], beginnings[:, 1] = projected, stored
-        candidates = completed(self._plant, estimates, beginnings, self._gains[[1, 0, 1, 0]])
+        candidates = completed(self._plant, estimates, beginnings, self._gains[[0, 1, 0, 1]])
         plans = self._best(estimates, tightening, candidates, proposed)
         if self.horizon > 1:
             needed = (plans.lengths == 0) | np.isnan(stored[:, 0, 0])

@@ -62,9 +62,10 @@ class Prediction:
         moved = (self._free @ estimates.T)[..., None] + pushed
         return moved.reshape(self.steps, self.plant.n, count, number)
 
-    def centers_alone(self, estimate: np.ndarray, plan: np.ndarray) -> np.ndarray:
-        """Returns what `centers` does for one estimate, shape (n,), and one plan, (N, m): c_1..c_N, shape (N, n)."""
-        return (self._free.dot(estimate) + self._forced.dot(plan.ravel())).reshape(self.steps, -1)
+    def centers_alone(self, estimate: np.ndarray, plans: np.ndarray) -> np.ndarray:
+        """Returns what `centers` does for one estimate, shape (n,), and its plans, (P, N, m): shape (N, n, P)."""
+        pushed = self._forced @ plans.reshape(len(plans), -1).T
+        return (self._free.dot(estimate)[:, None] + pushed).reshape(self.steps, -1, len(plans))
 
 
 class EndTest(OneStepTest):

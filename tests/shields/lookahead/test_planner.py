@@ -11,6 +11,7 @@ from ncs_gym import Ellipsoid
 from ncs_gym.uncertainty.ellipsoid import outer_sum
 from shields import SafetyFilter
 from shields.lookahead import planner, program
+from shields.lookahead.candidates import closed_loop
 from shields.runtime.decisions import REASONS
 from tests.certificates import certificate_of
 from tests.shields.lookahead.adversary import STABLE, UNSTABLE, case
@@ -254,6 +255,38 @@ def test_decisions_one_by_one_equal_those_of_a_batch(name):
         kept = many.plan[..., e]
         assert np.count_nonzero(~np.isnan(kept[:, 0])) == len(one.plan)
     assert {"planned", "stored"} <= {REASONS[code] for code in many.reason}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_single_proposal_that_a_gain_continues_is_kept_without_a_batch(name, monkeypatch):
+    shield, rng = shield_of(name), np.random.default_rng(7)
+    cases = list(zip(*beliefs(shield, rng, 150), strict=True))
+    kept = [(case, one) for case in cases if (one := shield.decide(*case)).reason == "planned" and not one.intervened]
+    monkeypatch.setattr(SafetyFilter, "decide_many", None)
+    decided = 0
+    for (x_hat, shape, proposed), expected in kept:
+        try:
+            one = shield.decide(x_hat, shape, proposed)
+        except TypeError:  # it needed a batch
+            continue
+        decided += 1
+        assert (one.intervened, one.passed, one.fallback, one.stored) == (False, True, False, False)
+        np.testing.assert_array_equal(one.input, proposed)
+        np.testing.assert_array_equal(one.plan, expected.plan)
+    assert decided > 0.6 * len(kept) > 0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_loop_in_one_product_is_the_loop_step_by_step(name):
+    shield, rng = shield_of(name), np.random.default_rng(8)
+    plant, gain = shield.plant, shield.certificate.K
+    x_hat, u = rng.uniform(-1, 1, plant.n) * plant.half_widths, rng.uniform(-1, 1, plant.m) * plant.u_max
+    expected, center = [u], plant.A @ x_hat + plant.B @ u
+    for _ in range(shield.horizon - 1):
+        expected.append(gain @ center)
+        center = plant.A @ center + plant.B @ expected[-1]
+    found = np.concatenate([x_hat, u]) @ closed_loop(plant, gain, shield.horizon)
+    np.testing.assert_allclose(found, np.concatenate(expected), rtol=1e-9, atol=1e-9 * plant.u_max.max())
 
 
 def broken_solver(how, rng):
