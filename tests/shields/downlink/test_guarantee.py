@@ -13,10 +13,11 @@ from ncs_gym import (
     NCSEnv,
     NCSVectorEnv,
     Packet,
+    cart_pole,
     truck_trailer,
 )
 from ncs_gym.network.packet_transmission import ChannelState
-from shields import SafeLoop, SafetyShield, VectorSafetyShield
+from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.downlink import Schedule, starts_known
 from shields.runtime.guarantee import (
     EXPLANATIONS,
@@ -33,6 +34,7 @@ from tests.shields.lookahead.adversary import box_ellipsoid
 PLANT = truck_trailer(mass=4000.0)
 UPLINK = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
 KEPT = Channel(loss=0.4, delay=1, max_consecutive_losses=1)
+UNSTABLE = Case(cart_pole(), Channel(loss=0.3, delay=1, max_consecutive_losses=1), Channel(delay=2))
 
 
 def shielded(mode="project", start=0.3, kind=NCSEnv, **settings):
@@ -168,6 +170,67 @@ def test_first_steps_are_known_exactly_where_they_can_leave_the_safe_set():
             gauges = shield.certificate.safe_set.gauge(states)
             assert not each.in_safe_set or gauges.max() <= 1.0
             states = states @ PLANT.A.T + PLANT.disturbance.sample_boundary(rng, 200)
+
+
+def test_a_given_start_is_followed_under_zero_input():
+    plant, certificate, lead, rng = UNSTABLE.plant, UNSTABLE.certificate, 3, np.random.default_rng(0)
+    shield, safe, root = SafetyFilter(certificate, plant), certificate.safe_set, np.linalg.cholesky(certificate.M).T
+    powers = [np.linalg.matrix_power(plant.A, k) for k in range(lead + 1)]
+    spread = [np.linalg.norm(root @ power @ np.linalg.cholesky(plant.disturbance.shape), 2) for power in powers]
+    entered = left = 0
+    for _ in range(200):
+        start = safe.sample_boundary(rng) * rng.uniform(0.7, 1.3)
+        known = [each.in_safe_set for each in starts_known(shield, start, lead)]
+        for k, power in enumerate(powers):
+            level = safe.gauge(power @ start)
+            assert not known[k] or level + max(spread[:k], default=0.0) <= 1.0
+            assert known[k] or level + 1.2 * sum(spread[:k]) > 1.0
+        entered += known[-1] and not known[0]
+        left += known[0] and not known[-1]
+    assert entered > 5
+    assert left > 5
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_first_plan_is_stored_for_the_state_at_which_the_first_input_takes_effect(many):
+    certificate, rng, shape = UNSTABLE.certificate, np.random.default_rng(0), UNSTABLE.plant.A.shape
+    settings = {"channel": UNSTABLE.uplink, "contract": UNSTABLE.contract, "downlink": UNSTABLE.downlink}
+    if many:
+        shield = VectorSafetyShield(NCSVectorEnv(1, plant=UNSTABLE.plant, **settings), certificate, "lookahead")
+    else:
+        shield = SafetyShield(NCSEnv(UNSTABLE.plant, **settings), certificate, "lookahead")
+    stored = 0
+    for seed in range(40):  # starts in S, some of which leave it in the two steps before any input
+        start = certificate.safe_set.sample_boundary(rng) * rng.uniform(0.9, 1.0)
+        now, *_, then = starts_known(shield.filter, start, 2)
+        _, info = shield.reset(seed=seed, options={"state": start[None] if many else start})
+        errors = shield.filter.errors_of(np.reshape(info["error_shape"], shape))
+        seen = shield.filter.test.knows_inside(np.ravel(info["estimate"]), errors, 1e-9)
+        assert now.in_safe_set
+        if not then.in_safe_set and not seen:
+            assert np.all(info["shield_guaranteed"] == (info["shield_plan_length"] > 0))
+            stored += np.sum(info["shield_plan_length"] > 0)
+    assert stored > 3
+
+
+def test_final_info_says_that_the_last_step_of_an_episode_broke_the_contract():
+    settings = {"downlink": Channel(loss=0.4, delay=1), "downlink_contract": ChannelContract(3)}
+    start = Ellipsoid(0.09 * certificate_of(PLANT).L)
+    env = NCSVectorEnv(30, plant=PLANT, initial_set=start, max_episode_steps=6, autoreset_mode="SameStep", **settings)
+    shield = VectorSafetyShield(env, certificate_of(PLANT))
+    _, info = shield.reset(seed=0)
+    first_at_the_end = 0
+    for _ in range(60):
+        held = info["shield_guaranteed"]
+        *_, truncated, info = shield.step(np.full((30, 1), 0.3))
+        if truncated.any():
+            final, chosen = info["final_info"], truncated & held
+            broken = final["downlink_broken"][chosen]
+            np.testing.assert_array_equal(final["shield_guaranteed"][chosen], ~broken)
+            assert set(final["shield_reason"][chosen][broken]) <= {LATE_INPUT}
+            assert info["shield_guaranteed"][truncated].all()
+            first_at_the_end += np.count_nonzero(broken)
+    assert first_at_the_end > 0
 
 
 def test_a_start_outside_the_box_is_not_guaranteed_although_a_plan_is_certified_once_inputs_take_effect():

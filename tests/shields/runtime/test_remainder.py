@@ -64,6 +64,20 @@ def test_behind_a_downlink_every_state_from_the_first_on_must_be_proved_inside(m
     assert all(np.all(np.asarray(reason) == "") for reason in reasons(LOCAL, [0.3, 0.3], "project", many, **downlink))
 
 
+@pytest.mark.parametrize("many", [False, True])
+def test_a_first_state_that_may_be_outside_is_not_forgotten_when_inputs_take_effect_inside(many):
+    downlink = {"downlink": Channel(loss=0.3, delay=2, max_consecutive_losses=1)}
+    first = (lambda values: [str(value[0]) for value in values]) if many else list
+    for plant, after in ((EXACT, ""), (LOCAL, LEFT_MODEL)):
+        safe = certificate_of(plant).safe_set
+        start = 1.02 * np.array([1.0, 0.0]) / safe.gauge(np.array([1.0, 0.0]))  # decays into S in two steps
+        assert safe.gauge(plant.A @ plant.A @ start) < 0.9
+        seen = first(reasons(plant, start, many=many, **downlink))
+        assert seen[0] == (after or NOT_KNOWN_INSIDE)
+        assert set(seen[3:-1]) == {after}
+        assert seen[-1] == ""
+
+
 def test_certificate_says_what_it_assumes_of_the_remainder():
     assumed = certificate_of(LOCAL).provenance["assumptions"]
     assert any("is assumed to lie in its bound while the state is in the box: an example" in each for each in assumed)
