@@ -7,7 +7,8 @@ import pytest
 from ncs_gym import Channel, NCSEnv, cart_pole
 from ncs_gym.network.contract import contract_of
 from shields import SafeLoop, SafetyShield
-from shields.lookahead.plan_test import PlanTest
+from shields.lookahead import plan_test
+from shields.lookahead.tightening import tightenings
 from shields.runtime.guarantee import LARGE_ERROR, NOT_KNOWN_INSIDE, OTHER_INPUT
 from tests.certificates import certificate_of
 from tests.shields.lookahead.adversary import CASES, OUTSIDE, WeakestPoint, attack, box_ellipsoid, case, extremal_env
@@ -54,25 +55,22 @@ def test_no_failure_of_the_solver_leaves_the_box(how, monkeypatch):
         assert counts["guaranteed"] > 0
 
 
-def without_tightening(self, shapes):
+def without_tightening(prediction, shapes):
     """Box rows as if states were known and nothing disturbed them."""
-    known = ORIGINAL(self, shapes)
+    known = tightenings(prediction, shapes)
     return known._replace(room=np.ones_like(known.room))
 
 
-def without_a_step_of_disturbance(self, shapes):
+def without_a_step_of_disturbance(prediction, shapes):
     """The last step's disturbance is left out of every row."""
-    known, plant = ORIGINAL(self, shapes), self.prediction.plant
+    known, plant = tightenings(prediction, shapes), prediction.plant
     return known._replace(room=known.room + plant.disturbance.support(plant.C))
-
-
-ORIGINAL = PlanTest.tightenings_of
 
 
 @pytest.mark.parametrize("mutation", [without_tightening, without_a_step_of_disturbance])
 @pytest.mark.parametrize("name", ["cruise", "cart-pole", "batch reactor"])
 def test_plans_checked_with_less_are_caught_leaving_the_box(name, mutation, monkeypatch):
-    monkeypatch.setattr(PlanTest, "tightenings_of", mutation)
+    monkeypatch.setattr(plan_test, "tightenings", mutation)
     env = extremal_env(name, "overtaking" if name != "cruise" else "blackout")
     with pytest.raises(AssertionError, match=OUTSIDE):
         attack_for_long(env)
