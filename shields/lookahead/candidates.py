@@ -7,13 +7,14 @@ from scipy.linalg import LinAlgError, solve_discrete_are
 
 from ncs_gym import LinearPlant
 
-# Weight of inputs, in units of their limits, against states, in units of the box, in the regulator that brakes.
-INPUT_WEIGHT = 1e-2
+# Weight of inputs, in units of their limits, against states, in units of the box, in the regulator that brakes, and in
+# the one whose prediction knows no limits: it has to keep them by itself.
+INPUT_WEIGHT, UNLIMITED_INPUT_WEIGHT = 1e-2, 1.0
 
 
-def regulator(plant: LinearPlant) -> np.ndarray | None:
-    """Returns the gain, shape (m, n), of a regulator with little weight on its inputs; None if there is none."""
-    R = INPUT_WEIGHT * np.diag(plant.u_max**-2.0)
+def regulator(plant: LinearPlant, input_weight: float = INPUT_WEIGHT) -> np.ndarray | None:
+    """Returns the gain, shape (m, n), of a linear-quadratic regulator; None if there is none."""
+    R = input_weight * np.diag(plant.u_max**-2.0)
     try:
         P = solve_discrete_are(plant.A, plant.B, plant.weight, R)
         gain = -np.linalg.solve(R + plant.B.T @ P @ plant.B, plant.B.T @ P @ plant.A)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shields.lookahead.candidates import closed_loop, completed, expressible, regulator
+from shields.lookahead.candidates import UNLIMITED_INPUT_WEIGHT, closed_loop, completed, expressible, regulator
 from shields.lookahead.plan_test import PlanTest
 from shields.lookahead.prediction import Prediction
 from shields.lookahead.program import PlanProgram
@@ -58,9 +58,10 @@ class Planner:
     def __init__(self, first: OneStepTest, gain: np.ndarray, horizon: int, margin: float) -> None:
         self.test, self.horizon = PlanTest(Prediction(first, horizon), margin), horizon
         self._plant = first.plant
-        braking = regulator(first.plant)
+        braking, unlimited = regulator(first.plant), regulator(first.plant, UNLIMITED_INPUT_WEIGHT)
         self._gains = np.array([gain if braking is None else braking, gain])
-        self._loops = np.concatenate([closed_loop(first.plant, each, horizon) for each in self._gains], axis=1)
+        loops = [closed_loop(first.plant, gain if each is None else each, horizon) for each in (unlimited, gain)]
+        self._loops = np.concatenate(loops, axis=1)
         self._program = PlanProgram(self.test.prediction)
 
     def beginning_alone(self, estimate: np.ndarray, shape: np.ndarray, proposed: np.ndarray) -> np.ndarray | None:
@@ -82,7 +83,7 @@ class Planner:
     ) -> Plans:
         """Returns certified plans of E environments whose first inputs are the proposed ones; for arguments see `find`.
 
-        After the proposal comes the regulator or K in a prediction that knows no limits, what is stored for later and
+        After the proposal comes a regulator or K in a prediction that knows no limits, what is stored for later and
         then K, or the saturated regulator. The first candidate that is certified counts; the solver is not asked.
         """
         beginnings = np.full((len(estimates), 4, self.horizon, self._plant.m), np.nan)
@@ -94,7 +95,7 @@ class Planner:
 
     @np.errstate(all="ignore")  # what is not finite passes no test
     def _continued(self, estimates: np.ndarray, proposed: np.ndarray) -> np.ndarray:
-        """Returns proposals followed by either gain, (E, 2, N, m), limited after the prediction: one product for all.
+        """Returns proposals followed by either loop, (E, 2, N, m), limited after the prediction: one product for all.
 
         Of a single estimate, shape (n,), and proposal, (m,), without the first axis.
         """
