@@ -18,7 +18,7 @@ import pytest
 
 from ncs_gym import LinearPlant, truck_trailer
 from shields import Certificate
-from tests.certificates import certificate_of
+from tests.certificates import certificate_of, share_between_workers
 from tests.workers import no_worker_processes
 
 # Gymnasium's checker tries every render mode: no windows while tests run.
@@ -89,3 +89,8 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callab
         return folder
 
     return folder_of
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _certificates_of_all_workers(made_once: Callable[[str, Callable[[Path], None]], Path]) -> None:
+    share_between_workers(made_once)

@@ -154,6 +154,7 @@ def test_extremal_noise_raises_no_false_alarm(name, channel, steps):
     env.reset(seed=0)
     for action in np.random.default_rng(0).uniform(-1, 1, (steps, 1)):
         assert not env.step(action)[4]["assumption_violated"]
+    assert env.smallest_noise() > 0.999
 
 
 def test_long_shielded_run_through_the_registered_environment_has_no_violation():
