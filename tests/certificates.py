@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 from ncs_gym import ChannelContract, LinearPlant
 from shields import Certificate, synthesize
+from shields.verification import require_valid
 
 _certificates: dict[tuple[str, ChannelContract | None], Certificate] = {}
 _made_once: Callable[[str, Callable[[Path], None]], Path] | None = None
@@ -35,3 +37,9 @@ def _read_or_synthesized(plant: LinearPlant, contract: ChannelContract | None) -
         f"certificate-{name}", lambda folder: synthesize(plant, contract=contract).save(folder / "certificate.json")
     )
     return Certificate.load(folder / "certificate.json")
+
+
+@cache
+def require_valid_once(certificate: Certificate, plant: LinearPlant) -> None:
+    """Raises unless a certificate verifies for a plant; the same objects, which cannot change, are verified once."""
+    require_valid(certificate, plant)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 # One thread per process, as in `ncs`: tests run side by side, and on small matrices waiting threads only burn time.
 # Read when numpy is imported.
@@ -18,7 +19,7 @@ import pytest
 
 from ncs_gym import LinearPlant, truck_trailer
 from shields import Certificate
-from tests.certificates import certificate_of, share_between_workers
+from tests.certificates import certificate_of, require_valid_once, share_between_workers
 from tests.workers import no_worker_processes
 
 # Gymnasium's checker tries every render mode: no windows while tests run.
@@ -92,5 +93,8 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callab
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _certificates_of_all_workers(made_once: Callable[[str, Callable[[Path], None]], Path]) -> None:
+def _nothing_proved_twice(made_once: Callable[[str, Callable[[Path], None]], Path]) -> Iterator[None]:
+    """Certificates are synthesized once per run of the suite, and shields verify each once per process and plant."""
     share_between_workers(made_once)
+    with mock.patch("shields.runtime.safety_filter.require_valid", require_valid_once):
+        yield

@@ -48,10 +48,9 @@ def make(name, count, **settings):
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
-@pytest.mark.parametrize("mass", [1000.0, 4000.0])
-def test_equals_the_scalar_environment_for_every_channel(channel, mass):
+def test_equals_the_scalar_environment_for_every_channel(channel):
     task = SpeedTracking(change_probability=0.2)
-    compare(NCSVectorEnv(3, plant=truck_trailer(mass=mass), channel=CHANNELS[channel], task=task), 100)
+    compare(NCSVectorEnv(3, plant=truck_trailer(mass=4000.0), channel=CHANNELS[channel], task=task), 100)
 
 
 @pytest.mark.parametrize("name", IDS)
@@ -59,7 +58,7 @@ def test_registered_environments_equal_their_scalar_versions(name):
     compare(make(name, 3, max_episode_steps=None, terminate_on_violation=False).unwrapped, 100)
 
 
-@pytest.mark.parametrize("name", IDS)
+@pytest.mark.parametrize("name", ["TruckTrailerCruise", "BatchReactor"])
 def test_registered_environments_with_gaussian_noise_equal_their_scalar_versions(name):
     settings = {"max_episode_steps": None, "terminate_on_violation": False}
     compare(make(name, 3, noise="gaussian", **settings).unwrapped, 100)
@@ -217,14 +216,14 @@ def test_threads_share_a_graph(most, monkeypatch):
 )
 def test_graphs_of_long_buffers_and_large_plants_hold_fewer_patterns(plant, channel, monkeypatch):
     monkeypatch.setattr(arrival_patterns, "_shared", {})
-    monkeypatch.setattr(arrival_patterns, "MAX_NUMBERS", 1 << 20)
+    monkeypatch.setattr(arrival_patterns, "MAX_NUMBERS", 1 << 19)
     env = NCSEnv(plant, channel)
     env.reset(seed=0)
     sizes, graphs, action = [], set(), np.zeros(plant.m, np.float32)
     tracemalloc.start()
     try:
         before = tracemalloc.get_traced_memory()[0]
-        for _ in range(800):
+        for _ in range(400):
             env.step(action)
             sizes.append(tracemalloc.get_traced_memory()[0] - before)
             graphs.add(id(env.estimator._patterns))

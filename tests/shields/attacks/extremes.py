@@ -126,8 +126,10 @@ def shielded(inner: NCSEnv, certificate, mode) -> SafetyShield:
 
 
 def largest_gauge(shapes: np.ndarray, points: np.ndarray) -> float:
-    """The largest sqrt(z' P^-1 z) of points (T, n), each in its own ellipsoid, shapes (T, n, n); NaN if one is flat."""
-    solved = np.linalg.solve(shapes, points[..., None])[..., 0]
+    """The largest sqrt(z' P^-1 z) of points (T, n), each in its own ellipsoid, shapes (T, n, n)."""
+    extents = np.sqrt(np.diagonal(shapes, axis1=1, axis2=2))
+    points = points / extents
+    solved = np.linalg.solve(shapes / (extents[:, :, None] * extents[:, None, :]), points[..., None])[..., 0]
     return float(np.sqrt((points * solved).sum(axis=1)).max())
 
 

@@ -18,7 +18,7 @@ DOWNLINKS = {
     "kept": (Channel(loss=0.4, delay=1, max_consecutive_losses=1), None),
 }
 KEYS = "shield_guaranteed", "shield_reason", "shield_intervened", "episode_interventions", "downlink_broken"
-COUNT = 12
+COUNT = 6
 
 
 class Follower(ScriptedEnv):

@@ -91,26 +91,28 @@ def test_a_stable_plant_needs_no_regulator():
     assert gain.margin > 0.0
 
 
+PENDULUM = {"A": [[1.1, 0.1], [0.1, 1.0]], "B": [[0.0], [0.1]], "box": [0.3, 1.0], "u_max": 5.0, "dt": 0.1}
+SMALL = {"disturbance_bound": [1e-4, 1e-3], "sensor_bound": 1e-3, "initial_bound": (np.eye(2), [1e-3, 1e-3])}
+
+
 def test_largest_gamma_and_age_are_what_synthesis_accepts():
-    plant = cart_pole(full_state=False, gamma=1e-5)
+    bounds = {"gamma": 1e-2, "process_noise_cov": 1e-8 * np.eye(2), "sensor_bound": 1e-3, "initial_bound": 1e-3}
+    plant = LinearPlant(**PENDULUM | bounds)
     with pytest.raises(Infeasible, match=r"gamma = .* is the largest that works") as caught:
         synthesize(plant, contract=ChannelContract(4, 1e-4))
     gamma = caught.value.details["largest_gamma"]
-    assert 0.0 < gamma < 1e-5
+    assert 0.0 < gamma < 1e-2
     assert synthesize(replace(plant, gamma=0.98 * gamma), contract=ChannelContract(4, 1e-4)) is not None
     with feasible_bounds_not_sought(), pytest.raises(Infeasible):
         synthesize(replace(plant, gamma=1.05 * gamma), contract=ChannelContract(4, 1e-4))
+    plant = replace(plant, gamma=1e-7)
     with pytest.raises(Infeasible, match=r"max_age = .* is the largest that works") as caught:
-        synthesize(batch_reactor(), contract=ChannelContract(16, 1e-3))
+        synthesize(plant, contract=ChannelContract(40, 1e-3))
     age = caught.value.details["max_age"]
-    problem, _ = design_problem(batch_reactor(), ChannelContract(age, 1e-3))
+    problem, _ = design_problem(plant, ChannelContract(age, 1e-3))
     assert max_margin_gain(problem, problem.covering_error_shape).margin >= 1.0
-    problem, _ = design_problem(batch_reactor(), ChannelContract(age + 1, 1e-3))
+    problem, _ = design_problem(plant, ChannelContract(age + 1, 1e-3))
     assert max_margin_gain(problem, problem.covering_error_shape).margin < 1.0 + 1e-4
-
-
-PENDULUM = {"A": [[1.1, 0.1], [0.1, 1.0]], "B": [[0.0], [0.1]], "box": [0.3, 1.0], "u_max": 5.0, "dt": 0.1}
-SMALL = {"disturbance_bound": [1e-4, 1e-3], "sensor_bound": 1e-3, "initial_bound": (np.eye(2), [1e-3, 1e-3])}
 
 
 @pytest.mark.parametrize(
@@ -183,7 +185,9 @@ def test_cart_pole_tolerates_at_least_the_measured_radii(full_state, age, radius
         measurement_noise_cov=np.diag((0.01 * radius * plant.H @ half_widths) ** 2) / chi2_quantile(0.95, plant.p),
         initial_cov=(0.01 * radius * half_widths.min()) ** 2 / chi2_quantile(0.95, n) * np.eye(n),
     )
-    assert verified(synthesize(plant, contract=ChannelContract(age)), plant).valid
+    problem, _ = design_problem(plant, ChannelContract(age))
+    # Exact verification accepts 0.99 times the radii that a margin allows: shown above.
+    assert max_margin_gain(problem, problem.covering_error_shape).margin > 1.0 / 0.99
 
 
 @pytest.mark.parametrize("contract", [ChannelContract(1), ChannelContract(3, 1e-3)])
