@@ -1,14 +1,14 @@
 """Searches PPO's settings for each registered environment, behind its shield (mode project).
 
-    python benchmarks/tune_agents.py [--env ncs_gym/CartPole-v0 ...] [--candidates 6] [--finalists 2] [--out runs/tune]
+    python benchmarks/tune_agents.py [--env ncs_gym/CartPole-v0 ...] [--candidates 6] [--finalists 2] [--seeds 1]
     python benchmarks/tune_agents.py --write
 
-A random search in two rounds: every candidate is trained once with 150,000 steps, the best ones once more, on another
-seed, with the steps that belong to the environment; the settings with the highest return of this last training are
-chosen. The first candidate is the default settings, the second a guess by hand, the others are drawn from `SPACE`.
-Seeds are those of `ncs compare --seed 1000000`, so that neither the seeds of a study (`--seed 0`) nor those of the
-table (benchmarks/tuned_agents.py) were searched on. Every result is a line of OUT/results.jsonl: started again, the
-search continues where it stopped. `--write` also writes the chosen settings to agents/tuned/ppo.json.
+A random search in two rounds: every candidate is trained once with 150,000 steps, the best ones `--seeds` times more,
+on other seeds, with the steps that belong to the environment; the settings with the highest mean return of these last
+trainings are chosen. The first candidate is the default settings, the second a guess by hand, the others are drawn
+from `SPACE`. Seeds are those of `ncs compare --seed 1000000`, so that neither the seeds of a study (`--seed 0`) nor
+those of the table (benchmarks/tuned_agents.py) were searched on. Every result is a line of OUT/results.jsonl: started
+again, the search continues where it stopped. `--write` also writes the chosen settings to agents/tuned/ppo.json.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SEARCH_SEED = 1_000_000
 EPISODES = 200
 # Steps of the first round and of a training; where more steps were seen to help, four times as many.
 STEPS, MORE_STEPS = 150_000, 600_000
-LONGER = ("ncs_gym/CartPole-v0",)
+LONGER = ("ncs_gym/CartPole-v0", "ncs_gym/CartPoleTwoWay-v0", "ncs_gym/CartPoleNonlinear-v0")
 GUESS = PPOSettings(envs=128, rollout=32, discount=0.98, gae_lambda=0.95)
 SPACE: dict[str, tuple[Any, ...]] = {
     "envs": (128,),
@@ -110,7 +110,7 @@ class Results:
         return self._known[key]
 
 
-def search(env_id: str, results: Results, candidates: int, finalists: int) -> PPOSettings:
+def search(env_id: str, results: Results, candidates: int, finalists: int, seeds: int) -> PPOSettings:
     """Prints both rounds and returns the chosen settings."""
     loop, steps = shielded_loop(env_id), steps_of(env_id)
     chosen = [candidate(env_id, number) for number in range(candidates)]
@@ -118,9 +118,13 @@ def search(env_id: str, results: Results, candidates: int, finalists: int) -> PP
     order = sorted(range(candidates), key=lambda number: -first[number])
     shown = ", ".join(f"#{number} {first[number]:.2f}" for number in order)
     print(f"{env_id}, {STEPS} steps: {shown}", flush=True)
-    last = {number: results.of(loop, chosen[number], steps, 1) for number in order[:finalists]}
-    print(f"  {steps} steps: " + ", ".join(f"#{number} {each:.2f}" for number, each in last.items()), flush=True)
-    best = max(last, key=lambda number: last[number])
+    last = {
+        number: [results.of(loop, chosen[number], steps, run) for run in range(1, 1 + seeds)]
+        for number in order[:finalists]
+    }
+    shown = ", ".join(f"#{number} {np.mean(each):.2f} {np.round(each, 2)}" for number, each in last.items())
+    print(f"  {steps} steps: {shown}", flush=True)
+    best = max(last, key=lambda number: np.mean(last[number]))
     print(f"  chosen: #{best}, {changes(chosen[best])}", flush=True)
     return chosen[best]
 
@@ -135,11 +139,13 @@ def main() -> None:
     parser.add_argument("--env", nargs="+", default=registered_ids())
     parser.add_argument("--candidates", type=int, default=6)
     parser.add_argument("--finalists", type=int, default=2)
+    parser.add_argument("--seeds", type=int, default=1, help="trainings of each finalist in the last round")
     parser.add_argument("--out", type=Path, default=Path("runs/tune"))
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     results = Results(options.out / "results.jsonl")
-    found = {each: search(each, results, options.candidates, options.finalists) for each in options.env}
+    size = (options.candidates, options.finalists, options.seeds)
+    found = {each: search(each, results, *size) for each in options.env}
     if options.write:
         known = json.loads(TUNED.read_text()) if TUNED.exists() else {}
         known |= {env_id: {"steps": steps_of(env_id)} | asdict(settings) for env_id, settings in found.items()}

@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
 
 from agents.control_loop import ControlLoop, ShieldSettings
-from agents.evaluation import Policy, evaluate
+from agents.evaluation import evaluate
 from agents.results import Episode, TrainingPoint, Trajectory
 from agents.settings import AgentSettings, LagrangianSettings, OffPolicySettings
-from experiments.baselines import FILTERS, controller, filtered
+from experiments.baselines import FILTERS, filtered
 from experiments.runs.environments import import_module, module_digest
 from experiments.runs.evaluation_conditions import AS_TRAINED, under
+from experiments.runs.policies import agent_of, vector_policy
 from experiments.runs.provenance import json_digest, versions
 from ncs_gym import Channel
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate
-
-if TYPE_CHECKING:
-    from agents.training import TrainingResult
 
 PolicyKind = Literal["trained", "untrained", "zero input", "K x_hat", "random", "proportional", "lqr"]
 
@@ -60,6 +59,7 @@ class TrainingRun:
         algorithm: Name of the learning algorithm, a key of `agents.algorithms`.
         settings: Settings of the learning algorithm.
         grid_point: Name of the point of a sweep's grid; part of the run's name only.
+        agent_files: Files of an agent that was trained before: it is evaluated, and nothing is trained. Empty for none.
     """
 
     arm: str
@@ -86,6 +86,12 @@ class TrainingRun:
     algorithm: str
     settings: AgentSettings
     grid_point: str = ""
+    agent_files: dict[str, bytes] = field(default_factory=dict)
+
+    @property
+    def trains(self) -> bool:
+        """Whether an agent is trained in this run."""
+        return self.policy_kind == "trained" and not self.agent_files
 
     @property
     def name(self) -> str:
@@ -142,6 +148,7 @@ class TrainingRun:
             "channel": self.channel and asdict(self.channel),
             "downlink": self.downlink and asdict(self.downlink),
             "lagrangian": self.lagrangian and asdict(self.lagrangian),
+            "agent_files": {name: hashlib.sha256(file).hexdigest() for name, file in self.agent_files.items()},
         }
         return json_digest(content | {"settings": asdict(self.settings), "versions": versions()})
 
@@ -149,7 +156,7 @@ class TrainingRun:
     def total_steps(self) -> int:
         """Training steps, in whole rollouts, and evaluation steps."""
         evaluation = self.episodes * (gym.spec(self.env).max_episode_steps or 1) * (1 + len(self.conditions))
-        if self.policy_kind != "trained":
+        if not self.trains:
             return evaluation
         steps_per_env = 1 if isinstance(self.settings, OffPolicySettings) else self.settings.rollout
         rollout = self.settings.envs * steps_per_env
@@ -200,7 +207,7 @@ def execute_run(run: TrainingRun, on_progress: Callable[[int], None], log_folder
     if run.module:
         import_module(run.module)
     trained = None
-    if run.policy_kind == "trained":
+    if run.trains:
         from agents.training import train  # imports torch, which the process that only collects results does without
 
         if log_folder is not None:
@@ -214,9 +221,10 @@ def execute_run(run: TrainingRun, on_progress: Callable[[int], None], log_folder
             log_folder=log_folder,
             on_progress=on_progress,
         )
+    agent = trained.agent if trained else agent_of(run)
     evaluations = {}
     for condition in (AS_TRAINED, *run.conditions):
-        loop, policy = under(condition, run.loop), _policy(run, trained)  # a random policy begins anew each time
+        loop, policy = under(condition, run.loop), vector_policy(run, agent)  # a random policy begins anew each time
         evaluations[condition] = evaluate(
             loop, policy, run.episodes, run.evaluation_seed, run.certificate.M, on_progress
         )
@@ -233,15 +241,3 @@ def execute_run(run: TrainingRun, on_progress: Callable[[int], None], log_folder
         files=trained.agent.files() if trained else {},
         conditions={condition: each.episodes for condition, each in evaluations.items()},
     )
-
-
-def _policy(run: TrainingRun, trained: TrainingResult | None) -> Policy:
-    """Returns the policy to evaluate."""
-    if trained is not None:
-        return lambda observations, infos: trained.agent.act(observations)
-    if run.policy_kind == "untrained":
-        from agents.training import untrained
-
-        agent = untrained(run.loop, run.training_seed, run.algorithm, run.settings)
-        return lambda observations, infos: agent.act(observations)
-    return controller(run.policy_kind, ncs_env(run.loop.single()), run.certificate.K, run.evaluation_seed)

@@ -1,22 +1,28 @@
-"""How a linear controller behind a filter leaves set and box, with and without the error set, on other channels."""
+"""How policies behind filters leave set and box, with and without the error set, on other channels."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from experiments.analysis.statistics import clopper_pearson
 from experiments.backends.execution import results_of
-from experiments.runs import ExperimentSetup, RunResult, TrainingRun
+from experiments.errors import ResultsError
+from experiments.runs import Arm, ExperimentSetup, RunResult, RunStore, TrainingRun, by_arm
 from experiments.runs.environments import registered_env
 from experiments.runs.evaluation_conditions import AS_TRAINED
 from experiments.settings import ChannelSettings, CompareSettings
 
-# The filters, in pairs without and with the error set: those that keep S, then those that may leave it.
-SWEPT_ARMS = ("lqr+trusting", "lqr+shielded", "lqr+trusting:lookahead", "lqr+lookahead")
+# The filters, in pairs without and with the error set, by the count in the rows that tells whether they do what they
+# are for: the first keep S, the others may leave it and keep the box.
+FILTERS_BY_COUNT = {"outside_set": ("trusting", "shielded"), "violating": ("trusting:lookahead", "lookahead")}
+SWEPT_FILTERS = tuple(name for pair in FILTERS_BY_COUNT.values() for name in pair)
 SWEPT_CONDITIONS = (AS_TRAINED, "worst-case disturbance")
 _LOSSES, _DELAYS, _QUANTIZATION = (0.0, 0.15, 0.3, 0.5, 0.7, 0.9), (0, 1, 2, 3, 4), (0.0, 0.5, 1.0, 2.0, 4.0)
+
+# Files of the agents of an arm, in the order of their runs.
+AgentFiles = Sequence[dict[str, bytes]]
 
 
 @dataclass(frozen=True)
@@ -37,13 +43,39 @@ class _Point:
         return f"{self.side.replace('_', '-')}{self.value:g}"
 
 
-def channel_sweep(settings: CompareSettings) -> list[dict[str, Any]]:
-    """Returns, for each channel, arm and disturbance, how many episodes left the safe set and the box, JSON values.
-
-    Channels that break the environment's contract are left out: the certificate says nothing of them.
+def trained_agents(settings: CompareSettings) -> dict[str, AgentFiles]:
+    """Returns the agents that a finished comparison trained behind filters of the sweep, by the filter's name.
 
     Args:
-        settings: Environment, seed, episodes of the sweep, output folder and backend.
+        settings: Settings of the comparison; filters that are none of its arms are left out.
+
+    Raises:
+        ValueError: If the environment is unknown.
+        Infeasible: If no certificate is found.
+        ResultsError: If the agents are missing or damaged.
+    """
+    setup, store = ExperimentSetup.of(settings.env, settings.channel, settings.certificate), RunStore(settings.out)
+    arms = {Arm.of(name, settings.mode).name for name in settings.arms}
+    agents: dict[str, AgentFiles] = {}
+    for name in (each for each in SWEPT_FILTERS if each in arms):
+        runs = [setup.training_run(settings.completed, name, index) for index in range(settings.seeds)]
+        agents[name] = [_files(store, run) for run in runs]
+    return agents
+
+
+def channel_sweep(settings: CompareSettings, agents: Mapping[str, AgentFiles]) -> list[dict[str, Any]]:
+    """Returns, for each channel, policy, filter and disturbance, how many episodes left the safe set and the box.
+
+    A linear-quadratic regulator acts behind every filter, and behind each filter the agents that were trained behind
+    it on the environment's own channel; they share the episodes. Channels that break the environment's contract are
+    left out: the certificate says nothing of them.
+
+    Args:
+        settings: Environment, seed, episodes of each point, output folder and backend.
+        agents: Files of the agents by the name of their filter, an element of `SWEPT_FILTERS`.
+
+    Returns:
+        Rows of JSON values; the arm of the regulator is named like "lqr+shielded", that of agents like "shielded".
 
     Raises:
         ValueError: If the environment is unknown or a stored result is damaged.
@@ -52,13 +84,18 @@ def channel_sweep(settings: CompareSettings) -> list[dict[str, Any]]:
         ClusterError: If a cluster cannot execute the runs.
         OSError: If the folder cannot be written.
     """
-    settings = replace(settings, arms=SWEPT_ARMS, references=(), conditions=SWEPT_CONDITIONS[1:])
-    points = _points(settings.env)
-    runs = [run for point in points for run in _runs(point, settings)]
-    results = results_of(runs, settings.out, settings)
-    count = len(SWEPT_ARMS)
-    parts = [results[i * count : (i + 1) * count] for i in range(len(points))]
-    return [row for point, part in zip(points, parts, strict=True) for row in _rows(point, part)]
+    settings = replace(settings, conditions=SWEPT_CONDITIONS[1:])
+    runs_at = {point: _runs(point, settings, agents) for point in _points(settings.env)}
+    results = iter(results_of([run for runs in runs_at.values() for run in runs], settings.out, settings))
+    return [row for point, runs in runs_at.items() for row in _rows(point, [next(results) for _ in runs])]
+
+
+def _files(store: RunStore, run: TrainingRun) -> dict[str, bytes]:
+    """Returns the files of the agent that a run left."""
+    result = store.load(run)
+    if result is None:
+        raise ResultsError(f"there is no result of the training {run.name}: run the comparison again")
+    return result.files
 
 
 def _points(env_id: str) -> list[_Point]:
@@ -80,25 +117,34 @@ def _changed(point: _Point) -> ChannelSettings:
     return ChannelSettings(loss=point.value) if point.side == "loss" else ChannelSettings(quantization_step=point.value)
 
 
-def _runs(point: _Point, settings: CompareSettings) -> list[TrainingRun]:
+def _runs(point: _Point, settings: CompareSettings, agents: Mapping[str, AgentFiles]) -> list[TrainingRun]:
     """Returns the runs at a point; nothing is trained in them."""
     setup = ExperimentSetup.of(settings.env, _changed(point), settings.certificate)
-    return [setup.training_run(settings, name, 0, grid_point=point.name) for name in SWEPT_ARMS]
+    runs = [setup.training_run(settings, f"lqr+{name}", 0, grid_point=point.name) for name in SWEPT_FILTERS]
+    for name, each in agents.items():
+        part = replace(settings, episodes=-(-settings.episodes // len(each)))
+        for index, files in enumerate(each):
+            run = setup.training_run(part, name, index, grid_point=point.name)
+            runs.append(replace(run, agent_files=files))
+    return runs
 
 
 def _rows(point: _Point, results: Sequence[RunResult]) -> list[dict[str, Any]]:
     """Returns what happened at a point, a row per arm and disturbance."""
     rows = []
-    for result in results:
-        for condition, episodes in ({AS_TRAINED: result.episodes} | result.conditions).items():
+    for arm, runs in by_arm(results).items():
+        for condition in (AS_TRAINED, *runs[0].conditions):
+            parts = [({AS_TRAINED: run.episodes} | run.conditions)[condition] for run in runs]
+            episodes = [episode for part in parts for episode in part]
             outside = sum(episode.largest_level > 1.0 for episode in episodes)
             violating = sum(episode.violation_steps > 0 for episode in episodes)
             rows.append(
                 {
                     "side": point.side,
                     "value": point.value,
-                    "arm": result.arm,
+                    "arm": arm,
                     "condition": condition,
+                    "policies": len(runs),
                     "episodes": len(episodes),
                     "outside_set": outside,
                     "outside_set_ci95": list(clopper_pearson(outside, len(episodes))),

@@ -16,7 +16,7 @@ from experiments.runs import claim_folder, prepare_output, versions
 from experiments.runs.experiment_setup import INCIDENTAL_SETTINGS
 from experiments.settings import BackendSettings, CompareSettings, StudySettings, settings_json
 from experiments.settings.study import short_name
-from experiments.study.channel_sweep import channel_sweep
+from experiments.study.channel_sweep import channel_sweep, trained_agents
 from experiments.study.quoted_tables import quoted, require_marks, tables_by_name
 from experiments.study.study_figures import study_figures
 from experiments.study.study_report import results_page, study_report
@@ -52,7 +52,7 @@ def study(settings: StudySettings) -> None:
         comparisons[name] = json.loads((part.out / "summary.json").read_bytes())
         if settings.channel_episodes:
             sweep = replace(part, out=part.out / _CHANNELS, episodes=settings.channel_episodes)
-            channels[name] = channel_sweep(sweep)
+            channels[name] = channel_sweep(sweep, trained_agents(part))
         print(flush=True)
     content = settings_json("study", settings)["settings"]
     provenance = {

@@ -11,14 +11,14 @@ from matplotlib.ticker import MaxNLocator
 
 from experiments.plots.arm_style import ArmStyle
 from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below, thousands
+from experiments.study.channel_sweep import FILTERS_BY_COUNT
 
 # Axis labels of the sides of the sweep of channels.
 _SIDES = {"loss": "packet loss probability", "delay": "delay [steps]", "quantization_step": "quantization step"}
-# What the rows of its figure count, with the filters in each: without and with the error set.
-_ROWS = {
-    "outside_set": ("episodes that left S [%]", ("lqr+trusting", "lqr+shielded")),
-    "violating": ("episodes outside the box [%]", ("lqr+trusting:lookahead", "lqr+lookahead")),
-}
+# What the rows of its figures count.
+_COUNTS = {"outside_set": "episodes that left S [%]", "violating": "episodes outside the box [%]"}
+# What stands before the filter in the names of the arms of each figure.
+_REGULATOR, _AGENTS = "lqr+", ""
 
 
 def study_figures(summary: dict[str, Any]) -> dict[str, tuple[str, bytes]]:
@@ -27,28 +27,35 @@ def study_figures(summary: dict[str, Any]) -> dict[str, tuple[str, bytes]]:
     Args:
         summary: What `page_summary` returns, with the rows of the sweep under "channels" by environment.
     """
-    figures = {f"trusting-{name}": sweep_figure(name, rows) for name, rows in summary["channels"].items()}
+    figures = {}
+    for name, rows in summary["channels"].items():
+        of_agents = [row for row in rows if not row["arm"].startswith(_REGULATOR)]
+        figures[f"trusting-{name}"] = sweep_figure(name, [row for row in rows if row not in of_agents])
+        if of_agents:
+            figures[f"trusting-agents-{name}"] = sweep_figure(name, of_agents)
     figures |= {"return": return_figure(summary), "training": training_figure(summary)}
     return {name: (figure.caption, figure.png) for name, figure in figures.items()}
 
 
 def sweep_figure(name: str, rows: list[dict[str, Any]]) -> CaptionedFigure:
-    """Returns how often a linear-quadratic regulator leaves set and box behind filters, against the channel.
+    """Returns how often policies leave set and box behind filters, against the channel.
 
     Args:
         name: Name of the environment.
-        rows: What `channel_sweep` returns.
+        rows: Those rows of `channel_sweep` that are about the regulator, or those about trained agents.
     """
+    policy = _REGULATOR if rows[0]["arm"].startswith(_REGULATOR) else _AGENTS
     sides = list(dict.fromkeys(row["side"] for row in rows))
     with matplotlib.rc_context(STYLE):
         figure = CaptionedFigure((3.7 * len(sides), 6.2), _sweep_caption(name, rows))
-        grid = figure.subplots(len(_ROWS), len(sides), sharey=True, squeeze=False)
+        grid = figure.subplots(len(FILTERS_BY_COUNT), len(sides), sharey=True, squeeze=False)
         handles = {}
-        for axes, (measure, (title, arms)) in zip(grid, _ROWS.items(), strict=True):
+        for axes, (count, filters) in zip(grid, FILTERS_BY_COUNT.items(), strict=True):
+            arms = [arm for each in filters if (arm := policy + each) in {row["arm"] for row in rows}]
             for axis, side in zip(axes, sides, strict=True):
                 for arm in arms:
-                    _draw_sweep(axis, [r for r in rows if r["side"] == side and r["arm"] == arm], measure, arm)
-                label(axis, _SIDES[side], title if axis is axes[0] else "")
+                    _draw_sweep(axis, [r for r in rows if r["side"] == side and r["arm"] == arm], count, arm)
+                label(axis, _SIDES[side], _COUNTS[count] if axis is axes[0] else "")
                 axis.set_ylim(-4.0, 104.0)
                 axis.xaxis.set_major_locator(MaxNLocator(4))
             handles |= {arm: ArmStyle.of(arm).handle(line=False, points=True) for arm in arms}
@@ -116,17 +123,17 @@ def training_figure(summary: dict[str, Any]) -> CaptionedFigure:
         return figure
 
 
-def _draw_sweep(axis: Axes, rows: list[dict[str, Any]], measure: str, arm: str) -> None:
+def _draw_sweep(axis: Axes, rows: list[dict[str, Any]], count: str, arm: str) -> None:
     """Draws an arm's curve for each disturbance, with exact intervals as bars."""
     style = ArmStyle.of(arm)
     for condition in dict.fromkeys(row["condition"] for row in rows):
         shown = [row for row in rows if row["condition"] == condition]
         values = [row["value"] for row in shown]
-        rates = [100.0 * row[measure] / row["episodes"] for row in shown]
+        rates = [100.0 * row[count] / row["episodes"] for row in shown]
         worst = condition != rows[0]["condition"]
         axis.plot(values, rates, color=style.color, ls="--" if worst else "-", lw=1.4, **style.points)
         for value, row in zip(values, shown, strict=True):
-            axis.plot([value] * 2, [100.0 * end for end in row[f"{measure}_ci95"]], "-", color=style.color, lw=1.0)
+            axis.plot([value] * 2, [100.0 * end for end in row[f"{count}_ci95"]], "-", color=style.color, lw=1.0)
 
 
 def _draw_point(axis: Axes, style: ArmStyle, arm: dict[str, Any]) -> None:
@@ -139,11 +146,18 @@ def _draw_point(axis: Axes, style: ArmStyle, arm: dict[str, Any]) -> None:
 
 
 def _sweep_caption(name: str, rows: list[dict[str, Any]]) -> str:
-    episodes = rows[0]["episodes"]
+    episodes, policies = rows[0]["episodes"], rows[0].get("policies", 1)
+    if rows[0]["arm"].startswith(_REGULATOR):
+        title, policy, given = "", "What acts is a linear-quadratic regulator", ""
+    else:
+        title = ", with trained agents"
+        policy = "What acts behind each filter is what was trained behind it, on the environment's own channel"
+        given = f" of {policies} agents" if policies > 1 else " of one agent"
+    intervals = "exact 95 % intervals given the agents" if given else "exact 95 % intervals"
     return (
-        f"The same filters with and without the error set on {name}, by the channel. What acts is a linear-quadratic "
-        "regulator; above behind the one-step filter, which is to keep S, below behind lookahead, which is to keep the "
-        "box. 'Trusting' takes the estimate for the truth. Solid: the environment's own disturbance, dashed: the worst "
-        f"case. Every point is {episodes:,} episodes, bars are exact 95 % intervals; values that are not varied are "
-        "the environment's own, and channels that break its contract are left out."
+        f"The same filters with and without the error set on {name}, by the channel{title}. {policy}; above behind the "
+        "one-step filter, which is to keep S, below behind lookahead, which is to keep the box. 'Trusting' takes the "
+        "estimate for the truth. Solid: the environment's own disturbance, dashed: the worst case. Every point is "
+        f"{episodes:,} episodes{given}, bars are {intervals}; values that are not varied are the environment's own, "
+        "and channels that break its contract are left out."
     )

@@ -7,6 +7,7 @@ from typing import Any
 from experiments.report.html import render_page
 from experiments.study.quoted_tables import budget_text
 from experiments.study.study_tables import (
+    channels_table,
     evaluation_table,
     pairs_table,
     price_table,
@@ -47,6 +48,7 @@ def _context(summary: dict[str, Any]) -> dict[str, Any]:
         "evaluation": {name: evaluation_table(env) for name, env in environments.items()},
         "training": {name: training_table(env) for name, env in environments.items()},
         "pairs": {name: pairs_table(env) for name, env in environments.items()},
+        "channels": {name: channels_table(rows) for name, rows in summary["channels"].items()},
         "price": price_table(summary),
         "simpler": simpler_table(summary),
         "scores": scores_table(summary),

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from experiments.analysis.text_table import text_table
+from experiments.study.channel_sweep import FILTERS_BY_COUNT
 from experiments.study.study_summary import MEASURES, SOUND_ARMS
 
 # Narrow headers of the conditions.
@@ -16,6 +17,9 @@ _CONDITIONS = {
 }
 # Policies that are simpler than a trained agent behind the shield.
 _SIMPLER = ("zero input", "K x_hat", "random+", "proportional", "lqr", "shield at test")
+# Headers of the table about channels, by the key of a count and by the side of the sweep.
+_SWEPT_COUNTS = {"outside_set": "left S [%]", "violating": "left the box [%]"}
+_SWEPT_SIDES = {"loss": "loss", "delay": "delay", "quantization_step": "step"}
 # Largest adjusted p-value at which a difference counts.
 LEVEL = 0.05
 
@@ -109,6 +113,27 @@ def simpler_table(summary: dict[str, Any]) -> str:
     return "\n\n".join(parts)
 
 
+def channels_table(rows: Sequence[dict[str, Any]]) -> str:
+    """Returns what filters do not keep at both ends of every side of a sweep, by its own disturbance and by the worst.
+
+    Args:
+        rows: What `channel_sweep` returns.
+    """
+    sides: dict[str, list[float]] = {}
+    for row in rows:
+        sides.setdefault(row["side"], []).append(row["value"])
+    ends = [(side, value) for side, values in sides.items() for value in dict.fromkeys((min(values), max(values)))]
+    arms = list(dict.fromkeys(row["arm"] for row in rows))
+    parts = []
+    for count, filters in FILTERS_BY_COUNT.items():
+        table = [[_SWEPT_COUNTS[count], *(f"{_SWEPT_SIDES[side]} {value:g}" for side, value in ends)]]
+        for arm in (each for each in arms if each.rpartition("+")[2] in filters):
+            own = [row for row in rows if row["arm"] == arm]
+            table.append([arm, *(_swept_rates(own, end, count) for end in ends)])
+        parts.append(text_table(table))
+    return "\n\n".join(parts)
+
+
 def scores_table(summary: dict[str, Any]) -> str:
     """Returns the interquartile means of scores over all environments; empty where there are none."""
     if not summary["scores"]:
@@ -122,6 +147,12 @@ def scores_table(summary: dict[str, Any]) -> str:
 
 def _titled(title: str, table: str) -> str:
     return f"{title}\n{table}"
+
+
+def _swept_rates(rows: Sequence[dict[str, Any]], end: tuple[str, float], count: str) -> str:
+    """Returns the percentages of episodes at a point of a sweep, one per disturbance."""
+    at_end = [row for row in rows if (row["side"], row["value"]) == end]
+    return "/".join(f"{100 * row[count] / row['episodes']:.0f}" for row in at_end)
 
 
 def _oriented(pairs: Sequence[dict[str, Any]], name: str, own: str) -> dict[str, Any]:

@@ -1,4 +1,5 @@
 import json
+from unittest import mock
 
 import pyarrow.parquet as pq
 import pytest
@@ -8,6 +9,7 @@ from experiments.study.study import study
 from tests.workers import no_worker_processes
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
+ONE_CHANNEL = {"_LOSSES": (0.9,), "_DELAYS": (), "_QUANTIZATION": ()}
 MARKED = "# A page\n\n<!-- ncs study: lead -->\n<!-- end -->\n"
 
 
@@ -23,15 +25,15 @@ def finished(tmp_path_factory):
         seeds=2,
         budget=0.01,
         episodes=2,
-        channel_episodes=0,
+        channel_episodes=2,
         jobs=1,
         arms=("unshielded", "shielded"),
         references=("random+shielded", "lqr+trusting", "lqr+shielded"),
         conditions=("worst-case-disturbance",),
     )
-    with no_worker_processes():
+    with no_worker_processes(), mock.patch.multiple("experiments.study.channel_sweep", **ONE_CHANNEL):
         study(settings)
-    return settings
+        yield settings
 
 
 def test_study_leaves_its_files(finished):
@@ -56,7 +58,8 @@ def test_table_has_a_row_for_every_arm_condition_and_run(finished):
 
 def test_page_quotes_and_figures_are_written_where_they_were_asked_for(finished):
     page = finished.page.read_text()
-    for link in ("results-return.png", "results-training.png"):
+    of_channels = [f"results-trusting-{kind}TruckTrailerCruise-v0.png" for kind in ("", "agents-")]
+    for link in ("results-return.png", "results-training.png", *of_channels):
         assert f"images/{link}" in page
         assert (finished.page.parent / "images" / link).is_file()
     assert "lqr+shielded" in finished.quote[0].read_text()
@@ -66,7 +69,9 @@ def test_page_quotes_and_figures_are_written_where_they_were_asked_for(finished)
 def test_finished_runs_are_kept_and_give_the_same_summary(finished, capsys):
     before = (finished.out / "summary.json").read_bytes()
     study(finished)
-    assert "10 of 10 runs were finished before" in capsys.readouterr().err
+    messages = capsys.readouterr().err
+    assert "10 of 10 runs were finished before" in messages
+    assert "6 of 6 runs were finished before" in messages  # of the sweep: the regulator's and those of two agents
     assert (finished.out / "summary.json").read_bytes() == before
 
 
