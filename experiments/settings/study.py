@@ -14,9 +14,9 @@ class StudySettings(BackendSettings):
     """Compares arms in several environments and under several conditions, with the statistics to judge them by.
 
     Every environment is a comparison of its own (`ncs compare`) in a folder below the output folder, with the settings
-    of that command; then linear controllers meet worse and better channels, with and without the error set. Leaves
-    report.html, results.md, figures, summary.json and study.parquet. Started again with the same folder, finished runs
-    are kept: a long study can be run in parts.
+    of that command; then linear controllers and trained agents meet worse and better channels, behind filters with and
+    without the error set. Leaves report.html, results.md, figures, summary.json and study.parquet. Started again with
+    the same folder, finished runs are kept: a long study can be run in parts.
 
     Attributes:
         config: Settings file (settings.json) of an earlier study; its settings hold where none are given here.
@@ -53,6 +53,7 @@ class StudySettings(BackendSettings):
         "penalized:10",
         "lagrangian",
         "psf",
+        "psf at test",
         "trusting",
         "trusting:lookahead",
         "shield at test",

@@ -20,6 +20,8 @@ FILTERS_BY_COUNT = {"outside_set": ("trusting", "shielded"), "violating": ("trus
 SWEPT_FILTERS = tuple(name for pair in FILTERS_BY_COUNT.values() for name in pair)
 SWEPT_CONDITIONS = (AS_TRAINED, "worst-case disturbance")
 _LOSSES, _DELAYS, _QUANTIZATION = (0.0, 0.15, 0.3, 0.5, 0.7, 0.9), (0, 1, 2, 3, 4), (0.0, 0.5, 1.0, 2.0, 4.0)
+# Agents per filter: what their trainings differ by shows, and the sweep takes minutes.
+MOST_AGENTS = 5
 
 # Files of the agents of an arm, in the order of their runs.
 AgentFiles = Sequence[dict[str, bytes]]
@@ -46,6 +48,8 @@ class _Point:
 def trained_agents(settings: CompareSettings) -> dict[str, AgentFiles]:
     """Returns the agents that a finished comparison trained behind filters of the sweep, by the filter's name.
 
+    They are those of the first runs, at most `MOST_AGENTS`.
+
     Args:
         settings: Settings of the comparison; filters that are none of its arms are left out.
 
@@ -57,8 +61,9 @@ def trained_agents(settings: CompareSettings) -> dict[str, AgentFiles]:
     setup, store = ExperimentSetup.of(settings.env, settings.channel, settings.certificate), RunStore(settings.out)
     arms = {Arm.of(name, settings.mode).name for name in settings.arms}
     agents: dict[str, AgentFiles] = {}
+    count = min(settings.seeds, MOST_AGENTS)
     for name in (each for each in SWEPT_FILTERS if each in arms):
-        runs = [setup.training_run(settings.completed, name, index) for index in range(settings.seeds)]
+        runs = [setup.training_run(settings.completed, name, index) for index in range(count)]
         agents[name] = [_files(store, run) for run in runs]
     return agents
 

@@ -113,3 +113,22 @@ def test_every_arm_plays(run_of, name):
     assert (result.arm, len(result.episodes)) == (name, 2)
     assert result.train_steps == (0 if name.startswith("lqr") else 256)
     assert (result.episodes[0].guaranteed, result.episodes[1].guaranteed) == (2 * (name[:6] == "shield",))
+
+
+def test_predictive_filter_acts_on_trained_agents_in_training_or_at_test_alone():
+    from experiments.runs import execute_run
+
+    tiny = PPOOverrides(envs=2, rollout=64, batch_size=64, epochs=1, width=8)
+    settings, setup = (
+        CompareSettings(steps=512, episodes=2, ppo=tiny),
+        ExperimentSetup.of("ncs_gym/BatchReactor-v0", None),
+    )
+    unshielded, filtered, at_test = (
+        execute_run(setup.training_run(settings, name, 0), lambda steps: None)
+        for name in ("unshielded", "psf", "psf at test")
+    )
+    assert [each.train_interventions > 0 for each in (unshielded, filtered, at_test)] == [False, True, False]
+    assert at_test.history == unshielded.history != filtered.history
+    overridden = [sum(episode.interventions for episode in each.episodes) for each in (unshielded, filtered, at_test)]
+    assert [count > 0 for count in overridden] == [False, True, True]
+    assert not any(episode.guaranteed for each in (filtered, at_test) for episode in each.episodes)  # it proves nothing
