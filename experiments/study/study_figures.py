@@ -57,7 +57,7 @@ def sweep_figure(name: str, rows: list[dict[str, Any]]) -> CaptionedFigure:
                     _draw_sweep(axis, [r for r in rows if r["side"] == side and r["arm"] == arm], count, arm)
                 label(axis, _SIDES[side], _COUNTS[count] if axis is axes[0] else "")
                 axis.set_ylim(-4.0, 104.0)
-                axis.xaxis.set_major_locator(MaxNLocator(4))
+                axis.xaxis.set_major_locator(MaxNLocator(4, integer=side == "delay"))
             handles |= {arm: ArmStyle.of(arm).handle(line=False, points=True) for arm in arms}
         legend_below(figure, handles)
         return figure
