@@ -72,8 +72,8 @@ def channel_sweep(settings: CompareSettings, agents: Mapping[str, AgentFiles]) -
     """Returns, for each channel, policy, filter and disturbance, how many episodes left the safe set and the box.
 
     A linear-quadratic regulator acts behind every filter, and behind each filter the agents that were trained behind
-    it on the environment's own channel; they share the episodes. Channels that break the environment's contract are
-    left out: the certificate says nothing of them.
+    it on the environment's own channel. They share the episodes; there are no more of them than episodes. Channels
+    that break the environment's contract are left out: the certificate says nothing of them.
 
     Args:
         settings: Environment, seed, episodes of each point, output folder and backend.
@@ -127,8 +127,9 @@ def _runs(point: _Point, settings: CompareSettings, agents: Mapping[str, AgentFi
     setup = ExperimentSetup.of(settings.env, _changed(point), settings.certificate)
     runs = [setup.training_run(settings, f"lqr+{name}", 0, grid_point=point.name) for name in SWEPT_FILTERS]
     for name, each in agents.items():
-        part = replace(settings, episodes=-(-settings.episodes // len(each)))
-        for index, files in enumerate(each):
+        chosen = each[: settings.episodes]
+        part = replace(settings, episodes=-(-settings.episodes // len(chosen)))
+        for index, files in enumerate(chosen):
             run = setup.training_run(part, name, index, grid_point=point.name)
             runs.append(replace(run, agent_files=files))
     return runs

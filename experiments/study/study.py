@@ -24,7 +24,7 @@ from experiments.study.study_summary import page_summary, study_summary
 from shields.atomic_write import write_atomically
 
 # Budget of `--smoke`: enough to pass through every part.
-_SMOKE = {"seeds": 2, "budget": 0.01, "episodes": 4, "channel_episodes": 4}
+_SMOKE = {"seeds": 2, "budget": 0.01, "episodes": 4, "channel_episodes": 1}
 # Folder of the sweep of channels below that of its environment, and settings that say nothing of results.
 _CHANNELS, _INCIDENTAL = "channels", (*INCIDENTAL_SETTINGS, "page", "quote", "smoke")
 
