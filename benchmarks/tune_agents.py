@@ -34,6 +34,18 @@ EPISODES = 200
 # Steps of the first round and of a training; where more steps were seen to help, four times as many.
 STEPS, MORE_STEPS = 150_000, 600_000
 LONGER = ("ncs_gym/CartPole-v0", "ncs_gym/CartPoleTwoWay-v0", "ncs_gym/CartPoleNonlinear-v0")
+# Random stream of each environment's candidates, so that they stay the same when further environments are registered.
+STREAMS = {
+    "ncs_gym/TruckTrailer-v0": 0,
+    "ncs_gym/TruckTrailerCruise-v0": 1,
+    "ncs_gym/TruckTrailerCruiseTwoWay-v0": 2,
+    "ncs_gym/CartPole-v0": 3,
+    "ncs_gym/CartPoleTwoWay-v0": 4,
+    "ncs_gym/BatchReactor-v0": 5,
+    "ncs_gym/Pendulum-v0": 6,
+    "ncs_gym/CartPoleNonlinear-v0": 7,
+    "ncs_gym/InvertedPendulum-v0": 7,
+}
 GUESS = PPOSettings(envs=128, rollout=32, discount=0.98, gae_lambda=0.95)
 SPACE: dict[str, tuple[Any, ...]] = {
     "envs": (128,),
@@ -83,7 +95,7 @@ def candidate(env_id: str, number: int) -> PPOSettings:
     """The settings of a number: the defaults, the guess, then random ones."""
     if number < 2:
         return (PPOSettings(), GUESS)[number]
-    rng = np.random.default_rng([SEARCH_SEED, registered_ids().index(env_id), number])
+    rng = np.random.default_rng([SEARCH_SEED, STREAMS[env_id], number])
     return PPOSettings(**{name: values[rng.integers(len(values))] for name, values in SPACE.items()})
 
 
