@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import warnings
-
-import cvxpy as cp
 import numpy as np
 
 from ncs_gym import LinearPlant
 from shields import Certificate
+from shields.lookahead.prediction import Prediction
+from shields.lookahead.program import PlanProgram
+from shields.runtime.one_step_test import OneStepTest
 from shields.verification import require_valid
 
 # Steps that are looked ahead.
 HORIZON = 20
+# A solution may miss the limits of box and safe set by this much, as solvers do.
+TOLERANCE = 1e-6
 
 
 class PredictiveFilter:
@@ -42,9 +44,9 @@ class PredictiveFilter:
         self._plant, self._K, self._horizon = plant, certificate.K, horizon
         self._root = np.linalg.cholesky(certificate.M).T
         self._plans = np.empty((0, horizon - 1, plant.m))
-        self._estimate, self._proposed = cp.Parameter(plant.n), cp.Parameter(plant.m)
-        self._inputs = cp.Variable((horizon, plant.m))
-        self._program = self._built()
+        self._prediction = Prediction(OneStepTest(certificate.L, plant), horizon)
+        self._program = PlanProgram(self._prediction)
+        self._room = np.ones((horizon - 1, len(plant.C)))
 
     def __call__(self, estimates: np.ndarray, proposed: np.ndarray, begun: np.ndarray) -> np.ndarray:
         """Returns the inputs to apply, shape (N, m).
@@ -85,27 +87,13 @@ class PredictiveFilter:
         missed = np.abs(plant.C @ plant.A @ estimate) - np.abs(plant.C @ plant.B) @ plant.u_max
         if not missed.max() <= 1.0:  # no input brings the next state into the box
             return None
-        self._estimate.value, self._proposed.value = estimate, proposed
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # an inaccurate solution is told by the status
-                self._program.solve(solver=cp.CLARABEL)
-        except cp.SolverError:
+        plan = self._program.solve(estimate, self._room, self._root, 1.0, proposed)
+        if plan is None:
             return None
-        inputs = self._inputs.value
-        if self._program.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) or inputs is None:
-            return None
-        return np.clip(inputs, -self._plant.u_max, self._plant.u_max)
-
-    def _built(self) -> cp.Problem:
-        """Returns the program, whose parameters are estimate and proposed input."""
-        plant, state = self._plant, self._estimate
-        constraints: list[cp.Constraint] = [cp.abs(self._inputs) <= plant.u_max[None]]
-        for i in range(self._horizon):
-            state = plant.A @ state + plant.B @ self._inputs[i]
-            inside = cp.norm(self._root @ state) <= 1.0 if i == self._horizon - 1 else cp.abs(plant.C @ state) <= 1.0
-            constraints.append(inside)
-        return cp.Problem(cp.Minimize(cp.sum_squares(self._inputs[0] - self._proposed)), constraints)
+        plan = np.clip(plan, -plant.u_max, plant.u_max)
+        centers = self._prediction.centers_alone(estimate, plan[None])[..., 0]
+        missed = max(np.abs(centers[:-1] @ plant.C.T).max(), np.linalg.norm(self._root @ centers[-1]))
+        return plan if missed <= 1.0 + TOLERANCE else None
 
     def _gained(self, states: np.ndarray) -> np.ndarray:
         """Returns u = K x within the limits, shape (m,) or (N, m)."""
