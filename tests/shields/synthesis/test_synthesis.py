@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import ChannelContract, LinearPlant, truck_trailer
+from ncs_gym import ChannelContract, LinearPlant, certified_error_set, truck_trailer
 from shields import Infeasible, SafetyShield, synthesize
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from tests.plants import random_plant
@@ -48,7 +48,7 @@ def test_random_stable_plants_get_a_certificate_that_verifies(seed, n, m):
 def test_flat_disturbances_get_a_certificate_whatever_their_direction(rank):
     # A torque moves the state along a line or a plane: such a D is singular, and oblique to the axes of the state.
     rng = np.random.default_rng(rank)
-    for _ in range(5):
+    for _ in range(3):
         declared = random_plant(rank, 3, 1)
         torque = (0.02 * rng.standard_normal((3, rank)), 1.0)
         plant = replace(declared, gamma=0.0, process_noise_cov=None, disturbance_bound=torque)
@@ -60,14 +60,15 @@ CART = {"dt": 0.1, "box": [1.0, 2.0], "u_max": 2.0, "initial_bound": [0.005, 0.0
 CART |= {"disturbance_bound": [0.001, 0.005], "sensor_bound": 0.002}
 
 
-@pytest.mark.parametrize("delay", [1, 2, 3])
-def test_inputs_under_way_are_known_exactly_under_every_contract(delay):
+def test_inputs_under_way_are_known_exactly_under_every_contract():
     # Their errors are zero: error sets are flat in their directions, which float64 has to bear.
     system = ([[0.0, 1.0], [0.0, -0.5]], [[0.0], [1.0]], [[1.0, 0.0]], [[0.0]])
-    plant = LinearPlant.from_statespace(system, **CART, input_delay=delay)
-    for age in (0, 1, 3):
-        certificate = synthesize(plant, contract=ChannelContract(age))
-        assert verified(certificate, plant).valid
+    for delay in (1, 2, 3):
+        plant = LinearPlant.from_statespace(system, **CART, input_delay=delay)
+        for age in (0, 1, 3, 5):
+            certified_error_set(plant, ChannelContract(age))
+    plant = LinearPlant.from_statespace(system, **CART, input_delay=1)
+    assert verified(synthesize(plant, contract=ChannelContract(1)), plant).valid
 
 
 def test_state_that_no_output_shows_is_named():
