@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -15,26 +13,6 @@ if TYPE_CHECKING:
 
 # The constant of x+ = A x + B u + c may differ by this from what an equilibrium needs, relative to its terms.
 EQUILIBRIUM_PRECISION = 1e-12
-
-Kind = TypeVar("Kind")
-
-
-def refuses_output_matrix(kind: Kind) -> Kind:
-    """Makes a constructor explain what to give in the place of C=, which means two things to two people."""
-    constructor: Any = kind
-    construct: Callable[..., None] = constructor.__init__
-
-    @functools.wraps(construct)
-    def __init__(self: Any, **settings: Any) -> None:
-        if "C" in settings:
-            raise ValueError(
-                "C= is not an argument: pass box=... for the limits |c_j x| <= 1 (rows, or half-widths of the states), "
-                "H=... for the output matrix of a state-space model"
-            )
-        construct(self, **settings)
-
-    constructor.__init__ = __init__
-    return kind
 
 
 class OperatingPoint:
@@ -54,10 +32,10 @@ class OperatingPoint:
         *,
         A: ArrayLike,
         B: ArrayLike,
-        operating_state: ArrayLike,
-        operating_input: ArrayLike,
         state_limits: tuple[ArrayLike, ArrayLike],
         input_limits: tuple[ArrayLike, ArrayLike],
+        operating_state: ArrayLike | None = None,
+        operating_input: ArrayLike | None = None,
         **settings: Any,
     ) -> Self:
         """Returns the plant in deviations from an equilibrium, with the largest symmetric limits inside those given.
@@ -65,10 +43,10 @@ class OperatingPoint:
         Args:
             A: State matrix of x+ = A x + B u + c, shape (n, n).
             B: Input matrix, shape (n, m).
-            operating_state: x0 with A x0 + B u0 + c = x0, shape (n,).
-            operating_input: u0, shape (m,).
             state_limits: Pair (low, high) around x0, each a number or shape (n,); infinite where there is no limit.
             input_limits: Pair (low, high) around u0, each a number or shape (m,).
+            operating_state: x0 with A x0 + B u0 + c = x0, shape (n,); zero by default.
+            operating_input: u0, shape (m,); zero by default.
             settings: Other arguments of `LinearPlant`, in deviations; and `offset`, c, zero by default. Of a model that
                 is linearized at (x0, u0), c is x0 - A x0 - B u0.
 
@@ -116,6 +94,8 @@ def as_box_rows(value: Any, n: int) -> np.ndarray:
     numbers = as_setting(value)
     if numbers is None or numbers.ndim > 2:
         raise ValueError(f"box must be half-widths of shape ({n},) or rows of shape (any, {n}), got {shown(value)}")
+    if _reads_as_pairs(value, numbers, n):
+        raise ValueError(_two_sides(value))
     if numbers.ndim == 2:
         rows = as_matrix(numbers, (None, n), "box")
     else:
@@ -128,14 +108,31 @@ def as_box_rows(value: Any, n: int) -> np.ndarray:
             )
         rows = np.diag(1.0 / np.broadcast_to(numbers, (n,)))[np.broadcast_to(limited, (n,))]
     if isinstance(value, (tuple, list)) and _reads_as_two_sides(rows):  # computed rows, an array, may be anything
-        raise ValueError(
-            "box looks like lower and upper limits, but must be half-widths, or rows c_j with |c_j x| <= 1: limits "
-            "that are not symmetric are given by LinearPlant.around(state_limits=(low, high), ...); if these are rows, "
-            f"change the sign of one, which leaves its limit as it is, got {shown(value)}"
-        )
+        raise ValueError(_two_sides(value))
     if (np.abs(rows).max(axis=1) < SMALLEST_NUMBER).any():
         raise ValueError(f"every row of box must limit something, got {shown(rows.tolist())}")
     return rows
+
+
+def _two_sides(value: Any) -> str:
+    """Returns what is wrong with a box given as lower and upper limits."""
+    return (
+        "box looks like lower and upper limits, but must be half-widths, or rows c_j with |c_j x| <= 1: limits that "
+        "are not symmetric are given by LinearPlant.around(state_limits=(low, high), ...); if these are rows, give "
+        f"them as an array, got {shown(value)}"
+    )
+
+
+def _reads_as_pairs(value: Any, numbers: np.ndarray, n: int) -> bool:
+    """Returns whether a box reads as a pair (low, high) per state: always but of two states, there as tuples.
+
+    Args:
+        value: The box as it was given.
+        numbers: The same as an array.
+        n: Number of states.
+    """
+    are_tuples = isinstance(value, (tuple, list)) and all(isinstance(each, tuple) for each in value)
+    return numbers.shape == (n, 2) and (n != 2 or are_tuples)
 
 
 def _reads_as_two_sides(rows: np.ndarray) -> bool:
@@ -254,8 +251,8 @@ def _arguments_around(
     A = as_matrix(A, (None, None), "A")
     A = as_matrix(A, (len(A), len(A)), "A")
     B = as_matrix(B, (len(A), None), "B")
-    state = _as_point(point[0], len(A), "operating_state")
-    applied = _as_point(point[1], B.shape[1], "operating_input")
+    state = as_operating_point(point[0], len(A), "operating_state")
+    applied = as_operating_point(point[1], B.shape[1], "operating_input")
     rest = {name: value for name, value in settings.items() if name != "offset"}
     offset = settings.get("offset")
     offset = np.zeros(len(A)) if offset is None else as_vector(offset, len(A), "offset")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from ncs_gym.plants import description, limits, statespace
+from ncs_gym.plants.arguments import explains_arguments
 from ncs_gym.plants.bounds import FLAT_INFLATION, INFLATION, SIMULATED_REACH, SMALLEST_DELTA, HardBounds
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.remainder import Remainder
@@ -35,7 +36,7 @@ __all__ = ["FLAT_INFLATION", "INFLATION", "SIMULATED_REACH", "SMALLEST_DELTA", "
 FARTHEST = 1e30
 
 
-@limits.refuses_output_matrix
+@explains_arguments
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinearPlant(HardBounds, limits.OperatingPoint):
     """x+ = A x + B u + d, y = H x + v, with limits and bounds (theory.md section 1).
@@ -170,7 +171,10 @@ class LinearPlant(HardBounds, limits.OperatingPoint):
             ValueError: If D is not zero, dt is missing or another than the model's, or an argument is wrong.
         """
         arguments = statespace.sampled_arguments(sys, dt, settings)
-        plant = cls.around(**arguments) if {"state_limits", "input_limits"} & set(settings) else cls(**arguments)
+        given = {"state_limits", "input_limits"} & set(settings)
+        if len(given) == 1:
+            raise ValueError(f"{given.pop()} is given alone: give state_limits and input_limits, or box and u_max")
+        plant = cls.around(**arguments) if given else cls(**arguments)
         return plant if input_delay == 0 else cls(**statespace.delayed_arguments(plant, input_delay))
 
     @classmethod

@@ -116,7 +116,7 @@ def _steps_of(
     try:
         if not body.is_written:
             raise ValueError("a linear model needs steps from chosen states: give GymProcess write_state")
-        origin = body.step(body.write(np.zeros(n)), np.zeros(m))
+        origin = _first_step(body, n, m)
         drawn = _sampled(body, frame, count, rng)
         fresh = _sampled(body, frame, max(int(HELD_OUT * count), 100), rng)
         again = _moved(body, drawn.states[:, :REPEATED], drawn.inputs[:, :REPEATED], rng)
@@ -124,6 +124,21 @@ def _steps_of(
         return drawn, fresh, origin, spread
     finally:
         body.close()
+
+
+def _first_step(body: Body, n: int, m: int) -> np.ndarray:
+    """Returns f(0, 0), shape (n,).
+
+    Raises:
+        ValueError: If the process takes no state of n entries with m inputs.
+    """
+    try:
+        return body.step(body.write(np.zeros(n)), np.zeros(m))
+    except (IndexError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"the process cannot move a state of {n} {'entry' if n == 1 else 'entries'} (as box has) with {m} "
+            f"input{'s' * (m != 1)} (as u_max has): {error}"
+        ) from error
 
 
 def _sampled(body: Body, frame: LinearPlant, count: int, rng: np.random.Generator) -> _Steps:

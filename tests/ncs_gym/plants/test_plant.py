@@ -96,6 +96,9 @@ def test_fingerprint_changes_with_every_number():
     assert truck_trailer().fingerprint == base.fingerprint
 
 
+QUIET = {"disturbance_bound": 0.01, "sensor_bound": 0.01, "initial_bound": 0.01}
+
+
 def good() -> dict:
     return {"A": np.eye(2) * 0.5, "B": np.ones((2, 1)), "box": np.eye(2), "u_max": 1.0, "dt": 0.1, "gamma": 0.0}
 
@@ -118,6 +121,11 @@ def good() -> dict:
         ({"box": "wide"}, r"box must be half-widths of shape \(2,\) or rows of shape \(any, 2\)"),
         ({"box": ([-1.0, -2.0], [1.0, 2.0])}, r"box looks like lower and upper limits.*LinearPlant.around"),
         ({"box": [(-1.0, 2.0), (-2.0, 3.0)]}, "box looks like lower and upper limits"),
+        ({"box": [(0.5, 1.0), (-2.0, 2.0)]}, "box looks like lower and upper limits"),
+        ({"box": [(0, 1), (-2, 2)]}, "box looks like lower and upper limits"),
+        ({"box": ((0, 3), (0, np.inf))}, r"box looks like lower and upper limits.*give them as an array"),
+        ({"A": [[0.5]], "B": [[1.0]], "box": [(0.5, 1.0)]}, "box looks like lower and upper limits"),
+        ({"A": np.eye(3) / 2, "B": np.ones((3, 1)), "box": [[-1, 1]] * 3}, r"box looks like.*\(state_limits="),
         ({"H": np.ones((1, 3))}, "H must have shape"),
         ({"u_max": -1.0}, "u_max must be a positive number"),
         ({"u_max": [1.0, 2.0]}, "u_max must be a positive number"),
@@ -141,6 +149,25 @@ def test_bad_numbers_are_refused_in_one_sentence(change, words):
     with pytest.raises(ValueError, match=words) as caught:
         LinearPlant(**(good() | change))
     assert "\n" not in str(caught.value)
+
+
+def test_rows_of_two_states_are_taken_from_lists_and_arrays():
+    rows = [[0.5, 1.0], [-2.0, 2.0]]
+    for box in (rows, np.array([(0.5, 1.0), (-2.0, 2.0)])):
+        np.testing.assert_array_equal(LinearPlant(**(good() | QUIET | {"box": box})).C, rows)
+    three = [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0)]  # more rows than states
+    np.testing.assert_array_equal(LinearPlant(**(good() | QUIET | {"box": three})).C, three)
+
+
+def test_arguments_that_a_plant_does_not_have_or_lacks_are_named():
+    with pytest.raises(
+        TypeError, match=r"^sensor_bonud= is not an argument of LinearPlant: did you mean sensor_bound=$"
+    ):
+        LinearPlant(**good(), sensor_bonud=0.1)
+    with pytest.raises(TypeError, match=r"^wheels= is not an argument of LinearPlant$"):
+        truck_trailer(wheels=18)
+    with pytest.raises(TypeError, match=r"^LinearPlant needs box= and u_max=$"):
+        LinearPlant(**{name: value for name, value in good().items() if name not in ("box", "u_max")})
 
 
 @pytest.mark.parametrize("change", [{"mass": 0.0}, {"stiffness": -1.0}, {"damping": -1.0}, {"dt": np.nan}, {"H": 3}])

@@ -24,8 +24,8 @@ def swing(state, u):
 
 
 def model(process=swing, **changes):
-    settings = {"samples": 2_000} | QUIET | changes
-    return linear_model(process, BOX, TORQUE, STEP, **settings)
+    settings = {"box": BOX, "samples": 2_000} | QUIET | changes
+    return linear_model(process, u_max=TORQUE, dt=STEP, **settings)
 
 
 def points(count, seed=7):
@@ -114,6 +114,11 @@ def test_ellipsoid_around_points_holds_them_and_is_nearly_the_smallest():
     assert np.linalg.det(shape) < 1.05 * np.linalg.det(root @ root.T)
 
 
+def two_states(state, u):
+    angle, rate = state
+    return np.array([angle + 0.1 * rate, rate + 0.1 * u[0]])
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -139,6 +144,10 @@ def test_ellipsoid_around_points_holds_them_and_is_nearly_the_smallest():
             "Box of actions, got Discre",
         ),
         ({"process": 3}, "must be a function"),
+        (
+            {"process": two_states, "box": [1.0, 1.0, 1.0]},
+            r"a state of 3 entries \(as box has\) with 1 input \(as u_max",
+        ),
         ({"process": LinearProcess()}, "the linear process is its own model"),
         ({"samples": 5}, "samples must be"),
         ({"safety_factor": 0.9}, "safety_factor must be"),
