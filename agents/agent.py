@@ -211,7 +211,10 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
     """Returns the agent of an `agent.json` and a `model.zip` whose checksums are right."""
     env_id, algorithm = content["env"], content["algorithm"]
     if env_id not in gym.registry:
-        raise AgentError(f"the agent was trained in {env_id}, which is not registered here")
+        raise AgentError(
+            f"the agent was trained in {env_id}, which is not registered here: import the module that registers it, or "
+            f"on the command line give --env module:{env_id}, with the name of that module"
+        )
     if content["plant"] != _plant_fingerprint(env_id):
         raise AgentError(f"the agent was trained on another plant than that of {env_id}: their fingerprints differ")
     if algorithm not in ALGORITHMS:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import PurePath
 from typing import Any, Self
 
 import numpy as np
@@ -63,9 +64,9 @@ def as_numbers(value: Any) -> np.ndarray | None:
 
 
 def shown(value: Any) -> str:
-    """Returns a value as messages quote it: on one line, and not without end."""
+    """Returns a value as messages quote it: on one line, and not without end; a path as it is."""
     try:
-        text = " ".join(repr(value).split())
+        text = " ".join((str(value) if isinstance(value, PurePath) else repr(value)).split())
     except Exception:
         text = f"a {type(value).__name__}"
     return text if len(text) <= MAX_QUOTED_LENGTH else f"{text[:MAX_QUOTED_LENGTH]}..."

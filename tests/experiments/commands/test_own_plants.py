@@ -77,6 +77,10 @@ def test_own_plant_is_trained_in_and_evaluated_by_its_id(folder, without_workers
     assert evaluated.returncode == 0, evaluated.stderr
     other = ncs("evaluate", model, "--env", "ncs_gym/TruckTrailer-v0", cwd=folder)
     assert_one_sentence(other, "was trained in Plants/Truck-v0, not in ncs_gym/TruckTrailer-v0")
+    gym.registry.pop("Plants/Truck-v0")
+    del sys.modules["own_plants"]
+    unknown = ncs("evaluate", model, cwd=folder)  # in a process that does not know the module
+    assert_one_sentence(unknown, "on the command line give --env module:Plants/Truck-v0, with the name of that module")
 
 
 def test_own_plant_is_drawn(folder):
@@ -137,7 +141,10 @@ def test_plant_of_a_file_is_no_environment(command, tmp_path, certificate):
     both = ncs(*command, "--plant", "p.json", "--env", "ncs_gym/TruckTrailer-v0", cwd=tmp_path)
     assert both.returncode == 2
     assert "not both" in both.stderr
-    assert_one_sentence(ncs(*command, "--plant", "nowhere.json", cwd=tmp_path), "nowhere.json")
+    missing = ncs(*command, "--plant", "nowhere.json", cwd=tmp_path)
+    assert_one_sentence(missing, "cannot read the plant in nowhere.json: No such file or directory")
+    wrong = ncs(*command, "--plant", "certificate.json", cwd=tmp_path)
+    assert_one_sentence(wrong, "ncs: certificate.json is not a plant of format")
 
 
 def read_until(terminal, words, seconds=120.0):
