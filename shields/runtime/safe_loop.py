@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from enum import Enum, auto
-from operator import index
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from ncs_gym import Channel, ChannelContract, Ellipsoid, Estimator, LinearPlant, Packet
 from ncs_gym.downlink import Command, CommittedInputs, downlink_protocol
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
+from ncs_gym.network.packet_reception import DiscardedPackets, as_packet
 from ncs_gym.validation import as_numbers, as_vector, shown
 from shields.certificate import Certificate
 from shields.downlink.start_under_zero_input import starts_known
@@ -60,7 +60,8 @@ class SafeLoop:
     Args:
         certificate: Verified exactly here.
         plant: The plant it was made for.
-        channel: Its longest delay (older packets are discarded) and quantization step count, its losses do not.
+        channel: Its longest delay and quantization step count, its losses do not. Packets that are older are discarded
+            and counted; what is sent after `decide` and received at the next step is one step late.
         mode: "project", "lookahead", "switch", "boundary" or "monitor"; see `SafetyFilter`.
         horizon: Longest plan of mode "lookahead", in steps; see `SafetyFilter`.
         downlink: The channel from here to the actuator; None if what is decided is applied at once.
@@ -97,6 +98,7 @@ class SafeLoop:
         self._guarded = MonitoredFilter(self.filter, protocol)
         self.lead = self._guarded.lead
         self._inputs = CommittedInputs(self.lead, plant.m)
+        self._discarded = DiscardedPackets()
         self._phase = _Phase.STOPPED
 
     def start(self, x_hat0: Any, initial_set: Ellipsoid | np.ndarray | None = None) -> None:
@@ -121,6 +123,7 @@ class SafeLoop:
         known = starts_known(self.filter, initial_set, self.lead)
         self._phase = _Phase.STOPPED
         self._estimator.reset(mean)
+        self._discarded = DiscardedPackets()
         self._inputs.start()
         earlier = [self._estimator.predicted(self._inputs.pending[:ahead]) for ahead in range(self.lead)]
         self._guarded.begin(self._report(), known, beliefs=earlier)
@@ -148,7 +151,7 @@ class SafeLoop:
             raise ValueError(
                 f"packets must be a list of Packet(stamp, measurement), empty if nothing arrived, got {shown(packets)}"
             )
-        arrived = [_as_packet(each, self.filter.plant.p) for each in packets]
+        arrived = [as_packet(each, self.filter.plant.p) for each in packets]
         phase = self._require_started()
         if phase is _Phase.RECEIVED:
             raise RuntimeError("receive was called twice in a step: hand over all packets of a step in one call")
@@ -158,6 +161,8 @@ class SafeLoop:
             told = due if applied is None else _as_input(applied, due.shape)
             self._estimator.advance(due if told is None else told, arrived)
             self._guarded.advance(told, True, self._report(), decided)
+        oldest = self._estimator.channel.longest_delay
+        self._discarded = self._discarded.with_those_of(arrived, self.steps, self.episode, oldest)
         self._phase = _Phase.RECEIVED
         return self.estimate
 
@@ -233,6 +238,11 @@ class SafeLoop:
         """Steps since the newest sample used was taken; the first estimate counts as one of step 0."""
         return self._estimator.age
 
+    @property
+    def discarded(self) -> DiscardedPackets:
+        """How many packets of this episode were discarded: too late for the channel, stamped ahead, of another one."""
+        return self._discarded
+
     def _require_started(self) -> _Phase:
         if self._phase is _Phase.STOPPED:
             raise RuntimeError("call start: there was none, or an earlier step failed half-way")
@@ -255,28 +265,6 @@ class SafeLoop:
         if numbers.shape != (plant.m,) or not np.isfinite(numbers).all():
             return numbers
         return np.minimum(np.maximum(numbers, -plant.u_max), plant.u_max)
-
-
-def _as_packet(value: Any, size: int) -> Packet:
-    """Returns a packet with a measurement of its own, shape (size,), which may be given as a number if size = 1.
-
-    Raises:
-        ValueError: If stamp or episode is no whole number, or the measurement is not numbers of that shape.
-    """
-    stamp = episode = 0
-    try:
-        stamp, measurement, episode = value if isinstance(value, Packet) else Packet(*value)
-        stamp, episode, numbers = index(stamp), index(episode), as_numbers(measurement)
-    except (TypeError, ValueError):
-        numbers = None
-    if numbers is not None and numbers.ndim == 0:
-        numbers = numbers.reshape(1)
-    if numbers is None or numbers.shape != (size,):
-        raise ValueError(
-            f"a packet is Packet(stamp, measurement) or Packet(stamp, measurement, episode) with whole numbers and a "
-            f"measurement of shape ({size},), got {shown(value)}"
-        )
-    return Packet(stamp, np.array(numbers), episode)
 
 
 def _as_input(applied: Any, shape: tuple[int, ...]) -> np.ndarray | None:

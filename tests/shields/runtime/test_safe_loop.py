@@ -524,3 +524,33 @@ def test_memory_does_not_grow(name):
             loop.receive(state.exchange(rng, step, plant.H @ x if state.sends_at(step) else None, loop.episode))
         assert loop.guaranteed
     assert sys.getallocatedblocks() - before < 100
+
+
+def test_packets_that_are_of_no_use_are_counted_by_reason():
+    loop = started(channel=Channel(delay=1, jitter=1))
+    zero = np.zeros(2)
+    assert loop.discarded == (0, 0, 0)
+    loop.step(0.0)
+    loop.step(0.0, [Packet(1, zero), Packet(1, zero), Packet(0, zero)])  # used, twice the same, and the first estimate
+    assert loop.discarded == (0, 0, 0)
+    loop.step(0.0, [Packet(3, zero), Packet(2000, zero)])
+    loop.step(0.0, [Packet(1, zero), Packet(3, zero, episode=1)])
+    loop.receive([Packet(1, zero)])
+    assert loop.discarded == (1, 2, 1)
+    assert (loop.discarded.too_late, loop.discarded.ahead, loop.discarded.other_episode) == (1, 2, 1)
+    loop.start(zero)
+    assert loop.discarded == (0, 0, 0)
+    loop.step(0.0)
+    loop.receive([Packet(1, zero)])
+    assert loop.discarded.other_episode == 1
+
+
+@pytest.mark.parametrize(("delay", "late"), [(0, 20), (1, 0)])
+def test_sample_that_is_sent_after_a_decision_and_received_at_the_next_step_is_one_step_late(delay, late):
+    loop = started(channel=Channel(delay=delay))
+    arrived = []
+    for step in range(21):
+        loop.step(0.0, arrived)
+        arrived = [Packet(step, np.zeros(2), loop.episode)]
+    assert loop.discarded.too_late == late
+    assert loop.measurement_age == (20 if late else 1)
