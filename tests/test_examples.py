@@ -30,7 +30,7 @@ RUNS = {
         [],
         [
             "proved in 9600 of 9600 steps, outside the box in 0; now: True",
-            r"proved in 24\d\d of 9600 steps, outside the box in 0; now: True; the error ellipsoid is not inside",
+            r"proved in 24\d\d of 9600 steps, outside the box in 0; now: True; the newest sample is older",
         ],
     ),
     "mpc_loop.py": (

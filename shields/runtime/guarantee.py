@@ -29,6 +29,7 @@ ALARM = "a measurement contradicts the assumed bounds"
 OTHER_INPUT = "the input applied is not the one decided"
 OTHER_STEPS = "the environment did not move exactly one step"
 LARGE_ERROR = "the error ellipsoid is not inside the certified one"
+OLD_SAMPLE = "the newest sample is older than the contract allows"
 FAR_OUT = "the estimate is so far out of the safe box that rounding counts"
 UNUSABLE = "there is no usable estimate or error shape"
 NO_ERROR_SET = "a certificate of the published method carries no error set"
@@ -39,7 +40,7 @@ NO_DOWNLINK_CONTRACT = "the downlink has no contract: nothing says that inputs a
 # Codes of `GuaranteeMonitor.reasons`; 0 while the proof holds.
 EXPLANATIONS = (
     "", ALARM, OTHER_INPUT, OTHER_STEPS, LARGE_ERROR, FAR_OUT, UNUSABLE, NO_ERROR_SET, NOT_KNOWN_INSIDE,
-    LEFT_MODEL, LATE_INPUT, NO_DOWNLINK_CONTRACT,
+    LEFT_MODEL, LATE_INPUT, NO_DOWNLINK_CONTRACT, OLD_SAMPLE,
 )  # fmt: skip
 CODES = {explanation: code for code, explanation in enumerate(EXPLANATIONS)}
 
@@ -69,11 +70,13 @@ class LoopObservation(NamedTuple):
         estimate: x_hat, shape (n,) or (n, N); NaN if it is unusable.
         errors: What is known of the error shapes, in the same order.
         alarm: Whether the innovation monitor raised an alarm.
+        age: Steps since the newest sample used was taken, which is asked for only to explain a large error.
     """
 
     estimate: np.ndarray
     errors: PredictedErrors
     alarm: Any
+    age: Any = 0
 
 
 class StartKnown(NamedTuple):
@@ -116,7 +119,10 @@ class GuaranteeMonitor:
         self._test = safety_filter.test
         # The present estimate, which is not observed then, is near where what was predicted of it is nearer still.
         self._reach = SIMULATED_REACH * safety_filter.plant.half_widths / (2.0 if self._lead else 1.0)
-        self._has_error_set = safety_filter.certificate.Sigma is not None
+        certificate = safety_filter.certificate
+        self._has_error_set = certificate.Sigma is not None
+        # Of the newest sample at present, while the contract of the certificate holds.
+        self._largest_age = np.inf if certificate.ages is None else certificate.ages.sets.contract.max_age - self._lead
         plant = safety_filter.plant
         self._is_local = plant.remainder is not None
         # S holds inputs under way beyond their limits, where a remainder has no bound; only a start can have them.
@@ -178,8 +184,13 @@ class GuaranteeMonitor:
             inside = inside | state.inside & (state.certified & decision.fallback | decision.stored)
         return self._observe(broken, inside, report, state.wait)
 
-    def reasons(self, state: MonitorState) -> Any:
-        """Returns why the proof does not hold now, as indices of `EXPLANATIONS`: 0 while it does."""
+    def reasons(self, state: MonitorState, age: Any = 0) -> Any:
+        """Returns why the proof does not hold now, as indices of `EXPLANATIONS`: 0 while it does.
+
+        Args:
+            state: What is known.
+            age: Steps since the newest sample used was taken, which tells a broken contract from other large errors.
+        """
         reason = state.broken
         if not self._has_error_set:
             reason = _first(reason, True, NO_ERROR_SET)
@@ -188,7 +199,11 @@ class GuaranteeMonitor:
         reason = _first(reason, state.inside == False, NOT_KNOWN_INSIDE)  # noqa: E712
         if self._lead:
             reason = _first(reason, state.wait > 0, NOT_KNOWN_INSIDE)
-        return _first(reason, state.certified == False, LARGE_ERROR)  # noqa: E712
+        if _all(state.certified):
+            return reason
+        is_large = state.certified == False  # noqa: E712
+        reason = _first(reason, is_large & (age > self._largest_age), OLD_SAMPLE)
+        return _first(reason, is_large, LARGE_ERROR)
 
     def _within_limits(self, broken: Any, report: LoopObservation) -> Any:
         """Returns what broke, with inputs under way at a start that are not known to lie within their limits."""
@@ -200,7 +215,7 @@ class GuaranteeMonitor:
 
     def _observe(self, broken: Any, inside: Any, report: LoopObservation, wait: Any) -> MonitorState:
         """Takes in the alarm, the running ellipsoid, and what the estimate alone proves."""
-        estimate, errors, alarm = report
+        estimate, errors, alarm, _ = report
         size = np.abs(estimate)
         reach = self._reach if estimate.ndim == 1 else self._reach[:, None]
         within = size + errors.half_widths <= reach  # never without a usable estimate and error shape

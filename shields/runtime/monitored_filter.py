@@ -103,9 +103,9 @@ class MonitoredFilter:
         self._state = self._monitor.advance(self._state, self._decision, moved_once, same_input, report, on_time)
         self.report = report
 
-    def reported(self, estimate: np.ndarray, error_shape: Any, alarm: bool) -> LoopObservation:
+    def reported(self, estimate: np.ndarray, error_shape: Any, alarm: bool, age: int = 0) -> LoopObservation:
         """Returns the report of an estimate, shape (n,), that nobody writes into, and of an error shape, (n, n)."""
-        return LoopObservation(estimate, self.filter.errors_of(error_shape), alarm)
+        return LoopObservation(estimate, self.filter.errors_of(error_shape), alarm, age)
 
     @property
     def plan_length(self) -> int:
@@ -115,7 +115,7 @@ class MonitoredFilter:
     @property
     def reason(self) -> str:
         """Why the state is not proved safe now; empty while it is."""
-        return EXPLANATIONS[self._monitor.reasons(self._state)]
+        return EXPLANATIONS[self._monitor.reasons(self._state, self.report.age)]
 
 
 def first_store(

@@ -250,7 +250,7 @@ class SafeLoop:
 
     def _report(self) -> LoopObservation:
         """Returns what the estimator says now."""
-        return self._guarded.reported(*self._belief(), self._estimator.alarm)
+        return self._guarded.reported(*self._belief(), self._estimator.alarm, self._estimator.age)
 
     def _belief(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimate and error shape of the time at which the next input takes effect."""

@@ -124,7 +124,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         self._start(restarted, now.steps == 0)
         self._clock = now
         idle = idle._replace(plan=self._stored)
-        return observation, info | self._info(idle, idle.input, self._state, self._interventions)
+        return observation, info | self._info(idle, idle.input, self._state, self._interventions, self._report.age)
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Applies the actions, or what the shield puts in the place of some.
@@ -163,16 +163,19 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         if self.penalty:
             rewards = rewards - self.penalty * charged
         decided = decided._replace(plan=self._stored)
-        info = info | added | self._info(decided, proposed, self._state, self._interventions)
+        info = info | added | self._info(decided, proposed, self._state, self._interventions, self._report.age)
         return observation, rewards, terminated, truncated, info
 
     def _observed(self, info: dict[str, Any]) -> LoopObservation:
         """Returns what decisions and the guarantee need of an info, as copies: callers may write into theirs."""
         estimates = columns(info.get("estimate"), (self.num_envs, self.filter.plant.n))
         errors = self._errors_of(self._inner.error_shapes[1])
-        return LoopObservation(
-            np.array(estimates, order="C"), errors, _alarms(info.get("assumption_violated"), self.num_envs)
-        )
+        alarms = _alarms(info.get("assumption_violated"), self.num_envs)
+        return LoopObservation(np.array(estimates, order="C"), errors, alarms, self._ages(info))
+
+    def _ages(self, info: dict[str, Any]) -> np.ndarray:
+        """Returns the ages of the newest samples used, shape (N,); NaN for what are none."""
+        return columns(info.get("measurement_age"), (self.num_envs,))
 
     def _errors_of(self, numbers: np.ndarray) -> PredictedErrors:
         """Returns what is known of the error shapes with these numbers in the environment's table."""
@@ -227,12 +230,13 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         ended = {key: np.asarray(final[key])[done] for key in keys}
         errors = self.filter.errors_of_many(np.asarray(final["error_shape"])[done])
         estimates = columns(ended["estimate"], (len(done), self.filter.plant.n))
-        report = LoopObservation(estimates, errors, _alarms(ended["assumption_violated"], len(done)))
+        alarms = _alarms(ended["assumption_violated"], len(done))
+        report = LoopObservation(estimates, errors, alarms, self._ages(final)[done])
         state = MonitorState(*(array[done] for array in state))
         decided = Decision(*(array[..., done] for array in decided))
         same_input, on_time = as_decided(ended, decided.input, None if due is None else due[:, done])
         state = self._monitor.advance(state, decided, moved_once[done], same_input, report, on_time)
-        for key, value in self._info(decided, proposed[:, done], state, self._interventions[done]).items():
+        for key, value in self._info(decided, proposed[:, done], state, self._interventions[done], report.age).items():
             final[key] = np.full((self.num_envs, *value.shape[1:]), "" if value.dtype == object else 0, value.dtype)
             final[key][done], final[f"_{key}"] = value, info["_final_info"].copy()
         return final
@@ -249,10 +253,10 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         return Clock(inner.episodes.copy(), inner.steps.copy(), inner.ticks)
 
     def _info(
-        self, decided: Decision, proposed: np.ndarray, state: MonitorState, interventions: np.ndarray
+        self, decided: Decision, proposed: np.ndarray, state: MonitorState, interventions: np.ndarray, ages: np.ndarray
     ) -> dict[str, Any]:
         """Returns the shield's keys, new arrays, for steps that applied these decisions."""
-        reasons = self._monitor.reasons(state)
+        reasons = self._monitor.reasons(state, ages)
         doubted = np.count_nonzero(reasons) > 0
         ahead = {}
         if len(self._stored):

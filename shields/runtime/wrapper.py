@@ -155,7 +155,8 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         """Returns what the decision and the guarantee need of an info, as copies: callers may write into theirs."""
         estimate, shape = as_numbers(info["estimate"]), self.filter.test.single[0]
         estimate = np.full(shape, np.nan) if estimate is None or estimate.shape != shape else estimate.copy()
-        return self._guarded.reported(estimate, info["error_shape"], info["assumption_violated"] not in (False,))
+        alarm = info["assumption_violated"] not in (False,)
+        return self._guarded.reported(estimate, info["error_shape"], alarm, self._inner.estimator.age)
 
     def _read_clock(self) -> tuple[int, int]:
         """Returns the number of episodes begun and of steps taken in this one."""

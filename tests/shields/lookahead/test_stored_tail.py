@@ -8,7 +8,7 @@ import pytest
 
 from ncs_gym import NCSEnv, NCSVectorEnv, Packet
 from shields import SafeLoop, SafetyShield, VectorSafetyShield
-from shields.runtime.guarantee import LARGE_ERROR, NOT_KNOWN_INSIDE
+from shields.runtime.guarantee import LARGE_ERROR, NOT_KNOWN_INSIDE, OLD_SAMPLE
 from tests.certificates import certificate_of
 from tests.shields.lookahead.adversary import case
 
@@ -74,7 +74,7 @@ def test_a_stored_tail_keeps_the_box_in_silence_and_proves_again_once_the_error_
             world.step(heard)
             too_old = world.loop.measurement_age > world_age()
             assert world.loop.guaranteed is not too_old
-            assert world.loop.reason == (LARGE_ERROR if too_old else "")
+            assert world.loop.reason == (OLD_SAMPLE if too_old else "")
             doubted += too_old
             recovered += heard
         assert world.loop.plan_length == 1
@@ -94,12 +94,12 @@ def test_a_tail_that_ends_in_silence_ends_in_the_safe_set_and_the_fallback_prove
         for _ in range(world.stored):
             world.step(heard=False)
         assert world.safe.gauge(world.x) <= 1.0
-        assert world.loop.reason == LARGE_ERROR
+        assert world.loop.reason == OLD_SAMPLE
         for _ in range(8):
             decision, loop = world.step(heard=False), world.loop
             assert decision.fallback
             is_known = bool(decision.passed or loop.filter.knows_inside(loop.estimate, loop.error_shape))
-            assert loop.reason == (LARGE_ERROR if is_known else NOT_KNOWN_INSIDE)
+            assert loop.reason == (OLD_SAMPLE if is_known else NOT_KNOWN_INSIDE)
             proved.add(is_known)
     assert False in proved
 

@@ -105,7 +105,7 @@ def test_proofs_break_and_recover_as_the_reference_says_whatever_is_reported(nam
             assert reasons[e] == reference.reason
             assert EXPLANATIONS[monitor.reasons(states[e])] == reference.reason
         seen |= set(reasons)
-    never = {proof.NO_ERROR_SET, proof.LEFT_MODEL, proof.LATE_INPUT, proof.NO_DOWNLINK_CONTRACT}
+    never = {proof.OLD_SAMPLE, proof.NO_ERROR_SET, proof.LEFT_MODEL, proof.LATE_INPUT, proof.NO_DOWNLINK_CONTRACT}
     assert seen == set(EXPLANATIONS) - never
 
 

@@ -21,7 +21,7 @@ from ncs_gym import (
 )
 from ncs_gym.network.packet_transmission import ChannelState
 from shields import CertificateError, SafeLoop, SafetyShield, VectorSafetyShield
-from shields.runtime.guarantee import ALARM, LARGE_ERROR, NOT_KNOWN_INSIDE, OTHER_INPUT
+from shields.runtime.guarantee import ALARM, NOT_KNOWN_INSIDE, OLD_SAMPLE, OTHER_INPUT
 from shields.runtime.safe_loop import NOT_STARTED
 from shields.runtime.safety_filter import MODES
 from tests import arrays
@@ -142,7 +142,7 @@ def test_loop_doubts_what_the_wrapper_doubts(name):
         reasons, _ = follow(env, loop_of(name, channel=channel), policy("random", env, rng), 120, seed)
         seen |= reasons
     assert ALARM in seen
-    assert (LARGE_ERROR in seen) == (name in UNSTABLE)
+    assert (OLD_SAMPLE in seen) == (name in UNSTABLE)
     inside_out = Ellipsoid(1.3 * certificate.L)
     env = SafetyShield(NCSEnv(plant, Channel(), initial_set=inside_out, contract=contract), certificate)
     start = {follow(env, loop_of(name, channel=Channel()), policy("random", env, rng), 1, s)[0].pop() for s in range(9)}

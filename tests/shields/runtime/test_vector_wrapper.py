@@ -8,7 +8,15 @@ from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatist
 
 from ncs_gym import Channel, ChannelContract, NCSVectorEnv, SphereDisturbance, batch_reactor, truck_trailer
 from shields import CertificateError, Decision, SafetyFilter, SafetyShield, VectorSafetyShield
-from shields.runtime.guarantee import EXPLANATIONS, OTHER_STEPS, GuaranteeMonitor, LoopObservation, start_known
+from shields.runtime.guarantee import (
+    EXPLANATIONS,
+    NOT_KNOWN_INSIDE,
+    OLD_SAMPLE,
+    OTHER_STEPS,
+    GuaranteeMonitor,
+    LoopObservation,
+    start_known,
+)
 from shields.runtime.monitored_filter import first_store
 from shields.runtime.safety_filter import MODES
 from shields.runtime.vector_wrapper import Clock, _moved, overridden
@@ -37,7 +45,10 @@ class Watched:
     def _seen(self, row):
         self.row = row
         return LoopObservation(
-            row["estimate"], self.shield.errors_of(row["error_shape"]), bool(row["assumption_violated"])
+            row["estimate"],
+            self.shield.errors_of(row["error_shape"]),
+            bool(row["assumption_violated"]),
+            int(row["measurement_age"]),
         )
 
     def decide(self, u):
@@ -58,7 +69,7 @@ class Watched:
 
     @property
     def reason(self):
-        return EXPLANATIONS[self.monitor.reasons(self.state)]
+        return EXPLANATIONS[self.monitor.reasons(self.state, self.row["measurement_age"])]
 
 
 def drive(env, steps, policy):
@@ -419,3 +430,22 @@ def test_sphere_disturbance_and_shared_certificate():
         shield.reset(seed=1)
     one, other = (shield.step(np.ones((2, 1)))[4] for shield in shields)
     np.testing.assert_array_equal(one["input"], other["input"])
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_broken_contract_is_the_reason_given_for_a_large_error(mode):
+    plant, contract = batch_reactor(), ChannelContract(3)
+    certificate = certificate_of(plant, contract)
+    settings = {"plant": plant, "channel": Channel(loss=1.0), "contract": contract, "max_episode_steps": 10}
+    env = VectorSafetyShield(NCSVectorEnv(num_envs=3, autoreset_mode=mode, **settings), certificate)
+    env.reset(seed=0)
+    seen, last = set(), {}
+    for _ in range(10):
+        *_, info = env.step(np.zeros((3, plant.m)))
+        last = info.get("final_info", info)
+        old = last["measurement_age"] > contract.max_age
+        assert (last["shield_guaranteed"] | old).all()
+        seen |= set(last["shield_reason"])
+    assert OLD_SAMPLE in seen <= {"", OLD_SAMPLE, NOT_KNOWN_INSIDE}
+    assert (last["measurement_age"] == 10).all()
+    assert OLD_SAMPLE in last["shield_reason"]
