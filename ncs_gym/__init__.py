@@ -6,7 +6,7 @@ from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlantError, certified_error_set
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet
-from ncs_gym.network.contract import ChannelContract, contract_of
+from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
 from ncs_gym.network.escape_probability import escape_probability
 from ncs_gym.plant_registration import register_plant
 from ncs_gym.plants.batch_reactor import batch_reactor
@@ -35,6 +35,7 @@ __all__ = [
     "Annotation",
     "BallDisturbance",
     "BoxDisturbance",
+    "BrokenContractWarning",
     "Channel",
     "ChannelContract",
     "Command",

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym import Ellipsoid
+from ncs_gym import ChannelContract, Ellipsoid
 from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_number, read_only, shown
 from shields import certificate_file
 from shields.certificate_text import description_of
@@ -118,6 +118,11 @@ class Certificate(ReadOnlyArrays):
     def safe_set(self) -> Ellipsoid:
         """The robust control invariant set S = E(L)."""
         return Ellipsoid(self.L)
+
+    @property
+    def contract(self) -> ChannelContract | None:
+        """The channel contract that it assumes; None without one."""
+        return None if self.ages is None else self.ages.sets.contract
 
     @cached_property
     def error_set(self) -> Ellipsoid | None:

@@ -7,12 +7,13 @@ its bounds, given how many samples a channel takes.
 """
 
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet
-from ncs_gym.network.contract import ChannelContract, contract_of
+from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
 from ncs_gym.network.escape_probability import escape_probability
 from ncs_gym.network.packet_reception import DiscardedPackets
 from ncs_gym.network.packet_transmission import ChannelState
 
 __all__ = [
+    "BrokenContractWarning",
     "Channel",
     "ChannelContract",
     "ChannelState",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 from ncs_gym.network.channel import Channel
@@ -9,6 +10,10 @@ from ncs_gym.validation import as_count, as_number
 
 # There is an error set for every age.
 MAX_AGE = 1000
+
+
+class BrokenContractWarning(UserWarning):
+    """The channels cannot keep the contract that a certificate assumes, so that its guarantee is likely to be lost."""
 
 
 @dataclass(frozen=True)
@@ -57,3 +62,33 @@ def contract_of(channel: Channel) -> ChannelContract | None:
         return None
     age = (losses + 1) * channel.send_period + channel.longest_delay - 1
     return ChannelContract(age, channel.quantization_step) if age <= MAX_AGE else None
+
+
+def warn_of_broken_contract(
+    contract: ChannelContract | None, channel: Channel, lead: int, *, counts_losses: bool = False
+) -> None:
+    """Warns the caller of the calling constructor if a channel cannot keep the contract that a certificate assumes.
+
+    Args:
+        contract: That of the certificate; None for none.
+        channel: The channel of the samples.
+        lead: c, the number of steps from a decision to its effect.
+        counts_losses: Whether the losses and the jitter that the channel promises not to exceed count. Without them it
+            is warned only of what breaks the contract although no packet is lost.
+    """
+    promised = contract_of(channel) if counts_losses else None
+    age = channel.send_period - 1 + channel.delay if promised is None else promised.max_age
+    if contract is None or age + lead <= contract.max_age:
+        return
+    later = f", and what is decided takes effect {_steps(lead)} later" if lead else ""
+    warnings.warn(
+        f"the channel lets the newest sample become {_steps(age)} old{later}, but the certificate's contract allows "
+        f"{_steps(contract.max_age)} in all, so that the guarantee is likely to be lost: give a certificate of "
+        f"ChannelContract(max_age={age + lead}), or of a larger max_age where packets are lost",
+        BrokenContractWarning,
+        stacklevel=3,
+    )
+
+
+def _steps(number: int) -> str:
+    return "1 step" if number == 1 else f"{number} steps"

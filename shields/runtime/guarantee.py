@@ -122,7 +122,7 @@ class GuaranteeMonitor:
         certificate = safety_filter.certificate
         self._has_error_set = certificate.Sigma is not None
         # Of the newest sample at present, while the contract of the certificate holds.
-        self._largest_age = np.inf if certificate.ages is None else certificate.ages.sets.contract.max_age - self._lead
+        self._largest_age = np.inf if certificate.contract is None else certificate.contract.max_age - self._lead
         plant = safety_filter.plant
         self._is_local = plant.remainder is not None
         # S holds inputs under way beyond their limits, where a remainder has no bound; only a start can have them.

@@ -11,6 +11,7 @@ import numpy as np
 from ncs_gym import Channel, ChannelContract, Ellipsoid, Estimator, LinearPlant, Packet
 from ncs_gym.downlink import Command, CommittedInputs, downlink_protocol
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
+from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.network.packet_reception import DiscardedPackets, as_packet
 from ncs_gym.validation import as_numbers, as_vector, shown
 from shields.certificate import Certificate
@@ -92,11 +93,12 @@ class SafeLoop:
         self.filter = SafetyFilter(certificate, plant, mode, horizon)
         if not isinstance(channel, Channel):
             raise ValueError(f"channel must be a Channel (its contract is the certificate's), got {shown(channel)}")
-        self.contract = None if certificate.ages is None else certificate.ages.sets.contract
+        self.contract = certificate.contract
         self._estimator = Estimator(plant, channel, patterns=arrival_patterns(plant, channel, self.contract))
         protocol = downlink_protocol(downlink, downlink_contract)
         self._guarded = MonitoredFilter(self.filter, protocol)
         self.lead = self._guarded.lead
+        warn_of_broken_contract(self.contract, channel, self.lead, counts_losses=self.lead > 0)
         self._inputs = CommittedInputs(self.lead, plant.m)
         self._discarded = DiscardedPackets()
         self._phase = _Phase.STOPPED

@@ -10,6 +10,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 
 from ncs_gym.envs.vector_env import NCSVectorEnv
+from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.validation import as_number, shown
 from shields.certificate import Certificate
 from shields.downlink.schedule import VectorSchedule, as_decided, columns
@@ -85,6 +86,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         self.filter = SafetyFilter(self.certificate, inner.plant, mode, horizon)
         self._monitor = GuaranteeMonitor(self.filter, inner.downlink)
         self._lead = 0 if inner.downlink is None else inner.downlink.lead
+        warn_of_broken_contract(self.certificate.contract, inner.channel, self._lead)
         self._start_known = starts_known(self.filter, inner.single.initial_set, self._lead)
         count, nothing = self.num_envs, np.zeros(self.num_envs, np.bool_)
         self._schedule = None if inner.downlink is None else VectorSchedule(self._lead, inner.plant.m, count)

@@ -14,6 +14,7 @@ from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, S
 
 from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv, NCSVectorEnv
 from ncs_gym.envs.env import applied_input
+from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.validation import as_number, as_numbers, shown
 from shields.certificate import Certificate
 from shields.downlink.start_under_zero_input import starts_known
@@ -97,6 +98,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         )
         self.filter = SafetyFilter(self.certificate, inner.plant, mode, horizon)
         self._guarded = MonitoredFilter(self.filter, inner.downlink)
+        warn_of_broken_contract(self.certificate.contract, inner.channel, self._guarded.lead)
         self._clock: tuple[int, int] | None = None
         self._start: Any = None
         self._known: tuple[StartKnown, ...] = ()

@@ -1,0 +1,75 @@
+"""What cannot keep the contract of a certificate is pointed out where certificate and channel meet."""
+
+import warnings
+
+import gymnasium as gym
+import pytest
+
+from ncs_gym import BrokenContractWarning, Channel, ChannelContract, NCSEnv, NCSVectorEnv, cart_pole
+from shields import SafeLoop, SafetyShield, VectorSafetyShield
+from tests.certificates import certificate_of
+
+PLANT, CONTRACT = cart_pole(), ChannelContract(4)
+DOWNLINK = Channel(loss=0.2, delay=1, max_consecutive_losses=2)  # c = 3
+
+
+def loop(channel, downlink):
+    return SafeLoop(certificate_of(PLANT, CONTRACT), PLANT, channel, downlink=downlink)
+
+
+def shield(channel, downlink):
+    env = NCSEnv(PLANT, channel, contract=CONTRACT, downlink=downlink)
+    return SafetyShield(env, certificate_of(PLANT, CONTRACT))
+
+
+def vector_shield(channel, downlink):
+    env = NCSVectorEnv(num_envs=2, plant=PLANT, channel=channel, contract=CONTRACT, downlink=downlink)
+    return VectorSafetyShield(env, certificate_of(PLANT, CONTRACT))
+
+
+@pytest.mark.parametrize("make", [loop, shield, vector_shield])
+@pytest.mark.parametrize(
+    ("channel", "downlink", "words"),
+    [
+        (Channel(delay=9), None, r"become 9 steps old, but .* allows 4 steps in all, .* ChannelContract\(max_age=9\)"),
+        (Channel(send_period=3, delay=3), None, "become 5 steps old, but"),
+        (Channel(delay=2), DOWNLINK, "become 2 steps old, and what is decided takes effect 3 steps later, but"),
+        (Channel(), Channel(delay=5), "become 0 steps old, and what is decided takes effect 5 steps later, but"),
+    ],
+)
+def test_channel_that_breaks_the_contract_without_any_loss_is_pointed_out(make, channel, downlink, words):
+    with pytest.warns(BrokenContractWarning, match=words) as caught:
+        make(channel, downlink)
+    assert [each.filename for each in caught] == [__file__]
+
+
+@pytest.mark.parametrize("make", [loop, shield, vector_shield])
+@pytest.mark.parametrize(
+    ("channel", "downlink"),
+    [
+        (Channel(delay=4), None),
+        (Channel(send_period=3, delay=2), None),
+        (Channel(loss=0.9, jitter=9), None),  # it may keep the contract, if seldom
+        (Channel(delay=1), DOWNLINK),
+        (Channel(loss=0.5), DOWNLINK),
+    ],
+)
+def test_channel_that_may_keep_the_contract_is_taken_without_a_warning(make, channel, downlink):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", BrokenContractWarning)
+        make(channel, downlink)
+
+
+def test_real_loop_behind_a_downlink_counts_what_its_uplink_promises():
+    uplink = Channel(loss=0.5, delay=1, max_consecutive_losses=2)  # samples up to 3 steps old, which c is added to
+    with pytest.warns(BrokenContractWarning, match=r"become 3 steps old.* ChannelContract\(max_age=6\)"):
+        loop(uplink, DOWNLINK)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", BrokenContractWarning)
+        loop(uplink, None)
+
+
+def test_certificate_of_the_registered_contract_is_compared_with_the_channel_asked_for():
+    env = gym.make("ncs_gym/CartPole-v0", channel=Channel(delay=9))
+    with pytest.warns(BrokenContractWarning, match="become 9 steps old"):
+        SafetyShield(env, certificate_of(env.unwrapped.plant, env.unwrapped.contract))
