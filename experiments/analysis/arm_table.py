@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import floor, log10
 from typing import Any
 
 from experiments.analysis.text_table import text_table
@@ -14,6 +15,7 @@ _HEADERS = (
 )
 # Number of columns after the first that are about the training.
 _TRAINING_COLUMNS = 2
+_MOST_DECIMALS = 4
 
 
 def summary_text(arms: dict[str, dict[str, Any]], references: dict[str, dict[str, Any]]) -> str:
@@ -72,5 +74,17 @@ def _overridden(arm: dict[str, Any], key: str) -> str:
 def _return_text(arm: dict[str, Any]) -> str:
     """Returns mean and half-width of Student's interval, which is symmetric."""
     interval = arm["eval_return_ci95"]
-    half = "[n/a]" if interval is None else f"+-{0.5 * (interval[1] - interval[0]):.1f}"
-    return f"{arm['eval_return_mean']:.1f} {half}"
+    mean = arm["eval_return_mean"]
+    if interval is None:
+        return f"{mean:.{decimals_of(mean)}f} [n/a]"
+    half = 0.5 * (interval[1] - interval[0])
+    decimals = decimals_of(mean, half)
+    return f"{mean:.{decimals}f} +-{half:.{decimals}f}"
+
+
+def decimals_of(*numbers: float) -> int:
+    """Returns how many decimals to print of numbers that belong together: one, more if the largest is below one."""
+    largest = max(map(abs, numbers))
+    if largest >= 1.0 or largest == 0.0:
+        return 1
+    return min(1 - floor(log10(largest)), _MOST_DECIMALS)

@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium as gym
 
 from agents.control_loop import ControlLoop
-from experiments.analysis.arm_table import condition_text, summary_text
+from experiments.analysis.arm_table import condition_text, decimals_of, summary_text
 from experiments.analysis.escapes import escape_sentences, escape_summary
 from experiments.analysis.parquet_tables import write_tables
 from experiments.analysis.summary import arm_summary, covered_fraction, paired_differences
@@ -168,9 +168,10 @@ def _findings(summary: dict[str, Any]) -> list[str]:
         ]
     paired = summary["paired_differences"]
     for name, difference in paired["arms"].items():
-        interval = difference["return_ci95"]
-        text = f" [{interval[0]:+.1f}, {interval[1]:+.1f}]" if interval else ""
-        findings.append(f"{name}, paired with {paired['baseline']}: return {difference['return_mean']:+.1f}{text}.")
+        mean, interval = difference["return_mean"], difference["return_ci95"]
+        decimals = decimals_of(mean, *(interval or ()))
+        text = f" [{interval[0]:+.{decimals}f}, {interval[1]:+.{decimals}f}]" if interval else ""
+        findings.append(f"{name}, paired with {paired['baseline']}: return {mean:+.{decimals}f}{text}.")
     if (covered := covered_fraction(summary)) is not None:
         findings.append(
             f"The shielded return covers {100 * covered:.0f} % of the way from the zero input to the unshielded agent."

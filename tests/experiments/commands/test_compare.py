@@ -155,14 +155,19 @@ def test_interval_of_a_fixed_policy_is_over_episodes():
     assert fixed[1] - 4.0 == pytest.approx(3.182 * 2.582 / 2, rel=1e-3)
 
 
-def covered(shielded, shielded_steps=200):
-    means = {"unshielded": (-5.0, 200), "shielded": (shielded, shielded_steps), "zero input": (-65.0, 200)}
+def covered(shielded, shielded_steps=200, unshielded=-5.0):
+    means = {"unshielded": (unshielded, 200), "shielded": (shielded, shielded_steps), "zero input": (-65.0, 200)}
     named = {name: {"eval_return_mean": mean, "eval_steps": steps} for name, (mean, steps) in means.items()}
     return covered_fraction({"arms": named, "references": named})
 
 
 def test_covered_fraction_is_zero_at_the_zero_input_and_one_at_the_unshielded_agent():
     assert [covered(value) for value in (-65.0, -5.0, -20.0)] == [0.0, 1.0, 0.75]
+
+
+@pytest.mark.parametrize("unshielded", [-65.0, -189.6])
+def test_an_agent_that_earns_no_more_than_the_zero_input_leaves_nothing_to_cover(unshielded):
+    assert covered(-60.0, unshielded=unshielded) is None
 
 
 def test_returns_of_episodes_that_end_early_are_no_covered_fraction():

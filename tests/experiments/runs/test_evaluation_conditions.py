@@ -110,6 +110,28 @@ def test_random_policy_acts_alike_under_every_condition(setup):
     np.testing.assert_array_equal(first, again)
 
 
+@pytest.mark.parametrize(
+    ("mean", "half", "text"),
+    [
+        (-124.26, 12.34, "-124.3 +-12.3"),
+        (-6.61, 0.21, "-6.6 +-0.2"),
+        (0.04, 3.0, "0.0 +-3.0"),
+        (-0.1234, 0.02, "-0.12 +-0.02"),
+        (-0.0123, 0.0041, "-0.012 +-0.004"),
+        (-1e-9, 1e-10, "-0.0000 +-0.0000"),
+        (0.0, 0.0, "0.0 +-0.0"),
+        (-0.0123, None, "-0.012 [n/a]"),
+    ],
+)
+def test_small_returns_are_printed_with_two_significant_digits(results, mean, half, text):
+    interval = None if half is None else [mean - half, mean + half]
+    summary = arm_summary([results["proportional"]], None, fixed_policy=True)
+    summary |= {"eval_return_mean": mean, "eval_return_ci95": interval}
+    printed = summary_text({"proportional": summary}, {})
+    assert printed.endswith(f" {text}")
+    assert max(map(len, printed.splitlines())) <= 100
+
+
 def test_summary_and_table_have_a_block_per_condition(results):
     modes = {"proportional": None, "proportional+trusting": "trusting", "proportional+shielded": "project"}
     arms = {name: arm_summary([results[name]], mode, fixed_policy=True) for name, mode in modes.items()}
