@@ -119,6 +119,9 @@ def test_figure_has_a_panel_for_every_side_and_measure(rows):
     figure = sweep_figure("Cruise", rows[0])
     assert len(figure.axes) == 6
     assert "3 episodes," in figure.caption
+    for axis in (axis for axis in figure.axes if axis.get_xlabel() == "delay [steps]"):
+        axis.set_xlim(0.0, 1.0)  # a range where round numbers would not be whole ones
+        assert all(tick == round(tick) for tick in axis.get_xticks())
 
 
 def test_figure_of_agents_says_how_many_there_are(sweep_of_agents):
