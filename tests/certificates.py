@@ -5,24 +5,38 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 
 from ncs_gym import ChannelContract, LinearPlant
 from shields import Certificate, synthesize
 from shields.verification import require_valid
 
+ROOT = Path(__file__).resolve().parent.parent
 _certificates: dict[tuple[str, ChannelContract | None], Certificate] = {}
-_made_once: Callable[[str, Callable[[Path], None]], Path] | None = None
+_kept: Callable[[str, Callable[[Path], None]], Path] | None = None
 
 
-def share_between_workers(made_once: Callable[[str, Callable[[Path], None]], Path]) -> None:
-    """Lets workers read the certificates that another worker of this run of the suite has synthesized."""
-    global _made_once
-    _made_once = made_once
+def source_digest() -> str:
+    """What certificates of tests depend on: the source of both packages and the versions of what it computes with."""
+    digest = hashlib.sha256("".join(map(version, ("numpy", "scipy", "cvxpy", "clarabel"))).encode())
+    for path in sorted(path for package in ("ncs_gym", "shields") for path in (ROOT / package).rglob("*.py")):
+        digest.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def keep_certificates(folder_of: Callable[[str, Callable[[Path], None]], Path]) -> None:
+    """Lets this process read the certificates that another one has synthesized from the same source.
+
+    Args:
+        folder_of: Returns the folder of a name, filled by the given function if it is new.
+    """
+    global _kept
+    _kept = folder_of
 
 
 def certificate_of(plant: LinearPlant, contract: ChannelContract | None = None) -> Certificate:
-    """The certificate of a plant under a contract, synthesized once per run of the suite."""
+    """The certificate of a plant under a contract, synthesized once for a state of the source."""
     key = plant.fingerprint, contract
     if key not in _certificates:
         _certificates[key] = _read_or_synthesized(plant, contract)
@@ -30,10 +44,10 @@ def certificate_of(plant: LinearPlant, contract: ChannelContract | None = None) 
 
 
 def _read_or_synthesized(plant: LinearPlant, contract: ChannelContract | None) -> Certificate:
-    if _made_once is None:
+    if _kept is None:
         return synthesize(plant, contract=contract)
     name = hashlib.sha256(f"{plant.fingerprint} {contract}".encode()).hexdigest()[:16]
-    folder = _made_once(
+    folder = _kept(
         f"certificate-{name}", lambda folder: synthesize(plant, contract=contract).save(folder / "certificate.json")
     )
     return Certificate.load(folder / "certificate.json")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import fcntl
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -19,7 +21,7 @@ import pytest
 
 from ncs_gym import LinearPlant, truck_trailer
 from shields import Certificate
-from tests.certificates import certificate_of, require_valid_once, share_between_workers
+from tests.certificates import certificate_of, keep_certificates, require_valid_once, source_digest
 from tests.workers import no_worker_processes
 
 # Gymnasium's checker tries every render mode: no windows while tests run.
@@ -77,24 +79,25 @@ def without_workers() -> Iterator[None]:
 def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], None]], Path]:
     """Returns the folder of a name; whichever worker is first fills it, the others wait and find it filled."""
     own = tmp_path_factory.getbasetemp()
-    place = own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+    return partial(_folder_of, own.parent if "PYTEST_XDIST_WORKER" in os.environ else own)
 
-    def folder_of(name: str, make: Callable[[Path], None]) -> Path:
-        folder, done = place / name, place / f"{name}.done"
-        with (place / f"{name}.lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            if not done.exists():
-                folder.mkdir()
-                make(folder)
-                done.touch()
-        return folder
 
-    return folder_of
+def _folder_of(place: Path, name: str, make: Callable[[Path], None]) -> Path:
+    folder, done = place / name, place / f"{name}.done"
+    with (place / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not done.exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+            make(folder)
+            done.touch()
+    return folder
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _nothing_proved_twice(made_once: Callable[[str, Callable[[Path], None]], Path]) -> Iterator[None]:
-    """Certificates are synthesized once per run of the suite, and shields verify each once per process and plant."""
-    share_between_workers(made_once)
+def _nothing_proved_twice(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Certificates are synthesized once for a state of the source, and shields verify each once per process."""
+    if (cache := getattr(request.config, "cache", None)) is not None:
+        keep_certificates(partial(_folder_of, cache.mkdir(f"certificates-{source_digest()}")))
     with mock.patch("shields.runtime.safety_filter.require_valid", require_valid_once):
         yield
