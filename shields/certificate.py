@@ -41,8 +41,8 @@ class Certificate(ReadOnlyArrays):
         fingerprint: Fingerprint of the plant that the certificate belongs to.
         kappa: Contraction factor of OP; this and the next three are None unless the method is "paper".
         rho: Bound of OP on the condition number of L.
-        epsilon: Bound on the squared state error of Liu et al. Theorem 7.
-        epsilon_up: Bound on the squared uplink error of Liu et al. Theorem 5.
+        epsilon: Bound on the squared state error of Liu et al. Theorem 3.
+        epsilon_up: Bound on the squared uplink error of Liu et al. Theorem 2.
         provenance: How the certificate was made (solver, versions, volume); it proves nothing.
     """
 

@@ -1,4 +1,4 @@
-"""The Kalman filter of Definition 3, for many episodes at once; it has no equation for late packets."""
+"""The Kalman filter of Definition 1, for many episodes at once; it has no equation for late packets."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class DefinitionThreeFilter:
         """Moves one step on.
 
         Args:
-            u: Applied inputs, shape (m, N); not used, because Definition 3 predicts with G.
+            u: Applied inputs, shape (m, N); not used, because Definition 1 predicts with G.
             samples: What was measured at this step, shape (p, N); None if nobody sends.
             arrivals: Ages of samples that arrive now, each with the episodes, shape (N,).
         """

@@ -14,7 +14,7 @@ from experiments.study.study_tables import (
 )
 
 # Arms that the short table of the first environment leaves out: they are beside the point or have a twin there.
-_NOT_IN_LEAD = ("penalized:1", "trusting", "shield at test", "K x_hat", "lqr+psf", "lqr+trusting:lookahead")
+_NOT_IN_LEAD = ("penalized:1", "shield at test", "psf at test", "K x_hat", "lqr+psf", "lqr+trusting:lookahead")
 _NOT_IN_LEAD += ("proportional", "proportional+trusting", "proportional+shielded")
 # A mark names a table; what stands between it and the end is replaced.
 _MARKED = re.compile(r"(<!-- ncs study: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)

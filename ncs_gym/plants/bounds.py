@@ -189,7 +189,7 @@ class HardBounds(ReadOnlyArrays):
     def kalman_covariances(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Covariances (Q, R, P0) from which a Kalman filter picks its gains, shapes (n, n), (p, p), (n, n).
 
-        Q + gamma I (Liu et al. Definition 3), where a declared disturbance counts as the ball of gamma does; sensor
+        Q + gamma I (Liu et al. Definition 1), where a declared disturbance counts as the ball of gamma does; sensor
         noise and first errors that are bounded count with the covariance of a uniform draw, P / (dim + 2).
         """
         Q = self.process_noise_cov + self.gamma * np.eye(self.n)

@@ -70,7 +70,7 @@ class TruncatedGaussian(ReadOnlyArrays):
 def chi2_quantile(probability: float, degrees: int) -> float:
     """Returns the chi-square quantile chi2_{degrees, probability}, rounded up.
 
-    Liu et al. Theorem 5 needs the 1 - delta quantile, so `probability` is 1 - delta. That float lies up to 2^-54 from
+    Liu et al. Theorem 2 needs the 1 - delta quantile, so `probability` is 1 - delta. That float lies up to 2^-54 from
     the number; where delta is small this counts, and the quantile is one for delta less that much. The functions of
     scipy.special are those behind scipy.stats.chi2, which takes long to import.
 

@@ -17,7 +17,7 @@ SMALLEST_GAP = 1e-9
 
 
 def covariance_bound(k: int, p0: float, g2: float, q_bar: float) -> float:
-    """Returns p_bar_k = p0 g2^k + q_bar (1 + g2 + ... + g2^(k-1)) (Liu et al. Theorem 4).
+    """Returns p_bar_k = p0 g2^k + q_bar (1 + g2 + ... + g2^(k-1)) (Liu et al. Theorem 1).
 
     The covariance P_k of a filter that predicts with G = A + BK obeys P_k <= p_bar_k I if G G' <= g2 I.
 
@@ -40,7 +40,7 @@ def covariance_bound(k: int, p0: float, g2: float, q_bar: float) -> float:
 
 
 def process_bound(gamma: float, process_noise_cov: np.ndarray) -> float:
-    """Returns q_bar = lambda_max(Q) + gamma, the smallest with Q + gamma I <= q_bar I (Liu et al. Definition 3).
+    """Returns q_bar = lambda_max(Q) + gamma, the smallest with Q + gamma I <= q_bar I (Liu et al. Definition 1).
 
     Raises:
         ValueError: If gamma is negative or Q is no covariance.
@@ -53,7 +53,7 @@ def process_bound(gamma: float, process_noise_cov: np.ndarray) -> float:
 def uplink_error_bound(
     gamma: float, process_noise_cov: np.ndarray, initial_cov: np.ndarray, delta: float, g2: float
 ) -> float:
-    """Returns eps_up = (p0 g2 + q_bar / (1 - g2)) chi2_{n,1-delta} (Liu et al. Theorem 5).
+    """Returns eps_up = (p0 g2 + q_bar / (1 - g2)) chi2_{n,1-delta} (Liu et al. Theorem 2).
 
     It is a quantile per step: if the error is Gaussian, its square stays below the bound with probability 1 - delta at
     each single step; "for all k" does not follow. The term p0 g2 is kept as printed, although p0 g2^k is p0 at k = 0.
@@ -79,7 +79,7 @@ def uplink_error_bound(
 
 
 def state_error_bound(A: np.ndarray, g2: float, epsilon_up: float) -> float:
-    """Returns eps = (g_bar + |A|_2)^2 eps_up, a bound on e'e, e = B K e_up (Liu et al. Theorem 7).
+    """Returns eps = (g_bar + |A|_2)^2 eps_up, a bound on e'e, e = B K e_up (Liu et al. Theorem 3).
 
     It uses |BK|_2 <= |A + BK|_2 + |A|_2 <= g_bar + |A|_2.
 
@@ -91,7 +91,7 @@ def state_error_bound(A: np.ndarray, g2: float, epsilon_up: float) -> float:
 
 
 def safety_margin(gamma: float, epsilon: float, kappa: float) -> float:
-    """Returns alpha = ((sqrt(gamma) + sqrt(eps)) / (1 - sqrt(kappa)))^2, 0 for kappa = 1 (Liu et al. Definition 2).
+    """Returns alpha = ((sqrt(gamma) + sqrt(eps)) / (1 - sqrt(kappa)))^2, 0 for kappa = 1 (Liu et al. Definition 4).
 
     Raises:
         ValueError: If gamma or eps is negative or kappa is outside (0, 1].
@@ -108,8 +108,8 @@ class PaperBounds:
     Attributes:
         kappa: Contraction factor, in (0, 1].
         rho: Bound on the condition number of L, in [1, 1 / kappa).
-        epsilon_up: Bound of Theorem 5 on the squared uplink error, at g_bar^2 = kappa rho.
-        epsilon: Bound of Theorem 7 on the squared state error.
+        epsilon_up: Bound of Theorem 2 on the squared uplink error, at g_bar^2 = kappa rho.
+        epsilon: Bound of Theorem 3 on the squared state error.
         alpha: Lower bound on lambda_min(L) that (C2) demands.
     """
 
@@ -158,17 +158,17 @@ def _largest(covariance: np.ndarray) -> float:
 
 
 def _uplink(p0: float, q_bar: float, quantile: float, g2: float, rest: float) -> float:
-    """Returns the bound of Theorem 5 from g2 and rest = 1 - g2, whose digits are lost if g2 is rounded first."""
+    """Returns the bound of Theorem 2 from g2 and rest = 1 - g2, whose digits are lost if g2 is rounded first."""
     return (p0 * g2 + q_bar / rest) * quantile
 
 
 def _state(norm: float, g2: float, epsilon_up: float) -> float:
-    """Returns the bound of Theorem 7 for the norm |A|_2."""
+    """Returns the bound of Theorem 3 for the norm |A|_2."""
     return (g2**0.5 + norm) ** 2 * epsilon_up
 
 
 def _alpha(gamma: float, epsilon: float, kappa: float) -> float:
-    """Returns alpha of Definition 2."""
+    """Returns alpha of Definition 4."""
     if kappa == 1.0:
         return 0.0
     # 1 - sqrt(kappa) = (1 - kappa) / (1 + sqrt(kappa)) keeps its digits near kappa = 1.

@@ -17,7 +17,7 @@ from shields.paper.optimization_problem import OPSolution
 
 
 def paper_certificate(plant: LinearPlant, *, dkappa: float, drho: float, search: str) -> Certificate:
-    """Returns the certificate of OP and Algorithm 1 (Liu et al. Definition 2), as printed.
+    """Returns the certificate of OP and Algorithm 1 (Liu et al. Definition 4), as printed.
 
     It carries the guarantee of the paper's own definitions, which assumes e'e <= eps. It has no error set, so a shield
     with this certificate is never guaranteed.
@@ -64,7 +64,7 @@ def _certificate(plant: LinearPlant, solution: OPSolution, provenance: dict[str,
         epsilon=solution.bounds.epsilon,
         epsilon_up=solution.bounds.epsilon_up,
         provenance={
-            "source": "Liu et al. Definition 2 and Algorithm 1",
+            "source": "Liu et al. Definition 4 and Algorithm 1",
             **provenance,
             "alpha": solution.bounds.alpha,
             "guarantee": "the paper's own: invariance if e'e <= epsilon at every step",

@@ -1,4 +1,4 @@
-"""The constraints of OP (Liu et al. Definition 2), checked exactly for a given set and gain."""
+"""The constraints of OP (Liu et al. Definition 4), checked exactly for a given set and gain."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def paper_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[C
     bounds = PaperModel(plant).at(constants.kappa, constants.rho)
     stated = np.array([constants.epsilon_up, constants.epsilon])
     agree = np.allclose(stated, [bounds.epsilon_up, bounds.epsilon], rtol=1e-9, atol=0.0)
-    yield flag("eps_up and eps are those of Theorems 5 and 7", bool(agree))
+    yield flag("eps_up and eps are those of Theorems 2 and 3", bool(agree))
     L, K = rational(certificate.L), rational(certificate.K)
     identity = rational(np.eye(plant.n))
     closed_loop = multiply(add(rational(plant.A), multiply(rational(plant.B), K)), L)

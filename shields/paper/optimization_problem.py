@@ -1,4 +1,4 @@
-"""The published optimization problem OP (Liu et al. Definition 2), as printed."""
+"""The published optimization problem OP (Liu et al. Definition 4), as printed."""
 
 from __future__ import annotations
 

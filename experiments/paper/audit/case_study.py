@@ -36,7 +36,7 @@ def sensor_claim(example: PaperExample) -> Claim:
     assumed = float(example.plant.measurement_noise_cov[0, 0])
     errors = [largest_error(example, taken_as_current, noise_variance=variance) for variance in _NOISE_VARIANCES]
     return Claim(
-        "the sensor of the simulation (H and R of Definition 3)",
+        "the sensor of the simulation (H and R of Definition 1)",
         "neither H nor R",
         f"H = I and R = {assumed:g} I are our assumptions. Row 16 alone rests on them: with R = "
         f"{_NOISE_VARIANCES[0]:g} I to {_NOISE_VARIANCES[-1]:g} I its max e'e with late packets taken as current is "

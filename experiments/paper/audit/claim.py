@@ -34,9 +34,9 @@ class Defect(StrEnum):
 
     INPUT_LIMIT = "the printed K is OP's optimum for |u| <= 6, not for the limit of 4"
     MARGIN = "(C2), the margin for disturbance and error, is not met and cannot be met at the printed bounds"
-    EPSILON = "the printed epsilon is not the one that Theorems 5 and 7 give"
-    NO_MARGIN_AT_ONE = "Definition 2 demands no margin at kappa = 1, against its own proof"
-    ONLY_IF = "the condition of Theorem 2 is sufficient, but not necessary"
+    EPSILON = "the printed epsilon is not the one that Theorems 2 and 3 give"
+    NO_MARGIN_AT_ONE = "Definition 4 demands no margin at kappa = 1, against its own proof"
+    ONLY_IF = "the condition of Theorem 5 is sufficient, but not necessary"
     BALL_OR_BOX = "Delta(gamma) is a ball in (3) and a box in Section 5"
 
 

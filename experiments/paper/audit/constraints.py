@@ -87,7 +87,7 @@ def _margin(example: PaperExample) -> Claim:
 
 
 def misread_alpha(example: PaperExample) -> float:
-    """Returns the alpha of Definition 2 with gamma in place of its square root, at the printed epsilon and kappa."""
+    """Returns the alpha of Definition 4 with gamma in place of its square root, at the printed epsilon and kappa."""
     return ((example.plant.gamma + example.epsilon**0.5) / (1.0 - example.kappa**0.5)) ** 2
 
 

@@ -21,11 +21,11 @@ def error_claims(example: PaperExample) -> Iterator[Claim]:
     tight = [norm**2 * _uplink(plant, g2) for g2 in (example.kappa, example.kappa * condition)]
     fails = least.epsilon > example.epsilon
     yield Claim(
-        "epsilon is the bound of Theorems 5 and 7 at the printed P0, Q, gamma and delta",
+        "epsilon is the bound of Theorems 2 and 3 at the printed P0, Q, gamma and delta",
         f"epsilon = {example.epsilon}",
         f"with g_bar^2 = kappa rho >= {example.kappa} the theorems give epsilon >= {least.epsilon:.3f}",
         Verdict.of(not fails),
-        f"with the actual |BK| = {norm:.3f} in place of Theorem 7's bound on it: {tight[0]:.4f} to {tight[1]:.4f}, so "
+        f"with the actual |BK| = {norm:.3f} in place of Theorem 3's bound on it: {tight[0]:.4f} to {tight[1]:.4f}, so "
         "the printed epsilon is a valid bound once K is known",
         Defect.EPSILON if fails else "",
     )
@@ -35,7 +35,7 @@ def error_claims(example: PaperExample) -> Iterator[Claim]:
     yield Claim(
         "the largest simulated error agrees with the bounds",
         f"max e'e = {example.largest_error} < epsilon = {example.epsilon}",
-        f"it needs e_up'e_up >= {needed:.4f}; the printed epsilon implies at most {implied:.4f} through Theorem 7, but "
+        f"it needs e_up'e_up >= {needed:.4f}; the printed epsilon implies at most {implied:.4f} through Theorem 3, but "
         f"up to {read_otherwise:.3f} under the reading of row 9, with the actual |BK|",
         Verdict.HOLDS if needed <= implied else Verdict.UNDECIDED if needed <= read_otherwise else Verdict.FAILS,
         f"no contradiction under either reading if {example.largest_error} is a norm, not its square (then "

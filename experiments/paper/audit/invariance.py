@@ -1,4 +1,4 @@
-"""Rows about the robust safety invariance of the printed set (Definition 1)."""
+"""Rows about the robust safety invariance of the printed set (Definition 3)."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ def invariance_claims(example: PaperExample) -> Iterator[Claim]:
     every = worst_step(closed_loop, M, Box(example.disturbance_half_widths), Ball(example.epsilon))
     stays = not every.confirmed and stays_inside(closed_loop, M, ball, Ball(example.epsilon))
     yield Claim(
-        "the set is (gamma, epsilon)-RSI (Definition 1): every e with e'e <= epsilon",
+        "the set is (gamma, epsilon)-RSI (Definition 3): every e with e'e <= epsilon",
         "x+ in S for all x in S, d, e",
         f"worst x+'M x+ = {every.level:.4f} with d in the box of Section 5" + (f"; {text_of(every)}"),
         Verdict.FAILS if every.confirmed else Verdict.HOLDS if stays else Verdict.UNDECIDED,
-        "row 8 reads Definition 1 with the errors that can occur" if every.confirmed else "",
+        "row 8 reads Definition 3 with the errors that can occur" if every.confirmed else "",
         Defect.MARGIN if every.confirmed else "",
     )
     reachable = Segment(example.B[:, 0], example.epsilon)

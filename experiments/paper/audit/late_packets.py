@@ -1,4 +1,4 @@
-"""The row about late packets: the closed loop of Section 5, simulated with each reading of Definition 3's filter.
+"""The row about late packets: the closed loop of Section 5, simulated with each reading of Definition 1's filter.
 
 The gain is the printed one; noise, disturbance, channel and starts are the same for every filter.
 """
@@ -27,12 +27,12 @@ MakeFilter = Callable[[PaperExample, LinearPlant, np.ndarray], DefinitionThreeFi
 
 
 def taken_as_current(example: PaperExample, plant: LinearPlant, mean: np.ndarray) -> DefinitionThreeFilter:
-    """Returns Definition 3's filter that takes a late sample for y_k."""
+    """Returns Definition 1's filter that takes a late sample for y_k."""
     return DefinitionThreeFilter(example, plant, mean, takes_late=True)
 
 
 def discarded(example: PaperExample, plant: LinearPlant, mean: np.ndarray) -> DefinitionThreeFilter:
-    """Returns Definition 3's filter that discards late samples."""
+    """Returns Definition 1's filter that discards late samples."""
     return DefinitionThreeFilter(example, plant, mean, takes_late=False)
 
 
@@ -53,7 +53,7 @@ def late_packet_claim(example: PaperExample) -> Claim:
     times = min(current) / example.epsilon
     return Claim(
         "the error stays within epsilon with packets that arrive two steps late",
-        f"e'e < epsilon = {example.epsilon}, with the filter of Definition 3, which has no late packets",
+        f"e'e < epsilon = {example.epsilon}, with the filter of Definition 1, which has no late packets",
         f"simulated with the printed K ({_SEEDS} times {_STARTS} starts, {_STEPS} steps): if the filter takes late "
         f"packets as current, max e'e = {min(current):.3f} to {max(current):.3f}, at least {times:.1f} times epsilon; "
         f"if it discards them, at most {max(skipped):.5f}; a filter that goes back to the step of the sample and "

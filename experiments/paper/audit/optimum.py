@@ -53,7 +53,7 @@ def optimum(example: PaperExample, u_max: float, *, with_misread_margin: bool = 
     # The smallest rho, to two digits, that (C7) allows for the printed set.
     rho = float(np.ceil(100.0 * np.linalg.cond(example.L)) / 100.0)
     g_bar = (example.kappa * rho) ** 0.5
-    epsilon_up = example.epsilon / (g_bar + float(np.linalg.norm(plant.A, 2))) ** 2  # Theorem 7, solved for epsilon_up
+    epsilon_up = example.epsilon / (g_bar + float(np.linalg.norm(plant.A, 2))) ** 2  # Theorem 3, solved for epsilon_up
     if not with_misread_margin:
         rho = 1.0 / example.kappa
     bounds = PaperBounds(example.kappa, rho, epsilon_up, example.epsilon, misread_alpha(example))

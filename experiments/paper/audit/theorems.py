@@ -1,4 +1,4 @@
-"""Rows about Definition 2 at kappa = 1 and about the "only if" of Theorem 2, each with an exact counterexample."""
+"""Rows about Definition 4 at kappa = 1 and about the "only if" of Theorem 5, each with an exact counterexample."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _ALMOST_ONE = 0.9999
 
 @dataclass(frozen=True)
 class OnlyIfExample:
-    """A set, a closed loop and bounds on which to try the "only if" of Theorem 2, in rational numbers.
+    """A set, a closed loop and bounds on which to try the "only if" of Theorem 5, in rational numbers.
 
     Attributes:
         M: Matrix of the set {x : x'Mx <= 1}.
@@ -108,13 +108,13 @@ def margin_claim(example: PaperExample) -> Claim:
     step = worst_step(closed, example.M, Box(example.disturbance_half_widths), Ball(0.0))
     fails = at_one == 0.0 and contracts(closed, example.M) and step.confirmed
     return Claim(
-        "Definition 2: no margin is needed at kappa = 1",
+        "Definition 4: no margin is needed at kappa = 1",
         "alpha = 0 if kappa = 1; the proof (its case 2): (Cond.B) then holds only if gamma = epsilon = 0",
         f"alpha = {safety_margin(gamma, example.epsilon, _ALMOST_ONE):.2g} at kappa = {_ALMOST_ONE}, {at_one:g} at "
         f"kappa = 1. With {factor:.4f} K in place of K, (C1) holds at kappa = 1, and with e = 0 and d in the box of "
         f"Section 5 the worst x+'M x+ = {step.level:.4f}; {text_of(step)}",
         Verdict.FAILS if fails else Verdict.UNDECIDED,
-        "right if gamma = epsilon = 0; at kappa = 1 epsilon itself is infinite (Theorem 5 divides by 1 - kappa rho)",
+        "right if gamma = epsilon = 0; at kappa = 1 epsilon itself is infinite (Theorem 2 divides by 1 - kappa rho)",
         Defect.NO_MARGIN_AT_ONE if fails else "",
     )
 
@@ -136,12 +136,12 @@ def contracts(closed: np.ndarray, M: np.ndarray) -> bool:
 
 
 def equivalence_claim(example: OnlyIfExample = ONLY_IF) -> Claim:
-    """Returns the row about "if and only if" in Theorem 2."""
+    """Returns the row about "if and only if" in Theorem 5."""
     fails = example.is_invariant and example.breaks_condition
     ball = Ball(float(example.radius**2))
     worst = worst_step(to_float(example.closed_loop), to_float(example.M), ball, ball)
     return Claim(
-        "Theorem 2: a set is invariant only if some kappa meets (Cond.A) and (Cond.B)",
+        "Theorem 5: a set is invariant only if some kappa meets (Cond.A) and (Cond.B)",
         "if and only if there exists a kappa in (0, 1]",
         f"M = {_entries(example.M)}, A+BK = {_entries(example.closed_loop)}, d + e in the ball of radius "
         f"{float(2 * example.radius):g}: the set is {'' if example.is_invariant else 'not proved '}invariant (worst "

@@ -1,4 +1,4 @@
-"""The constraints of OP (Liu et al. Definition 2) for a given set and gain, with its constants in ball arithmetic."""
+"""The constraints of OP (Liu et al. Definition 4) for a given set and gain, with its constants in ball arithmetic."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shields.verification.conditions import Condition
 from shields.verification.flint.bounds import PRECISION, keeps_enough
 from shields.verification.flint.exact import at_least_zero, definite, form, identity, is_so, mapped, matrix, number
 
-# Where 1 - kappa rho is smaller, Theorem 5 bounds nothing.
+# Where 1 - kappa rho is smaller, Theorem 2 bounds nothing.
 _SMALLEST_GAP = 1e-9
 # The constants that a certificate states are floats: they may differ from the true ones by this, relative to them.
 _STATED = fmpq(1, 10**9)
@@ -47,7 +47,7 @@ def paper_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[C
     with ctx.workprec(PRECISION):
         constants = _constants(kappa, rho, plant)
         agree = _is_near(stated.epsilon_up, constants.epsilon_up) and _is_near(stated.epsilon, constants.epsilon)
-        yield is_so("eps_up and eps are those of Theorems 5 and 7", agree)
+        yield is_so("eps_up and eps are those of Theorems 2 and 3", agree)
     yield keeps_enough("chi-square: no more than delta is truncated", plant.process_noise, plant)
     yield from _set_conditions(certificate, kappa, rho, constants, plant)
 
@@ -79,7 +79,7 @@ def _set_conditions(
 
 
 def _constants(kappa: Any, rho: Any, plant: LinearPlant) -> _Constants:
-    """Returns the constants of Theorems 5 and 7 and of Definition 2 with g_bar^2 = kappa rho."""
+    """Returns the constants of Theorems 2 and 3 and of Definition 4 with g_bar^2 = kappa rho."""
     g2, gamma = arb(kappa * rho), arb(number(plant.gamma))
     q_bar = _largest_eigenvalue(matrix(plant.process_noise_cov)) + gamma
     p0, A = _largest_eigenvalue(matrix(plant.initial_cov)), matrix(plant.A)

@@ -57,7 +57,7 @@ def test_printed_design_is_the_optimum_for_an_input_limit_of_six():
     assert np.linalg.eigvalsh(L)[0] > alpha
     epsilon_up = 0.0094 / ((0.9029 * 1.01) ** 0.5 + np.linalg.norm(CASE.plant.A, 2)) ** 2
     np.testing.assert_allclose(K, semidefinite_optimum(6.0, alpha**2 / epsilon_up), atol=5e-5)
-    # With the alpha of Definition 2 in place of this one, the gain is another.
+    # With the alpha of Definition 4 in place of this one, the gain is another.
     right = ((5e-4**0.5 + 0.0094**0.5) / (1.0 - 0.9029**0.5)) ** 2
     assert np.abs(semidefinite_optimum(6.0, right**2 / epsilon_up) - CASE.K).max() > 3e-4
 

@@ -16,7 +16,7 @@ EVERYWHERE = np.array([True])
 
 
 def textbook_filter(mean):
-    """Definition 3 by filterpy."""
+    """Definition 1 by filterpy."""
     kalman = KalmanFilter(dim_x=2, dim_z=2)
     kalman.x, kalman.P = np.array(mean), np.array(PLANT.initial_cov)
     kalman.F, kalman.H = PLANT.A + PLANT.B @ CASE.K, PLANT.H
