@@ -94,7 +94,16 @@ class Agent:
     horizon: int | None = None
 
     def act(self, observations: np.ndarray) -> np.ndarray:
-        """Returns deterministic actions, shape (N, m), for raw observations, shape (N, entries)."""
+        """Returns deterministic actions, shape (N, m), for raw observations, shape (N, entries).
+
+        Raises:
+            ValueError: If observations have another number of entries than those the agent was trained with.
+        """
+        if np.shape(observations)[1:] != self.normalization.mean.shape:
+            raise ValueError(
+                f"the agent was trained in {self.env} with observations of {self.normalization.mean.size} entries: "
+                f"they must have shape (N, {self.normalization.mean.size}), got {np.shape(observations)}"
+            )
         actions = self.model.predict(self.normalization(observations), deterministic=True)[0]
         return actions if self.residual_gain is None else with_gain(self.residual_gain, observations, actions)
 

@@ -14,8 +14,9 @@ import ncs_gym  # noqa: F401  (registers the environments)
 from agents.loop_wrappers import CostPenalty, ResidualActions
 from agents.settings import LagrangianSettings
 from ncs_gym import Channel
+from ncs_gym.validation import shown
 from shields import Certificate, SafetyShield, VectorSafetyShield
-from shields.runtime.safety_filter import DEFAULT_HORIZON
+from shields.runtime.safety_filter import DEFAULT_HORIZON, MODES
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,13 @@ class ShieldSettings:
     horizon: int | None = None
 
     def __post_init__(self) -> None:
-        """Puts the default in the place of a horizon that is not given, so that whoever keeps it keeps a number."""
+        """Checks the mode, and gives a horizon that is not given its default, so that whoever keeps it keeps a number.
+
+        Raises:
+            ValueError: If the mode is unknown.
+        """
+        if self.mode not in MODES:
+            raise ValueError(f"mode must be one of {list(MODES)}, got {shown(self.mode)}")
         if self.mode == "lookahead" and self.horizon is None:
             object.__setattr__(self, "horizon", DEFAULT_HORIZON)
 
@@ -64,7 +71,7 @@ class ControlLoop:
         residual_gain: Normalized gain, shape (m, n), to whose action an agent in training adds its own.
 
     Raises:
-        ValueError: If the shield is something else than its settings.
+        ValueError: If the shield is something else than its settings, or another filter is given beside it.
     """
 
     env: str
@@ -83,6 +90,8 @@ class ControlLoop:
         """Refuses what is not the settings of a shield, a bare certificate say, before anything is trained with it."""
         if self.shield is not None and not isinstance(self.shield, ShieldSettings):
             raise ValueError(f"shield must be ShieldSettings(certificate), got {type(self.shield).__name__}")
+        if self.shield is not None and self.filter is not None:
+            raise ValueError("give either a shield or a filter: two of them would override each other")
 
     @property
     def without_penalties(self) -> ControlLoop:

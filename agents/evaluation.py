@@ -39,7 +39,12 @@ def evaluate(
         seed: Seed of all random numbers (see `Episode.index`).
         level_matrix: M, shape (n, n), for `Episode.largest_level`.
         on_progress: Called with the number of steps taken since its last call.
+
+    Raises:
+        ValueError: If there is no episode to play.
     """
+    if episodes < 1:
+        raise ValueError(f"episodes must be at least 1, got {episodes}")
     finished: list[Episode] = []
     trajectory: Trajectory | None = None
     for first in range(0, episodes, _MAX_PARALLEL_EPISODES):

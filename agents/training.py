@@ -67,6 +67,8 @@ def train(
         ModuleNotFoundError: If the algorithm's package is not installed.
     """
     settings = checked_settings(algorithm, settings)
+    if steps < 1:
+        raise ValueError(f"steps must be at least 1, got {steps}")
     if isinstance(settings, OffPolicySettings) and steps <= settings.learning_starts:
         raise ValueError(f"{steps} steps train nothing: learning starts after {settings.learning_starts}")
     envs = loop.vector(settings.envs)

@@ -49,6 +49,11 @@ def test_loaded_agent_acts_like_the_saved_one(algorithm, tmp_path):
         assert again.channel == bursts
 
 
+def test_observations_of_another_environment_are_refused(agent):
+    with pytest.raises(ValueError, match=r"was trained in .* with observations of 3 entries.*got \(4, 5\)$"):
+        agent.act(np.zeros((4, 5)))
+
+
 def test_shared_folder_has_the_agent_its_shield_and_a_card(agent, certificate, tmp_path):
     shield = ShieldSettings(certificate, "switch")
     loop = ControlLoop(env=CRUISE, shield=shield)

@@ -30,6 +30,16 @@ def test_bare_certificate_is_refused_before_training(certificate):
         ControlLoop(env="ncs_gym/TruckTrailerCruise-v0", shield=certificate)
 
 
+def test_unknown_mode_is_refused_before_training(certificate):
+    with pytest.raises(ValueError, match=r"^mode must be one of \["):
+        ShieldSettings(certificate, mode="x")
+
+
+def test_shield_and_filter_are_not_mixed(certificate):
+    with pytest.raises(ValueError, match="give either a shield or a filter"):
+        ControlLoop(env="ncs_gym/TruckTrailerCruise-v0", shield=ShieldSettings(certificate), filter=lambda envs: envs)
+
+
 def test_channel_reaches_both_kinds_of_environment():
     loop = ControlLoop(env=CRUISE, channel=Channel(delay=7))
     assert loop.single().unwrapped.channel.delay == loop.vector(2).unwrapped.channel.delay == 7

@@ -113,6 +113,8 @@ def test_many_episodes_are_played_in_parts(monkeypatch):
     played = evaluate(CRUISE, zero, 8, 0)
     assert [record.index for record in played.episodes] == list(range(8))
     assert len({record.episode_return for record in played.episodes}) == 8
+    with pytest.raises(ValueError, match="episodes must be at least 1, got 0"):
+        evaluate(CRUISE, zero, 0, 0)
 
 
 def test_progress_is_reported_in_steps():

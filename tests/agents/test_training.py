@@ -121,6 +121,8 @@ def test_weight_of_the_entropy_and_normalization_of_rewards_change_what_is_learn
 def test_too_few_steps_to_learn_are_refused():
     with pytest.raises(ValueError, match="64 steps train nothing: learning starts after 64"):
         train(CRUISE, 64, 0, "SAC", TINY_REPLAY)
+    with pytest.raises(ValueError, match="steps must be at least 1, got -5"):
+        train(CRUISE, -5, 0)
 
 
 @pytest.mark.parametrize(
