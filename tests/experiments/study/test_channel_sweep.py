@@ -9,6 +9,7 @@ from experiments.backends.execution import results_of
 from experiments.errors import ResultsError
 from experiments.runs import ExperimentSetup, execute_run
 from experiments.settings import CompareSettings
+from experiments.settings.agent_overrides import PPOOverrides
 from experiments.study.channel_sweep import SWEPT_CONDITIONS, SWEPT_FILTERS, channel_sweep, trained_agents
 from experiments.study.channel_sweep import _changed as changed
 from experiments.study.channel_sweep import _points as points_of
@@ -33,7 +34,14 @@ def trained(tmp_path_factory):
     """A comparison with two short trainings behind every filter, its results, and its agents."""
     out = tmp_path_factory.mktemp("trained")
     settings = CompareSettings(
-        env=CRUISE, arms=("unshielded", *SWEPT_FILTERS), seeds=2, steps=1_000, episodes=2, jobs=1, out=out
+        env=CRUISE,
+        arms=("unshielded", *SWEPT_FILTERS),
+        seeds=2,
+        steps=256,
+        ppo=PPOOverrides(envs=8, rollout=32, batch_size=64),
+        episodes=2,
+        jobs=1,
+        out=out,
     )
     setup = ExperimentSetup.of(CRUISE, None)
     runs = [setup.training_run(settings.completed, name, index) for name in SWEPT_FILTERS for index in range(2)]

@@ -36,7 +36,7 @@ def test_truck_trailers_reach_the_measured_volumes(mass, gamma, fraction):
 
 @pytest.mark.parametrize("m", [1, 2])
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_random_stable_plants_get_a_certificate_that_verifies(seed, n, m):
     plant = random_plant(seed, n, m, p=max(1, n - 1))
     certificate = synthesize(plant)
