@@ -15,13 +15,17 @@ FRAMES, REPEATS = 200, 5
 
 
 def main() -> None:
-    print(f"{'environment':<32}{'step [ms]':>10}{'picture [ms]':>14}{'pictures/s':>12}")
+    print(f"{'environment':<38}{'step [ms]':>10}{'picture [ms]':>14}{'pictures/s':>12}")
     for env_id in ENTRY_POINTS:
         if env_id == "ncs_gym/LinearNCS-v0":
             continue
-        env = gym.make(env_id, render_mode="rgb_array", terminate_on_violation=False).unwrapped
+        try:
+            env = gym.make(env_id, render_mode="rgb_array", terminate_on_violation=False).unwrapped
+        except ModuleNotFoundError as missing:
+            print(f"{env_id:<38}{missing}")
+            continue
         step, picture = [min(times) for times in zip(*(measured(env) for _ in range(REPEATS)), strict=True)]
-        print(f"{env_id:<32}{1e3 * step:>10.2f}{1e3 * picture:>14.2f}{1.0 / (step + picture):>12.0f}")
+        print(f"{env_id:<38}{1e3 * step:>10.2f}{1e3 * picture:>14.2f}{1.0 / (step + picture):>12.0f}")
 
 
 def measured(env: gym.Env) -> tuple[float, float]:
