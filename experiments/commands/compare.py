@@ -68,7 +68,8 @@ def compare(settings: CompareSettings) -> None:
     count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
     trained = max(arm["train_steps"] for arm in summary["arms"].values())
     print(f"\n{settings.env}: {count} and {trained:,} training steps per arm, {settings.episodes} episodes per run\n")
-    print(_tables(summary), *findings, f"files: {settings.out}", sep="\n")
+    short = ["A smoke run shows that everything runs; its agents have hardly learned."] if settings.smoke else []
+    print(_tables(summary), *findings, *short, f"files: {settings.out}", sep="\n")
 
 
 def _with_full_names(settings: CompareSettings) -> CompareSettings:

@@ -124,6 +124,7 @@ def test_smoke_run_prints_the_table_and_the_files(smoke):
     assert all(name in {line.split("  ")[0] for line in table} for name in ("trusting", "proportional+shielded"))
     assert max(len(line) for line in table if not line.startswith(("The", "shielded:", "files"))) <= 100
     assert str(out) in run.stdout
+    assert "A smoke run shows that everything runs" in run.stdout
     assert "step/s" in run.stderr
 
 
