@@ -9,8 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from ncs_gym import ChannelContract, LinearPlant
-from shields import Certificate, synthesize
-from shields.verification import require_valid
+from shields import Certificate
 
 ROOT = Path(__file__).resolve().parent.parent
 _certificates: dict[tuple[str, ChannelContract | None], Certificate] = {}
@@ -44,6 +43,8 @@ def certificate_of(plant: LinearPlant, contract: ChannelContract | None = None) 
 
 
 def _read_or_synthesized(plant: LinearPlant, contract: ChannelContract | None) -> Certificate:
+    from shields import synthesize  # what is kept needs no solver
+
     if _kept is None:
         return synthesize(plant, contract=contract)
     name = hashlib.sha256(f"{plant.fingerprint} {contract}".encode()).hexdigest()[:16]
@@ -56,4 +57,6 @@ def _read_or_synthesized(plant: LinearPlant, contract: ChannelContract | None) -
 @cache
 def require_valid_once(certificate: Certificate, plant: LinearPlant) -> None:
     """Raises unless a certificate verifies for a plant; the same objects, which cannot change, are verified once."""
+    from shields.verification import require_valid
+
     require_valid(certificate, plant)

@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ncs_gym import ChannelContract, LinearPlant
-from shields import Certificate, CertificateError, synthesize
+from shields import Certificate, CertificateError
 from shields.certificate_file import _digest
+from tests.certificates import certificate_of
 from tests.fuzz import examples
 from tests.verdicts import verified
 
@@ -28,7 +29,7 @@ def case(name):
         plant, contract = LinearPlant(A=[[0.9, 0.1], [0.0, 0.8]], initial_cov=1e-6 * np.eye(2), **sizes), None
     else:
         plant, contract = LinearPlant(A=[[1.02, 0.1], [0.0, 0.8]], **sizes), ChannelContract(1, 0.001)
-    return plant, synthesize(plant, contract=contract)
+    return plant, certificate_of(plant, contract)
 
 
 def damaged(data, at, kind):

@@ -5,7 +5,8 @@ import pytest
 
 from experiments.attack.worst_case import WorstCaseVectorEnv
 from ncs_gym import Channel, Ellipsoid, LinearPlant
-from shields import VectorSafetyShield, synthesize
+from shields import VectorSafetyShield
+from tests.certificates import certificate_of
 
 COUNT = 32
 SLANTED = np.array([[4e-4, 1e-4], [1e-4, 1e-4]])
@@ -29,7 +30,7 @@ def plant_with(**first_error) -> LinearPlant:
 
 def first_errors(plant: LinearPlant) -> np.ndarray:
     """First errors of the campaign, shape (COUNT, n); no step of it breaks an assumption."""
-    certificate = synthesize(plant)
+    certificate = certificate_of(plant)
     env = VectorSafetyShield(WorstCaseVectorEnv(COUNT, certificate, plant=plant, channel=Channel()), certificate)
     _, info = env.reset(seed=0)
     errors = info["estimation_error"]

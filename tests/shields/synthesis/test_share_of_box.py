@@ -8,9 +8,10 @@ import pytest
 from experiments.runs import ExperimentSetup
 from ncs_gym import LinearPlant, cart_pole, truck_trailer
 from ncs_gym.plants.statespace import inputs_under_way
-from shields import synthesize, verify
+from shields import verify
 from shields.certificate_text import size_of
 from shields.synthesis.share_of_box import share_of_box
+from tests.certificates import certificate_of
 from tests.plants import random_plant
 
 # A continuous-time oscillator with delayed inputs.
@@ -67,7 +68,7 @@ def test_too_many_corners_are_a_reason_not_a_number(certificate):
 def test_share_with_delayed_inputs_is_that_of_the_states_with_no_input_under_way(steps):
     plant = delayed(steps)
     assert inputs_under_way(plant) == steps
-    certificate = synthesize(plant)
+    certificate = certificate_of(plant)
     states = np.random.default_rng(1).uniform(-1.0, 1.0, (100_000, 2)) * [1.0, 1.5]
     at_rest = np.concatenate([states, np.zeros((len(states), steps))], axis=1)
     share = float((certificate.safe_set.gauge(at_rest) <= 1.0).mean())

@@ -9,6 +9,7 @@ import pytest
 from ncs_gym import ChannelContract, cart_pole
 from shields import Certificate, synthesize
 from shields.certificate_file import _digest
+from tests.certificates import certificate_of
 
 
 @pytest.fixture
@@ -19,7 +20,7 @@ def path(certificate, tmp_path):
 
 @pytest.fixture(scope="module")
 def by_age():
-    return synthesize(cart_pole(), contract=ChannelContract(3, 1e-4))
+    return certificate_of(cart_pole(), ChannelContract(3, 1e-4))
 
 
 def test_what_is_loaded_equals_what_was_saved(certificate, by_age, tmp_path):

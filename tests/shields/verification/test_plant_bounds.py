@@ -7,6 +7,7 @@ import pytest
 
 from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, truck_trailer
 from shields import synthesize
+from tests.certificates import certificate_of
 from tests.shields.verification.test_verification import replaced
 from tests.verdicts import verified
 
@@ -25,7 +26,7 @@ CASES = {
 @pytest.fixture(scope="module", params=CASES)
 def designed(request):
     plant = truck_trailer(4000.0, **CASES[request.param], **BOUNDS)
-    return plant, synthesize(plant)
+    return plant, certificate_of(plant)
 
 
 def broken(certificate, plant):
@@ -64,7 +65,7 @@ def test_certificate_belongs_to_its_declared_bounds(designed, name):
 
 def test_noise_set_under_a_contract_holds_the_declared_noise():
     plant = truck_trailer(4000.0, **BOUNDS)
-    certificate = synthesize(plant, contract=ChannelContract(1, 0.02))
+    certificate = certificate_of(plant, ChannelContract(1, 0.02))
     assert verified(certificate, plant).valid
     larger = replaced(plant, sensor_bound=Ellipsoid(1.001 * plant.sensor_bound.shape))
     found = broken(certificate, larger)
