@@ -96,8 +96,8 @@ class SafeLoop:
         self.contract = certificate.contract
         self._estimator = Estimator(plant, channel, patterns=arrival_patterns(plant, channel, self.contract))
         protocol = downlink_protocol(downlink, downlink_contract)
-        self._guarded = MonitoredFilter(self.filter, protocol)
-        self.lead = self._guarded.lead
+        self._monitored = MonitoredFilter(self.filter, protocol)
+        self.lead = self._monitored.lead
         warn_of_broken_contract(self.contract, channel, self.lead, counts_losses=self.lead > 0)
         self._inputs = CommittedInputs(self.lead, plant.m)
         self._discarded = DiscardedPackets()
@@ -128,7 +128,7 @@ class SafeLoop:
         self._discarded = DiscardedPackets()
         self._inputs.start()
         earlier = [self._estimator.predicted(self._inputs.pending[:ahead]) for ahead in range(self.lead)]
-        self._guarded.begin(self._report(), known, beliefs=earlier)
+        self._monitored.begin(self._report(), known, beliefs=earlier)
         self._phase = _Phase.STARTED
 
     def receive(self, packets: Iterable[Packet] = (), applied: Any = None) -> np.ndarray:
@@ -159,10 +159,10 @@ class SafeLoop:
             raise RuntimeError("receive was called twice in a step: hand over all packets of a step in one call")
         if phase is _Phase.DECIDED:
             self._phase = _Phase.STOPPED  # if something is raised in between, what is known is not consistent
-            decided, due = np.array(self._guarded.decided), self._inputs.pop()
+            decided, due = np.array(self._monitored.decided), self._inputs.pop()
             told = due if applied is None else _as_input(applied, due.shape)
             self._estimator.advance(due if told is None else told, arrived)
-            self._guarded.advance(told, True, self._report(), decided)
+            self._monitored.advance(told, True, self._report(), decided)
         oldest = self._estimator.channel.longest_delay
         self._discarded = self._discarded.with_those_of(arrived, self.steps, self.episode, oldest)
         self._phase = _Phase.RECEIVED
@@ -180,7 +180,7 @@ class SafeLoop:
         """
         if self._require_started() is _Phase.DECIDED:
             raise RuntimeError("decide was called twice in a step: call receive in between, with the packets that came")
-        decision = self._guarded.decide(self._clipped(proposed))
+        decision = self._monitored.decide(self._clipped(proposed))
         self._inputs.commit(decision.input)
         self._phase = _Phase.DECIDED
         return decision
@@ -208,12 +208,12 @@ class SafeLoop:
     @property
     def reason(self) -> str:
         """Why it is not; empty while it is."""
-        return NOT_STARTED if self._phase is _Phase.STOPPED else self._guarded.reason
+        return NOT_STARTED if self._phase is _Phase.STOPPED else self._monitored.reason
 
     @property
     def plan_length(self) -> int:
         """Number of inputs stored for the steps after this decision; 0 in other modes than "lookahead"."""
-        return 0 if self._phase is _Phase.STOPPED else self._guarded.plan_length
+        return 0 if self._phase is _Phase.STOPPED else self._monitored.plan_length
 
     @property
     def estimate(self) -> np.ndarray:
@@ -252,7 +252,7 @@ class SafeLoop:
 
     def _report(self) -> LoopObservation:
         """Returns what the estimator says now."""
-        return self._guarded.reported(*self._belief(), self._estimator.alarm, self._estimator.age)
+        return self._monitored.reported(*self._belief(), self._estimator.alarm, self._estimator.age)
 
     def _belief(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimate and error shape of the time at which the next input takes effect."""

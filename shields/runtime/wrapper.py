@@ -97,8 +97,8 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             certificate_for(inner.plant, inner.certificate_contract) if certificate is None else certificate
         )
         self.filter = SafetyFilter(self.certificate, inner.plant, mode, horizon)
-        self._guarded = MonitoredFilter(self.filter, inner.downlink)
-        warn_of_broken_contract(self.certificate.contract, inner.channel, self._guarded.lead)
+        self._monitored = MonitoredFilter(self.filter, inner.downlink)
+        warn_of_broken_contract(self.certificate.contract, inner.channel, self._monitored.lead)
         self._clock: tuple[int, int] | None = None
         self._start: Any = None
         self._known: tuple[StartKnown, ...] = ()
@@ -118,8 +118,8 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         clock, report = self._read_clock(), self._observed(info)
         start = self._inner.start
         if start is not self._start:  # decided exactly, which takes longer than a step; starts are read-only
-            self._start, self._known = start, starts_known(self.filter, start, self._guarded.lead)
-        self._guarded.begin(report, self._known, clock[1] == 0, self._inner.beliefs()[:-1])
+            self._start, self._known = start, starts_known(self.filter, start, self._monitored.lead)
+        self._monitored.begin(report, self._known, clock[1] == 0, self._inner.beliefs()[:-1])
         self._interventions = 0
         u = np.zeros(self.filter.plant.m)
         margin = self.filter.margin(report.estimate, info["error_shape"], u)
@@ -136,7 +136,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         if self._clock is None:
             raise gym.error.ResetNeeded("call reset before the first step")
         proposed = applied_input(self.filter.plant, action)
-        decision = self._guarded.decide(proposed)
+        decision = self._monitored.decide(proposed)
         if decision.intervened and self.filter.mode != "monitor":
             action = (decision.input / self.filter.plant.u_max).astype(np.float32)
         if self._is_drawn:
@@ -147,7 +147,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         clock = self._read_clock()
         committed = None if self._inner.downlink is None else as_numbers(info["input_committed"])
         moved_once = clock == (episode, step + 1)
-        self._guarded.advance(as_numbers(info["input"]), moved_once, self._observed(info), committed)
+        self._monitored.advance(as_numbers(info["input"]), moved_once, self._observed(info), committed)
         self._interventions += decision.intervened
         self._clock = clock
         info = info | self._info(proposed, decision.input, decision.margin, intervened=decision.intervened)
@@ -158,7 +158,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         estimate, shape = as_numbers(info["estimate"]), self.filter.test.single[0]
         estimate = np.full(shape, np.nan) if estimate is None or estimate.shape != shape else estimate.copy()
         alarm = info["assumption_violated"] not in (False,)
-        return self._guarded.reported(estimate, info["error_shape"], alarm, self._inner.estimator.age)
+        return self._monitored.reported(estimate, info["error_shape"], alarm, self._inner.estimator.age)
 
     def _read_clock(self) -> tuple[int, int]:
         """Returns the number of episodes begun and of steps taken in this one."""
@@ -178,8 +178,8 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         self._inner.annotate(note)
 
     def _info(self, proposed: np.ndarray, applied: np.ndarray, margin: float, *, intervened: bool) -> dict[str, Any]:
-        reason = self._guarded.reason
-        ahead = {} if self.filter.lookahead is None else {"shield_plan_length": self._guarded.plan_length}
+        reason = self._monitored.reason
+        ahead = {} if self.filter.lookahead is None else {"shield_plan_length": self._monitored.plan_length}
         return ahead | {
             "shield_intervened": intervened,
             "input_proposed": proposed.copy(),

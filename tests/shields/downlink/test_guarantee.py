@@ -141,10 +141,10 @@ def test_a_guarantee_that_is_regained_is_one_about_the_present_only_after_c_step
     direction = np.array([1.0, 0.0]) / np.sqrt(shield.certificate.M[0, 0])
     _, info = shield.reset(seed=0, options={"state": 1.001 * direction})
     assert info["shield_reason"] == NOT_KNOWN_INSIDE
-    guarded = shield._guarded
+    monitored = shield._monitored
     waited = []
     for _ in range(30):
-        waited.append((bool(guarded._state.inside), int(guarded._state.wait), info["shield_guaranteed"]))
+        waited.append((bool(monitored._state.inside), int(monitored._state.wait), info["shield_guaranteed"]))
         *_, info = shield.step(np.zeros(1))
     begins = next(k for k, (inside, _, _) in enumerate(waited) if inside)
     first = next(k for k, (_, _, guaranteed) in enumerate(waited) if guaranteed)
@@ -242,7 +242,7 @@ def test_a_start_outside_the_box_is_not_guaranteed_although_a_plan_is_certified_
     )
     for seed, start in enumerate(drifting):
         _, info = shield.reset(seed=seed, options={"state": start})
-        assert shield._guarded._state.inside  # that of step 3 is
+        assert shield._monitored._state.inside  # that of step 3 is
         assert info["cost"] == 1.0
         assert info["shield_reason"] == NOT_KNOWN_INSIDE
     infos = vector.reset(seed=0, options={"state": drifting})[1]

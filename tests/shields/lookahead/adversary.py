@@ -59,7 +59,7 @@ class WeakestPoint:
         self.shield: SafetyShield | None = None
 
     def __call__(self, rng, plant, nominal_next):
-        stored = self.shield._guarded._stored if self.shield is not None else []
+        stored = self.shield._monitored._stored if self.shield is not None else []
         bound, center, power, spread = plant.nominal_disturbance, nominal_next, np.eye(plant.n), 0.0
         values, pulled = [plant.C @ center], [plant.C]
         rooms = [1.0 - np.abs(plant.C @ center)]

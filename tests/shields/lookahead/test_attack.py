@@ -79,13 +79,13 @@ def test_plans_checked_with_less_are_caught_leaving_the_box(name, mutation, monk
 @pytest.mark.parametrize("name", ["cruise", "cart-pole", "batch reactor"])
 def test_plans_changed_afterwards_are_caught_leaving_the_box(name):
     env = extremal_env(name, "overtaking" if name != "cruise" else "blackout")
-    advance = env._guarded.advance
+    advance = env._monitored.advance
 
     def changed(*arguments):
         advance(*arguments)
-        env._guarded._stored = -env._guarded._stored
+        env._monitored._stored = -env._monitored._stored
 
-    env._guarded.advance = changed
+    env._monitored.advance = changed
     with pytest.raises(AssertionError, match=OUTSIDE):
         attack_for_long(env)
 
@@ -142,11 +142,11 @@ def test_an_input_other_than_the_decided_one_drops_the_stored_plan():
         _, info = env.reset(seed=seed)
         if info["shield_plan_length"] > 2:
             break
-    report = env._guarded.report
-    env._guarded.decide(np.zeros(2))
-    env._guarded.advance(np.full(2, 0.123), True, report)
-    assert env._guarded.plan_length == 0
-    assert env._guarded.reason == OTHER_INPUT
+    report = env._monitored.report
+    env._monitored.decide(np.zeros(2))
+    env._monitored.advance(np.full(2, 0.123), True, report)
+    assert env._monitored.plan_length == 0
+    assert env._monitored.reason == OTHER_INPUT
 
 
 def test_reset_clears_what_was_stored():
@@ -158,7 +158,7 @@ def test_reset_clears_what_was_stored():
         lengths.add(info["shield_plan_length"])
     assert max(lengths) > 0
     _, info = env.reset(seed=1, options={"state": np.zeros(2)})
-    assert info["shield_plan_length"] == env._guarded.plan_length == 0
+    assert info["shield_plan_length"] == env._monitored.plan_length == 0
 
 
 def test_loop_without_gymnasium_keeps_the_plan_between_steps():

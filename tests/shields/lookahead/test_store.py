@@ -114,10 +114,10 @@ def test_who_writes_into_a_decision_does_not_change_what_is_stored():
     for seed in range(20):
         shield.reset(seed=seed)
         for _ in range(4):
-            decision = shield._guarded.decide(plant.u_max)
+            decision = shield._monitored.decide(plant.u_max)
             if len(decision.plan):
-                stored = shield._guarded._stored.copy()
+                stored = shield._monitored._stored.copy()
                 decision.plan[:] = -plant.u_max
-                np.testing.assert_array_equal(shield._guarded._stored, stored)
+                np.testing.assert_array_equal(shield._monitored._stored, stored)
                 written += not np.array_equal(stored, decision.plan)
     assert written > 5
