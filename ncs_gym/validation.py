@@ -129,7 +129,7 @@ def as_covariance(value: Any, size: int | None, name: str) -> np.ndarray:
     matrix = as_matrix(value, (size, size), name)
     matrix = as_matrix(matrix, (len(matrix), len(matrix)), name)
     scale = np.abs(matrix).max()
-    if not np.allclose(matrix, matrix.T, rtol=0.0, atol=1e-12 * scale):
+    if (np.abs(matrix - matrix.T) > 1e-12 * scale).any():
         raise ValueError(f"{name} must be symmetric, got {shown(matrix.tolist())}")
     matrix = 0.5 * (matrix + matrix.T)
     smallest = float(np.linalg.eigvalsh(matrix)[0])

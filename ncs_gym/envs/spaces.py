@@ -36,16 +36,15 @@ def observation_space(plant: LinearPlant, task: Task, error_set: ErrorSet, initi
     Raises:
         ValueError: If an entry is beyond float32's range, so that observations would be infinite, or always zero.
     """
-    reach = np.zeros(plant.n)
-    power = np.eye(plant.n)
-    largest = initial_set.support(power)
+    powers = [np.eye(plant.n)]
     for _ in range(horizon):
-        reach += np.abs(power @ plant.B) @ plant.u_max + plant.disturbance.support(power)
-        power = power @ plant.A
-        largest = np.maximum(largest, reach + initial_set.support(power))
+        powers.append(powers[-1] @ plant.A)
+    unforced = np.array(powers)
+    added = np.abs(unforced[:-1] @ plant.B) @ plant.u_max + plant.disturbance.support(unforced[:-1])
+    reach = np.vstack([np.zeros(plant.n), added.cumsum(axis=0)]) + initial_set.support(unforced)
     ages = error_set.ages
     shapes = error_set.Sigma[None] if ages is None else ages.shapes
-    estimate = largest + np.sqrt(np.diagonal(shapes, axis1=1, axis2=2).max(axis=0))
+    estimate = reach.max(axis=0) + np.sqrt(np.diagonal(shapes, axis1=1, axis2=2).max(axis=0))
     start = initial_set.support(np.eye(plant.n))
     estimate = np.minimum(estimate, np.maximum(FARTHEST_OBSERVED * plant.half_widths, start))
     bound = OBSERVATION_MARGIN * np.concatenate([estimate, task.observation_bound(plant, horizon)])

@@ -77,7 +77,7 @@ class Ellipsoid(ReadOnlyArrays):
         return (values > 0.0) | (not values.any())
 
     def support(self, direction: np.ndarray) -> np.ndarray | float:
-        """Returns max of a'z over the ellipsoid for a direction a (n,), or for each row of (k, n)."""
+        """Returns max of a'z over the ellipsoid for a direction a (n,), or for each of shape (..., n)."""
         direction = np.asarray(direction, dtype=np.float64)
         value = np.sqrt(np.maximum(((direction @ self.shape) * direction).sum(axis=-1), 0.0))
         return float(value) if value.ndim == 0 else value
