@@ -144,7 +144,7 @@ def test_saved_certificate_verifies(smoke, loaded):
 
 def test_killed_run_goes_on_by_its_settings_file_and_ends_like_an_uninterrupted_one(smoke, tmp_path):
     out, units = tmp_path / "out", tmp_path / "out" / "units"
-    command = [sys.executable, "-m", "experiments", *SMOKE, "--out", str(out)]
+    command = [sys.executable, "-m", "experiments", *SMOKE, "--jobs", "1", "--out", str(out)]
     run = subprocess.Popen(command, env=environment(), stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 200.0
     while len(list(units.glob("*.json"))) < 2:
