@@ -39,7 +39,7 @@ def test_certificate_carries_the_papers_constants_and_no_error_set(paper):
 )
 def test_where_op_succeeds_its_constraints_hold_exactly(bounds, search):
     plant = truck_trailer(**bounds)
-    certificate = synthesize(plant, method="paper", search=search)
+    certificate = synthesize(plant, method="paper", search=search, dkappa=0.03, drho=0.08)
     report = verified(certificate, plant)
     assert report.valid, str(report)
     assert {f"(C{i})" for i in (1, 2, 3, 7)} <= {c.name.split()[0] for c in report.conditions}

@@ -83,10 +83,11 @@ def test_first_feasible_pair_wins():
 
 def test_largest_search_is_no_smaller_than_the_first_and_than_any_point_of_the_grid():
     plant = truck_trailer(gamma=1e-5, process_noise_cov=np.zeros((2, 2)))
-    first, largest = search_grid(plant), search_grid(plant, search="largest")
+    grid = {"dkappa": 0.03, "drho": 0.08}
+    first, largest = search_grid(plant, **grid), search_grid(plant, search="largest", **grid)
     assert largest.log_det > first.log_det + 0.1
     model, reduced = PaperModel(plant), ReducedProblem(plant)
-    volumes = [reduced.largest_log_det(model.at(kappa, rho)) for kappa, rho in list(kappa_rho_grid(0.02, 0.05))[::7]]
+    volumes = [reduced.largest_log_det(model.at(kappa, rho)) for kappa, rho in list(kappa_rho_grid(**grid))[::5]]
     assert largest.log_det >= max(volumes) - 1e-5
 
 
