@@ -6,7 +6,7 @@ import pytest
 
 from agents.control_loop import ControlLoop, ShieldSettings
 from agents.evaluation import _SEED_STREAM, evaluate
-from shields.runtime.wrapper import certificate_for
+from tests.certificates import certificate_of
 
 CRUISE = ControlLoop(env="ncs_gym/TruckTrailerCruise-v0")
 
@@ -93,7 +93,7 @@ def test_arms_have_common_random_numbers(shield):
 
 def test_episode_that_ends_early_changes_nothing_for_the_others():
     env = "ncs_gym/CartPole-v0"
-    loop = ControlLoop(env=env, shield=ShieldSettings(certificate_for(*_of(env)), "project"))
+    loop = ControlLoop(env=env, shield=ShieldSettings(certificate_of(*_of(env)), "project"))
 
     def push_the_first(observations, infos):
         actions = np.zeros((len(observations), 1), np.float32)
