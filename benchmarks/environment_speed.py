@@ -129,7 +129,7 @@ def first_steps() -> None:
     for each in actions[1:]:
         env.step(each)
     print(f"\nfirst step of 1024 shielded environments: {first:.2f} s of CPU, first 200 steps: ", end="")
-    print(f"{time.process_time() - start:.2f} s (made, reset and patterns of arrivals worked out)")
+    print(f"{time.process_time() - start:.2f} s\n  (made, reset and patterns of arrivals worked out)")
 
 
 def main() -> None:

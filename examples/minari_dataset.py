@@ -1,6 +1,7 @@
 """Shows Minari: a dataset of shielded episodes for offline learning, with the cost of every step among the infos.
 
-Takes about five seconds on one core; needs minari with its extra "create". The dataset goes into Minari's own folder.
+Takes about five seconds on one core; needs minari with its extras "create" and "hdf5". The dataset goes into Minari's
+own folder.
 """
 
 import gymnasium as gym

@@ -83,7 +83,7 @@ TRAINING = {
 }
 # Packages that no extra installs, and the versions that the examples were tried with (docs/integrations.md).
 FOREIGN = {
-    "minari_dataset.py": {"minari": "0.5.4", "jax": None},
+    "minari_dataset.py": {"minari": "0.5.4", "jax": None, "h5py": None},
     "tianshou_processes.py": {"tianshou": "2.0.1"},
     "torchrl_rollout.py": {"torchrl": "0.14.1"},
 }

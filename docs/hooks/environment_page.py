@@ -17,10 +17,13 @@ import numpy as np
 from gymnasium.envs.registration import load_env_creator
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearPlant, NCSEnv
+from ncs_gym.envs.spaces import FARTHEST_OBSERVED
 from shields import Certificate, SafetyShield, verify
 
 # Characters in a line of a block that fit the page.
-WIDTH = 96
+WIDTH = 110
+# A page of the documentation as docstrings name it.
+NAMED_PAGE = re.compile(r"\b(?:docs/)?(\w+)\.md\b")
 
 
 def environment_page(env_id: str, picture: str = "") -> str:
@@ -84,7 +87,12 @@ def _prose(documented: Any, verb: str = "") -> str:
     """Returns the description in a docstring, without its lists; `verb` stands for a leading "Returns "."""
     parsed = docstring_parser.parse(inspect.getdoc(documented) or "")
     text = "\n\n".join(filter(None, [parsed.short_description, parsed.long_description]))
-    return verb + text.removeprefix("Returns ") if verb else text
+    return _linked(verb + text.removeprefix("Returns ") if verb else text)
+
+
+def _linked(text: str) -> str:
+    """Returns a text of a docstring with links to the pages it names."""
+    return NAMED_PAGE.sub(r"[\1.md](../\1.md)", text)
 
 
 def _wrapped(text: str, indent: int) -> str:
@@ -94,7 +102,7 @@ def _wrapped(text: str, indent: int) -> str:
 
 
 def _actions(plant: LinearPlant) -> str:
-    rows = ["| entry | input | limit: action 1 is |", "|---|---|---|"]
+    rows = ["| entry | input | value at action 1 |", "|---|---|---|"]
     for index, name in enumerate(plant.input_names):
         rows.append(f"| {index} | {name} | {_with_unit(plant.u_max[index], plant.input_units, index)} |")
     return "\n".join(rows)
@@ -104,15 +112,14 @@ def _observations(env: NCSEnv) -> str:
     rows = ["| entry | what | from | to |", "|---|---|---|---|"]
     space, plant = env.observation_space, env.plant
     extra = len(space.low) - plant.n
-    names = [f"estimate of {name}" for name in plant.state_names] + [
-        f"the task's own, number {i}" for i in range(extra)
-    ]
+    names = [f"estimate of {name}" for name in plant.state_names] + [f"entry {i} of the task" for i in range(extra)]
     units = (*plant.state_units, *("" for _ in range(extra)))
     for index, name in enumerate(names):
         low, high = (_with_unit(bound[index], units, index) for bound in (space.low, space.high))
         rows.append(f"| {index} | {name} | {low} | {high} |")
     task = " [Rewards](#rewards) says what the task adds." if extra else ""
-    return "\n".join(rows) + f"\n\nThe limits are what can be reached within an episode.{task}"
+    cap = "" if plant.spectral_radius < 1.0 else f", at most {FARTHEST_OBSERVED:,.0f} half-widths of the safe box"
+    return "\n".join(rows) + f"\n\nThe limits are what can be reached within an episode{cap}.{task}"
 
 
 def _settings(settings: Any) -> str:
@@ -157,6 +164,8 @@ def _channel(env: NCSEnv) -> str:
             f"Between controller and actuator is a network as well: `{downlink.channel}`. "
             f"An action takes effect {_steps(downlink.lead)} later."
         )
+        if env.contract is not None:
+            texts[-1] += f" The certificate rests on both, {_steps(env.certificate_contract.max_age)} in all."
     return "\n\n".join(texts)
 
 
@@ -222,7 +231,7 @@ def _value(value: Any) -> str:
 
 
 def _cell(text: str | None) -> str:
-    return " ".join((text or "").split()).replace("|", "\\|")
+    return _linked(" ".join((text or "").split()).replace("|", "\\|"))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from mkdocs.structure.files import File
 
 from experiments.commands.render import render
 from experiments.settings import RenderSettings
-from ncs_gym.registration import registered_ids
+from ncs_gym.registration import needing_extras, registered_ids
 
 # Steps of the episode whose last picture a page shows.
 STEPS = 12
@@ -43,7 +43,9 @@ def on_files(files: Any, config: Any) -> Any:
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Puts a list of the pages on the page of all environments."""
     pages = [f"[{name}](environments/{name}.md)" for name in _ids_by_name()]
-    return markdown.replace(MARK, f"Each that has a plant of its own has a page: {', '.join(pages)}.")
+    absent = ", ".join(f"`{env_id}`" for env_id in needing_extras())
+    missing = f" (not {absent}: its extra was not installed when this site was built)" if absent else ""
+    return markdown.replace(MARK, f"Each that has a plant of its own has a page: {', '.join(pages)}{missing}.")
 
 
 @lru_cache

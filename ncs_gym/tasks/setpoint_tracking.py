@@ -19,10 +19,10 @@ class SetpointTracking(Task):
     every step survived pays. The task's state is the target, a number or shape (N,).
 
     Attributes:
-        output: c, shape (n,).
+        output: The row c of the output c x that follows the target, shape (n,).
         reach: Targets are uniform in [-reach, reach], in the unit of c x.
-        width: The error that pays nothing, in the unit of c x.
-        change_probability: Per step, to draw a new target.
+        width: The error |c x - target| from which on a step pays nothing, in the unit of c x.
+        change_probability: Probability per step that a new target is drawn.
 
     Raises:
         ValueError: If a value is out of range.

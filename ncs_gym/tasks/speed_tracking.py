@@ -21,9 +21,9 @@ class SpeedTracking(Task):
 
     Attributes:
         fastest: Targets (and the first speed) are uniform in `[0, fastest]` [m/s].
-        change_probability: Per step, to draw a new target.
-        error_weight: Per 5 m/s of error.
-        input_weight: Per (m/s^2)^2.
+        change_probability: Probability per step that a new target is drawn.
+        error_weight: What 5 m/s of speed error cost in a step.
+        input_weight: What an acceleration of 1 m/s^2 costs in a step.
         input_index: Which input is the acceleration [m/s^2].
 
     Raises:
