@@ -1,4 +1,4 @@
-"""Formulas of the pages: as the site and GitHub read them."""
+"""Formulas and names of the pages: as the site and GitHub read them."""
 
 import importlib.util
 import re
@@ -55,3 +55,15 @@ def test_formulas_become_mathml(page):
     assert made.count("<math") == len(lines) + len(blocks)
     assert made.count('<div class="formula">') == len(blocks)
     assert "arithmatex" not in made
+
+
+def test_options_and_ids_stay_on_one_line():
+    spec = importlib.util.spec_from_file_location("unbroken", ROOT / "docs" / "hooks" / "unbroken.py")
+    assert spec is not None
+    assert spec.loader is not None
+    hook = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(hook)
+    block = "<pre><span></span><code>ncs train --seed 1</code></pre>"
+    made = hook.on_page_content(f"<p>a--b <code>ncs train --a2c.n-steps 1 ncs_gym/CartPole-v0</code></p>{block}")
+    kept = '<span class="unbroken">--a2c.n-steps</span> 1 <span class="unbroken">ncs_gym/CartPole-v0</span>'
+    assert made == f"<p>a--b <code>ncs train {kept}</code></p>{block}"
