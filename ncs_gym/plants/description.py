@@ -9,6 +9,7 @@ import sys
 import warnings
 from dataclasses import MISSING, fields
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,7 +28,10 @@ _KINDS = {
     "sensor noise": ("the sensors measure without noise", "sensor_bound or measurement_noise_cov"),
     "the first estimate": ("the first estimate is exact", "initial_bound or initial_cov"),
 }
-_INDENT = 16
+# Columns of the description: where its texts begin, and where they end.
+_INDENT, _WIDTH = 16, 110
+# Stands for a space at which no line ends.
+_UNBROKEN = "\N{NO-BREAK SPACE}"
 
 
 class NoNoiseWarning(UserWarning):
@@ -92,16 +96,15 @@ def describe(plant: LinearPlant) -> str:
         ],
     }
     for title, (sizes_of, names, units) in extents.items():
-        lines[title] = [
-            ", ".join(f"{name} up to {_sized(*each)}" for name, *each in zip(names, sizes_of, units, strict=True))
-        ]
+        parts = [f"{name} up to {_sized(*each)}" for name, *each in zip(names, sizes_of, units, strict=True)]
+        lines[title] = [", ".join(part.replace(" ", _UNBROKEN) for part in parts)]
     lines["assumptions"] = list(plant.assumptions)
     shown_lines = (
-        f"{title if number == 0 else '':<{_INDENT}}{text}"
+        fill(text, _WIDTH, initial_indent=f"{title if number == 0 else '':<{_INDENT}}", subsequent_indent=" " * _INDENT)
         for title, texts in lines.items()
         for number, text in enumerate(texts)
     )
-    return "\n".join(shown_lines)
+    return "\n".join(shown_lines).replace(_UNBROKEN, " ")
 
 
 def fingerprint_of(plant: LinearPlant) -> str:
