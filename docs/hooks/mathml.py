@@ -8,8 +8,8 @@ from math_core import LatexToMathML
 
 # A fenced block of language math, which GitHub draws as well and leaves its backslashes alone.
 BLOCK = re.compile(r"^```math\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-# What pymdownx.arithmatex makes of `$...$` and `$$...$$`.
-FORMULA = re.compile(r'<(span|div) class="arithmatex">\s*\\[(\[](.*?)\\[)\]]\s*</\1>', re.DOTALL)
+# What pymdownx.arithmatex makes of `$...$` and `$$...$$`, with the brackets and punctuation that stay on its line.
+FORMULA = re.compile(r'([(\[]*)<(span|div) class="arithmatex">\s*\\[(\[](.*?)\\[)\]]\s*</\2>([.,;:)\]]*)', re.DOTALL)
 CONVERTER = LatexToMathML(fancy_error=False)
 
 
@@ -35,6 +35,8 @@ def on_page_content(content: str, **_: Any) -> str:
 
 
 def _mathml(found: re.Match[str]) -> str:
-    is_block = found[1] == "div"
-    formula = CONVERTER.convert_with_local_state(html.unescape(found[2]).strip(), displaystyle=is_block)
-    return f'<div class="formula">{formula}</div>' if is_block else formula
+    before, tag, latex, after = found.groups()
+    formula = CONVERTER.convert_with_local_state(html.unescape(latex).strip(), displaystyle=tag == "div")
+    if tag == "div":
+        return f'{before}<div class="formula">{formula}</div>{after}'
+    return f'<span class="inline-formula">{before}{formula}{after}</span>' if before or after else formula
