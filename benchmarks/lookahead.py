@@ -164,10 +164,10 @@ def report(name: str, horizon: int, count: int) -> str:
     ]
     quick = timed(project.decide, [each for each in cases if project.decide(*each).reason == "safe"][:300])
     return (
-        f"{name:20s} {horizon:3d} {inside:7.1%} {one_step:9.1%} {admitted:9.1%} {bound:8.1%}   "
-        f"{np.median(quick):8.0f} {np.median(ours):8.0f} {np.quantile(ours, 0.99):8.0f} "
-        f"{np.median(again):8.0f} {np.median(others):8.0f} "
-        f"{np.median(others) / np.median(ours):6.1f}x {np.median(others) / np.median(again):6.1f}x "
+        f"{name:18s}{horizon:3d}{inside:7.1%}{one_step:9.1%}{admitted:10.1%}{bound:8.1%}"
+        f"{np.median(quick):9.0f}{np.median(ours):7.0f}{np.quantile(ours, 0.99):6.0f}"
+        f"{np.median(again):7.0f}{np.median(others):6.0f}"
+        f"{np.median(others) / np.median(ours):7.1f}x{np.median(others) / np.median(again):7.1f}x"
         f"{np.mean(far) / plant.u_max.max():8.2f}"
     )
 
@@ -245,10 +245,11 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=150_000)
     options = parser.parse_args()
     if "beliefs" in options.sections:
-        print("                             share of states in S, of beliefs admitted          us per decision")
+        print(f"{'states':>28s}{'beliefs admitted':>27s}{'us per decision':>35s}{'cvxpy over':>16s}")
         print(
-            "environment            N       S   one step lookahead    bound   one step   search      99%   stored    "
-            "cvxpy  search  stored  too far"
+            f"{'environment':18s}{'N':>3s}{'in S':>7s}{'one step':>9s}{'lookahead':>10s}{'bound':>8s}"
+            f"{'one step':>9s}{'search':>7s}{'99%':>6s}{'stored':>7s}"
+            f"{'cvxpy':>6s}{'search':>8s}{'stored':>8s}{'too far':>8s}"
         )
         for name, horizon in CASES:
             print(report(name, horizon, options.beliefs), flush=True)

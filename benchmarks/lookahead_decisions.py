@@ -51,11 +51,12 @@ def row(name: str, horizon: int, steps: int) -> str:
     plain = PlainProgram(shield)
     programs = [(x_hat, errors.shape, u) for x_hat, errors, u, _ in (searched or cases)[:CVXPY]]
     others = np.median(timed(plain.solve, programs))
+    searching = f"{np.median(alone[failed]):.0f}" if failed.any() else "-"
     return (
-        f"{name:20s} {horizon:3d} {failed.mean():8.1%}   {np.median(alone):7.0f} {np.quantile(alone, 0.99):6.0f} "
-        f"{np.median(alone[failed]) if failed.any() else np.nan:8.0f}   "
-        f"{np.median(together):7.0f} {np.quantile(together, 0.99):6.0f} {others:7.0f}   "
-        f"{others / np.median(alone):6.0f}x {others / np.median(together):9.0f}x"
+        f"{name:18s}{horizon:3d}{failed.mean():9.1%}"
+        f"{np.median(alone):9.0f}{np.quantile(alone, 0.99):6.0f}{searching:>9s}"
+        f"{np.median(together):9.0f}{np.quantile(together, 0.99):6.0f}{others:8.0f}"
+        f"{others / np.median(alone):11.0f}x{others / np.median(together):11.0f}x"
     )
 
 
@@ -71,9 +72,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=100)
     steps = parser.parse_args().steps
-    print(" " * 34 + "us per decision: one by one           in batches of 64            cvxpy / median of")
+    print(f"{'us per decision: one by one':>54s}{'batches of 64':>15s}{'cvxpy / median of':>32s}")
     print(
-        "environment            N searched    median    99% searched    median    99%   cvxpy  one by one  in batches"
+        f"{'environment':18s}{'N':>3s}{'searched':>9s}{'median':>9s}{'99%':>6s}{'searched':>9s}"
+        f"{'median':>9s}{'99%':>6s}{'cvxpy':>8s}{'one by one':>12s}{'in batches':>12s}"
     )
     for name, horizon in CASES:
         print(row(name, horizon, steps), flush=True)
