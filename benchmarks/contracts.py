@@ -100,6 +100,7 @@ def drawn(ages: list[int], radii_of: dict[str, np.ndarray]) -> CaptionedFigure:
             "largest disturbance [% of the box]",
         )
         axes.set_xticks(ages)
+        axes.set_yticks([0.1, 0.3, 1.0, 3.0])
         axes.yaxis.set_major_formatter("{x:g}")
         axes.minorticks_off()
         legend_below(figure, handles)

@@ -89,7 +89,7 @@ def picture(path: str) -> None:
             assert not missing
             text = f"$u_{int(u)}$" if step >= LEAD else "0"
             axes.text(step, -0.1, text, ha="center", va="top", fontsize=12, weight="bold")
-            source = "agreed" if step < LEAD else f"from command {newest}"
+            source = "agreed" if step < LEAD else f"of command {newest}"
             second = step == LOST + DELAY
             axes.text(step, -0.32, source, ha="center", va="top", fontsize=8, color="#b3261e" if second else "#555555")
         axes.text(-0.75, 1.0, "controller\nsends", ha="right", va="center")
@@ -97,7 +97,7 @@ def picture(path: str) -> None:
         axes.set(xlim=(-0.7, STEPS - 0.4), ylim=(-0.5, 1.35), xticks=range(STEPS), yticks=[], xlabel="step")
         for spine in ("left", "bottom"):
             axes.spines[spine].set_visible(False)
-        figure.savefig(path, dpi=130, metadata={"Software": ""})
+        figure.savefig(path, dpi=200, metadata={"Software": ""})
 
 
 def main() -> None:

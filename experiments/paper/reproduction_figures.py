@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from experiments.paper.reproduction import Simulation
-from experiments.plots.figure_style import STYLE, CaptionedFigure
+from experiments.plots.figure_style import STYLE, CaptionedFigure, with_unit
 
 _COLOR = "#1f6f8b"
 # The transient is over after these steps; the other inputs are near zero.
@@ -27,7 +27,7 @@ def reproduction_figures(simulations: Sequence[Simulation]) -> dict[str, bytes]:
 def _panels(simulations: Sequence[Simulation], draw: Callable[[Axes, Simulation], None]) -> CaptionedFigure:
     """Returns one panel per design, with one legend below."""
     with matplotlib.rc_context(STYLE):
-        figure = CaptionedFigure((12, 4.6))
+        figure = CaptionedFigure((12, 4.8))
         axes = figure.subplots(1, len(simulations), sharey=True)
         for axis, simulation in zip(axes, simulations, strict=True):
             draw(axis, simulation)
@@ -35,7 +35,9 @@ def _panels(simulations: Sequence[Simulation], draw: Callable[[Axes, Simulation]
             if axis is not axes[0]:
                 axis.set_ylabel("")
         handles, labels = axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+        legend = figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+        for handle in legend.get_lines():  # what is drawn thin and faint a hundred times is not seen once
+            handle.set(lw=1.6, alpha=1.0)
         return figure
 
 
@@ -66,4 +68,4 @@ def _draw_inputs(axis: Axes, simulation: Simulation) -> None:
     starts, steps = np.nonzero(np.abs(shown) > limit)
     axis.plot(time[steps], shown[starts, steps], "x", color="#c8553d", ms=7, label="beyond the limit")
     axis.set_xlabel(f"time [s], first {_SHOWN_STEPS} steps")
-    axis.set_ylabel("input asked for [m/s^2]")
+    axis.set_ylabel(with_unit("input asked for", "m/s^2"))

@@ -38,6 +38,8 @@ _CONTROLLER_MARKERS = {
 _SOLID, _DOTTED, _DASHED = "-", (0, (1.0, 1.3)), (0, (4.5, 1.6))
 # Length of a dash that stands for a price of 1 per violating step, in line widths; it doubles with every factor of ten.
 _PRICE_DASH = 6.0
+# Size of the marker of that price [points], and what every factor of ten adds.
+_PRICE_SIZE, _PRICE_GROWTH = 7.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,8 @@ class ArmStyle:
         """Returns the style of an arm: the color stands for the shield, dashed lines and hollow markers for a penalty.
 
         Dotted lines and hollow markers stand for what acts in evaluation alone; so they do for the monitor, whose agent
-        is the unshielded one and whose curves lie on that arm's.
+        is the unshielded one and whose curves lie on that arm's. The higher a price, the longer the dashes and the
+        larger the marker. Of fixed policies that share a color, the one behind a trusting lookahead is hollow.
 
         Raises:
             ValueError: If the arm is unknown.
@@ -73,10 +76,13 @@ class ArmStyle:
         if name == "monitor" or not arm.filters_training:
             return cls(color, _DOTTED, marker if arm.filters_training else "h", hollow=True, size=11.0)
         if not arm.is_trained:
-            return cls(color, _DASHED, _CONTROLLER_MARKERS[arm.policy], hollow=False, size=9.0)
+            hollow = arm.mode == "trusting:lookahead"
+            return cls(color, _DASHED, _CONTROLLER_MARKERS[arm.policy], hollow, size=9.0)
         if arm.violation_weight is not None:
-            dash = float(np.clip(_PRICE_DASH * 2.0 ** np.log10(max(arm.violation_weight, 1e-9)), 0.5, 50.0))
-            return cls(color, (0, (dash, 1.6)), marker, hollow=True, size=7.0)
+            decades = np.log10(max(arm.violation_weight, 1e-9))
+            dash = float(np.clip(_PRICE_DASH * 2.0**decades, 0.5, 50.0))
+            size = float(np.clip(_PRICE_SIZE + _PRICE_GROWTH * decades, 3.0, 14.0))
+            return cls(color, (0, (dash, 1.6)), marker, hollow=True, size=size)
         changed = arm.penalizes_interventions or arm.is_residual or arm.mode == "trusting:lookahead"
         return cls(color, _DASHED if changed else _SOLID, marker, hollow=changed, size=10.0 if changed else 7.0)
 

@@ -7,6 +7,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from experiments.plots.arm_style import ArmStyle
@@ -15,8 +16,11 @@ from experiments.study.channel_sweep import FILTERS_BY_COUNT
 
 # Axis labels of the sides of the sweep of channels.
 _SIDES = {"loss": "packet loss probability", "delay": "delay [steps]", "quantization_step": "quantization step"}
-# What the rows of its figures count.
+# What the rows of its figures count, and what acts there.
 _COUNTS = {"outside_set": "episodes that left S [%]", "violating": "episodes outside the box [%]"}
+_ROWS = {"outside_set": "behind the one-step filter", "violating": "behind lookahead"}
+# Color of what stands for all arms in a legend.
+_ANY_ARM = "#222222"
 # What stands before the filter in the names of the arms of each figure.
 _REGULATOR, _AGENTS = "lqr+", ""
 
@@ -56,9 +60,13 @@ def sweep_figure(name: str, rows: list[dict[str, Any]]) -> CaptionedFigure:
                 for arm in arms:
                     _draw_sweep(axis, [r for r in rows if r["side"] == side and r["arm"] == arm], count, arm)
                 label(axis, _SIDES[side], _COUNTS[count] if axis is axes[0] else "")
-                axis.set_ylim(-4.0, 104.0)
+                axis.set_ylim(-5.0, 105.0)
                 axis.xaxis.set_major_locator(MaxNLocator(4, integer=side == "delay"))
+                axis.xaxis.set_major_formatter("{x:g}")
+            axes[0].set_title(_ROWS[count], loc="left")
             handles |= {arm: ArmStyle.of(arm).handle(line=False, points=True) for arm in arms}
+        conditions = {"own disturbance": "-", "worst case": "--"}
+        handles |= {name: Line2D([], [], color=_ANY_ARM, ls=dashes) for name, dashes in conditions.items()}
         legend_below(figure, handles)
         return figure
 
@@ -153,11 +161,12 @@ def _sweep_caption(name: str, rows: list[dict[str, Any]]) -> str:
         title = ", with trained agents"
         policy = "What acts behind each filter is what was trained behind it, on the environment's own channel"
         given = f" of {policies} agents" if policies > 1 else " of one agent"
+    points = f"{episodes:,} {'episode' if episodes == 1 else 'episodes'}"
     intervals = "exact 95 % intervals given the agents" if given else "exact 95 % intervals"
     return (
         f"The same filters with and without the error set on {name}, by the channel{title}. {policy}; above behind the "
         "one-step filter, which is to keep S, below behind lookahead, which is to keep the box. 'Trusting' takes the "
         "estimate for the truth. Solid: the environment's own disturbance, dashed: the worst case. Every point is "
-        f"{episodes:,} episodes{given}, bars are {intervals}; values that are not varied are the environment's own, "
+        f"{points}{given}, bars are {intervals}; values that are not varied are the environment's own, "
         "and channels that break its contract are left out."
     )

@@ -62,6 +62,13 @@ def test_all_arms_look_different_and_a_penalty_keeps_the_color():
         ArmStyle.of("hoped")
 
 
+def test_markers_tell_prices_apart_and_filters_of_a_fixed_policy():
+    sizes = [ArmStyle.of(f"penalized:{price}").size for price in (1, 10, 100)]
+    assert sizes == sorted(set(sizes))
+    policies = [ArmStyle.of(f"lqr+{name}") for name in ("trusting", "trusting:lookahead", "shielded", "lookahead")]
+    assert len({(style.color, style.hollow) for style in policies}) == len(policies)
+
+
 @pytest.mark.parametrize("seen", [np.eye(3), DEUTERANOPIA, PROTANOPIA])
 def test_color_blind_readers_can_tell_the_colors_apart(seen):
     linear = {arm: np.power(to_rgb(color), 2.2) for arm, (color, _) in ARM_COLORS_AND_MARKERS.items()}
