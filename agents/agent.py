@@ -39,7 +39,8 @@ class Normalization:
     """Normalizes observations: clip((o - mean) / sqrt(variance + epsilon), -clip, clip).
 
     Attributes:
-        mean, variance: Statistics of the observations in training, shape (entries,).
+        mean: Mean of the observations in training, shape (entries,).
+        variance: Their variance, shape (entries,).
         epsilon: Keeps the root away from 0.
         clip: Largest absolute value of a normalized entry.
     """

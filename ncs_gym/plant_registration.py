@@ -27,7 +27,7 @@ def register_plant(
 ) -> None:
     """Registers a plant as a Gymnasium environment, scalar and vectorized, with a time limit.
 
-    With this in a module `tank.py`::
+    With this in a module `tank.py`:
 
         import numpy as np
         from ncs_gym import Channel, LinearPlant, register_plant
@@ -44,7 +44,7 @@ def register_plant(
         )
         register_plant("Plants/Tanks-v0", plant, channel=Channel(loss=0.3, delay=2))
 
-    the id works wherever Gymnasium's do, and for the commands (which import the module before the colon)::
+    the id works wherever Gymnasium's do, and for the commands (which import the module before the colon):
 
         gym.make("tank:Plants/Tanks-v0")
         gym.make_vec("tank:Plants/Tanks-v0", num_envs=64)

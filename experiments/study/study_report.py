@@ -9,6 +9,7 @@ from experiments.study.quoted_tables import budget_text
 from experiments.study.study_tables import (
     channels_table,
     evaluation_table,
+    overview_table,
     pairs_table,
     price_table,
     scores_table,
@@ -45,6 +46,7 @@ def _context(summary: dict[str, Any]) -> dict[str, Any]:
     return {
         "summary": summary,
         "budget": budget_text(summary),
+        "overview": overview_table(summary),
         "evaluation": {name: evaluation_table(env) for name, env in environments.items()},
         "training": {name: training_table(env) for name, env in environments.items()},
         "pairs": {name: pairs_table(env) for name, env in environments.items()},

@@ -17,6 +17,8 @@ _CONDITIONS = {
 }
 # Policies that are simpler than a trained agent behind the shield.
 _SIMPLER = ("zero input", "K x_hat", "random+", "proportional", "lqr", "shield at test")
+# Arms of the overview, of which a study has some: what people would use, and the arms with a proof.
+_OVERVIEW = ("unshielded", "penalized:10", "psf", "shielded", "lookahead", "lqr+shielded")
 # Headers of the table about channels, by the key of a count and by the side of the sweep.
 _SWEPT_COUNTS = {"outside_set": "left S [%]", "violating": "left the box [%]"}
 _SWEPT_SIDES = {"loss": "loss", "delay": "delay", "quantization_step": "step"}
@@ -48,6 +50,23 @@ def evaluation_table(env: dict[str, Any]) -> str:
         for name, arm in env["arms"].items()
     ]
     return text_table([*head, *rows], rules=(len(head), len(head) + len(env["trained"])))
+
+
+def overview_table(summary: dict[str, Any]) -> str:
+    """Returns violating episodes, as trained and under every other condition at worst, and the return of a few arms.
+
+    Args:
+        summary: What `page_summary` returns.
+    """
+    environments = summary["environments"]
+    names = [name for name in _OVERVIEW if all(name in env["arms"] for env in environments.values())]
+    violating = [["violating episodes [%]", *names]]
+    returns = [["mean return", *names]]
+    for title, env in environments.items():
+        arms = [env["arms"][name] for name in names]
+        violating.append([title, *map(_rates, arms)])
+        returns.append([title, *(f"{arm['eval_return_mean']:.1f}" for arm in arms)])
+    return f"{text_table(violating)}\n\n{text_table(returns)}"
 
 
 def training_table(env: dict[str, Any]) -> str:
@@ -171,6 +190,14 @@ def _verdict(arm: dict[str, Any], returned: dict[str, Any]) -> str:
     if returned["p_holm"] is None or returned["p_holm"] > LEVEL:
         return "not shown"
     return "wins" if returned["mean"] > 0.0 else "loses"
+
+
+def _rates(arm: dict[str, Any]) -> str:
+    """Returns the violating episodes of an arm as trained, and those under the condition where most violate."""
+    worst = max(
+        (each["eval_violation_rate"] for each in arm["conditions"].values()), default=arm["eval_violation_rate"]
+    )
+    return f"{100 * arm['eval_violation_rate']:.1f}/{100 * worst:.1f}"
 
 
 def _violating(arm: dict[str, Any]) -> str:

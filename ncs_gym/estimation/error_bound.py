@@ -72,7 +72,7 @@ class ErrorSet(ReadOnlyArrays):
 
 
 def certified_error_set(plant: LinearPlant, contract: ChannelContract | None = None) -> ErrorSet:
-    """Returns the error set of a plant: of a stable one without a promise, of any under a contract.
+    """Returns the error set of a plant: of a stable one without a contract, of any under one.
 
     Raises:
         UnstablePlantError: If the plant is not Schur stable and there is no contract.

@@ -53,7 +53,7 @@ class Estimator:
 
     Raises:
         UnstablePlantError: If no error set is given and the plant is not Schur stable.
-        ErrorSetError: If the error set that is given does not meet its conditions, with room for rounding.
+        ErrorSetError: If the error set that is given does not meet its conditions, with slack for rounding.
         ValueError: If the channel rounds more coarsely than the contract of the error set allows.
     """
 

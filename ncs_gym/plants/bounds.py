@@ -176,7 +176,7 @@ class HardBounds(ReadOnlyArrays):
 
     @cached_property
     def initial_error(self) -> Ellipsoid:
-        """Holds the error of the first estimate, shape (n, n), with room for rounding."""
+        """Holds the error of the first estimate, shape (n, n), with slack for rounding."""
         return Ellipsoid(INFLATION * self.nominal_initial_error.shape + self.estimate_rounding)
 
     @cached_property

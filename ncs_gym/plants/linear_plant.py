@@ -70,7 +70,10 @@ class LinearPlant(HardBounds, limits.OperatingPoint):
             are chosen (docs/contracts.md), a certificate's K in round numbers; a regulator's by default.
         operating_state: State that deviations are counted from, shape (n,); for conversion and text.
         operating_input: Input that deviations are counted from, shape (m,).
-        state_names, state_units, input_names, input_units: For tables and figures.
+        state_names: Names of the states, for tables and figures.
+        state_units: Units of the states.
+        input_names: Names of the inputs.
+        input_units: Units of the inputs.
 
     Raises:
         ValueError: If a matrix has a wrong shape, is not finite or not a covariance, or a bound is negative.

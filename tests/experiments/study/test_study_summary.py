@@ -7,7 +7,14 @@ from experiments.analysis.paired_tests import paired_difference
 from experiments.study.quoted_tables import quoted, tables_by_name
 from experiments.study.study_figures import study_figures
 from experiments.study.study_summary import page_summary, sound_counterpart, study_summary
-from experiments.study.study_tables import evaluation_table, pairs_table, price_table, simpler_table, training_table
+from experiments.study.study_tables import (
+    evaluation_table,
+    overview_table,
+    pairs_table,
+    price_table,
+    simpler_table,
+    training_table,
+)
 from tests.experiments.results import run, summary_of
 
 RETURNS = {
@@ -47,6 +54,19 @@ def study(**environments):
 def row(table, name):
     """The cells of a table's row that begins with a name."""
     return next(line for line in table.splitlines() if line.startswith(f"{name} "))
+
+
+def test_overview_has_rates_as_trained_and_at_worst_of_every_environment():
+    summary = page_summary(study(One=comparison(), Two=comparison(unshielded=7.0)))
+    arm = summary["environments"]["One"]["arms"]["lookahead"]
+    arm["conditions"]["worse channel"] = arm["conditions"]["worst-case disturbance"] | {"eval_violation_rate": 0.25}
+    violating, returns = overview_table(summary).split("\n\n")
+    names = ["unshielded", "shielded", "lookahead", "lqr+shielded"]
+    assert violating.splitlines()[0].split()[-4:] == returns.splitlines()[0].split()[-4:] == names
+    assert row(violating, "One").split()[1:] == ["50.0/50.0", "0.0/0.0", "0.0/25.0", "0.0/0.0"]
+    assert row(violating, "Two").split()[1:] == ["50.0/50.0", "0.0/0.0", "0.0/0.0", "0.0/0.0"]
+    for title, env in summary["environments"].items():
+        assert row(returns, title).split()[1:] == [f"{env['arms'][name]['eval_return_mean']:.1f}" for name in names]
 
 
 def test_every_pair_of_arms_is_compared_by_seed():
