@@ -31,7 +31,7 @@ def cart_pole(
     pendulum by less than 1 % of gravity's pull at the edge of the box (sin 0.2 = 0.1987).
 
     Args:
-        cart_mass: [kg].
+        cart_mass: Of the cart [kg].
         pole_mass: Of a point mass at the end of a light rod [kg].
         length: Of the rod [m].
         dt: Step [s].

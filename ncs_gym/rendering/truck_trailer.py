@@ -76,7 +76,7 @@ def _draw_coupling(canvas: Canvas, hitch: float, stretch: float, limit: float) -
     ys = y + 9.0 * np.array([0.0, *([1.0, -1.0] * coils)[:-1], 0.0])
     canvas.line([(_FRONT - 2, y), *zip(xs, ys, strict=True), (hitch + 2, y)], color, 3.0)
     text = theme.value_label(stretch, limit, "m")
-    canvas.text(text, (_FRONT + 76, _ROAD - 88), color, theme.LARGE, align=0.5, bold=True)
+    canvas.text(text, (_FRONT + 76, _ROAD - 95), color, theme.LARGE, align=0.5, bold=True)
 
 
 def _draw_wheels(canvas: Canvas, *xs: float) -> None:
