@@ -9,15 +9,16 @@ def text_table(rows: Sequence[Sequence[str]], rules: Collection[int] = (1,), lef
     """Returns rows of cells as aligned text.
 
     Args:
-        rows: Rows of equal length, the header first.
+        rows: Rows of equal length, the header first; a row of a single cell is a title, which may be wider than its
+            column, of the rows below it.
         rules: Indices of the rows above which a horizontal rule is drawn.
         left_columns: Number of columns that are aligned to the left; the others are aligned to the right.
     """
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    widths = [max(map(len, column)) for column in zip(*(row for row in rows if len(row) > 1), strict=True)]
     rule = "-" * (sum(widths) + 2 * (len(widths) - 1))
     lines = []
     for index, row in enumerate(rows):
-        cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=True)]
+        cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=len(row) > 1)]
         cells[:left_columns] = [cell.ljust(width) for cell, width in zip(row, widths[:left_columns], strict=False)]
         lines += [rule] * (index in rules) + ["  ".join(cells).rstrip()]
     return "\n".join(lines)

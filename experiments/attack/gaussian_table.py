@@ -10,8 +10,8 @@ from experiments.attack.safety_counts import SafetyCounts
 from experiments.errors import SafetyBroken
 
 GAUSSIAN_LEGEND = """failed: episodes that left S or the box; interval: the exact 95 % interval of their probability;
-bound: the union bound on it over all draws of noise, for the shielded loop; a bound of 1 says nothing (--delta makes it
-small)"""
+bound: the union bound on it over all draws of noise, for the shielded loop;
+a bound of 1 says nothing (--delta makes it small)"""
 
 
 def gaussian_table(counts: Mapping[str, SafetyCounts], limits: Mapping[str, float]) -> str:

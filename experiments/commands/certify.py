@@ -64,7 +64,7 @@ def certify(settings: CertifySettings) -> None:
     seconds = time.perf_counter() - start
     counts = {case: sum((store.counts[each] for each in planned), SafetyCounts()) for case, planned in batches.items()}
     total = sum(counts.values(), SafetyCounts())
-    print(counts_table(counts | {"all": total}, looks_ahead=campaign.looks_ahead))
+    print(counts_table(counts, looks_ahead=campaign.looks_ahead))
     limits = {name: case.escape_probability() for name, case in cases.items()} if campaign.gaussian else {}
     if limits:
         print("", gaussian_table(counts, limits), GAUSSIAN_LEGEND, sep="\n")

@@ -1,0 +1,44 @@
+"""The tables of `ncs certify` fit into a terminal and say all that was counted."""
+
+import pytest
+
+from experiments.attack.attack_cases import attack_cases
+from experiments.attack.counts_table import counts_table
+from experiments.attack.gaussian_table import GAUSSIAN_LEGEND, gaussian_table
+from experiments.attack.safety_counts import SafetyCounts
+
+LONG_CAMPAIGN = SafetyCounts(
+    steps=40_000_000,
+    episodes=200_000,
+    exits=2_500_000,
+    violations=120_000,
+    broken_episodes=4_000,
+    interventions=30_000_000,
+    level=1.25,
+    planned=20_000_000,
+    outside_starts=100_000,
+)
+
+
+@pytest.mark.parametrize("looks_ahead", [False, True])
+def test_table_of_a_long_campaign_fits_into_a_hundred_columns(looks_ahead):
+    lines = counts_table(dict.fromkeys(attack_cases(0, 4), LONG_CAMPAIGN), looks_ahead=looks_ahead).splitlines()
+    assert max(map(len, lines)) <= 100
+    assert all(line == line.rstrip() for line in lines)
+
+
+def test_table_of_gaussian_noise_fits_into_a_hundred_columns():
+    cases = dict.fromkeys(attack_cases(0, 4), LONG_CAMPAIGN)
+    text = f"{gaussian_table(cases, dict.fromkeys(cases, 0.5))}\n{GAUSSIAN_LEGEND}"
+    assert max(map(len, text.splitlines())) <= 100
+
+
+def test_cases_of_a_plant_stand_below_its_name_and_the_sum_below_a_rule():
+    first, second = SafetyCounts(steps=400, episodes=2, exits=1), SafetyCounts(steps=600, episodes=3, violations=7)
+    counts = {"CartPole-v0, late": first, "random plant 0, bursts": first, "CartPole-v0, rare": second}
+    head, _, _, _, rule, *rows = counts_table(counts, looks_ahead=False).splitlines()
+    assert head == "1,400 steps, 200 in each episode"
+    assert [row.split()[0] for row in rows[:5]] == ["CartPole-v0", "late", "rare", "random", "bursts"]
+    assert rows[2].split()[1:5] == ["3", "0", "7", "0"]
+    assert rows[5] == rule
+    assert rows[6].split()[:5] == ["all", "7", "2", "7", "0"]
