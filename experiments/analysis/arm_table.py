@@ -76,10 +76,10 @@ def _return_text(arm: dict[str, Any]) -> str:
     interval = arm["eval_return_ci95"]
     mean = arm["eval_return_mean"]
     if interval is None:
-        return f"{mean:.{decimals_of(mean)}f} [n/a]"
+        return f"{mean:z.{decimals_of(mean)}f} [n/a]"
     half = 0.5 * (interval[1] - interval[0])
     decimals = decimals_of(mean, half)
-    return f"{mean:.{decimals}f} +-{half:.{decimals}f}"
+    return f"{mean:z.{decimals}f} +-{half:.{decimals}f}"
 
 
 def decimals_of(*numbers: float) -> int:

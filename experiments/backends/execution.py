@@ -68,7 +68,7 @@ def _described(result: RunResult) -> str:
     violating = sum(episode.violation_steps > 0 for episode in result.episodes)
     mean = sum(episode.episode_return for episode in result.episodes) / len(result.episodes)
     training = f"{result.train_violation_steps:,} violating training steps, " if result.train_steps else ""
-    return f"{training}{violating} of {len(result.episodes)} episodes violating, return {mean:.2f}"
+    return f"{training}{violating} of {len(result.episodes)} episodes violating, return {mean:z.2f}"
 
 
 def _without_files(result: RunResult) -> RunResult:

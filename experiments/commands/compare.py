@@ -171,8 +171,8 @@ def _findings(summary: dict[str, Any]) -> list[str]:
     for name, difference in paired["arms"].items():
         mean, interval = difference["return_mean"], difference["return_ci95"]
         decimals = decimals_of(mean, *(interval or ()))
-        text = f" [{interval[0]:+.{decimals}f}, {interval[1]:+.{decimals}f}]" if interval else ""
-        findings.append(f"{name}, paired with {paired['baseline']}: return {mean:+.{decimals}f}{text}.")
+        text = f" [{interval[0]:+z.{decimals}f}, {interval[1]:+z.{decimals}f}]" if interval else ""
+        findings.append(f"{name}, paired with {paired['baseline']}: return {mean:+z.{decimals}f}{text}.")
     if (covered := covered_fraction(summary)) is not None:
         findings.append(
             f"The shielded return covers {100 * covered:.0f} % of the way from the zero input to the unshielded agent."

@@ -11,7 +11,7 @@ from typing import Any
 
 from experiments.analysis.parquet_tables import parquet
 from experiments.analysis.summary import summarize_arm
-from experiments.analysis.text_table import text_table
+from experiments.analysis.sweep_table import sweep_table
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.plots.heatmaps import sweep_figures
@@ -102,7 +102,8 @@ def sweep(settings: SweepSettings) -> None:
     rows = [row for point, part in zip(points, parts, strict=True) for row in _rows(point, part)]
     _write(settings, summary, rows, setups[0])
     count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
-    print(f"{settings.env}: {count} per arm and channel\n", _text(summary), f"files: {settings.out}", sep="\n")
+    print(f"{settings.env}: {count} per arm and channel\n", sweep_table(summary["cells"]), sep="\n")
+    print(f"files: {settings.out}")
 
 
 def _setup(settings: SweepSettings, point: _GridPoint) -> ExperimentSetup:
@@ -148,32 +149,6 @@ def _write(settings: SweepSettings, summary: dict[str, Any], rows: list[dict], s
     write_atomically(out / "sweep.parquet", parquet(rows, setup.provenance("sweep", settings)))
     write_atomically(out / "report.html", sweep_report(summary, setup.verification, dict(figures.values())))
     write_atomically(out / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-
-
-def _text(summary: dict[str, Any]) -> str:
-    """Returns the table for a terminal: a row per channel and arm."""
-    both = any(cell["downlink_loss"] is not None for cell in summary["cells"])
-    sides = ["loss", "of commands"] if both else ["loss"]
-    outcomes = ["violating episodes", "training steps", "overridden", "return"]
-    rows = [[*sides, "delay", "quantization", "burst", "mass", "arm", *outcomes]]
-    for cell in summary["cells"]:
-        channel = [
-            f"{cell['loss']:g}",
-            *([f"{cell['downlink_loss']:g}"] if both else []),
-            str(cell["delay"]),
-            "own" if cell["quantization_step"] is None else f"{cell['quantization_step']:g}",
-            f"{cell['burst_length']:g}" if cell["burst_length"] else "none",
-            "own" if cell["mass_factor"] is None else f"{cell['mass_factor']:g}",
-        ]
-        for name, arm in cell["arms"].items():
-            outcome = [
-                f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,}",
-                f"{arm['train_violation_steps']:,} of {arm['train_steps']:,}",
-                "-" if Arm.of(name).mode is None else f"{100 * arm['intervention_rate']:.1f} %",
-                f"{arm['eval_return_mean']:.1f}",
-            ]
-            rows.append([*channel, name, *outcome])
-    return text_table(rows, left_columns=0)
 
 
 def _arms(results: Sequence[RunResult]) -> dict[str, Any]:

@@ -183,7 +183,7 @@ def _draw(axis: Axes, values: np.ndarray, colors: str, norm: Normalize) -> None:
     for (i, j), value in np.ndenumerate(values):
         if np.isfinite(value):
             dark = np.array(matplotlib.colormaps[colors](norm(value))[:3]) @ _LUMINANCE < _DARK
-            text = f"{value:.{digits}f}".replace("-", "\N{MINUS SIGN}") if value else "0"
+            text = f"{value:z.{digits}f}".replace("-", "\N{MINUS SIGN}") if value else "0"
             axis.text(j, i, text, ha="center", va="center", fontsize=9, color="white" if dark else "#222222")
 
 

@@ -130,7 +130,7 @@ def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, str]:
 
 
 def _decimal(value: float, sign: str = "") -> str:
-    return _with_minus(f"{value:{sign},.1f}")
+    return _with_minus(f"{value:{sign}z,.1f}")
 
 
 def _interval(interval: list[float] | None, sign: str = "") -> str:

@@ -160,7 +160,8 @@ def scores_table(summary: dict[str, Any]) -> str:
     rows = [["", "score", "[95 % CI]"]]
     for name, score in summary["scores"].items():
         interval = score["ci95"]
-        rows.append([name, f"{score['iqm']:.2f}", f"[{interval[0]:.2f}, {interval[1]:.2f}]" if interval else "one run"])
+        cell = f"[{interval[0]:z.2f}, {interval[1]:z.2f}]" if interval else "one run"
+        rows.append([name, f"{score['iqm']:z.2f}", cell])
     return text_table(rows)
 
 
@@ -208,7 +209,7 @@ def _violating(arm: dict[str, Any]) -> str:
 def _return(arm: dict[str, Any]) -> str:
     interval = arm["eval_return_ci95"]
     half = "[n/a]" if interval is None else f"+-{0.5 * (interval[1] - interval[0]):.1f}"
-    return f"{arm['eval_return_mean']:.1f} {half}"
+    return f"{arm['eval_return_mean']:z.1f} {half}"
 
 
 def _difference(difference: dict[str, Any], scale: float = 1.0) -> str:
@@ -218,7 +219,7 @@ def _difference(difference: dict[str, Any], scale: float = 1.0) -> str:
 
 
 def _signed(value: float) -> str:
-    return f"{round(value, 1) + 0.0:+.1f}"  # no negative zero
+    return f"{value:+z.1f}"
 
 
 def _p_text(p_value: float | None) -> str:

@@ -1,0 +1,80 @@
+"""What the commands print: tables of at most a hundred columns, and no negative zero."""
+
+import re
+
+import pytest
+
+from experiments.analysis.arm_table import condition_text, summary_text
+from experiments.analysis.sweep_table import sweep_table
+from experiments.backends.execution import _described
+from experiments.commands.compare import _findings
+from experiments.report.html import _decimal, _interval
+from experiments.study.study_summary import page_summary, study_summary
+from experiments.study.study_tables import evaluation_table, pairs_table, price_table, scores_table, simpler_table
+from tests.experiments.results import run, summary_of
+
+# Returns whose mean lies just below zero, and so do both ends of its interval.
+TINY = (-1e-9, -1.2e-9)
+NEGATIVE_ZERO = re.compile(r"(?<!\+)[-\N{MINUS SIGN}]0(\.0*)?(?![\d.])")
+
+
+def comparison(runs=2):
+    names = ("unshielded", "trusting", "shielded")
+    results = {name: [run(name, violations=(0, 0), returns=TINY) for _ in range(runs)] for name in names}
+    for each in (one for group in results.values() for one in group):
+        each.conditions["worst-case disturbance"] = each.episodes
+    return summary_of(results, seeds=runs)
+
+
+def cell(**changes):
+    own = {"loss": 0.3, "downlink_loss": None, "delay": 2, "quantization_step": None, "burst_length": 0.0}
+    return own | {"mass_factor": None, "arms": comparison()["arms"]} | changes
+
+
+@pytest.mark.parametrize("runs", [1, 2])
+def test_no_table_prints_a_negative_zero(runs):
+    summary = comparison(runs)
+    study = page_summary(study_summary({"Plant-v0": summary}))
+    env = study["environments"]["Plant-v0"]
+    study["scores"] = {"shielded": {"iqm": -1e-9, "ci95": [-1e-9, -1e-9]}}
+    printed = [
+        summary_text(summary["arms"], {}),
+        condition_text("worst-case disturbance", summary["arms"], {}),
+        *_findings(summary),
+        _described(run("shielded", violations=(0, 0), returns=TINY)),
+        sweep_table([cell()]),
+        *(evaluation_table(env), pairs_table(env)),
+        *(price_table(study), simpler_table(study), scores_table(study)),
+        *(_decimal(-1e-9), _decimal(-1e-9, "+"), _interval([-1e-9, -1e-9], "+")),
+    ]
+    assert [text for text in printed if NEGATIVE_ZERO.search(text)] == []
+
+
+@pytest.mark.parametrize("text", ["-0.0", "-0.0000", "\N{MINUS SIGN}0.0", "[-0.0, 1.0]", "-0"])
+def test_a_negative_zero_would_be_found(text):
+    assert NEGATIVE_ZERO.search(f"return {text}")
+
+
+def test_sweep_says_once_what_all_points_have_in_common():
+    first, *rows = sweep_table([cell(), cell(loss=0.6)]).splitlines()
+    assert first == "in all rows: delay 2, quantization own, burst none, mass own"
+    assert rows[2].split()[:2] == ["loss", "arm"]
+    assert [row.split()[:2] for row in rows[4:]] == [
+        [loss, arm] for loss in ("0.3", "0.6") for arm in ("unshielded", "trusting", "shielded")
+    ]
+
+
+def test_sweep_of_every_side_has_a_column_for_each():
+    other = {"loss": 0.6, "delay": 4, "quantization_step": 0.05, "burst_length": 5.0, "mass_factor": 1.1}
+    first, second, *_, last = sweep_table([cell(downlink_loss=0.0), cell(downlink_loss=0.1, **other)]).splitlines()
+    assert first.split()[:2] == ["commands", "quanti-"]
+    assert second.split()[:7] == ["loss", "lost", "delay", "zation", "burst", "mass", "arm"]
+    assert last.split()[:7] == ["0.6", "0.1", "4", "0.05", "5", "1.1", "shielded"]
+
+
+def test_sweep_of_a_downlink_fits_into_a_hundred_columns():
+    arms = {f"{name}:project+penalty": arm for name, arm in comparison()["arms"].items() if name == "shielded"}
+    for arm in arms.values():
+        arm |= {"train_steps": 9_000_000, "train_violation_steps": 8_000_000, "eval_episodes": 5_000}
+    points = [cell(loss=loss, downlink_loss=loss, delay=delay, arms=arms) for loss in (0.0, 0.05) for delay in (0, 12)]
+    assert max(map(len, sweep_table(points).splitlines())) <= 100
