@@ -78,3 +78,13 @@ def test_sweep_of_a_downlink_fits_into_a_hundred_columns():
         arm |= {"train_steps": 9_000_000, "train_violation_steps": 8_000_000, "eval_episodes": 5_000}
     points = [cell(loss=loss, downlink_loss=loss, delay=delay, arms=arms) for loss in (0.0, 0.05) for delay in (0, 12)]
     assert max(map(len, sweep_table(points).splitlines())) <= 100
+
+
+def test_columns_of_a_wide_table_stand_closer_together():
+    arm = summary_of({"lookahead": [run("lookahead", returns=(-10.0, -30.0)) for _ in range(2)]})["arms"]["lookahead"]
+    arm |= {"eval_violating_episodes": 19, "eval_violation_rate_ci95": [0.751, 0.999], "train_violation_steps": 123_456}
+    narrow = summary_text({"lookahead": arm}, {})
+    wide = summary_text({"lookahead": arm, "proportional+lookahead": arm}, {})
+    assert "  19 [75.1, 99.9 %]  " in narrow
+    assert "19 [75.1, 99.9 %]    " in wide
+    assert 90 < max(map(len, wide.splitlines())) <= 100
