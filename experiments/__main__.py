@@ -7,7 +7,10 @@ import importlib.util
 import os
 import signal
 import sys
+from contextlib import nullcontext
 from pathlib import Path
+
+from experiments.warning_sentences import warnings_as_sentences
 
 _ERROR = 2
 _INTERRUPTED = 130
@@ -29,14 +32,18 @@ COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
 
 
 def main() -> None:
-    """Parses the command line and runs the command; errors become one sentence on stderr and exit code 2."""
+    """Parses the command line and runs the command.
+
+    Errors become one sentence on stderr and exit code 2, warnings one sentence; NCS_DEBUG=1 shows where they come from.
+    """
     signal.signal(signal.SIGTERM, _interrupt)
     # Matrices are small: more threads only wait for each other. Read when numpy is imported, here and in workers.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         _require_own_agents()
         settings = _parse(sys.argv[1:])
-        _run(settings)
+        with nullcontext() if os.environ.get("NCS_DEBUG") else warnings_as_sentences():
+            _run(settings)
     except KeyboardInterrupt as interrupt:
         sys.exit(_complain(str(interrupt) or "interrupted", _INTERRUPTED))
     except BrokenPipeError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import warnings
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -11,8 +12,10 @@ from pathlib import Path
 
 from experiments.attack.counts_store import CountsStore
 from experiments.attack.monte_carlo_batch import Campaign, MonteCarloBatch, run_batch
+from experiments.attack.safety_counts import SafetyCounts
 from experiments.backends import initialize_worker
 from experiments.backends.execution import progress_bar
+from experiments.warning_sentences import warnings_sent
 
 # Batches of each case that are not finished.
 _MissingBatches = dict[str, deque[MonteCarloBatch]]
@@ -44,7 +47,7 @@ def execute_batches(
         def submit_next(worker: ProcessPoolExecutor) -> None:
             batch = next(assigned[worker], None)
             if batch is not None:
-                pending[worker.submit(run_batch, campaign, batch, certificates[batch.case])] = worker, batch
+                pending[worker.submit(_counts_and_warnings, campaign, batch, certificates[batch.case])] = worker, batch
 
         for _ in range(min(jobs, count)):
             worker = stack.enter_context(ProcessPoolExecutor(1, mp_context=context, initializer=initialize_worker))
@@ -53,9 +56,21 @@ def execute_batches(
         while pending:
             for future in wait(pending, return_when=FIRST_COMPLETED).done:
                 worker, batch = pending.pop(future)
-                store.add(batch, future.result())
+                counts, texts = future.result()
+                for text in texts:
+                    warnings.warn(text, stacklevel=1)
+                store.add(batch, counts)
                 bar.update(campaign.batch_steps)
                 submit_next(worker)
+
+
+def _counts_and_warnings(
+    campaign: Campaign, batch: MonteCarloBatch, certificate: Path
+) -> tuple[SafetyCounts, list[str]]:
+    """Executes a batch in a worker process, whose warnings belong above the progress bar of this one."""
+    texts: list[str] = []
+    with warnings_sent(texts.append):
+        return run_batch(campaign, batch, certificate), texts
 
 
 def _batches_of_worker(missing: _MissingBatches, unassigned: deque[str]) -> Iterator[MonteCarloBatch]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import queue
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from multiprocessing.managers import SyncManager
@@ -13,6 +14,7 @@ from typing import Any
 from experiments.backends.worker_init import initialize_worker
 from experiments.errors import RunError, RunStopped
 from experiments.runs import RunResult, TrainingRun, execute_run
+from experiments.warning_sentences import warnings_sent
 
 # Smallest number of steps that a worker reports at a time.
 _REPORTED_STEPS = 1000
@@ -57,7 +59,10 @@ def execute_all(
 
 
 def _execute(run: TrainingRun, log_folder: Path | None, reports: Any, stop: Any) -> RunResult:
-    """Executes a run in a worker process; it gives up at its next report after `stop` is set."""
+    """Executes a run in a worker process; it gives up at its next report after `stop` is set.
+
+    Reports are numbers of steps, and the texts of warnings.
+    """
     unreported = 0
 
     def report(steps: int) -> None:
@@ -69,7 +74,8 @@ def _execute(run: TrainingRun, log_folder: Path | None, reports: Any, stop: Any)
             reports.put(unreported)
             unreported = 0
 
-    result = execute_run(run, report, log_folder)
+    with warnings_sent(reports.put):
+        result = execute_run(run, report, log_folder)
     reports.put(unreported)
     return result
 
@@ -80,15 +86,19 @@ def _collect(
     on_result: Callable[[TrainingRun, RunResult], None],
     on_progress: Callable[[int], object],
 ) -> None:
-    """Passes reports and results on until every run is finished; raises the first failure."""
+    """Passes reports, warnings and results on until every run is finished; raises the first failure."""
     pending = set(futures)
     while pending:
         done, pending = wait(pending, timeout=_READING_PERIOD, return_when=FIRST_COMPLETED)
         while True:
             try:
-                on_progress(reports.get_nowait())
+                report = reports.get_nowait()
             except queue.Empty:
                 break
+            if isinstance(report, str):
+                warnings.warn(report, stacklevel=1)
+            else:
+                on_progress(report)
         for future in sorted(done, key=lambda each: each.exception() is not None):
             on_result(futures[future], _result(futures[future], future))
 

@@ -362,7 +362,7 @@ def test_command_in_this_process_hides_no_warning_and_changes_nothing_outside(mo
     monkeypatch.setattr("experiments.commands.audit.audit", warn)
     run = ncs("audit", cwd=tmp_path, SAID="this")
     assert (run.returncode, (tmp_path / "here").read_text()) == (0, "this")
-    assert "UserWarning: loud" in run.stderr
+    assert "ncs: warning: loud\n" in run.stderr
     assert run.stderr.endswith("native\n")
     assert before == (os.getcwd(), sys.argv, sys.stdout, sys.stderr, signal.getsignal(signal.SIGTERM))
     assert "SAID" not in os.environ

@@ -1,0 +1,71 @@
+"""Warnings of a command are sentences, each printed once on a line of its own."""
+
+import re
+import sys
+import warnings
+from queue import Queue
+
+import pytest
+from tqdm import tqdm
+
+from experiments.attack import campaign_execution
+from experiments.warning_sentences import warnings_as_sentences, warnings_sent
+from tests.command import ncs
+
+# Samples may become older than the contract allows from a delay of 5 steps on.
+SWEEP = ("sweep", "--env", "ncs_gym/CartPole-v0", "--losses", 0, "--delays", 8, 9, "--seeds", 1, "--episodes", 1)
+SWEEP += ("--arms", "lqr+shielded", "lqr+lookahead")
+
+
+def lines_of(text):
+    """The lines that stand on a terminal at some time: a carriage return begins a line anew."""
+    return [line for line in re.split(r"[\r\n]", text) if line.strip()]
+
+
+def assert_said_once_for_each_delay(run):
+    assert run.returncode == 0, run.stderr
+    said = [line for line in lines_of(run.stderr) if "is likely to be lost" in line]
+    starts = [f"ncs: warning: the channel lets the newest sample become {age} steps old" for age in (8, 9)]
+    assert [line.partition(",")[0] for line in sorted(said)] == starts
+    assert "Warning" not in run.stderr
+    assert ".py" not in run.stderr
+
+
+def test_warning_of_a_sweep_is_one_sentence_on_its_own_line(tmp_path, without_workers):
+    assert_said_once_for_each_delay(ncs(*SWEEP, "--out", tmp_path))
+
+
+@pytest.mark.slow
+def test_warning_of_worker_processes_is_said_once(tmp_path):
+    assert_said_once_for_each_delay(ncs(*SWEEP, "--jobs", 2, "--out", tmp_path))
+
+
+def test_where_a_warning_comes_from_is_shown_on_request(monkeypatch, without_workers):
+    def warn(settings):
+        warnings.warn("loud", stacklevel=1)
+
+    monkeypatch.setattr("experiments.commands.audit.audit", warn)
+    assert ncs("audit").stderr == "ncs: warning: loud\n"
+    assert re.search(r"test_warning_sentences\.py:\d+: UserWarning: loud", ncs("audit", NCS_DEBUG="1").stderr)
+
+
+def test_progress_bar_is_cleared_before_a_sentence(capsys):
+    with warnings_as_sentences(), tqdm(total=4, file=sys.stderr) as bar:
+        bar.update()
+        for text in ("one\n  sentence", "one sentence", "another"):
+            warnings.warn(text, stacklevel=1)
+    said = [line for line in lines_of(capsys.readouterr().err) if "warning" in line]
+    assert said == ["ncs: warning: one sentence", "ncs: warning: another"]
+
+
+def test_warnings_of_a_worker_reach_the_command(monkeypatch):
+    def warn(*batch):
+        warnings.warn("from a batch", stacklevel=1)
+        return "counts"
+
+    monkeypatch.setattr(campaign_execution, "run_batch", warn)
+    assert campaign_execution._counts_and_warnings(None, None, None) == ("counts", ["from a batch"])
+    sent: Queue = Queue()
+    with warnings_sent(sent.put):
+        warnings.warn("from a run", stacklevel=1)
+    assert sent.get_nowait() == "from a run"
