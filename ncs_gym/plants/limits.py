@@ -89,12 +89,13 @@ def as_box_rows(value: Any, n: int) -> np.ndarray:
         n: Number of states.
 
     Raises:
-        ValueError: If it is neither, or limits nothing.
+        ValueError: If it is neither, limits nothing, or may as well be lower and upper limits.
     """
     numbers = as_setting(value)
     if numbers is None or numbers.ndim > 2:
         raise ValueError(f"box must be half-widths of shape ({n},) or rows of shape (any, {n}), got {shown(value)}")
-    if _reads_as_pairs(value, numbers, n):
+    is_computed = not isinstance(value, (tuple, list))
+    if _reads_as_pairs(value, numbers, n) or (numbers.ndim == 2 and _reads_as_two_sides(numbers, is_computed)):
         raise ValueError(_two_sides(value))
     if numbers.ndim == 2:
         rows = as_matrix(numbers, (None, n), "box")
@@ -107,19 +108,18 @@ def as_box_rows(value: Any, n: int) -> np.ndarray:
                 f"everywhere, or rows of shape (any, {n}), got {shown(value)}"
             )
         rows = np.diag(1.0 / np.broadcast_to(numbers, (n,)))[np.broadcast_to(limited, (n,))]
-    if isinstance(value, (tuple, list)) and _reads_as_two_sides(rows):  # computed rows, an array, may be anything
-        raise ValueError(_two_sides(value))
     if (np.abs(rows).max(axis=1) < SMALLEST_NUMBER).any():
         raise ValueError(f"every row of box must limit something, got {shown(rows.tolist())}")
     return rows
 
 
 def _two_sides(value: Any) -> str:
-    """Returns what is wrong with a box given as lower and upper limits."""
+    """Returns what is wrong with a box that can be read as lower and upper limits, and how to say what is meant."""
     return (
-        "box looks like lower and upper limits, but must be half-widths, or rows c_j with |c_j x| <= 1: limits that "
-        "are not symmetric are given by LinearPlant.around(state_limits=(low, high), ...); if these are rows, give "
-        f"them as an array, got {shown(value)}"
+        "box looks like lower and upper limits, but must be half-widths, or rows c_j with |c_j x| <= 1: if these are "
+        "limits, give their half-widths or, where they are not symmetric, LinearPlant.around(state_limits=(low, high), "
+        "...); if these are rows, no two of them the same but for their signs, give them as an array, got "
+        f"{shown(value)}"
     )
 
 
@@ -135,12 +135,19 @@ def _reads_as_pairs(value: Any, numbers: np.ndarray, n: int) -> bool:
     return numbers.shape == (n, 2) and (n != 2 or are_tuples)
 
 
-def _reads_as_two_sides(rows: np.ndarray) -> bool:
-    """Returns whether rows, shape (k, n), read as (low, high), or as a pair (low, high) per state."""
+def _reads_as_two_sides(rows: np.ndarray, is_computed: bool) -> bool:
+    """Returns whether a box reads as (low, high), or as a pair (low, high) per state.
+
+    Args:
+        rows: The box read as rows, shape (k, n).
+        is_computed: Whether it is an array. Only low = -high is refused then, as rows the same limit twice.
+    """
     k, n = rows.shape
-    sides = (rows[0], rows[1]) if k == 2 else ()
-    pairs = (rows[:, 0], rows[:, 1]) if k == n == 2 else ()
-    return any(bool((low < 0.0).all() and (high > 0.0).all()) for low, high in (x for x in (sides, pairs) if x))
+    sides = [(rows[0], rows[1])] if k == 2 else []
+    pairs = [(rows[:, 0], rows[:, 1])] if k == n == 2 else []
+    return any(
+        bool((low < high).all()) and (not is_computed or np.array_equal(low, -high)) for low, high in sides + pairs
+    )
 
 
 def as_input_limits(value: Any, size: int) -> np.ndarray:

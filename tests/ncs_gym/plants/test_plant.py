@@ -152,8 +152,8 @@ def test_bad_numbers_are_refused_in_one_sentence(change, words):
 
 
 def test_rows_of_two_states_are_taken_from_lists_and_arrays():
-    rows = [[0.5, 1.0], [-2.0, 2.0]]
-    for box in (rows, np.array([(0.5, 1.0), (-2.0, 2.0)])):
+    rows = [[0.5, 1.0], [2.0, -2.0]]
+    for box in (rows, np.array([(0.5, 1.0), (2.0, -2.0)])):
         np.testing.assert_array_equal(LinearPlant(**(good() | QUIET | {"box": box})).C, rows)
     three = [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0)]  # more rows than states
     np.testing.assert_array_equal(LinearPlant(**(good() | QUIET | {"box": three})).C, three)

@@ -63,6 +63,46 @@ def test_rows_that_are_computed_may_have_any_signs(tmp_path):
     np.testing.assert_array_equal(LinearPlant.load(tmp_path / "plant.json").C, rows)
 
 
+@pytest.mark.parametrize(
+    "box",
+    [
+        ([-1, -2], [1, 2]),
+        [[-1, -2], [1, 2]],
+        [[-1, 1], [-2, 2]],
+        [[1, 2], [3, 4]],  # without zero between them
+        ([0, 0], [10, 5]),
+        [[-1, -np.inf], [1, np.inf]],
+        [[-1, 1], [0, 2]],  # a pair for each state
+        np.array([[-1, -2], [1, 2]]),  # as rows the same row twice
+        np.array([[-1, 1], [-2, 2]]),
+    ],
+)
+def test_box_of_two_states_that_may_be_limits_is_refused_with_both_remedies(box):
+    with pytest.raises(ValueError, match=r"box looks like lower and upper limits.* LinearPlant.around.* as an array"):
+        LinearPlant(**MODEL, box=box)
+
+
+@pytest.mark.parametrize("sides", [([-1, -2, -3], [1, 2, 3]), np.array([[-1, -2, -3], [1, 2, 3]])])
+def test_box_of_three_states_given_as_limits_is_refused(sides):
+    with pytest.raises(ValueError, match="box looks like lower and upper limits"):
+        LinearPlant(A=np.eye(3) / 2, B=np.ones((3, 1)), box=sides, u_max=1.0, dt=0.1, **QUIET)
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [[0.5, 0.0], [0.0, 2.0]],
+        ([1, 1], [1, -1]),
+        [[1, 2], [3, 2]],
+        [[1, 2], [3, 4], [5, 6]],
+        np.array([[1.0, 2.0], [3.0, 4.0]]),
+        np.array([[-1.0, 1.0], [0.0, 2.0]]),
+    ],
+)
+def test_rows_of_two_states_that_cannot_be_limits_or_are_an_array_are_taken(rows):
+    np.testing.assert_array_equal(LinearPlant(**MODEL, box=rows).C, np.asarray(rows, dtype=np.float64))
+
+
 def test_a_number_stands_for_a_vector_of_one_entry():
     limits = {"state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
     plant = LinearPlant.around(**ROOM | {"operating_state": 20.0, "operating_input": 10.0}, **limits)
