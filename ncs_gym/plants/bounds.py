@@ -62,7 +62,9 @@ class HardBounds(ReadOnlyArrays):
             )
             if (value := getattr(self, bound)) is not None:
                 object.__setattr__(self, bound, as_bound(value, size, bound))
-        object.__setattr__(self, "remainder", as_remainder(self.remainder, self.n))
+        if (remainder := as_remainder(self.remainder, self.n)) is not None:
+            remainder = remainder.of_model({name: getattr(self, name) for name in ("A", "B", "box", "u_max", "dt")})
+        object.__setattr__(self, "remainder", remainder)
         return is_given[0] or self.gamma > 0.0 or self.remainder is not None, is_given[1], is_given[2]
 
     @property

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, Self
+
+import numpy as np
 
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
@@ -13,6 +17,9 @@ from ncs_gym.validation import as_flag, shown
 @dataclass(frozen=True, eq=False)
 class Remainder:
     """f(x, u) - A x - B u lies in an ellipsoid, for x in the safe box and u within its limits.
+
+    The remainder that a plant keeps knows the model, the box and the limits of that plant, and no plant of others takes
+    it over.
 
     Attributes:
         bound: E(R) around the remainder, in units of the state.
@@ -27,6 +34,7 @@ class Remainder:
     bound: Ellipsoid
     proved: bool
     basis: str
+    _model: ClassVar[Mapping[str, np.ndarray] | None] = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.bound, Ellipsoid):
@@ -34,6 +42,27 @@ class Remainder:
         object.__setattr__(self, "proved", as_flag(self.proved, "proved"))
         if not isinstance(self.basis, str):
             raise ValueError(f"the basis of a remainder must be text, got {shown(self.basis)}")
+
+    def of_model(self, model: Mapping[str, np.ndarray]) -> Self:
+        """Returns the same remainder, which from now on belongs to this model alone.
+
+        Args:
+            model: What the bound depends on, by the name of the plant's argument: A, B, box, u_max and dt.
+
+        Raises:
+            ValueError: If it belongs to another model.
+        """
+        if self._model is not None:
+            others = [name for name, value in model.items() if not np.array_equal(value, self._model[name])]
+            if others:
+                raise ValueError(
+                    f"the remainder belongs to a plant with another {', '.join(others)}: find the model anew by "
+                    "ncs_gym.linear_model, or give Remainder(bound, proved, basis) anew if it holds for this plant, too"
+                )
+            return self
+        own = copy.copy(self)
+        object.__setattr__(own, "_model", {name: np.array(value) for name, value in model.items()})
+        return own
 
     @property
     def sentence(self) -> str:
