@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import importlib.util
 import os
@@ -14,6 +15,18 @@ from experiments.warning_sentences import warnings_as_sentences
 
 _ERROR = 2
 _INTERRUPTED = 130
+# What to do about an error of the operating system.
+_REMEDIES = {
+    errno.EEXIST: "a file stands where a folder is needed, choose another path",
+    errno.ENOTDIR: "a file stands where a folder is needed, choose another path",
+    errno.EISDIR: "a folder stands where a file is needed, name the file",
+    errno.ENOENT: "check the path",
+    errno.EACCES: "choose a path where you may read and write",
+    errno.EPERM: "choose a path where you may read and write",
+    errno.EROFS: "choose a path where you may write",
+    errno.ENOSPC: "make room and start the command again, which keeps what is finished",
+    errno.EDQUOT: "make room and start the command again, which keeps what is finished",
+}
 _TRAINING = {"train": ("stable_baselines3", "torch", "tensorboard", "pyarrow", "jinja2")}
 # The settings and the function of each command, and the packages that it needs of each extra.
 COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
@@ -108,6 +121,7 @@ def _sentence(error: Exception) -> str:
     expected = ours or isinstance(error, (ValueError, OSError, ImportError))
     if isinstance(error, OSError) and error.strerror:
         text = f"{error.strerror}: {error.filename}" if error.filename else error.strerror
+        text += f"; {_REMEDIES[error.errno]}" if error.errno in _REMEDIES else ""
     else:
         text = str(error) if expected else f"{type(error).__name__}: {error} (NCS_DEBUG=1 shows the traceback)"
     return " ".join(text.split())

@@ -12,6 +12,7 @@ from textwrap import TextWrapper
 
 from experiments.paper.audit import Claim, Verdict, audited_claims, defects
 from experiments.paper.paper_example import PaperExample
+from experiments.runs import require_place
 from experiments.settings import AuditSettings
 from shields.atomic_write import write_atomically
 
@@ -27,6 +28,7 @@ def audit(settings: AuditSettings) -> None:
     Raises:
         OSError: If the file cannot be written.
     """
+    require_place(settings.out)
     claims = list(audited_claims(PaperExample()))
     document = json.dumps([asdict(claim) for claim in claims], indent=1)
     if settings.out is not None:

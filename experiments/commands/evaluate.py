@@ -11,7 +11,7 @@ from agents.control_loop import ControlLoop, ShieldSettings
 from experiments.analysis.arm_table import summary_text
 from experiments.analysis.summary import arm_summary
 from experiments.commands import short_version
-from experiments.runs import ExperimentSetup, RunResult, versions
+from experiments.runs import ExperimentSetup, RunResult, require_place, versions
 from experiments.runs.environments import module_and_id, registered_env
 from experiments.runs.policies import agent_folder, certificate_file
 from experiments.settings import EvaluateSettings
@@ -39,6 +39,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     from agents.agent import Agent  # imports torch
 
     settings = short_version(settings, **_SMOKE)
+    require_place(settings.out)
     if settings.env is not None:
         registered_env(settings.env)
     folder = agent_folder(settings.model)

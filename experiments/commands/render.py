@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
 from collections.abc import Iterator
 
 import gymnasium as gym
@@ -12,6 +10,7 @@ from tqdm import tqdm
 
 from experiments.commands import require_extra, short_version
 from experiments.plots.animation import FORMATS, save_animation
+from experiments.runs import require_place
 from experiments.runs.environments import module_and_id, registered_env
 from experiments.runs.policies import UNTRAINED_POLICIES, policy_by_name
 from experiments.settings import RenderSettings
@@ -126,7 +125,7 @@ def _check(settings: RenderSettings) -> None:
 
     Raises:
         ValueError: If a setting is wrong.
-        OSError: If the folder of the file does not exist.
+        OSError: If the file cannot be written.
     """
     registered_env(settings.env)
     if settings.out.suffix not in FORMATS:
@@ -139,5 +138,4 @@ def _check(settings: RenderSettings) -> None:
             raise ValueError(f"--{name} must be {limits}, got {value}")
     if settings.side_by_side and settings.shield == "none":
         raise ValueError('--side-by-side compares with a shield: choose a --shield other than "none"')
-    if not settings.out.resolve().parent.is_dir():
-        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(settings.out))
+    require_place(settings.out)

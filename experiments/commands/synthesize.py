@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shields
+from experiments.runs import require_place
 from experiments.runs.environments import registered_env
 from experiments.runs.synthesis_status import synthesis_status
 from experiments.settings import SynthesizeSettings
@@ -22,6 +23,7 @@ def synthesize(settings: SynthesizeSettings) -> None:
         SynthesisInterrupted: If it is interrupted; the best certificate so far is saved.
         OSError: If the file cannot be written.
     """
+    require_place(settings.out)
     plant, contract = _plant_and_contract(settings)
     try:
         with synthesis_status() as show:

@@ -6,6 +6,7 @@ import json
 from dataclasses import asdict
 
 import shields
+from experiments.runs import require_place
 from experiments.runs.environments import registered_env
 from experiments.settings import VerifySettings
 from ncs_gym import LinearPlant
@@ -23,6 +24,7 @@ def verify(settings: VerifySettings) -> None:
         ModuleNotFoundError: If the engine is "flint" and python-flint is not installed.
         OSError: If the verdicts cannot be written.
     """
+    require_place(settings.out)
     certificate = Certificate.load(settings.file)
     if settings.plant is None:
         origin = settings.env or _matching_env(certificate)
@@ -38,6 +40,11 @@ def verify(settings: VerifySettings) -> None:
         document = {"env": origin, "valid": report.valid, "conditions": conditions}
         write_atomically(settings.out, json.dumps(document, indent=1) + "\n")
     if not report.valid:
+        if certificate.fingerprint != plant.fingerprint:
+            raise CertificateError(
+                f"{settings.file} does not verify: it was made for another plant than that of {origin}; without --env "
+                "and --plant the registered environment that it belongs to is found"
+            )
         broken = sum(not condition.holds for condition in report.conditions)
         raise CertificateError(
             f"{settings.file} does not verify: {broken} of {len(report.conditions)} conditions broken"

@@ -2,7 +2,7 @@
 
 from experiments.runs.arms import Arm, by_arm
 from experiments.runs.experiment_setup import ExperimentSetup
-from experiments.runs.output_folder import claim_folder
+from experiments.runs.output_folder import claim_folder, require_place
 from experiments.runs.provenance import versions
 from experiments.runs.run_store import RunStore, prepare_output
 from experiments.runs.training_run import RunResult, TrainingRun, execute_run
@@ -17,5 +17,6 @@ __all__ = [
     "claim_folder",
     "execute_run",
     "prepare_output",
+    "require_place",
     "versions",
 ]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -47,6 +49,30 @@ def claim_folder(command: str, settings: Any) -> None:
         _require_same(folder, command, settings)
     folder.mkdir(parents=True, exist_ok=True)
     save_settings(folder / "settings.json", command, settings)
+
+
+def require_place(path: Path | None) -> None:
+    """Returns if a command can write a file, which it finds out before it computes what it would lose.
+
+    Args:
+        path: Of the file; None for none.
+
+    Raises:
+        OSError: If there is a folder in its place, or no folder to write it in.
+    """
+    if path is None:
+        return
+    if path.is_dir():
+        raise _system_error(errno.EISDIR, path)
+    if not path.parent.is_dir():
+        raise _system_error(errno.ENOTDIR if path.parent.exists() else errno.ENOENT, path.parent)
+    if not os.access(path.parent, os.W_OK):
+        raise _system_error(errno.EACCES, path.parent)
+
+
+def _system_error(number: int, path: Path) -> OSError:
+    """Returns what the operating system would raise: a subclass of OSError that belongs to the number."""
+    return OSError(number, os.strerror(number), str(path))
 
 
 def _require_same(folder: Path, command: str, settings: Any) -> None:

@@ -100,7 +100,9 @@ def require_valid(certificate: Certificate, plant: LinearPlant) -> None:
     for condition in verify(certificate, plant).conditions:
         if not condition.holds:
             if condition.name.startswith("plant"):
-                raise CertificateError("the certificate was made for another plant: their fingerprints differ")
+                raise CertificateError(
+                    "the certificate was made for another plant (fingerprints differ): synthesize one for this plant"
+                )
             raise CertificateError(
                 f"the certificate does not verify: {condition.name} does not hold (margin {condition.margin:.3g})"
             )

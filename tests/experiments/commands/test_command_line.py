@@ -1,5 +1,6 @@
 """The command as a user meets it: in a process of its own where that matters, else in this one."""
 
+import errno
 import json
 import os
 import shutil
@@ -343,7 +344,7 @@ def test_synthesize_then_verify(tmp_path):
     assert "chi-square" in again.stdout
     for engine in ("rational", "flint"):
         other = ncs("verify", file, "--env", "ncs_gym/TruckTrailerCruise-v0", "--engine", engine)
-        assert_one_sentence(other, "does not verify")
+        assert_one_sentence(other, "does not verify: it was made for another plant", "without --env and --plant")
 
 
 @pytest.mark.parametrize("arguments", [["verify", "--help"], ["verify", "nowhere.json"]], ids=["help", "error"])
@@ -462,6 +463,39 @@ def test_usage_errors_are_the_parsers(arguments, words):
 def test_other_errors_are_one_sentence(arguments, words, tmp_path):
     assert_one_sentence(ncs(*arguments, cwd=tmp_path), *words)
     assert list(tmp_path.iterdir()) == [] or not any(tmp_path.rglob("*.json"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["synthesize", "--out", "here"], ["Is a directory: here", "name the file"]),
+        (["synthesize", "--out", "file/c.json"], ["Not a directory: file;", "choose another path"]),
+        (["verify", "c.json", "--out", "here"], ["Is a directory: here", "name the file"]),
+        (["verify", "c.json", "--out", "nowhere/v.json"], ["No such file or directory: nowhere;", "check the path"]),
+        (["evaluate", "agent", "--out", "nowhere/e.json"], ["No such file or directory: nowhere;", "check the path"]),
+        (["audit", "--out", "nowhere/a.json"], ["No such file or directory: nowhere;", "check the path"]),
+        (["render", "--out", "nowhere/e.gif"], ["No such file or directory: nowhere;", "check the path"]),
+        (["reproduce", "--out", "file"], ["File exists: file;", "choose another path"]),
+        (["study", "--quote", "nowhere.md"], ["No such file or directory: nowhere.md;", "check the path"]),
+    ],
+)
+def test_file_that_cannot_be_written_is_refused_before_anything_is_computed(arguments, words, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "here").mkdir()
+    run = ncs(*arguments, cwd=tmp_path)
+    assert_one_sentence(run, *words)
+    assert run.stdout == ""
+    assert (tmp_path / "file").read_text() == "mine"
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "here"}
+
+
+@pytest.mark.parametrize(("number", "remedy"), [(errno.ENOSPC, "make room"), (errno.EROFS, "choose a path")])
+def test_errors_of_the_disk_say_what_to_do(number, remedy, monkeypatch, tmp_path):
+    def fail(*arguments, **settings):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("shields.atomic_write.tempfile.mkstemp", fail)
+    assert_one_sentence(ncs("audit", "--out", "a.json", cwd=tmp_path), os.strerror(number), remedy)
 
 
 def test_infeasible_problem_is_one_sentence(tmp_path):
