@@ -50,7 +50,7 @@ LAYERS = {
         {"training"},
     ),
     "experiments": (
-        {"errors"},
+        {"errors", "warning_sentences"},
         {"settings", "baselines"},
         {"runs"},
         {"backends", "analysis", "plots"},
