@@ -161,7 +161,7 @@ def read_until(terminal, words, seconds=120.0):
 def test_long_synthesis_shows_its_stage_and_saves_the_best_when_interrupted(tmp_path):
     (tmp_path / "slow.py").write_text(
         "from ncs_gym import register_plant\nfrom tests.plants import random_plant\n"
-        "register_plant('Plants/Slow-v0', random_plant(0, 9, 3))\n"
+        "register_plant('Plants/Slow-v0', random_plant(0, 12, 3))\n"
     )
     ours, theirs = pty.openpty()
     termios.tcsetwinsize(theirs, (24, 110))
@@ -175,5 +175,5 @@ def test_long_synthesis_shows_its_stage_and_saves_the_best_when_interrupted(tmp_
     end = read_until(ours, "certificate.json\r\n")
     assert process.wait(60) == 130
     assert "ncs: interrupted: the best certificate so far, which verifies (" in end
-    assert verified(Certificate.load(tmp_path / "certificate.json"), random_plant(0, 9, 3)).valid
+    assert verified(Certificate.load(tmp_path / "certificate.json"), random_plant(0, 12, 3)).valid
     os.close(ours)
