@@ -23,7 +23,7 @@ from tests.verdicts import verified
 from tests.workers import no_worker_processes
 
 # A short comparison whose unshielded agents explore enough to violate in training.
-SMOKE = ("compare", "--smoke", "--ppo.log-std", "0.0")
+SMOKE = ("compare", "--smoke", "--ppo.log-std", "0.0", "--ppo.epochs", "2")
 ARM_KEYS = {
     "train_steps",
     "train_violation_steps",
@@ -311,8 +311,8 @@ def test_agent_behind_lookahead_is_trained_and_evaluated_with_its_horizon(tmp_pa
 
 def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path, without_workers):
     out = tmp_path / "sweep"
-    grid = ["--losses", "0.5", "--delays", "1", "--burst-lengths", "0", "3", "--episodes", "3", "--steps", "512"]
-    run = ncs("sweep", *grid, "--ppo.envs", "4", "--ppo.rollout", "128", "--out", out)
+    grid = ["--losses", "0.5", "--delays", "1", "--burst-lengths", "0", "3", "--episodes", "3", "--steps", "256"]
+    run = ncs("sweep", *grid, "--ppo.envs", "4", "--ppo.rollout", "64", "--out", out)
     assert run.returncode == 0, run.stderr
     summary = json.loads((out / "summary.json").read_text())
     assert [(cell["loss"], cell["burst_length"]) for cell in summary["cells"]] == [(0.5, 0), (0.5, 3)]
@@ -490,12 +490,14 @@ def test_file_that_cannot_be_written_is_refused_before_anything_is_computed(argu
 
 
 @pytest.mark.parametrize(("number", "remedy"), [(errno.ENOSPC, "make room"), (errno.EROFS, "choose a path")])
-def test_errors_of_the_disk_say_what_to_do(number, remedy, monkeypatch, tmp_path):
+def test_errors_of_the_disk_say_what_to_do(number, remedy, certificate, monkeypatch, tmp_path):
+    certificate.save(tmp_path / "c.json")
+
     def fail(*arguments, **settings):
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr("shields.atomic_write.tempfile.mkstemp", fail)
-    assert_one_sentence(ncs("audit", "--out", "a.json", cwd=tmp_path), os.strerror(number), remedy)
+    assert_one_sentence(ncs("verify", "c.json", "--out", "a.json", cwd=tmp_path), os.strerror(number), remedy)
 
 
 def test_infeasible_problem_is_one_sentence(tmp_path):

@@ -21,7 +21,7 @@ from tests.shields.attacks.extremes import (
 MODES = ("project", "switch", "boundary")
 RANDOM_POLICIES = ("random", "outwards", "searching")
 # Steps per episode in the ordinary suite and in the slow one.
-TRUCK_STEPS, RANDOM_STEPS = (270, 2700), (240, 2400)
+TRUCK_STEPS, RANDOM_STEPS = (280, 2800), (200, 2000)
 
 
 @pytest.mark.parametrize(("suite", "total"), [(0, 100_000), (1, 1_000_000)])

@@ -31,15 +31,15 @@ def test_certificate_carries_the_papers_constants_and_no_error_set(paper):
 
 
 @pytest.mark.parametrize(
-    ("bounds", "search"),  # the first search for SMALL is the fixture's
+    ("bounds", "search", "steps"),  # the first search for SMALL is the fixture's
     [
-        ({"gamma": 1e-6, "process_noise_cov": 1e-6 * np.eye(2)}, "largest"),
-        ({"gamma": 1e-5, "process_noise_cov": np.zeros((2, 2))}, "first"),
+        ({"gamma": 1e-6, "process_noise_cov": 1e-6 * np.eye(2)}, "largest", (0.05, 0.1)),
+        ({"gamma": 1e-5, "process_noise_cov": np.zeros((2, 2))}, "first", (0.02, 0.05)),
     ],
 )
-def test_where_op_succeeds_its_constraints_hold_exactly(bounds, search):
+def test_where_op_succeeds_its_constraints_hold_exactly(bounds, search, steps):
     plant = truck_trailer(**bounds)
-    certificate = synthesize(plant, method="paper", search=search, dkappa=0.03, drho=0.08)
+    certificate = synthesize(plant, method="paper", search=search, dkappa=steps[0], drho=steps[1])
     report = verified(certificate, plant)
     assert report.valid, str(report)
     assert {f"(C{i})" for i in (1, 2, 3, 7)} <= {c.name.split()[0] for c in report.conditions}
@@ -110,7 +110,7 @@ def test_shield_with_a_paper_certificate_works_but_is_never_guaranteed(paper):
 
 def test_printed_parameters_are_infeasible_and_the_reason_has_figures():
     with pytest.raises(Infeasible, match=r"\(C2\) binds") as caught:
-        synthesize(truck_trailer(), method="paper")
+        synthesize(truck_trailer(), method="paper", dkappa=0.05, drho=0.1)  # proven over the whole domain
     error = caught.value
     assert error.binding == "C2"
     assert error.shortfall == pytest.approx(1.0 - 0.034, abs=5e-4)
@@ -174,12 +174,12 @@ def one_state(A, B, u_max, gamma, Q, P0):
 
 def test_a_plant_no_gain_can_contract_is_infeasible_not_falsely_certified(coarse_scan):
     with pytest.raises(Infeasible):
-        synthesize(one_state(0.999, 1e-6, 1.0, 1e-12, 1e-13, 1e-12), method="paper")
+        synthesize(one_state(0.999, 1e-6, 1.0, 1e-12, 1e-13, 1e-12), method="paper", dkappa=0.05, drho=0.1)
 
 
 def test_an_input_limit_that_binds_is_named(coarse_scan):
     with pytest.raises(Infeasible, match="input limit") as caught:
-        synthesize(one_state(1.5, 1.0, 0.4, 9.985e-4, 9.985e-4, 9.985e-4), method="paper")
+        synthesize(one_state(1.5, 1.0, 0.4, 9.985e-4, 9.985e-4, 9.985e-4), method="paper", dkappa=0.05, drho=0.1)
     assert caught.value.binding == "C5"
     assert 0.0 < caught.value.shortfall < 1.0
 
