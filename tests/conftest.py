@@ -1,15 +1,19 @@
-"""Plants that many tests share."""
+"""Plants that many tests share.
+
+What takes long is imported by the fixtures: the process that only hands tests out to others needs none of it.
+"""
 
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import is_dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from unittest import mock
 
 # One thread per process, as in `ncs`: tests run side by side, and on small matrices waiting threads only burn time.
@@ -19,10 +23,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import pytest
 
-from ncs_gym import LinearPlant, truck_trailer
-from shields import Certificate
-from tests.certificates import certificate_of, keep_certificates, require_valid_once, source_digest
-from tests.workers import no_worker_processes
+if TYPE_CHECKING:
+    from ncs_gym import LinearPlant
+    from shields import Certificate
 
 # Gymnasium's checker tries every render mode: no windows while tests run.
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
@@ -35,6 +38,12 @@ def pytest_make_parametrize_id(val: Any) -> str | None:
     if isinstance(val, dict | list | tuple | np.ndarray) or is_dataclass(val):
         return _shown(val)[:LONGEST_ID]
     return None
+
+
+def pytest_collection_finish() -> None:
+    """What is imported by now stays: the collector of garbage does not walk through it again and again."""
+    gc.freeze()
+    gc.set_threshold(100_000, 50, 100)
 
 
 def _shown(value: Any) -> str:
@@ -53,24 +62,32 @@ def _shown(value: Any) -> str:
 @pytest.fixture(scope="session")
 def plant() -> LinearPlant:
     """The plant of the case study."""
+    from ncs_gym import truck_trailer
+
     return truck_trailer()
 
 
 @pytest.fixture(scope="session")
 def loaded() -> LinearPlant:
     """The plant of the cruise."""
+    from ncs_gym import truck_trailer
+
     return truck_trailer(mass=4000.0)
 
 
 @pytest.fixture(scope="session")
 def certificate(loaded: LinearPlant) -> Certificate:
     """A certificate for the cruise."""
+    from tests.certificates import certificate_of
+
     return certificate_of(loaded)
 
 
 @pytest.fixture
 def without_workers() -> Iterator[None]:
     """Commands start no worker processes, which would have to import everything."""
+    from tests.workers import no_worker_processes
+
     with no_worker_processes():
         yield
 
@@ -97,6 +114,8 @@ def _folder_of(place: Path, name: str, make: Callable[[Path], None]) -> Path:
 @pytest.fixture(scope="session", autouse=True)
 def _nothing_proved_twice(request: pytest.FixtureRequest) -> Iterator[None]:
     """Certificates are synthesized once for a state of the source, and shields verify each once per process."""
+    from tests.certificates import keep_certificates, require_valid_once, source_digest
+
     if (cache := getattr(request.config, "cache", None)) is not None:
         keep_certificates(partial(_folder_of, cache.mkdir(f"certificates-{source_digest()}")))
     with mock.patch("shields.runtime.safety_filter.require_valid", require_valid_once):
