@@ -15,6 +15,8 @@ from shields.paper.reduced_problem import ReducedProblem
 # 1 / kappa, which are denser near rho = 1.
 _KAPPAS = np.linspace(0.01, 0.995, 120)
 _RHO_FRACTIONS = np.linspace(0.0, 1.0, 40) ** 2
+# So many points in a row without a solution end the scan of a kappa; one would do if the solver were exact.
+_POINTS_WITHOUT_SOLUTION = 3
 # Halvings of the interval in which a largest feasible bound is sought.
 _BISECTIONS = 50
 # A bound found is reduced by this factor, at most this often, until all of OP is confirmed to be feasible.
@@ -120,10 +122,15 @@ class FeasibilityScan:
 
 
 def _scanned(problem: ReducedProblem) -> list[tuple[float, float, float]]:
-    """Returns the points (kappa, rho) at which (C1) has a solution, each with its largest lambda_min(L)."""
+    """Returns the points (kappa, rho) at which (C1) has a solution, each with its largest lambda_min(L).
+
+    A smaller rho only restricts L further ((C7) is the one constraint with rho in it, the error being left out), so the
+    scan of a kappa goes from its largest rho downwards and ends where there is no solution any more.
+    """
     points = []
     for kappa in _KAPPAS.tolist():
-        for fraction in _RHO_FRACTIONS.tolist():
+        without = 0
+        for fraction in _RHO_FRACTIONS[::-1].tolist():
             rho = 1.0 + (1.0 / kappa - 1.0) * fraction
             if kappa * rho > 1.0 - SMALLEST_GAP:
                 continue
@@ -131,7 +138,12 @@ def _scanned(problem: ReducedProblem) -> list[tuple[float, float, float]]:
             eigenvalue = problem.largest_eigenvalue(bounds, with_error=False)
             if eigenvalue > 0.0:
                 points.append((kappa, rho, eigenvalue))
-    return points
+                without = 0
+            else:
+                without += 1
+            if without == _POINTS_WITHOUT_SOLUTION:
+                break
+    return sorted(points)
 
 
 def largest_gamma(scan: FeasibilityScan, plant: LinearPlant) -> float:
