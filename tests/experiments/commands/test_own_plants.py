@@ -158,6 +158,7 @@ def read_until(terminal, words, seconds=120.0):
     return seen
 
 
+@pytest.mark.slow
 def test_long_synthesis_shows_its_stage_and_saves_the_best_when_interrupted(tmp_path):
     (tmp_path / "slow.py").write_text(
         "from ncs_gym import register_plant\nfrom tests.plants import random_plant\n"
