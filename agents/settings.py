@@ -20,8 +20,8 @@ class _Settings:
 class PPOSettings(_Settings):
     """Settings of PPO and TRPO; the defaults learn the cruise task in 150,000 steps.
 
-    Many environments, batches of 2048 and a higher learning rate than stable-baselines3's defaults train an order of
-    magnitude faster at no loss of return on these small tasks (`python benchmarks/ppo_settings.py`).
+    Many environments, batches of 2048 and a higher learning rate than stable-baselines3's defaults train about eight
+    times as fast at no loss of return on these small tasks (`python benchmarks/ppo_settings.py`).
 
     Attributes:
         envs: Number of environments stepped side by side.
