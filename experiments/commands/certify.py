@@ -92,7 +92,10 @@ def _require_safe(total: SafetyCounts, campaign: Campaign) -> None:
     left_set = total.exits > 0 and not campaign.looks_ahead
     if left_set or total.violations or total.unproved:
         outside_set = "" if campaign.looks_ahead else f"{total.exits:,} steps outside S, "
-        raise SafetyBroken(f"{outside_set}{total.violations:,} outside the box, {total.unproved:,} without a proof")
+        hint = " (a channel that breaks its contract takes the proof away)" if total.unproved else ""
+        raise SafetyBroken(
+            f"{outside_set}{total.violations:,} outside the box, {total.unproved:,} without a proof{hint}"
+        )
 
 
 def _certificate_files(cases: dict[str, AttackCase], folder: Path) -> dict[str, Path]:
