@@ -1,6 +1,5 @@
 """The page of an environment says what the environment is."""
 
-import importlib.util
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,6 +11,7 @@ from ncs_gym.registration import registered_ids
 from shields import SafetyShield
 from shields.runtime.wrapper import _synthesized
 from tests.certificates import certificate_of
+from tests.site_hooks import site_hook
 
 ROOT = Path(__file__).resolve().parent.parent
 SECTIONS = (
@@ -31,12 +31,7 @@ SECTIONS = (
 @pytest.fixture(scope="module")
 def pages():
     """The module that writes the pages, which is part of no package."""
-    spec = importlib.util.spec_from_file_location("environment_page", ROOT / "docs" / "hooks" / "environment_page.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return site_hook("environment_page")
 
 
 def section(page, title):

@@ -1,10 +1,11 @@
 """Formulas and names of the pages: as the site and GitHub read them."""
 
-import importlib.util
 import re
 from pathlib import Path
 
 import pytest
+
+from tests.site_hooks import site_hook
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted((ROOT / "docs").glob("*.md"))
@@ -41,11 +42,7 @@ def test_formulas_in_a_line_are_left_alone_by_markdown(page):
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_formulas_become_mathml(page):
     pytest.importorskip("math_core", reason="the extra [docs] is not installed")
-    spec = importlib.util.spec_from_file_location("mathml", ROOT / "docs" / "hooks" / "mathml.py")
-    assert spec is not None
-    assert spec.loader is not None
-    hook = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(hook)
+    hook = site_hook("mathml")
     lines, blocks = formulas(page)
     text = hook.on_page_markdown("".join(f"```math\n{block}```\n" for block in blocks))
     assert text.count("$$") == 2 * len(blocks)
@@ -58,11 +55,7 @@ def test_formulas_become_mathml(page):
 
 
 def test_options_and_ids_stay_on_one_line():
-    spec = importlib.util.spec_from_file_location("unbroken", ROOT / "docs" / "hooks" / "unbroken.py")
-    assert spec is not None
-    assert spec.loader is not None
-    hook = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(hook)
+    hook = site_hook("unbroken")
     block = "<pre><span></span><code>ncs train --seed 1</code></pre>"
     made = hook.on_page_content(f"<p>a--b <code>ncs train --a2c.n-steps 1 ncs_gym/CartPole-v0</code></p>{block}")
     kept = '<span class="unbroken">--a2c.n-steps</span> 1 <span class="unbroken">ncs_gym/CartPole-v0</span>'

@@ -1,23 +1,16 @@
 """The pages of the reference link to the pages and names that docstrings mention."""
 
-import importlib.util
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-HOOK = Path(__file__).resolve().parent.parent / "docs" / "hooks" / "reference_links.py"
+from tests.site_hooks import site_hook
 
 
 @pytest.fixture(scope="module")
 def hook():
     """The module of the site, which is part of no package."""
-    spec = importlib.util.spec_from_file_location("reference_links", HOOK)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return site_hook("reference_links")
 
 
 def site_page(path, content="", title="", toc=()):

@@ -65,7 +65,7 @@ def overview_table(summary: dict[str, Any]) -> str:
     for title, env in environments.items():
         arms = [env["arms"][name] for name in names]
         violating.append([title, *map(_rates, arms)])
-        returns.append([title, *(f"{arm['eval_return_mean']:.1f}" for arm in arms)])
+        returns.append([title, *(f"{arm['eval_return_mean']:z.1f}" for arm in arms)])
     return f"{text_table(violating)}\n\n{text_table(returns)}"
 
 
