@@ -1,7 +1,8 @@
 """The Monte Carlo campaign behind `ncs certify`: worst-case disturbances and hostile agents against shielded loops."""
 
 from experiments.attack.attack_cases import AttackCase
-from experiments.attack.monte_carlo_batch import Campaign, MonteCarloBatch, run_batch
+from experiments.attack.campaign import Campaign
+from experiments.attack.monte_carlo_batch import MonteCarloBatch, run_batch
 from experiments.attack.safety_counts import SafetyCounts
 
 __all__ = ["AttackCase", "Campaign", "MonteCarloBatch", "SafetyCounts", "run_batch"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cache
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -50,6 +51,7 @@ class AttackCase:
         contract: Channel contract that the estimator assumes; None for a stable plant.
         process: What really moves.
         downlink: The channel between controller and actuator; None for an ideal one.
+        downlink_contract: What is assumed of the downlink; None for nothing.
     """
 
     plant: LinearPlant
@@ -57,6 +59,7 @@ class AttackCase:
     contract: ChannelContract | None = None
     process: Process = field(default_factory=LinearProcess)
     downlink: Channel | None = None
+    downlink_contract: ChannelContract | None = None
 
     def with_delta(self, delta: float | None) -> AttackCase:
         """Returns the case with a plant whose bounds hold for Gaussian noise at another level; None keeps it."""
@@ -69,7 +72,7 @@ class AttackCase:
     @property
     def certificate_contract(self) -> ChannelContract | None:
         """Contract that the certificate rests on, which counts the steps of both channels; None for a stable plant."""
-        protocol = downlink_protocol(self.downlink, None)
+        protocol = downlink_protocol(self.downlink, self.downlink_contract)
         return self.contract if protocol is None else protocol.behind(self.contract)
 
     @property
@@ -104,13 +107,24 @@ def attack_cases(seed: int, random_plants: int, env_id: str | None = None) -> di
     return found
 
 
+def plant_cases(file: Path, contract: ChannelContract | None) -> dict[str, AttackCase]:
+    """Returns the cases of a plant that `LinearPlant.save` wrote: channels that use its contract up, or all kinds.
+
+    Raises:
+        ValueError: If the file cannot be read.
+    """
+    plant, channels = LinearPlant.load(file), _CHANNELS if contract is None else _extremes(contract)
+    return {f"{file.name}, {kind}": AttackCase(plant, channel, contract) for kind, channel in channels.items()}
+
+
 def _env_cases(name: str, env: NCSEnv, *, all_channels: bool = False) -> dict[str, AttackCase]:
     """Returns the cases of an environment: its own channel, those that use its contract up, and all kinds if asked."""
     channels = {"its channel": env.channel} | ({} if env.contract is None else _extremes(env.contract))
     channels |= _CHANNELS if all_channels else {}
-    downlink = None if env.downlink is None else env.downlink.channel
+    protocol = env.downlink
+    downlink = (None, None) if protocol is None else (protocol.channel, protocol.contract)
     cases = {
-        kind: AttackCase(env.plant, channel, env.contract, env.process, downlink) for kind, channel in channels.items()
+        kind: AttackCase(env.plant, channel, env.contract, env.process, *downlink) for kind, channel in channels.items()
     }
     return {f"{name}, {kind}": case for kind, case in cases.items()}
 

@@ -10,8 +10,9 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from contextlib import ExitStack
 from pathlib import Path
 
+from experiments.attack.campaign import Campaign
 from experiments.attack.counts_store import CountsStore
-from experiments.attack.monte_carlo_batch import Campaign, MonteCarloBatch, run_batch
+from experiments.attack.monte_carlo_batch import MonteCarloBatch, run_batch
 from experiments.attack.safety_counts import SafetyCounts
 from experiments.backends import initialize_worker
 from experiments.backends.execution import progress_bar

@@ -16,10 +16,14 @@ _EPISODES: _Columns = {("", "episodes"): lambda counts: f"{counts.episodes:,}"}
 _FAILURES: _Columns = {
     ("", "failed"): lambda counts: f"{counts.broken_episodes:,}",
     ("", "p <"): lambda counts: f"{counts.bound:.1e}",
-    ("", "margin"): lambda counts: f"{counts.margin:.1e}",
+    ("", "margin"): lambda counts: f"{counts.margin:.1e}" if counts.level > 0.0 else "-",
 }
 _OUTSIDE_BOX: _Columns = {("outside", "box"): lambda counts: f"{counts.violations:,}"}
 _OVERRIDDEN: _Columns = {("over-", "ridden"): lambda counts: f"{counts.interventions / counts.steps:.1%}"}
+_LAPSED: _Columns = {
+    ("no", "claim"): lambda counts: f"{counts.lapsed / counts.steps:.1%}",
+    ("outside", "then"): lambda counts: f"{counts.lapsed_violations:,}",
+}
 _SET_COLUMNS: _Columns = {
     **_EPISODES,
     ("outside", "S"): lambda counts: f"{counts.exits:,}",
@@ -48,6 +52,10 @@ failed: episodes that left the box; p <: upper end of the exact 95 % interval of
 margin: smallest 1 - |c_j x| from step {SETTLING_STEPS} on;
 planned: steps with inputs of a certified plan in store; overridden: steps that the shield changed"""
 
+_LAPSED_LEGEND = """
+no claim: steps from a broken contract on, until the proof holds again, which no failure counts;
+outside then: such steps outside the box"""
+
 
 def counts_table(counts: Mapping[str, SafetyCounts], *, looks_ahead: bool) -> str:
     """Returns the counts as text, with a legend; the sum of all rows stands below a rule.
@@ -58,6 +66,8 @@ def counts_table(counts: Mapping[str, SafetyCounts], *, looks_ahead: bool) -> st
     """
     columns, legend = (_BOX_COLUMNS, _BOX_LEGEND) if looks_ahead else (_SET_COLUMNS, _SET_LEGEND)
     total = sum(counts.values(), SafetyCounts())
+    if total.lapsed:
+        columns, legend = columns | _LAPSED, legend + _LAPSED_LEGEND
     rows = [list(line) for line in zip(("", "case"), *columns, strict=True)]
     plants = {name: name.rpartition(", ")[0] for name in counts}
     for plant in dict.fromkeys(plants.values()):

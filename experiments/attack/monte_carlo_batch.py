@@ -3,75 +3,22 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.attack.attack_cases import attack_cases
+from experiments.attack.campaign import SHIELD_MODES, Campaign
 from experiments.attack.safety_counts import SafetyCounts
 from experiments.attack.worst_case import GaussianVectorEnv, HostileAgents, WorstCaseVectorEnv, starts_in_box
-from experiments.runs.provenance import json_digest, versions
 from ncs_gym import NCSVectorEnv
 from ncs_gym.registration import EPISODE_STEPS
 from shields import Certificate, VectorSafetyShield
 
-# Modes of the shield, one per batch in turn, where none is chosen.
-SHIELD_MODES = ("project", "switch", "boundary")
 # Episodes start on the boundary of S; the largest level is taken from this step on.
 SETTLING_STEPS = 20
-
-
-@dataclass(frozen=True, kw_only=True)
-class Campaign:
-    """Settings that all batches share.
-
-    Attributes:
-        seed: Seed of the campaign; all batches derive their seeds from it.
-        random_plants: Number of random plants.
-        envs: Number of environments in a batch, each of which runs one episode.
-        shielded: Whether the shield acts; otherwise it only watches.
-        gaussian: Whether noise is Gaussian, without a bound; otherwise it is the worst within the bounds.
-        delta: Replaces the plants' own level at which Gaussian noise is inside the bounds; None keeps it.
-        env: Id, or "module:id", of the only environment to attack; None for all.
-        mode: Only mode of the shield; None for `SHIELD_MODES`.
-        horizon: Longest plan of mode "lookahead" [steps]; None in other modes.
-    """
-
-    seed: int
-    random_plants: int
-    envs: int
-    shielded: bool
-    gaussian: bool = False
-    delta: float | None = None
-    env: str | None = None
-    mode: str | None = None
-    horizon: int | None = None
-
-    @property
-    def looks_ahead(self) -> bool:
-        """Whether the shield is that of mode "lookahead", whose claim is the safe box."""
-        return self.mode == "lookahead"
-
-    @property
-    def kinds_of_batches(self) -> int:
-        """Number of kinds of batches, which take turns."""
-        if self.looks_ahead:
-            return 2
-        return len(SHIELD_MODES) if self.shielded and self.mode is None else 1
-
-    @property
-    def key(self) -> str:
-        """SHA-256 of everything that the counts depend on except the certificates and the channels."""
-        given = {name: value for name, value in asdict(self).items() if value is not None}
-        return json_digest(given | {"versions": versions()})
-
-    @property
-    def batch_steps(self) -> int:
-        """Number of steps in a batch."""
-        return self.envs * EPISODE_STEPS
 
 
 @dataclass(frozen=True)
@@ -107,34 +54,64 @@ def run_batch(campaign: Campaign, batch: MonteCarloBatch, certificate: Path) -> 
     rng = np.random.default_rng(policy_seed)
     info = _begin(campaign, shield, seed >> 1, rng)
     agents = HostileAgents(campaign.envs, plant, shield.certificate, rng)
-    outside_starts = np.count_nonzero(_squares(root, info) > 1.0)
-    exits = violations = interventions = planned = 0
-    unproved = campaign.envs - np.count_nonzero(info["shield_guaranteed"])
-    broken, level = np.zeros(campaign.envs, np.bool_), 0.0
-    for step in range(EPISODE_STEPS):
-        *_, info = shield.step(agents.act(info["estimate"]))
-        squares = _squares(root, info)
-        outside_set, outside_box = ~(squares <= 1.0), info["cost"] != 0.0
-        exits += np.count_nonzero(outside_set)
-        violations += np.count_nonzero(outside_box)
-        interventions += np.count_nonzero(info["shield_intervened"])
-        unproved += campaign.envs - np.count_nonzero(info["shield_guaranteed"])
-        planned += np.count_nonzero(info.get("shield_plan_length", 0))
-        broken |= outside_box | (outside_set & (not campaign.looks_ahead))
-        if step >= SETTLING_STEPS:
-            reached = info["constraint_values"] + 1.0 if campaign.looks_ahead else np.sqrt(squares)
-            level = max(level, float(np.nan_to_num(reached, nan=np.inf).max()))
-    return SafetyCounts(
+    counts = SafetyCounts(
         steps=campaign.batch_steps,
         episodes=campaign.envs,
-        exits=int(exits),
-        violations=int(violations),
-        broken_episodes=int(broken.sum()),
-        interventions=int(interventions),
-        unproved=int(unproved),
-        level=level,
-        planned=int(planned),
-        outside_starts=int(outside_starts),
+        unproved=int(np.count_nonzero(~info["shield_guaranteed"])),
+        outside_starts=int(np.count_nonzero(_squares(root, info) > 1.0)),
+    )
+    kept, broken = np.ones(campaign.envs, np.bool_), np.zeros(campaign.envs, np.bool_)
+    for step in range(EPISODE_STEPS):
+        *_, info = shield.step(agents.act(info["estimate"]))
+        claimed, kept = _claimed_and_kept(info, kept)
+        if not campaign.shielded:  # nothing is claimed, and everything counted
+            claimed[:] = True
+        outside, reached = _outside_and_reached(campaign, info, _squares(root, info))
+        counts += _step_counts(info, outside, claimed, kept)
+        broken |= claimed & (outside.box | (outside.safe_set & (not campaign.looks_ahead)))
+        if step >= SETTLING_STEPS:
+            level = float(np.nan_to_num(reached, nan=np.inf).max(initial=0.0, where=claimed))
+            counts += SafetyCounts(level=level)
+    return counts + SafetyCounts(broken_episodes=int(broken.sum()))
+
+
+class _Outside(NamedTuple):
+    """Which true states lie outside S and outside the safe box, arrays of shape (N,)."""
+
+    safe_set: np.ndarray
+    box: np.ndarray
+
+
+def _claimed_and_kept(info: dict[str, Any], kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns of which states safety is claimed now, and in which episodes all contracts were kept so far.
+
+    The present state is the result of an earlier decision: it does not rest on the age of the newest sample now, but on
+    the input that the actuator applied. After a broken contract what the shield says itself is claimed.
+
+    Args:
+        info: What the step returned.
+        kept: In which episodes all contracts were kept before the step, shape (N,).
+    """
+    kept = kept & ~info["downlink_broken"]
+    return kept | info["shield_guaranteed"], kept & ~info["contract_broken"]
+
+
+def _outside_and_reached(campaign: Campaign, info: dict[str, Any], squares: np.ndarray) -> tuple[_Outside, np.ndarray]:
+    """Returns what lies outside, and the levels that the claim limits to one, shape (N,): sqrt(x'Mx) or max |c_j x|."""
+    outside = _Outside(~(squares <= 1.0), info["cost"] != 0.0)
+    return outside, info["constraint_values"].max(axis=1) + 1.0 if campaign.looks_ahead else np.sqrt(squares)
+
+
+def _step_counts(info: dict[str, Any], outside: _Outside, claimed: np.ndarray, kept: np.ndarray) -> SafetyCounts:
+    """Returns what one step adds to the counts."""
+    return SafetyCounts(
+        exits=int(np.count_nonzero(claimed & outside.safe_set)),
+        violations=int(np.count_nonzero(claimed & outside.box)),
+        interventions=int(np.count_nonzero(info["shield_intervened"])),
+        unproved=int(np.count_nonzero(kept & ~info["shield_guaranteed"])),
+        planned=int(np.count_nonzero(info.get("shield_plan_length", 0))),
+        lapsed=int(np.count_nonzero(~claimed)),
+        lapsed_violations=int(np.count_nonzero(~claimed & outside.box)),
     )
 
 
@@ -170,9 +147,8 @@ def _shields(campaign: Campaign, case: str, certificate: Path) -> dict[str, Vect
     Raises:
         CertificateError: If the certificate is damaged or does not verify for the case's plant.
     """
-    cases = attack_cases(campaign.seed, campaign.random_plants, campaign.env)
-    chosen, loaded = cases[case].with_delta(campaign.delta), Certificate.load(certificate)
-    settings = {name: getattr(chosen, name) for name in ("plant", "channel", "contract", "process", "downlink")}
+    chosen, loaded = campaign.cases()[case], Certificate.load(certificate)
+    settings = {each.name: getattr(chosen, each.name) for each in fields(chosen)}
     kind = GaussianVectorEnv if campaign.gaussian else WorstCaseVectorEnv
     env = kind(campaign.envs, loaded, **settings)
     if campaign.looks_ahead:

@@ -12,20 +12,23 @@ from experiments.analysis.statistics import clopper_pearson
 class SafetyCounts:
     """Counts of some episodes.
 
-    The claim of mode "lookahead" is the safe box alone: there only violations break an episode.
+    The claim of mode "lookahead" is the safe box alone: there only violations break an episode. After a channel has
+    broken its contract nothing is claimed until the proof holds again; such steps are *lapsed* and counted apart.
 
     Attributes:
         steps: Number of simulated steps.
         episodes: Number of episodes.
-        exits: Number of steps whose true state lay outside S.
-        violations: Number of steps whose true state lay outside the safe box.
+        exits: Number of steps whose true state lay outside S, without lapsed ones.
+        violations: Number of steps whose true state lay outside the safe box, without lapsed ones.
         broken_episodes: Number of episodes with an exit or a violation; in mode "lookahead" with a violation.
         interventions: Number of steps in which the shield intervened.
-        unproved: Number of steps at which the shield's proof did not hold.
-        level: Largest sqrt(x'Mx) of a true state after `monte_carlo_batch.SETTLING_STEPS`; in mode "lookahead" the
-            largest |c_j x|.
+        unproved: Number of steps at which the shield's proof did not hold though the channels kept their contracts.
+        level: Largest sqrt(x'Mx) of a true state after `monte_carlo_batch.SETTLING_STEPS`, without lapsed steps; in
+            mode "lookahead" the largest |c_j x|.
         planned: Number of steps after whose decision inputs of a certified plan were in store.
         outside_starts: Number of episodes that began outside S, with a certified plan.
+        lapsed: Number of lapsed steps.
+        lapsed_violations: Number of lapsed steps whose true state lay outside the safe box.
     """
 
     steps: int = 0
@@ -38,6 +41,8 @@ class SafetyCounts:
     level: float = 0.0
     planned: int = 0
     outside_starts: int = 0
+    lapsed: int = 0
+    lapsed_violations: int = 0
 
     def __add__(self, other: SafetyCounts) -> SafetyCounts:
         """Returns the counts of both."""

@@ -12,15 +12,17 @@ from pathlib import Path
 from tqdm import tqdm
 
 from experiments.attack import MonteCarloBatch, SafetyCounts
-from experiments.attack.attack_cases import AttackCase, attack_cases
+from experiments.attack.attack_cases import AttackCase
+from experiments.attack.campaign import Campaign
 from experiments.attack.campaign_execution import execute_batches
 from experiments.attack.counts_store import CountsStore
 from experiments.attack.counts_table import counts_table
 from experiments.attack.gaussian_table import GAUSSIAN_LEGEND, gaussian_table, require_within
-from experiments.attack.monte_carlo_batch import Campaign
 from experiments.errors import SafetyBroken
 from experiments.runs import claim_folder, versions
 from experiments.settings import CertifySettings
+from experiments.settings.certificates import changed_contract
+from ncs_gym.downlink import downlink_protocol
 from shields import Certificate
 from shields.atomic_write import write_atomically
 from shields.runtime.safety_filter import DEFAULT_HORIZON
@@ -30,32 +32,26 @@ def certify(settings: CertifySettings) -> None:
     """Runs `ncs certify`.
 
     Raises:
-        SafetyBroken: If a shielded state left S or its box (in mode "lookahead": its box), or a proof did not hold;
-            with Gaussian noise, if more episodes did so than the bound on their probability allows.
+        SafetyBroken: If a shielded state left S or its box (in mode "lookahead": its box), or a proof did not hold,
+            although the channels kept their contracts; with Gaussian noise, if more episodes did so than the bound on
+            their probability allows.
         ResultsError: If the stored counts are damaged.
         OtherResultsError: If the output folder holds finished results of other settings.
-        ValueError: If there is no environment of the given id.
+        ValueError: If there is no environment of the given id, the plant's file cannot be read, or nothing is
+            claimed of an environment because its downlink promises nothing.
+        Infeasible: If there is no certificate for the plant.
         CertificateError: If a certificate in the folder is damaged.
         OSError: If the folder cannot be written.
     """
-    campaign = Campaign(
-        seed=settings.seed,
-        random_plants=settings.random_plants,
-        envs=settings.envs,
-        shielded=not settings.unshielded,
-        gaussian=settings.noise == "gaussian",
-        delta=settings.delta,
-        env=settings.env,
-        mode=settings.mode,
-        horizon=(settings.horizon or DEFAULT_HORIZON) if settings.mode == "lookahead" else None,
-    )
-    cases = attack_cases(campaign.seed, campaign.random_plants, campaign.env)
-    cases = {name: case.with_delta(campaign.delta) for name, case in cases.items()}
+    campaign = _campaign(settings)
+    cases = campaign.cases()
+    if campaign.shielded:
+        _require_claims(cases)
     claim_folder("certify", settings)
     certificates = _certificate_files(cases, settings.out / "certificates")
     keys = {case: f"{campaign.key} {Certificate.load(file).checksum}" for case, file in certificates.items()}
     if campaign.env is not None:  # what a module registers may change
-        keys = {case: f"{key} {cases[case].channel}" for case, key in keys.items()}
+        keys = {case: f"{key} {cases[case].channel} {cases[case].downlink}" for case, key in keys.items()}
     store = CountsStore(settings.out / "tallies.jsonl", keys)
     batches = _batches(list(cases), settings.steps / campaign.batch_steps, campaign.kinds_of_batches)
     missing = {case: deque(each for each in planned if each not in store.counts) for case, planned in batches.items()}
@@ -83,6 +79,37 @@ def certify(settings: CertifySettings) -> None:
         _require_safe(total, campaign)
 
 
+def _campaign(settings: CertifySettings) -> Campaign:
+    return Campaign(
+        seed=settings.seed,
+        random_plants=settings.random_plants,
+        envs=settings.envs,
+        shielded=not settings.unshielded,
+        gaussian=settings.noise == "gaussian",
+        delta=settings.delta,
+        env=settings.env,
+        plant=None if settings.plant is None else str(settings.plant),
+        contract=changed_contract(None, settings.max_age, settings.quantization_step),
+        mode=settings.mode,
+        horizon=(settings.horizon or DEFAULT_HORIZON) if settings.mode == "lookahead" else None,
+    )
+
+
+def _require_claims(cases: dict[str, AttackCase]) -> None:
+    """Returns if something is claimed of every case.
+
+    Raises:
+        ValueError: If a downlink promises nothing, so that there is nothing to attack.
+    """
+    for name, case in cases.items():
+        protocol = downlink_protocol(case.downlink, case.downlink_contract)
+        if protocol is not None and protocol.contract is None:
+            raise ValueError(
+                f"{name}: nothing is claimed behind a downlink without a contract, so that there is nothing to attack; "
+                "give it max_consecutive_losses, or the environment downlink_contract=ChannelContract(c)"
+            )
+
+
 def _require_safe(total: SafetyCounts, campaign: Campaign) -> None:
     """Returns if the shield kept what it claims in every step.
 
@@ -92,10 +119,7 @@ def _require_safe(total: SafetyCounts, campaign: Campaign) -> None:
     left_set = total.exits > 0 and not campaign.looks_ahead
     if left_set or total.violations or total.unproved:
         outside_set = "" if campaign.looks_ahead else f"{total.exits:,} steps outside S, "
-        hint = " (a channel that breaks its contract takes the proof away)" if total.unproved else ""
-        raise SafetyBroken(
-            f"{outside_set}{total.violations:,} outside the box, {total.unproved:,} without a proof{hint}"
-        )
+        raise SafetyBroken(f"{outside_set}{total.violations:,} outside the box, {total.unproved:,} without a proof")
 
 
 def _certificate_files(cases: dict[str, AttackCase], folder: Path) -> dict[str, Path]:

@@ -7,6 +7,7 @@ from experiments.runs import require_place
 from experiments.runs.environments import registered_env
 from experiments.runs.synthesis_status import synthesis_status
 from experiments.settings import SynthesizeSettings
+from experiments.settings.certificates import changed_contract
 from ncs_gym import ChannelContract, LinearPlant
 from shields.certificate_text import size_of
 from shields.errors import SynthesisInterrupted
@@ -51,11 +52,4 @@ def _plant_and_contract(settings: SynthesizeSettings) -> tuple[LinearPlant, Chan
         plant, contract = env.plant, env.certificate_contract
     else:
         plant, contract = LinearPlant.load(settings.plant), None
-    if settings.max_age is None and settings.quantization_step is None:
-        return plant, contract
-    max_age = settings.max_age if contract is None or settings.max_age is not None else contract.max_age
-    if max_age is None:
-        raise ValueError("--quantization-step belongs to a contract of the channel: give --max-age, too")
-    own_step = 0.0 if contract is None else contract.quantization_step
-    step = own_step if settings.quantization_step is None else settings.quantization_step
-    return plant, ChannelContract(max_age, step)
+    return plant, changed_contract(contract, settings.max_age, settings.quantization_step)

@@ -9,6 +9,7 @@ from typing import Literal
 import tyro
 
 from experiments.settings.horizon import require_horizon
+from ncs_gym import ChannelContract
 from ncs_gym.plants.linear_plant import SMALLEST_DELTA
 
 
@@ -68,6 +69,25 @@ class VerifySettings:
         _refuse_both(self.env, self.plant)
 
 
+def changed_contract(
+    contract: ChannelContract | None, max_age: int | None, quantization_step: float | None
+) -> ChannelContract | None:
+    """Returns a channel contract with what is given, None for what stays.
+
+    Raises:
+        ValueError: If a value is out of range, or there is a quantization step and no age.
+    """
+    if max_age is None and quantization_step is None:
+        return contract
+    if max_age is None:
+        if contract is None:
+            raise ValueError("--quantization-step belongs to a contract of the channel: give --max-age, too")
+        max_age = contract.max_age
+    if quantization_step is None:
+        quantization_step = 0.0 if contract is None else contract.quantization_step
+    return ChannelContract(max_age, quantization_step)
+
+
 def _refuse_both(env: str | None, plant: Path | None) -> None:
     """Raises ValueError if both an environment and the file of a plant are given."""
     if env is not None and plant is not None:
@@ -97,8 +117,13 @@ class CertifySettings:
         noise: "truncated" is the worst noise within the bounds; "gaussian" noise has none: it is drawn, next to
             the worst of the other disturbances, and the bound on the probability of an exit is printed.
         delta: Level at which the certificates' ellipsoids hold for a draw of Gaussian noise, in place of the plants'.
-        env: Id of the only environment to attack, behind its own channel and, if it has no contract, every kind of
-            channel; module:id first imports the module, which registers one of your own. By default all of the above.
+        env: Id of the only environment to attack, behind its own channel and those that use its contract up, or every
+            kind of channel without one; module:id first imports the module, which registers one of your own. By default
+            all of the above.
+        plant: File of the only plant to attack, which `LinearPlant.save` wrote: behind channels that use its contract
+            up, or every kind of channel without one.
+        max_age: Largest measurement age of the contract of --plant [steps]; no contract by default.
+        quantization_step: Coarsest quantization that the contract of --plant allows.
         force: Replace the finished results of another campaign in the output folder, which otherwise is refused; counts
             of batches are kept.
         seed: Seed of the campaign, >= 0.
@@ -115,11 +140,17 @@ class CertifySettings:
     noise: Literal["truncated", "gaussian"] = "truncated"
     delta: float | None = None
     env: str | None = None
+    plant: Path | None = None
+    max_age: int | None = None
+    quantization_step: float | None = None
     force: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Raises ValueError if a value is out of range."""
+        """Raises ValueError if a value is out of range or contradicts another."""
+        _refuse_both(self.env, self.plant)
+        if self.plant is None and (self.max_age is not None or self.quantization_step is not None):
+            raise ValueError("--max-age and --quantization-step belong to --plant: environments have contracts already")
         if self.delta is not None and not SMALLEST_DELTA <= self.delta <= 0.5:
             raise ValueError(f"--delta must be between {SMALLEST_DELTA:g} and 0.5, got {self.delta:g}")
         if not 1.0 <= self.steps < 1e15:

@@ -1,5 +1,7 @@
 """The tables of `ncs certify` fit into a terminal and say all that was counted."""
 
+from dataclasses import replace
+
 import pytest
 
 from experiments.attack.attack_cases import attack_cases
@@ -18,6 +20,23 @@ LONG_CAMPAIGN = SafetyCounts(
     planned=20_000_000,
     outside_starts=100_000,
 )
+
+
+@pytest.mark.parametrize("looks_ahead", [False, True])
+def test_steps_of_which_nothing_is_claimed_have_columns_and_a_legend_where_there_are_any(looks_ahead):
+    counts = {"CartPole-v0, its channel": LONG_CAMPAIGN, "CartPole-v0, late": LONG_CAMPAIGN}
+    assert "no claim" not in counts_table(counts, looks_ahead=looks_ahead)
+    counts["CartPole-v0, its channel"] = replace(LONG_CAMPAIGN, lapsed=2_000_000, lapsed_violations=1_234)
+    lines = counts_table(counts, looks_ahead=looks_ahead).splitlines()
+    rows = [line.split()[-2:] for line in lines if line.startswith(("  its channel", "  late", "all"))]
+    assert rows == [["5.0%", "1,234"], ["0.0%", "0"], ["2.5%", "1,234"]]
+    assert "no claim: steps from a broken contract on, until the proof holds again, " in lines[-2]
+    assert max(map(len, lines)) <= 100
+
+
+def test_margin_of_no_step_is_no_number():
+    counts = SafetyCounts(steps=400, episodes=2, lapsed=400)
+    assert counts_table({"CartPole-v0, its channel": counts}, looks_ahead=False).splitlines()[6].split()[7] == "-"
 
 
 @pytest.mark.parametrize("looks_ahead", [False, True])

@@ -3,7 +3,8 @@
 import pytest
 
 from experiments.attack.attack_cases import attack_cases
-from experiments.attack.monte_carlo_batch import Campaign, MonteCarloBatch, run_batch
+from experiments.attack.campaign import Campaign
+from experiments.attack.monte_carlo_batch import MonteCarloBatch, run_batch
 from experiments.attack.safety_counts import SafetyCounts
 from ncs_gym.registration import EPISODE_STEPS, needing_extras
 from tests.certificates import certificate_of

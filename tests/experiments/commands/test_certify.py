@@ -8,9 +8,10 @@ import pytest
 
 from experiments.attack import monte_carlo_batch
 from experiments.attack.attack_cases import AttackCase, attack_cases
+from experiments.attack.campaign import Campaign
 from experiments.attack.counts_store import CountsStore
 from experiments.attack.gaussian_table import gaussian_table, require_within
-from experiments.attack.monte_carlo_batch import Campaign, MonteCarloBatch, run_batch
+from experiments.attack.monte_carlo_batch import MonteCarloBatch, run_batch
 from experiments.attack.safety_counts import SafetyCounts
 from experiments.commands import certify as command
 from experiments.commands.certify import certify
@@ -205,7 +206,9 @@ def test_more_exits_than_the_bound_allows_are_an_error():
 def small(monkeypatch):
     """A campaign of two cases."""
     chosen = {name: attack_cases(0, 1)[name] for name in (CRUISE, "TruckTrailer-v0, perfect")}
-    monkeypatch.setattr(command, "attack_cases", lambda seed, random_plants, env_id: chosen)
+    monkeypatch.setattr(
+        Campaign, "cases", lambda self: {name: case.with_delta(self.delta) for name, case in chosen.items()}
+    )
 
 
 def settings(out, **changes):
@@ -360,6 +363,9 @@ def test_wrong_settings_are_named(changes, flag, tmp_path):
         ({"horizon": 6}, "--horizon 6 is for mode lookahead"),
         ({"horizon": 6, "mode": "project"}, "--horizon 6 is for mode lookahead"),
         ({"unshielded": True, "mode": "switch"}, "give either --mode switch or --unshielded"),
+        ({"env": "ncs_gym/CartPole-v0", "plant": "p.json"}, "give either --env or --plant"),
+        ({"max_age": 3}, "--max-age and --quantization-step belong to --plant"),
+        ({"env": "ncs_gym/CartPole-v0", "quantization_step": 0.1}, "--max-age and --quantization-step belong to --pla"),
     ],
 )
 def test_settings_that_contradict_each_other_are_refused(changes, words, tmp_path):

@@ -135,7 +135,35 @@ def test_plant_of_a_file_under_a_contract(tmp_path):
     assert_one_sentence(alone, "give --max-age, too")
 
 
-@pytest.mark.parametrize("command", [("synthesize",), ("verify", "certificate.json")])
+def test_plant_of_a_file_is_attacked_behind_channels_that_use_its_contract_up(tmp_path, without_workers):
+    random_plant(3, 3, 2).save(tmp_path / "plant.json")
+    asked = ("--plant", "plant.json", "--steps", 1, "--envs", 8)
+    contract = ("--max-age", 2, "--quantization-step", 0.001)
+    for given, kinds in (((), ("perfect", "blackout", "bursts", "overtaking")), (contract, ("late", "rare"))):
+        folder = f"of {len(kinds)}"
+        run = ncs("certify", *asked, *given, "--out", folder, cwd=tmp_path)
+        assert run.returncode == 0, run.stderr
+        document = json.loads((tmp_path / folder / "certify.json").read_text())
+        assert list(document["cases"]) == [f"plant.json, {kind}" for kind in kinds]
+        assert document["total"]["exits"] == document["total"]["unproved"] == document["total"]["lapsed"] == 0
+        assert document["total"]["interventions"] > 0
+        (certificate,) = (tmp_path / folder / "certificates").iterdir()
+        assert (Certificate.load(certificate).contract is None) == (given == ())
+
+
+def test_another_plant_in_the_same_file_is_attacked_anew(tmp_path, without_workers):
+    asked = ("--plant", "plant.json", "--steps", 1, "--envs", 8, "--out", "c")
+    totals = []
+    for seed in (3, 5):
+        random_plant(seed, 3, 2).save(tmp_path / "plant.json")
+        run = ncs("certify", *asked, cwd=tmp_path)
+        assert run.returncode == 0, run.stderr
+        assert "per second" in run.stdout
+        totals.append(json.loads((tmp_path / "c" / "certify.json").read_text())["total"])
+    assert totals[0] != totals[1]
+
+
+@pytest.mark.parametrize("command", [("synthesize",), ("verify", "certificate.json"), ("certify",)])
 def test_plant_of_a_file_is_no_environment(command, tmp_path, certificate):
     certificate.save(tmp_path / "certificate.json")
     both = ncs(*command, "--plant", "p.json", "--env", "ncs_gym/TruckTrailer-v0", cwd=tmp_path)

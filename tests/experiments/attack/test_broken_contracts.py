@@ -1,0 +1,112 @@
+"""Where a channel breaks its contract nothing is claimed; what happens then is counted, and is no failure."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from experiments.attack import monte_carlo_batch
+from experiments.attack.attack_cases import attack_cases
+from experiments.attack.campaign import Campaign
+from experiments.attack.monte_carlo_batch import MonteCarloBatch, _claimed_and_kept, run_batch
+from experiments.commands.certify import certify
+from experiments.settings.certificates import CertifySettings
+from ncs_gym import Channel
+from tests.certificates import certificate_of
+
+NAME = "BatchReactor-v0, late"
+CAMPAIGN = Campaign(seed=0, random_plants=0, envs=16, shielded=True)
+
+
+@pytest.fixture
+def attacked(monkeypatch, tmp_path):
+    """Counts of a batch behind a channel that replaces the one that keeps the contract of the batch reactor."""
+
+    def counts_behind(channel, campaign=CAMPAIGN, **changes):
+        case = replace(attack_cases(0, 0)[NAME], channel=channel, **changes)
+        monkeypatch.setattr(Campaign, "cases", lambda self: {NAME: case})
+        monte_carlo_batch._shields.cache_clear()
+        certificate_of(case.plant, case.certificate_contract).save(tmp_path / "certificate.json")
+        return run_batch(campaign, MonteCarloBatch(NAME, 0), tmp_path / "certificate.json")
+
+    yield counts_behind
+    monte_carlo_batch._shields.cache_clear()
+
+
+def test_what_comes_after_a_broken_contract_is_counted_apart(attacked):
+    counts = attacked(Channel(loss=0.3, quantization_step=1e-3))
+    assert (counts.exits, counts.violations, counts.broken_episodes, counts.unproved) == (0, 0, 0, 0)
+    assert 0 < counts.lapsed < counts.steps
+    assert 0.9 < counts.level <= 1.0
+
+
+def test_states_outside_after_a_broken_contract_are_no_failure_and_not_hidden(attacked):
+    counts = attacked(Channel(loss=1.0, quantization_step=1e-3))
+    assert (counts.exits, counts.violations, counts.broken_episodes, counts.unproved) == (0, 0, 0, 0)
+    assert counts.lapsed > 0.9 * counts.steps
+    assert counts.lapsed_violations > 1000
+    assert counts.level == 0.0  # nothing was claimed that late
+    watched = attacked(Channel(loss=1.0, quantization_step=1e-3), replace(CAMPAIGN, shielded=False))
+    assert (watched.lapsed, watched.lapsed_violations) == (0, 0)
+    assert watched.violations > 1000
+    assert watched.broken_episodes == watched.episodes
+
+
+def test_a_channel_that_keeps_its_contract_has_no_lapsed_step(attacked):
+    counts = attacked(attack_cases(0, 0)[NAME].channel)
+    assert (counts.lapsed, counts.lapsed_violations, counts.unproved) == (0, 0, 0)
+
+
+def test_a_downlink_that_breaks_its_contract_is_counted_apart(attacked):
+    case = attack_cases(0, 0)["CartPoleTwoWay-v0, its channel"]
+    promised = case.downlink_contract
+    assert promised is not None
+    counts = attacked(**{**vars(case), "downlink": Channel(loss=0.4, delay=1)})
+    assert (counts.exits, counts.violations, counts.broken_episodes, counts.unproved) == (0, 0, 0, 0)
+    assert 0 < counts.lapsed < counts.steps
+
+
+def info(**values):
+    return {name: np.array([value]) for name, value in values.items()}
+
+
+@pytest.mark.parametrize(
+    ("kept", "downlink_broken", "contract_broken", "guaranteed", "claimed", "still_kept"),
+    [
+        (True, False, False, True, True, True),
+        (True, False, False, False, True, True),  # a proof that is lost for no reason is not believed
+        (True, False, True, False, True, False),  # the present state was decided while the contract was kept
+        (True, True, False, False, False, False),
+        (False, False, False, False, False, False),
+        (False, False, False, True, True, False),  # the shield claims it again
+        (True, True, False, True, True, False),
+    ],
+)
+def test_what_is_claimed(kept, downlink_broken, contract_broken, guaranteed, claimed, still_kept):
+    given = info(downlink_broken=downlink_broken, contract_broken=contract_broken, shield_guaranteed=guaranteed)
+    found = _claimed_and_kept(given, np.array([kept]))
+    assert [each.item() for each in found] == [claimed, still_kept]
+
+
+def test_a_shield_that_claims_too_much_after_a_broken_contract_is_found_out(attacked, monkeypatch):
+    from shields import VectorSafetyShield
+
+    step = VectorSafetyShield.step
+
+    def boasting(self, actions):
+        *rest, found = step(self, actions)
+        return *rest, found | {"shield_guaranteed": np.ones(16, np.bool_)}
+
+    monkeypatch.setattr(VectorSafetyShield, "step", boasting)
+    counts = attacked(Channel(loss=1.0, quantization_step=1e-3))
+    assert counts.violations > 1000
+    assert counts.broken_episodes > 0
+    assert counts.lapsed == 0
+
+
+def test_a_downlink_without_a_contract_is_refused(monkeypatch, tmp_path):
+    case = replace(attack_cases(0, 0)[NAME], downlink=Channel(loss=0.3))
+    monkeypatch.setattr(Campaign, "cases", lambda self: {NAME: case})
+    with pytest.raises(ValueError, match="BatchReactor-v0, late: nothing is claimed behind a downlink without a contr"):
+        certify(CertifySettings(out=tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
