@@ -16,7 +16,7 @@ import gymnasium as gym
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from ncs_gym.uncertainty.ellipsoid import outer_sum
+from ncs_gym.uncertainty.shape_matrices import outer_sum
 from shields import SafetyFilter, SafetyShield, synthesize
 from shields.runtime.safety_filter import MARGIN
 

@@ -21,7 +21,7 @@ import gymnasium as gym
 import numpy as np
 
 from ncs_gym import Channel, LinearPlant, NCSEnv
-from ncs_gym.uncertainty.ellipsoid import outer_sum
+from ncs_gym.uncertainty.shape_matrices import outer_sum
 from shields import SafetyFilter, SafetyShield, VectorSafetyShield, synthesize
 from shields.runtime.safety_filter import MARGIN
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import field, fields, make_dataclass
+from inspect import cleandoc
 from typing import Annotated, Any, get_type_hints
 
 import tyro
@@ -42,5 +43,5 @@ def _first_level(kind: Any) -> Any:
         )
         for each in later
     ]
-    text = kind.__doc__.replace("    Attributes:", f"    {_POINTER}\n\n    Attributes:", 1)
+    text = cleandoc(kind.__doc__).replace("Attributes:", f"{_POINTER}\n\nAttributes:", 1)
     return make_dataclass(kind.__name__, hidden, bases=(kind,), frozen=True, kw_only=True, namespace={"__doc__": text})

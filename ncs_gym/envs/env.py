@@ -23,9 +23,8 @@ from ncs_gym.processes.process import LinearProcess, Process
 from ncs_gym.rendering import Annotation, Renderer
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.tasks.task import Task
-from ncs_gym.uncertainty.disturbance_settings import as_disturbance
+from ncs_gym.uncertainty.disturbance_settings import as_disturbance, as_noise
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.uncertainty.gaussian_noise import as_noise
 from ncs_gym.validation import as_count, as_flag, shown
 
 # Keeps the rounding of a sampled start inside the initial set.

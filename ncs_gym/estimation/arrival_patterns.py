@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import threading
 import weakref
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ncs_gym.estimation.error_bound import ErrorSet, certified_error_set
 from ncs_gym.estimation.error_statistics_table import NO_SAMPLE, UNKNOWN, NumberedUpdate, StatisticsTable
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
-from ncs_gym.estimation.pattern_arrays import PatternArrays
+from ncs_gym.estimation.pattern_arrays import NO_REPLAY, Pattern, PatternArrays, Replay
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
@@ -28,43 +28,6 @@ MAX_PATTERNS, MAX_NUMBERS = 1 << 17, 1 << 25
 SMALLEST_GROWTH = 4
 # Of more plants and channels than this, graphs are kept only as long as an estimator uses them.
 MAX_GRAPHS = 32
-# A pattern without a history to replay.
-NO_REPLAY = UNKNOWN
-
-
-class Pattern(NamedTuple):
-    """What an estimator remembers besides means, inputs and samples.
-
-    Attributes:
-        present: Number of the statistics of the present estimate.
-        priors: Numbers of the statistics before the update at the step of each age 0..buffer; UNKNOWN before the first
-            step of the episode.
-        held: For each age, whether the sample taken then has arrived.
-        replay_from: Age of the oldest sample that arrived at this step and is not used yet, or NO_REPLAY.
-    """
-
-    present: int
-    priors: tuple[int, ...]
-    held: tuple[bool, ...]
-    replay_from: int
-
-
-class Replay(NamedTuple):
-    """What becomes of the arrivals of a pattern: the history from its oldest new sample on, once more.
-
-    Attributes:
-        oldest: Age at which the replay begins.
-        used: For each age 0..oldest, the number of the statistics before the update there; NO_SAMPLE without one.
-        accepted: Whether the replayed history is kept.
-        new_age: Age of the newest sample used afterwards; UNKNOWN where it is the same as before.
-        target: Number of the pattern afterwards.
-    """
-
-    oldest: int
-    used: tuple[int, ...]
-    accepted: bool
-    new_age: int
-    target: int
 
 
 class ArrivalPatterns:

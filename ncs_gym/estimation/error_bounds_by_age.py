@@ -9,7 +9,7 @@ import numpy as np
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import INFLATION, LinearPlant
 from ncs_gym.plants.lqr import regulator_gain
-from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER, is_inside, joined, outer_sum
+from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, is_inside, joined, outer_sum
 from ncs_gym.validation import ReadOnlyArrays
 
 # The sets are made for noise this much larger than allowed, so that at run time good gains nearly always fit in.

@@ -1,19 +1,53 @@
-"""The arrays of a graph of arrival patterns that vectorized environments look up."""
+"""A pattern of arrivals, what becomes of its late samples, and the arrays of a graph of patterns."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 
 from ncs_gym.estimation.error_statistics_table import UNKNOWN
 from ncs_gym.network.channel import Channel
 
-if TYPE_CHECKING:
-    from ncs_gym.estimation.arrival_patterns import Replay
-
 # Entries that arrays begin with; they double when they are full.
 _FIRST_CAPACITY = 256
+# A pattern without a history to replay.
+NO_REPLAY = UNKNOWN
+
+
+class Pattern(NamedTuple):
+    """What an estimator remembers besides means, inputs and samples.
+
+    Attributes:
+        present: Number of the statistics of the present estimate.
+        priors: Numbers of the statistics before the update at the step of each age 0..buffer; UNKNOWN before the first
+            step of the episode.
+        held: For each age, whether the sample taken then has arrived.
+        replay_from: Age of the oldest sample that arrived at this step and is not used yet, or NO_REPLAY.
+    """
+
+    present: int
+    priors: tuple[int, ...]
+    held: tuple[bool, ...]
+    replay_from: int
+
+
+class Replay(NamedTuple):
+    """What becomes of the arrivals of a pattern: the history from its oldest new sample on, once more.
+
+    Attributes:
+        oldest: Age at which the replay begins.
+        used: For each age 0..oldest, the number of the statistics before the update there; NO_SAMPLE without one.
+        accepted: Whether the replayed history is kept.
+        new_age: Age of the newest sample used afterwards; UNKNOWN where it is the same as before.
+        target: Number of the pattern afterwards.
+    """
+
+    oldest: int
+    used: tuple[int, ...]
+    accepted: bool
+    new_age: int
+    target: int
 
 
 class PatternArrays:

@@ -7,7 +7,7 @@ from scipy.linalg import solve_triangular
 
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.plants.linear_plant import FLAT_INFLATION, INFLATION, LinearPlant
-from ncs_gym.uncertainty.ellipsoid import is_inside, outer_sum
+from ncs_gym.uncertainty.shape_matrices import is_inside, outer_sum
 
 # Per dimension, the growth of computed shapes that covers the rounding of F S F' (see `enlarged_by_rounding`).
 ROUNDING = 1e-13

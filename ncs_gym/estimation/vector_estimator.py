@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym.estimation.arrival_patterns import NO_REPLAY, ArrivalPatterns
+from ncs_gym.estimation.arrival_patterns import ArrivalPatterns
 from ncs_gym.estimation.error_statistics_table import NO_SAMPLE, UNKNOWN
 from ncs_gym.estimation.innovation_test import ALARM_TOLERANCE
+from ncs_gym.estimation.pattern_arrays import NO_REPLAY
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.minkowski_sum import outside_sum_in_axes
 

@@ -7,8 +7,9 @@ from functools import cached_property
 import numpy as np
 
 from ncs_gym.uncertainty.declared_bound import as_bound
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid, outer_sum
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.remainder import Remainder, as_remainder
+from ncs_gym.uncertainty.shape_matrices import outer_sum
 from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_KEPT, TruncatedGaussian, chi2_quantile
 from ncs_gym.validation import ReadOnlyArrays, as_covariance, as_number, read_only
 

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid, outer_sum
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.remainder import Remainder
+from ncs_gym.uncertainty.shape_matrices import outer_sum
 from ncs_gym.uncertainty.truncated_gaussian import chi2_quantile
 from ncs_gym.validation import as_count, as_matrix, as_number, shown
 

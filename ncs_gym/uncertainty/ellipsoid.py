@@ -1,4 +1,4 @@
-"""Ellipsoids given by their shape, and sums of them."""
+"""Ellipsoids given by their shape, and points of their sums."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, outer_sum
 from ncs_gym.validation import ReadOnlyArrays, as_covariance, read_only
 
 if TYPE_CHECKING:
@@ -18,11 +19,6 @@ if TYPE_CHECKING:
 FLAT = 2e-14
 # A point this far off a flat ellipsoid, relative to its extent, still counts as rounding.
 OFF_FLAT = 1e-12
-# The multiplier of a term in an outer sum stays this far from 0 and 1, so that no division overflows.
-SMALLEST_MULTIPLIER = 1e-9
-# Relative rounding of a determinant of four entries, or per dimension of an eigenvalue, with room; products below the
-# second number may have lost all their digits.
-INCLUSION_ROUNDING, SMALLEST_PRODUCT = 64.0 * 2.0**-53, 1e-290
 # Newton's method for farthest points converges in about five steps, near the hard case in at most 25 of those tried;
 # a step below this fraction of nu is rounding.
 NEWTON_STEPS, NEWTON_PRECISION = 40, 1e-15
@@ -194,67 +190,6 @@ def _trust_region_root(slopes: np.ndarray, values: np.ndarray) -> np.ndarray:
         if not moving.any():
             break
     return root
-
-
-def is_inside(inner: np.ndarray, outer: np.ndarray) -> bool:
-    """Returns whether E(inner) is shown to be a subset of E(outer): outer - inner >= 0 in exact arithmetic.
-
-    What is said to be inside is inside: what the rounding of this test could have decided counts as outside, so that
-    proofs that begin with "it lies inside" need no room. Every entry of a difference is exact but for its own last
-    digit, hence its sign, a zero and a diagonal difference are exact; a set lies inside itself.
-    """
-    difference = outer - inner
-    if difference.shape == (2, 2):  # four times faster than an eigenvalue call, and the common case
-        a, b, d = difference.item(0), difference.item(1), difference.item(3)
-        return a >= 0.0 and d >= 0.0 and (b == 0.0 or a * d * (1.0 - INCLUSION_ROUNDING) > b * b + SMALLEST_PRODUCT)
-    diagonal = difference.diagonal()
-    if not (diagonal >= 0.0).all():
-        return False
-    if np.count_nonzero(difference) == np.count_nonzero(diagonal):
-        return True
-    # In coordinates where the outer shape has unit diagonal: an eigenvalue's rounding then does not depend on units.
-    extent = np.sqrt(outer.diagonal())
-    moved = diagonal > 0.0
-    if difference[~moved].any():
-        return False
-    # A direction in which nothing differs says nothing; in the others the smallest eigenvalue must exceed its rounding.
-    extent = extent[moved]
-    values = np.linalg.eigvalsh(difference[np.ix_(moved, moved)] / np.outer(extent, extent))
-    return bool(values[0] > INCLUSION_ROUNDING * len(values) * values[-1])
-
-
-def outer_sum(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Returns P1/nu + P2/(1-nu), an ellipsoid around E(P1) + E(P2), with the smallest tr(W P).
-
-    Source: theory.md section 1 (Cauchy-Schwarz on the supports); the best multiplier is
-    nu = sqrt(tr W P1) / (sqrt(tr W P1) + sqrt(tr W P2)).
-
-    Args:
-        first: P1, shape (n, n).
-        second: P2, shape (n, n).
-        weight: W, shape (n, n), positive definite, so that a zero trace means a zero shape.
-    """
-    a = np.sqrt(max(float(np.vdot(weight, first)), 0.0))
-    b = np.sqrt(max(float(np.vdot(weight, second)), 0.0))
-    if b == 0.0:
-        return first + second
-    nu = min(max(a / (a + b), SMALLEST_MULTIPLIER), 1.0 - SMALLEST_MULTIPLIER)
-    return first / nu + second / (1.0 - nu)
-
-
-def joined(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Returns the smallest ellipsoid around two: in axes in which both are diagonal, the larger of each entry.
-
-    Args:
-        first: P1, shape (n, n), positive definite.
-        second: P2, shape (n, n), positive semidefinite.
-    """
-    root = np.linalg.cholesky(first)
-    inverse = np.linalg.inv(root)
-    values, axes = np.linalg.eigh(inverse @ second @ inverse.T)
-    turned = root @ axes
-    shape = (turned * np.maximum(values, 1.0)) @ turned.T
-    return 0.5 * (shape + shape.T)
 
 
 def sum_gauge(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> float:

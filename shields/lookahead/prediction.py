@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER
+from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
 from ncs_gym.validation import read_only
 from shields.runtime.one_step_test import OneStepTest
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER, is_inside
+from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, is_inside
 
 if TYPE_CHECKING:
     from shields.runtime.one_step_test import OneStepTest

@@ -8,7 +8,7 @@ from functools import reduce
 import numpy as np
 
 from ncs_gym import ChannelContract, ErrorSet, ErrorSetError, LinearPlant, UnstablePlantError, certified_error_set
-from ncs_gym.uncertainty.ellipsoid import is_inside, joined
+from ncs_gym.uncertainty.shape_matrices import is_inside, joined
 from shields.errors import Infeasible
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from shields.verification import ACTION_ROUNDING

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym import Ellipsoid, LinearPlant
-from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER
+from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
 from shields.certificate import Certificate
 from shields.proof_data import CertifiedProof, ContractProof
 from shields.verification.conditions import Condition, flag, matrix_condition, scalar_condition

@@ -9,7 +9,7 @@ from ncs_gym import Channel, ChannelContract, ErrorSet, LinearPlant, certified_e
 from ncs_gym.estimation.error_bounds_by_age import ErrorSetsByAge
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.plants.linear_plant import INFLATION, SIMULATED_REACH
-from ncs_gym.uncertainty.ellipsoid import is_inside
+from ncs_gym.uncertainty.shape_matrices import is_inside
 
 # Radius of Sigma_0 in half-widths of the box: of sensors so fine that the rounding of an estimate far out counts.
 RADIUS, GAIN, RATE = 1e-8, 0.9, 1.02

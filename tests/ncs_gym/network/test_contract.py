@@ -29,7 +29,7 @@ from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
 from ncs_gym.estimation.set_membership import SetMembership
 from ncs_gym.network.packet_transmission import ChannelState
-from ncs_gym.uncertainty.ellipsoid import is_inside
+from ncs_gym.uncertainty.shape_matrices import is_inside
 from shields.verification.rational_matrix import (
     add,
     congruence,

@@ -17,7 +17,7 @@ from ncs_gym import (
     NCSEnv,
     truck_trailer,
 )
-from ncs_gym.uncertainty.ellipsoid import INCLUSION_ROUNDING
+from ncs_gym.uncertainty.shape_matrices import INCLUSION_ROUNDING
 from shields import SafetyFilter, SafetyShield
 from tests.certificates import certificate_of
 from tests.plants import random_plant

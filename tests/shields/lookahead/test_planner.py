@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid
-from ncs_gym.uncertainty.ellipsoid import outer_sum
+from ncs_gym.uncertainty.shape_matrices import outer_sum
 from shields import SafetyFilter
 from shields.lookahead import planner, program
 from shields.lookahead.candidates import closed_loop

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ncs_gym.plants.linear_plant import SIMULATED_REACH
-from ncs_gym.uncertainty.ellipsoid import is_inside
+from ncs_gym.uncertainty.shape_matrices import is_inside
 from shields import Decision, SafetyFilter
 from shields.runtime import guarantee as proof
 from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, LoopObservation

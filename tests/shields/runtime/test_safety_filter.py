@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ncs_gym import Ellipsoid, truck_trailer
-from ncs_gym.uncertainty.ellipsoid import outer_sum
+from ncs_gym.uncertainty.shape_matrices import outer_sum
 from shields import CertificateError, SafetyFilter
 from shields.runtime.safety_filter import MARGIN, MODES, REASONS
 from tests.certificates import certificate_of
