@@ -72,22 +72,23 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     process. Truncation is `TimeLimit`'s, or that environment's.
 
     ## Info (the same keys from reset and step, every array a fresh copy)
-    | key | meaning |
-    |---|---|
-    | `state`, `estimate` | x and x_hat, float64, shape (n,) |
-    | `estimation_error` | estimate - state |
-    | `error_shape` | running Sigma_k, shape (n, n): the error lies in E(Sigma_k) |
-    | `input` | input applied now, shape (m,) [physical units]; zeros at reset |
-    | `input_committed` | input decided now; without a downlink it is applied at once |
-    | `constraint_values` | abs(c_j x) - 1 per row of the safe box; positive is violated |
-    | `cost` | 1.0 if the true state violates the box now, else 0.0 |
-    | `measurement_age` | steps since the newest sample used was taken (the first estimate is step 0's) |
-    | `packet_arrived` | whether a packet arrived at this step |
-    | `assumption_violated` | latched alarm of the estimator's innovation monitor, or of a process that left E(D) |
-    | `episode_violations` | running sum of `cost` in this episode |
-    | `is_success` | 1.0 while there was none |
-    | `contract_broken` | whether the newest sample used is older now than the channel's contract allows |
-    | `downlink_broken` | whether zero is applied now because the input committed for now has not arrived |
+    | key | shape or type | unit | meaning |
+    |---|---|---|---|
+    | `state` | `(n,)` | of the states | the true state x |
+    | `estimate` | `(n,)` | of the states | the estimate x_hat |
+    | `estimation_error` | `(n,)` | of the states | x_hat - x now, also behind a downlink |
+    | `error_shape` | `(n, n)` | of the states, squared | Sigma_k: the error of `estimate` lies in E(Sigma_k) |
+    | `input` | `(m,)` | of the inputs | the input applied in this step; zeros at reset |
+    | `input_committed` | `(m,)` | of the inputs | the input decided in this step; without a downlink the one applied |
+    | `constraint_values` | `(k,)` | - | abs(c_j x) - 1 for each of the k rows of the safe box; positive is violated |
+    | `cost` | float | - | 1.0 if the true state violates the safe box now, else 0.0 |
+    | `measurement_age` | int | steps | age of the newest sample used; the first estimate counts as a sample of step 0 |
+    | `packet_arrived` | bool | - | whether a packet arrived at this step |
+    | `assumption_violated` | bool | - | whether a measurement or the process broke a bound since the last reset |
+    | `episode_violations` | float | steps | sum of `cost` in this episode |
+    | `is_success` | float | - | 1.0 while `episode_violations` is zero, else 0.0 |
+    | `contract_broken` | bool | - | whether the newest sample used is older now than the channel's contract allows |
+    | `downlink_broken` | bool | - | whether zero was applied in this step because the input committed had not arrived |
 
     Behind a downlink `estimate`, `error_shape` and observation belong to the time at which the next action acts.
 
