@@ -1,4 +1,4 @@
-"""The table of docs/ncs_gym.md has every key of `info`, and the docstrings of environment and shield repeat its rows."""
+"""The table of docs/ncs_gym.md has every key of `info`; the docstrings of environment and shield repeat its rows."""
 
 import inspect
 import re
@@ -20,9 +20,8 @@ NUMBER = 5
 
 def rows(text):
     """Cells of the rows of the tables of keys in a text; the key comes first."""
-    head, *tables = re.split(r"^ *\| key \|.*\n.*\n", text, flags=re.MULTILINE)
-    lines = [line.strip() for table in tables for line in re.match(r"(?: *\|.*\n)*", table)[0].splitlines()]
-    return [tuple(cell.strip() for cell in line.strip("|").split("|")) for line in lines]
+    tables = re.findall(r"^\| key \|.*\n\|[-|]+\n((?:\|.*\n)+)", text, re.MULTILINE)
+    return [tuple(cell.strip() for cell in line.strip("|").split("|")) for line in "".join(tables).splitlines()]
 
 
 def kinds(mode):

@@ -52,7 +52,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
 
     | entries | meaning | unit |
     |---|---|---|
-    | first n | Kalman estimate x_hat | those of the state |
+    | first n | the estimate x_hat (`info["estimate"]`) | those of the state |
     | rest | the task's own, perfectly known entries | those of the task |
 
     ## Step
@@ -75,7 +75,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     | key | shape or type | unit | meaning |
     |---|---|---|---|
     | `state` | `(n,)` | of the states | the true state x |
-    | `estimate` | `(n,)` | of the states | the estimate x_hat |
+    | `estimate` | `(n,)` | of the states | the estimate x_hat; behind a downlink that of when the next action acts |
     | `estimation_error` | `(n,)` | of the states | x_hat - x now, also behind a downlink |
     | `error_shape` | `(n, n)` | of the states, squared | Sigma_k: the error of `estimate` lies in E(Sigma_k) |
     | `input` | `(m,)` | of the inputs | the input applied in this step; zeros at reset |
@@ -89,8 +89,6 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     | `is_success` | float | - | 1.0 while `episode_violations` is zero, else 0.0 |
     | `contract_broken` | bool | - | whether the newest sample used is older now than the channel's contract allows |
     | `downlink_broken` | bool | - | whether zero was applied in this step because the input committed had not arrived |
-
-    Behind a downlink `estimate`, `error_shape` and observation belong to the time at which the next action acts.
 
     Args:
         plant: The plant with its bounds.
