@@ -41,7 +41,7 @@ class RenderModeError(ValueError, TypeError):
 
 
 class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
-    """A plant behind an imperfect network; the controller sees a Kalman estimate.
+    """A plant behind an imperfect network; the controller sees an estimate of the state.
 
     ## Action space
     `Box(-1, 1, (m,), float32)`: the input in units of its limit, u = u_max * action [physical units].
@@ -61,7 +61,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     was really applied and takes in what arrived (`theory.md` section 1).
 
     ## Rewards
-    The task's; see `Regulation` and `SpeedTracking`.
+    The task's; see `Regulation`, `SpeedTracking` and `SetpointTracking`.
 
     ## Starting state
     Uniform in `initial_set`, or `options={"state": x0}`. The first estimate is off by Gaussian noise
