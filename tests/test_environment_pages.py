@@ -21,6 +21,7 @@ SECTIONS = (
     "Rewards",
     "Starting state",
     "Episode end",
+    "Info",
     "Arguments",
     "Channel and contract",
     "Certificate",
@@ -53,6 +54,7 @@ def test_every_environment_has_a_page_with_its_own_figures(pages, env_id, monkey
     assert [line[3:] for line in page.splitlines() if line.startswith("## ")] == list(SECTIONS)
     assert all(section(page, title).strip() for title in SECTIONS)
     assert "](picture.png)" in page.partition("\n## ")[0]
+    assert "Protocol" not in section(page, "Arguments")
     inner = env.unwrapped
     assert words(inner.plant) in words(section(page, "Description"))
     assert section(page, "Observation space").count("\n| ") == 1 + env.observation_space.shape[0]

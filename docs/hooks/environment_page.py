@@ -22,8 +22,7 @@ from shields import Certificate, SafetyShield, verify
 
 # Characters in a line of a block that fit the page.
 WIDTH = 110
-# A page of the documentation as docstrings name it.
-NAMED_PAGE = re.compile(r"\b(?:docs/)?(\w+)\.md\b")
+CAPTION = "*The last frame of a short episode behind the shield; [Pictures](../rendering.md) explains what is drawn.*"
 
 
 def environment_page(env_id: str, picture: str = "") -> str:
@@ -44,13 +43,14 @@ def environment_page(env_id: str, picture: str = "") -> str:
         "Rewards": _settings(env.task),
         "Starting state": docs["Starting state"] + _start(env),
         "Episode end": _end(env, spec),
+        "Info": "All environments report [the same keys](../ncs_gym.md#every-key-of-info).",
         "Arguments": _arguments(env, spec),
         "Channel and contract": _channel(env),
         "Certificate": _certificate(env, SafetyShield(gym.make(env_id)).certificate),
         "Version history": _versions(spec),
     }
     head = [f"# {spec.name}", _summary(env, spec)]
-    head += [f"![An episode of {env_id} behind a shield]({picture})"] if picture else []
+    head += [f"![An episode of {env_id} behind a shield]({picture})", CAPTION] if picture else []
     body = [f"## {title}\n\n{text.strip()}" for title, text in sections.items()]
     return "\n\n".join(head + body) + "\n"
 
@@ -87,12 +87,7 @@ def _prose(documented: Any, verb: str = "") -> str:
     """Returns the description in a docstring, without its lists; `verb` stands for a leading "Returns "."""
     parsed = docstring_parser.parse(inspect.getdoc(documented) or "")
     text = "\n\n".join(filter(None, [parsed.short_description, parsed.long_description]))
-    return _linked(verb + text.removeprefix("Returns ") if verb else text)
-
-
-def _linked(text: str) -> str:
-    """Returns a text of a docstring with links to the pages it names."""
-    return NAMED_PAGE.sub(r"[\1.md](../\1.md)", text)
+    return verb + text.removeprefix("Returns ") if verb else text
 
 
 def _wrapped(text: str, indent: int) -> str:
@@ -152,6 +147,7 @@ def _arguments(env: NCSEnv, spec: Any) -> str:
         if each.args[0] != "param":
             continue
         value = getattr(env, each.arg_name, None)
+        value = getattr(value, "channel", value)  # an environment keeps a downlink's protocol, of which this was given
         rows.append(f"| `{each.arg_name}` | {_value(value)} | {_cell(each.description)} |")
     return "\n".join(rows) + f"\n\n`gym.make` takes `max_episode_steps` besides, {spec.max_episode_steps} by default."
 
@@ -231,7 +227,7 @@ def _value(value: Any) -> str:
 
 
 def _cell(text: str | None) -> str:
-    return _linked(" ".join((text or "").split()).replace("|", "\\|"))
+    return " ".join((text or "").split()).replace("|", "\\|")
 
 
 if __name__ == "__main__":

@@ -51,8 +51,8 @@ class LearningSettings:
         a2c: Settings of A2C.
         off_policy: Settings of SAC, TD3, TQC and CrossQ.
         lagrangian: How the arm "lagrangian" adapts its penalty per violating step.
-        smoke: Run a short version, whatever else is asked for, to see that everything works; if --out is not given, in
-            a folder of its own, with -smoke at the end of its name.
+        smoke: Run a short version, whatever else is asked for, to see that everything works; if `--out` is not given,
+            in a folder of its own, with -smoke at the end of its name.
         force: Replace finished results of other settings in the output folder, which otherwise is refused.
     """
 

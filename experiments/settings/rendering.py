@@ -31,7 +31,7 @@ class RenderSettings:
         scale: Pixels of a frame per unit of its layout of 640 by 480; by default 2, sharp on dense screens, and
             1 for a .gif, whose file would be several times as large.
         width: Width of the animation [pixels]; by default as drawn.
-        smoke: Draw a few steps only, to see that everything works; if --out is not given, into episode-smoke.gif.
+        smoke: Draw a few steps only, to see that everything works; if `--out` is not given, into episode-smoke.gif.
     """
 
     env: str = "ncs_gym/TruckTrailerCruise-v0"

@@ -15,13 +15,14 @@ class StudySettings(BackendSettings):
 
     Every environment is a comparison of its own (`ncs compare`) in a folder below the output folder, with the settings
     of that command; then linear controllers and trained agents meet worse and better channels, behind filters with and
-    without the error set. Leaves report.html, results.md, figures, summary.json and study.parquet. Started again with
-    the same folder, finished runs are kept: a long study can be run in parts.
+    without the error set. Leaves report.html, the same as a page of Markdown (docs/results.md is one), figures,
+    summary.json and study.parquet. Started again with the same folder, finished runs are kept: a long study can be run
+    in parts.
 
     Attributes:
         config: Settings file (settings.json) of an earlier study; its settings hold where none are given here.
         out: Output folder; created if it does not exist.
-        envs: Ids of the environments; the first one leads the page.
+        envs: Ids of the environments; the first one comes first in the report.
         seed: Seed of the study, >= 0.
         seeds: Number of paired training runs per arm and environment.
         budget: Fraction of the training steps of each environment, in (0, 1].
@@ -31,11 +32,11 @@ class StudySettings(BackendSettings):
         references: Arms in which nothing is trained.
         conditions: What policies are evaluated under besides "as trained".
         channel_episodes: Episodes per point of the figure about channels; 0 leaves it out.
-        page: Also write the page results.md to this file, its figures into the folder images beside it, and its numbers
-            into the file with the ending .json.
+        page: Also write the page of Markdown to this file, its figures into the folder images beside it, and its
+            numbers into the file with the ending .json.
         quote: Pages in which the marked tables are replaced by those of this study.
-        smoke: Run a short version, whatever else is asked for, to see that everything works; if --out is not given, in
-            a folder of its own, with -smoke at the end of its name.
+        smoke: Run a short version, whatever else is asked for, to see that everything works; if `--out` is not given,
+            in a folder of its own, with -smoke at the end of its name.
         force: Replace finished results of other settings in the output folder, which otherwise is refused.
     """
 

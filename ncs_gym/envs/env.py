@@ -40,7 +40,7 @@ class RenderModeError(ValueError, TypeError):
 
 
 class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
-    """A plant behind an imperfect network; the controller sees a Kalman estimate.
+    """A plant behind an imperfect network; the controller sees an estimate of the state.
 
     ## Action space
     `Box(-1, 1, (m,), float32)`: the input in units of its limit, u = u_max * action [physical units].
@@ -51,7 +51,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
 
     | entries | meaning | unit |
     |---|---|---|
-    | first n | Kalman estimate x_hat | those of the state |
+    | first n | the estimate x_hat (`info["estimate"]`) | those of the state |
     | rest | the task's own, perfectly known entries | those of the task |
 
     ## Step
@@ -60,7 +60,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     was really applied and takes in what arrived (`theory.md` section 1).
 
     ## Rewards
-    The task's; see `Regulation` and `SpeedTracking`.
+    The task's; see `Regulation`, `SpeedTracking` and `SetpointTracking`.
 
     ## Starting state
     Uniform in `initial_set`, or `options={"state": x0}`. The first estimate is off by Gaussian noise
@@ -71,24 +71,23 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     process. Truncation is `TimeLimit`'s, or that environment's.
 
     ## Info (the same keys from reset and step, every array a fresh copy)
-    | key | meaning |
-    |---|---|
-    | `state`, `estimate` | x and x_hat, float64, shape (n,) |
-    | `estimation_error` | estimate - state |
-    | `error_shape` | running Sigma_k, shape (n, n): the error lies in E(Sigma_k) |
-    | `input` | input applied now, shape (m,) [physical units]; zeros at reset |
-    | `input_committed` | input decided now; without a downlink it is applied at once |
-    | `constraint_values` | abs(c_j x) - 1 per row of the safe box; positive is violated |
-    | `cost` | 1.0 if the true state violates the box now, else 0.0 |
-    | `measurement_age` | steps since the newest sample used was taken (the first estimate is step 0's) |
-    | `packet_arrived` | whether a packet arrived at this step |
-    | `assumption_violated` | latched alarm of the estimator's innovation monitor, or of a process that left E(D) |
-    | `episode_violations` | running sum of `cost` in this episode |
-    | `is_success` | 1.0 while there was none |
-    | `contract_broken` | whether the newest sample used is older now than the channel's contract allows |
-    | `downlink_broken` | whether zero is applied now because the input committed for now has not arrived |
-
-    Behind a downlink `estimate`, `error_shape` and observation belong to the time at which the next action acts.
+    | key | shape or type | unit | meaning |
+    |---|---|---|---|
+    | `state` | `(n,)` | of the states | the true state x |
+    | `estimate` | `(n,)` | of the states | the estimate x_hat; behind a downlink that of when the next action acts |
+    | `estimation_error` | `(n,)` | of the states | x_hat - x now, also behind a downlink |
+    | `error_shape` | `(n, n)` | of the states, squared | Sigma_k: the error of `estimate` lies in E(Sigma_k) |
+    | `input` | `(m,)` | of the inputs | the input applied in this step; zeros at reset |
+    | `input_committed` | `(m,)` | of the inputs | the input decided in this step; without a downlink the one applied |
+    | `constraint_values` | `(k,)` | - | abs(c_j x) - 1 for each of the k rows of the safe box; positive is violated |
+    | `cost` | float | - | 1.0 if the true state violates the safe box now, else 0.0 |
+    | `measurement_age` | int | steps | age of the newest sample used; the first estimate counts as a sample of step 0 |
+    | `packet_arrived` | bool | - | whether a packet arrived at this step |
+    | `assumption_violated` | bool | - | whether a measurement or the process broke a bound since the last reset |
+    | `episode_violations` | float | steps | sum of `cost` in this episode |
+    | `is_success` | float | - | 1.0 while `episode_violations` is zero, else 0.0 |
+    | `contract_broken` | bool | - | whether the newest sample used is older now than the channel's contract allows |
+    | `downlink_broken` | bool | - | whether zero was applied in this step because the input committed had not arrived |
 
     Args:
         plant: The plant with its bounds.

@@ -106,12 +106,12 @@ class SafeLoop:
     def start(self, x_hat0: Any, initial_set: Ellipsoid | np.ndarray | None = None) -> None:
         """Starts an episode at step 0; also how one is begun anew after the guarantee was lost.
 
+        Packets of earlier episodes are discarded from now on: `episode` is the number of the new one.
+
         Args:
             x_hat0: First estimate, shape (n,), whose error lies in `plant.initial_error`.
             initial_set: What the state is known to lie in besides, an ellipsoid or the state itself, shape (n,). It
                 counts where x_hat0 alone does not prove that the state is in S (in mode "lookahead": in the box).
-
-        Packets of earlier episodes are discarded from now on: `episode` is the number of the new one.
 
         Raises:
             ValueError: If an argument is not finite or does not fit the plant; nothing has changed then.
@@ -132,9 +132,9 @@ class SafeLoop:
         self._phase = _Phase.STARTED
 
     def receive(self, packets: Iterable[Packet] = (), applied: Any = None) -> np.ndarray:
-        """Returns the estimate at this control step, shape (n,): that of the last one moved on, then corrected.
+        """Returns the estimate at this control step, shape (n,): predicted from the last one, then corrected.
 
-        Behind a downlink it is that of the time at which the input decided next takes effect.
+        Behind a downlink it is that of the step at which the input decided next takes effect.
 
         At step 0 it is the first estimate: packets from before the first step are of no use.
 
@@ -217,12 +217,15 @@ class SafeLoop:
 
     @property
     def estimate(self) -> np.ndarray:
-        """x_hat at this control step, shape (n,); behind a downlink of the time of the next effect."""
+        """x_hat at this control step, shape (n,).
+
+        Behind a downlink it is that of the step at which the next decision takes effect.
+        """
         return self._belief()[0].copy()
 
     @property
     def error_shape(self) -> np.ndarray:
-        """Sigma_k, shape (n, n): x_hat - x lies in E(Sigma_k), at the time of the estimate."""
+        """Sigma_k, shape (n, n): x_hat - x lies in E(Sigma_k), at the step of the estimate."""
         return self._belief()[1].copy()
 
     @property
@@ -242,7 +245,7 @@ class SafeLoop:
 
     @property
     def discarded(self) -> DiscardedPackets:
-        """How many packets of this episode were discarded: too late for the channel, stamped ahead, of another one."""
+        """How many packets were discarded in this episode: too late, stamped ahead, or of another episode."""
         return self._discarded
 
     def _require_started(self) -> _Phase:

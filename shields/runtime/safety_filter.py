@@ -34,7 +34,8 @@ class SafetyFilter(ReadOnlyArrays):
     """A certificate made ready to judge inputs (docs/shield.md).
 
     An input passes if everything that one step can reach with it, for every error in E(Sigma_k) and disturbance in
-    E(D), lies in S (`OneStepTest`). K x_hat needs no test: its safety follows from x in S by (I) and (U).
+    E(D), lies in S (`OneStepTest`). K x_hat needs no test: its safety follows from x in S by (I) and (U) of
+    docs/theory.md section 3.
 
     Args:
         certificate: Verified exactly here.
@@ -49,7 +50,7 @@ class SafetyFilter(ReadOnlyArrays):
 
     Attributes:
         test: The one-step test.
-        lookahead: What is special about mode "lookahead"; None in others.
+        lookahead: What finds and certifies the plans of mode "lookahead"; None in others.
 
     Raises:
         CertificateError: If the certificate does not verify for the plant, or float64 is too coarse for it.
@@ -122,7 +123,7 @@ class SafetyFilter(ReadOnlyArrays):
     def decide_knowing(
         self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray, stored: Any = ()
     ) -> Decision:
-        """Returns what `decide` does, given `errors_of` the error shape."""
+        """Returns what `decide` does, given what `errors_of` returns for the error shape."""
         if (estimate.shape, proposed.shape) == self.test.single and self.mode != "boundary":
             try:
                 decision = self._decide_single(estimate, errors, proposed)
@@ -215,7 +216,7 @@ class SafetyFilter(ReadOnlyArrays):
 
     @np.errstate(all="ignore")
     def margin(self, estimate: np.ndarray, error_shape: np.ndarray, u: np.ndarray) -> float:
-        """Returns 1 - h - |A x_hat + B u|_M for an input u, shape (m,); NaN if any of them is unusable."""
+        """Returns the margin of an input u, shape (m,), as `Decision` defines it; NaN if any argument is unusable."""
         x_hat, u = _as_column(_as_array(estimate), self.plant.n), _as_column(_as_array(u), self.plant.m)
         return self.test.reachable(x_hat, self.errors_of(error_shape).batch()).slack(u)[1].item()
 

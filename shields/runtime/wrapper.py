@@ -46,16 +46,16 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
     Wrap it directly around what `gym.make` returns; wrappers that change or repeat actions go outside it.
 
     ## Info (added to the environment's, at reset too)
-    | key | meaning |
-    |---|---|
-    | `shield_intervened` | whether the action was overridden; in mode "monitor" whether "switch" would have |
-    | `input_proposed` | the agent's input, shape (m,) [physical units]; zeros at reset |
-    | `shield_correction` | Euclidean norm of input - input_proposed |
-    | `shield_margin` | 1 - h - norm(A x_hat + B u)_M for the input applied (`Decision.margin`); at reset for u = 0 |
-    | `shield_guaranteed` | whether x in S is proved now (in mode "lookahead": in the box, to stay) |
-    | `shield_reason` | why not; empty while guaranteed |
-    | `episode_interventions` | running number in this episode |
-    | `shield_plan_length` | in mode "lookahead" only: inputs stored for later steps, after this decision |
+    | key | shape or type | unit | meaning |
+    |---|---|---|---|
+    | `shield_intervened` | bool | - | whether it overrode the action; in mode "monitor" whether "switch" would have |
+    | `input_proposed` | `(m,)` | of the inputs | the agent's input; zeros at reset |
+    | `shield_correction` | float | of the inputs | Euclidean norm of `input_committed` - `input_proposed` |
+    | `shield_margin` | float | - | how far inside S the next state stays (`Decision.margin`); at reset for u = 0 |
+    | `shield_guaranteed` | bool | - | whether x in S is proved now (in mode "lookahead": x in the box, to stay) |
+    | `shield_reason` | str | - | why it is not; empty while it is |
+    | `episode_interventions` | int | steps | number of steps of this episode with `shield_intervened` |
+    | `shield_plan_length` | int | steps | in mode "lookahead" only: number of inputs stored for later steps |
 
     In mode "lookahead" an input passes too if a certified plan that begins with it keeps the state in the box until it
     is in S; `shield_guaranteed` then says whether the state is proved to be in the box now and to stay there.

@@ -1,0 +1,103 @@
+"""The table of docs/ncs_gym.md has every key of `info`; the docstrings of environment and shield repeat its rows."""
+
+import inspect
+import re
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from ncs_gym import NCSEnv
+from shields import SafetyShield, VectorSafetyShield
+from tests.certificates import certificate_of
+
+PAGE = (Path(__file__).resolve().parent.parent / "docs" / "ncs_gym.md").read_text()
+ENVIRONMENTS = ("ncs_gym/TruckTrailerCruise-v0", "ncs_gym/BatchReactor-v0", "ncs_gym/TruckTrailerCruiseTwoWay-v0")
+TYPES = {"float": float, "int": (int, np.integer), "bool": (bool, np.bool_), "str": str}
+NUMBER = 5
+
+
+def rows(text):
+    """Cells of the rows of the tables of keys in a text; the key comes first."""
+    tables = re.findall(r"^\| key \|.*\n\|[-|]+\n((?:\|.*\n)+)", text, re.MULTILINE)
+    return [tuple(cell.strip() for cell in line.strip("|").split("|")) for line in "".join(tables).splitlines()]
+
+
+def kinds(mode):
+    """Shape or type of every key that the page says an environment has, behind a shield of a mode or without one."""
+    authors = ("environment",) if mode is None else ("environment", "shield")
+    listed = {key.strip("`"): kind.strip("`") for key, kind, *_, author in rows(PAGE) if author in authors}
+    return {key: kind for key, kind in listed.items() if key != "shield_plan_length" or mode == "lookahead"}
+
+
+def infos(env, steps):
+    """What reset and the steps of an environment report."""
+    action = env.action_space.high
+    return [env.reset(seed=0)[1], *(env.step(action)[-1] for _ in range(steps))]
+
+
+def assert_is(value, kind, plant):
+    """A value has the shape or the type that the page says."""
+    if kind in TYPES:
+        assert isinstance(value, TYPES[kind])
+    else:
+        sizes = {"n": plant.n, "m": plant.m, "k": len(plant.C)}
+        assert value.shape == tuple(sizes[size] for size in re.findall("[nmk]", kind))
+
+
+@pytest.fixture(params=ENVIRONMENTS)
+def loop(request):
+    """An id, and the certificate of its plant."""
+    env = gym.make(request.param).unwrapped
+    assert isinstance(env, NCSEnv)
+    return request.param, certificate_of(env.plant, env.certificate_contract)
+
+
+@pytest.mark.parametrize(("kind", "author"), [(NCSEnv, "environment"), (SafetyShield, "shield")])
+def test_docstring_has_the_rows_of_the_page(kind, author):
+    of_page = [row[:-1] for row in rows(PAGE) if row[-1] == author]
+    assert of_page
+    assert rows(inspect.getdoc(kind)) == of_page
+
+
+@pytest.mark.parametrize("mode", [None, "project", "monitor", "lookahead"])
+def test_page_has_every_key_of_one_environment(loop, mode):
+    env_id, certificate = loop
+    env = gym.make(env_id) if mode is None else SafetyShield(gym.make(env_id), certificate, mode)
+    expected = kinds(mode)
+    for info in infos(env, 4):
+        assert set(info) == set(expected)
+        for key, kind in expected.items():
+            assert_is(info[key], kind, env.unwrapped.plant)
+
+
+@pytest.mark.parametrize("mode", [None, "project", "monitor", "lookahead"])
+def test_page_has_every_key_of_many_environments(loop, mode):
+    env_id, certificate = loop
+    envs = gym.make_vec(env_id, num_envs=NUMBER)
+    envs = envs if mode is None else VectorSafetyShield(envs, certificate, mode)
+    expected = kinds(mode)
+    for info in infos(envs, 4):
+        assert set(info) == set(expected)
+        for key, kind in expected.items():
+            assert isinstance(info[key], np.ndarray)
+            assert len(info[key]) == NUMBER
+            assert_is(info[key][0], kind, envs.unwrapped.plant)
+
+
+def test_page_names_what_the_end_of_an_episode_adds():
+    envs = gym.make_vec(ENVIRONMENTS[0], num_envs=NUMBER, max_episode_steps=2, autoreset_mode="SameStep")
+    *_, last = infos(envs, 2)
+    added = set(last) - set(kinds(None))
+    assert "final_info" in added
+    assert all(f"`{key}`" in PAGE for key in added)
+
+
+def test_correction_is_what_the_page_says(loop):
+    env_id, certificate = loop
+    steps = infos(SafetyShield(gym.make(env_id), certificate), 100)
+    assert any(info["shield_correction"] > 0.0 for info in steps)
+    for info in steps:
+        correction = np.linalg.norm(info["input_committed"] - info["input_proposed"])
+        assert info["shield_correction"] == pytest.approx(correction, abs=1e-12)
