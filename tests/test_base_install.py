@@ -12,7 +12,7 @@ pytestmark = pytest.mark.slow
 
 
 # Every Python that pyproject.toml declares; the training extra is tested with the first.
-VERSIONS = ("3.11", "3.12", "3.13")
+VERSIONS = ("3.11", "3.12", "3.13", "3.14")
 
 
 @pytest.fixture(scope="module", params=VERSIONS)
