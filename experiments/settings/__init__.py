@@ -13,12 +13,11 @@ from experiments.settings.learning import (
     CompareSettings,
     EvaluateSettings,
     LearningSettings,
-    SweepSettings,
     TrainSettings,
 )
 from experiments.settings.rendering import RenderSettings
 from experiments.settings.settings_file import config_defaults, save_settings, settings_json
-from experiments.settings.study import StudySettings
+from experiments.settings.study import StudySettings, SweepSettings
 
 __all__ = [
     "AuditSettings",

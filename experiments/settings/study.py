@@ -1,4 +1,4 @@
-"""Settings of `ncs study`."""
+"""Settings of `ncs sweep` and `ncs study`, which repeat the comparison on other channels and in other environments."""
 
 from __future__ import annotations
 
@@ -6,7 +6,50 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.settings.backend import BackendSettings
-from experiments.settings.learning import Algorithm
+from experiments.settings.learning import Algorithm, LearningSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepSettings(BackendSettings, LearningSettings):
+    """Compares arms over a grid of channels: how safety, return and interventions depend on the channel.
+
+    Every point of the grid is a comparison of its own with the same seeds. Leaves sweep.parquet, summary.json,
+    settings.json, report.html with heatmaps, and the models. Started again with the same folder, finished runs are
+    kept.
+
+    Attributes:
+        out: Output folder; created if it does not exist.
+        seeds: Number of paired training runs per arm and channel.
+        steps: Training steps per run, rounded up to whole rollouts.
+        episodes: Evaluation episodes per run.
+        arms: Arms of the comparison; see `ncs compare`.
+        losses: Loss probabilities of the grid.
+        delays: Delays of the grid [steps].
+        quantization_steps: Quantization steps of the grid; the environment's own if none is given.
+        burst_lengths: Mean numbers of packets lost in a row; 0 stands for independent losses.
+        mass_factors: Factors of the mass in the environment's process, the certificate being that of the model (factor
+            1); for environments whose process has a mass.
+        downlink_losses: Loss probabilities of commands, for environments with a downlink; the environment's own if none
+            is given. The heatmaps then show losses of samples against losses of commands. Where none are lost, inputs
+            are committed for the delay only.
+    """
+
+    out: Path = Path("runs/sweep")
+    seeds: int = 1
+    steps: int = 50_000
+    episodes: int = 100
+    arms: tuple[str, ...] = ("unshielded", "shielded")
+    losses: tuple[float, ...] = (0.0, 0.3, 0.6)
+    delays: tuple[int, ...] = (0, 2, 4)
+    quantization_steps: tuple[float, ...] = ()
+    burst_lengths: tuple[float, ...] = (0.0,)
+    mass_factors: tuple[float, ...] = ()
+    downlink_losses: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        LearningSettings.__post_init__(self)
+        BackendSettings.__post_init__(self)
 
 
 @dataclass(frozen=True, kw_only=True)

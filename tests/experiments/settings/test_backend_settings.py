@@ -6,7 +6,8 @@ from experiments.__main__ import COMMANDS, _run
 from experiments.runs.experiment_setup import INCIDENTAL_SETTINGS
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings
-from experiments.settings.learning import CompareSettings, SweepSettings
+from experiments.settings.learning import CompareSettings
+from experiments.settings.study import SweepSettings
 
 
 @pytest.mark.parametrize(

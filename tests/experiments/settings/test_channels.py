@@ -4,7 +4,7 @@ import pytest
 from experiments.commands.sweep import _grid_points
 from experiments.runs import ExperimentSetup
 from experiments.settings.channel import ChannelSettings, _bursts
-from experiments.settings.learning import SweepSettings
+from experiments.settings.study import SweepSettings
 from ncs_gym import Channel, ChannelContract, GilbertElliott
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.network.packet_transmission import ChannelState
