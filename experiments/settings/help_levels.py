@@ -12,7 +12,7 @@ import tyro
 HELP_ALL = "--help-all"
 # Settings that the first level leaves out: of clusters, and of the learning algorithms.
 _LATER = {"ray_address", "ray_wait", "cpus_per_run", "gpus_per_run", "ppo", "a2c", "off_policy", "lagrangian"}
-_POINTER = f"{HELP_ALL} also lists the settings of Ray and of the learning algorithms."
+_POINTER = f"Settings of Ray and of the learning algorithms are listed by {HELP_ALL}."
 
 
 def at_help_level(arguments: list[str], kinds: dict[str, Any]) -> tuple[list[str], dict[str, Any]]:
