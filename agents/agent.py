@@ -97,16 +97,23 @@ class Agent:
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Returns deterministic actions, shape (N, m), for raw observations, shape (N, entries).
 
+        Args:
+            observations: As the environment returns them; a single one, shape (entries,), gives one action, shape (m,).
+
         Raises:
             ValueError: If observations have another number of entries than those the agent was trained with.
         """
-        if np.shape(observations)[1:] != self.normalization.mean.shape:
+        shape, entries = np.shape(observations), self.normalization.mean.size
+        if shape[-1:] != (entries,) or len(shape) > 2:
             raise ValueError(
-                f"the agent was trained in {self.env} with observations of {self.normalization.mean.size} entries: "
-                f"they must have shape (N, {self.normalization.mean.size}), got {np.shape(observations)}"
+                f"the agent was trained in {self.env} with observations of {entries} entries: "
+                f"they must have shape ({entries},) or (N, {entries}), got {shape}"
             )
-        actions = self.model.predict(self.normalization(observations), deterministic=True)[0]
-        return actions if self.residual_gain is None else with_gain(self.residual_gain, observations, actions)
+        batch = np.reshape(observations, (-1, entries))
+        actions = self.model.predict(self.normalization(batch), deterministic=True)[0]
+        if self.residual_gain is not None:
+            actions = with_gain(self.residual_gain, batch, actions)
+        return actions[0] if len(shape) == 1 else actions
 
     @cached_property
     def checksum(self) -> str:

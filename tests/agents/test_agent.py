@@ -1,6 +1,8 @@
 import json
 import pickle
+import re
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -49,9 +51,20 @@ def test_loaded_agent_acts_like_the_saved_one(algorithm, tmp_path):
         assert again.channel == bursts
 
 
-def test_observations_of_another_environment_are_refused(agent):
-    with pytest.raises(ValueError, match=r"was trained in .* with observations of 3 entries.*got \(4, 5\)$"):
-        agent.act(np.zeros((4, 5)))
+@pytest.mark.parametrize("gain", [None, np.array([[0.2, -0.1]])])
+def test_single_observation_gives_the_action_of_a_batch_of_one(agent, gain):
+    one = replace(agent, residual_gain=gain)
+    action = one.act(OBSERVATIONS[7])
+    assert action.shape == (1,)
+    np.testing.assert_array_equal(action, one.act(OBSERVATIONS[7:8])[0])
+    np.testing.assert_array_equal(action, one.act(OBSERVATIONS[7].tolist()))
+
+
+@pytest.mark.parametrize("shape", [(4, 5), (5,), (2, 4, 3), (3, 1), ()])
+def test_observations_of_another_environment_are_refused(agent, shape):
+    words = r"was trained in .* with observations of 3 entries.*shape \(3,\) or \(N, 3\), got "
+    with pytest.raises(ValueError, match=f"{words}{re.escape(str(shape))}$"):
+        agent.act(np.zeros(shape))
 
 
 def test_shared_folder_has_the_agent_its_shield_and_a_card(agent, certificate, tmp_path):
