@@ -4,6 +4,7 @@ import ast
 import importlib
 import importlib.util
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -241,6 +242,18 @@ def test_command_is_declared_and_runs_as_a_module():
     run = subprocess.run([sys.executable, "-m", "experiments", "--help"], cwd=ROOT, capture_output=True, text=True)
     assert run.returncode == 0
     assert "compare" in run.stdout
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
+def test_virtual_environment_is_ignored_as_a_folder_and_as_a_link(tmp_path):
+    shutil.copy(ROOT / ".gitignore", tmp_path)
+    (tmp_path / ".venv").symlink_to(ROOT)
+    (tmp_path / "clone" / ".venv" / "bin").mkdir(parents=True)
+    (tmp_path / "clone" / ".venv" / "bin" / "ncs").touch()
+    subprocess.run(["git", "init", "-q"], cwd=tmp_path, check=True)
+    seen = ["git", "-c", "core.excludesFile=/dev/null", "ls-files", "--others", "--exclude-standard"]
+    run = subprocess.run(seen, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert run.stdout.split() == [".gitignore"]
 
 
 def test_files_that_the_makefile_names_exist():
