@@ -42,7 +42,7 @@ def synthesize(settings: SynthesizeSettings) -> None:
     if certificate.method == "paper":
         also = "hold" if certificate.provenance["exact_conditions_hold"] else "were not shown to hold"
         print(f"guarantee: {certificate.provenance['guarantee']}; our exact conditions {also} for it too")
-    print(f"valid; saved to {settings.out}")
+    print(f"saved to {settings.out}")
 
 
 def _plant_and_contract(settings: SynthesizeSettings) -> tuple[LinearPlant, ChannelContract | None]:

@@ -33,8 +33,6 @@ def verify(settings: VerifySettings) -> None:
         origin, plant = str(settings.plant), LinearPlant.load(settings.plant)
     report = shields.verify(certificate, plant, engine=settings.engine)
     print(f"{certificate}\nagainst the plant of {origin}:\n{report}")
-    if certificate.ages is not None:
-        print(f"it rests on {certificate.ages.sets.contract}")
     if settings.out is not None:
         conditions = [asdict(condition) for condition in report.conditions]
         document = {"env": origin, "valid": report.valid, "conditions": conditions}
@@ -49,7 +47,8 @@ def verify(settings: VerifySettings) -> None:
         raise CertificateError(
             f"{settings.file} does not verify: {broken} of {len(report.conditions)} conditions broken"
         )
-    print("valid")
+    contract = "" if certificate.contract is None else f"; it rests on {certificate.contract}"
+    print(f"{settings.file} verifies{contract}")
 
 
 def _matching_env(certificate: Certificate) -> str:

@@ -18,7 +18,7 @@ from shields.verification.conditions import Condition, flag
 
 @dataclass(frozen=True)
 class Report:
-    """The outcome of a verification.
+    """The outcome of a verification; printed it begins with the verdict.
 
     Attributes:
         conditions: All conditions that were checked, in order; later ones are left out where earlier ones fail.
@@ -32,8 +32,11 @@ class Report:
         return all(condition.holds for condition in self.conditions)
 
     def __str__(self) -> str:
+        holding, total = sum(c.holds for c in self.conditions), len(self.conditions)
+        valid = f"valid: {holding} of {total} conditions hold in exact arithmetic"
+        verdict = valid if self.valid else f"not valid: {total - holding} of {total} conditions broken"
         rows = (f"{'holds ' if c.holds else 'BROKEN'}  {c.margin:+.3e}  {c.name}" for c in self.conditions)
-        return "\n".join(rows)
+        return "\n".join([verdict, *rows])
 
 
 def verify(

@@ -344,13 +344,23 @@ def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path, without_worke
     assert "4 of 8 runs were finished before" in more.stderr
 
 
+def assert_verdict_first(printed, last):
+    """The verdict once, above the conditions, and a last line of which file it is about."""
+    lines = printed.splitlines()
+    (verdict,) = [number for number, line in enumerate(lines) if "valid" in line]
+    assert lines[verdict].startswith("valid: ")
+    assert lines[verdict + 1].startswith("holds ")
+    assert lines[-1] == last
+
+
 def test_synthesize_then_verify(tmp_path):
     file = tmp_path / "c.json"
     made = ncs("synthesize", "--env", "ncs_gym/TruckTrailer-v0", "--out", file)
     assert made.returncode == 0, made.stderr
     checked = ncs("verify", file, "--out", tmp_path / "report.json")
     assert checked.returncode == 0, checked.stderr
-    assert checked.stdout.strip().endswith("valid")
+    assert_verdict_first(made.stdout, f"saved to {file}")
+    assert_verdict_first(checked.stdout, f"{file} verifies")
     assert json.loads((tmp_path / "report.json").read_text())["valid"] is True
     again = ncs("verify", file, "--engine", "flint")
     assert again.returncode == 0, again.stderr

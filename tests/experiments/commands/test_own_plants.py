@@ -46,7 +46,7 @@ def test_certificate_for_a_registered_plant_is_made_and_verified(folder):
     assert "% of the safe box's volume" in run.stdout
     certificate = Certificate.load(folder / "certificate.json")
     assert verified(certificate, truck_trailer(mass=2000.0)).valid
-    assert ncs("verify", "certificate.json", *ENV, cwd=folder).stdout.endswith("valid\n")
+    assert ncs("verify", "certificate.json", *ENV, cwd=folder).stdout.endswith("\ncertificate.json verifies\n")
     assert_one_sentence(ncs("verify", "certificate.json", "--env", "ncs_gym/TruckTrailer-v0", cwd=folder), "verify")
 
 
@@ -121,7 +121,7 @@ def test_plant_of_a_file_is_certified(tmp_path):
     assert made.returncode == 0, made.stderr
     assert Certificate.load(tmp_path / "certificate.json").ages is None
     checked = ncs("verify", "certificate.json", "--plant", "plant.json", "--out", "v.json", cwd=tmp_path)
-    assert checked.stdout.endswith("valid\n")
+    assert checked.stdout.endswith("\ncertificate.json verifies\n")
     assert json.loads((tmp_path / "v.json").read_text())["env"] == "plant.json"
 
 

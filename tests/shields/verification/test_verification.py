@@ -139,8 +139,16 @@ def test_margins_of_several_inputs_agree_with_floating_point():
         assert margins[f"(U) input {i + 1}"] == pytest.approx(limit - used, rel=1e-12)
 
 
-def test_report_prints_one_line_per_condition(certificate, loaded):
-    lines = str(verified(replace(certificate, K=certificate.K + 4.0), loaded)).splitlines()
+def test_report_prints_the_verdict_and_one_line_per_condition(certificate, loaded):
+    report = verified(certificate, loaded)
+    verdict, *lines = str(report).splitlines()
+    assert verdict == f"valid: {len(lines)} of {len(lines)} conditions hold in exact arithmetic"
+    assert [line.split("  ")[-1] for line in lines] == [condition.name for condition in report.conditions]
+    report = verified(replace(certificate, K=certificate.K + 4.0), loaded)
+    verdict, *lines = str(report).splitlines()
+    broken = [condition.name for condition in report.conditions if not condition.holds]
+    assert verdict == f"not valid: {len(broken)} of {len(lines)} conditions broken"
+    assert [line.split("  ")[-1] for line in lines if line.startswith("BROKEN")] == broken
     assert any(line.startswith("BROKEN") and "(U)" in line for line in lines)
     assert any(line.startswith("holds") and "(E1)" in line for line in lines)
 
