@@ -1,4 +1,4 @@
-"""A certificate in words, for people."""
+"""A certificate, and a loop that runs under one, in words, for people."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from shields.certificate import Certificate
+    from shields.runtime.safe_loop import SafeLoop
 
 _WIDTH, _INDENT = 110, 14
 _METHODS = {
@@ -32,13 +33,25 @@ def description_of(certificate: Certificate) -> str:
         ("assumes", _assumptions(recorded)),
         ("interrupted", _interruption(recorded)),
     ]
-    lines = ["Certificate of a robust control invariant set; shields.verify(certificate, plant) checks it"]
-    for name, text in rows:
-        if text:
-            indent = " " * _INDENT
-            first = f"  {name}".ljust(_INDENT)
-            lines.append(textwrap.fill(text, _WIDTH, initial_indent=first, subsequent_indent=indent))
-    return "\n".join(lines)
+    title = "Certificate of a robust control invariant set; shields.verify(certificate, plant) checks it"
+    return _table(title, rows)
+
+
+def description_of_loop(loop: SafeLoop, is_started: bool) -> str:
+    """Returns how a loop decides, what it rests on and what is proved now, a line or more for each."""
+    certificate, mode, horizon = loop.filter.certificate, loop.filter.mode, loop.filter.horizon
+    fingerprint = f"of the plant with fingerprint {certificate.fingerprint[:16]}"
+    age = _count(loop.measurement_age, "step")
+    proved = "the state stays in the box" if mode == "lookahead" else "the state is in S"
+    rows = [
+        ("mode", mode if horizon is None else f"{mode}, horizon {_count(horizon, 'step')}"),
+        ("certificate", ", ".join(filter(None, (fingerprint, size_of(certificate.provenance))))),
+        ("contract", _contract(certificate)),
+        ("downlink", f"inputs take effect {_count(loop.lead, 'step')} after the decision" if loop.lead else ""),
+        ("step", f"{loop.steps} of episode {loop.episode}, the newest sample is {age} old" if is_started else ""),
+        ("guaranteed", f"yes: {proved}" if loop.guaranteed else f"no: {loop.reason}"),
+    ]
+    return _table("Safe loop: estimator, safety filter and monitor of the guarantee", rows)
 
 
 def size_of(recorded: dict[str, Any]) -> str:
@@ -61,6 +74,16 @@ def size_of(recorded: dict[str, Any]) -> str:
         ),
     )
     return ", ".join(filter(None, shares))
+
+
+def _table(title: str, rows: list[tuple[str, str]]) -> str:
+    """Returns a title and named texts below it, without those that are empty."""
+    lines, indent = [title], " " * _INDENT
+    for name, text in rows:
+        if text:
+            first = f"  {name}".ljust(_INDENT)
+            lines.append(textwrap.fill(text, _WIDTH, initial_indent=first, subsequent_indent=indent))
+    return "\n".join(lines)
 
 
 def _contract(certificate: Certificate) -> str:

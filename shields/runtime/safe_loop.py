@@ -15,6 +15,7 @@ from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.network.packet_reception import DiscardedPackets, as_packet
 from ncs_gym.validation import as_numbers, as_vector, shown
 from shields.certificate import Certificate
+from shields.certificate_text import description_of_loop
 from shields.downlink.start_under_zero_input import starts_known
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import LoopObservation
@@ -50,9 +51,9 @@ class SafeLoop:
     `start`; a packet carries the number of the step at which its sample was taken, and that of the episode.
 
     The guarantee is that of `SafetyShield`, under the same assumptions (docs/shield.md): `guaranteed` says whether the
-    state is proved to be in S at this step, `reason` why not. What the loop cannot see is that the clock misses a step,
-    that the actuator applies something else (unless it is told), or that packets carry wrong stamps. A certificate
-    under a channel contract brings its error sets along. Not for use by several threads at once.
+    state is proved to be in S at this step, `reason` why not, `print(loop)` both. What the loop cannot see is that the
+    clock misses a step, that the actuator applies something else (unless it is told), or that packets carry wrong
+    stamps. A certificate under a channel contract brings its error sets along. Not for use by several threads at once.
 
     Behind a downlink that is late or loses commands, send `command` after each `decide` instead, and let an
     `ncs_gym.Actuator` apply what it holds (docs/contracts.md, "Both directions"). What is decided takes effect `lead`
@@ -102,6 +103,9 @@ class SafeLoop:
         self._inputs = CommittedInputs(self.lead, plant.m)
         self._discarded = DiscardedPackets()
         self._phase = _Phase.STOPPED
+
+    def __str__(self) -> str:
+        return description_of_loop(self, self._phase is not _Phase.STOPPED)
 
     def start(self, x_hat0: Any, initial_set: Ellipsoid | np.ndarray | None = None) -> None:
         """Starts an episode at step 0; also how one is begun anew after the guarantee was lost.

@@ -554,3 +554,43 @@ def test_sample_that_is_sent_after_a_decision_and_received_at_the_next_step_is_o
         arrived = [Packet(step, np.zeros(2), loop.episode)]
     assert loop.discarded.too_late == late
     assert loop.measurement_age == (20 if late else 1)
+
+
+def text_of(loop):
+    """The rows that a loop prints, by name."""
+    title, *lines = str(loop).splitlines()
+    assert title.startswith("Safe loop")
+    return {line[:14].strip(): line[14:] for line in lines if line[:14].strip()}
+
+
+def test_printed_loop_says_whether_the_state_is_proved_to_be_safe_and_why_not():
+    loop = loop_of("cart-pole", "switch")
+    text = text_of(loop)
+    assert text["mode"] == "switch"
+    assert loop.filter.certificate.fingerprint[:16] in text["certificate"]
+    assert "older than 4 steps" in text["contract"]
+    assert text["guaranteed"] == f"no: {NOT_STARTED}"
+    assert {"step", "downlink"} & set(text) == set()
+    loop.start(np.zeros(4))
+    loop.step(0.0)
+    loop.receive([Packet(1, np.zeros(4))])
+    text = text_of(loop)
+    assert text["step"] == "1 of episode 0, the newest sample is 0 steps old"
+    assert text["guaranteed"] == "yes: the state is in S"
+    loop.decide(0.0)
+    loop.receive(applied=[3.0])
+    text = text_of(loop)
+    assert text["step"] == "2 of episode 0, the newest sample is 1 step old"
+    assert text["guaranteed"] == f"no: {OTHER_INPUT}" == f"no: {loop.reason}"
+
+
+def test_printed_loop_names_horizon_and_downlink():
+    plant, _, channel = LOOPS["truck"]
+    loop = SafeLoop(certificate_of(plant), plant, channel, "lookahead", 1)
+    loop.start(np.zeros(2))
+    assert text_of(loop)["mode"] == "lookahead, horizon 1 step"
+    assert text_of(loop)["contract"] == "none: any packets may be lost or late"
+    assert text_of(loop)["guaranteed"] == "yes: the state stays in the box"
+    certificate = certificate_of(cart_pole(), ChannelContract(4))
+    loop = SafeLoop(certificate, cart_pole(), Channel(), downlink=Channel(delay=2))
+    assert text_of(loop)["downlink"] == "inputs take effect 2 steps after the decision"
