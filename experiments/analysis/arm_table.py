@@ -23,17 +23,26 @@ def summary_text(arms: dict[str, dict[str, Any]], references: dict[str, dict[str
 
     Violating episodes have their exact interval, the return has Student's (`experiments.analysis.summary`). "Left S"
     counts episodes in which the true state was outside the safe set at some step, "from a plan" the steps after whose
-    decision the shield of mode "lookahead" had inputs of a certified plan in store.
+    decision the shield of mode "lookahead" had inputs of a certified plan in store. The columns about the training are
+    left out where nothing was trained.
     """
-    return text_table(_rows(arms | references), rules=(len(_HEADERS), len(_HEADERS) + len(arms)))
+    rows = _rows(arms | references)
+    if not any(arm["train_steps"] for arm in (arms | references).values()):
+        rows = _without_training(rows)
+    return text_table(rows, rules=(len(_HEADERS), len(_HEADERS) + len(arms)))
 
 
 def condition_text(condition: str, arms: dict[str, dict[str, Any]], references: dict[str, dict[str, Any]]) -> str:
     """Returns the table of the evaluation under a condition, with its name in the corner."""
     rows = _rows({name: arm | arm["conditions"][condition] for name, arm in (arms | references).items()})
-    rows = [[row[0], *row[1 + _TRAINING_COLUMNS :]] for row in rows]
+    rows = _without_training(rows)
     rows[0] = [f"{condition}:", *[""] * (len(rows[0]) - 1)]
     return text_table(rows, rules=(len(_HEADERS), len(_HEADERS) + len(arms)))
+
+
+def _without_training(rows: list[list[str]]) -> list[list[str]]:
+    """Returns the rows without the columns about the training."""
+    return [[row[0], *row[1 + _TRAINING_COLUMNS :]] for row in rows]
 
 
 def _with_plans(rows: list[list[str]], arms: Mapping[str, dict[str, Any]]) -> list[list[str]]:

@@ -80,6 +80,18 @@ def test_sweep_of_a_downlink_fits_into_a_hundred_columns():
     assert max(map(len, sweep_table(points).splitlines())) <= 100
 
 
+def test_table_has_columns_of_the_training_only_where_something_was_trained():
+    arms = comparison()["arms"]
+    whole = summary_text(arms, {})
+    untrained = {name: arm | {"train_steps": 0} for name, arm in arms.items()}
+    short = summary_text(untrained, {})
+    assert "training:" in whole
+    assert "training:" in summary_text(arms, {"untrained": untrained["shielded"]})
+    assert short.splitlines()[0].split() == ["evaluation:"]
+    of_the_arm = r"(?m)^shielded .*?(\d+ \[.*)"
+    assert re.findall(of_the_arm, short) == re.findall(of_the_arm, whole) != []
+
+
 def test_columns_of_a_wide_table_stand_closer_together():
     arm = summary_of({"lookahead": [run("lookahead", returns=(-10.0, -30.0)) for _ in range(2)]})["arms"]["lookahead"]
     arm |= {"eval_violating_episodes": 19, "eval_violation_rate_ci95": [0.751, 0.999], "train_violation_steps": 123_456}
