@@ -40,7 +40,8 @@ def results_of(runs: Sequence[TrainingRun], folder: Path, settings: BackendSetti
         print(f"{len(results)} of {len(runs)} runs were finished before", file=sys.stderr)
     if not missing:
         return [results[run.name] for run in runs]
-    with progress_bar(sum(run.total_steps for run in missing)) as bar:
+    counted = "training and evaluation" if any(run.trains for run in missing) else "evaluation"
+    with progress_bar(sum(run.total_steps for run in missing), counted) as bar:
 
         def keep(run: TrainingRun, result: RunResult) -> None:
             store.save(run, result)
@@ -57,10 +58,23 @@ def results_of(runs: Sequence[TrainingRun], folder: Path, settings: BackendSetti
     return [results[run.name] for run in runs]
 
 
-def progress_bar(total_steps: int) -> tqdm:
-    """Returns a progress bar of simulated steps on stderr."""
+def progress_bar(total_steps: int, counted: str | None = None) -> tqdm:
+    """Returns a progress bar of simulated steps on stderr.
+
+    Args:
+        total_steps: Number of steps in all.
+        counted: What the steps belong to, in front of the bar; None if there is only one thing.
+    """
     period = _TERMINAL_PERIOD if sys.stderr.isatty() else _FILE_PERIOD
-    return tqdm(total=total_steps, unit="step", unit_scale=True, mininterval=period, miniters=0, file=sys.stderr)
+    return tqdm(
+        total=total_steps,
+        desc=counted,
+        unit="step",
+        unit_scale=True,
+        mininterval=period,
+        miniters=0,
+        file=sys.stderr,
+    )
 
 
 def _described(result: RunResult) -> str:

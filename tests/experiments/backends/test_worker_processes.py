@@ -8,9 +8,11 @@ from queue import Queue
 import pytest
 
 from agents.settings import PPOSettings
+from experiments.backends.execution import results_of
 from experiments.backends.worker_processes import _execute, execute_all
 from experiments.errors import RunStopped
 from experiments.runs.training_run import TrainingRun
+from experiments.settings import BackendSettings
 
 
 @pytest.fixture(scope="module")
@@ -47,3 +49,14 @@ def test_the_first_failure_stops_the_others_and_is_the_one_reported(endless):
     assert not isinstance(caught.value, RunStopped)
     assert kept == []
     assert time.monotonic() - begin < 300.0
+
+
+def test_progress_bar_names_what_its_steps_are(endless, tmp_path, capsys, without_workers):
+    results_of([replace(endless, episodes=1)], tmp_path / "fixed", BackendSettings(jobs=1))
+    assert "\revaluation: 100%" in capsys.readouterr().err
+    small = PPOSettings(envs=1, rollout=8, batch_size=8, epochs=1, width=8)
+    run = replace(endless, policy_kind="trained", episodes=1, steps=8, settings=small)
+    results_of([run], tmp_path / "trained", BackendSettings(jobs=1))
+    shown = capsys.readouterr().err
+    assert "\rtraining and evaluation: 100%" in shown
+    assert f"/{run.total_steps} [" in shown

@@ -127,6 +127,7 @@ def test_smoke_run_prints_the_table_and_the_files(smoke):
     assert str(out) in run.stdout
     assert "A smoke run shows that everything runs" in run.stdout
     assert "step/s" in run.stderr
+    assert "training and evaluation: 100%" in run.stderr
 
 
 def test_report_is_one_self_contained_page(smoke):
