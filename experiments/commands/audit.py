@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
-from textwrap import TextWrapper
 
+from experiments.analysis.wrapped_text import terminal_width, wrapped
 from experiments.paper.audit import Claim, Verdict, audited_claims, defects
 from experiments.paper.paper_example import PaperExample
 from experiments.runs import require_place
 from experiments.settings import AuditSettings
 from shields.atomic_write import write_atomically
 
-# Lines follow the terminal between these widths, and have the greatest where there is no terminal.
-_LEAST_WIDTH, _GREATEST_WIDTH = 60, 100
 _INDENT = 16
 _RELATIONS = re.compile(r" (=|<=|>=|<|>) ")
 
@@ -33,8 +30,7 @@ def audit(settings: AuditSettings) -> None:
     document = json.dumps([asdict(claim) for claim in claims], indent=1)
     if settings.out is not None:
         write_atomically(settings.out, document + "\n")
-    columns = shutil.get_terminal_size((_GREATEST_WIDTH, 24)).columns
-    print(document if settings.json else _text(claims, min(max(columns, _LEAST_WIDTH), _GREATEST_WIDTH)))
+    print(document if settings.json else _text(claims, terminal_width()))
 
 
 def _text(claims: Sequence[Claim], width: int) -> str:
@@ -67,13 +63,6 @@ def _summary(claims: Sequence[Claim], width: int) -> str:
 
 def _wrapped(label: str, text: str, width: int, indent: int = _INDENT) -> str:
     """Returns a label and a text in lines of at most that width; a formula is not broken at its relation."""
-    wrapper = TextWrapper(
-        width,
-        initial_indent=label.ljust(indent),
-        subsequent_indent=" " * indent,
-        break_on_hyphens=False,
-        break_long_words=False,
-    )
     for product in ("K L K'", "x+'M x+"):
         text = text.replace(product, product.replace(" ", "\0"))
-    return wrapper.fill(_RELATIONS.sub("\0\\1\0", text)).replace("\0", " ")
+    return wrapped(_RELATIONS.sub("\0\\1\0", text), width, label=label, indent=indent).replace("\0", " ")

@@ -15,6 +15,7 @@ from experiments.analysis.arm_table import condition_text, decimals_of, summary_
 from experiments.analysis.escapes import escape_sentences, escape_summary
 from experiments.analysis.parquet_tables import write_tables
 from experiments.analysis.summary import arm_summary, covered_fraction, paired_differences
+from experiments.analysis.wrapped_text import wrapped
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.plots.comparison_figures import comparison_figures
@@ -56,7 +57,7 @@ def compare(settings: CompareSettings) -> None:
     setup = ExperimentSetup.of(settings.env, settings.channel, settings.certificate, settings.noise)
     claim_folder("compare", settings.completed)
     prepare_output(settings.out)
-    print(setup.title, settings.agent_line, sep="\n", flush=True)
+    print(wrapped(setup.title), wrapped(settings.agent_line), sep="\n", flush=True)
     settings = settings.completed
     runs = _training_runs(settings, setup)
     results = results_of(runs, settings.out, settings)
@@ -69,7 +70,7 @@ def compare(settings: CompareSettings) -> None:
     trained = max(arm["train_steps"] for arm in summary["arms"].values())
     print(f"\n{settings.env}: {count} and {trained:,} training steps per arm, {settings.episodes} episodes per run\n")
     short = ["A smoke run shows that everything runs; its agents have hardly learned."] if settings.smoke else []
-    print(_tables(summary), *findings, *short, f"files: {settings.out}", sep="\n")
+    print(_tables(summary), *map(wrapped, [*findings, *short]), f"files: {settings.out}", sep="\n")
 
 
 def _with_full_names(settings: CompareSettings) -> CompareSettings:

@@ -12,6 +12,7 @@ from typing import Any
 from experiments.analysis.parquet_tables import parquet
 from experiments.analysis.summary import summarize_arm
 from experiments.analysis.sweep_table import sweep_table
+from experiments.analysis.wrapped_text import wrapped
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.plots.heatmaps import sweep_figures
@@ -83,7 +84,7 @@ def sweep(settings: SweepSettings) -> None:
     setups = [_setup(settings, each) for each in points]
     claim_folder("sweep", settings.completed)
     prepare_output(settings.out)
-    print(settings.agent_line, flush=True)
+    print(wrapped(settings.agent_line), flush=True)
     settings = settings.completed
     runs = [
         setup.training_run(settings, name, index, grid_point=point.name)

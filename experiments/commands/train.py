@@ -6,6 +6,7 @@ import json
 
 from experiments.analysis.arm_table import summary_text
 from experiments.analysis.summary import arm_summary
+from experiments.analysis.wrapped_text import wrapped
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.runs import Arm, ExperimentSetup, claim_folder, prepare_output
@@ -32,7 +33,7 @@ def train(settings: TrainSettings) -> None:
     setup = ExperimentSetup.of(settings.env, settings.channel, settings.certificate)
     claim_folder("train", settings.completed)
     prepare_output(settings.out)
-    print(settings.agent_line, flush=True)
+    print(wrapped(settings.agent_line), flush=True)
     settings = settings.completed
     run = setup.training_run(settings, settings.arm, 0)
     results = results_of([run], settings.out, BackendSettings(jobs=1))
