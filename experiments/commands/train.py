@@ -9,7 +9,7 @@ from experiments.analysis.summary import arm_summary
 from experiments.analysis.wrapped_text import wrapped
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
-from experiments.runs import Arm, ExperimentSetup, claim_folder, prepare_output
+from experiments.runs import Arm, ExperimentSetup, RunResult, claim_folder, prepare_output
 from experiments.settings import BackendSettings, TrainSettings
 from shields.atomic_write import write_atomically
 
@@ -42,4 +42,18 @@ def train(settings: TrainSettings) -> None:
     content = {"arms": arms} | setup.provenance("train", settings)
     write_atomically(settings.out / "summary.json", json.dumps(content, indent=1) + "\n")
     print(f"{results[0].train_steps:,} training steps, {settings.episodes:,} episodes\n")
-    print(summary_text(arms, {}), f"agent: {settings.out / 'models' / run.name}", sep="\n")
+    print(summary_text(arms, {}), *_hints(results[0], is_smoke=settings.smoke), sep="\n")
+    print(f"agent: {settings.out / 'models' / run.name}")
+
+
+def _hints(result: RunResult, *, is_smoke: bool) -> list[str]:
+    """Returns what to do after a training in which a shield had nothing to do; nothing after another one."""
+    if not result.train_steps or result.train_violation_steps or result.train_interventions:
+        return []
+    longer = "leave out --smoke" if is_smoke else "raise --steps"
+    return [
+        wrapped(
+            "This training had no violation and no override, so it does not show what the shield is for: "
+            f"{longer}, or run `ncs compare`, which trains with and without the shield."
+        )
+    ]
