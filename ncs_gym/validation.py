@@ -97,10 +97,20 @@ def as_matrix(value: Any, shape: tuple[int | None, int | None], name: str) -> np
         have > 0 and (want is None or have == want) for have, want in zip(matrix.shape, shape, strict=True)
     )
     if not fits:
-        raise ValueError(f"{name} must have shape {expected}, got {matrix.shape}")
+        raise ValueError(f"{name} must have shape {expected}, got {matrix.shape}{_advice(matrix, shape)}")
     if not (np.abs(matrix) < LARGEST_NUMBER).all():
         raise ValueError(f"{name} must be finite and below {LARGEST_NUMBER:g} in size, got {shown(matrix.tolist())}")
     return matrix
+
+
+def _advice(array: np.ndarray, shape: tuple[int | None, int | None]) -> str:
+    """Returns how to write a vector that fits the expected (rows, columns) as a single one of either; else nothing."""
+    rows, columns = shape
+    if array.ndim == 1 and rows == array.size and columns in (None, 1):
+        return f"; a single column is written {shown(array[:, None].tolist())}"
+    if array.ndim == 1 and columns == array.size and rows in (None, 1):
+        return f"; a single row is written {shown(array[None].tolist())}"
+    return ""
 
 
 def as_vector(value: Any, size: int | None, name: str) -> np.ndarray:
