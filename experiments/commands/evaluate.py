@@ -15,7 +15,7 @@ from experiments.runs import ExperimentSetup, RunResult, require_place, versions
 from experiments.runs.environments import module_and_id, registered_env
 from experiments.runs.policies import agent_folder, certificate_file
 from experiments.settings import EvaluateSettings
-from experiments.settings.horizon import require_horizon
+from experiments.settings.steps import require_horizon
 from ncs_gym.envs.env import ncs_env
 from shields.atomic_write import write_atomically
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 import tyro
 
-from experiments.settings.horizon import require_horizon
+from experiments.settings.steps import StepCount, require_horizon
 from ncs_gym import ChannelContract
 from ncs_gym.plants.linear_plant import SMALLEST_DELTA
 
@@ -196,6 +196,6 @@ class ReproduceSettings:
 
     out: Path = Path("runs/reproduce")
     starts: int = 100
-    steps: int = 200
+    steps: StepCount = 200
     force: bool = False
     seed: int = 0

@@ -20,7 +20,7 @@ from experiments.settings.agent_overrides import (
 )
 from experiments.settings.backend import BackendSettings
 from experiments.settings.channel import ChannelSettings
-from experiments.settings.horizon import require_horizon
+from experiments.settings.steps import OptionalStepCount, require_horizon
 
 Algorithm = Literal["PPO", "A2C", "SAC", "TD3", "TRPO", "TQC", "CrossQ"]
 Mode = Literal["project", "lookahead", "switch", "boundary"]
@@ -59,7 +59,7 @@ class LearningSettings:
     config: Path | None = None
     env: str = "ncs_gym/TruckTrailerCruise-v0"
     seed: int = 0
-    steps: int | None = None
+    steps: OptionalStepCount = None
     episodes: int = 200
     algo: Algorithm = "PPO"
     mode: Mode = "project"

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from experiments.settings.horizon import require_horizon
+from experiments.settings.steps import StepCount, require_horizon
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +42,7 @@ class RenderSettings:
     side_by_side: bool = False
     certificate: Path | None = None
     seed: int = 0
-    steps: int = 200
+    steps: StepCount = 200
     fps: int = 10
     scale: int | None = None
     width: int | None = None

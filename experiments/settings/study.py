@@ -7,6 +7,7 @@ from pathlib import Path
 
 from experiments.settings.backend import BackendSettings
 from experiments.settings.learning import Algorithm, LearningSettings
+from experiments.settings.steps import StepCount
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +37,7 @@ class SweepSettings(BackendSettings, LearningSettings):
 
     out: Path = Path("runs/sweep")
     seeds: int = 1
-    steps: int = 50_000
+    steps: StepCount = 50_000
     episodes: int = 100
     arms: tuple[str, ...] = ("unshielded", "shielded")
     losses: tuple[float, ...] = (0.0, 0.3, 0.6)

@@ -1,0 +1,64 @@
+"""Numbers of steps that commands share: counts, of which 100000 is also written 1e5, and the check of a horizon."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from decimal import Decimal, InvalidOperation
+from typing import Annotated
+
+from tyro.constructors import PrimitiveConstructorSpec
+
+from ncs_gym.validation import shown
+from shields.runtime.safety_filter import LONGEST_HORIZON
+
+# Counts are below this, so that no exponent makes an endless number.
+_LIMIT = Decimal("1e15")
+
+
+def _step_count(texts: list[str]) -> int:
+    """Returns the whole number that the only text stands for exactly.
+
+    Raises:
+        ValueError: If it stands for none, or for one out of range.
+    """
+    try:
+        number = Decimal(texts[0])
+    except InvalidOperation:
+        number = Decimal("NaN")
+    if not (number.is_finite() and -_LIMIT < number < _LIMIT and number == int(number)):
+        raise ValueError(f"expected a whole number below 1e15, such as 100000 or 1e5, got {shown(texts[0])}")
+    return int(number)
+
+
+def _step_count_or_none(texts: list[str]) -> int | None:
+    """Returns None for the text None, otherwise what `_step_count` does."""
+    return None if texts == ["None"] else _step_count(texts)
+
+
+def _argument(metavar: str, read: Callable[[list[str]], int | None]) -> PrimitiveConstructorSpec[int | None]:
+    """Returns how the parser reads and shows a number of steps."""
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=metavar,
+        instance_from_str=read,
+        is_instance=lambda value: value is None or type(value) is int,
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+StepCount = Annotated[int, _argument("INT", _step_count)]
+OptionalStepCount = Annotated[int | None, _argument("{None}|INT", _step_count_or_none)]
+
+
+def require_horizon(horizon: int | None, *modes: str | None) -> None:
+    """Returns if a horizon may be given with these modes or arms; None may always.
+
+    Raises:
+        ValueError: If it is out of range, or none of them is or names "lookahead".
+    """
+    if horizon is None:
+        return
+    if not 1 <= horizon <= LONGEST_HORIZON:
+        raise ValueError(f"--horizon must be at least 1 and at most {LONGEST_HORIZON}, got {horizon}")
+    if not any("lookahead" in (mode or "") for mode in modes):
+        raise ValueError(f"--horizon {horizon} is for mode lookahead, which is not asked for")
