@@ -1,17 +1,13 @@
-"""The `ncs` command."""
+"""The `ncs` command.
+
+Whatever takes time to import is imported inside `main`, where an interrupt ends the command without a traceback.
+"""
 
 from __future__ import annotations
 
 import errno
-import importlib
-import importlib.util
 import os
-import signal
 import sys
-from contextlib import nullcontext
-from pathlib import Path
-
-from experiments.warning_sentences import warnings_as_sentences
 
 _ERROR = 2
 _INTERRUPTED = 130
@@ -49,10 +45,15 @@ def main() -> None:
 
     Errors become one sentence on stderr and exit code 2, warnings one sentence; NCS_DEBUG=1 shows where they come from.
     """
-    signal.signal(signal.SIGTERM, _interrupt)
-    # Matrices are small: more threads only wait for each other. Read when numpy is imported, here and in workers.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
+        import signal
+        from contextlib import nullcontext
+
+        from experiments.warning_sentences import warnings_as_sentences
+
+        signal.signal(signal.SIGTERM, _interrupt)
+        # Matrices are small: more threads only wait for each other. Read when numpy is imported, here and in workers.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         _require_own_agents()
         settings = _parse(sys.argv[1:])
         with nullcontext() if os.environ.get("NCS_DEBUG") else warnings_as_sentences():
@@ -88,6 +89,8 @@ def _parse(arguments: list[str]) -> object:
 
 
 def _run(settings: object) -> None:
+    from importlib import import_module
+
     from experiments.commands import require_extra
 
     _, target, extras = next(entry for entry in COMMANDS.values() if entry[0] == type(settings).__name__)
@@ -96,7 +99,7 @@ def _run(settings: object) -> None:
     if getattr(settings, "engine", "local") == "ray":
         require_extra("ray", "ray")
     module, _, function = target.partition(":")
-    getattr(importlib.import_module(module), function)(settings)
+    getattr(import_module(module), function)(settings)
 
 
 def _interrupt(number: int, frame: object) -> None:
@@ -106,7 +109,10 @@ def _interrupt(number: int, frame: object) -> None:
 
 def _require_own_agents() -> None:
     """Refuses to run with another distribution's `agents` package, whose generic name ours shares."""
-    spec = importlib.util.find_spec("agents")
+    from importlib.util import find_spec
+    from pathlib import Path
+
+    spec = find_spec("agents")
     here = Path(__file__).resolve().parent.parent
     if spec is None or spec.origin is None or Path(spec.origin).resolve().parent.parent != here:
         raise ImportError(

@@ -357,6 +357,25 @@ def assert_verdict_first(printed, last):
     assert lines[-1] == last
 
 
+@pytest.mark.parametrize("module", ["experiments.warning_sentences", "tyro", "numpy", "shields"])
+def test_interrupt_while_the_command_starts_is_one_line(module):
+    code = f"""
+import sys
+
+class Interrupt:
+    def find_spec(self, name, path=None, target=None):
+        if name == {module!r}:
+            raise KeyboardInterrupt
+
+sys.meta_path.insert(0, Interrupt())
+sys.argv = ["ncs", "verify", "nowhere.json"]
+from experiments.__main__ import main
+main()
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment())
+    assert (run.returncode, run.stdout, run.stderr) == (130, "", "ncs: interrupted\n")
+
+
 def test_synthesize_then_verify(tmp_path):
     file = tmp_path / "c.json"
     made = ncs("synthesize", "--env", "ncs_gym/TruckTrailer-v0", "--out", file)
