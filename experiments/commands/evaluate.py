@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from agents import evaluation
@@ -36,17 +37,10 @@ def evaluate(settings: EvaluateSettings) -> None:
         Infeasible: If no certificate is found.
         OSError: If the summary cannot be written.
     """
-    from agents.agent import Agent  # imports torch
-
     settings = short_version(settings, **_SMOKE)
     require_place(settings.out)
-    if settings.env is not None:
-        registered_env(settings.env)
     folder = agent_folder(settings.model)
-    agent = Agent.load(folder)
-    env_id = settings.env or agent.env
-    if module_and_id(env_id)[1] != agent.env:
-        raise ValueError(f"the agent in {folder} was trained in {agent.env}, not in {env_id}")
+    agent, env_id = _agent_and_env(folder, settings.env)
     own = ncs_env(ControlLoop(env=agent.env, channel=agent.channel).single()).channel
     channel = settings.channel.applied_to(own) or agent.channel
     mode = _mode(settings, agent)
@@ -79,6 +73,28 @@ def evaluate(settings: EvaluateSettings) -> None:
             "versions": versions(),
         }
         write_atomically(settings.out, json.dumps(content, indent=1) + "\n")
+
+
+def _agent_and_env(folder: Path, env_id: str | None) -> tuple[Agent, str]:
+    """Returns the agent in a folder, and the id of the environment that it acts in.
+
+    Args:
+        folder: The agent's folder.
+        env_id: Id that the user gave, which may name a module to import; None for the agent's own.
+
+    Raises:
+        AgentError: If the agent's files are missing or damaged.
+        ValueError: If the environment is unknown, or not the one that the agent was trained in.
+    """
+    from agents.agent import Agent  # imports torch
+
+    if env_id is not None:
+        registered_env(env_id)
+    agent = Agent.load(folder)
+    env_id = env_id or agent.env
+    if module_and_id(env_id)[1] != agent.env:
+        raise ValueError(f"the agent in {folder} was trained in {agent.env}, not in {env_id}")
+    return agent, env_id
 
 
 def _mode(settings: EvaluateSettings, agent: Agent) -> str | None:
