@@ -10,13 +10,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from agents.agent import Agent, AgentError
+    from agents.agent import Agent
     from agents.callbacks import DualAscentCallback, EvaluationCallback, SafetyCallback
     from agents.control_loop import ControlLoop, ShieldSettings
     from agents.evaluation import evaluate
     from agents.results import Episode, Evaluation, TrainingPoint, Trajectory
     from agents.sb3_vec_env import SB3VecEnv
     from agents.settings import A2CSettings, LagrangianSettings, OffPolicySettings, PPOSettings
+    from agents.sharing.agent_file import AgentError
     from agents.training import TrainingResult, train
     from agents.tuned import tuned_settings, tuned_steps
 
@@ -45,12 +46,13 @@ __all__ = [
 ]
 
 _MODULES = {
-    "agent": ("Agent", "AgentError"),
+    "agent": ("Agent",),
     "callbacks": ("DualAscentCallback", "EvaluationCallback", "SafetyCallback"),
     "control_loop": ("ControlLoop", "ShieldSettings"),
     "evaluation": ("evaluate",),
     "results": ("Episode", "Evaluation", "TrainingPoint", "Trajectory"),
     "sb3_vec_env": ("SB3VecEnv",),
+    "sharing.agent_file": ("AgentError",),
     "settings": ("A2CSettings", "LagrangianSettings", "OffPolicySettings", "PPOSettings"),
     "training": ("TrainingResult", "train"),
     "tuned": ("tuned_settings", "tuned_steps"),

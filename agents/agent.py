@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,16 +21,10 @@ from agents.loop_wrappers import with_gain
 from agents.results import Evaluation
 from agents.sb3_vec_env import SB3VecEnv
 from agents.settings import AgentSettings
+from agents.sharing.agent_file import AgentError, channel_from_json, document_of, read_files, shield_from_json
 from agents.sharing.model_card import card_text
-from ncs_gym import Channel, GilbertElliott
+from ncs_gym import Channel
 from shields.atomic_write import write_atomically
-from shields.runtime.safety_filter import LONGEST_HORIZON, MODES
-
-_FORMAT = "ncs-gym agent 1"
-
-
-class AgentError(ValueError):
-    """A folder holds no agent, a damaged or altered one, or one of another environment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,8 +137,7 @@ class Agent:
         }
         if self.residual_gain is not None:
             content["residual_gain"] = self.residual_gain.tolist()
-        document = {"format": _FORMAT, "sha256": _digest(content), "agent": content}
-        return {"model.zip": buffer.getvalue(), "agent.json": (json.dumps(document, indent=1) + "\n").encode()}
+        return {"model.zip": buffer.getvalue(), "agent.json": document_of(content)}
 
     def save(
         self, folder: str | Path, shield: ShieldSettings | None = None, evaluation: Evaluation | None = None
@@ -182,24 +174,7 @@ class Agent:
             AgentError: If the files are missing, damaged, of another format or of an environment that has changed.
             ModuleNotFoundError: If the algorithm's package is not installed.
         """
-        folder = Path(folder)
-        folder = folder.parent if folder.name in ("model.zip", "agent.json") else folder
-        try:
-            document, weights = json.loads((folder / "agent.json").read_bytes()), (folder / "model.zip").read_bytes()
-        except OSError as error:
-            raise AgentError(
-                f"no agent in {folder}: cannot read {Path(error.filename).name} ({error.strerror}); `ncs compare` "
-                "leaves agents in OUT/models"
-            ) from error
-        except (ValueError, RecursionError) as error:
-            raise AgentError(f"{folder / 'agent.json'} is damaged: it is not valid JSON") from error
-        if not isinstance(document, dict) or document.get("format") != _FORMAT:
-            raise AgentError(f"{folder / 'agent.json'} is not of format {_FORMAT!r}")
-        content = document.get("agent")
-        if not isinstance(content, dict) or document.get("sha256") != _digest(content):
-            raise AgentError(f"{folder / 'agent.json'} was altered: its checksum does not match")
-        if hashlib.sha256(weights).hexdigest() != content.get("sha256_of_model"):
-            raise AgentError(f"{folder / 'model.zip'} was altered: its checksum does not match")
+        folder, content, weights = read_files(folder)
         try:
             return _rebuilt(content, weights)
         except AgentError:
@@ -215,15 +190,6 @@ def _plant_fingerprint(env_id: str) -> str | None:
     return None if plant is None else plant.fingerprint
 
 
-def _channel_from_json(content: dict[str, Any] | None) -> Channel | None:
-    """Returns the channel whose `dataclasses.asdict` is `content`."""
-    if content is None:
-        return None
-    loss = content["loss"]
-    settings: dict[str, Any] = content | {"loss": GilbertElliott(**loss) if isinstance(loss, dict) else loss}
-    return Channel(**settings)
-
-
 def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
     """Returns the agent of an `agent.json` and a `model.zip` whose checksums are right."""
     env_id, algorithm = content["env"], content["algorithm"]
@@ -237,8 +203,8 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
     if algorithm not in ALGORITHMS:
         raise AgentError(f"the agent is of an unknown algorithm, {algorithm!r}")
     settings = ALGORITHMS[algorithm][1](**content["settings"])
-    channel = _channel_from_json(content["channel"])
-    shield_mode, horizon = _shield_from_json(content.get("shield"))
+    channel = channel_from_json(content["channel"])
+    shield_mode, horizon = shield_from_json(content.get("shield"))
     model = build_model(algorithm, SB3VecEnv(ControlLoop(env=env_id, channel=channel).vector(1)), settings, seed=0)
     _, parameters, _ = load_from_zip_file(io.BytesIO(weights), load_data=False, device="cpu")
     model.set_parameters(parameters, exact_match=True, device="cpu")
@@ -264,17 +230,3 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         shield_mode=shield_mode,
         horizon=horizon,
     )
-
-
-def _shield_from_json(content: dict[str, Any] | None) -> tuple[str | None, int | None]:
-    """Returns mode and horizon of the shield that an agent was trained behind; None each for no shield."""
-    if content is None:
-        return None, None
-    mode, horizon = content["mode"], content["horizon"]
-    if mode not in MODES or not (horizon is None or (type(horizon) is int and 1 <= horizon <= LONGEST_HORIZON)):
-        raise AgentError("the agent is damaged: there is no shield of that mode and horizon")
-    return mode, horizon
-
-
-def _digest(content: Any) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

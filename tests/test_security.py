@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from agents.agent import Agent, AgentError, _digest
+from agents.agent import Agent
 from agents.control_loop import ControlLoop
+from agents.sharing.agent_file import AgentError, digest
 from agents.training import untrained
 from experiments.settings import CompareSettings, settings_json
 from shields import Certificate, CertificateError
@@ -146,7 +147,7 @@ def test_agents_of_others_import_no_module(evil):
     untrained(ControlLoop(env="ncs_gym/TruckTrailer-v0"), seed=0).save(evil)
     document = json.loads((evil / "agent.json").read_text())
     document["agent"]["env"] = "evil:Evil-v0"
-    document["sha256"] = _digest(document["agent"])
+    document["sha256"] = digest(document["agent"])
     (evil / "agent.json").write_text(json.dumps(document))
     with pytest.raises(AgentError, match="evil:Evil-v0, which is not registered"):
         Agent.load(evil)

@@ -1,1 +1,1 @@
-"""What comes with an agent that is shared: the card that says where it was trained and what it did."""
+"""The files of an agent that is shared, and the card that says where it was trained and what it did."""

@@ -47,7 +47,8 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
         return lambda observation, info: rng.uniform(-1.0, 1.0, size).astype(np.float32)
     if name == "greedy":
         return lambda observation, info: _greedy_action(env, observation, info["estimate"])
-    from agents.agent import Agent, AgentError  # imports torch
+    from agents.agent import Agent  # imports torch
+    from agents.sharing.agent_file import AgentError
 
     agent = Agent.load(agent_folder(Path(name)))
     if agent.env != env_id:

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents.agent import Agent, AgentError, Normalization, _digest
+from agents.agent import Agent, Normalization
 from agents.control_loop import ControlLoop, ShieldSettings
 from agents.evaluation import evaluate
 from agents.settings import OffPolicySettings, PPOSettings
+from agents.sharing.agent_file import AgentError, digest
 from agents.training import train
 from ncs_gym import Channel, GilbertElliott, truck_trailer
 from shields import Certificate
@@ -130,7 +131,7 @@ def test_saved_agent_keeps_the_shield_it_was_trained_behind(certificate, tmp_pat
     for wrong in ({"mode": "hope", "horizon": None}, {"mode": "lookahead", "horizon": 0}, {"mode": "lookahead"}):
         document = json.loads((tmp_path / "agent.json").read_text())
         document["agent"]["shield"] = wrong
-        document["sha256"] = _digest(document["agent"])
+        document["sha256"] = digest(document["agent"])
         (tmp_path / "agent.json").write_text(json.dumps(document))
         with pytest.raises(AgentError, match="is damaged"):
             Agent.load(tmp_path)
@@ -176,8 +177,6 @@ def test_weights_with_code_in_them_are_refused(folder):
 
     import torch
 
-    from agents.agent import _digest
-
     class Evil:
         def __reduce__(self):
             return (print, ("run!",))
@@ -190,18 +189,16 @@ def test_weights_with_code_in_them_are_refused(folder):
     (folder / "new.zip").replace(folder / "model.zip")
     document = json.loads((folder / "agent.json").read_text())
     document["agent"]["sha256_of_model"] = hashlib.sha256((folder / "model.zip").read_bytes()).hexdigest()
-    document["sha256"] = _digest(document["agent"])
+    document["sha256"] = digest(document["agent"])
     (folder / "agent.json").write_text(json.dumps(document))
     with pytest.raises(AgentError, match="damaged"):
         Agent.load(folder)
 
 
 def change(folder, **values):
-    from agents.agent import _digest
-
     document = json.loads((folder / "agent.json").read_text())
     document["agent"] |= values
-    document["sha256"] = _digest(document["agent"])
+    document["sha256"] = digest(document["agent"])
     (folder / "agent.json").write_text(json.dumps(document))
 
 

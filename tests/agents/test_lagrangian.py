@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents.agent import Agent, AgentError
+from agents.agent import Agent
 from agents.callbacks import DualAscentCallback
 from agents.control_loop import ControlLoop
 from agents.loop_wrappers import CostPenalty, ResidualActions
 from agents.settings import LagrangianSettings, PPOSettings
+from agents.sharing.agent_file import AgentError
 from agents.training import train
 
 CRUISE = ControlLoop(env="ncs_gym/TruckTrailerCruise-v0")

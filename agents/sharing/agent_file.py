@@ -1,0 +1,77 @@
+"""The files of an agent, checked: `agent.json` with numbers and names, and `model.zip`, whose checksum it has."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from ncs_gym import Channel, GilbertElliott
+from shields.runtime.safety_filter import LONGEST_HORIZON, MODES
+
+_FORMAT = "ncs-gym agent 1"
+
+
+class AgentError(ValueError):
+    """A folder holds no agent, a damaged or altered one, or one of another environment."""
+
+
+def document_of(content: dict[str, Any]) -> bytes:
+    """Returns the `agent.json` of some content."""
+    document = {"format": _FORMAT, "sha256": digest(content), "agent": content}
+    return (json.dumps(document, indent=1) + "\n").encode()
+
+
+def read_files(folder: str | Path) -> tuple[Path, dict[str, Any], bytes]:
+    """Returns the folder of an agent, the content of its `agent.json` and its `model.zip`, whose checksums are right.
+
+    Args:
+        folder: The folder, or one of the two files in it.
+
+    Raises:
+        AgentError: If a file is missing, damaged or of another format.
+    """
+    folder = Path(folder)
+    folder = folder.parent if folder.name in ("model.zip", "agent.json") else folder
+    try:
+        document, weights = json.loads((folder / "agent.json").read_bytes()), (folder / "model.zip").read_bytes()
+    except OSError as error:
+        raise AgentError(
+            f"no agent in {folder}: cannot read {Path(error.filename).name} ({error.strerror}); `ncs compare` leaves "
+            "agents in OUT/models"
+        ) from error
+    except (ValueError, RecursionError) as error:
+        raise AgentError(f"{folder / 'agent.json'} is damaged: it is not valid JSON") from error
+    if not isinstance(document, dict) or document.get("format") != _FORMAT:
+        raise AgentError(f"{folder / 'agent.json'} is not of format {_FORMAT!r}")
+    content = document.get("agent")
+    if not isinstance(content, dict) or document.get("sha256") != digest(content):
+        raise AgentError(f"{folder / 'agent.json'} was altered: its checksum does not match")
+    if hashlib.sha256(weights).hexdigest() != content.get("sha256_of_model"):
+        raise AgentError(f"{folder / 'model.zip'} was altered: its checksum does not match")
+    return folder, content, weights
+
+
+def channel_from_json(content: dict[str, Any] | None) -> Channel | None:
+    """Returns the channel whose `dataclasses.asdict` is `content`."""
+    if content is None:
+        return None
+    loss = content["loss"]
+    settings: dict[str, Any] = content | {"loss": GilbertElliott(**loss) if isinstance(loss, dict) else loss}
+    return Channel(**settings)
+
+
+def shield_from_json(content: dict[str, Any] | None) -> tuple[str | None, int | None]:
+    """Returns mode and horizon of the shield that an agent was trained behind; None each for no shield."""
+    if content is None:
+        return None, None
+    mode, horizon = content["mode"], content["horizon"]
+    if mode not in MODES or not (horizon is None or (type(horizon) is int and 1 <= horizon <= LONGEST_HORIZON)):
+        raise AgentError("the agent is damaged: there is no shield of that mode and horizon")
+    return mode, horizon
+
+
+def digest(content: Any) -> str:
+    """Returns the SHA-256 of JSON content, whatever the order of its keys."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
