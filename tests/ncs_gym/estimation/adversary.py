@@ -71,7 +71,8 @@ class Attack:
         many: The estimators.
         error: x_hat - x, shape (n, N).
         largest: The largest gauge of an error in its running ellipsoid so far.
-        seen: Numbers of the statistics that occurred, each with its true age.
+        seen: Error shapes that occurred, as bytes of float64, each with its true age. (Numbers of statistics belong to
+            a graph of patterns, and there is a new one when it has grown large.)
     """
 
     def __init__(
@@ -89,7 +90,7 @@ class Attack:
         self.gain = plant.u_max[:, None] * holding_gain(plant)
         self.history: list[np.ndarray] = []
         self.step, self.largest = 0, 0.0
-        self.seen: set[tuple[int, int]] = set()
+        self.seen: set[tuple[bytes, int]] = set()
 
     def _axes(self) -> np.ndarray:
         """Random directions in units of the box, shape (n, N)."""
@@ -125,4 +126,4 @@ class Attack:
         self.largest = max(self.largest, float(np.sqrt((self.error * inward).sum(axis=0)).max()))
         assert self.largest <= 1.0
         assert not many.alarm.any()
-        self.seen.update(zip(many.statistics.tolist(), many.age.tolist(), strict=True))
+        self.seen.update(zip((shape.tobytes() for shape in shapes), many.age.tolist(), strict=True))
