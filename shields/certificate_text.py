@@ -41,14 +41,18 @@ def description_of_loop(loop: SafeLoop, is_started: bool) -> str:
     """Returns how a loop decides, what it rests on and what is proved now, a line or more for each."""
     certificate, mode, horizon = loop.filter.certificate, loop.filter.mode, loop.filter.horizon
     fingerprint = f"of the plant with fingerprint {certificate.fingerprint[:16]}"
-    age = _count(loop.measurement_age, "step")
+    age = f"the newest sample is {_count(loop.measurement_age, 'step')} old"
+    contract = None if certificate.ages is None else certificate.ages.sets.contract
+    largest = None if contract is None else contract.max_age - loop.lead
+    if largest is not None and loop.measurement_age > largest:
+        age += ", older than the contract allows"
     proved = "the state stays in the box" if mode == "lookahead" else "the state is in S"
     rows = [
         ("mode", mode if horizon is None else f"{mode}, horizon {_count(horizon, 'step')}"),
         ("certificate", ", ".join(filter(None, (fingerprint, size_of(certificate.provenance))))),
-        ("contract", _contract(certificate)),
+        ("contract", _contract(certificate, largest)),
         ("downlink", f"inputs take effect {_count(loop.lead, 'step')} after the decision" if loop.lead else ""),
-        ("step", f"{loop.steps} of episode {loop.episode}, the newest sample is {age} old" if is_started else ""),
+        ("step", f"{loop.steps} of episode {loop.episode}, {age}" if is_started else ""),
         ("guaranteed", f"yes: {proved}" if loop.guaranteed else f"no: {loop.reason}"),
     ]
     return _table("Safe loop: estimator, safety filter and monitor of the guarantee", rows)
@@ -86,8 +90,13 @@ def _table(title: str, rows: list[tuple[str, str]]) -> str:
     return "\n".join(lines)
 
 
-def _contract(certificate: Certificate) -> str:
-    """Returns what the channel has to promise."""
+def _contract(certificate: Certificate, largest: int | None = None) -> str:
+    """Returns what the channel has to promise.
+
+    Args:
+        certificate: A certificate.
+        largest: What a downlink leaves of the contract's age for the samples [steps]; all of it if None.
+    """
     if certificate.method == "paper":
         return "none; no error set: the guarantee is the paper's own, and a shield with it is never guaranteed"
     if certificate.ages is None:
@@ -95,7 +104,10 @@ def _contract(certificate: Certificate) -> str:
     contract = certificate.ages.sets.contract
     step = contract.quantization_step
     rounding = f"rounded to {step:g} or finer" if step else "not rounded"
-    return f"the newest sample is never older than {contract.max_age} steps; samples are {rounding}"
+    age = contract.max_age if largest is None else largest
+    less = contract.max_age - age
+    of = f" ({contract.max_age} less the downlink's {less})" if less else ""
+    return f"the newest sample is never older than {_count(age, 'step')}{of}; samples are {rounding}"
 
 
 def _tolerance(recorded: dict[str, Any]) -> str:

@@ -52,6 +52,16 @@ failed: episodes that left the box; p <: upper end of the exact 95 % interval of
 margin: smallest 1 - |c_j x| from step {SETTLING_STEPS} on;
 planned: steps with inputs of a certified plan in store; overridden: steps that the shield changed"""
 
+# What the channels of `attack_cases` do.
+_CHANNELS = {
+    "its channel": "the environment's own",
+    "late": "the oldest sample that the contract allows, at every step",
+    "rare": "the longest gap that it allows, every time",
+    "perfect": "loses and delays nothing",
+    "blackout": "no packet at all",
+    "bursts": "losses in a row",
+    "overtaking": "packets overtake one another",
+}
 _LAPSED_LEGEND = """
 no claim: steps from a broken contract on, until the proof holds again, which no failure counts;
 outside then: such steps outside the box"""
@@ -77,7 +87,10 @@ def counts_table(counts: Mapping[str, SafetyCounts], *, looks_ahead: bool) -> st
         ]
     rows.append(_row("all", total, columns))
     steps = f"{total.steps:,} steps, {total.steps // total.episodes} in each episode"
-    return f"{steps}\n\n{text_table(rows, rules=(2, len(rows) - 1))}\n{legend}"
+    seen = dict.fromkeys(name.rpartition(", ")[2] for name in counts)
+    channels = "\n".join(f"{kind}: {_CHANNELS[kind]};" for kind in seen if kind in _CHANNELS)
+    table = text_table(rows, rules=(2, len(rows) - 1))
+    return "\n".join(filter(None, (f"{steps}\n", table, channels, legend)))
 
 
 def _row(name: str, counts: SafetyCounts, columns: _Columns) -> list[str]:

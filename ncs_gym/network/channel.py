@@ -93,6 +93,11 @@ class Channel:
         step = as_number(self.quantization_step, "quantization_step", low=0.0)
         object.__setattr__(self, "quantization_step", step)
         object.__setattr__(self, "send_period", as_count(self.send_period, "send_period", low=1))
+        if isinstance(self.delay, (tuple, list)):
+            raise ValueError(
+                f"delay is one number of steps, got {shown(self.delay)}: jitter is the largest random delay beyond it, "
+                "so that delay=1, jitter=1 stands for 1 to 2 steps"
+            )
         for name in ("delay", "jitter"):
             object.__setattr__(self, name, as_count(getattr(self, name), name, low=0, high=LONGEST_DELAY))
         if self.max_consecutive_losses is not None:

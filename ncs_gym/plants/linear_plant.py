@@ -158,7 +158,7 @@ class LinearPlant(HardBounds, limits.OperatingPoint):
         object.__setattr__(self, name, value)
 
     @classmethod
-    def from_statespace(cls, sys: Any, *, dt: float | None = None, input_delay: int = 0, **settings: Any) -> Self:
+    def from_statespace(cls, sys: Any, dt: float | None = None, *, input_delay: int = 0, **settings: Any) -> Self:
         """Returns the plant of a state-space model; its C becomes H.
 
         Args:

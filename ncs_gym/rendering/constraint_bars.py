@@ -85,8 +85,9 @@ class ConstraintBarsDrawing:
             estimated = _x(bar, constraint.load(frame.estimate))
             canvas.dashed([(estimated, bar.y - 4), (estimated, bar.bottom + 4)], theme.ESTIMATE, 2.0, dash=3.0)
             text = theme.value_label(value * constraint.limit, constraint.limit, constraint.unit)
-            place, bold = (bar.right + 10, bar.y + 7), abs(value) > 0.8
-            canvas.text(text, place, color, bold=bold, max_width=self._text_width)
+            place, violated = (bar.right + 10, bar.y + 7), abs(value) > 1.0
+            text_color = theme.DANGER if violated else theme.INK
+            canvas.text(text, place, text_color, bold=violated, max_width=self._text_width)
         draw_packets(canvas, frame, 130.0, theme.WIDTH - 130.0)
 
     def _bar(self, index: int) -> theme.Rect:

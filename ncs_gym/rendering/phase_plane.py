@@ -84,6 +84,9 @@ class PhasePlane:
         if frame.violated:
             canvas.circle(truth, 9.0, theme.DANGER, width=2.0)
         canvas.clip(None)
+        if np.any(np.abs(frame.state[pair]) > _AXIS_REACH * self._limits):
+            place = self._rect.right - 6, self._rect.y + 9
+            canvas.text("state outside the axes", place, theme.DANGER, align=1.0, bold=True)
 
     def _draw_path(self, canvas: Canvas, frame: FrameRecord) -> None:
         points = [self._inside(state) for state in frame.path[:, list(self._pair)]]

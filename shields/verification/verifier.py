@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
@@ -15,10 +16,16 @@ from shields.paper.conditions import paper_conditions
 from shields.verification.certified_conditions import certified_conditions, multipliers_fit
 from shields.verification.conditions import Condition, flag
 
+# Where the name of a condition says which age it is about.
+_AGE = re.compile(r"(?<=Sigma_)\d+| at age \d+")
+
 
 @dataclass(frozen=True)
 class Report:
-    """The outcome of a verification; printed it begins with the verdict.
+    """The outcome of a verification.
+
+    Printed it begins with the verdict; of conditions that hold and differ in the age alone, the one with the least
+    margin is printed.
 
     Attributes:
         conditions: All conditions that were checked, in order; later ones are left out where earlier ones fail.
@@ -35,8 +42,23 @@ class Report:
         holding, total = sum(c.holds for c in self.conditions), len(self.conditions)
         valid = f"valid: {holding} of {total} conditions hold in exact arithmetic"
         verdict = valid if self.valid else f"not valid: {total - holding} of {total} conditions broken"
-        rows = (f"{'holds ' if c.holds else 'BROKEN'}  {c.margin:+.3e}  {c.name}" for c in self.conditions)
-        return "\n".join([verdict, *rows])
+        return "\n".join([verdict, *map(_line, _alike(self.conditions))])
+
+
+def _alike(conditions: Iterable[Condition]) -> list[list[Condition]]:
+    """Returns the conditions in groups: those that differ in the age alone and hold, and each other one by itself."""
+    groups: dict[str, list[Condition]] = {}
+    for condition in conditions:
+        name = _AGE.sub("", condition.name) if condition.holds else condition.name
+        groups.setdefault(name, []).append(condition)
+    return list(groups.values())
+
+
+def _line(alike: list[Condition]) -> str:
+    """Returns a group of conditions as a line of text."""
+    least = min(alike, key=lambda condition: condition.margin)
+    count = "" if len(alike) == 1 else f" (the least of {len(alike)})"
+    return f"{'holds ' if least.holds else 'BROKEN'}  {least.margin:+.3e}  {least.name}{count}"
 
 
 def verify(

@@ -34,6 +34,18 @@ def test_steps_of_which_nothing_is_claimed_have_columns_and_a_legend_where_there
     assert max(map(len, lines)) <= 100
 
 
+def test_the_channels_of_the_rows_are_explained():
+    cases = attack_cases(0, 1)
+    lines = counts_table(dict.fromkeys(cases, LONG_CAMPAIGN), looks_ahead=False).splitlines()
+    for kind in {name.rpartition(", ")[2] for name in cases}:
+        assert sum(line.startswith(f"{kind}: ") for line in lines) == 1, kind
+    assert not any(line.startswith("rare: ") for line in _table_of("CartPole-v0, late"))
+
+
+def _table_of(*names):
+    return counts_table(dict.fromkeys(names, LONG_CAMPAIGN), looks_ahead=False).splitlines()
+
+
 def test_margin_of_no_step_is_no_number():
     counts = SafetyCounts(steps=400, episodes=2, lapsed=400)
     assert counts_table({"CartPole-v0, its channel": counts}, looks_ahead=False).splitlines()[6].split()[7] == "-"

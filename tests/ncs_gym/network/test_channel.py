@@ -127,6 +127,11 @@ def test_bad_channels_are_refused(kwargs, word):
         Channel(**kwargs)
 
 
+def test_a_range_of_delays_is_refused_with_what_stands_for_it():
+    with pytest.raises(ValueError, match=r"got \(1, 2\): jitter is .* delay=1, jitter=1 stands for 1 to 2 steps"):
+        Channel(delay=(1, 2))
+
+
 def test_bad_burst_probability_is_refused():
     with pytest.raises(ValueError, match="p_good_to_bad must be"):
         GilbertElliott(p_good_to_bad=2.0, p_bad_to_good=0.5)

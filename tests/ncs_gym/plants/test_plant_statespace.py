@@ -39,6 +39,7 @@ DISCRETE = {
 @pytest.mark.parametrize("name", CONTINUOUS)
 def test_continuous_model_is_sampled_exactly(name):
     plant = LinearPlant.from_statespace(CONTINUOUS[name], dt=0.1, **REST)
+    assert LinearPlant.from_statespace(CONTINUOUS[name], 0.1, **REST).fingerprint == plant.fingerprint
     assert plant.dt == 0.1
     model = CONTINUOUS[name].to_ss() if name == "scipy transfer function" else SimpleNamespace(A=A, B=B, C=C)
     end = solve_ivp(lambda _, x: model.A @ x + model.B[:, 0] * 1.7, (0.0, 0.1), [0.4, -0.9], rtol=1e-11, atol=1e-12)

@@ -127,6 +127,26 @@ def test_coupling_turns_red_near_its_limit(picture):
     assert min(red[2:]) > mark + 100
 
 
+def test_numbers_are_red_only_beyond_their_limit_and_a_state_beyond_the_axes_is_said_to_be():
+    env = make("ncs_gym/BatchReactor-v0").unwrapped
+    env.reset(seed=0)
+    limit, picture = env.plant.half_widths[0], _Picture(env.plant, scale=1)
+
+    def red_of(position):
+        state = np.array([position, 0.0, 0.0, 0.0])
+        frame = replace(env.renderer.frame_record(), state=state, estimate=state, path=state[None], violated=False)
+        pixels, bar = pixels_of(picture, frame), picture._drawing._bar(0)
+        number = theme.Rect(bar.right + 6, bar.y, 70, 14)
+        corner = theme.Rect(theme.PLANE.right - 150, theme.PLANE.y + 2, 146, 16)
+        return count(pixels, theme.DANGER, number), count(pixels, theme.DANGER, corner)
+
+    near, beyond, far = (red_of(fraction * limit) for fraction in (0.97, 1.02, 3.0))
+    assert near[0] == 0
+    assert min(beyond[0], far[0]) > 20
+    assert near[1] == beyond[1] < 5
+    assert far[1] > 100
+
+
 def test_coupling_stretches(picture):
     fronts = []
     for stretch in (-1.0, 0.0, 1.0):

@@ -594,3 +594,16 @@ def test_printed_loop_names_horizon_and_downlink():
     certificate = certificate_of(cart_pole(), ChannelContract(4))
     loop = SafeLoop(certificate, cart_pole(), Channel(), downlink=Channel(delay=2))
     assert text_of(loop)["downlink"] == "inputs take effect 2 steps after the decision"
+    assert "never older than 2 steps (4 less the downlink's 2)" in text_of(loop)["contract"]
+
+
+@pytest.mark.parametrize("downlink", [None, Channel(delay=2)])
+def test_printed_loop_says_that_the_contract_is_broken_now(downlink):
+    plant, allowed = cart_pole(), 4 if downlink is None else 2
+    loop = SafeLoop(certificate_of(plant, ChannelContract(4)), plant, Channel(), downlink=downlink)
+    loop.start(np.zeros(4))
+    for age in range(1, 7):
+        loop.decide(0.0)
+        loop.receive()
+        old = f"{age} of episode 0, the newest sample is {age} step{'' if age == 1 else 's'} old"
+        assert text_of(loop)["step"] == old + (", older than the contract allows" if age > allowed else "")

@@ -153,6 +153,28 @@ def test_report_prints_the_verdict_and_one_line_per_condition(certificate, loade
     assert any(line.startswith("holds") and "(E1)" in line for line in lines)
 
 
+def test_report_prints_conditions_that_differ_in_the_age_alone_once_and_every_broken_one():
+    from shields.verification import Condition, Report
+
+    held = [Condition(f"(I) of Sigma at age {age}", margin, True) for age, margin in enumerate((3.0, 1.0, 2.0))]
+    others = [Condition("(C0) of Sigma_0", 0.5, True), Condition("(S) c_1", 0.1, True), Condition("(S) c_2", 0.2, True)]
+    verdict, *lines = str(Report((*held, *others))).splitlines()
+    assert verdict == "valid: 6 of 6 conditions hold in exact arithmetic"
+    assert lines == [
+        "holds   +1.000e+00  (I) of Sigma at age 1 (the least of 3)",
+        "holds   +5.000e-01  (C0) of Sigma_0",
+        "holds   +1.000e-01  (S) c_1",
+        "holds   +2.000e-01  (S) c_2",
+    ]
+    broken = [replace(condition, holds=False) for condition in held[1:]]
+    assert str(Report((held[0], *broken))).splitlines() == [
+        "not valid: 2 of 3 conditions broken",
+        "holds   +3.000e+00  (I) of Sigma at age 0",
+        "BROKEN  +1.000e+00  (I) of Sigma at age 1",
+        "BROKEN  +2.000e+00  (I) of Sigma at age 2",
+    ]
+
+
 def replaced(plant, **values):
     """The plant with numbers or derived bounds replaced and nothing derived anew, as a faulty derivation leaves it."""
     assert plant.fingerprint
