@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
@@ -14,6 +15,7 @@ from agents.loop_wrappers import CostPenalty, with_gain
 from agents.results import TrainingPoint
 from agents.sb3_vec_env import SB3VecEnv
 from agents.settings import LagrangianSettings
+from ncs_gym.registration import EPISODE_STEPS
 
 # The history has about this many points where every step of all environments is a rollout.
 _MAX_POINTS = 200
@@ -51,10 +53,7 @@ class SafetyCallback(BaseCallback):
         self._interval = self.locals["total_timesteps"] // _MAX_POINTS
 
     def _on_step(self) -> bool:
-        batch = _batch_info(self.training_env)
-        if batch is None:
-            infos = self.locals["infos"]
-            batch = {key: [info[key] for info in infos] for key in _COUNTED if key in infos[0]}
+        batch = _counted(self)
         self.violation_steps += int((np.asarray(batch["cost"]) > 0.0).sum())
         self.interventions += int(np.sum(batch.get("shield_intervened", 0)))
         if "shield_correction" in batch:
@@ -90,9 +89,13 @@ class DualAscentCallback(BaseCallback):
     """Raises the penalty of violations while the agent violates: the dual ascent of PPO-Lagrangian.
 
     The agent maximizes the mean of reward - multiplier * cost, the multiplier minimizes it over the numbers >= 0. After
-    every rollout in which episodes ended, with J their mean number of violating steps and d the limit,
+    every rollout, with J the cost of an episode of full length at the rollout's mean cost per step, and d the limit,
 
         multiplier <- max(0, multiplier + learning_rate (J - d)).
+
+    Rollouts shorter than an episode (off-policy algorithms') are taken together until they are as long. J does not wait
+    for episodes to end, which those of many environments do in the same step, and an episode that a violation ends does
+    not count as a cheap one.
 
     This is Ray, Achiam and Amodei's constrained baseline ("Benchmarking Safe Exploration in Deep Reinforcement
     Learning", 2019) with a plain gradient step in place of Adam, and Stooke, Achiam and Abbeel's PID controller
@@ -108,18 +111,19 @@ class DualAscentCallback(BaseCallback):
     def __init__(self, settings: LagrangianSettings, priced: CostPenalty) -> None:
         super().__init__()
         self._settings, self._priced = settings, priced
-        self._costs: list[float] = []
+        self._episode_steps = getattr(priced.unwrapped, "max_episode_steps", None) or EPISODE_STEPS
+        self._cost, self._steps = 0.0, 0
 
     def _on_step(self) -> bool:
-        ended = np.flatnonzero(self.locals["dones"]).tolist()
-        self._costs += [float(self.locals["infos"][e]["episode_violations"]) for e in ended]
+        costs = _counted(self)["cost"]
+        self._cost, self._steps = self._cost + float(np.sum(costs)), self._steps + len(costs)
         return True
 
     def _on_rollout_end(self) -> None:
-        if self._costs:
-            excess = float(np.mean(self._costs)) - self._settings.cost_limit
+        if self._steps >= self._episode_steps:
+            excess = self._cost / self._steps * self._episode_steps - self._settings.cost_limit
             self._priced.penalty = max(0.0, self._priced.penalty + self._settings.learning_rate * excess)
-            self._costs = []
+            self._cost, self._steps = 0.0, 0
         self.logger.record("safety/multiplier", self._priced.penalty)
 
 
@@ -175,8 +179,12 @@ class EvaluationCallback(BaseCallback):
         return actions if gain is None else with_gain(gain, observations, actions)
 
 
-def _batch_info(env: VecEnv) -> dict[str, np.ndarray] | None:
-    """Returns the infos of the last step as arrays; None if the environment has one dict per environment only."""
+def _counted(callback: BaseCallback) -> dict[str, Any]:
+    """Returns what is counted of the infos of the last step, an entry for each environment."""
+    env: VecEnv = callback.training_env
     while isinstance(env, VecEnvWrapper):
         env = env.venv
-    return env.batch_info if isinstance(env, SB3VecEnv) else None
+    if isinstance(env, SB3VecEnv):
+        return env.batch_info
+    infos = callback.locals["infos"]
+    return {key: [info[key] for info in infos] for key in _COUNTED if key in infos[0]}

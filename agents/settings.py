@@ -111,8 +111,8 @@ class LagrangianSettings:
     """Settings of PPO-Lagrangian: how the price of a violating step is adapted (Ray et al. 2019).
 
     Attributes:
-        cost_limit: Largest mean cost of an episode (violating steps) that the agent is trained for.
-        learning_rate: Added to the multiplier per violating step of a mean episode above the limit.
+        cost_limit: Largest cost of an episode of full length (violating steps) that the agent is trained for.
+        learning_rate: Added to the multiplier per rollout and violating step of such an episode above the limit.
         multiplier: Price of a violating step at the start of the training.
     """
 

@@ -18,32 +18,54 @@ TINY = PPOSettings(envs=4, rollout=50, batch_size=200, epochs=1, width=8)
 GAIN = np.array([[0.4, -0.3]])
 
 
-def raised(settings, costs):
-    """The multiplier after rollouts in which episodes with these costs ended."""
-    priced = CostPenalty(CRUISE.vector(1), settings.multiplier)
+def raised(settings, rollouts, env_id=CRUISE.env):
+    """The multiplier after rollouts, each given by its number of steps in two environments and its violating steps."""
+    priced = CostPenalty(ControlLoop(env=env_id).vector(2), settings.multiplier)
     callback, multipliers = DualAscentCallback(settings, priced), []
 
     class Quiet:
         logger = type("Logger", (), {"record": lambda *entry: None})()
 
+        def get_env(self):
+            return priced  # no SB3VecEnv: infos are dictionaries
+
     callback.model = Quiet()
-    for rollout in costs:
-        for cost in rollout:
-            callback.locals = {"dones": np.array([True, False]), "infos": [{"episode_violations": cost}, {}]}
+    for steps, violating in rollouts:
+        for step in range(steps):
+            callback.locals = {"infos": [{"cost": float(step < violating)}, {"cost": 0.0}]}
             assert callback._on_step()
         callback._on_rollout_end()
         multipliers.append(priced.penalty)
     return multipliers
 
 
-def test_multiplier_climbs_by_the_mean_cost_of_the_episodes_that_ended():
+def test_multiplier_climbs_by_the_cost_of_a_full_episode_at_the_rate_of_the_rollout():
     settings = LagrangianSettings(learning_rate=0.1)
-    assert raised(settings, [[4.0, 2.0], [], [10.0], [0.0]]) == pytest.approx([0.3, 0.3, 1.3, 1.3])
+    # 200 steps in an episode: 3 of 200, 0 of 100 (too few), 5 of 200 together, 0 of 400 steps violate.
+    rollouts = [(100, 3), (50, 0), (50, 5), (200, 0)]
+    assert raised(settings, rollouts) == pytest.approx([0.3, 0.3, 0.8, 0.8])
+
+
+def test_episodes_that_a_violation_ends_are_not_cheap():
+    settings = LagrangianSettings(learning_rate=0.1)
+    assert raised(settings, [(200, 4)], "ncs_gym/BatchReactor-v0") == pytest.approx([0.1 * 4 * 200 / 400])
 
 
 def test_multiplier_falls_below_the_limit_but_not_below_zero():
     settings = LagrangianSettings(learning_rate=0.5, cost_limit=3.0, multiplier=2.0)
-    assert raised(settings, [[5.0], [1.0], [0.0], [0.0]]) == pytest.approx([3.0, 2.0, 0.5, 0.0])
+    assert raised(settings, [(100, 5), (100, 1), (100, 0), (100, 0)]) == pytest.approx([3.0, 2.0, 0.5, 0.0])
+
+
+def test_multiplier_moves_at_every_rollout_although_all_episodes_end_in_the_same_step(monkeypatch):
+    prices = []
+    original = DualAscentCallback._on_rollout_end
+    monkeypatch.setattr(
+        DualAscentCallback, "_on_rollout_end", lambda self: (original(self), prices.append(self._priced.penalty))
+    )
+    loop = ControlLoop(env=CRUISE.env, lagrangian=LagrangianSettings())
+    train(loop, 32 * 20 * 6, 0, settings=replace(TINY, envs=32, rollout=20, batch_size=640))
+    assert len(prices) == 6  # 120 of an episode's 200 steps
+    assert len(set(prices)) > 3
 
 
 @pytest.mark.parametrize("name", ["cost_limit", "learning_rate", "multiplier"])
@@ -66,10 +88,9 @@ def test_training_raises_the_price_of_what_the_agent_violates(monkeypatch):
     loop = ControlLoop(env=CRUISE.env, lagrangian=LagrangianSettings(learning_rate=0.5))
     result = train(loop, 1600, 0, settings=TINY)
     assert result.violation_steps > 0
-    assert prices[:3] == [0.0, 0.0, 0.0]  # no episode has ended
-    at_200 = next(point.violation_steps for point in result.history if point.steps == 800)
-    assert prices[3] == pytest.approx(0.5 * at_200 / 4)
-    assert prices[-1] == pytest.approx(0.5 * result.violation_steps / 4)
+    # Rollouts are as long as an episode, 200 steps in all.
+    violating = np.array([point.violation_steps for point in result.history])
+    np.testing.assert_allclose(prices, 0.5 * violating, rtol=1e-12)
     plain = train(CRUISE, 1600, 0, settings=TINY)
     observations = np.random.default_rng(0).standard_normal((20, 3))
     assert (plain.agent.act(observations) != result.agent.act(observations)).any()
