@@ -94,7 +94,8 @@ class Agent:
             observations: As the environment returns them; a single one, shape (entries,), gives one action, shape (m,).
 
         Raises:
-            ValueError: If observations have another number of entries than those the agent was trained with.
+            ValueError: If observations have another number of entries than those the agent was trained with, or are
+                not finite.
         """
         shape, entries = np.shape(observations), self.normalization.mean.size
         if shape[-1:] != (entries,) or len(shape) > 2:
@@ -103,6 +104,8 @@ class Agent:
                 f"they must have shape ({entries},) or (N, {entries}), got {shape}"
             )
         batch = np.reshape(observations, (-1, entries))
+        if not np.isfinite(batch).all():
+            raise ValueError("observations must be finite numbers, got NaN or infinity")
         actions = self.model.predict(self.normalization(batch), deterministic=True)[0]
         if self.residual_gain is not None:
             actions = with_gain(self.residual_gain, batch, actions)

@@ -75,7 +75,11 @@ class SB3VecEnv(VecEnv):
         super().__init__(vector_env.num_envs, vector_env.single_observation_space, vector_env.single_action_space)
 
     def reset(self) -> np.ndarray:
-        """Starts all episodes, with the seeds and options given by `seed` and `set_options`."""
+        """Starts all episodes, with the seeds and options given by `seed` and `set_options`.
+
+        Raises:
+            ValueError: If options differ between environments, or `info_keys` names what no info has.
+        """
         options = self._options[0]
         if not all(_same(option, options) for option in self._options):
             raise ValueError("a vector environment takes the same options for all environments")
@@ -83,12 +87,24 @@ class SB3VecEnv(VecEnv):
         if seeds is not None and not isinstance(self.vector_env.unwrapped, _WITH_RESET_MASK[1:]):
             seeds = seeds[0]
         observation, info = self.vector_env.reset(seed=seeds, options=options or None)
+        self._require_known_keys(info)
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{key: value[e] for key, value in _dense(info).items()} for e in range(self.num_envs)]
         self._returns, self._lengths = np.zeros(self.num_envs), np.zeros(self.num_envs, np.int64)
         self._resetting = np.zeros(self.num_envs, np.bool_)
         return observation
+
+    def _require_known_keys(self, info: dict[str, Any]) -> None:
+        """Returns if all of `info_keys` occur; of other environments than ours a reset does not say.
+
+        Raises:
+            ValueError: If one does not.
+        """
+        unknown = sorted(set(self._info_keys) - set(_STEP_KEYS) - set(info))
+        if unknown and isinstance(self.vector_env.unwrapped, NCSVectorEnv):
+            known = ", ".join(sorted(key for key in info if not key.startswith("_")))
+            raise ValueError(f"info_keys names {', '.join(map(repr, unknown))}, which no info has; known are {known}")
 
     def step_async(self, actions: np.ndarray) -> None:
         """Stores the actions for `step_wait`."""

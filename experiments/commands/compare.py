@@ -160,6 +160,11 @@ def _findings(summary: dict[str, Any]) -> list[str]:
         if not arm["shielded"]:
             continue
         upper = 100.0 * arm["eval_violation_rate_ci95"][1]
+        if not arm["train_intervention_rate"] and not arm["intervention_rate"]:
+            findings.append(
+                f"{name}: nothing was overridden, so that this arm shows nothing of the shield: train longer."
+            )
+            continue
         limit = "may be left in this mode, the box may not" if arm["mode"] == "lookahead" else "ends at 1"
         proof = "no broken assumption was seen" if "gaussian_noise" in summary else "the proof held"
         findings += [
@@ -174,7 +179,8 @@ def _findings(summary: dict[str, Any]) -> list[str]:
         decimals = decimals_of(mean, *(interval or ()))
         text = f" [{interval[0]:+z.{decimals}f}, {interval[1]:+z.{decimals}f}]" if interval else ""
         findings.append(f"{name}, paired with {paired['baseline']}: return {mean:+z.{decimals}f}{text}.")
-    if (covered := covered_fraction(summary)) is not None:
+    acted = any(arm["shielded"] and arm["train_intervention_rate"] for arm in summary["arms"].values())
+    if acted and (covered := covered_fraction(summary)) is not None:
         findings.append(
             f"The shielded return covers {100 * covered:.0f} % of the way from the zero input to the unshielded agent."
         )

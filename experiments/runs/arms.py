@@ -66,7 +66,8 @@ class Arm:
         found = _controller(kind, mode) if kind == spaced else None
         found = found or _trained(kind, mode)
         if found is None:
-            raise ValueError(f"unknown arm {name!r}; known are {_KNOWN_ARMS}")
+            hint = " (several are separated by spaces)" if "," in name else ""
+            raise ValueError(f"unknown arm {name!r}{hint}; known are {_KNOWN_ARMS}")
         return replace(found, name=spaced, is_residual=kind != spaced)
 
     @property

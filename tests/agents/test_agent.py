@@ -68,6 +68,12 @@ def test_observations_of_another_environment_are_refused(agent, shape):
         agent.act(np.zeros(shape))
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_observations_that_are_not_finite_are_refused(agent, value):
+    with pytest.raises(ValueError, match="observations must be finite numbers"):
+        agent.act([value, 0.0, 0.0])
+
+
 def test_shared_folder_has_the_agent_its_shield_and_a_card(agent, certificate, tmp_path):
     shield = ShieldSettings(certificate, "switch")
     loop = ControlLoop(env=CRUISE, shield=shield)

@@ -143,6 +143,12 @@ def test_infos_hold_what_is_asked_for():
     assert {"estimate", "shield_reason"} <= set(env.batch_info)
 
 
+def test_infos_that_no_step_has_are_refused():
+    env = SB3VecEnv(VectorSafetyShield(gym.make_vec(CRUISE, num_envs=3)), info_keys=("intervened", "cost"))
+    with pytest.raises(ValueError, match=r"names 'intervened', which no info has; known are .*shield_intervened"):
+        env.reset()
+
+
 def test_last_infos_of_sync_environments_are_complete_when_all_end_at_once():
     class Extra(gym.Wrapper):
         def step(self, action):

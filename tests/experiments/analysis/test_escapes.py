@@ -72,7 +72,8 @@ def test_comparison_under_gaussian_noise_plays_it_and_states_the_bound(setup):
 
 def test_proof_is_not_said_to_have_held_under_gaussian_noise():
     arm = {"shielded": True, "eval_violation_rate_ci95": [0.0, 0.1], "guaranteed_episodes": 3, "eval_episodes": 4}
-    arm |= {"mode": "project", "largest_level": 1.2, "eval_violating_episodes": 0}
+    arm |= {"mode": "project", "largest_level": 1.2, "eval_violating_episodes": 0, "intervention_rate": 0.1}
+    arm["train_intervention_rate"] = 0.1
     summary = {"arms": {"shielded": arm}, "references": {}, "paired_differences": {"baseline": "", "arms": {}}}
     assert "the proof held in 3 of 4" in _findings(summary)[0]
     assert "no broken assumption was seen in 3 of 4" in _findings(summary | {"gaussian_noise": {}})[0]

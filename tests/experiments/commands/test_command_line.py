@@ -492,6 +492,7 @@ def test_usage_errors_are_the_parsers(arguments, words):
         (["compare", "--config", "nowhere.json"], ["cannot read settings nowhere.json"]),
         (["compare", "--channel.loss", "1.5"], ["loss"]),
         (["train", "--arm", "hope"], ["unknown arm 'hope'"]),
+        (["compare", "--arms", "unshielded,shielded"], ["'unshielded,shielded' (several are separated by spaces)"]),
         (["evaluate", "nowhere"], ["no agent in nowhere"]),
         (["sweep", "--losses", "0.1", "0.1"], ["--losses must be different"]),
         (["sweep", "--downlink-losses", "0.1"], ["has an ideal downlink, which loses nothing"]),

@@ -8,7 +8,7 @@ from agents.results import Episode
 from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
 from experiments.analysis.arm_table import _rows
 from experiments.analysis.summary import covered_fraction, paired_differences, summarize_arm
-from experiments.commands.compare import _training_runs
+from experiments.commands.compare import _findings, _training_runs
 from experiments.runs.arms import Arm, by_arm
 from experiments.runs.experiment_setup import ExperimentSetup
 from experiments.runs.run_store import prepare_output
@@ -173,6 +173,22 @@ def test_an_agent_that_earns_no_more_than_the_zero_input_leaves_nothing_to_cover
 def test_returns_of_episodes_that_end_early_are_no_covered_fraction():
     assert covered(-20.0, shielded_steps=150) is None
     assert covered_fraction({"arms": {}, "references": {}}) is None
+
+
+@pytest.mark.parametrize(("trained", "evaluated"), [(0.0, 0.0), (0.0, 0.1), (0.1, 0.0)])
+def test_a_shield_that_overrode_nothing_is_not_said_to_have_shown_anything(trained, evaluated):
+    shares = {"train_intervention_rate": trained, "intervention_rate": evaluated}
+    counts = {"eval_violation_rate_ci95": [0.0, 0.1], "guaranteed_episodes": 4, "eval_episodes": 4}
+    arm = {"shielded": True, "mode": "project", "largest_level": 0.5, "eval_violating_episodes": 0, **counts, **shares}
+    arm |= {"eval_steps": 200, "eval_return_mean": -5.0}
+    others = {name: arm | {"shielded": False, "train_violation_steps": 0} for name in ("unshielded", "zero input")}
+    others["zero input"]["eval_return_mean"] = -60.0
+    summary = {"arms": {"unshielded": others["unshielded"], "shielded": arm}, "references": others}
+    findings = _findings(summary | {"paired_differences": {"baseline": "unshielded", "arms": {}}})
+    nothing = [line for line in findings if "shielded: nothing was overridden" in line]
+    assert len(nothing) == (trained == evaluated == 0.0)
+    assert any("episodes violating" in line for line in findings) == (not nothing)
+    assert any("covers" in line for line in findings) == (trained > 0.0)
 
 
 def test_interquartile_mean_leaves_the_extreme_runs_out():
