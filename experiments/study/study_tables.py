@@ -27,7 +27,9 @@ LEVEL = 0.05
 
 
 def evaluation_table(env: dict[str, Any]) -> str:
-    """Returns violating episodes [%] under every condition, episodes that left S, overridden steps and the return.
+    """Returns the steps that violated in training [%], and what the evaluation counted.
+
+    That is violating episodes [%] under every condition, episodes that left S, overridden steps and the return.
 
     Args:
         env: An environment of `page_summary`.
@@ -35,12 +37,13 @@ def evaluation_table(env: dict[str, Any]) -> str:
     conditions = list(next(iter(env["arms"].values()))["conditions"])
     narrow = [_CONDITIONS.get(name, (name, "")) for name in conditions]
     head = [
-        ["", "violating episodes [%]", *(first for first, _ in narrow), "left S", "over-", "return"],
-        ["", "as trained [95 % CI]", *(second for _, second in narrow), "[%]", "ridden", "[95 % CI]"],
+        ["", "train", "violating [%]", *(first for first, _ in narrow), "left S", "over-", "return"],
+        ["", "[%]", "[95 % CI]", *(second for _, second in narrow), "[%]", "ridden", "[95 % CI]"],
     ]
     rows = [
         [
             name,
+            f"{100 * arm['train_violation_steps'] / arm['train_steps']:.2f}" if arm["train_steps"] else "-",
             _violating(arm),
             *(f"{100 * arm['conditions'][each]['eval_violation_rate']:.1f}" for each in conditions),
             f"{100 * arm['eval_episodes_outside_set'] / arm['eval_episodes']:.1f}",
