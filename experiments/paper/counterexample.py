@@ -25,12 +25,14 @@ from shields.verification.rational_matrix import (
 
 # Factor that pulls the points found into their sets by more than rounding.
 _INSIDE = 1.0 - 1e-9
+# Digits that a step is shown with, if it leaves the set with these alone.
+_DECIMALS = 4
 _STARTS, _ASCENT_STEPS = 200, 200
 
 
 @dataclass(frozen=True, eq=False)
 class OneStep:
-    """The worst step of the closed loop that was found.
+    """The worst step of the closed loop that was found; in few digits if it leaves the set with these, too.
 
     Attributes:
         state: x, shape (n,).
@@ -77,9 +79,16 @@ def worst_step(
         return float(end @ M @ end), x, d, e
 
     level, x, d, e = max((ascended() for _ in range(starts)), key=itemgetter(0))
-    x, d, e = (np.asarray(_INSIDE * point) for point in (x, d, e))
-    is_allowed = disturbances.contains(d) and errors.contains(e)
-    return OneStep(x, d, e, closed @ x + d + e, level, is_allowed and _leaves(closed, M, x, d, e))
+    inside = tuple(np.asarray(_INSIDE * point) for point in (x, d, e))
+    nearest = tuple(np.round(point, _DECIMALS) for point in inside)
+    inward = tuple(np.trunc(point * 10**_DECIMALS) / 10**_DECIMALS for point in inside)
+
+    def is_confirmed(points: tuple[np.ndarray, ...]) -> bool:
+        x, d, e = points
+        return disturbances.contains(d) and errors.contains(e) and _leaves(closed, M, x, d, e)
+
+    x, d, e = next(filter(is_confirmed, (nearest, (inward[0], *nearest[1:]), inward)), inside)
+    return OneStep(x, d, e, closed @ x + d + e, level, is_confirmed((x, d, e)))
 
 
 def stays_inside(closed: np.ndarray, M: np.ndarray, disturbances: Ball, errors: Ball | Segment) -> bool:

@@ -97,8 +97,8 @@ def _diagnosis(plant: LinearPlant) -> Infeasible:
     gamma, noise, scale = largest_gamma(scan, plant), largest_noise_scale(scan, plant), largest_scale(scan, plant)
     return Infeasible(
         f"OP is infeasible, (C2) binds: over the whole domain the largest lambda_min(L)/alpha is {best.ratio:.3g} (at "
-        f"kappa = {best.kappa:.3f}, rho = {best.rho:.3f}) and must be at least 1; it is feasible for "
-        f"{_tolerated(gamma, noise)}, or with gamma, Q and P0 all scaled by {scale:.3g}",
+        f"kappa = {best.kappa:.3f}, rho = {best.rho:.3f}) and must be at least 1; it is feasible with "
+        f"gamma, Q and P0 all scaled by {scale:.3g}. {_tolerated(gamma, noise)}",
         "C2",
         1.0 - best.ratio,
         {
@@ -113,7 +113,7 @@ def _diagnosis(plant: LinearPlant) -> Infeasible:
 
 
 def _tolerated(gamma: float, noise: float) -> str:
-    """Returns which gamma, and which scale of Q, are each feasible alone."""
-    by_gamma = f"gamma up to {gamma:.3g}" if gamma > 0.0 else "no gamma"
-    by_noise = f"Q scaled by up to {noise:.3g}" if noise > 0.0 else "no scale of Q"
-    return f"{by_gamma} alone, {by_noise} alone"
+    """Returns in sentences which gamma, and which scale of Q, make OP feasible while everything else stays."""
+    by_gamma = f"enough to lower gamma to {gamma:.3g}" if gamma > 0.0 else "not enough to lower gamma, even to 0"
+    by_noise = f"enough to scale Q by {noise:.3g}" if noise > 0.0 else "not enough to lower Q, even to 0"
+    return f"With Q unchanged it is {by_gamma}; with gamma unchanged it is {by_noise}"

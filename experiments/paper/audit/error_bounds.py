@@ -25,8 +25,8 @@ def error_claims(example: PaperExample) -> Iterator[Claim]:
         f"epsilon = {example.epsilon}",
         f"with g_bar^2 = kappa rho >= {example.kappa} the theorems give epsilon >= {least.epsilon:.3f}",
         Verdict.of(not fails),
-        f"with the actual |BK| = {norm:.3f} in place of Theorem 3's bound on it: {tight[0]:.4f} to {tight[1]:.4f}, so "
-        "the printed epsilon is a valid bound once K is known",
+        f"with the actual |BK| = {norm:.3f} in place of Theorem 3's bound on it: {tight[0]:.4f} for g_bar^2 = kappa, "
+        f"{tight[1]:.4f} for kappa cond(L), so the printed epsilon is a valid bound once K is known",
         Defect.EPSILON if fails else "",
     )
     needed = example.largest_error / norm**2

@@ -38,8 +38,8 @@ def invariance_claims(example: PaperExample) -> Iterator[Claim]:
 
 
 def text_of(step: OneStep) -> str:
-    """Returns the step in words; an error of zero is left out."""
-    x, d, e, end = (np.round(v, 4).tolist() for v in (step.state, step.disturbance, step.error, step.following))
+    """Returns the step in words; an error of zero is left out. All but the end is shown as it was confirmed."""
+    x, d, e, end = (v.tolist() for v in (step.state, step.disturbance, step.error, np.round(step.following, 4)))
     start = f"x = {x}, d = {d}" + (f", e = {e}" if np.any(step.error) else "")
     confirmed = "confirmed in exact arithmetic" if step.confirmed else "not confirmed exactly"
     return f"for example {start} go to x+ = {end} ({confirmed})"

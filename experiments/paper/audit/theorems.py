@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -103,7 +104,7 @@ def margin_claim(example: PaperExample) -> Claim:
     """Returns the row about alpha at kappa = 1."""
     gamma = example.plant.gamma
     at_one = safety_margin(gamma, example.epsilon, 1.0)
-    factor = least_contracting_gain(example)
+    factor = _shown_upwards(least_contracting_gain(example))
     closed = example.A + factor * example.B @ example.K
     step = worst_step(closed, example.M, Box(example.disturbance_half_widths), Ball(0.0))
     fails = at_one == 0.0 and contracts(closed, example.M) and step.confirmed
@@ -111,7 +112,7 @@ def margin_claim(example: PaperExample) -> Claim:
         "Definition 4: no margin is needed at kappa = 1",
         "alpha = 0 if kappa = 1; the proof (its case 2): (Cond.B) then holds only if gamma = epsilon = 0",
         f"alpha = {safety_margin(gamma, example.epsilon, _ALMOST_ONE):.2g} at kappa = {_ALMOST_ONE}, {at_one:g} at "
-        f"kappa = 1. With {factor:.4f} K in place of K, (C1) holds at kappa = 1, and with e = 0 and d in the box of "
+        f"kappa = 1. With {factor:g} K in place of K, (C1) holds at kappa = 1, and with e = 0 and d in the box of "
         f"Section 5 the worst x+'M x+ = {step.level:.4f}; {text_of(step)}",
         Verdict.FAILS if fails else Verdict.UNDECIDED,
         "right if gamma = epsilon = 0; at kappa = 1 epsilon itself is infinite (Theorem 2 divides by 1 - kappa rho)",
@@ -127,6 +128,11 @@ def least_contracting_gain(example: PaperExample) -> float:
         is_enough = contracts(example.A + middle * example.B @ example.K, example.M)
         low, high = (low, middle) if is_enough else (middle, high)
     return high
+
+
+def _shown_upwards(factor: float) -> float:
+    """Returns a factor rounded up to four decimals, so that the row is about the number that it shows."""
+    return math.ceil(1e4 * factor) / 1e4
 
 
 def contracts(closed: np.ndarray, M: np.ndarray) -> bool:

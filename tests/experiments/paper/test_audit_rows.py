@@ -16,6 +16,7 @@ from experiments.paper.paper_example import PaperExample
 from ncs_gym import BoxDisturbance, truck_trailer
 from shields.paper.bounds import PaperModel
 from shields.paper.optimization_problem import solve_op
+from shields.verification.rational_matrix import add, multiply, quadratic, rational, to_float, transpose
 
 CASE = PaperExample()
 
@@ -91,6 +92,17 @@ def test_reduced_gain_contracts_exactly_and_no_smaller_one_does():
     image = CASE.A + factor * CASE.B @ CASE.K
     levels = np.linalg.eigvals(np.linalg.solve(CASE.M, image.T @ CASE.M @ image)).real
     assert levels.max() == pytest.approx(1.0, abs=1e-9)
+
+
+def test_gain_and_step_that_the_row_about_the_margin_shows_are_those_it_confirms():
+    text = margin_claim(CASE).computed
+    factor = float(text.split("With ")[1].split(" K")[0])
+    closed = CASE.A + factor * CASE.B @ CASE.K
+    assert contracts(closed, CASE.M)
+    x, d = (np.array([float(v) for v in text.split(f"{name} = [")[1].split("]")[0].split(",")]) for name in "xd")
+    (x, d), exact_M = (rational(x), rational(d)), rational(CASE.M)
+    assert (np.abs(to_float(d)) <= CASE.disturbance_half_widths).all()
+    assert quadratic(x, exact_M) <= 1 < quadratic(add(multiply(x, transpose(rational(closed))), d), exact_M)
 
 
 def test_margin_at_one_is_right_without_disturbance():
