@@ -30,7 +30,6 @@ QUICK_PAGES = (
     "docs/constrained_rl.md",
     "docs/vector.md",
     "docs/paper.md",
-    "docs/shield_proof.md",
 )
 # Their programs run in a process of their own; some train an agent, or synthesize certificates that take seconds.
 SLOW_PAGES = (

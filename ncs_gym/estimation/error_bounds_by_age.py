@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ncs_gym.network.contract import ChannelContract
-from ncs_gym.plants.linear_plant import INFLATION, LinearPlant
+from ncs_gym.plants.linear_plant import INFLATION, SIMULATED_REACH, LinearPlant
 from ncs_gym.plants.lqr import regulator_gain
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, is_inside, joined, outer_sum
 from ncs_gym.validation import ReadOnlyArrays
@@ -64,7 +64,7 @@ class ErrorSetsByAge(ReadOnlyArrays):
     def needs(self, plant: LinearPlant) -> dict[str, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
         """Returns, per condition, triples (outer, inner, size): each outer must hold the inner one, computed to `size`.
 
-        In (C2) the inner one includes the rounding of the updated estimate, as `SetMembership.updated` does.
+        In (C2) the inner one includes the rounding of the estimate that is updated with T_j.
         """
         D, identity = plant.disturbance.shape, np.eye(plant.n)
         first = congruence_sum((identity, plant.initial_error.shape, 1.0))
@@ -77,7 +77,7 @@ class ErrorSetsByAge(ReadOnlyArrays):
             congruence_sum(
                 (kept[j], self.shapes[j + 1], INFLATION / self.multipliers[j]),
                 (self.gains[j], self.noise, INFLATION / (1.0 - self.multipliers[j])),
-                (identity, plant.estimate_rounding, 1.0),
+                (identity, self._rounding_of_update(plant, j), 1.0),
             )
             for j in range(len(self.gains))
         ]
@@ -86,6 +86,19 @@ class ErrorSetsByAge(ReadOnlyArrays):
             "(C1)": [(self.shapes[j + 1], *inner) for j, inner in enumerate(grown)],
             "(C2)": [(self.shapes[0], *inner) for inner in updated],
         }
+
+    def _rounding_of_update(self, plant: LinearPlant, j: int) -> np.ndarray:
+        """Returns F for an update with T_{j+1}, shape (n, n): at least the plant's `estimate_rounding`.
+
+        With x_hat up to SIMULATED_REACH half-widths out, and a residual that an error in E(Sigma_{j+1}) and noise in
+        E(N) leave, x_hat + T (y - H x_hat) is rounded by at most half of r (docs/shield_proof.md, "What the room
+        covers").
+        """
+        gain, H, reach = np.abs(self.gains[j]), np.abs(plant.H), SIMULATED_REACH * plant.half_widths
+        residual = H @ np.sqrt(self.shapes[j + 1].diagonal()) + np.sqrt(self.noise.diagonal())
+        r = np.finfo(float).eps * (plant.n * gain @ (H @ reach) + (plant.p + 1) * gain @ residual + reach)
+        room = 2.0 * plant.n / (INFLATION - 1.0) * r**2
+        return np.diag(np.maximum(room, plant.estimate_rounding.diagonal()))
 
 
 def congruence_sum(*terms: tuple[np.ndarray, np.ndarray, float]) -> tuple[np.ndarray, np.ndarray]:

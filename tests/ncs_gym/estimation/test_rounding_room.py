@@ -5,7 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, ChannelContract, ErrorSet, LinearPlant, certified_error_set
+from ncs_gym import Channel, ChannelContract, Ellipsoid, ErrorSet, LinearPlant, certified_error_set
 from ncs_gym.estimation.error_bounds_by_age import ErrorSetsByAge
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.plants.linear_plant import INFLATION, SIMULATED_REACH
@@ -101,3 +101,61 @@ def test_sets_that_are_found_have_the_room():
         outer, inner, _ = zip(*error_set.ages.needs(plant)["(C2)"], strict=True)
         for held, needed in zip(outer, inner, strict=True):
             assert is_inside(needed, held)
+
+
+def sets_of_two_sensors_whose_noise_is_nearly_common():
+    """A plant and sets for age 0 that meet (C2) with the plant's room; the gain is some hundred times a difference."""
+    matched, rate, radius = np.array([[0.9], [0.9027]]), 1.02, 9.063308727606456e-05
+    common, own = 1e-4, 3e-7  # radii of the sensors' noise
+
+    def plant_of(initial):
+        noise = Ellipsoid(common**2 * np.ones((2, 2)) + own**2 * np.eye(2))
+        settings = {"box": [1.0], "u_max": 1.0, "dt": 0.1, "disturbance_bound": 0.0}
+        return LinearPlant(A=[[rate]], B=[[1.0]], H=matched, sensor_bound=noise, initial_bound=initial, **settings)
+
+    plain = plant_of(0.0)
+    push, room = plain.disturbance.shape[0, 0] ** 0.5, plain.estimate_rounding[0, 0]
+    plant = plant_of(((radius**2 * (1.0 - 1e-8) - room) / INFLATION) ** 0.5)
+    older, noise = (1.0 + 1e-9) * (rate * radius + push) ** 2, plant.sensor_error_with(0.0).shape
+    found = []
+    for mu in np.linspace(0.001, 0.999, 999):
+        spread = older * matched / mu
+        gain = np.linalg.solve(spread @ matched.T + noise / (1.0 - mu), spread).T
+        kept, noisy = abs(1.0 - (gain @ matched).item()) * older**0.5, (gain @ noise @ gain.T).item() ** 0.5
+        found.append((kept + noisy, kept / (kept + noisy), gain))
+    _, mu, gain = min(found, key=lambda each: each[0])
+    sets = ErrorSetsByAge(
+        contract=ChannelContract(0),
+        shapes=np.array([[[radius**2]], [[older]]]),
+        rates=np.array([rate * radius / (rate * radius + push)]),
+        gains=np.array([gain]),
+        multipliers=np.array([mu]),
+        noise=noise,
+    )
+    return plant, ErrorSet(Sigma=sets.shapes[0], rate=float(sets.rates[0]), ages=sets)
+
+
+def test_room_grows_with_the_gain_and_sets_without_it_are_refused():
+    plant, error_set = sets_of_two_sensors_whose_noise_is_nearly_common()
+    sets = error_set.ages
+    gain, mu = sets.gains[0], sets.multipliers[0]
+    assert np.abs(gain).min() > 100.0
+    kept = (1.0 - (gain @ plant.H).item()) ** 2 * sets.shapes[1] / mu
+    updated = INFLATION * (kept + gain @ sets.noise @ gain.T / (1.0 - mu))
+    assert is_inside(updated + plant.estimate_rounding, sets.shapes[0])  # with the room of small gains (C2) holds
+    # In exact arithmetic: float64 moves an update of an estimate far out by more than that room is for.
+    rng, moved = np.random.default_rng(0), 0.0
+    for _ in range(300):
+        estimate = np.array([SIMULATED_REACH * rng.uniform(0.6, 0.97)])
+        sample = plant.H @ estimate + 1e-4 * rng.uniform(0.9, 1.1, 2)
+        computed = estimate + gain @ (sample - plant.H @ estimate)
+        start, end = (Fraction(float(value[0])) for value in (estimate, computed))
+        numbers = zip(gain[0].tolist(), sample.tolist(), plant.H[:, 0].tolist(), strict=True)
+        terms = [Fraction(t) * (Fraction(y) - Fraction(h) * start) for t, y, h in numbers]
+        moved = max(moved, abs(float(end - start - sum(terms))))
+    assert moved > 4.0 * np.finfo(float).eps * SIMULATED_REACH
+    with pytest.raises(ValueError, match=r"\(C2\)"):
+        Estimator(plant, Channel(), error_set)
+    ((_, inner, _),) = sets.needs(plant)["(C2)"]
+    room = (inner - updated).item()
+    assert moved < (room * (INFLATION - 1.0) / 2.0) ** 0.5
