@@ -49,6 +49,7 @@ types: $(INSTALLED)
 benchmark: $(INSTALLED) $(RAY_INSTALLED)
 	$(BIN)/python benchmarks/import_time.py
 	$(BIN)/python benchmarks/shield_decision.py
+	$(BIN)/python benchmarks/shield_cost.py
 	$(BIN)/python benchmarks/containment.py
 	$(BIN)/python benchmarks/kalman_gain.py
 	$(BIN)/python benchmarks/synthesis.py

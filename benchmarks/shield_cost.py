@@ -1,0 +1,63 @@
+"""What the shield costs in time: steps per second without it, behind the one-step test and behind lookahead.
+
+python benchmarks/shield_cost.py [--seconds 1]
+
+Actions are random; each row is measured once for one environment and once for 64 side by side, one after the other on
+one core.
+"""
+
+import argparse
+import time
+
+import gymnasium as gym
+import numpy as np
+
+import ncs_gym
+from shields import SafetyShield, VectorSafetyShield
+
+assert ncs_gym  # registers the ids
+NAMES = ("TruckTrailerCruise-v0", "CartPole-v0", "BatchReactor-v0")
+MODES = (None, "project", "lookahead")
+COUNT = 64
+
+
+def steps_per_second(env: gym.Env | gym.vector.VectorEnv, count: int, seconds: float) -> float:
+    """Returns how many steps an environment, or `count` together, takes in a second of random actions."""
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(100)]
+    env.reset(seed=0)
+    steps, start = 0, None
+    while start is None or time.perf_counter() - start < seconds:
+        for action in actions:
+            _, _, terminated, truncated, _ = env.step(action)
+            if count == 1 and (terminated or truncated):
+                env.reset()
+        if start is None:  # the first actions are for what is computed once
+            start = time.perf_counter()
+        else:
+            steps += len(actions) * count
+    return steps / (time.perf_counter() - start)
+
+
+def row(name: str, mode: str | None, seconds: float) -> list[float]:
+    """Returns the steps per second of one environment and of `COUNT`, behind a mode of the shield or, for None, none."""
+    single, many = gym.make(f"ncs_gym/{name}"), gym.make_vec(f"ncs_gym/{name}", num_envs=COUNT)
+    if mode is not None:
+        single, many = SafetyShield(single, mode=mode), VectorSafetyShield(many, mode=mode)
+    return [steps_per_second(single, 1, seconds), steps_per_second(many, COUNT, seconds)]
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=1.0, help="length of a measurement [s]")
+    seconds = parser.parse_args().seconds
+    print(f"{'steps per second':24}{'no shield':>12}{'project':>12}{'lookahead':>12}")
+    for name in NAMES:
+        rates = np.array([row(name, mode, seconds) for mode in MODES])
+        for number, label in enumerate((name, f"  {COUNT} side by side")):
+            print(f"{label:24}" + "".join(f"{rate:12,.0f}" for rate in rates[:, number]), flush=True)
+
+
+if __name__ == "__main__":
+    main()
