@@ -40,7 +40,7 @@ def steps_per_second(env: gym.Env | gym.vector.VectorEnv, count: int, seconds: f
 
 
 def row(name: str, mode: str | None, seconds: float) -> list[float]:
-    """Returns the steps per second of one environment and of `COUNT`, behind a mode of the shield or, for None, none."""
+    """Returns the steps per second of one environment and of `COUNT`, behind a mode of the shield; none if None."""
     single, many = gym.make(f"ncs_gym/{name}"), gym.make_vec(f"ncs_gym/{name}", num_envs=COUNT)
     if mode is not None:
         single, many = SafetyShield(single, mode=mode), VectorSafetyShield(many, mode=mode)
