@@ -244,7 +244,6 @@ def test_command_is_declared_and_runs_as_a_module():
     assert "compare" in run.stdout
 
 
-@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
 def test_virtual_environment_is_ignored_as_a_folder_and_as_a_link(tmp_path):
     shutil.copy(ROOT / ".gitignore", tmp_path)
     (tmp_path / ".venv").symlink_to(ROOT)
