@@ -19,7 +19,7 @@ import numpy as np
 
 from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below
 from ncs_gym import ChannelContract, LinearPlant, batch_reactor, cart_pole
-from ncs_gym.uncertainty.truncated_gaussian import chi2_quantile
+from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
 from shields import Infeasible, synthesize
 from shields.synthesis.design_problem import design_problem
 from shields.synthesis.initial_designs import initial_design
@@ -43,9 +43,9 @@ def with_radius(plant: LinearPlant, radius: float) -> LinearPlant:
     outputs = np.abs(plant.H) @ half_widths
     return replace(
         plant,
-        process_noise_cov=np.diag((radius * half_widths) ** 2) / chi2_quantile(0.95, n),
-        measurement_noise_cov=np.diag((0.01 * radius * outputs) ** 2) / chi2_quantile(0.95, plant.p),
-        initial_cov=(0.01 * radius * half_widths.min()) ** 2 / chi2_quantile(0.95, n) * np.eye(n),
+        process_noise_cov=np.diag((radius * half_widths) ** 2) / truncation_energy(0.05, n),
+        measurement_noise_cov=np.diag((0.01 * radius * outputs) ** 2) / truncation_energy(0.05, plant.p),
+        initial_cov=(0.01 * radius * half_widths.min()) ** 2 / truncation_energy(0.05, n) * np.eye(n),
     )
 
 

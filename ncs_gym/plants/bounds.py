@@ -1,4 +1,7 @@
-"""The hard bounds on everything uncertain about a plant, derived from what is declared of it."""
+"""The hard bounds on everything uncertain about a plant, derived from what is declared of it.
+
+Proofs take them, so they are the same numbers on every machine (`ncs_gym.exact`).
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,12 @@ from functools import cached_property
 
 import numpy as np
 
+from ncs_gym import exact
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.remainder import Remainder, as_remainder
 from ncs_gym.uncertainty.shape_matrices import outer_sum
-from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_KEPT, TruncatedGaussian, chi2_quantile
+from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_KEPT, TruncatedGaussian, truncation_energy
 from ncs_gym.validation import ReadOnlyArrays, as_covariance, as_number, read_only
 
 # Relative growth of every hard bound, so that rounding in sampling and quantizing stays inside (theory.md section 1).
@@ -91,8 +95,14 @@ class HardBounds(ReadOnlyArrays):
     @cached_property
     def weight(self) -> np.ndarray:
         """Positive definite W, shape (n, n), that measures ellipsoids in units of the safe box: C'C, regularized."""
-        gram = self.C.T @ self.C
-        return read_only(gram + 1e-6 * np.diag(np.diag(gram) + np.trace(gram) / self.n * (np.diag(gram) == 0.0)))
+        gram = exact.product(self.C.T, self.C)
+        squares = np.diag(gram)
+        return read_only(gram + 1e-6 * np.diag(squares + exact.total(squares) / self.n * (squares == 0.0)))
+
+    @cached_property
+    def _box_shape(self) -> np.ndarray:
+        """The inverse of `weight`, shape (n, n): that of the ellipsoid {x : x'Wx <= 1}."""
+        return exact.inverse(self.weight)
 
     @cached_property
     def relative_weight(self) -> np.ndarray:
@@ -102,22 +112,22 @@ class HardBounds(ReadOnlyArrays):
     @cached_property
     def half_widths(self) -> np.ndarray:
         """Half-widths of the ellipsoid {x : x'Wx <= 1} around the safe box' center, shape (n,)."""
-        return read_only(np.sqrt(np.diag(np.linalg.inv(self.weight))))
+        return read_only(np.sqrt(np.diag(self._box_shape)))
 
     @cached_property
     def process_noise(self) -> TruncatedGaussian:
         """w ~ N(0, Q) truncated at chi2_{n,1-delta}."""
-        return TruncatedGaussian(self.process_noise_cov, chi2_quantile(1.0 - self.delta, self.n))
+        return TruncatedGaussian(self.process_noise_cov, truncation_energy(self.delta, self.n))
 
     @cached_property
     def sensor_noise(self) -> TruncatedGaussian:
         """v ~ N(0, R) truncated at chi2_{p,1-delta}; what lies in `sensor_bound` is added to it."""
-        return TruncatedGaussian(self.measurement_noise_cov, chi2_quantile(1.0 - self.delta, self.p))
+        return TruncatedGaussian(self.measurement_noise_cov, truncation_energy(self.delta, self.p))
 
     @cached_property
     def initial_noise(self) -> TruncatedGaussian:
         """e_0 ~ N(0, P0) truncated at chi2_{n,1-delta}; what lies in `initial_bound` is added to it."""
-        return TruncatedGaussian(self.initial_cov, chi2_quantile(1.0 - self.delta, self.n))
+        return TruncatedGaussian(self.initial_cov, truncation_energy(self.delta, self.n))
 
     @cached_property
     def disturbance(self) -> Ellipsoid:
@@ -138,10 +148,9 @@ class HardBounds(ReadOnlyArrays):
     def _rounding_room(self) -> np.ndarray:
         """What D gains for rounding, shape (n, n)."""
         reach = SIMULATED_REACH * self.half_widths
-        rounding = np.abs(self.A) @ reach + np.abs(self.B) @ self.u_max + reach
+        rounding = exact.product(np.abs(self.A), reach) + exact.product(np.abs(self.B), self.u_max) + reach
         rounding *= (self.n + self.m + 2) * np.finfo(float).eps
-        box = np.linalg.inv(self.weight)
-        return THINNEST * 0.5 * (box + box.T) + 10.0 * self.n / (INFLATION - 1.0) * np.diag(rounding**2)
+        return THINNEST * self._box_shape + 10.0 * self.n / (INFLATION - 1.0) * np.diag(np.square(rounding))
 
     @cached_property
     def nominal_disturbance(self) -> Ellipsoid:
@@ -169,7 +178,7 @@ class HardBounds(ReadOnlyArrays):
     @cached_property
     def initial_radius_squared(self) -> float:
         """r0^2 = lambda_max(P0) chi2_{n,1-delta}: the truncated first error is no longer than r0."""
-        return max(float(np.linalg.eigvalsh(self.initial_noise.bound.shape)[-1]), 0.0)
+        return max(exact.largest_eigenvalue(self.initial_noise.bound.shape), 0.0)
 
     @cached_property
     def nominal_initial_error(self) -> Ellipsoid:
@@ -186,7 +195,7 @@ class HardBounds(ReadOnlyArrays):
     def estimate_rounding(self) -> np.ndarray:
         """Room for the rounding of x_hat up to SIMULATED_REACH half-widths out, shape (n, n), next to an inflation."""
         rounding = 4.0 * np.finfo(float).eps * SIMULATED_REACH * self.half_widths
-        return read_only(2.0 * self.n / (INFLATION - 1.0) * np.diag(rounding**2))
+        return read_only(2.0 * self.n / (INFLATION - 1.0) * np.diag(np.square(rounding)))
 
     @cached_property
     def kalman_covariances(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

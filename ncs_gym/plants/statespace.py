@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ncs_gym import exact
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.uncertainty.shape_matrices import outer_sum
-from ncs_gym.uncertainty.truncated_gaussian import chi2_quantile
+from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
 from ncs_gym.validation import as_count, as_matrix, as_number, shown
 
 if TYPE_CHECKING:
@@ -25,18 +26,24 @@ LONGEST_INPUT_DELAY = 100
 
 
 def zero_order_hold(A: np.ndarray, B: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the matrices of x+ = A x + B u for x' = A x + B u with u held constant over each step, exactly.
+    """Returns the matrices of x+ = A x + B u for x' = A x + B u with u held constant over each step.
+
+    Every entry is rounded once, so that it is the same on every machine.
 
     Args:
         A: Continuous-time state matrix, shape (n, n) [1/s].
         B: Continuous-time input matrix, shape (n, m).
         dt: Duration of a step [s].
-    """
-    from scipy.signal import cont2discrete  # takes long to import
 
+    Raises:
+        ValueError: If an entry is too large for a float64.
+    """
     n, m = B.shape
-    sampled: Any = cont2discrete((A, B, np.eye(n), np.zeros((n, m))), dt, method="zoh")
-    return sampled[0], sampled[1]
+    try:
+        sampled = exact.exponential(np.block([[A, B], [np.zeros((m, n + m))]]), dt)
+    except OverflowError as error:
+        raise ValueError(f"the model grows beyond all numbers within a step of {dt:g} s: give a smaller dt") from error
+    return sampled[:n, :n], sampled[:n, n:]
 
 
 def arguments_with_noise(
@@ -65,12 +72,13 @@ def arguments_with_noise(
     sampled_A, sampled_B = zero_order_hold(A, B, dt)
     disturbance, sensor = noise_fractions
     delta = arguments.get("delta", 0.05)
-    outputs = np.abs(H) @ half_widths
+    outputs = exact.product(np.abs(H), half_widths)
+    smallest = np.full(n, half_widths.min())
     defaults = {
         "gamma": 0.0,
-        "process_noise_cov": np.diag((disturbance * half_widths) ** 2) / chi2_quantile(1.0 - delta, n),
-        "measurement_noise_cov": np.diag((sensor * outputs) ** 2) / chi2_quantile(1.0 - delta, len(H)),
-        "initial_cov": (sensor * half_widths.min()) ** 2 / chi2_quantile(1.0 - delta, n) * np.eye(n),
+        "process_noise_cov": np.diag(np.square(disturbance * half_widths)) / truncation_energy(delta, n),
+        "measurement_noise_cov": np.diag(np.square(sensor * outputs)) / truncation_energy(delta, len(H)),
+        "initial_cov": np.diag(np.square(sensor * smallest)) / truncation_energy(delta, n),
     }
     common = {"A": sampled_A, "B": sampled_B, "box": half_widths, "H": H, "u_max": u_max, "dt": dt}
     return common | defaults | arguments

@@ -7,7 +7,9 @@ from typing import Any, Self
 
 import gymnasium as gym
 import numpy as np
+from flint import arb
 
+from ncs_gym import exact
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.body_simulation import Body
 from ncs_gym.processes.gym_process import GymProcess
@@ -92,9 +94,10 @@ def pendulum(gravity: float = GRAVITY, mass: float = MASS, length: float = LENGT
             f"the remainder of pendulum() is proved for its own {', '.join(PROVED_FOR[:-1])}, which "
             f"{', '.join(changed)} would replace: ncs_gym.linear_model finds the model of another box"
         )
-    pull, gain = 3.0 * gravity / (2.0 * length), 3.0 / (mass * length**2)
-    ratio = np.sin(ANGLE) / ANGLE
-    fastest = RATE + STEP * (pull * np.sin(ANGLE) + gain * TORQUE)
+    pull, gain = 3.0 * gravity / (2.0 * length), 3.0 / (mass * (length * length))
+    (sine,) = exact.nearest(lambda: [arb(ANGLE).sin()])
+    ratio = sine / ANGLE
+    fastest = RATE + STEP * (pull * sine + gain * TORQUE)
     if not fastest < FASTEST:
         raise ValueError(
             f"a step from the box reaches {fastest:.3g} rad/s, which Pendulum-v1 clips to {FASTEST:g}: no linear model "
@@ -104,7 +107,7 @@ def pendulum(gravity: float = GRAVITY, mass: float = MASS, length: float = LENGT
     left_out = STEP * (pull * ANGLE * 0.5 * (1.0 - ratio) + gain * TORQUE * TORQUE_ROUNDING) * (1.0 + ROUNDING)
     direction = np.array([[STEP], [1.0]])
     settings = {
-        "A": np.array([[1.0, STEP], [0.0, 1.0]]) + slope * direction @ np.array([[1.0, 0.0]]),
+        "A": np.array([[1.0, STEP], [0.0, 1.0]]) + slope * np.outer(direction, [1.0, 0.0]),
         "B": STEP * gain * direction,
         "box": [ANGLE, RATE],
         "u_max": TORQUE,

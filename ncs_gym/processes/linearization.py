@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ncs_gym import exact
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.body_simulation import Body
 from ncs_gym.processes.function_process import FunctionProcess
@@ -192,7 +193,7 @@ def _from_jacobians(
     if (low > high).any():
         raise ValueError("jacobian_bounds must be the smallest values, then the largest")
     middle = 0.5 * (low + high)
-    sizes = np.abs(origin) + np.maximum(high - middle, middle - low) @ np.concatenate([widths, limits])
+    sizes = np.abs(origin) + exact.product(np.maximum(high - middle, middle - low), np.concatenate([widths, limits]))
     sizes = np.where(sizes > 0.0, sizes * (1.0 + ROUNDING), 0.0)
     return middle[:, :n], middle[:, n:], as_bound(sizes, n, "the remainder")
 

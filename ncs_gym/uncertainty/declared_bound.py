@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ncs_gym import exact
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_matrix, as_setting, shown
 
@@ -51,7 +52,7 @@ def as_bound(value: Any, size: int, name: str) -> Ellipsoid:
             f"d = E w (a covariance has an argument of its own), got {shown(value)}"
         )
     widths = _as_sizes(value, size, name)
-    return Ellipsoid(widths[0] ** 2 * np.eye(size)) if sizes.ndim == 0 else _around_box(np.eye(size), widths)
+    return Ellipsoid(np.diag(np.square(widths))) if sizes.ndim == 0 else _around_box(np.eye(size), widths)
 
 
 def sample_box(bound: Ellipsoid, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
@@ -109,4 +110,4 @@ def _as_sizes(value: Any, size: int, name: str) -> np.ndarray:
 def _around_box(E: np.ndarray, widths: np.ndarray) -> Ellipsoid:
     """Returns q E diag(w^2) E' around {E s : |s_i| <= w_i}, q the number of nonzero w_i."""
     scaled = E * widths
-    return Ellipsoid(np.count_nonzero(widths) * (scaled @ scaled.T))
+    return Ellipsoid(np.count_nonzero(widths) * exact.product(scaled, scaled.T))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ncs_gym import exact
+
 # The multiplier of a term in an outer sum stays this far from 0 and 1, so that no division overflows.
 SMALLEST_MULTIPLIER = 1e-9
 # Relative rounding of a determinant of four entries, or per dimension of an eigenvalue, with room; products below the
@@ -49,8 +51,8 @@ def outer_sum(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.n
         second: P2, shape (n, n).
         weight: W, shape (n, n), positive definite, so that a zero trace means a zero shape.
     """
-    a = np.sqrt(max(float(np.vdot(weight, first)), 0.0))
-    b = np.sqrt(max(float(np.vdot(weight, second)), 0.0))
+    a = np.sqrt(max(exact.total(weight * first), 0.0))
+    b = np.sqrt(max(exact.total(weight * second), 0.0))
     if b == 0.0:
         return first + second
     nu = min(max(a / (a + b), SMALLEST_MULTIPLIER), 1.0 - SMALLEST_MULTIPLIER)

@@ -6,13 +6,15 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
-from scipy.special import chdtr, chdtri, gammaincinv
+from flint import arb, ctx, fmpq
 
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import ReadOnlyArrays
 
 # A truncation that keeps less than this probability would make rejection sampling crawl.
 SMALLEST_KEPT = 1e-3
+# Bits of ball arithmetic that tell nearly always on which side of a probability a tail lies.
+PRECISION = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +23,7 @@ class TruncatedGaussian(ReadOnlyArrays):
 
     Attributes:
         covariance: Shape (n, n), of the Gaussian before truncation.
-        energy: The largest squared Mahalanobis norm that is kept, a chi-square quantile.
+        energy: The largest squared Mahalanobis norm that is kept (`truncation_energy`).
     """
 
     covariance: np.ndarray
@@ -67,20 +69,29 @@ class TruncatedGaussian(ReadOnlyArrays):
 
 
 @cache
-def chi2_quantile(probability: float, degrees: int) -> float:
-    """Returns the chi-square quantile chi2_{degrees, probability}, rounded up.
+def truncation_energy(delta: float, degrees: int) -> float:
+    """Returns chi2_{degrees, 1 - delta}, rounded up: the smallest float64 exceeded with at most probability delta.
 
-    Liu et al. Theorem 2 needs the 1 - delta quantile, so `probability` is 1 - delta. That float lies up to 2^-54 from
-    the number; where delta is small this counts, and the quantile is one for delta less that much. The functions of
-    scipy.special are those behind scipy.stats.chi2, which takes long to import.
+    Ball arithmetic decides on which side of it a float lies, so that it is the same on every machine.
 
     Args:
-        probability: In [0.001, 1).
+        delta: Probability that is cut off, in [1e-12, 0.999].
         degrees: Degrees of freedom, >= 1.
     """
-    certainly_removed = (1.0 - probability) - 2.0**-54
-    quantile = 2.0 * float(gammaincinv(0.5 * degrees, probability)) * (1.0 + 1e-12)
-    quantile = max(quantile, float(chdtri(degrees, certainly_removed)) * (1.0 + 1e-13))
-    while chdtr(degrees, quantile) < probability:
-        quantile = float(np.nextafter(quantile, np.inf))
-    return quantile
+    low, high = 0.0, 1.0
+    while _cuts_off_more(high, delta, degrees):
+        low, high = high, 2.0 * high
+    while low < (middle := 0.5 * (low + high)) < high:
+        low, high = (middle, high) if _cuts_off_more(middle, delta, degrees) else (low, middle)
+    return high
+
+
+def _cuts_off_more(energy: float, delta: float, degrees: int) -> bool:
+    """Returns whether a chi-square variable exceeds an energy with more than the probability delta."""
+    precision = PRECISION
+    while True:
+        with ctx.workprec(precision):
+            beyond = arb(energy / 2.0).gamma_upper(arb(fmpq(degrees, 2)), regularized=1)
+            if beyond > arb(delta) or beyond <= arb(delta):
+                return bool(beyond > arb(delta))
+        precision *= 2

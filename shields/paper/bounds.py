@@ -9,7 +9,7 @@ import numpy as np
 
 from ncs_gym import LinearPlant
 from ncs_gym.plants.linear_plant import SMALLEST_DELTA
-from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_KEPT, chi2_quantile
+from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_KEPT, truncation_energy
 from ncs_gym.validation import as_covariance, as_matrix, as_number
 
 # Where kappa rho is nearer to 1 than this, the error bound is infinite for practical purposes.
@@ -75,7 +75,7 @@ def uplink_error_bound(
     delta = as_number(delta, "delta", low=SMALLEST_DELTA, high=1.0 - SMALLEST_KEPT)
     Q = as_covariance(process_noise_cov, len(np.atleast_1d(process_noise_cov)), "process_noise_cov")
     P0 = as_covariance(initial_cov, len(Q), "initial_cov")
-    return _uplink(_largest(P0), process_bound(gamma, Q), chi2_quantile(1.0 - delta, len(Q)), g2, 1.0 - g2)
+    return _uplink(_largest(P0), process_bound(gamma, Q), truncation_energy(delta, len(Q)), g2, 1.0 - g2)
 
 
 def state_error_bound(A: np.ndarray, g2: float, epsilon_up: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from typing import NamedTuple
@@ -218,7 +219,7 @@ def _sum_bound(first: Matrix, second: Matrix, weight: Matrix) -> Matrix:
 
 def _smallest_trace_multiplier(first: Matrix, second: Matrix, weight: Matrix) -> Fraction:
     """Returns a rational nu near the minimizer of tr(W P); every nu in (0, 1) proves containment."""
-    a, b = (float(_trace(multiply(weight, matrix))) ** 0.5 for matrix in (first, second))
+    a, b = (math.sqrt(_trace(multiply(weight, matrix))) for matrix in (first, second))
     nu = Fraction(a) / (Fraction(a) + Fraction(b)) if a + b > 0.0 else Fraction(1, 2)
     return min(max(nu, Fraction(SMALLEST_MULTIPLIER)), 1 - Fraction(SMALLEST_MULTIPLIER))
 

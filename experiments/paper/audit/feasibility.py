@@ -9,7 +9,7 @@ import numpy as np
 from experiments.paper.audit.claim import Claim, Defect, Verdict
 from experiments.paper.paper_example import PaperExample
 from ncs_gym import LinearPlant
-from ncs_gym.uncertainty.truncated_gaussian import chi2_quantile
+from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
 from shields.paper.bounds import PaperModel
 from shields.paper.feasibility import FeasibilityScan, largest_gamma, largest_scale
 
@@ -37,7 +37,7 @@ def feasibility_claim(example: PaperExample) -> Claim:
 
 def _charitable(plant: LinearPlant, scan: FeasibilityScan) -> str:
     """Returns what other readings of the bounds give."""
-    tail = chi2_quantile(plant.delta, plant.n)
+    tail = truncation_energy(1.0 - plant.delta, plant.n)
     model = PaperModel(plant, quantile=tail)
     best = scan.best(plant, model)
     is_feasible = scan.full_ratio(plant, model) >= 1.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -42,7 +43,7 @@ def bound_conditions(D: Any, ages: ContractProof | None, plant: LinearPlant) -> 
     """
     weight, quantizer = plant.relative_weight, np.eye(plant.p)
     own = matrix(plant.disturbance.shape)
-    ball = Part(number(plant.gamma) * identity(plant.n), _size(plant.gamma * np.eye(plant.n), weight))
+    ball = _part(number(plant.gamma) * identity(plant.n), weight)
     declared = [_declared(bound, weight) for bound in (plant.disturbance_bound, plant.remainder_bound)]
     disturbed = [ball, _noise(plant.process_noise, weight), *declared]
     yield _holds_sum("D: the plant's holds the disturbance and the process noise", own, disturbed)
@@ -53,9 +54,9 @@ def bound_conditions(D: Any, ages: ContractProof | None, plant: LinearPlant) -> 
     else:
         step = number(ages.sets.contract.quantization_step)
         box = plant.p * step * step / 4 * identity(plant.p)  # in the ball around the box of |v_i| <= step/2
-        sensed.append(Part(box, float(plant.p * step / 2)))
+        sensed.append(_part(box, quantizer))
         yield _holds_sum("N: holds the sensor noise and the quantization error", matrix(ages.sets.noise), sensed)
-    radius = (plant.initial_radius_squared * np.trace(weight)) ** 0.5
+    radius = _part(number(plant.initial_radius_squared) * identity(plant.n), weight).size
     first = [_noise(plant.initial_noise, weight)._replace(size=radius), _declared(plant.initial_bound, weight)]
     yield _holds_sum("r0: holds the error of the first estimate", matrix(plant.initial_error.shape), first)
     yield from _truncations(plant)
@@ -85,19 +86,22 @@ def _truncations(plant: LinearPlant) -> Iterator[Condition]:
 
 def _noise(noise: TruncatedGaussian, weight: np.ndarray) -> Part:
     """Returns the ellipsoid of truncated noise."""
-    shape = number(noise.energy) * matrix(noise.covariance)
-    return Part(shape, _size(noise.energy * noise.covariance, weight))
+    return _part(number(noise.energy) * matrix(noise.covariance), weight)
 
 
 def _declared(bound: Ellipsoid | None, weight: np.ndarray) -> Part:
     """Returns a declared bound; zero if there is none."""
-    shape = np.zeros_like(weight) if bound is None else bound.shape
-    return Part(matrix(shape), _size(shape, weight))
+    return _part(matrix(np.zeros_like(weight) if bound is None else bound.shape), weight)
 
 
-def _size(shape: np.ndarray, weight: np.ndarray) -> float:
-    """Returns sqrt(tr W P): the sum of P_i / w_i has the smallest weighted trace with w_i in this proportion."""
-    return float(max(np.vdot(weight, shape), 0.0)) ** 0.5
+def _part(shape: Any, weight: np.ndarray) -> Part:
+    """Returns an ellipsoid of an exact shape, with its size.
+
+    The sum of P_i / w_i has the smallest trace, weighted with W, for w_i in proportion to sqrt(tr W P_i).
+    """
+    product = matrix(weight) * shape
+    trace = sum((product[i, i] for i in range(product.nrows())), fmpq(0))
+    return Part(shape, math.sqrt(max(float(trace), 0.0)))
 
 
 def _holds_sum(name: str, outer: Any, parts: list[Part]) -> Condition:
@@ -121,7 +125,7 @@ def _weights(sizes: list[float]) -> list[Any]:
     if not sizes:
         return []
     largest = max(range(len(sizes)), key=lambda index: sizes[index])
-    total = sum(sizes) or 1.0
+    total = math.fsum(sizes) or 1.0
     weights = [number(max(size / total, _SMALLEST_WEIGHT)) for size in sizes]
     weights[largest] = 1 - sum((weight for index, weight in enumerate(weights) if index != largest), fmpq(0))
     return weights

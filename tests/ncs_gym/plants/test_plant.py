@@ -1,6 +1,8 @@
 import ast
 import inspect
+import math
 from dataclasses import fields, replace
+from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.stats import chi2
 
 from ncs_gym import LinearPlant, truck_trailer
-from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, chi2_quantile
+from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
 
 
 def test_truck_trailer_reproduces_the_printed_matrices():
@@ -55,25 +57,31 @@ def test_sensor_bound_with_quantizer_holds_corners_of_the_rounding_box():
 
 
 def test_quantile_is_of_the_kept_mass_not_of_the_removed_one():
-    assert chi2_quantile(0.95, 2) == pytest.approx(-2.0 * np.log(0.05), rel=1e-9)
-    assert chi2_quantile(0.95, 2) >= -2.0 * np.log(0.05)
+    assert truncation_energy(0.05, 2) == pytest.approx(-2.0 * np.log(0.05), rel=1e-15)
 
 
 @pytest.mark.parametrize("degrees", [1, 2, 3, 7])
-@pytest.mark.parametrize("probability", [0.001, 0.5, 0.95, 1.0 - 1e-9, 1.0 - 2.0**-53])
-def test_quantile_is_that_of_scipy_stats_rounded_up(probability, degrees):
-    quantile = chi2_quantile(probability, degrees)
-    assert chi2.cdf(quantile, degrees) >= probability
-    # One for delta less 2^-54, the rounding of 1 - delta, as the docstring says.
-    removed = (1.0 - probability) - 2.0**-54
-    assert chi2.isf(removed, degrees) <= quantile
-    assert quantile <= max(chi2.isf(removed, degrees), chi2.ppf(probability, degrees)) * (1.0 + 1e-11)
+@pytest.mark.parametrize("delta", [0.999, 0.5, 0.05, 1e-9, 1e-12])
+def test_truncation_energy_is_the_quantile_of_scipy_stats(delta, degrees):
+    assert truncation_energy(delta, degrees) == pytest.approx(chi2.isf(delta, degrees), rel=1e-11)
+
+
+@pytest.mark.parametrize("degrees", [2, 4, 6])
+@pytest.mark.parametrize("delta", [0.999, 0.05, 1e-12])
+def test_truncation_energy_is_the_smallest_float_that_cuts_off_no_more_than_delta(delta, degrees):
+    """An even number of degrees has the tail e^-h (1 + h + h^2/2 + ..), h half of the energy."""
+    tails = []
+    for energy in (truncation_energy(delta, degrees), math.nextafter(truncation_energy(delta, degrees), 0.0)):
+        with localcontext(prec=60):
+            half = Decimal(energy) / 2
+            tails.append((-half).exp() * sum(half**k / math.factorial(k) for k in range(degrees // 2)))
+    assert tails[0] <= Decimal(delta) < tails[1]
 
 
 def test_truncated_noise_stays_in_its_bound_and_keeps_its_mass():
     rng = np.random.default_rng(4)
     covariance = np.array([[2.0, 0.3], [0.3, 0.5]])
-    noise = TruncatedGaussian(covariance, chi2_quantile(0.5, 2))
+    noise = TruncatedGaussian(covariance, truncation_energy(0.5, 2))
     samples = np.array([noise.sample(rng) for _ in range(4000)])
     assert all(noise.bound.gauge(sample) <= 1.0 + 1e-12 for sample in samples)
     # A Gaussian truncated at its median energy keeps 1 - log 2 of its covariance in two dimensions.

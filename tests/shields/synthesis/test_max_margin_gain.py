@@ -6,7 +6,7 @@ import pytest
 
 from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, batch_reactor, cart_pole, truck_trailer
 from ncs_gym.plants.lqr import regulator_gain
-from ncs_gym.uncertainty.truncated_gaussian import chi2_quantile
+from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
 from shields import Infeasible, synthesize
 from shields.errors import SynthesisInterrupted
 from shields.synthesis.design_problem import design_problem
@@ -181,9 +181,9 @@ def test_cart_pole_tolerates_at_least_the_measured_radii(full_state, age, radius
     half_widths, n = plant.half_widths, plant.n
     plant = replace(
         plant,
-        process_noise_cov=np.diag((radius * half_widths) ** 2) / chi2_quantile(0.95, n),
-        measurement_noise_cov=np.diag((0.01 * radius * plant.H @ half_widths) ** 2) / chi2_quantile(0.95, plant.p),
-        initial_cov=(0.01 * radius * half_widths.min()) ** 2 / chi2_quantile(0.95, n) * np.eye(n),
+        process_noise_cov=np.diag((radius * half_widths) ** 2) / truncation_energy(0.05, n),
+        measurement_noise_cov=np.diag((0.01 * radius * plant.H @ half_widths) ** 2) / truncation_energy(0.05, plant.p),
+        initial_cov=(0.01 * radius * half_widths.min()) ** 2 / truncation_energy(0.05, n) * np.eye(n),
     )
     problem, _ = design_problem(plant, ChannelContract(age))
     # Exact verification accepts 0.99 times the radii that a margin allows: shown above.

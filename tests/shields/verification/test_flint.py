@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ncs_gym import ChannelContract, batch_reactor, truck_trailer
-from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, chi2_quantile
+from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
 from shields import synthesize, verify
 from shields.verification import flint as second_engine
 from shields.verification.flint.bounds import keeps_enough
@@ -141,7 +141,7 @@ def test_no_truncation_removes_more_than_delta(delta):
 def test_quantile_a_hair_too_small_is_noticed_by_the_second_engine(certificate, loaded):
     noise = loaded.process_noise
     for factor, holds in ((1.0, True), (1.0 - 1e-9, False)):
-        changed = TruncatedGaussian(noise.covariance, factor * chi2_quantile(1.0 - loaded.delta, loaded.n))
+        changed = TruncatedGaussian(noise.covariance, factor * truncation_energy(loaded.delta, loaded.n))
         report = verify(certificate, replaced(loaded, process_noise=changed), engine="flint")
         broken = [condition.name for condition in report.conditions if not condition.holds]
         assert broken == ([] if holds else ["chi-square: no more than delta of the process noise is truncated"])

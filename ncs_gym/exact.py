@@ -1,0 +1,120 @@
+"""Numbers that come out the same on every machine: computed in rational or ball arithmetic, then rounded once.
+
+BLAS, LAPACK and SIMD round differently on different processors. What identifies a plant, and every number that a proof
+takes from it, is made by these functions, or by single operations of float64 (+, -, *, /, sqrt), which the standard
+IEEE 754 prescribes to the last bit. FLINT computes (https://flintlib.org).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import reduce
+from typing import Any
+
+import numpy as np
+from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
+
+# Bits of ball arithmetic to begin with, and at most: a ball that is still ambiguous there holds a tie of two floats.
+FIRST_PRECISION, LAST_PRECISION = 128, 4096
+
+
+def product(*factors: np.ndarray) -> np.ndarray:
+    """Returns the product of finite float matrices, every entry rounded once; a vector counts as a column at the end.
+
+    Args:
+        factors: Shapes (n, k), (k, l), .., the last one (l, p) or (l,).
+    """
+    columns = [*factors[:-1], factors[-1].reshape(len(factors[-1]), -1)]
+    exact = reduce(lambda left, right: left * right, map(_rational, columns))
+    return _rounded(exact).reshape((len(factors[0]), *factors[-1].shape[1:]))
+
+
+def inverse(matrix: np.ndarray) -> np.ndarray:
+    """Returns the inverse of a float matrix, shape (n, n), every entry rounded once.
+
+    Raises:
+        ZeroDivisionError: If it is singular.
+    """
+    return _rounded(_rational(matrix).inv())
+
+
+def total(values: np.ndarray) -> float:
+    """Returns the sum of all entries, rounded once."""
+    return math.fsum(values.ravel().tolist())
+
+
+def largest_eigenvalue(symmetric: np.ndarray) -> float:
+    """Returns the largest eigenvalue of a symmetric float matrix, shape (n, n), rounded once."""
+    if np.count_nonzero(symmetric) == np.count_nonzero(np.diag(symmetric)):
+        return float(np.diag(symmetric).max())
+    whole, denominator = _rational(symmetric).numer_denom()
+    polynomial = whole.charpoly()
+
+    def largest_root() -> list[Any]:
+        roots = [root.real for root, _ in polynomial.complex_roots()]
+        return [reduce(lambda left, right: left.max(right), roots) / arb(denominator)]
+
+    return nearest(largest_root)[0]
+
+
+def exponential(generator: np.ndarray, time: float) -> np.ndarray:
+    """Returns exp(G t) of a float matrix G, shape (n, n), every entry rounded once."""
+    exact = _rational(generator) * _as_rational(time)
+    return np.reshape(nearest(lambda: arb_mat(exact).exp().entries()), generator.shape)
+
+
+def nearest(balls: Callable[[], list[Any]]) -> list[float]:
+    """Returns the float64 numbers next to some real numbers.
+
+    Args:
+        balls: Returns enclosures at the precision of FLINT's context; it is called with more and more of it.
+
+    Raises:
+        OverflowError: If no precision encloses them, or one is too large for a float64.
+    """
+    precision = FIRST_PRECISION
+    while True:
+        with ctx.workprec(precision):
+            numbers = balls()
+            if all(number.is_finite() for number in numbers):
+                ends = [[_nearest_to(end(number).fmpq()) for number in numbers] for end in (arb.lower, arb.upper)]
+                if ends[0] == ends[1]:
+                    return ends[0]
+                if precision >= LAST_PRECISION:
+                    return [_tie(low, high) for low, high in zip(*ends, strict=True)]
+        if precision >= LAST_PRECISION:
+            raise OverflowError("a number cannot be enclosed closely enough")
+        precision *= 2
+
+
+def _tie(low: float, high: float) -> float:
+    """Returns the even one of two floats whose midpoint is, as far as any precision tells, the number itself.
+
+    Raises:
+        OverflowError: If they are not next to each other.
+    """
+    if low != high and math.nextafter(low, math.inf) != high:
+        raise OverflowError("a number cannot be enclosed closely enough")
+    return _nearest_to((_as_rational(low) + _as_rational(high)) / 2)
+
+
+def _rational(matrix: np.ndarray) -> Any:
+    return fmpq_mat([[_as_rational(entry) for entry in row] for row in matrix.tolist()])
+
+
+def _as_rational(number: float) -> Any:
+    return fmpq(*float(number).as_integer_ratio())
+
+
+def _rounded(matrix: Any) -> np.ndarray:
+    return np.array([[_nearest_to(entry) for entry in row] for row in matrix.tolist()])
+
+
+def _nearest_to(number: Any) -> float:
+    """Returns the float64 next to a rational number: Python divides whole numbers with a single rounding.
+
+    Raises:
+        OverflowError: If it is too large for one.
+    """
+    return int(number.p) / int(number.q) + 0.0  # a zero has no sign
