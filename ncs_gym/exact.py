@@ -44,6 +44,28 @@ def total(values: np.ndarray) -> float:
     return math.fsum(values.ravel().tolist())
 
 
+def rounded(numbers: np.ndarray | float, digits: int, axis: int | None = None) -> np.ndarray:
+    """Returns numbers of any shape, rounded to this many decimal digits of the largest one.
+
+    What was computed with BLAS, and differs between machines in its last bits, is nearly always the same after that.
+
+    Args:
+        numbers: Finite.
+        digits: Significant digits of the largest number.
+        axis: None for the largest of all; an axis for the largest along it.
+    """
+    array = np.asarray(numbers, dtype=np.float64)
+    largest = np.broadcast_to(np.abs(array).max(axis=axis, keepdims=axis is not None, initial=0.0), array.shape)
+    places = [digits - 1 - _exponent(size) for size in largest.ravel().tolist()]
+    entries = zip(array.ravel().tolist(), places, strict=True)
+    return np.array([round(entry, place) + 0.0 for entry, place in entries]).reshape(array.shape)
+
+
+def _exponent(size: float) -> int:
+    """Returns the decimal exponent of a size; 0 of zero."""
+    return int(f"{size:e}".partition("e")[2])
+
+
 def largest_eigenvalue(symmetric: np.ndarray) -> float:
     """Returns the largest eigenvalue of a symmetric float matrix, shape (n, n), rounded once."""
     if np.count_nonzero(symmetric) == np.count_nonzero(np.diag(symmetric)):

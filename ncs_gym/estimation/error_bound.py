@@ -10,13 +10,17 @@ import numpy as np
 from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov
 from scipy.optimize import minimize_scalar
 
+from ncs_gym import exact
 from ncs_gym.estimation.error_bounds_by_age import ErrorSetsByAge, congruence_sum, error_sets_by_age
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.uncertainty.shape_matrices import rounded_up
 from ncs_gym.validation import ReadOnlyArrays
 
 # Growth c of the optimal set: gives (E1) slack that an exact check can see, and updates room (theory.md section 3).
 GROWTH = 1.1
+# Digits of a set relative to its extents, and of 1 - rate: what differs between processors beyond them is cut off.
+DIGITS, RATE_DIGITS = 11, 4
 # Beyond this many roundings of the largest entry a checked inequality is taken to hold.
 ROUNDINGS = 100.0
 # Smaller singular values, and smaller distances from the unit circle, count as zero in the test of detectability.
@@ -194,11 +198,11 @@ def _unconditional_set(plant: LinearPlant) -> ErrorSet:
     slowest = max(radius**2, 1e-6)
     margin = 1e-4 * (1.0 - slowest)
     best = minimize_scalar(size, bounds=(slowest + margin, 1.0 - margin), method="bounded", options={"xatol": margin})
-    rate = float(best.x)
+    rate = 1.0 - float(exact.rounded(1.0 - best.x, RATE_DIGITS))
     scaled = GROWTH * _smallest_solution(A, D, first, rate)
     _check(scaled, A, D, first, rate)
     Sigma = T @ scaled @ T.T
-    return ErrorSet(Sigma=0.5 * (Sigma + Sigma.T), rate=rate)
+    return ErrorSet(Sigma=rounded_up(Sigma, DIGITS), rate=rate)
 
 
 def _check(Sigma: np.ndarray, A: np.ndarray, D: np.ndarray, first: np.ndarray, rate: float) -> None:

@@ -6,12 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ncs_gym import exact
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import INFLATION, SIMULATED_REACH, LinearPlant
 from ncs_gym.plants.lqr import regulator_gain
-from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, is_inside, joined, outer_sum
+from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, is_inside, joined, outer_sum, rounded_up
 from ncs_gym.validation import ReadOnlyArrays
 
+# Digits of sets, relative to their extents, of gains and of rates: what differs between processors beyond them is cut
+# off. It is less than the slack below.
+DIGITS = 10
 # The sets are made for noise this much larger than allowed, so that at run time good gains nearly always fit in.
 NOISE_MARGIN = 1.2
 # Strict inequalities at the end.
@@ -19,7 +23,7 @@ SLACK = 1.0 + 1e-7
 # Growth per iteration; it doubles now and then, which ends cycles between multipliers that are equally good.
 SMALLEST_GROWTH, DOUBLING = 1e-6, 50.0
 # Multipliers mu that gains are chosen from: fine sensors want it close to 1.
-MULTIPLIERS = np.concatenate([np.linspace(0.01, 0.99, 99), 1.0 - np.logspace(-2.1, -4.0, 20)])
+MULTIPLIERS = np.round(np.concatenate([np.linspace(0.01, 0.99, 99), 1.0 - np.logspace(-2.1, -4.0, 20)]), 12)
 ITERATIONS = 1000
 # No set is thinner than this in any direction, in units of the weight: an input under way is known exactly.
 THINNEST = 1e-5
@@ -28,6 +32,8 @@ THINNEST = 1e-5
 EFFORT, DECAY, ANSWER = 10.0, 0.75, 10.0
 # How much the answer counts of a gain that the plant names.
 NAMED_ANSWER = 1000.0
+# Digits of that regulator.
+REGULATOR_DIGITS = 6
 # Sets this much larger than the safe box are of no use.
 LARGEST = 1e6
 
@@ -136,8 +142,8 @@ def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsBy
     D = D + 1e-9 * float(np.trace(D)) / plant.n * np.eye(plant.n)
     first = inverse @ plant.initial_error.shape @ inverse.T + THINNEST**2 * np.eye(plant.n)
     rounding = inverse @ plant.estimate_rounding @ inverse.T
-    exact = plant.sensor_error_with(contract.quantization_step).shape
-    noise = NOISE_MARGIN * exact + 1e-12 * np.diag(np.diag(H @ H.T)) * float(np.trace(D)) / plant.n
+    allowed = plant.sensor_error_with(contract.quantization_step).shape
+    noise = NOISE_MARGIN * allowed + 1e-12 * np.diag(np.diag(H @ H.T)) * float(np.trace(D)) / plant.n
     start, steps = first, contract.max_age + 1
     for turn in range(ITERATIONS):
         shapes = _carried(start, A, D, steps)
@@ -158,11 +164,11 @@ def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsBy
     gains, multipliers, _ = zip(*(_update(shape, H, noise) for shape in shapes[1:]), strict=True)
     return ErrorSetsByAge(
         contract=contract,
-        shapes=np.stack([_symmetric(T @ shape @ T.T) for shape in shapes]),
-        rates=np.array([_rate(shape, A, D) for shape in shapes[:-1]]),
-        gains=np.stack([T @ gain for gain in gains]),
+        shapes=np.stack([rounded_up(T @ shape @ T.T, DIGITS) for shape in shapes]),
+        rates=np.round([_rate(shape, A, D) for shape in shapes[:-1]], DIGITS),
+        gains=np.stack([exact.rounded(T @ gain, DIGITS, axis=1) for gain in gains]),
         multipliers=np.array(multipliers),
-        noise=exact,
+        noise=allowed,
     )
 
 
@@ -176,7 +182,7 @@ def _cost(plant: LinearPlant) -> np.ndarray:
     K = regulator_gain(inverse @ plant.A @ T, inverse @ plant.B * plant.u_max, EFFORT, DECAY)
     if K is None:
         return plant.weight
-    K = K @ inverse
+    K = exact.rounded(K @ inverse, REGULATOR_DIGITS)
     return plant.weight + ANSWER * K.T @ K
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ncs_gym.uncertainty.shape_matrices import rounded_up
+
 # Rounds of reweighting: the largest remainder settles to about a percent.
 ROUNDS = 60
 # The ellipsoid around the samples is at most this much larger than the smallest one, in squared radii.
@@ -77,14 +79,4 @@ def surrounding_shape(points: np.ndarray, widths: np.ndarray) -> np.ndarray:
     moments = whitened.T @ (weights[:, None] * whitened)
     sizes = np.einsum("ij,jk,ik->i", whitened, np.linalg.inv(moments), whitened)
     factor = widths[:, None] * axes.T * extents
-    return _rounded_up(sizes.max() * factor @ moments @ factor.T)
-
-
-def _rounded_up(shape: np.ndarray) -> np.ndarray:
-    """Returns a slightly larger ellipsoid in round numbers: the diagonal added to exceeds what rounding takes away."""
-    scale = np.sqrt(np.diag(shape))
-    unit = 10.0 ** (np.floor(np.log10(scale)) - DIGITS // 2)
-    scale = np.ceil(scale / unit) * unit
-    ratios = np.round(shape / np.outer(scale, scale), DIGITS) + len(shape) * 10.0**-DIGITS * np.eye(len(shape))
-    larger = ratios * np.outer(scale, scale)
-    return 0.5 * (larger + larger.T)
+    return rounded_up(sizes.max() * factor @ moments @ factor.T, DIGITS)

@@ -72,3 +72,18 @@ def joined(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     turned = root @ axes
     shape = (turned * np.maximum(values, 1.0)) @ turned.T
     return 0.5 * (shape + shape.T)
+
+
+def rounded_up(shape: np.ndarray, digits: int) -> np.ndarray:
+    """Returns a slightly larger ellipsoid in round numbers: the diagonal added to exceeds what rounding takes away.
+
+    Args:
+        shape: P, shape (n, n), with a positive diagonal.
+        digits: Of every entry, relative to the extents of the ellipsoid.
+    """
+    extents = np.sqrt(np.diag(shape))
+    unit = 10.0 ** (np.floor(np.log10(extents)) - digits // 2)
+    extents = np.ceil(extents / unit) * unit
+    ratios = np.round(shape / np.outer(extents, extents), digits) + len(shape) * 10.0**-digits * np.eye(len(shape))
+    larger = ratios * np.outer(extents, extents)
+    return 0.5 * (larger + larger.T)

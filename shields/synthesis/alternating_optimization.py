@@ -14,7 +14,8 @@ from shields.synthesis.initial_designs import (
     multiplier_triple,
 )
 from shields.synthesis.invariant_set_program import InvariantSetProgram, max_slack_gain
-from shields.synthesis.multipliers import best_input_multipliers, best_multipliers
+from shields.synthesis.multipliers import best_input_multipliers, best_multipliers, with_best_multipliers
+from shields.synthesis.round_numbers import in_round_numbers
 
 # Some plants still gain 1 % of volume per alternation after ten of them.
 _ALTERNATIONS = 40
@@ -47,14 +48,7 @@ def largest_set(problem: DesignProblem, slack: float, report: ProgressCallback) 
             if step < _SMALLEST_STEP:
                 break
         best = better
-    return with_best_gain(problem, best)
-
-
-def with_best_multipliers(problem: DesignProblem, design: CandidateDesign, error_shapes: np.ndarray) -> CandidateDesign:
-    """Returns a design with the multipliers that suit the error sets of the given shapes (k, n, n) best."""
-    multipliers, _ = best_multipliers(problem, error_shapes, design.L, design.K, design.multipliers)
-    inputs = best_input_multipliers(error_shapes, design.L, design.K)
-    return replace(design, multipliers=multipliers, inputs=inputs)
+    return in_round_numbers(problem, best, slack) or with_best_gain(problem, best)
 
 
 def _alternate(

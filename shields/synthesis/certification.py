@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym import ErrorSet, LinearPlant
+from ncs_gym import ErrorSet, LinearPlant, exact
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.bounds import inflated
 from ncs_gym.validation import shown
@@ -18,17 +18,20 @@ from shields.certificate import Certificate
 from shields.certificate_text import size_of
 from shields.errors import Infeasible, SynthesisInterrupted
 from shields.proof_data import ContractProof, Multipliers
-from shields.synthesis.alternating_optimization import largest_set, with_best_gain, with_best_multipliers
+from shields.synthesis.alternating_optimization import largest_set, with_best_gain
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem, design_problem
 from shields.synthesis.diagnosis import infeasibility, with_feasible_bounds
 from shields.synthesis.max_margin_gain import max_margin_gain
-from shields.synthesis.multipliers import best_input_multipliers, best_multipliers
+from shields.synthesis.multipliers import best_input_multipliers, best_multipliers, with_best_multipliers
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from shields.synthesis.share_of_box import share_of_box
 from shields.verification import Report, verify
 
 # Relative tightenings of the semidefinite programs, tried in turn until the result verifies exactly.
 _SLACKS = (1e-6, 1e-5, 1e-4, 1e-3)
+# Significant digits of the numbers of a certificate: what differs between processors beyond them is cut off. Sizes
+# that are for people have fewer.
+_DIGITS, _SHOWN_DIGITS = 12, 6
 # Called with a line of text: the stage, and the volume reached so far.
 Progress = Callable[[str], object]
 # Multipliers from which those of a given set and gain are sought.
@@ -180,7 +183,9 @@ def _with_tolerated_scale(certificate: Certificate, problem: DesignProblem) -> C
     gain = max_margin_gain(problem, problem.covering_error_shape, searches=1)
     if gain is None or gain.margin < 1.0:  # the search for it is local, and covers the error sets of all ages by one
         return certificate
-    return replace(certificate, provenance=certificate.provenance | {"tolerated_scale": gain.margin})
+    return replace(
+        certificate, provenance=certificate.provenance | {"tolerated_scale": float(exact.rounded(gain.margin, 3))}
+    )
 
 
 def _failed_verification(report: Report) -> Infeasible:
@@ -198,6 +203,9 @@ def _certificate(
 ) -> Certificate:
     """Returns the certificate of a design, not yet verified."""
     L, K = problem.to_physical(design.L, design.K)
+    extents = np.array([float(exact.rounded(extent, 1)) for extent in np.sqrt(np.diag(L))])
+    units = np.outer(extents, extents)
+    L, K = np.round(L / units, _DIGITS) * units, exact.rounded(K, _DIGITS, axis=1)
     ages = None
     if errors.ages is not None:
         by_age = [with_best_multipliers(problem, design, Sigma[None]) for Sigma in problem.error_shapes]
@@ -231,7 +239,11 @@ def _description(plant: LinearPlant, L: np.ndarray, volume: float) -> dict[str, 
         L: Shape of the set, (n, n).
         volume: Volume of the set in units of the largest ellipsoid in the safe box.
     """
-    description: dict[str, Any] = {"volume_of_box_ellipsoid": volume} | share_of_box(plant, L)
+    sizes = {"volume_of_box_ellipsoid": volume} | share_of_box(plant, L)
+    description: dict[str, Any] = {
+        name: float(exact.rounded(size, _SHOWN_DIGITS)) if isinstance(size, float) else size
+        for name, size in sizes.items()
+    }
     assumptions = getattr(plant, "assumptions", ())
     if assumptions:
         description["assumptions"] = [assumptions] if isinstance(assumptions, str) else list(assumptions)
@@ -246,5 +258,5 @@ def _multipliers(problem: DesignProblem, design: CandidateDesign, lam_e: float) 
 
 
 def _rounded_down(multipliers: tuple[float, float, float]) -> tuple[float, ...]:
-    """Returns multipliers so much smaller that rounding cannot lift lx + le + ld above 1."""
-    return tuple(multiplier * (1.0 - 1e-15) for multiplier in multipliers)
+    """Returns multipliers of few digits, so much smaller that rounding cannot lift lx + le + ld above 1."""
+    return tuple(exact.rounded((1.0 - 2e-12) * np.array(multipliers), _DIGITS).tolist())

@@ -7,7 +7,15 @@ from functools import reduce
 
 import numpy as np
 
-from ncs_gym import ChannelContract, ErrorSet, ErrorSetError, LinearPlant, UnstablePlantError, certified_error_set
+from ncs_gym import (
+    ChannelContract,
+    ErrorSet,
+    ErrorSetError,
+    LinearPlant,
+    UnstablePlantError,
+    certified_error_set,
+    exact,
+)
 from ncs_gym.uncertainty.shape_matrices import is_inside, joined
 from shields.errors import Infeasible
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
@@ -149,7 +157,7 @@ def _scaled(plant: LinearPlant, error_shapes: np.ndarray, box: np.ndarray) -> De
     rounding = plant.m * step @ step.T
     weight = np.linalg.inv(box)
     ratio = np.vdot(weight, rounding) / max(float(np.vdot(weight, D)), 1e-30)
-    s = float(np.sqrt(np.clip(ratio, 1e-16, 1.0)))
+    s = float(exact.rounded(np.sqrt(np.clip(ratio, 1e-16, 1.0)), 6))
     inverse = np.linalg.inv(T)
     D_u = (1.0 + s) * D + (1.0 + 1.0 / s) * rounding
     return DesignProblem(

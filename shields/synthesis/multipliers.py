@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.optimize import minimize
 
-from shields.synthesis.design_problem import DesignProblem
+from shields.synthesis.design_problem import CandidateDesign, DesignProblem
+
+# Digits of the logarithms of ratios of multipliers: a search ends at the same ones on every processor.
+LOGARITHM_DIGITS = 9
 
 
 def best_multipliers(
@@ -44,9 +49,10 @@ def best_multipliers(
         return float(np.linalg.eigvalsh(successors)[:, -1].max())
 
     logits = np.log(np.array(initial[:2]) / initial[2])
-    options = {"xatol": 1e-7, "fatol": 1e-12, "maxiter": 400}
+    # What is compared differs by much more than rounding: all processors go the same way.
+    options = {"xatol": 1e-5, "fatol": 1e-10, "maxiter": 400}
     minimum = minimize(largest_eigenvalue, logits, method="Nelder-Mead", options=options)
-    lx, le, ld = multipliers_of(minimum.x)
+    lx, le, ld = multipliers_of(np.round(minimum.x, LOGARITHM_DIGITS))
     return (float(lx), float(le), float(ld)), float(minimum.fun)
 
 
@@ -62,4 +68,11 @@ def best_input_multipliers(error_shapes: np.ndarray, L: np.ndarray, K: np.ndarra
     """
     by_state = np.sqrt(np.maximum(((K @ L) * K).sum(axis=1), 0.0))
     by_error = np.sqrt(np.maximum(((K @ error_shapes) * K).sum(axis=-1), 0.0)).max(axis=0)
-    return np.clip(by_state / np.maximum(by_state + by_error, 1e-300), 1e-6, 1.0 - 1e-6)
+    return np.clip(np.round(by_state / np.maximum(by_state + by_error, 1e-300), 6), 1e-6, 1.0 - 1e-6)
+
+
+def with_best_multipliers(problem: DesignProblem, design: CandidateDesign, error_shapes: np.ndarray) -> CandidateDesign:
+    """Returns a design with the multipliers that suit the error sets of the given shapes (k, n, n) best."""
+    multipliers, _ = best_multipliers(problem, error_shapes, design.L, design.K, design.multipliers)
+    inputs = best_input_multipliers(error_shapes, design.L, design.K)
+    return replace(design, multipliers=multipliers, inputs=inputs)
