@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, overload
 
 import numpy as np
@@ -102,9 +102,21 @@ def _conditional_set(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
         raise ErrorSetError(
             f"no error set was found under a contract of max_age = {contract.max_age}: promise less age"
         )
-    error_set = ErrorSet(Sigma=sets.shapes[contract.max_age], rate=float(sets.rates[-1]), ages=sets)
-    require_error_set(error_set, plant)
-    return error_set
+    rounded, found = (
+        ErrorSet(Sigma=each.shapes[contract.max_age], rate=float(each.rates[-1]), ages=each)
+        for each in (sets.in_round_numbers(), sets)
+    )
+    require_error_set(found, plant)
+    return _round_if_it_holds(rounded, found, plant)
+
+
+def _round_if_it_holds(rounded: ErrorSet, other: ErrorSet, plant: LinearPlant) -> ErrorSet:
+    """Returns an error set in round numbers if its conditions hold like that, else the other one."""
+    try:
+        require_error_set(rounded, plant)
+    except ErrorSetError:
+        return other
+    return rounded
 
 
 def _unseen_state(plant: LinearPlant) -> str | None:
@@ -202,7 +214,8 @@ def _unconditional_set(plant: LinearPlant) -> ErrorSet:
     scaled = GROWTH * _smallest_solution(A, D, first, rate)
     _check(scaled, A, D, first, rate)
     Sigma = T @ scaled @ T.T
-    return ErrorSet(Sigma=rounded_up(Sigma, DIGITS), rate=rate)
+    found = ErrorSet(Sigma=0.5 * (Sigma + Sigma.T), rate=rate)
+    return _round_if_it_holds(replace(found, Sigma=rounded_up(found.Sigma, DIGITS)), found, plant)
 
 
 def _check(Sigma: np.ndarray, A: np.ndarray, D: np.ndarray, first: np.ndarray, rate: float) -> None:

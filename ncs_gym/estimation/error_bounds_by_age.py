@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -66,6 +66,15 @@ class ErrorSetsByAge(ReadOnlyArrays):
 
     def __post_init__(self) -> None:
         self._make_arrays_read_only()
+
+    def in_round_numbers(self) -> ErrorSetsByAge:
+        """Returns the sets, a little larger, in numbers that hardly depend on the processor; they are to be checked."""
+        return replace(
+            self,
+            shapes=np.stack([rounded_up(shape, DIGITS) for shape in self.shapes]),
+            rates=np.round(self.rates, DIGITS),
+            gains=np.stack([exact.rounded(gain, DIGITS, axis=1) for gain in self.gains]),
+        )
 
     def needs(self, plant: LinearPlant) -> dict[str, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
         """Returns, per condition, triples (outer, inner, size): each outer must hold the inner one, computed to `size`.
@@ -164,9 +173,9 @@ def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsBy
     gains, multipliers, _ = zip(*(_update(shape, H, noise) for shape in shapes[1:]), strict=True)
     return ErrorSetsByAge(
         contract=contract,
-        shapes=np.stack([rounded_up(T @ shape @ T.T, DIGITS) for shape in shapes]),
-        rates=np.round([_rate(shape, A, D) for shape in shapes[:-1]], DIGITS),
-        gains=np.stack([exact.rounded(T @ gain, DIGITS, axis=1) for gain in gains]),
+        shapes=np.stack([_symmetric(T @ shape @ T.T) for shape in shapes]),
+        rates=np.array([_rate(shape, A, D) for shape in shapes[:-1]]),
+        gains=np.stack([T @ gain for gain in gains]),
         multipliers=np.array(multipliers),
         noise=allowed,
     )
