@@ -23,7 +23,7 @@ from agents.sb3_vec_env import SB3VecEnv
 from agents.settings import AgentSettings
 from agents.sharing.agent_file import AgentError, channel_from_json, document_of, read_files, shield_from_json
 from agents.sharing.model_card import card_text
-from ncs_gym import Channel
+from ncs_gym import Channel, LinearPlant
 from shields.atomic_write import write_atomically
 
 
@@ -129,7 +129,7 @@ class Agent:
             "env": self.env,
             "channel": None if self.channel is None else asdict(self.channel),
             "shield": None if self.shield_mode is None else {"mode": self.shield_mode, "horizon": self.horizon},
-            "plant": _plant_fingerprint(self.env),
+            "plant": None if (plant := _plant_of(self.env)) is None else plant.fingerprint,
             "normalization": {
                 "mean": self.normalization.mean.tolist(),
                 "variance": self.normalization.variance.tolist(),
@@ -156,8 +156,8 @@ class Agent:
             ValueError: If the certificate is for another plant than that of the agent's environment.
             OSError: If a file cannot be written.
         """
-        folder, plant = Path(folder), _plant_fingerprint(self.env)
-        if shield is not None and shield.certificate.fingerprint != plant:
+        folder = Path(folder)
+        if shield is not None and not _is_for_plant_of(self.env, shield.certificate.fingerprint):
             raise ValueError(f"the certificate is for another plant than that of {self.env}: their fingerprints differ")
         of_agent = {name: getattr(self, name) for name in ("algorithm", "settings", "env", "channel", "checksum")}
         files = self.files() | {"README.md": card_text(**of_agent, shield=shield, evaluation=evaluation).encode()}
@@ -187,10 +187,15 @@ class Agent:
             raise AgentError(f"the agent in {folder} is damaged: {reason}") from error
 
 
-def _plant_fingerprint(env_id: str) -> str | None:
-    """Returns the fingerprint of an environment's plant, None for an environment without one."""
-    plant = getattr(gym.make(env_id).unwrapped, "plant", None)
-    return None if plant is None else plant.fingerprint
+def _plant_of(env_id: str) -> LinearPlant | None:
+    """Returns an environment's plant, None for an environment without one."""
+    return getattr(gym.make(env_id).unwrapped, "plant", None)
+
+
+def _is_for_plant_of(env_id: str, fingerprint: str | None) -> bool:
+    """Returns whether what was stored with a fingerprint belongs to an environment's plant, or lack of one."""
+    plant = _plant_of(env_id)
+    return fingerprint is None if plant is None else fingerprint is not None and plant.has_fingerprint(fingerprint)
 
 
 def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
@@ -201,7 +206,7 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
             f"the agent was trained in {env_id}, which is not registered here: import the module that registers it, or "
             f"on the command line give --env module:{env_id}, with the name of that module"
         )
-    if content["plant"] != _plant_fingerprint(env_id):
+    if not _is_for_plant_of(env_id, content["plant"]):
         raise AgentError(f"the agent was trained on another plant than that of {env_id}: their fingerprints differ")
     if algorithm not in ALGORITHMS:
         raise AgentError(f"the agent is of an unknown algorithm, {algorithm!r}")

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
+
+from numpy._core._multiarray_umath import __cpu_features__
 
 from ncs_gym import ChannelContract, LinearPlant
 from shields import Certificate
@@ -17,8 +20,12 @@ _kept: Callable[[str, Callable[[Path], None]], Path] | None = None
 
 
 def source_digest() -> str:
-    """What certificates of tests depend on: the source of both packages and the versions of what it computes with."""
-    digest = hashlib.sha256("".join(map(version, ("numpy", "scipy", "cvxpy", "clarabel"))).encode())
+    """What certificates of tests depend on: the source of both packages, the libraries, and the processor's kernels."""
+    versions = map(version, ("numpy", "scipy", "cvxpy", "clarabel", "python-flint"))
+    kernels = [
+        os.environ.get(name) for name in ("OPENBLAS_CORETYPE", "OPENBLAS_NUM_THREADS", "NPY_DISABLE_CPU_FEATURES")
+    ]
+    digest = hashlib.sha256(repr([*versions, *kernels, sorted(__cpu_features__.items())]).encode())
     for path in sorted(path for package in ("ncs_gym", "shields") for path in (ROOT / package).rglob("*.py")):
         digest.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]

@@ -19,6 +19,7 @@ from ncs_gym import (
     NCSEnv,
     Process,
     escape_probability,
+    exact,
     truck_trailer,
 )
 from ncs_gym.downlink import downlink_protocol
@@ -141,7 +142,7 @@ def _random_plant(seed: int, index: int) -> LinearPlant:
     rng = np.random.default_rng([seed, index])
     n, m, p = _SIZES[index % len(_SIZES)]
     A = rng.standard_normal((n, n))
-    A *= rng.uniform(0.4, 0.9) / np.abs(np.linalg.eigvals(A)).max()
+    A *= rng.uniform(0.4, 0.9) / exact.rounded(np.abs(np.linalg.eigvals(A)).max(), 6)
     return LinearPlant(
         A=A,
         B=rng.standard_normal((n, m)),

@@ -38,7 +38,7 @@ def verify(settings: VerifySettings) -> None:
         document = {"env": origin, "valid": report.valid, "conditions": conditions}
         write_atomically(settings.out, json.dumps(document, indent=1) + "\n")
     if not report.valid:
-        if certificate.fingerprint != plant.fingerprint:
+        if not plant.has_fingerprint(certificate.fingerprint):
             raise CertificateError(
                 f"{settings.file} does not verify: it was made for another plant than that of {origin}; without --env "
                 "and --plant the registered environment that it belongs to is found"
@@ -54,7 +54,7 @@ def verify(settings: VerifySettings) -> None:
 def _matching_env(certificate: Certificate) -> str:
     """Returns the id of the registered environment whose plant the certificate was made for."""
     for env_id in registered_ids():
-        if registered_env(env_id).plant.fingerprint == certificate.fingerprint:
+        if registered_env(env_id).plant.has_fingerprint(certificate.fingerprint):
             return env_id
     raise CertificateError(
         "the certificate belongs to no registered environment's plant; "

@@ -39,6 +39,7 @@ class ExperimentSetup:
         noise: "truncated", or "gaussian" for noise without a bound.
         process: Fields of the process that replace the environment's own, JSON values; None keeps it.
         downlink: Channel that replaces the environment's own downlink; None keeps it.
+        certificate_basis: What the certificate was synthesized from, in words; empty for one that was given.
     """
 
     env: str
@@ -50,6 +51,7 @@ class ExperimentSetup:
     noise: str = "truncated"
     process: dict[str, Any] | None = None
     downlink: Channel | None = None
+    certificate_basis: str = ""
 
     @classmethod
     def of(
@@ -87,12 +89,14 @@ class ExperimentSetup:
         if certificate_file is None:
             with synthesis_status() as show:
                 certificate = certificate_for(env.plant, env.certificate_contract, show)
+            basis = f"synthesized for plant {env.plant.fingerprint} under {env.certificate_contract}"
         else:
             certificate = Certificate.load(certificate_file)
             require_valid(certificate, env.plant)
+            basis = ""
         process = None if mass_factor is None else asdict(env.process.with_mass(mass_factor))  # pyright: ignore
         verification = verify(certificate, env.plant)
-        return cls(name, channel, env.plant, certificate, verification, module, noise, process, downlink)
+        return cls(name, channel, env.plant, certificate, verification, module, noise, process, downlink, basis)
 
     @property
     def title(self) -> str:
@@ -133,6 +137,7 @@ class ExperimentSetup:
             steps=settings.training_steps,
             episodes=settings.episodes,
             certificate=self.certificate,
+            certificate_basis=self.certificate_basis,
             mode=arm.mode,
             horizon=settings.horizon if arm.mode in ("lookahead", "trusting:lookahead") else None,
             filters_training=arm.filters_training,

@@ -48,6 +48,8 @@ class TrainingRun:
         steps: Training steps.
         episodes: Evaluation episodes.
         certificate: Certificate of the shield, which also defines x'Mx.
+        certificate_basis: What the certificate was synthesized from, in words; empty for one that was given. Its last
+            digits may depend on the machine, and a run that another machine finished is still the same run.
         mode: Mode of the shield, or name of another filter; None for neither.
         horizon: Longest plan of modes that look ahead [steps]; None in other modes, and for the default.
         filters_training: Whether shield or filter act in training too.
@@ -75,6 +77,7 @@ class TrainingRun:
     steps: int
     episodes: int
     certificate: Certificate
+    certificate_basis: str = ""
     mode: str | None
     horizon: int | None = None
     filters_training: bool = True
@@ -140,11 +143,11 @@ class TrainingRun:
     @property
     def key(self) -> str:
         """SHA-256 of everything the result depends on: all settings, this project's source and versions of packages."""
-        names = set(self.__dataclass_fields__) - {"certificate", "grid_point", "module"}
+        names = set(self.__dataclass_fields__) - {"certificate", "certificate_basis", "grid_point", "module"}
         content = {name: getattr(self, name) for name in names}
         content |= {
             "module": module_digest(self.module),
-            "certificate": self.certificate.checksum,
+            "certificate": self.certificate_basis or self.certificate.checksum,
             "channel": self.channel and asdict(self.channel),
             "downlink": self.downlink and asdict(self.downlink),
             "lagrangian": self.lagrangian and asdict(self.lagrangian),

@@ -227,8 +227,15 @@ class LinearPlant(HardBounds, limits.OperatingPoint):
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 over every number of the plant, to bind certificates and models to it."""
+        """SHA-256 over every number that the plant was declared with, to bind certificates and models to it.
+
+        It is the same on every machine: these numbers are given, or rounded once (`ncs_gym.exact`).
+        """
         return description.fingerprint_of(self)
+
+    def has_fingerprint(self, fingerprint: str) -> bool:
+        """Returns whether a fingerprint is this plant's, of today or of earlier versions that kept it elsewhere."""
+        return description.has_fingerprint(self, fingerprint)
 
     def constraint_values(self, state: np.ndarray) -> np.ndarray:
         """Returns |c_j x| - 1 for each row of the safe box, shape (k,) or (k, N); positive is violated."""

@@ -90,7 +90,7 @@ def verify(
 
 def _rational_conditions(certificate: Certificate, plant: LinearPlant) -> list[Condition]:
     """Returns the conditions as the first engine judges them."""
-    conditions = [flag("plant: the certificate belongs to it", certificate.fingerprint == plant.fingerprint)]
+    conditions = [flag("plant: the certificate belongs to it", plant.has_fingerprint(certificate.fingerprint))]
     fits = certificate.L.shape == (plant.n, plant.n) and certificate.K.shape == (plant.m, plant.n)
     if certificate.method == "paper":
         conditions.append(flag("shapes: L (n, n), K (m, n)", fits))

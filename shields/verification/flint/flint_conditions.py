@@ -14,5 +14,5 @@ from shields.verification.flint.paper import paper_conditions
 
 def flint_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
     """Yields every condition of a certificate, judged without the code of the first engine."""
-    yield is_so("plant: the certificate belongs to it", certificate.fingerprint == plant.fingerprint)
+    yield is_so("plant: the certificate belongs to it", plant.has_fingerprint(certificate.fingerprint))
     yield from (paper_conditions if certificate.method == "paper" else certified_conditions)(certificate, plant)

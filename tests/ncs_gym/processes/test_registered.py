@@ -9,7 +9,15 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 import ncs_gym
-from ncs_gym.processes import CartPoleProcess, InvertedPendulumProcess, PendulumProcess, inverted_pendulum
+from ncs_gym.processes import (
+    CartPoleProcess,
+    InvertedPendulumProcess,
+    PendulumProcess,
+    inverted_pendulum,
+    nonlinear_cart_pole,
+)
+from ncs_gym.processes.cart_pole_process import sampled_cart_pole
+from ncs_gym.processes.mujoco_pendulum import sampled_inverted_pendulum
 from ncs_gym.registration import needing_extras, registered_ids
 
 IDS = ("ncs_gym/Pendulum-v0", "ncs_gym/CartPoleNonlinear-v0", "ncs_gym/InvertedPendulum-v0")
@@ -67,6 +75,24 @@ def test_linear_model_is_that_of_the_process_and_spec_is_json(env_id):
 
 
 @pytest.mark.parametrize(
+    ("declared", "sampled", "needs"),
+    [(nonlinear_cart_pole, sampled_cart_pole, ""), (inverted_pendulum, sampled_inverted_pendulum, "mujoco")],
+)
+def test_declared_model_is_the_one_that_sampling_finds(declared, sampled, needs):
+    if needs:
+        pytest.importorskip(needs)
+    plant, again = declared(), sampled()
+    assert plant.remainder.proved is again.remainder.proved is False
+    widths = plant.half_widths
+    np.testing.assert_allclose(plant.A * widths / widths[:, None], again.A * widths / widths[:, None], atol=1e-6)
+    np.testing.assert_allclose(plant.B / widths[:, None], again.B / widths[:, None], atol=1e-6)
+    units = np.sqrt(np.outer(*2 * [np.diag(again.remainder.bound.shape)]))
+    np.testing.assert_allclose(plant.remainder.bound.shape / units, again.remainder.bound.shape / units, atol=1e-3)
+    for name in ("sensor_bound", "initial_bound", "disturbance_bound"):
+        np.testing.assert_array_equal(getattr(plant, name).shape, getattr(again, name).shape)
+
+
+@pytest.mark.parametrize(
     ("env_id", "fields", "expected"),
     [
         (IDS[0], {"mass": 1.2}, PendulumProcess(mass=1.2)),
@@ -94,13 +120,10 @@ def test_missing_extra_is_named_in_one_sentence(monkeypatch):
     inverted = IDS[2]
     monkeypatch.setattr("ncs_gym.processes.mujoco_pendulum.find_spec", lambda name: None)
     monkeypatch.setattr("ncs_gym.scenario.find_spec", lambda name: None)
-    from ncs_gym.processes.mujoco_pendulum import _own_model
-
-    _own_model.cache_clear()
     assert inverted in gym.registry
     assert inverted not in registered_ids()
     assert needing_extras() == [inverted]
-    for make in (lambda: gym.make(inverted), lambda: gym.make_vec(inverted, num_envs=2), inverted_pendulum):
+    for make in (lambda: gym.make(inverted), lambda: gym.make_vec(inverted, num_envs=2), sampled_inverted_pendulum):
         with pytest.raises(ModuleNotFoundError, match=r"needs MuJoCo: .* pip install -e '.\[mujoco\]'$"):
             make()
 
