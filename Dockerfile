@@ -10,7 +10,7 @@ WORKDIR /opt/ncs-gym
 COPY constraints.txt ./
 RUN pip install --no-cache-dir -c constraints.txt ${TORCH_INDEX:+--index-url $TORCH_INDEX} torch
 COPY . .
-RUN pip install --no-cache-dir -c constraints.txt '.[train,contrib,render,verify]'
+RUN pip install --no-cache-dir -c constraints.txt '.[train,contrib,render]'
 
 # Runs as an ordinary user, in a folder of its own.
 RUN useradd --create-home user && install -d -o user /project/runs

@@ -33,7 +33,7 @@ _INDENT, _WIDTH = 16, 110
 # Fingerprints that registered plants had on various processors (x86) before the last digits of their A and B were the
 # same on all. A certificate or an agent with one of them belongs to the plant of today: what a certificate claims is
 # verified for the numbers of today anyway.
-_FORMER = {
+FORMER_FINGERPRINTS = {
     "177ea6db2c10f489ba3cd8ac4f550bcba49144e95e7f714551d3193871f948aa": (
         "29a79af5f1181432d4aca2f00608251d0cfb5c931d2b1a52891c5b2d9711428f",
         "0801c535bdcaf0781d2a22bc8a29c98232f10983aa974ee6bac5e9f24a90641a",
@@ -153,8 +153,8 @@ def fingerprint_of(plant: LinearPlant) -> str:
 
 
 def has_fingerprint(plant: LinearPlant, fingerprint: str) -> bool:
-    """Returns whether a fingerprint is that of a plant, or one that the plant had before: see `_FORMER`."""
-    return fingerprint == plant.fingerprint or fingerprint in _FORMER.get(plant.fingerprint, ())
+    """Returns whether a fingerprint is that of a plant, or one that the plant had before: see `FORMER_FINGERPRINTS`."""
+    return fingerprint == plant.fingerprint or fingerprint in FORMER_FINGERPRINTS.get(plant.fingerprint, ())
 
 
 def write_plant(plant: LinearPlant, path: str | os.PathLike[str]) -> None:

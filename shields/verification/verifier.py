@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from shields.errors import CertificateError
 from shields.paper.conditions import paper_conditions
 from shields.verification.certified_conditions import certified_conditions, multipliers_fit
 from shields.verification.conditions import Condition, flag
+from shields.verification.flint import flint_conditions
 
 # Where the name of a condition says which age it is about.
 _AGE = re.compile(r"(?<=Sigma_)\d+| at age \d+")
@@ -77,7 +77,6 @@ def verify(
             and decides by the signs of characteristic polynomials; it also checks the chi-square quantiles.
 
     Raises:
-        ModuleNotFoundError: If the engine is "flint" and python-flint is not installed.
         ValueError: If an argument is of another kind.
     """
     if not isinstance(certificate, Certificate) or not isinstance(plant, LinearPlant):
@@ -85,7 +84,7 @@ def verify(
         raise ValueError(f"verify takes a Certificate and a LinearPlant, got {kinds}")
     if not isinstance(engine, str) or engine not in ("rational", "flint"):
         raise ValueError(f"engine must be 'rational' or 'flint', got {shown(engine)}")
-    return Report(tuple((_rational_conditions if engine == "rational" else _flint_conditions)(certificate, plant)))
+    return Report(tuple((_rational_conditions if engine == "rational" else flint_conditions)(certificate, plant)))
 
 
 def _rational_conditions(certificate: Certificate, plant: LinearPlant) -> list[Condition]:
@@ -100,20 +99,6 @@ def _rational_conditions(certificate: Certificate, plant: LinearPlant) -> list[C
         conditions.append(flag("shapes: L (n, n), K (m, n), one input multiplier per input", fits))
         conditions += certified_conditions(certificate, plant) if fits else []
     return conditions
-
-
-def _flint_conditions(certificate: Certificate, plant: LinearPlant) -> Iterable[Condition]:
-    """Returns the conditions as the second engine judges them.
-
-    Raises:
-        ModuleNotFoundError: If python-flint is not installed.
-    """
-    if importlib.util.find_spec("flint") is None:
-        sentence = "engine 'flint' needs python-flint: in a clone of ncs-gym, pip install -e '.[verify]'"
-        raise ModuleNotFoundError(sentence, name="flint")
-    from shields.verification.flint import flint_conditions  # an optional dependency
-
-    return flint_conditions(certificate, plant)
 
 
 def require_valid(certificate: Certificate, plant: LinearPlant) -> None:

@@ -1,0 +1,253 @@
+"""The same on every processor: plants, certificates, agents and finished runs, made by other kernels and instructions.
+
+OpenBLAS takes the kernels that `OPENBLAS_CORETYPE` names, numpy leaves out the instructions that
+`NPY_DISABLE_CPU_FEATURES` names; both are read when a process starts.
+"""
+
+import functools
+import json
+import os
+import platform
+import subprocess
+import sys
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import ncs_gym
+from agents import Agent
+from ncs_gym import LinearPlant
+from shields import Certificate, SafetyFilter, verify
+from shields.verification.rational_matrix import add, congruence, is_positive_semidefinite, rational, scale, subtract
+from tests.certificates import ROOT, certificate_of
+from tests.verdicts import verified
+
+pytestmark = pytest.mark.skipif(
+    platform.machine() not in ("x86_64", "AMD64"), reason="only x86 has kernels that can be chosen"
+)
+
+KERNELS = ("Haswell", "SkylakeX", "Sandybridge", "Nehalem", "Prescott")
+WIDE = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR AVX2 FMA3 X86_V4 X86_V3"
+IDS = ("TruckTrailer", "TruckTrailerCruise", "CartPole", "BatchReactor", "Pendulum", "CartPoleNonlinear")
+DATA = Path(__file__).resolve().parent.parent / "data" / "certificates"
+
+
+def random_plant(index):
+    """A plant from a continuous-time model of 2 to 6 states; a contract is needed where it is unstable."""
+    rng = np.random.default_rng([7, index])
+    n, m = 2 + index % 5, 1 + index // 5 % 2
+    A, B = rng.standard_normal((n, n)), rng.standard_normal((n, m))
+    if index % 3:
+        A = A - 0.5 * float(np.abs(A).sum(axis=1).max()) * np.eye(n)
+    bounds = {"disturbance_bound": 0.004 * np.ones(n), "sensor_bound": 0.003 * np.ones(n), "initial_bound": 0.003}
+    model = (A, B, np.eye(n), np.zeros((n, m)))
+    return LinearPlant.from_statespace(model, 0.1, box=np.ones(n), u_max=np.full(m, 2.0), **bounds)
+
+
+def all_plants():
+    """Registered and random plants by name, with the contracts of their certificates."""
+    registered = {name: gym.make(f"ncs_gym/{name}-v0").unwrapped for name in IDS}
+    found = {name: (env.plant, env.certificate_contract) for name, env in registered.items()}
+    for index in range(50):
+        contract = ncs_gym.ChannelContract(1 + index % 3) if index % 3 == 0 or index % 2 else None
+        found[f"random plant {index}"] = random_plant(index), contract
+    return found
+
+
+def derived(plant):
+    """Every number that a proof takes from a plant, as text."""
+    bounds = (plant.disturbance, plant.sensor_error_with(0.01), plant.initial_error)
+    numbers = [plant.fingerprint, *(bound.shape.tolist() for bound in bounds)]
+    return json.dumps([*numbers, plant.relative_weight.tolist(), plant.initial_radius_squared, plant.u_max.tolist()])
+
+
+def print_plants():
+    print(json.dumps({name: derived(plant) for name, (plant, _) in all_plants().items()}))
+
+
+def print_verdicts(folder):
+    """Prints which certificates in a folder verify, by both engines."""
+    plants = all_plants()
+    for file in sorted(Path(folder).glob("*.json")):
+        certificate, plant = Certificate.load(file), plants[file.stem][0]
+        print(file.stem, all(verify(certificate, plant, engine=engine).valid for engine in ("rational", "flint")))
+
+
+def make_certificates(folder):
+    """Saves a certificate of every plant that has one."""
+    from shields import Infeasible, synthesize
+
+    for name, (plant, contract) in all_plants().items():
+        try:
+            synthesize(plant, contract=contract).save(Path(folder) / f"{name}.json")
+        except Infeasible:
+            continue
+
+
+def under(kernels, *command, wide=True):
+    """What a command prints in a process with other kernels, and without numpy's wide instructions unless `wide`."""
+    environment = os.environ | {"OPENBLAS_CORETYPE": kernels} | ({} if wide else {"NPY_DISABLE_CPU_FEATURES": WIDE})
+    command = [sys.executable, "-W", "ignore", *map(str, command)]
+    run = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    return run.stdout
+
+
+def call(function, *arguments):
+    """A command that calls a function of this module."""
+    file = Path(__file__).resolve()
+    load = f"import runpy; runpy.run_path({str(file)!r})[{function.__name__!r}]"
+    return "-c", f"{load}(*{tuple(map(str, arguments))!r})"
+
+
+@functools.cache
+def own_plants():
+    return {name: derived(plant) for name, (plant, _) in all_plants().items()}
+
+
+@pytest.mark.parametrize(("kernels", "wide"), [("Haswell", True), ("SkylakeX", True), ("Prescott", False)])
+def test_plants_and_their_bounds_are_the_same_numbers(kernels, wide):
+    assert json.loads(under(kernels, *call(print_plants), wide=wide)) == own_plants()
+
+
+def test_certificate_made_here_verifies_under_other_kernels(tmp_path):
+    for name in IDS:
+        env = gym.make(f"ncs_gym/{name}-v0").unwrapped
+        certificate_of(env.plant, env.certificate_contract).save(tmp_path / f"{name}.json")
+    expected = "".join(f"{name} True\n" for name in sorted(IDS))
+    assert under("Prescott", *call(print_verdicts, tmp_path), wide=False) == expected
+    assert under("Haswell", *call(print_verdicts, tmp_path)) == expected
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("maker", KERNELS)
+def test_certificates_of_every_plant_verify_under_all_kernels(tmp_path, maker):
+    under(maker, *call(make_certificates, tmp_path))
+    made = sorted(file.stem for file in tmp_path.glob("*.json"))
+    assert set(IDS) <= set(made)
+    assert len(made) >= 40
+    for judge in KERNELS:
+        assert under(judge, *call(print_verdicts, tmp_path)) == "".join(f"{name} True\n" for name in made)
+
+
+@pytest.mark.parametrize("file", sorted(DATA.glob("*.json")), ids=lambda file: file.stem)
+def test_certificate_of_an_earlier_version_and_another_processor_still_holds(file):
+    """Made when the last bits of A and B, and with them the fingerprint, depended on the processor."""
+    certificate = Certificate.load(file)
+    plant = gym.make(f"ncs_gym/{file.stem.partition('-')[0]}-v0").unwrapped.plant
+    assert certificate.fingerprint != plant.fingerprint
+    assert plant.has_fingerprint(certificate.fingerprint)
+    assert verified(certificate, plant).valid
+    assert SafetyFilter(certificate, plant).certificate is certificate
+    other = replace(plant, gamma=0.9 * plant.gamma + 1e-9)
+    assert not other.has_fingerprint(certificate.fingerprint)
+    assert not verified(certificate, other).valid
+
+
+def test_agent_and_finished_runs_of_one_processor_are_taken_by_another(tmp_path):
+    train = ("-m", "experiments", "train", "--env", "ncs_gym/BatchReactor-v0", "--steps", "512", "--episodes", "2")
+    train = (*train, "--out", tmp_path, "--agent.rollout", "16", "--agent.envs", "4", "--jobs", "1")
+    under("Haswell", *train)
+    files = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("units/*.json")}
+    assert files
+    under("Prescott", *train, wide=False)
+    assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("units/*.json")} == files
+    (folder,) = {file.parent for file in tmp_path.rglob("model.zip")}
+    load = f"from agents import Agent; print(Agent.load({str(folder)!r}).env)"
+    assert under("Prescott", "-c", load) == "ncs_gym/BatchReactor-v0\n"
+    assert Agent.load(folder).env == "ncs_gym/BatchReactor-v0"
+
+
+@pytest.mark.parametrize("name", ["TruckTrailerCruise", "CartPole", "BatchReactor"])
+def test_verdicts_are_true_in_any_order_of_summation(name):
+    """With the states in other orders every sum is taken in another order; what passes lies inside, exactly."""
+    env = gym.make(f"ncs_gym/{name}-v0").unwrapped
+    plant, rng = env.plant, np.random.default_rng(3)
+    certificate = certificate_of(plant, env.certificate_contract)
+    shape = certificate.error_shapes[0]
+    orders = [np.arange(plant.n), np.arange(plant.n)[::-1], rng.permutation(plant.n)]
+    filters = [SafetyFilter(*reordered(certificate, plant, order)) for order in orders]
+    passed = 0
+    for _ in range(60):
+        direction = rng.standard_normal(plant.n)
+        direction /= certificate.safe_set.gauge(direction)
+        u, low, high = rng.uniform(-1.0, 1.0, plant.m) * plant.u_max, 0.0, 2.0
+        for _ in range(50):  # to the edge of what passes, where the last bits decide
+            middle = 0.5 * (low + high)
+            passes = filters[0].decide(middle * direction, shape, u).reason == "safe"
+            low, high = (middle, high) if passes else (low, middle)
+        x_hat = low * direction
+        for each, order in zip(filters, orders, strict=True):
+            decision = each.decide(x_hat[order], shape[np.ix_(order, order)], u)
+            if decision.reason == "safe":
+                passed += 1
+                assert is_inside_exactly(certificate, plant, x_hat, shape, u)
+    assert passed >= 60
+
+
+def reordered(certificate, plant, order):
+    """Certificate and plant with the states in another order; the proof of the certificate does not change."""
+    square = np.ix_(order, order)
+    bounds = {
+        name: bound and ncs_gym.Ellipsoid(bound.shape[np.ix_(*2 * [order[: bound.dim]])])
+        for name, bound in (("disturbance_bound", plant.disturbance_bound), ("initial_bound", plant.initial_bound))
+    }
+    names = {name: [getattr(plant, name)[i] for i in order] for name in ("state_names", "state_units")}
+    turned = replace(
+        plant,
+        A=plant.A[square],
+        B=plant.B[order],
+        box=plant.C[:, order],
+        H=plant.H[:, order],
+        process_noise_cov=plant.process_noise_cov[square],
+        initial_cov=plant.initial_cov[square],
+        error_gain=None if plant.error_gain is None else plant.error_gain[:, order],
+        operating_state=plant.operating_state[order],
+        **bounds,
+        **names,
+    )
+    ages = certificate.ages
+    if ages is not None:
+        sets = replace(ages.sets, shapes=ages.sets.shapes[:, order][:, :, order], gains=ages.sets.gains[:, order])
+        ages = replace(ages, sets=sets)
+    return (
+        replace(
+            certificate,
+            L=certificate.L[square],
+            K=certificate.K[:, order],
+            Sigma=certificate.Sigma[square],
+            D=certificate.D[square],
+            ages=ages,
+            fingerprint=turned.fingerprint,
+        ),
+        turned,
+    )
+
+
+def is_inside_exactly(certificate, plant, x_hat, shape, u):
+    """Whether {A x_hat + B u} + E(A P A') + E(D) lies in E(L) for some multipliers, in rational arithmetic."""
+    column = [[Fraction(float(x))] for x in [*x_hat, *u]]
+    both = [[*a, *b] for a, b in zip(rational(plant.A), rational(plant.B), strict=True)]
+    center = [sum(a * b[0] for a, b in zip(row, column, strict=True)) for row in both]
+    moved, D, L = (
+        congruence(rational(plant.A), rational(shape)),
+        rational(plant.disturbance.shape),
+        rational(certificate.L),
+    )
+    sizes = [np.sqrt(np.trace(certificate.M @ part)) for part in (plant.A @ shape @ plant.A.T, plant.disturbance.shape)]
+    nus = np.clip(sizes[0] / sum(sizes) + np.linspace(-0.02, 0.02, 9), 1e-9, 1.0 - 1e-9)
+    M, c = certificate.M, np.array([float(x) for x in center])
+    for nu in map(Fraction, nus.tolist()):
+        total = add(scale(1 / nu, moved), scale(1 / (1 - nu), D))
+        spread = np.linalg.eigvals(M @ np.array([[float(x) for x in row] for row in total])).real.max()
+        for t in map(Fraction, np.clip(np.sqrt(spread) + np.linspace(-0.05, 0.05, 11), 1e-6, 1 - 1e-6).tolist()):
+            # {c} + E(P) lies in E(L) if [t, c'; c, L - P/(1-t')] >= 0 for 1-t' = the share of P, t = 1 - t'.
+            rest = subtract(L, scale(1 / t, total))
+            block = [[1 - t, *center]] + [[x, *row] for x, row in zip(center, rest, strict=True)]
+            if is_positive_semidefinite(block):
+                return True
+    return bool(c @ M @ c < 0.0)
