@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.vector import VectorWrapper
 
 from ncs_gym import (
     Actuator,
@@ -21,10 +22,13 @@ from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.downlink import Schedule, starts_known
 from shields.runtime.guarantee import (
     EXPLANATIONS,
+    FAR_OUT,
     LATE_INPUT,
     NO_DOWNLINK_CONTRACT,
     NOT_KNOWN_INSIDE,
     OTHER_INPUT,
+    GuaranteeMonitor,
+    LoopObservation,
 )
 from tests.certificates import certificate_of
 from tests.shields.attacks.extremes import ExtremalNoise
@@ -250,6 +254,21 @@ def test_a_start_outside_the_box_is_not_guaranteed_although_a_plan_is_certified_
     assert not infos["shield_guaranteed"].any()
 
 
+def test_what_is_predicted_must_be_nearer_than_what_is_observed_now():
+    """The present estimate, which is not seen then, may be farther out than its prediction was: rounding counts it."""
+    shield = SafetyFilter(certificate_of(PLANT), PLANT)
+    errors = shield.errors_of(0.1 * certificate_of(PLANT).Sigma)
+
+    def reason(distance, downlink):
+        monitor = GuaranteeMonitor(shield, downlink)
+        seen = LoopObservation(distance * PLANT.half_widths, errors, False)
+        return EXPLANATIONS[monitor.reasons(monitor.start(True, True, seen))]
+
+    lately = shielded().unwrapped.downlink
+    assert [reason(distance, None) for distance in (49.0, 51.0, 99.0, 101.0)] == ["", "", "", FAR_OUT]
+    assert [reason(distance, lately) for distance in (49.0, 51.0)] == ["", FAR_OUT]
+
+
 class Meddling(gym.Wrapper):
     """Reports other inputs than were committed or applied."""
 
@@ -277,6 +296,47 @@ def test_other_inputs_than_decided_end_the_guarantee(key, reason):
     assert shield.step(np.array([0.2]))[4]["shield_reason"] == reason  # for the rest of the episode
     shield.reset()
     assert shield.step(np.array([0.2]))[4]["shield_guaranteed"]
+
+
+class MeddlingWithMany(VectorWrapper):
+    """Reports of some environments that another input was applied than was due."""
+
+    chosen = np.zeros(6, np.bool_)
+
+    def step(self, actions):
+        *result, info = self.env.step(actions)
+        return *result, info | {"input": np.where(self.chosen[:, None], info["input"] + 1e-12, info["input"])}
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_late_input_drops_the_plan_that_was_certified_for_its_being_on_time(late):
+    settings = {"channel": UNSTABLE.uplink, "contract": UNSTABLE.contract, "downlink": UNSTABLE.downlink}
+    env = Meddling(NCSEnv(UNSTABLE.plant, **settings), "input")
+    shield, kept = SafetyShield(env, UNSTABLE.certificate, "lookahead"), 0
+    rng, push = np.random.default_rng(0), np.ones(1, np.float32)
+    for seed in range(15):
+        env.active = False
+        _, info = shield.reset(seed=seed, options={"state": UNSTABLE.certificate.safe_set.sample_boundary(rng)})
+        env.active = late
+        *_, info = shield.step(push)
+        assert not late or info["shield_reason"] == LATE_INPUT
+        assert not late or info["shield_plan_length"] == 0
+        kept += info["shield_plan_length"] > 0
+    assert late or kept > 3
+
+
+def test_late_inputs_drop_the_plans_of_their_own_environments_in_a_vector():
+    settings = {"channel": UNSTABLE.uplink, "contract": UNSTABLE.contract, "downlink": UNSTABLE.downlink}
+    env = MeddlingWithMany(NCSVectorEnv(6, plant=UNSTABLE.plant, **settings))
+    shield, rng, kept = VectorSafetyShield(env, UNSTABLE.certificate, "lookahead"), np.random.default_rng(0), 0
+    for seed in range(5):
+        shield.reset(seed=seed, options={"state": UNSTABLE.certificate.safe_set.sample_boundary(rng, 6)})
+        env.chosen = np.arange(6) % 2 == 0
+        *_, info = shield.step(np.ones((6, 1), np.float32))
+        assert set(info["shield_reason"][env.chosen]) == {LATE_INPUT}
+        assert not info["shield_plan_length"][env.chosen].any()
+        kept += np.count_nonzero(info["shield_plan_length"][~env.chosen])
+    assert kept > 3
 
 
 @pytest.mark.parametrize("mode", ["project", "lookahead"])
