@@ -11,6 +11,7 @@ from ncs_gym import (
     ChannelContract,
     Ellipsoid,
     FunctionProcess,
+    LinearPlant,
     NCSEnv,
     NCSVectorEnv,
     Packet,
@@ -30,6 +31,7 @@ from shields.runtime.guarantee import (
     GuaranteeMonitor,
     LoopObservation,
 )
+from shields.verification.rational_matrix import multiply, quadratic, rational, transpose
 from tests.certificates import certificate_of
 from tests.shields.attacks.extremes import ExtremalNoise
 from tests.shields.downlink.adversary import Case, edges
@@ -193,6 +195,27 @@ def test_a_given_start_is_followed_under_zero_input():
         left += known[0] and not known[-1]
     assert entered > 5
     assert left > 5
+
+
+@pytest.mark.parametrize("size", [1.0, 1e7, 1e11])
+def test_a_start_however_far_out_is_known_to_move_into_the_safe_set_only_if_it_does(size):
+    # Starts that A annihilates, but for the rounding of products of huge numbers.
+    settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 1e-9, "sensor_bound": 0.0, "initial_bound": 0.0}
+    plant = LinearPlant(A=[[0.5, -0.3], [0.25, -0.15]], B=np.ones((2, 1)), box=np.eye(2), **settings)
+    certificate, rng, known = certificate_of(plant), np.random.default_rng(0), 0
+    shield, M = SafetyFilter(certificate, plant), rational(certificate.M)
+    *_, axes = np.linalg.svd(plant.A)
+    for _ in range(100):
+        base, low, high = axes[1] * size * rng.uniform(0.5, 1.0), 0.0, 4.0
+        for _ in range(50):  # to the edge of what is known to be inside
+            middle = 0.5 * (low + high)
+            inside = starts_known(shield, base + middle * axes[0], 1)[1].in_safe_set
+            low, high = (middle, high) if inside else (low, middle)
+        if low > 0.0:
+            known += 1
+            moved = multiply(rational(plant.A), rational((base + low * axes[0])[:, None]))
+            assert quadratic(transpose(moved), M) <= 1
+    assert known > 50
 
 
 @pytest.mark.parametrize("many", [False, True])
