@@ -7,7 +7,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ncs_gym import Channel, Ellipsoid, ErrorSet, Estimator, LinearPlant, Packet, certified_error_set, truck_trailer
+from ncs_gym import (
+    Channel,
+    ChannelContract,
+    Ellipsoid,
+    ErrorSet,
+    Estimator,
+    LinearPlant,
+    Packet,
+    cart_pole,
+    certified_error_set,
+    truck_trailer,
+)
 from ncs_gym.estimation.arrival_patterns import patterns_of
 from ncs_gym.estimation.innovation_test import InnovationTest
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
@@ -302,6 +313,32 @@ def test_computed_shapes_hold_the_exact_ones():
         assert is_positive_semidefinite(subtract(rational(grown), exact))
         if aspect <= 1e3:  # ... and no more than that
             assert np.trace(grown) <= np.trace(A @ shape @ A.T) * (1 + 1e-7)
+
+
+@pytest.mark.parametrize("age", [0, 2, 4])
+def test_a_shape_outside_the_certified_one_of_its_age_is_not_brought_back_by_a_prediction(age):
+    """After an outage longer than the contract an estimate may be as new as it promises and as wrong as before."""
+    plant = cart_pole()
+    sets = SetMembership(plant, 0.0, certified_error_set(plant, ChannelContract(4)))
+    certified, rng = sets.error_set.shape_at(age), np.random.default_rng(age)
+    for _ in range(20):
+        outwards = np.linalg.cholesky(certified) @ rng.standard_normal(plant.n)
+        shape = 0.5 * certified + 4.0 * np.outer(outwards, outwards)  # smaller in other directions
+        exact = congruence(rational(plant.A), rational(shape))
+        assert is_positive_semidefinite(subtract(rational(sets.predicted(shape, age)), exact))
+
+
+def test_a_shape_that_outgrows_the_states_themselves_becomes_one_around_all_their_differences():
+    settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
+    plant = LinearPlant(A=np.diag([1.5, 1.1]), B=np.ones((2, 1)), box=[1.0, 3.0], **settings)
+    sets = SetMembership(plant, 0.0, ErrorSet(Sigma=np.eye(2), rate=0.5))
+    farthest = 2.0 * plant.state_limit  # between states at opposite ends of where a simulation stops them
+    for grown in (np.diag([9.0 * farthest[0] ** 2, 1.0]), np.diag([1.0, 9.0 * farthest[1] ** 2])):
+        shape = sets.predicted(grown, 0)
+        assert Ellipsoid(shape).gauge(farthest) == pytest.approx(1.0)
+        np.testing.assert_array_equal(sets.predicted(shape, 0), shape)
+    within = np.diag((0.5 * farthest) ** 2)
+    assert np.diag(sets.predicted(within, 0)) == pytest.approx([1.5**2, 1.1**2] * np.diag(within), rel=1e-2)
 
 
 def ill_conditioned_sets(n):

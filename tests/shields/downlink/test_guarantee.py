@@ -24,9 +24,11 @@ from shields.downlink import Schedule, starts_known
 from shields.runtime.guarantee import (
     EXPLANATIONS,
     FAR_OUT,
+    LARGE_ERROR,
     LATE_INPUT,
     NO_DOWNLINK_CONTRACT,
     NOT_KNOWN_INSIDE,
+    OLD_SAMPLE,
     OTHER_INPUT,
     GuaranteeMonitor,
     LoopObservation,
@@ -290,6 +292,19 @@ def test_what_is_predicted_must_be_nearer_than_what_is_observed_now():
     lately = shielded().unwrapped.downlink
     assert [reason(distance, None) for distance in (49.0, 51.0, 99.0, 101.0)] == ["", "", "", FAR_OUT]
     assert [reason(distance, lately) for distance in (49.0, 51.0)] == ["", FAR_OUT]
+
+
+def test_a_large_error_is_put_down_to_old_samples_once_they_are_older_than_the_sensors_contract_allows():
+    """The certificate counts the steps of both channels, the age of a sample those of its own alone."""
+    shield = SafetyFilter(UNSTABLE.certificate, UNSTABLE.plant)
+    monitor = GuaranteeMonitor(shield, UNSTABLE.env(1, "random").single.downlink)
+    n, allowed = UNSTABLE.plant.n, UNSTABLE.contract.max_age
+    assert UNSTABLE.certificate.contract.max_age == allowed + 2
+    largest = np.linalg.eigvalsh(UNSTABLE.certificate.error_shapes).max()
+    seen = LoopObservation(np.zeros(n), shield.errors_of(1.01 * largest * np.eye(n)), False)
+    state = monitor.start(True, True, seen)
+    found = [EXPLANATIONS[monitor.reasons(state, age)] for age in (allowed, allowed + 1)]
+    assert found == [LARGE_ERROR, OLD_SAMPLE]
 
 
 class Meddling(gym.Wrapper):
