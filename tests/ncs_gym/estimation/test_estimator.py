@@ -268,6 +268,17 @@ def test_damaged_packet_is_not_used_and_raises_the_alarm():
     assert np.isfinite(estimator.belief.mean).all()
 
 
+def test_two_sensors_that_contradict_each_other_raise_the_alarm_where_one_of_them_says_what_was_predicted():
+    """So exact, and so alike, that no inverse vouches for a residual: infinite weights times zero are no number."""
+    settings = {"disturbance_bound": 0.1, "sensor_bound": 1e-9, "initial_bound": 0.1}
+    plant = LinearPlant(A=[[0.5]], B=[[1.0]], H=[[1.0], [1.0]], box=[1.0], u_max=1.0, dt=0.1, **settings)
+    for off, alarm in ((0.0, False), (0.01, True)):
+        estimator = Estimator(plant, Channel())
+        estimator.reset(np.zeros(1))
+        estimator.advance(np.zeros(1), [Packet(1, np.array([0.0, off]))])
+        assert estimator.alarm is alarm
+
+
 def test_innovation_at_the_edge_of_both_bounds_is_no_alarm():
     # The test against E(H Sigma H' + N) would raise it; the exact Minkowski test must not.
     plant = truck_trailer()
@@ -326,6 +337,19 @@ def test_a_shape_outside_the_certified_one_of_its_age_is_not_brought_back_by_a_p
         shape = 0.5 * certified + 4.0 * np.outer(outwards, outwards)  # smaller in other directions
         exact = congruence(rational(plant.A), rational(shape))
         assert is_positive_semidefinite(subtract(rational(sets.predicted(shape, age)), exact))
+
+
+@pytest.mark.parametrize("size", [1.0, 2.0**10, 2.0**20])
+def test_a_long_thin_shape_is_moved_without_loss(size):
+    settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
+    plant = LinearPlant(A=[[0.9, -0.45], [0.45, -0.225]], B=np.ones((2, 1)), box=np.eye(2), **settings)
+    sets = SetMembership(plant, 0.0, ErrorSet(Sigma=1e2 * np.eye(2), rate=0.9), shape_step=2.0**-90)
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        long = (size * rng.uniform(0.5, 1.0)) ** 2 * np.array([[1.0, 2.0], [2.0, 4.0]])  # which A annihilates
+        shape = long + 10.0 ** rng.uniform(-2, 0) * np.array([[1.0, -0.5], [-0.5, 0.25]])
+        exact = congruence(rational(plant.A), rational(shape))
+        assert is_positive_semidefinite(subtract(rational(sets.predicted(shape, 0)), exact))
 
 
 def test_a_shape_that_outgrows_the_states_themselves_becomes_one_around_all_their_differences():

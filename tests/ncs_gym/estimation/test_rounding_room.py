@@ -12,6 +12,7 @@ from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.set_membership import SetMembership
 from ncs_gym.plants.linear_plant import INFLATION, SIMULATED_REACH
 from ncs_gym.uncertainty.shape_matrices import is_inside
+from shields.verification.rational_matrix import congruence, rational
 
 # Radius of Sigma_0 in half-widths of the box: of sensors so fine that the rounding of an estimate far out counts.
 RADIUS, GAIN, RATE = 1e-8, 0.9, 1.02
@@ -100,6 +101,35 @@ def test_a_gain_chosen_at_run_time_has_the_room_where_shapes_are_hardly_rounded_
         updated = estimate + gain * (sample - H * estimate)
         largest = max(largest, float((Fraction(updated) - state) / Fraction(limit)))
     assert 0.5 < largest < 1.0
+
+
+def test_an_update_holds_noise_that_is_nearly_common_to_two_sensors():
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        noise = Ellipsoid(1e4 * rng.uniform(0.5, 1.0) * np.array([[1.0, 0.7], [0.7, 0.49]]) + 1e-12 * np.eye(2))
+        settings = {"disturbance_bound": 0.0, "sensor_bound": noise, "initial_bound": 0.0}
+        plant = LinearPlant(A=[[RATE]], B=[[1.0]], H=[[1.0], [0.7]], box=[1.0], u_max=1.0, dt=0.1, **settings)
+        sets = SetMembership(plant, 0.0, ErrorSet(Sigma=np.array([[1.0]]), rate=0.5), shape_step=2.0**-90)
+        gain, shape = np.array([[70.0, -100.0]]) * rng.uniform(0.5, 1.0), np.array([[1e-26]])
+        N = congruence(rational(gain), rational(sets.noise))
+        assert sets.updated(shape, gain).item() >= N[0][0]
+
+
+@pytest.mark.parametrize("gain", [0.0, 1.0])
+def test_an_update_that_keeps_the_error_or_takes_the_noise_alone_needs_the_inflation_and_the_room(gain):
+    plant = plant_with(1.0)
+    sets = ErrorSetsByAge(
+        contract=ChannelContract(0),
+        shapes=np.array([[[1.0]], [[1.0]]]),
+        rates=np.array([0.5]),
+        gains=np.array([[[gain]]]),
+        multipliers=np.array([0.5]),
+        noise=np.array([[1.0]]),
+    )
+    ((_, inner, _),) = sets.needs(plant)["(C2)"]
+    assert inner.item() == pytest.approx(2.0 * INFLATION, rel=1e-10)
+    room = sets._rounding_of_update(plant, 0)
+    assert room >= plant.estimate_rounding if gain else room == plant.estimate_rounding
 
 
 def test_sets_that_are_found_have_the_room():

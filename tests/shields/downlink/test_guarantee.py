@@ -33,7 +33,15 @@ from shields.runtime.guarantee import (
     GuaranteeMonitor,
     LoopObservation,
 )
-from shields.verification.rational_matrix import multiply, quadratic, rational, transpose
+from shields.verification.rational_matrix import (
+    congruence,
+    is_positive_semidefinite,
+    multiply,
+    quadratic,
+    rational,
+    subtract,
+    transpose,
+)
 from tests.certificates import certificate_of
 from tests.shields.attacks.extremes import ExtremalNoise
 from tests.shields.downlink.adversary import Case, edges
@@ -42,6 +50,7 @@ from tests.shields.lookahead.adversary import box_ellipsoid
 PLANT = truck_trailer(mass=4000.0)
 UPLINK = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
 KEPT = Channel(loss=0.4, delay=1, max_consecutive_losses=1)
+THIN = np.array([[1.0, -0.5], [-0.5, 0.25]])
 UNSTABLE = Case(cart_pole(), Channel(loss=0.3, delay=1, max_consecutive_losses=1), Channel(delay=2))
 
 
@@ -220,6 +229,23 @@ def test_a_start_however_far_out_is_known_to_move_into_the_safe_set_only_if_it_d
     assert known > 50
 
 
+@pytest.mark.parametrize("size", [1.0, 2.0**10, 2.0**20])
+def test_starts_along_a_line_that_moves_into_the_safe_set_are_known_to_only_if_they_do(size):
+    settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 1e-9, "sensor_bound": 0.0, "initial_bound": 0.0}
+    plant = LinearPlant(A=[[0.9, -0.45], [0.45, -0.225]], B=np.ones((2, 1)), box=np.eye(2), **settings)
+    certificate, rng = certificate_of(plant), np.random.default_rng(0)
+    shield, A, L = SafetyFilter(certificate, plant), rational(plant.A), rational(certificate.L)
+    for _ in range(60):
+        long = (size * rng.uniform(0.5, 1.0)) ** 2 * np.array([[1.0, 2.0], [2.0, 4.0]])  # which A annihilates
+        low, high = 0.0, 16.0
+        for _ in range(50):  # to the edge of what is known to be inside
+            middle = 0.5 * (low + high)
+            inside = starts_known(shield, Ellipsoid(long + middle * THIN), 1)[1].in_safe_set
+            low, high = (middle, high) if inside else (low, middle)
+        assert low > 0.1
+        assert is_positive_semidefinite(subtract(L, congruence(A, rational(long + low * THIN))))
+
+
 @pytest.mark.parametrize("many", [False, True])
 def test_first_plan_is_stored_for_the_state_at_which_the_first_input_takes_effect(many):
     certificate, rng, shape = UNSTABLE.certificate, np.random.default_rng(0), UNSTABLE.plant.A.shape
@@ -375,6 +401,19 @@ def test_late_inputs_drop_the_plans_of_their_own_environments_in_a_vector():
         assert not info["shield_plan_length"][env.chosen].any()
         kept += np.count_nonzero(info["shield_plan_length"][~env.chosen])
     assert kept > 3
+
+
+def test_an_input_that_is_not_reported_counts_as_late():
+    class Silent(gym.Wrapper):
+        def step(self, action):
+            *result, info = self.env.step(action)
+            return *result, info | {"input": "none"}
+
+    certificate = certificate_of(PLANT)
+    env = NCSEnv(PLANT, UPLINK, initial_set=Ellipsoid(0.09 * certificate.L), downlink=KEPT)
+    shield = SafetyShield(Silent(env), certificate)
+    assert shield.reset(seed=0)[1]["shield_guaranteed"]
+    assert shield.step(np.array([0.2]))[4]["shield_reason"] == LATE_INPUT
 
 
 @pytest.mark.parametrize("mode", ["project", "lookahead"])
