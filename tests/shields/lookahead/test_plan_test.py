@@ -13,6 +13,7 @@ from shields import SafetyFilter
 from shields.lookahead import PlanTest, Prediction
 from shields.lookahead.tightening import Tightening
 from shields.runtime.one_step_test import OneStepTest
+from shields.runtime.predicted_errors import SMALLEST_RADIUS
 from shields.runtime.safety_filter import MARGIN
 from shields.verification.rational_matrix import multiply, quadratic, rational
 from tests.certificates import certificate_of
@@ -277,17 +278,54 @@ QUIET = {"u_max": 1.0, "dt": 0.1, "sensor_bound": 0.0, "initial_bound": 0.0}
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.1])
-def test_box_is_certified_in_rational_arithmetic_where_large_inputs_cancel(margin):
-    plant = LinearPlant(A=[[0.5]], B=[[1e6, -1e6]], box=[1.0], disturbance_bound=0.0, **QUIET)
-    test, rng = PlanTest(Prediction(OneStepTest(np.array([[1e4]]), plant), 2), margin), np.random.default_rng(0)
+@pytest.mark.parametrize(("where", "step"), [("box", 1), ("box", 2), ("end", 1), ("end", 2)])
+def test_plans_are_certified_in_rational_arithmetic_where_large_inputs_cancel(where, step, margin):
+    plant = LinearPlant(A=[[1e-4]], B=[[1e6, -1e6]], box=[1.0], disturbance_bound=0.0, **QUIET)
+    L, steps = (np.array([[1e4]]), step + 1) if where == "box" else (np.eye(1), step)  # one of them is far away
+    test, rng = PlanTest(Prediction(OneStepTest(L, plant), steps), margin), np.random.default_rng(0)
     nothing, levels = np.zeros((1, 1)), []
     known = test.tightenings_of(nothing[None])
     for _ in range(40):
-        first = rng.uniform(-0.9, 0.9)
-        plan = np.array([[first, first - rng.uniform(0.2, 0.8) * 1e-6], [0.0, 0.0]])
-        x_hat = edge_of(lambda x, plan=plan: test.certified(np.array([[x]]), known, plan[None, None])[0, 0, 1], 4.0)
-        levels.append(exact_reach(plant, plant.C[0], np.array([x_hat]), nothing, plan[:1]))
+        plan, first, start = np.zeros((steps, 2)), rng.uniform(-0.9, 0.9), np.array([1e-3 * rng.uniform(-1.0, 1.0)])
+
+        def passes(size, plan=plan, first=first, start=start):
+            plan[step - 1] = first, first - size
+            return test.certified(start[None], known, plan[None, None])[0, 0, -1]
+
+        passes(edge_of(passes, 1e-5))
+        levels.append(exact_reach(plant, plant.C[0], start, nothing, plan[:step]))
     assert 1.0 - margin - 1e-6 < min(levels) <= max(levels) <= 1.0 - margin
+
+
+@pytest.mark.parametrize(("where", "step"), [("box", 2), ("box", 3), ("end", 2), ("end", 3)])
+def test_plans_are_certified_in_rational_arithmetic_where_powers_cancel(where, step):
+    # A is half of the identity and what its own square annihilates, but for rounding.
+    A = 3001.7 * np.array([[0.3, -0.1], [0.9, -0.3]]) + 0.5 * np.eye(2)
+    plant = LinearPlant(A=A, B=[[0.3], [0.9]], box=[1.0, 1.0], disturbance_bound=0.0, **QUIET)
+    L, steps = (1e4 * np.eye(2), step + 1) if where == "box" else (np.diag([1e16, 1.0]), step)
+    test, rng = PlanTest(Prediction(OneStepTest(L, plant), steps), 0.0), np.random.default_rng(0)
+    nothing, levels = np.zeros((2, 2)), []
+    known = test.tightenings_of(nothing[None])
+    for _ in range(60):
+        plan, start = np.zeros((steps, 1)), rng.uniform(0.1, 0.5) * np.array([1.0, 3.0])
+
+        def passes(size, plan=plan, start=start):
+            plan[step - 1] = size
+            return test.certified(start[None], known, plan[None, None])[0, 0, -1]
+
+        passes(edge_of(passes, 1.0))
+        levels.append(exact_reach(plant, np.array([0.0, 1.0]), start, nothing, plan[:step]))
+    assert 1.0 - 1e-3 < min(levels) <= max(levels) <= 1.0
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0])
+def test_nothing_is_certified_where_the_radius_is_too_small_for_the_weights(case, scale):
+    plant, certificate, _ = case
+    test = PlanTest(Prediction(OneStepTest(certificate.L, plant), 1), 0.0)
+    nothing, plan = np.zeros((1, plant.n)), np.zeros((1, 1, 1, plant.m))
+    shape = scale * certificate.L[None]
+    size = edge_of(lambda s: test.certified(nothing, test.tightenings_of(s * shape), plan)[0, 0, 0], 1e3)
+    assert SMALLEST_RADIUS <= test.tightenings_of(size * shape).radius.item() < 1.01 * SMALLEST_RADIUS
 
 
 @pytest.mark.parametrize("size", [1.0, 1e4, 1e7, 1e10])
