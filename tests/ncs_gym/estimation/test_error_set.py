@@ -3,8 +3,16 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from ncs_gym import Ellipsoid, ErrorSetError, LinearPlant, UnstablePlantError, certified_error_set, truck_trailer
-from ncs_gym.estimation.error_bound import _check
+from ncs_gym import (
+    Ellipsoid,
+    ErrorSet,
+    ErrorSetError,
+    LinearPlant,
+    UnstablePlantError,
+    certified_error_set,
+    truck_trailer,
+)
+from ncs_gym.estimation.error_bound import _check, require_error_set
 from shields.verification.rational_matrix import add, congruence, is_positive_semidefinite, rational, scale, subtract
 from tests.plants import random_plant
 
@@ -110,6 +118,24 @@ def test_unstable_plant_is_refused_with_its_spectral_radius():
     plant = LinearPlant(A=[[1.02]], B=[[1.0]], box=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-3)
     with pytest.raises(UnstablePlantError, match=r"spectral radius of A is 1\.02"):
         certified_error_set(plant)
+
+
+@pytest.mark.parametrize("growth", [1.0, 1.0 + 2.0**-50, 1.0 + 1e-10])
+def test_set_that_holds_by_no_more_than_rounding_is_an_error(growth):
+    # As below; without a first error (E1) alone decides.
+    settings = {"disturbance_bound": 0.1, "sensor_bound": 0.1, "initial_bound": 0.0}
+    plant = LinearPlant(A=[[0.5]], B=[[1.0]], box=[1.0], u_max=1.0, dt=0.1, **settings)
+    Sigma = growth * 4.0 * plant.disturbance.shape
+    checks = [
+        lambda: _check(Sigma, plant.A, plant.disturbance.shape, plant.initial_error.shape, 0.5),
+        lambda: require_error_set(ErrorSet(Sigma=Sigma, rate=0.5), plant),
+    ]
+    for check in checks:
+        if growth > 1.0 + 1e-12:
+            check()
+        else:
+            with pytest.raises(ErrorSetError, match=r"\(E1\)"):
+                check()
 
 
 def test_set_that_fails_a_condition_in_one_direction_is_an_error():

@@ -7,7 +7,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ncs_gym import Channel, Ellipsoid, ErrorSet, Estimator, LinearPlant, Packet, certified_error_set, truck_trailer
+from ncs_gym import (
+    Channel,
+    ChannelContract,
+    Ellipsoid,
+    ErrorSet,
+    Estimator,
+    LinearPlant,
+    Packet,
+    cart_pole,
+    certified_error_set,
+    truck_trailer,
+)
 from ncs_gym.estimation.arrival_patterns import patterns_of
 from ncs_gym.estimation.innovation_test import InnovationTest
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
@@ -257,6 +268,17 @@ def test_damaged_packet_is_not_used_and_raises_the_alarm():
     assert np.isfinite(estimator.belief.mean).all()
 
 
+def test_two_sensors_that_contradict_each_other_raise_the_alarm_where_one_of_them_says_what_was_predicted():
+    """So exact, and so alike, that no inverse vouches for a residual: infinite weights times zero are no number."""
+    settings = {"disturbance_bound": 0.1, "sensor_bound": 1e-9, "initial_bound": 0.1}
+    plant = LinearPlant(A=[[0.5]], B=[[1.0]], H=[[1.0], [1.0]], box=[1.0], u_max=1.0, dt=0.1, **settings)
+    for off, alarm in ((0.0, False), (0.01, True)):
+        estimator = Estimator(plant, Channel())
+        estimator.reset(np.zeros(1))
+        estimator.advance(np.zeros(1), [Packet(1, np.array([0.0, off]))])
+        assert estimator.alarm is alarm
+
+
 def test_innovation_at_the_edge_of_both_bounds_is_no_alarm():
     # The test against E(H Sigma H' + N) would raise it; the exact Minkowski test must not.
     plant = truck_trailer()
@@ -302,6 +324,45 @@ def test_computed_shapes_hold_the_exact_ones():
         assert is_positive_semidefinite(subtract(rational(grown), exact))
         if aspect <= 1e3:  # ... and no more than that
             assert np.trace(grown) <= np.trace(A @ shape @ A.T) * (1 + 1e-7)
+
+
+@pytest.mark.parametrize("age", [0, 2, 4])
+def test_a_shape_outside_the_certified_one_of_its_age_is_not_brought_back_by_a_prediction(age):
+    """After an outage longer than the contract an estimate may be as new as it promises and as wrong as before."""
+    plant = cart_pole()
+    sets = SetMembership(plant, 0.0, certified_error_set(plant, ChannelContract(4)))
+    certified, rng = sets.error_set.shape_at(age), np.random.default_rng(age)
+    for _ in range(20):
+        outwards = np.linalg.cholesky(certified) @ rng.standard_normal(plant.n)
+        shape = 0.5 * certified + 4.0 * np.outer(outwards, outwards)  # smaller in other directions
+        exact = congruence(rational(plant.A), rational(shape))
+        assert is_positive_semidefinite(subtract(rational(sets.predicted(shape, age)), exact))
+
+
+@pytest.mark.parametrize("size", [1.0, 2.0**10, 2.0**20])
+def test_a_long_thin_shape_is_moved_without_loss(size):
+    settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
+    plant = LinearPlant(A=[[0.9, -0.45], [0.45, -0.225]], B=np.ones((2, 1)), box=np.eye(2), **settings)
+    sets = SetMembership(plant, 0.0, ErrorSet(Sigma=1e2 * np.eye(2), rate=0.9), shape_step=2.0**-90)
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        long = (size * rng.uniform(0.5, 1.0)) ** 2 * np.array([[1.0, 2.0], [2.0, 4.0]])  # which A annihilates
+        shape = long + 10.0 ** rng.uniform(-2, 0) * np.array([[1.0, -0.5], [-0.5, 0.25]])
+        exact = congruence(rational(plant.A), rational(shape))
+        assert is_positive_semidefinite(subtract(rational(sets.predicted(shape, 0)), exact))
+
+
+def test_a_shape_that_outgrows_the_states_themselves_becomes_one_around_all_their_differences():
+    settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
+    plant = LinearPlant(A=np.diag([1.5, 1.1]), B=np.ones((2, 1)), box=[1.0, 3.0], **settings)
+    sets = SetMembership(plant, 0.0, ErrorSet(Sigma=np.eye(2), rate=0.5))
+    farthest = 2.0 * plant.state_limit  # between states at opposite ends of where a simulation stops them
+    for grown in (np.diag([9.0 * farthest[0] ** 2, 1.0]), np.diag([1.0, 9.0 * farthest[1] ** 2])):
+        shape = sets.predicted(grown, 0)
+        assert Ellipsoid(shape).gauge(farthest) == pytest.approx(1.0)
+        np.testing.assert_array_equal(sets.predicted(shape, 0), shape)
+    within = np.diag((0.5 * farthest) ** 2)
+    assert np.diag(sets.predicted(within, 0)) == pytest.approx([1.5**2, 1.1**2] * np.diag(within), rel=1e-2)
 
 
 def ill_conditioned_sets(n):

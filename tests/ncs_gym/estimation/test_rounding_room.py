@@ -1,5 +1,6 @@
 """The room that error sets by age have for the rounding of an estimate that is updated with a certified gain."""
 
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -8,8 +9,10 @@ import pytest
 from ncs_gym import Channel, ChannelContract, Ellipsoid, ErrorSet, LinearPlant, certified_error_set
 from ncs_gym.estimation.error_bounds_by_age import ErrorSetsByAge
 from ncs_gym.estimation.estimator import Estimator
+from ncs_gym.estimation.set_membership import SetMembership
 from ncs_gym.plants.linear_plant import INFLATION, SIMULATED_REACH
 from ncs_gym.uncertainty.shape_matrices import is_inside
+from shields.verification.rational_matrix import congruence, rational
 
 # Radius of Sigma_0 in half-widths of the box: of sensors so fine that the rounding of an estimate far out counts.
 RADIUS, GAIN, RATE = 1e-8, 0.9, 1.02
@@ -80,6 +83,53 @@ def test_with_room_an_updated_estimate_stays_in_its_set():
     plant, error_set = sets_that_just_hold(room=True)
     assert 0.5 < largest_gauge_after_an_update(plant, error_set) < 1.0
     assert Estimator(plant, Channel(), error_set).error_set is error_set
+
+
+@pytest.mark.parametrize(("radius", "gain"), [(1e-8, 0.9), (4e-3, 0.5)])
+def test_a_gain_chosen_at_run_time_has_the_room_where_shapes_are_hardly_rounded_up(radius, gain):
+    """The inflation covers what rounding takes of a large error, and what the plant adds that of a small one."""
+    plant, rng, largest, H = replace(plant_with(radius), H=np.array([[0.9]])), np.random.default_rng(0), 0.0, 0.9
+    sets = SetMembership(plant, 0.0, ErrorSet(Sigma=np.array([[1.0]]), rate=0.5), shape_step=2.0**-90)
+    error, noise = Fraction(radius), Fraction(float(sets.noise[0, 0] ** 0.5)) * (1 - Fraction(1, 10**15))
+    limit = sets.updated(np.array([[radius**2]]), np.array([[gain]])).item() ** 0.5
+    for _ in range(500):
+        estimate = SIMULATED_REACH * rng.uniform(0.7, 1.0)
+        sample = float(Fraction(H) * (Fraction(estimate) - error) + noise)
+        state = max(
+            Fraction(estimate) - error, (Fraction(sample) - noise) / Fraction(H)
+        )  # both are within their bounds
+        updated = estimate + gain * (sample - H * estimate)
+        largest = max(largest, float((Fraction(updated) - state) / Fraction(limit)))
+    assert 0.5 < largest < 1.0
+
+
+def test_an_update_holds_noise_that_is_nearly_common_to_two_sensors():
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        noise = Ellipsoid(1e4 * rng.uniform(0.5, 1.0) * np.array([[1.0, 0.7], [0.7, 0.49]]) + 1e-12 * np.eye(2))
+        settings = {"disturbance_bound": 0.0, "sensor_bound": noise, "initial_bound": 0.0}
+        plant = LinearPlant(A=[[RATE]], B=[[1.0]], H=[[1.0], [0.7]], box=[1.0], u_max=1.0, dt=0.1, **settings)
+        sets = SetMembership(plant, 0.0, ErrorSet(Sigma=np.array([[1.0]]), rate=0.5), shape_step=2.0**-90)
+        gain, shape = np.array([[70.0, -100.0]]) * rng.uniform(0.5, 1.0), np.array([[1e-26]])
+        N = congruence(rational(gain), rational(sets.noise))
+        assert sets.updated(shape, gain).item() >= N[0][0]
+
+
+@pytest.mark.parametrize("gain", [0.0, 1.0])
+def test_an_update_that_keeps_the_error_or_takes_the_noise_alone_needs_the_inflation_and_the_room(gain):
+    plant = plant_with(1.0)
+    sets = ErrorSetsByAge(
+        contract=ChannelContract(0),
+        shapes=np.array([[[1.0]], [[1.0]]]),
+        rates=np.array([0.5]),
+        gains=np.array([[[gain]]]),
+        multipliers=np.array([0.5]),
+        noise=np.array([[1.0]]),
+    )
+    ((_, inner, _),) = sets.needs(plant)["(C2)"]
+    assert inner.item() == pytest.approx(2.0 * INFLATION, rel=1e-10)
+    room = sets._rounding_of_update(plant, 0)
+    assert room >= plant.estimate_rounding if gain else room == plant.estimate_rounding
 
 
 def test_sets_that_are_found_have_the_room():
@@ -159,3 +209,33 @@ def test_room_grows_with_the_gain_and_sets_without_it_are_refused():
     ((_, inner, _),) = sets.needs(plant)["(C2)"]
     room = (inner - updated).item()
     assert moved < (room * (INFLATION - 1.0) / 2.0) ** 0.5
+
+
+@pytest.mark.parametrize(("error", "noise"), [(1e4, 1e-6), (1e-6, 1e4)])
+def test_room_holds_what_the_residual_of_a_large_error_or_of_large_noise_rounds(error, noise):
+    """Two sensors that agree but for little: each is far off, their difference is not."""
+    matched = np.array([[1.0], [0.7]])
+    gain = np.array([[1.0, 0.0]]) if error > noise else np.array([[7.0, -10.0]])
+    own = Ellipsoid(noise**2 * matched @ matched.T + 1e-12 * np.eye(2))  # the gain does not see what is common to both
+    settings = {"box": [1.0], "u_max": 1.0, "dt": 0.1, "disturbance_bound": 0.0, "initial_bound": 0.0}
+    plant = LinearPlant(A=[[0.5]], B=[[1.0]], H=matched, sensor_bound=own, **settings)
+    sets = ErrorSetsByAge(
+        contract=ChannelContract(0),
+        shapes=np.array([[[1.0]], [[error**2]]]),
+        rates=np.array([0.5]),
+        gains=np.array([gain]),
+        multipliers=np.array([0.5]),
+        noise=plant.sensor_error_with(0.0).shape,
+    )
+    rng, moved = np.random.default_rng(0), 0.0
+    for _ in range(300):
+        estimate = np.array([SIMULATED_REACH * rng.uniform(0.6, 1.0)])
+        sample = matched @ (estimate + error * rng.uniform(-1.0, 1.0)) + noise * rng.uniform(-1.0, 1.0) * matched[:, 0]
+        start, end = (
+            Fraction(float(value[0])) for value in (estimate, estimate + gain @ (sample - matched @ estimate))
+        )
+        numbers = zip(gain[0].tolist(), sample.tolist(), matched[:, 0].tolist(), strict=True)
+        terms = [Fraction(t) * (Fraction(y) - Fraction(h) * start) for t, y, h in numbers]
+        moved = max(moved, abs(float(end - start - sum(terms))))
+    room = sets._rounding_of_update(plant, 0).item()
+    assert 0.02 < moved / (room * (INFLATION - 1.0) / 2.0) ** 0.5 < 1.0

@@ -72,6 +72,19 @@ def test_linear_process_leaves_nothing_out():
     assert np.sqrt(plant.remainder.bound.shape.max()) < 1e-9
 
 
+@pytest.mark.parametrize("offset", [0.0, 0.02, -0.02])
+def test_proved_bound_holds_what_a_step_from_rest_leaves_out(offset):
+    """A kink attains the mean value theorem's bound, and what happens at rest comes on top of that."""
+
+    def kinked(state, u):
+        return 0.5 * state + 0.3 * u + 0.1 * np.abs(state) + offset
+
+    bounds = [[0.4, 0.3]], [[0.6, 0.3]]
+    plant = linear_model(kinked, [0.5], [1.0], 0.1, jacobian_bounds=bounds, samples=200, **QUIET)
+    assert plant.remainder.proved
+    np.testing.assert_allclose(np.sqrt(plant.remainder.bound.shape), [[0.05 + abs(offset)]], rtol=1e-6)
+
+
 def test_inner_environment_is_modeled_like_its_equations():
     inner, own = model(PendulumProcess()), model()
     np.testing.assert_allclose(inner.A, own.A, atol=1e-8)

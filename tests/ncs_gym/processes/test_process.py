@@ -205,10 +205,11 @@ def test_remainder_is_left_to_the_process():
         assert (np.abs(info["state"] - A @ before).max() > 1e-6) == moves
 
 
+@pytest.mark.parametrize("loss", [0.0, 1.0])  # without any sample the alarm is that of the process alone
 @pytest.mark.parametrize("many", [False, True])
-def test_step_outside_the_model_raises_the_alarm_until_the_next_episode(many):
+def test_step_outside_the_model_raises_the_alarm_until_the_next_episode(many, loss):
     strong = GymProcess(lambda: Inner(gain=1.5), read_state=read, write_state=write)
-    settings = {"plant": plant(), "process": strong}
+    settings = {"plant": plant(), "process": strong, "channel": Channel(loss=loss)}
     env = NCSVectorEnv(2, **settings, autoreset_mode="Disabled") if many else NCSEnv(**settings)
     full = np.array([[1.0], [0.0]], np.float32) if many else np.ones(1, np.float32)
     env.reset(seed=0, options={"state": np.zeros(2)})

@@ -70,6 +70,18 @@ def test_a_point_on_the_bound_passes_and_one_beyond_it_raises(plant):
     np.testing.assert_array_equal(checked(plant, 9 * edge, allow_assumption_violation=True), 9 * edge)
 
 
+def test_what_rounding_may_have_put_beyond_the_bound_is_scaled_back_and_no_more_than_that(plant):
+    rng, allowed = np.random.default_rng(0), plant.allowed_disturbance
+    for _ in range(50):
+        edge = plant.disturbance.extreme_point(rng.standard_normal(2))
+        edge /= plant.disturbance.gauge(edge)
+        taken = checked(plant, (1.0 + 0.9e-9) * edge, allow_assumption_violation=False)
+        assert 1.0 - 2e-12 < allowed.gauge(taken) < 1.0
+        np.testing.assert_allclose(taken, edge, rtol=1e-8)
+        with pytest.raises(ValueError, match=r"outside its bound E\(D\)"):
+            checked(plant, (1.0 + 1.1e-9) * edge, allow_assumption_violation=False)
+
+
 @pytest.mark.parametrize("d", [[np.nan, 0.0], [0.0], "gust", None])
 def test_what_is_no_disturbance_is_refused(d, plant):
     with pytest.raises(ValueError, match="the disturbance must"):

@@ -201,6 +201,25 @@ def test_what_is_said_to_be_inside_is_inside_in_exact_arithmetic(n):
     assert missed == 0
 
 
+@pytest.mark.parametrize("exponent", [0, -200, -537])
+def test_inclusion_is_exact_where_differences_round_and_products_lose_their_digits(exponent):
+    """The last digit of each entry of a difference decides, at 2^-537 beside products that keep no more than two."""
+    rng, contradicted = np.random.default_rng(0), 0
+    for _ in range(4000):
+        level = rng.integers(1, 6) + 0.5  # two neighbors of a product this large differ by one in its last digit
+        d, b = np.sqrt(level) * rng.uniform(0.8, 1.25), np.nextafter(np.sqrt(level), 0.0)
+        a = np.nextafter(level / d, np.inf)
+        lost = 0.49 * 2.0**-52
+        inner = lost * np.array([[1.0, -1.0], [-1.0, 1.0]])
+        outer = np.ldexp([[a, b], [b, d]], exponent)
+        inner = np.ldexp(inner, exponent)
+        exact = is_positive_semidefinite(subtract(rational(outer), rational(inner)))
+        assert exact or not is_inside(inner, outer)
+        difference = outer - inner
+        contradicted += not exact and difference[0, 0] * difference[1, 1] > difference[0, 1] ** 2
+    assert contradicted > 0
+
+
 def test_a_set_lies_inside_itself_however_flat():
     rng = np.random.default_rng(0)
     for n in (1, 2, 3, 6):

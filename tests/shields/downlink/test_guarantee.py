@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.vector import VectorWrapper
 
 from ncs_gym import (
     Actuator,
@@ -10,6 +11,7 @@ from ncs_gym import (
     ChannelContract,
     Ellipsoid,
     FunctionProcess,
+    LinearPlant,
     NCSEnv,
     NCSVectorEnv,
     Packet,
@@ -21,10 +23,24 @@ from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.downlink import Schedule, starts_known
 from shields.runtime.guarantee import (
     EXPLANATIONS,
+    FAR_OUT,
+    LARGE_ERROR,
     LATE_INPUT,
     NO_DOWNLINK_CONTRACT,
     NOT_KNOWN_INSIDE,
+    OLD_SAMPLE,
     OTHER_INPUT,
+    GuaranteeMonitor,
+    LoopObservation,
+)
+from shields.verification.rational_matrix import (
+    congruence,
+    is_positive_semidefinite,
+    multiply,
+    quadratic,
+    rational,
+    subtract,
+    transpose,
 )
 from tests.certificates import certificate_of
 from tests.shields.attacks.extremes import ExtremalNoise
@@ -34,6 +50,7 @@ from tests.shields.lookahead.adversary import box_ellipsoid
 PLANT = truck_trailer(mass=4000.0)
 UPLINK = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
 KEPT = Channel(loss=0.4, delay=1, max_consecutive_losses=1)
+THIN = np.array([[1.0, -0.5], [-0.5, 0.25]])
 UNSTABLE = Case(cart_pole(), Channel(loss=0.3, delay=1, max_consecutive_losses=1), Channel(delay=2))
 
 
@@ -191,6 +208,44 @@ def test_a_given_start_is_followed_under_zero_input():
     assert left > 5
 
 
+@pytest.mark.parametrize("size", [1.0, 1e7, 1e11])
+def test_a_start_however_far_out_is_known_to_move_into_the_safe_set_only_if_it_does(size):
+    # Starts that A annihilates, but for the rounding of products of huge numbers.
+    settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 1e-9, "sensor_bound": 0.0, "initial_bound": 0.0}
+    plant = LinearPlant(A=[[0.5, -0.3], [0.25, -0.15]], B=np.ones((2, 1)), box=np.eye(2), **settings)
+    certificate, rng, known = certificate_of(plant), np.random.default_rng(0), 0
+    shield, M = SafetyFilter(certificate, plant), rational(certificate.M)
+    *_, axes = np.linalg.svd(plant.A)
+    for _ in range(100):
+        base, low, high = axes[1] * size * rng.uniform(0.5, 1.0), 0.0, 4.0
+        for _ in range(50):  # to the edge of what is known to be inside
+            middle = 0.5 * (low + high)
+            inside = starts_known(shield, base + middle * axes[0], 1)[1].in_safe_set
+            low, high = (middle, high) if inside else (low, middle)
+        if low > 0.0:
+            known += 1
+            moved = multiply(rational(plant.A), rational((base + low * axes[0])[:, None]))
+            assert quadratic(transpose(moved), M) <= 1
+    assert known > 50
+
+
+@pytest.mark.parametrize("size", [1.0, 2.0**10, 2.0**20])
+def test_starts_along_a_line_that_moves_into_the_safe_set_are_known_to_only_if_they_do(size):
+    settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 1e-9, "sensor_bound": 0.0, "initial_bound": 0.0}
+    plant = LinearPlant(A=[[0.9, -0.45], [0.45, -0.225]], B=np.ones((2, 1)), box=np.eye(2), **settings)
+    certificate, rng = certificate_of(plant), np.random.default_rng(0)
+    shield, A, L = SafetyFilter(certificate, plant), rational(plant.A), rational(certificate.L)
+    for _ in range(60):
+        long = (size * rng.uniform(0.5, 1.0)) ** 2 * np.array([[1.0, 2.0], [2.0, 4.0]])  # which A annihilates
+        low, high = 0.0, 16.0
+        for _ in range(50):  # to the edge of what is known to be inside
+            middle = 0.5 * (low + high)
+            inside = starts_known(shield, Ellipsoid(long + middle * THIN), 1)[1].in_safe_set
+            low, high = (middle, high) if inside else (low, middle)
+        assert low > 0.1
+        assert is_positive_semidefinite(subtract(L, congruence(A, rational(long + low * THIN))))
+
+
 @pytest.mark.parametrize("many", [False, True])
 def test_first_plan_is_stored_for_the_state_at_which_the_first_input_takes_effect(many):
     certificate, rng, shape = UNSTABLE.certificate, np.random.default_rng(0), UNSTABLE.plant.A.shape
@@ -250,6 +305,34 @@ def test_a_start_outside_the_box_is_not_guaranteed_although_a_plan_is_certified_
     assert not infos["shield_guaranteed"].any()
 
 
+def test_what_is_predicted_must_be_nearer_than_what_is_observed_now():
+    """The present estimate, which is not seen then, may be farther out than its prediction was: rounding counts it."""
+    shield = SafetyFilter(certificate_of(PLANT), PLANT)
+    errors = shield.errors_of(0.1 * certificate_of(PLANT).Sigma)
+
+    def reason(distance, downlink):
+        monitor = GuaranteeMonitor(shield, downlink)
+        seen = LoopObservation(distance * PLANT.half_widths, errors, False)
+        return EXPLANATIONS[monitor.reasons(monitor.start(True, True, seen))]
+
+    lately = shielded().unwrapped.downlink
+    assert [reason(distance, None) for distance in (49.0, 51.0, 99.0, 101.0)] == ["", "", "", FAR_OUT]
+    assert [reason(distance, lately) for distance in (49.0, 51.0)] == ["", FAR_OUT]
+
+
+def test_a_large_error_is_put_down_to_old_samples_once_they_are_older_than_the_sensors_contract_allows():
+    """The certificate counts the steps of both channels, the age of a sample those of its own alone."""
+    shield = SafetyFilter(UNSTABLE.certificate, UNSTABLE.plant)
+    monitor = GuaranteeMonitor(shield, UNSTABLE.env(1, "random").single.downlink)
+    n, allowed = UNSTABLE.plant.n, UNSTABLE.contract.max_age
+    assert UNSTABLE.certificate.contract.max_age == allowed + 2
+    largest = np.linalg.eigvalsh(UNSTABLE.certificate.error_shapes).max()
+    seen = LoopObservation(np.zeros(n), shield.errors_of(1.01 * largest * np.eye(n)), False)
+    state = monitor.start(True, True, seen)
+    found = [EXPLANATIONS[monitor.reasons(state, age)] for age in (allowed, allowed + 1)]
+    assert found == [LARGE_ERROR, OLD_SAMPLE]
+
+
 class Meddling(gym.Wrapper):
     """Reports other inputs than were committed or applied."""
 
@@ -277,6 +360,60 @@ def test_other_inputs_than_decided_end_the_guarantee(key, reason):
     assert shield.step(np.array([0.2]))[4]["shield_reason"] == reason  # for the rest of the episode
     shield.reset()
     assert shield.step(np.array([0.2]))[4]["shield_guaranteed"]
+
+
+class MeddlingWithMany(VectorWrapper):
+    """Reports of some environments that another input was applied than was due."""
+
+    chosen = np.zeros(6, np.bool_)
+
+    def step(self, actions):
+        *result, info = self.env.step(actions)
+        return *result, info | {"input": np.where(self.chosen[:, None], info["input"] + 1e-12, info["input"])}
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_late_input_drops_the_plan_that_was_certified_for_its_being_on_time(late):
+    settings = {"channel": UNSTABLE.uplink, "contract": UNSTABLE.contract, "downlink": UNSTABLE.downlink}
+    env = Meddling(NCSEnv(UNSTABLE.plant, **settings), "input")
+    shield, kept = SafetyShield(env, UNSTABLE.certificate, "lookahead"), 0
+    rng, push = np.random.default_rng(0), np.ones(1, np.float32)
+    for seed in range(15):
+        env.active = False
+        _, info = shield.reset(seed=seed, options={"state": UNSTABLE.certificate.safe_set.sample_boundary(rng)})
+        env.active = late
+        *_, info = shield.step(push)
+        assert not late or info["shield_reason"] == LATE_INPUT
+        assert not late or info["shield_plan_length"] == 0
+        kept += info["shield_plan_length"] > 0
+    assert late or kept > 3
+
+
+def test_late_inputs_drop_the_plans_of_their_own_environments_in_a_vector():
+    settings = {"channel": UNSTABLE.uplink, "contract": UNSTABLE.contract, "downlink": UNSTABLE.downlink}
+    env = MeddlingWithMany(NCSVectorEnv(6, plant=UNSTABLE.plant, **settings))
+    shield, rng, kept = VectorSafetyShield(env, UNSTABLE.certificate, "lookahead"), np.random.default_rng(0), 0
+    for seed in range(5):
+        shield.reset(seed=seed, options={"state": UNSTABLE.certificate.safe_set.sample_boundary(rng, 6)})
+        env.chosen = np.arange(6) % 2 == 0
+        *_, info = shield.step(np.ones((6, 1), np.float32))
+        assert set(info["shield_reason"][env.chosen]) == {LATE_INPUT}
+        assert not info["shield_plan_length"][env.chosen].any()
+        kept += np.count_nonzero(info["shield_plan_length"][~env.chosen])
+    assert kept > 3
+
+
+def test_an_input_that_is_not_reported_counts_as_late():
+    class Silent(gym.Wrapper):
+        def step(self, action):
+            *result, info = self.env.step(action)
+            return *result, info | {"input": "none"}
+
+    certificate = certificate_of(PLANT)
+    env = NCSEnv(PLANT, UPLINK, initial_set=Ellipsoid(0.09 * certificate.L), downlink=KEPT)
+    shield = SafetyShield(Silent(env), certificate)
+    assert shield.reset(seed=0)[1]["shield_guaranteed"]
+    assert shield.step(np.array([0.2]))[4]["shield_reason"] == LATE_INPUT
 
 
 @pytest.mark.parametrize("mode", ["project", "lookahead"])

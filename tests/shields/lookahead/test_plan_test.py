@@ -1,6 +1,7 @@
 """The plan test against extreme errors and disturbances, sampled ones, and rational arithmetic."""
 
 from dataclasses import replace
+from decimal import Decimal, localcontext
 from fractions import Fraction
 
 import numpy as np
@@ -12,7 +13,9 @@ from shields import SafetyFilter
 from shields.lookahead import PlanTest, Prediction
 from shields.lookahead.tightening import Tightening
 from shields.runtime.one_step_test import OneStepTest
+from shields.runtime.predicted_errors import SMALLEST_RADIUS
 from shields.runtime.safety_filter import MARGIN
+from shields.verification.rational_matrix import multiply, quadratic, rational
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 
@@ -239,6 +242,163 @@ def test_certified_is_true_in_rational_arithmetic_however_far_out_the_estimate_i
                 closest = max(closest, float(abs(center) + Fraction(float(s))))
     assert passed > 20
     assert closest > 1.0 - 1e-6 or size > 1e7
+
+
+def root_of(number):
+    """The square root of a fraction, to fifty digits."""
+    with localcontext(prec=50):
+        return (Decimal(number.numerator) / Decimal(number.denominator)).sqrt()
+
+
+def exact_reach(plant, row, x_hat, shape, plan):
+    """The farthest that an error and disturbances take c x_j from zero after all inputs of a plan, to fifty digits."""
+    A, B, D = (rational(matrix) for matrix in (plant.A, plant.B, plant.disturbance.shape))
+    pulls = [rational(row[None])]
+    for _ in plan:
+        pulls.append(multiply(pulls[-1], A))
+    center = multiply(pulls[-1], rational(x_hat[:, None]))[0][0]
+    for pull, u in zip(pulls[-2::-1], plan, strict=True):
+        center += multiply(multiply(pull, B), rational(u[:, None]))[0][0]
+    spread = root_of(quadratic(pulls[-1], rational(shape))) + sum(root_of(quadratic(p, D)) for p in pulls[:-1])
+    with localcontext(prec=50):
+        return abs(Decimal(center.numerator) / Decimal(center.denominator)) + spread
+
+
+def edge_of(passes, high):
+    """The largest number found that passes, by bisection from 0, which must."""
+    low = 0.0
+    assert passes(low)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if passes(middle) else (low, middle)
+    return low
+
+
+QUIET = {"u_max": 1.0, "dt": 0.1, "sensor_bound": 0.0, "initial_bound": 0.0}
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.1])
+@pytest.mark.parametrize(("where", "step"), [("box", 1), ("box", 2), ("end", 1), ("end", 2)])
+def test_plans_are_certified_in_rational_arithmetic_where_large_inputs_cancel(where, step, margin):
+    plant = LinearPlant(A=[[1e-4]], B=[[1e6, -1e6]], box=[1.0], disturbance_bound=0.0, **QUIET)
+    L, steps = (np.array([[1e4]]), step + 1) if where == "box" else (np.eye(1), step)  # one of them is far away
+    test, rng = PlanTest(Prediction(OneStepTest(L, plant), steps), margin), np.random.default_rng(0)
+    nothing, levels = np.zeros((1, 1)), []
+    known = test.tightenings_of(nothing[None])
+    for _ in range(40):
+        plan, first, start = np.zeros((steps, 2)), rng.uniform(-0.9, 0.9), np.array([1e-3 * rng.uniform(-1.0, 1.0)])
+
+        def passes(size, plan=plan, first=first, start=start):
+            plan[step - 1] = first, first - size
+            return test.certified(start[None], known, plan[None, None])[0, 0, -1]
+
+        passes(edge_of(passes, 1e-5))
+        levels.append(exact_reach(plant, plant.C[0], start, nothing, plan[:step]))
+    assert 1.0 - margin - 1e-6 < min(levels) <= max(levels) <= 1.0 - margin
+
+
+@pytest.mark.parametrize(("where", "step"), [("box", 2), ("box", 3), ("end", 2), ("end", 3)])
+def test_plans_are_certified_in_rational_arithmetic_where_powers_cancel(where, step):
+    # A is half of the identity and what its own square annihilates, but for rounding.
+    A = 3001.7 * np.array([[0.3, -0.1], [0.9, -0.3]]) + 0.5 * np.eye(2)
+    plant = LinearPlant(A=A, B=[[0.3], [0.9]], box=[1.0, 1.0], disturbance_bound=0.0, **QUIET)
+    L, steps = (1e4 * np.eye(2), step + 1) if where == "box" else (np.diag([1e16, 1.0]), step)
+    test, rng = PlanTest(Prediction(OneStepTest(L, plant), steps), 0.0), np.random.default_rng(0)
+    nothing, levels = np.zeros((2, 2)), []
+    known = test.tightenings_of(nothing[None])
+    for _ in range(60):
+        plan, start = np.zeros((steps, 1)), rng.uniform(0.1, 0.5) * np.array([1.0, 3.0])
+
+        def passes(size, plan=plan, start=start):
+            plan[step - 1] = size
+            return test.certified(start[None], known, plan[None, None])[0, 0, -1]
+
+        passes(edge_of(passes, 1.0))
+        levels.append(exact_reach(plant, np.array([0.0, 1.0]), start, nothing, plan[:step]))
+    assert 1.0 - 1e-3 < min(levels) <= max(levels) <= 1.0
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0])
+def test_nothing_is_certified_where_the_radius_is_too_small_for_the_weights(case, scale):
+    plant, certificate, _ = case
+    test = PlanTest(Prediction(OneStepTest(certificate.L, plant), 1), 0.0)
+    nothing, plan = np.zeros((1, plant.n)), np.zeros((1, 1, 1, plant.m))
+    shape = scale * certificate.L[None]
+    size = edge_of(lambda s: test.certified(nothing, test.tightenings_of(s * shape), plan)[0, 0, 0], 1e3)
+    assert SMALLEST_RADIUS <= test.tightenings_of(size * shape).radius.item() < 1.01 * SMALLEST_RADIUS
+
+
+@pytest.mark.parametrize("size", [1.0, 1e4, 1e7, 1e10])
+@pytest.mark.parametrize(("steps", "margin"), [(1, 0.0), (2, 0.0), (2, 0.05)])
+def test_end_is_certified_in_rational_arithmetic_however_far_out_the_estimate_is(steps, margin, size):
+    plant = LinearPlant(A=[[0.5, -0.3], [0.0, 0.0]], B=[[1.0], [0.0]], box=[1.0, 1.0], disturbance_bound=0.0, **QUIET)
+    test, rng = PlanTest(Prediction(OneStepTest(np.eye(2), plant), steps), margin), np.random.default_rng(0)
+    nothing, inwards, levels = np.zeros((2, 2)), np.array([1.0, 0.0]), []
+    known = test.tightenings_of(nothing[None])
+    plan = np.array([[0.0], [0.9]])[2 - steps :]
+    for _ in range(40):
+        far = np.array([0.3, 0.5]) * size * rng.uniform(0.5, 1.0)  # which A annihilates, but for rounding
+
+        def passes(x, far=far):
+            return test.certified((far + inwards * x)[None], known, plan[None, None])[0, 0, -1]
+
+        if passes(0.0):
+            x_hat = far + inwards * edge_of(passes, 16.0)
+            levels.append(exact_reach(plant, inwards, x_hat, nothing, plan))
+    assert len(levels) > 30
+    assert max(levels) <= 1.0 - margin
+    assert min(levels) > 1.0 - margin - 1e-13 * size - 1e-6
+
+
+# Coordinates x = F z in which the second row of the box, and of a root of S, is (-TILT, 1): products with it cancel. F,
+# its inverse and S = F F' are exact in float64, since TILT is a whole number, and what is multiplied by it is rounded.
+TILT = 20003.0
+TILTED = np.array([[1.0, 0.0], [TILT, 1.0]])
+ROWS = np.array([[1.0, 0.0], [-TILT, 1.0]])
+
+
+def test_box_is_certified_in_rational_arithmetic_where_the_error_is_long_and_thin():
+    plant = LinearPlant(A=0.5 * np.eye(2), B=np.zeros((2, 1)), box=ROWS, disturbance_bound=0.0, **QUIET)
+    test, rng = PlanTest(Prediction(OneStepTest(1e4 * TILTED @ TILTED.T, plant), 2), 0.0), np.random.default_rng(0)
+    nothing, plan, levels = np.zeros((1, 2)), np.zeros((1, 1, 2, 1)), []
+    for _ in range(60):
+        factor = TILTED @ rng.standard_normal((2, 2)) * [1.0, 0.1]
+        shape = factor @ factor.T
+        size = edge_of(lambda s, P=shape: test.certified(nothing, test.tightenings_of(s * P[None]), plan)[0, 0, 1], 1e3)
+        levels.append(max(exact_reach(plant, row, nothing[0], size * shape, plan[0, 0, :1]) for row in ROWS))
+    assert 1.0 - 1e-4 < min(levels) <= max(levels) <= 1.0
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.1])
+@pytest.mark.parametrize("far", [0.0, 1.0, 1e6])
+def test_a_state_is_known_to_be_in_the_box_in_rational_arithmetic(far, margin):
+    """With an error that is long and thin, or with an estimate so far along the box that it cancels in its row."""
+    wide = np.diag([1e-9, 0.9]) @ ROWS
+    plant = LinearPlant(A=0.5 * np.eye(2), B=np.zeros((2, 1)), box=wide, disturbance_bound=0.0, **QUIET)
+    test, rng = PlanTest(Prediction(OneStepTest(1e4 * TILTED @ TILTED.T, plant), 1), margin), np.random.default_rng(0)
+    levels = []
+    for _ in range(60):
+        x_hat = far * rng.uniform(0.5, 1.0) * np.array([1.0, TILT])
+        factor = TILTED @ rng.standard_normal((2, 2)) * [1.0, 0.1]
+        shape = factor @ factor.T if far == 0.0 else np.diag([0.0, 1.0])
+        size = edge_of(lambda s, P=shape, x=x_hat: test.knows_in_box(x, s * P), 1e3)
+        levels.append(max(exact_reach(plant, row, x_hat, size * shape, []) for row in wide))
+    assert 1.0 - margin - 1e-2 < min(levels) <= max(levels) <= 1.0 - margin
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3])
+def test_end_is_certified_in_rational_arithmetic_where_disturbances_are_long_and_thin(steps):
+    # Disturbances that do not move on add up tightly, and so does an error as small as the smallest multiplier.
+    rng, levels = np.random.default_rng(0), []
+    error = np.diag([0.0, 1e-18])
+    for _ in range(40):
+        bound = TILTED @ np.diag([1e-3, 1e-2] * rng.uniform(0.5, 1.0, 2)) @ TILTED.T
+        plant = LinearPlant(A=np.eye(2), B=np.zeros((2, 1)), box=ROWS, disturbance_bound=Ellipsoid(bound), **QUIET)
+        test = PlanTest(Prediction(OneStepTest(TILTED @ TILTED.T, plant), steps), 0.0)
+        known, plan = test.tightenings_of(error[None]), np.zeros((1, 1, steps, 1))
+        x = edge_of(lambda x, t=test, k=known, p=plan: t.certified(np.array([[0.0, x]]), k, p)[0, 0, -1], 16.0)
+        levels.append(exact_reach(plant, ROWS[1], np.array([0.0, x]), error, plan[0, 0]))
+    assert 1.0 - 1e-4 < min(levels) <= max(levels) <= 1.0
 
 
 def test_tightenings_are_remembered_and_do_not_depend_on_the_batch(case):

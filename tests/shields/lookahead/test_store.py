@@ -78,6 +78,8 @@ def test_an_estimate_proves_the_box_only_with_room_for_its_error():
     room = 1.0 - Ellipsoid(shape).support(plant.C[0])
     assert shield.lookahead.knows_in_box((room - 1e-6) * row, errors)
     assert not shield.lookahead.knows_in_box((room + 1e-6) * row, errors)
+    indefinite = shield.errors_of(shape + 0.02 * np.eye(plant.n)[::-1])
+    assert not shield.lookahead.knows_in_box(0.0 * row, indefinite)
 
 
 def test_a_projected_input_leaves_nothing_of_an_earlier_plan(monkeypatch):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearPlant, NCSEnv, NCSVectorEnv, Remainder
-from shields import Infeasible, SafetyShield, VectorSafetyShield, synthesize, verify
-from shields.runtime.guarantee import LEFT_MODEL, NOT_KNOWN_INSIDE
+from shields import Infeasible, SafetyFilter, SafetyShield, VectorSafetyShield, synthesize, verify
+from shields.runtime.guarantee import EXPLANATIONS, LEFT_MODEL, NOT_KNOWN_INSIDE, GuaranteeMonitor, LoopObservation
 from tests.certificates import certificate_of
 
 COMMON = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.3]], "box": [1.0, 1.0], "u_max": 1.0, "dt": 0.1}
@@ -125,6 +125,19 @@ def test_inputs_under_way_beyond_their_limits_are_outside_the_model(many, downli
     assert set(first(reasons(plants[0], start, many=many, **downlink))[:-1]) == {LEFT_MODEL}
     assert set(first(reasons(plants[0], [0.0, 0.0, 0.9], many=many, **downlink))) == {""}
     assert set(first(reasons(plants[1], start, many=many, **downlink))) == {""}
+
+
+def test_inputs_under_way_that_an_error_may_put_beyond_their_limits_are_outside_the_model():
+    settings = {"box": [1.0, 1.0], "u_max": 1.0, "disturbance_bound": 0.0, "sensor_bound": 1e-3, "initial_bound": 1e-3}
+    model = (COMMON["A"], COMMON["B"], np.eye(2), np.zeros((2, 1)), 0.1)
+    plant = LinearPlant.from_statespace(model, input_delay=1, remainder=LEFT_OUT, **settings)
+    shield = SafetyFilter(certificate_of(plant), plant)
+    for error, reason in ((0.0, ""), (0.009, ""), (0.011, LEFT_MODEL)):
+        errors = shield.errors_of(np.diag([1e-12, 1e-12, error**2]))
+        for last in (0.99, -0.99):
+            seen = LoopObservation(np.array([0.0, 0.0, last]), errors, False)
+            state = GuaranteeMonitor(shield).start(True, True, seen)
+            assert EXPLANATIONS[state.broken] == reason
 
 
 def test_remainder_that_the_box_cannot_bear_is_named():

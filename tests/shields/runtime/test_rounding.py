@@ -13,7 +13,14 @@ from shields.runtime.guarantee import FAR_OUT, NOT_KNOWN_INSIDE
 from shields.runtime.one_step_test import OneStepTest, certified_root
 from shields.runtime.predicted_errors import predicted_errors
 from shields.runtime.safety_filter import require_computable
-from shields.verification.rational_matrix import congruence, is_positive_semidefinite, multiply, rational, subtract
+from shields.verification.rational_matrix import (
+    congruence,
+    is_positive_semidefinite,
+    multiply,
+    rational,
+    scale,
+    subtract,
+)
 from tests.certificates import certificate_of
 
 SINGULAR = np.array([[0.5, -0.3], [0.25, -0.15]])
@@ -141,6 +148,26 @@ def test_known_inside_is_true_to_the_last_bit_without_any_margin(tilt):
         p, q = (Fraction(float(entry)) for entry in low * x)
         assert low > 0.0
         assert p * p + (q - Fraction(tilt) * p) ** 2 <= 1
+
+
+@pytest.mark.parametrize("tilt", [2.0**8, 2.0**10, 2.0**12])
+def test_known_inside_leaves_room_for_the_error_to_the_last_bit_without_any_margin(tilt):
+    factor = np.array([[1.0, 0.0], [tilt, 1.0]])
+    L, rng, nothing, closest = factor @ factor.T, np.random.default_rng(0), np.zeros((0, 2, 2)), 0.0
+    test = OneStepTest(L, slanted(10.0))
+    for _ in range(80):
+        root = factor @ rng.standard_normal((2, 2))
+        shape = 0.5 * (root @ root.T + (root @ root.T).T)
+        low, high = 0.0, 1e3
+        for _ in range(60):  # to the edge of what is known to be inside
+            middle = 0.5 * (low + high)
+            known = test.knows_inside(np.zeros(2), predicted_errors(test, middle * shape[None], nothing).single(), 0.0)
+            low, high = (middle, high) if known else (low, middle)
+        assert low > 0.0
+        assert is_positive_semidefinite(subtract(rational(L), rational(low * shape)))
+        grown = scale(1 + Fraction(1, 10**4), rational(low * shape))
+        closest += not is_positive_semidefinite(subtract(rational(L), grown))
+    assert closest > 40
 
 
 def test_safe_set_too_thin_for_float64_is_refused():
