@@ -26,6 +26,11 @@ class Schedule:
         """Starts an episode: the inputs of its first c steps are zero."""
         self._decided = deque([self._nothing] * self._lead)
 
+    def __copy__(self) -> Schedule:
+        twin = Schedule(self._lead, len(self._nothing))
+        twin._decided = self._decided.copy()
+        return twin
+
     def due(self, decided: list[float]) -> list[float]:
         """Adds the input decided at this step, and removes and returns the one that is to be applied at it."""
         self._decided.append(decided)
