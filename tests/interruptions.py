@@ -35,14 +35,21 @@ def tracing(seen: Callable[[str, int], None]) -> Iterator[None]:
         sys.settrace(before)
 
 
-def places(call: Callable[[], Any], stride: int = 1) -> list[int]:
-    """Where each line is executed for the first time in a call, counted in lines; of many lines every `stride`-th."""
+def places(call: Callable[[], Any], stride: int = 1, within: str = "") -> list[int]:
+    """Where each line is executed for the first time in a call, counted in lines.
+
+    Args:
+        call: What is called.
+        stride: Of the lines every how-manieth.
+        within: Part of the names of the files whose lines count.
+    """
     first: dict[tuple[str, int], int] = {}
     count = 0
 
     def note(file: str, line: int) -> None:
         nonlocal count
-        first.setdefault((file, line), count)
+        if within in file:
+            first.setdefault((file, line), count)
         count += 1
 
     with tracing(note):

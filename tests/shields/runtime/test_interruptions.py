@@ -9,11 +9,13 @@ import pytest
 
 from ncs_gym import Channel, Ellipsoid, NCSEnv, NCSVectorEnv, Packet, truck_trailer
 from shields import SafeLoop, SafetyShield, VectorSafetyShield
+from shields.lookahead.planner import Planner, Plans
 from shields.runtime.safe_loop import NOT_STARTED
 from shields.runtime.safety_filter import MODES
 from tests.certificates import certificate_of
 from tests.interruptions import interrupt, places
 from tests.shields.lookahead.adversary import box_ellipsoid
+from tests.shields.lookahead.adversary import case as plan_case
 
 PLANT = truck_trailer(mass=4000.0)
 UPLINK = Channel(loss=0.3, quantization_step=0.01, delay=1, jitter=1)
@@ -83,18 +85,23 @@ def all_same(some, others):
     return all(same(as_arrays(one), as_arrays(other)) for one, other in zip(some, others, strict=True))
 
 
-def assert_inside(mode, info):
+def assert_inside(shield, info):
     """What is guaranteed is true."""
     guaranteed, states = np.atleast_1d(info["shield_guaranteed"]), np.atleast_2d(info["state"])
-    inside = np.abs(states @ PLANT.C.T).max(axis=1) <= 1.0
-    if mode != "lookahead":
-        inside &= certificate_of(PLANT).safe_set.gauge(states) <= 1.0
+    inside = np.abs(states @ shield.filter.plant.C.T).max(axis=1) <= 1.0
+    if shield.filter.mode != "lookahead":
+        inside &= shield.certificate.safe_set.gauge(states) <= 1.0
     assert inside[guaranteed].all()
 
 
 def check_wrapper(kind, mode, downlink, call, stride, goes_on=GOES_ON, **settings):
     """Interrupts a call at many lines; returns how often it was as if nothing, and how often the guarantee ended."""
     shield, action = case(kind, mode, downlink, **settings)
+    return check(shield, action, call, stride, goes_on)
+
+
+def check(shield, action, call, stride, goes_on=GOES_ON, within=""):
+    """The same for a shield that is given."""
     begun = {
         "step": lambda env: env.step(action),
         "reset": lambda env: env.reset(seed=5),
@@ -106,7 +113,7 @@ def check_wrapper(kind, mode, downlink, call, stride, goes_on=GOES_ON, **setting
     expected = [played(before, further), played(after, further)]
     anew = [fresh.reset(seed=7)[1], *played(fresh, further)]
     counts = {"as if nothing": 0, "ended": 0, "refused": 0}
-    for place in places(partial(begun, deepcopy(shield)), stride):
+    for place in places(partial(begun, deepcopy(shield)), stride, within):
         env = deepcopy(shield)
         if not interrupt(place, partial(begun, env)):
             continue
@@ -116,7 +123,7 @@ def check_wrapper(kind, mode, downlink, call, stride, goes_on=GOES_ON, **setting
             counts["refused"] += 1
         else:
             for info in infos:
-                assert_inside(mode, info)
+                assert_inside(env, info)
             if any(np.any(info["shield_guaranteed"]) for info in infos):
                 assert any(all_same(infos, each) for each in expected), f"line {place} of {call}"
                 counts["as if nothing"] += 1
@@ -142,6 +149,32 @@ def test_interrupted_call_of_the_shield_ends_the_guarantee_or_has_not_happened(c
 def test_interrupted_call_of_the_vector_shield_ends_the_guarantee_or_has_not_happened(call, mode, downlink):
     counts = check_wrapper("vector", mode, downlink, call, STRIDE)
     assert counts["refused"] > 0
+    assert counts["ended"] > 0
+
+
+@pytest.mark.parametrize("kind", ["scalar", "vector"])
+def test_interrupted_step_in_which_a_stored_input_is_applied_skips_none(kind, monkeypatch):
+    plant, horizon, channel, contract = plan_case("batch reactor", "constant delay")
+    given = {"channel": channel, "contract": contract, "initial_set": box_ellipsoid(plant, 0.95)}
+    if kind == "scalar":
+        shield = SafetyShield(NCSEnv(plant, **given), certificate_of(plant, contract), "lookahead", horizon=horizon)
+    else:
+        env = NCSVectorEnv(1, plant=plant, **given)
+        shield = VectorSafetyShield(env, certificate_of(plant, contract), "lookahead", horizon=horizon)
+    lengths = np.array(0)
+    for seed in range(300):
+        if lengths.min() < 3:
+            lengths = np.array(shield.reset(seed=seed)[1]["shield_plan_length"])
+    assert lengths.min() >= 3
+    nothing = lambda planner, x_hat, *_: Plans(  # noqa: E731
+        np.full((len(x_hat), horizon, plant.m), np.nan), np.zeros(len(x_hat), np.int64), np.full(len(x_hat), np.inf)
+    )
+    monkeypatch.setattr(Planner, "find", nothing)
+    monkeypatch.setattr(Planner, "beginning_with", nothing)
+    monkeypatch.setattr(Planner, "beginning_alone", lambda *_: None)
+    proposed = np.broadcast_to(np.float32(np.nextafter(1.0, 0.0)), shield.action_space.shape)
+    counts = check(shield, proposed, "step", 1, goes_on=2, within="shields/runtime/")
+    assert counts["as if nothing"] > 0
     assert counts["ended"] > 0
 
 
