@@ -35,20 +35,20 @@ def tracing(seen: Callable[[str, int], None]) -> Iterator[None]:
         sys.settrace(before)
 
 
-def places(call: Callable[[], Any], stride: int = 1, within: str = "") -> list[int]:
+def places(call: Callable[[], Any], stride: int = 1, *within: str) -> list[int]:
     """Where each line is executed for the first time in a call, counted in lines.
 
     Args:
         call: What is called.
         stride: Of the lines every how-manieth.
-        within: Part of the names of the files whose lines count.
+        within: Parts of the names of the files whose lines count; all by default.
     """
     first: dict[tuple[str, int], int] = {}
     count = 0
 
     def note(file: str, line: int) -> None:
         nonlocal count
-        if within in file:
+        if any(part in file for part in within or ("",)):
             first.setdefault((file, line), count)
         count += 1
 

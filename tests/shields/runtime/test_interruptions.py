@@ -100,7 +100,7 @@ def check_wrapper(kind, mode, downlink, call, stride, goes_on=GOES_ON, **setting
     return check(shield, action, call, stride, goes_on)
 
 
-def check(shield, action, call, stride, goes_on=GOES_ON, within=""):
+def check(shield, action, call, stride, goes_on=GOES_ON, within=()):
     """The same for a shield that is given."""
     begun = {
         "step": lambda env: env.step(action),
@@ -113,7 +113,7 @@ def check(shield, action, call, stride, goes_on=GOES_ON, within=""):
     expected = [played(before, further), played(after, further)]
     anew = [fresh.reset(seed=7)[1], *played(fresh, further)]
     counts = {"as if nothing": 0, "ended": 0, "refused": 0}
-    for place in places(partial(begun, deepcopy(shield)), stride, within):
+    for place in places(partial(begun, deepcopy(shield)), stride, *within):
         env = deepcopy(shield)
         if not interrupt(place, partial(begun, env)):
             continue
@@ -173,7 +173,7 @@ def test_interrupted_step_in_which_a_stored_input_is_applied_skips_none(kind, mo
     monkeypatch.setattr(Planner, "beginning_with", nothing)
     monkeypatch.setattr(Planner, "beginning_alone", lambda *_: None)
     proposed = np.broadcast_to(np.float32(np.nextafter(1.0, 0.0)), shield.action_space.shape)
-    counts = check(shield, proposed, "step", 1, goes_on=2, within="shields/runtime/")
+    counts = check(shield, proposed, "step", 1, goes_on=2, within=["shields/runtime/"])
     assert counts["as if nothing"] > 0
     assert counts["ended"] > 0
 
