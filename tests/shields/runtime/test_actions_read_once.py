@@ -1,7 +1,7 @@
 """What is tested is what is applied, whatever an action is made of and whoever writes into it meanwhile."""
 
+from copy import deepcopy
 from functools import partial
-from itertools import cycle
 
 import gymnasium as gym
 import numpy as np
@@ -95,19 +95,25 @@ def test_action_written_into_at_any_line_of_a_step_is_applied_as_it_was_tested(s
 
 
 def check_decisions(decide, judged):
-    """A decision about a buffer that changes at every line is one about numbers that were in it."""
-    values = np.array([np.nan, 0.0, PLANT.u_max[0], -PLANT.u_max[0], 0.1])
-    buffer, applied = np.empty(PLANT.m), set()
-    for first in range(len(values)):
-        for second in range(len(values)):
-            turn = cycle([values[second], values[first]])
-            buffer[:] = values[first]
-            with tracing(lambda *_, turn=turn: buffer.fill(next(turn))):
-                decision = decide(buffer)
-            assert decision.reason != "unsafe"
-            assert decision.fallback or judged(decision.input).passed
-            applied.add(decision.input.item())
-    assert len(applied) > 2
+    """Decides about a buffer that turns harmless at one line and full throttle at a later one."""
+    limit, buffer, applied = PLANT.u_max.item(), np.zeros(PLANT.m), set()
+    lines = max(places(partial(decide, np.full(PLANT.m, value)))[-1] for value in (np.nan, 0.0, limit))
+    for begins in (np.nan, 0.0):
+        for harmless in range(0, lines, 2):
+            for harmful in range(harmless, lines, 3):
+                buffer.fill(begins)
+                count = iter(range(10 * lines))
+
+                def write(*_, count=count, turns=(harmless, harmful)):
+                    line = next(count)
+                    if line in turns:
+                        buffer.fill(limit if line == turns[1] else 0.0)
+
+                with tracing(write):
+                    decision = decide(buffer)
+                assert decision.fallback or judged(decision.input).passed
+                applied.add(decision.input.item())
+    assert len(applied) > 1
 
 
 def test_filter_decides_about_one_and_the_same_input():
@@ -120,11 +126,11 @@ def test_filter_decides_about_one_and_the_same_input():
 def test_loop_decides_about_one_and_the_same_input():
     certificate = certificate_of(PLANT)
     edge = 0.9 * certificate.safe_set.extreme_point(np.array([1.0, 0.4]))
+    loop = SafeLoop(certificate, PLANT, CHANNELS["perfect"])
+    loop.start(edge, initial_set=edge)
 
     def decide(proposed):
-        loop = SafeLoop(certificate, PLANT, CHANNELS["perfect"])
-        loop.start(edge, initial_set=edge)
-        return loop.decide(proposed)
+        return deepcopy(loop).decide(proposed)
 
     check_decisions(decide, decide)
 
