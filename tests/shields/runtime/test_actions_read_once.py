@@ -94,45 +94,40 @@ def test_action_written_into_at_any_line_of_a_step_is_applied_as_it_was_tested(s
     assert seen == {0.0, PLANT.u_max.item()}
 
 
-def check_decisions(decide, judged):
-    """Decides about a buffer that turns harmless at one line and full throttle at a later one."""
-    limit, buffer, applied = PLANT.u_max.item(), np.zeros(PLANT.m), set()
-    lines = max(places(partial(decide, np.full(PLANT.m, value)))[-1] for value in (np.nan, 0.0, limit))
-    for begins in (np.nan, 0.0):
-        for harmless in range(0, lines, 2):
-            for harmful in range(harmless, lines, 3):
-                buffer.fill(begins)
-                count = iter(range(10 * lines))
+CERTIFICATE = certificate_of(PLANT)
+EDGE = 0.9 * CERTIFICATE.safe_set.extreme_point(np.array([1.0, 0.4]))
+HARMFUL = (PLANT.u_max * np.sign(PLANT.B.T @ CERTIFICATE.M @ PLANT.A @ EDGE)).item()
 
-                def write(*_, count=count, turns=(harmless, harmful)):
-                    line = next(count)
-                    if line in turns:
-                        buffer.fill(limit if line == turns[1] else 0.0)
 
-                with tracing(write):
-                    decision = decide(buffer)
-                assert decision.fallback or judged(decision.input).passed
-                applied.add(decision.input.item())
-    assert len(applied) > 1
+def check_decisions(decide):
+    """Decides about a buffer that turns harmless at a line, or is that already, and harmful at a later one."""
+    buffer = np.zeros(PLANT.m)
+    lines = max(places(partial(decide, np.full(PLANT.m, value)))[-1] for value in (np.nan, 0.0, HARMFUL))
+    assert decide(np.array([HARMFUL])).intervened
+    turns = [(0.0, -1, second) for second in range(lines)]
+    turns += [(np.nan, first, second) for first in range(0, lines, 3) for second in range(first + 1, first + 12, 2)]
+    for begins, *turn in turns:
+        buffer.fill(begins)
+        count = iter(range(10 * lines))
+
+        def write(*_, count=count, turn=turn):
+            line = next(count)
+            if line in turn:
+                buffer.fill(HARMFUL if line == turn[1] else 0.0)
+
+        with tracing(write):
+            decision = decide(buffer)
+        assert decision.fallback or decision.input.item() != HARMFUL
 
 
 def test_filter_decides_about_one_and_the_same_input():
-    certificate = certificate_of(PLANT)
-    shield, edge = SafetyFilter(certificate, PLANT), 0.9 * certificate.safe_set.extreme_point(np.array([1.0, 0.4]))
-    shape = 0.1 * certificate.Sigma
-    check_decisions(partial(shield.decide, edge, shape), partial(shield.decide, edge, shape))
+    check_decisions(partial(SafetyFilter(CERTIFICATE, PLANT).decide, EDGE, 0.1 * CERTIFICATE.Sigma))
 
 
 def test_loop_decides_about_one_and_the_same_input():
-    certificate = certificate_of(PLANT)
-    edge = 0.9 * certificate.safe_set.extreme_point(np.array([1.0, 0.4]))
-    loop = SafeLoop(certificate, PLANT, CHANNELS["perfect"])
-    loop.start(edge, initial_set=edge)
-
-    def decide(proposed):
-        return deepcopy(loop).decide(proposed)
-
-    check_decisions(decide, decide)
+    loop = SafeLoop(CERTIFICATE, PLANT, CHANNELS["perfect"])
+    loop.start(EDGE, initial_set=EDGE)
+    check_decisions(lambda proposed: deepcopy(loop).decide(proposed))
 
 
 def test_error_shape_that_is_written_into_is_remembered_as_what_was_judged():
