@@ -114,8 +114,6 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             ValueError: If what is wrapped is not any more what the shield was made for.
         """
         before, self._clock = self._clock or self._interrupted, self._clock and self._interrupted
-        inner = self._environment_in(self.env)
-        require_same(self._made_for, premises_of(inner, inner.single))
         try:
             # gymnasium's annotation leaves out the lists that its own vector environments take.
             observation, info = self.env.reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
@@ -123,6 +121,8 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             if self._clock and all(np.array_equal(*pair) for pair in zip(before, self._read_clock(), strict=True)):
                 self._clock = before  # refused before anything moved
             raise
+        inner = self._environment_in(self.env)
+        require_same(self._made_for, premises_of(inner, inner.single))
         now = self._read_clock()
         restarted = now.episodes != before.episodes
         unmoved = (now.steps == before.steps) & (now.ticks == before.ticks)

@@ -118,8 +118,6 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             ValueError: If what is wrapped is not any more what the shield was made for.
         """
         before, self._clock = self._clock, self._clock and INTERRUPTED
-        inner = self._environment_in(self.env)
-        require_same(self._made_for, premises_of(inner, inner))
         if self._is_drawn:
             self._annotate(None, 0, NO_PLAN, intervened=False)
         try:
@@ -128,6 +126,8 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             if self._read_clock() == before:  # refused before anything moved
                 self._clock = before
             raise
+        inner = self._environment_in(self.env)
+        require_same(self._made_for, premises_of(inner, inner))
         clock, report = self._read_clock(), self._observed(info)
         start = self._inner.start
         if start is not self._start:  # decided exactly, which takes longer than a step; starts are read-only

@@ -16,7 +16,6 @@ CHANNEL = Channel(delay=1, jitter=1)
 STEPS = 12
 # Where what is shared is written.
 SHARED = "arrival_patterns.py", "pattern_arrays.py", "error_statistics_table.py"
-ERROR_SET = certified_error_set(PLANT)
 
 
 @pytest.fixture(autouse=True)
@@ -27,7 +26,7 @@ def _small_tables(monkeypatch):
 
 
 def graph():
-    return patterns_of(PLANT, CHANNEL, ERROR_SET)
+    return patterns_of(PLANT, CHANNEL, certified_error_set(PLANT))
 
 
 def traffic(rng):

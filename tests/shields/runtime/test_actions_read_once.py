@@ -94,16 +94,17 @@ def test_action_written_into_at_any_line_of_a_step_is_applied_as_it_was_tested(s
     assert seen == {0.0, PLANT.u_max.item()}
 
 
-CERTIFICATE = certificate_of(PLANT)
-EDGE = 0.9 * CERTIFICATE.safe_set.extreme_point(np.array([1.0, 0.4]))
-HARMFUL = (PLANT.u_max * np.sign(PLANT.B.T @ CERTIFICATE.M @ PLANT.A @ EDGE)).item()
+def edge():
+    """A state near the boundary of S, of which one full throttle would leave S."""
+    return 0.9 * certificate_of(PLANT).safe_set.extreme_point(np.array([1.0, 0.4]))
 
 
 def check_decisions(decide):
     """Decides about a buffer that turns harmless at a line, or is that already, and harmful at a later one."""
+    (harmful,) = PLANT.u_max * np.sign(PLANT.B.T @ certificate_of(PLANT).M @ PLANT.A @ edge())
     buffer = np.zeros(PLANT.m)
-    lines = max(places(partial(decide, np.full(PLANT.m, value)))[-1] for value in (np.nan, 0.0, HARMFUL))
-    assert decide(np.array([HARMFUL])).intervened
+    lines = max(places(partial(decide, np.full(PLANT.m, value)))[-1] for value in (np.nan, 0.0, harmful))
+    assert decide(np.array([harmful])).intervened
     turns = [(0.0, -1, second) for second in range(lines)]
     turns += [(np.nan, first, second) for first in range(0, lines, 3) for second in range(first + 1, first + 12, 2)]
     for begins, *turn in turns:
@@ -113,20 +114,21 @@ def check_decisions(decide):
         def write(*_, count=count, turn=turn):
             line = next(count)
             if line in turn:
-                buffer.fill(HARMFUL if line == turn[1] else 0.0)
+                buffer.fill(harmful if line == turn[1] else 0.0)
 
         with tracing(write):
             decision = decide(buffer)
-        assert decision.fallback or decision.input.item() != HARMFUL
+        assert decision.fallback or decision.input.item() != harmful
 
 
 def test_filter_decides_about_one_and_the_same_input():
-    check_decisions(partial(SafetyFilter(CERTIFICATE, PLANT).decide, EDGE, 0.1 * CERTIFICATE.Sigma))
+    certificate = certificate_of(PLANT)
+    check_decisions(partial(SafetyFilter(certificate, PLANT).decide, edge(), 0.1 * certificate.Sigma))
 
 
 def test_loop_decides_about_one_and_the_same_input():
-    loop = SafeLoop(CERTIFICATE, PLANT, CHANNELS["perfect"])
-    loop.start(EDGE, initial_set=EDGE)
+    loop = SafeLoop(certificate_of(PLANT), PLANT, CHANNELS["perfect"])
+    loop.start(edge(), initial_set=edge())
     check_decisions(lambda proposed: deepcopy(loop).decide(proposed))
 
 
