@@ -107,8 +107,8 @@ class SB3VecEnv(VecEnv):
             raise ValueError(f"info_keys names {', '.join(map(repr, unknown))}, which no info has; known are {known}")
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Stores the actions for `step_wait`."""
-        self._actions = actions
+        """Stores a copy of the actions for `step_wait`."""
+        self._actions = np.array(actions)
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Steps all environments; returns observations, rewards (float32), dones and a dict per environment."""

@@ -64,7 +64,7 @@ def gains_taken(env_id: str, episodes: int, seed: int = 0) -> Counter[str]:
     """Returns how often each kind of gain is taken in some episodes under random actions."""
     env = ncs_env(gym.make(env_id, terminate_on_violation=False))
     patterns = CountingPatterns(env)
-    env.estimator = Estimator(env.plant, env.channel, patterns=patterns)
+    env._estimator = Estimator(env.plant, env.channel, patterns=patterns)
     env.action_space.seed(seed)
     for episode in range(episodes):
         env.reset(seed=seed + episode)

@@ -37,7 +37,7 @@ class Recorded(SafetyFilter):
 
 def row(name: str, horizon: int, steps: int) -> str:
     env, rng = shielded(name, "lookahead", horizon), np.random.default_rng(0)
-    env.filter = Recorded(env.filter.certificate, env.filter.plant, "lookahead", horizon)
+    env._filter = Recorded(env.filter.certificate, env.filter.plant, "lookahead", horizon)
     env.reset(seed=0)
     for _ in range(WARM + steps):
         env.step(rng.uniform(-1, 1, env.action_space.shape).astype(np.float32))

@@ -1,7 +1,8 @@
-"""Immutable settings: dataclasses whose arrays cannot be written to."""
+"""Immutable settings: dataclasses whose arrays cannot be written to, attributes that cannot be set anew."""
 
 from __future__ import annotations
 
+from operator import attrgetter
 from pathlib import PurePath
 from typing import Any, Self
 
@@ -40,6 +41,21 @@ class ReadOnlyArrays:
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         return self
+
+
+def setting(name: str, kept_as: str | None = None) -> Any:
+    """Returns a property for what an object is made with, and other parts of it rest on: it is read, and never set.
+
+    Args:
+        name: Of the property.
+        kept_as: Attribute that holds the value; the name after an underscore by default.
+    """
+
+    def refuse(owner: Any, value: Any) -> None:
+        kind = type(owner).__name__
+        raise AttributeError(f"{name} is a setting of {kind} and cannot be changed: make another {kind} with it")
+
+    return property(attrgetter(kept_as or f"_{name}"), refuse)
 
 
 def read_only(array: np.ndarray) -> np.ndarray:

@@ -75,7 +75,7 @@ APART = [
     ("experiments.backends", "experiments.analysis"),
     ("experiments.plots", "experiments.backends"),
 ]
-MOST_MODULES, MOST_LINES_OF_FILE, MOST_LINES_OF_FUNCTION, MOST_PUBLIC_NAMES = 10, 300, 60, 200
+MOST_MODULES, MOST_LINES_OF_FILE, MOST_LINES_OF_FUNCTION, MOST_PUBLIC_NAMES = 10, 330, 60, 200
 
 
 def name_of(path: Path) -> str:

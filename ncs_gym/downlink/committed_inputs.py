@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +25,10 @@ class CommittedInputs:
     def start(self) -> None:
         """Starts an episode: the inputs of its first c steps are zero."""
         self._queue: deque[np.ndarray] = deque(np.zeros(self._inputs) for _ in range(self._lead))
+
+    def saved(self) -> dict[str, Any]:
+        """Returns all that changes, as attributes to be put back."""
+        return {"_queue": self._queue.copy()}
 
     def commit(self, u: np.ndarray) -> None:
         """Adds the input decided now, shape (m,), behind those committed."""

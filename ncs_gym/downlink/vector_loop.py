@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
-
 import numpy as np
 
 from ncs_gym.downlink.loop import Inputs
@@ -71,7 +69,7 @@ class VectorCommittedDownlink(VectorIdealDownlink):
         super().__init__(estimator, size)
         self.protocol, self.lead = protocol, protocol.lead
         self._channel, self._size = protocol.channel, size
-        self._inputs = deque(np.zeros((estimator.plant.m, size)) for _ in range(self.lead))
+        self._inputs = [np.zeros((estimator.plant.m, size)) for _ in range(self.lead)]
         self._newest = np.full(size, NEVER, np.int64)
         self._ahead = [PredictedStatistics(steps) for steps in range(self.lead + 1)]
         self._channel_state: VectorChannelState
@@ -86,11 +84,10 @@ class VectorCommittedDownlink(VectorIdealDownlink):
             u[:, chosen] = 0.0
 
     def exchange(self, rng: np.random.Generator, steps: np.ndarray, u: np.ndarray) -> Inputs:  # noqa: D102
-        self._inputs.append(u.copy())
+        scheduled, *self._inputs = *self._inputs, u.copy()  # at once: never one too many, whatever interrupts a step
         self._channel_state.send(rng, steps)
         for age, arrives in self._channel_state.arrivals():
             self._newest = np.where(arrives, np.maximum(self._newest, steps - age), self._newest)
-        scheduled = self._inputs.popleft()
         missing = (self._newest < steps - self.lead) & (steps >= self.lead)
         return Inputs(np.where(missing, 0.0, scheduled), u, missing)
 

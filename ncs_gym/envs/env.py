@@ -9,11 +9,13 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from ncs_gym.downlink.loop import Inputs, downlink_of, no_inputs
+from ncs_gym.downlink.protocol import DownlinkProtocol
 from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.reset_options import start_option
 from ncs_gym.envs.settings import expect, loop_contracts, require_suitable, starting_set
-from ncs_gym.envs.spaces import applied_input, observation_space
+from ncs_gym.envs.spaces import observation_space, read_action
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
+from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
@@ -23,9 +25,10 @@ from ncs_gym.processes.process import LinearProcess, Process
 from ncs_gym.rendering import Annotation, Renderer
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.tasks.task import Task
+from ncs_gym.uncertainty.disturbance import Disturbance
 from ncs_gym.uncertainty.disturbance_settings import as_disturbance, as_noise
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import as_count, as_flag, shown
+from ncs_gym.validation import as_count, as_flag, setting, shown
 
 # Keeps the rounding of a sampled start inside the initial set.
 SAMPLE_ROUNDING = 1e-9
@@ -126,6 +129,21 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES, "render_fps": RENDER_FPS}
     observation_space: Box
     action_space: Box
+    plant: LinearPlant = setting("plant")
+    channel: Channel = setting("channel")
+    task: Task = setting("task")
+    disturbance: Disturbance = setting("disturbance")
+    initial_set: Ellipsoid = setting("initial_set")
+    terminate_on_violation: bool = setting("terminate_on_violation")
+    allow_assumption_violation: bool = setting("allow_assumption_violation")
+    contract: ChannelContract | None = setting("contract")
+    certificate_contract: ChannelContract | None = setting("certificate_contract")
+    error_set: ErrorSet = setting("error_set")
+    estimator: Estimator = setting("estimator")
+    horizon: int = setting("horizon")
+    noise: str = setting("noise")
+    process: Process = setting("process", "_process_given")
+    downlink: DownlinkProtocol | None = setting("downlink", "_protocol")
 
     def __init__(
         self,
@@ -144,36 +162,36 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         downlink: Channel | None = None,
         downlink_contract: ChannelContract | None = None,
     ) -> None:
-        self.plant = expect(plant, LinearPlant, "plant")
-        self.channel = Channel() if channel is None else expect(channel, Channel, "channel")
-        self.task = Regulation() if task is None else expect(task, Task, "task")
-        self.terminate_on_violation = as_flag(terminate_on_violation, "terminate_on_violation")
-        self.allow_assumption_violation = as_flag(allow_assumption_violation, "allow_assumption_violation")
-        self.disturbance = as_disturbance(disturbance, plant, self.allow_assumption_violation)
-        self.initial_set = starting_set(initial_set, plant)
-        require_suitable(self.task, plant)
+        self._plant = expect(plant, LinearPlant, "plant")
+        self._channel = Channel() if channel is None else expect(channel, Channel, "channel")
+        self._task = Regulation() if task is None else expect(task, Task, "task")
+        self._terminate_on_violation = as_flag(terminate_on_violation, "terminate_on_violation")
+        self._allow_assumption_violation = as_flag(allow_assumption_violation, "allow_assumption_violation")
+        self._disturbance = as_disturbance(disturbance, plant, self._allow_assumption_violation)
+        self._initial_set = starting_set(initial_set, plant)
+        require_suitable(self._task, plant)
         if render_mode is not None and not (isinstance(render_mode, str) and render_mode in RENDER_MODES):
             raise RenderModeError(f"render_mode must be None or one of {RENDER_MODES}, got {shown(render_mode)}")
         self.render_mode = render_mode
-        self.renderer = None if render_mode is None else Renderer(plant, self.task, render_mode, RENDER_FPS)
-        contracts = loop_contracts(plant, self.channel, contract, downlink, downlink_contract)
-        self.contract, self.downlink, self.certificate_contract = contracts
-        patterns = arrival_patterns(plant, self.channel, self.certificate_contract)
-        self.error_set = patterns.recursion.error_set
-        self.estimator = Estimator(plant, self.channel, patterns=patterns)
-        self._downlink = downlink_of(self.downlink, self.estimator)
-        self.noise = as_noise(noise, plant)
-        truncated = self.noise == "truncated"
-        self.process = LinearProcess() if process is None else expect(process, Process, "process")
-        allowed = self.allow_assumption_violation
-        self._process = self.process.simulation(plant, self.disturbance, allowed, truncated=truncated)
-        self.horizon = as_count(horizon, "horizon", low=1, high=LONGEST_HORIZON)
+        self.renderer = None if render_mode is None else Renderer(plant, self._task, render_mode, RENDER_FPS)
+        contracts = loop_contracts(plant, self._channel, contract, downlink, downlink_contract)
+        self._contract, self._protocol, self._certificate_contract = contracts
+        patterns = arrival_patterns(plant, self._channel, self._certificate_contract)
+        self._error_set = patterns.recursion.error_set
+        self._estimator = Estimator(plant, self._channel, patterns=patterns)
+        self._downlink = downlink_of(self._protocol, self._estimator)
+        self._noise = as_noise(noise, plant)
+        truncated = self._noise == "truncated"
+        self._process_given = LinearProcess() if process is None else expect(process, Process, "process")
+        allowed = self._allow_assumption_violation
+        self._process = self._process_given.simulation(plant, self._disturbance, allowed, truncated=truncated)
+        self._horizon = as_count(horizon, "horizon", low=1, high=LONGEST_HORIZON)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)
-        steps = self.horizon + self._downlink.lead
-        self.observation_space = observation_space(plant, self.task, self.error_set, self.initial_set, steps)
+        steps = self._horizon + self._downlink.lead
+        self.observation_space = observation_space(plant, self._task, self._error_set, self._initial_set, steps)
         self._low, self._high = self.observation_space.low, self.observation_space.high
         self.steps = self.episodes = 0
-        self.start: Ellipsoid | np.ndarray = self.initial_set
+        self.start: Ellipsoid | np.ndarray = self._initial_set
         self._consistent = False
 
     def reset(
@@ -188,24 +206,24 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         Raises:
             ValueError: If an option is unknown or x0 has a wrong shape or is not finite.
         """
-        start = start_option(options, self.plant.n)
+        start = start_option(options, self._plant.n)
         super().reset(seed=seed)
         self._consistent = False
         if seed is not None:
             self._process.forget()
         rng = self.np_random
-        initial, first = (None, start) if start is not None else (self.initial_set, self._drawn_start(rng))
+        initial, first = (None, start) if start is not None else (self._initial_set, self._drawn_start(rng))
         self._state, self.start = self._process.start(rng, first, initial)
-        self._task_state = self.task.begin(rng, self.plant)
+        self._task_state = self._task.begin(rng, self._plant)
         self._disturbance_memory = self._process.begin(rng)
-        self._channel_state = ChannelState(self.channel, rng)
-        self.estimator.reset(self._state + self._process.first_error(rng))
+        self._channel_state = ChannelState(self._channel, rng)
+        self._estimator.reset(self._state + self._process.first_error(rng))
         self._downlink.begin(rng)
         self.steps = 0
         self.episodes += 1
         self._violations = 0.0
         self._consistent = True
-        info = self._info(no_inputs(self.plant.m), arrived=False)
+        info = self._info(no_inputs(self._plant.m), arrived=False)
         if self.renderer is not None:
             self.renderer.begin(info, self._task_state)
         return self._observation(), info
@@ -217,7 +235,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             ValueError: If the action is not finite or wrongly shaped; nothing has moved then.
             gymnasium.error.ResetNeeded: If there was no reset, or an earlier step failed half-way.
         """
-        decided = applied_input(self.plant, action)
+        _, decided = read_action(self._plant, action)
         if not self._consistent:
             raise gym.error.ResetNeeded("call reset: there was none, or an earlier step failed half-way")
         self._consistent = False
@@ -225,15 +243,15 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         inputs = self._downlink.exchange(rng, self.steps, decided)
         u = inputs.applied
         self._state = self._process.advance(rng, self._state, u, self.steps, self._disturbance_memory)
-        self._task_state = self.task.advance(rng, self.plant, self._task_state, u)
+        self._task_state = self._task.advance(rng, self._plant, self._task_state, u)
         self.steps += 1
         sends = self._channel_state.sends_at(self.steps)
         sample = self._process.measure(rng, self._state) if sends else None
-        packets = self._channel_state.exchange(rng, self.steps, sample, self.estimator.episode)
-        self.estimator.advance(u, packets)
-        reward = float(self.task.reward(self.plant, self._task_state, self._state, u))
+        packets = self._channel_state.exchange(rng, self.steps, sample, self._estimator.episode)
+        self._estimator.advance(u, packets)
+        reward = float(self._task.reward(self._plant, self._task_state, self._state, u))
         info = self._info(inputs, arrived=bool(packets))
-        terminated = self._process.terminated or (self.terminate_on_violation and info["cost"] > 0.0)
+        terminated = self._process.terminated or (self._terminate_on_violation and info["cost"] > 0.0)
         self._consistent = True
         if self.renderer is not None:
             self.renderer.record(info, self._task_state, self._channel_state, packets)
@@ -269,21 +287,21 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             self.renderer.close()
 
     def _drawn_start(self, rng: np.random.Generator) -> np.ndarray:
-        return (1.0 - SAMPLE_ROUNDING) * self.initial_set.sample(rng)
+        return (1.0 - SAMPLE_ROUNDING) * self._initial_set.sample(rng)
 
     def _observation(self) -> np.ndarray:
-        task_state = self._downlink.predicted(self.task, self._task_state)
-        entries = np.concatenate([self._belief[0], self.task.observe(task_state)])
+        task_state = self._downlink.predicted(self._task, self._task_state)
+        entries = np.concatenate([self._belief[0], self._task.observe(task_state)])
         return np.minimum(np.maximum(entries, self._low), self._high).astype(np.float32)
 
     def _info(self, inputs: Inputs, *, arrived: bool) -> dict[str, Any]:
-        values = self.plant.constraint_values(self._state)
+        values = self._plant.constraint_values(self._state)
         cost = 1.0 if max(values.tolist()) > 0.0 else 0.0
         self._violations += cost
         constraints = values, cost, self._violations
         self._belief = self._downlink.belief()
-        alarm = self.estimator.alarm or self._process.alarm
-        return loop_info(self.estimator, self._belief, self.contract, self._state, inputs, arrived, constraints, alarm)
+        known, alarm = self._estimator, self._estimator.alarm or self._process.alarm
+        return loop_info(known, self._belief, self._contract, self._state, inputs, arrived, constraints, alarm)
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:

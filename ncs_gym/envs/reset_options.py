@@ -29,12 +29,13 @@ def vector_reset_options(options: dict[str, Any] | None, count: int, n: int) -> 
     """
     options = _known_options(options, {"state", "reset_mask"})
     given = options.get("reset_mask", np.ones(count, np.bool_))
-    mask = np.zeros(0, np.bool_) if as_numbers(given) is None else np.asarray(given)
+    mask = np.zeros(0, np.bool_) if as_numbers(given) is None else np.array(given)
     if mask.shape != (count,) or mask.dtype != np.bool_ or not mask.any():
         raise ValueError(f"options['reset_mask'] must be bool with shape ({count},), some True, got {shown(given)}")
     if "state" not in options:
         return mask, None
     starts = as_numbers(options["state"])
+    starts = None if starts is None else starts.copy()
     if starts is None or starts.shape not in {(n,), (count, n)} or not np.isfinite(starts).all():
         raise ValueError(f"options['state'] must be finite with shape ({n},) or ({count}, {n}), got {shown(starts)}")
     return mask, np.broadcast_to(starts, (count, n))

@@ -56,33 +56,39 @@ def observation_space(plant: LinearPlant, task: Task, error_set: ErrorSet, initi
     return Box(-bound.astype(np.float32), bound.astype(np.float32), dtype=np.float32)
 
 
-def applied_input(plant: LinearPlant, action: Any) -> np.ndarray:
-    """Returns the float64 input u = u_max * clip(action, -1, 1), shape (m,), that an action stands for.
+def read_action(plant: LinearPlant, action: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Reads an action, once: whoever writes into it later, or makes numbers of it anew, changes nothing any more.
+
+    Returns:
+        A copy of the action, float32 if it is an array of that and float64 otherwise, and the float64 input
+        u = u_max * clip(action, -1, 1) that it stands for, shape (m,) each.
 
     Raises:
         ValueError: If the action is not finite or does not have shape (m,).
     """
-    numbers = action if type(action) is np.ndarray and action.dtype.char in "fd" else as_numbers(action)
+    is_float = type(action) is np.ndarray and action.dtype.char in "fd"
+    numbers = action.copy() if is_float else as_numbers(action)
     if numbers is not None and numbers.shape == (plant.m,):
         values = numbers.tolist()
         if all([-1.0 <= value <= 1.0 for value in values]):  # the usual case, in half the time
-            return plant.u_max * numbers
+            return numbers, plant.u_max * numbers
         if all(map(isfinite, values)):
-            return plant.u_max * np.array([min(max(value, -1.0), 1.0) for value in values])
+            return numbers, plant.u_max * np.array([min(max(value, -1.0), 1.0) for value in values])
     raise ValueError(f"the action must be finite with shape ({plant.m},), got {shown(action)}")
 
 
-def applied_inputs(plant: LinearPlant, actions: Any, count: int) -> np.ndarray:
-    """Returns the float64 inputs, shape (m, count), that actions of shape (count, m) stand for.
+def read_actions(plant: LinearPlant, actions: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns what `read_action` does for `count` environments: a copy, shape (count, m), and inputs, (m, count).
 
     Raises:
         ValueError: If one is not finite or the shape is wrong.
     """
-    numbers = actions if type(actions) is np.ndarray and actions.dtype.char in "fd" else as_numbers(actions)
+    is_float = type(actions) is np.ndarray and actions.dtype.char in "fd"
+    numbers = actions.copy() if is_float else as_numbers(actions)
     if numbers is not None and numbers.shape == (count, plant.m):
         farthest = np.abs(numbers).max()
         if farthest <= 1.0:  # the usual case
-            return plant.u_max[:, None] * numbers.T
+            return numbers, plant.u_max[:, None] * numbers.T
         if np.isfinite(farthest):
-            return plant.u_max[:, None] * np.minimum(np.maximum(numbers.T, -1.0), 1.0)
+            return numbers, plant.u_max[:, None] * np.minimum(np.maximum(numbers.T, -1.0), 1.0)
     raise ValueError(f"the actions must be finite with shape ({count}, {plant.m}), got {shown(actions)}")

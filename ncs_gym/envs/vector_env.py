@@ -10,16 +10,22 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from ncs_gym.downlink.loop import Inputs, no_inputs
+from ncs_gym.downlink.protocol import DownlinkProtocol
 from ncs_gym.downlink.vector_loop import vector_downlink_of
 from ncs_gym.envs.env import SAMPLE_ROUNDING, NCSEnv, RenderModeError
 from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.reset_options import vector_reset_options
-from ncs_gym.envs.spaces import applied_inputs
+from ncs_gym.envs.spaces import read_actions
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
+from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.error_statistics_table import StatisticsTable
 from ncs_gym.estimation.vector_estimator import VectorEstimator
+from ncs_gym.network.channel import Channel
+from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.packet_transmission import VectorChannelState
-from ncs_gym.validation import as_count, shown
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.tasks.task import Task
+from ncs_gym.validation import as_count, setting, shown
 
 
 class NCSVectorEnv(VectorEnv):
@@ -47,6 +53,17 @@ class NCSVectorEnv(VectorEnv):
         ValueError: If a setting is wrong; see `NCSEnv`.
     """
 
+    single: NCSEnv = setting("single")
+    plant: LinearPlant = setting("plant")
+    channel: Channel = setting("channel")
+    task: Task = setting("task")
+    contract: ChannelContract | None = setting("contract")
+    certificate_contract: ChannelContract | None = setting("certificate_contract")
+    error_set: ErrorSet = setting("error_set")
+    downlink: DownlinkProtocol | None = setting("downlink", "_protocol")
+    max_episode_steps: int | None = setting("max_episode_steps")
+    autoreset_mode: AutoresetMode = setting("autoreset_mode")
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -57,14 +74,14 @@ class NCSVectorEnv(VectorEnv):
     ) -> None:
         self.num_envs = as_count(num_envs, "num_envs", low=1)
         limit = max_episode_steps
-        self.max_episode_steps = None if limit is None else as_count(limit, "max_episode_steps", low=1)
-        self.autoreset_mode = _autoreset_mode(autoreset_mode)
-        self.metadata = NCSEnv.metadata | {"autoreset_mode": self.autoreset_mode, "render_modes": []}
+        self._max_episode_steps = None if limit is None else as_count(limit, "max_episode_steps", low=1)
+        self._autoreset_mode = _autoreset_mode(autoreset_mode)
+        self.metadata = NCSEnv.metadata | {"autoreset_mode": self._autoreset_mode, "render_modes": []}
         if settings.get("render_mode") is not None:
             raise RenderModeError("a vector environment draws nothing: use gym.make(..., render_mode=...)")
-        self.single = single = NCSEnv(**settings)
-        self.plant, self.channel, self.task = single.plant, single.channel, single.task
-        self.contract, self.error_set, self.render_mode = single.contract, single.error_set, None
+        self._single = single = NCSEnv(**settings)
+        self._plant, self._channel, self._task = single.plant, single.channel, single.task
+        self._contract, self._error_set, self.render_mode = single.contract, single.error_set, None
         self.single_observation_space = single.observation_space
         self.single_action_space = single.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -73,16 +90,16 @@ class NCSVectorEnv(VectorEnv):
         self._low, self._high = (np.asarray(bound, dtype=np.float64)[:, None] for bound in bounds)
         allowed, truncated = single.allow_assumption_violation, single.noise == "truncated"
         simulation = single.process.simulation
-        self._process = simulation(self.plant, single.disturbance, allowed, self.num_envs, truncated=truncated)
-        self.downlink, self.certificate_contract = single.downlink, single.certificate_contract
-        patterns = arrival_patterns(self.plant, self.channel, self.certificate_contract)
-        self._estimator = VectorEstimator(self.plant, patterns, self.num_envs)
-        self._downlink = vector_downlink_of(self.downlink, self._estimator, self.num_envs)
+        self._process = simulation(self._plant, single.disturbance, allowed, self.num_envs, truncated=truncated)
+        self._protocol, self._certificate_contract = single.downlink, single.certificate_contract
+        patterns = arrival_patterns(self._plant, self._channel, self._certificate_contract)
+        self._estimator = VectorEstimator(self._plant, patterns, self.num_envs)
+        self._downlink = vector_downlink_of(self._protocol, self._estimator, self.num_envs)
         self._belief = self._downlink.belief()
-        self._state = np.zeros((self.plant.n, self.num_envs))
+        self._state = np.zeros((self._plant.n, self.num_envs))
         self._violations, self._done = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
         self.steps, self.episodes = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, np.int64)
-        self.starts = np.full((self.num_envs, self.plant.n), np.nan)
+        self.starts = np.full((self.num_envs, self._plant.n), np.nan)
         self.ticks, self._consistent = 0, False
 
     @property
@@ -109,7 +126,7 @@ class NCSVectorEnv(VectorEnv):
         Raises:
             ValueError: If an option is unknown, has a wrong shape or is not finite.
         """
-        mask, starts = vector_reset_options(options, self.num_envs, self.plant.n)
+        mask, starts = vector_reset_options(options, self.num_envs, self._plant.n)
         if isinstance(seed, (list, tuple, np.ndarray)):
             seeds = [as_count(each, "each seed", low=0, high=2**64) for each in seed]
             seed = int(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0] >> 1)
@@ -120,7 +137,7 @@ class NCSVectorEnv(VectorEnv):
             raise gym.error.ResetNeeded("reset all environments first")
         self._consistent = False
         self._begin(mask, starts)
-        info = self._info(no_inputs(self.plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), mask)
+        info = self._info(no_inputs(self._plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), mask)
         self._consistent = True
         return self._observation(), info
 
@@ -131,17 +148,17 @@ class NCSVectorEnv(VectorEnv):
             ValueError: If an action is not finite or the shape is wrong; nothing has moved then.
             gymnasium.error.ResetNeeded: If there was no reset, or an earlier step failed half-way.
         """
-        u = applied_inputs(self.plant, actions, self.num_envs)
+        u = read_actions(self._plant, actions, self.num_envs)[1]
         if not self._consistent:
             raise gym.error.ResetNeeded("call reset: there was none, or an earlier step failed half-way")
         some_done = bool(self._done.any())
-        if some_done and self.autoreset_mode is AutoresetMode.DISABLED:
+        if some_done and self._autoreset_mode is AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded("some episodes are over: reset them with options={'reset_mask': ...}")
         self._consistent = False
         inputs = self._downlink.exchange(self.np_random, self.steps, u)
         applied, committed, missing = inputs
         arrived = self._advance(applied)
-        reward = self.task.reward_many(self.plant, self._task_state, self._state, applied)
+        reward = self._task.reward_many(self._plant, self._task_state, self._state, applied)
         restarted = self._done.copy() if some_done else None
         if restarted is not None:  # NEXT_STEP: the last step ended these episodes
             self._begin(restarted, None)
@@ -152,7 +169,7 @@ class NCSVectorEnv(VectorEnv):
         terminated, truncated = self._ends(info["cost"], restarted)
         self._done = terminated | truncated
         observation = self._observation()
-        if self.autoreset_mode is AutoresetMode.SAME_STEP and self._done.any():
+        if self._autoreset_mode is AutoresetMode.SAME_STEP and self._done.any():
             observation, info = self._restarted(observation, info)
         self._consistent = True
         return observation, reward, terminated, truncated, info
@@ -160,7 +177,7 @@ class NCSVectorEnv(VectorEnv):
     def close_extras(self, **kwargs: Any) -> None:
         """Closes the process."""
         self._process.close()
-        self.single.close()
+        self._single.close()
 
     def inputs_of(self, actions: np.ndarray) -> np.ndarray:
         """Returns the float64 inputs, shape (m, N), that actions (N, m) stand for.
@@ -168,18 +185,18 @@ class NCSVectorEnv(VectorEnv):
         Raises:
             ValueError: If one is not finite or the shape is wrong.
         """
-        return applied_inputs(self.plant, actions, self.num_envs)
+        return read_actions(self._plant, actions, self.num_envs)[1]
 
     def _advance(self, u: np.ndarray) -> np.ndarray:
         """Moves everything one step on with inputs (m, N), and returns where packets arrived, shape (N,)."""
         rng, estimator = self.np_random, self._estimator
         self._state = self._process.advance(rng, self._state, u, self.steps, self._disturbance_memory)
-        self._task_state = self.task.advance_many(rng, self.plant, self._task_state, u)
+        self._task_state = self._task.advance_many(rng, self._plant, self._task_state, u)
         self.steps += 1
         self.ticks += 1
         sends, samples = self._channel_state.send(rng, self.steps), None
         if sends.any():
-            samples = self.channel.quantize(self._process.measure(rng, self._state))
+            samples = self._channel.quantize(self._process.measure(rng, self._state))
             if not np.isfinite(samples.sum()):  # no sensor within the assumptions sends this
                 damaged = np.asarray(~np.isfinite(samples).all(axis=0))
                 self._channel_state.discard(damaged)
@@ -197,10 +214,10 @@ class NCSVectorEnv(VectorEnv):
         terminated, truncated = np.zeros((2, self.num_envs), np.bool_)
         if self._process.terminated is not False:  # other people's environments may end
             terminated, truncated = terminated | self._process.terminated, truncated | self._process.truncated
-        if self.single.terminate_on_violation:
+        if self._single.terminate_on_violation:
             terminated |= cost > 0.0
-        if self.max_episode_steps is not None:
-            truncated |= self.steps >= self.max_episode_steps
+        if self._max_episode_steps is not None:
+            truncated |= self.steps >= self._max_episode_steps
         if restarted is not None:
             terminated, truncated = terminated & ~restarted, truncated & ~restarted
         return terminated, truncated
@@ -209,12 +226,12 @@ class NCSVectorEnv(VectorEnv):
         """Starts episodes where `mask` (N,) says so, at `starts` (N, n) or drawn from the initial set."""
         rng, count = self.np_random, int(np.count_nonzero(mask))
         first_states, first_errors = self._first(count)
-        initial, states = (self.single.initial_set, first_states) if starts is None else (None, starts[mask].T)
+        initial, states = (self._single.initial_set, first_states) if starts is None else (None, starts[mask].T)
         states, known = self._process.start_many(rng, states, initial, mask)
-        task_state, memory = self.task.begin_many(rng, self.plant, count), self._process.begin(rng, count)
+        task_state, memory = self._task.begin_many(rng, self._plant, count), self._process.begin(rng, count)
         if count == self.num_envs:
             self._task_state, self._disturbance_memory = task_state, memory
-            self._channel_state = VectorChannelState(self.channel, rng, count)
+            self._channel_state = VectorChannelState(self._channel, rng, count)
         else:
             self._task_state[..., mask], self._disturbance_memory[..., mask] = task_state, memory
             self._channel_state.begin(rng, mask)
@@ -228,20 +245,20 @@ class NCSVectorEnv(VectorEnv):
     def _first(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns states that episodes start at, and the errors of their first estimates, shape (n, count) each."""
         rng = self.np_random
-        states = (1.0 - SAMPLE_ROUNDING) * self.single.initial_set.sample(rng, count)
+        states = (1.0 - SAMPLE_ROUNDING) * self._single.initial_set.sample(rng, count)
         return states.T, self._process.first_error(rng, count)
 
     def _observation(self) -> np.ndarray:
         """Returns the observations, shape (N, n + extra)."""
-        task_state = self._downlink.predicted(self.task, self._task_state)
-        entries = np.concatenate([self._belief[0], self.task.observe_many(task_state)])
+        task_state = self._downlink.predicted(self._task, self._task_state)
+        entries = np.concatenate([self._belief[0], self._task.observe_many(task_state)])
         observation = np.empty(entries.shape, np.float32)
         np.minimum(np.maximum(entries, self._low), self._high, out=observation, casting="same_kind")
         return observation.T
 
     def _info(self, inputs: Inputs, arrived: np.ndarray, counted: np.ndarray | None) -> dict[str, Any]:
         """Returns the infos; the costs of environments that are not `counted`, shape (N,), do not count once more."""
-        values = self.plant.constraint_values(self._state)
+        values = self._plant.constraint_values(self._state)
         cost = (np.maximum.reduce(values) > 0.0).astype(np.float64)
         self._violations = self._violations + (cost if counted is None else cost * counted)
         self._belief = self._downlink.belief()
@@ -249,7 +266,7 @@ class NCSVectorEnv(VectorEnv):
         belief = self._belief[0], table.shapes.take(numbers, axis=0)
         constraints = values, cost, self._violations.copy()
         alarm = self._estimator.alarm | self._process.alarm
-        return loop_info(self._estimator, belief, self.contract, self._state, inputs, arrived, constraints, alarm)
+        return loop_info(self._estimator, belief, self._contract, self._state, inputs, arrived, constraints, alarm)
 
     def _restarted(self, observation: np.ndarray, info: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
         """Returns the first of new episodes where old ones ended, whose last go to final_obs and final_info."""
@@ -258,7 +275,7 @@ class NCSVectorEnv(VectorEnv):
         final |= {f"_{key}": done.copy() for key in info}
         final_observation = _where(done, observation, np.zeros_like(observation))
         self._begin(done, None)
-        fresh = self._info(no_inputs(self.plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), done)
+        fresh = self._info(no_inputs(self._plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), done)
         merged = {key: _where(done, fresh[key], value) for key, value in info.items()}
         return _where(done, self._observation(), observation), merged | {
             "final_obs": final_observation,

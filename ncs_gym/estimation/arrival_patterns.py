@@ -147,8 +147,8 @@ class ArrivalPatterns:
             successor = None if self._successor is None else self._successor()
             if successor is None or successor.is_full:
                 successor = ArrivalPatterns(self.recursion, self.channel)
-                self._successor = weakref.ref(successor)
                 successor._lock = self._lock  # the recursion, which belongs to both, has a filter that moves
+                self._successor = weakref.ref(successor)
             for key, shared in list(_shared.items()):
                 if shared is self:
                     _shared[key] = successor
@@ -172,11 +172,11 @@ class ArrivalPatterns:
     def _number_of_pattern(self, pattern: Pattern) -> int:
         """Returns the number of a pattern, a new one if it has not occurred."""
         if pattern not in self._pattern_numbers:
-            self.arrays.add_pattern(pattern.present, replays=pattern.replay_from != NO_REPLAY)
-            self._pattern_numbers[pattern] = len(self._patterns)
-            self._patterns.append(pattern)
+            count = len(self._patterns) + 1
+            self.arrays.add_pattern(count - 1, pattern.present, replays=pattern.replay_from != NO_REPLAY)
             self._next.append(UNKNOWN)
-            count = len(self._patterns)
+            self._patterns.append(pattern)
+            self._pattern_numbers[pattern] = count - 1  # last: if it is interrupted, the pattern has not occurred
             numbers = self._sizes[0] * count + self._sizes[1] * len(self.table.statistics)
             is_large = count >= MAX_PATTERNS or numbers >= MAX_NUMBERS
             self.is_full = is_large and count >= SMALLEST_GROWTH * self._adopted_count

@@ -115,10 +115,10 @@ class StatisticsTable:
     def _add(self, statistics: ErrorStatistics) -> int:
         """Returns the number of new statistics."""
         number = len(self.statistics)
-        if number == len(self._shapes):
-            self._shapes = np.concatenate([self._shapes, np.zeros_like(self._shapes)])
+        if number == len(self._shapes):  # which grow last: if growing is interrupted, it begins again
             self.gains = np.concatenate([self.gains, np.zeros_like(self.gains)], axis=-1)
             self.quick_tests = np.concatenate([self.quick_tests, np.zeros_like(self.quick_tests)], axis=-1)
+            self._shapes = np.concatenate([self._shapes, np.zeros_like(self._shapes)])
         self._shapes[number] = statistics.shape
         self._predictions.append(UNKNOWN)
         self._updates.append(None)

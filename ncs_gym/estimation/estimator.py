@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from ncs_gym.estimation.error_bound import ErrorSet, require_error_set
 from ncs_gym.estimation.error_statistics_table import NO_SAMPLE, UNKNOWN
 from ncs_gym.network.channel import Channel, Packet
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.validation import setting
 
 
 class Belief(NamedTuple):
@@ -57,6 +58,11 @@ class Estimator:
         ValueError: If the channel rounds more coarsely than the contract of the error set allows.
     """
 
+    plant: LinearPlant = setting("plant")
+    channel: Channel = setting("channel")
+    buffer: int = setting("buffer")
+    error_set: ErrorSet = setting("error_set")
+
     def __init__(
         self,
         plant: LinearPlant,
@@ -64,7 +70,7 @@ class Estimator:
         error_set: ErrorSet | None = None,
         patterns: ArrivalPatterns | None = None,
     ) -> None:
-        self.plant, self.channel, self.buffer = plant, channel, channel.longest_delay
+        self._plant, self._channel, self._buffer = plant, channel, channel.longest_delay
         if patterns is None:
             if error_set is None:
                 patterns = arrival_patterns(plant, channel, None)
@@ -72,13 +78,20 @@ class Estimator:
                 require_error_set(error_set, plant)
                 patterns = patterns_of(plant, channel, error_set)
         self._patterns = patterns
-        self.error_set = self._patterns.recursion.error_set
-        ages = self.error_set.ages
+        self._error_set = self._patterns.recursion.error_set
+        ages = self._error_set.ages
         if ages is not None and not ages.contract.is_fine_enough_for(channel):
             raise ValueError(f"the channel rounds more coarsely than the contract of the error set: {ages.contract}")
         self._limit = plant.state_limit if np.isfinite(plant.state_limit).all() else None
         self.episode, self._is_new = 0, True
         self._begin(np.zeros(plant.n))
+
+    def saved(self) -> dict[str, Any]:
+        """Returns all that changes, as attributes to be put back; arrays are replaced, never written into."""
+        saved = vars(self).copy()
+        for name in ("_priors", "_inputs", "_samples"):
+            saved[name] = saved[name].copy()
+        return saved
 
     def reset(self, mean: np.ndarray) -> None:
         """Starts an episode at step 0 with a first estimate, shape (n,), whose error lies in E(r0^2 I).
@@ -96,9 +109,9 @@ class Estimator:
         self.mean = np.array(mean, dtype=np.float64)
         self._pattern = self._patterns.root
         # By age: means before updates, inputs that led there, and samples.
-        self._priors: deque[np.ndarray] = deque(maxlen=self.buffer + 1)
-        self._inputs: deque[np.ndarray] = deque(maxlen=self.buffer + 1)
-        self._samples: deque[np.ndarray | None] = deque(maxlen=self.buffer + 1)
+        self._priors: deque[np.ndarray] = deque(maxlen=self._buffer + 1)
+        self._inputs: deque[np.ndarray] = deque(maxlen=self._buffer + 1)
+        self._samples: deque[np.ndarray | None] = deque(maxlen=self._buffer + 1)
 
     @property
     def shape(self) -> np.ndarray:
@@ -164,7 +177,7 @@ class Estimator:
     @np.errstate(invalid="ignore", over="ignore")  # an infinite weight of a residual of zero, a huge residual
     def _replayed(self, pattern: int) -> int:
         """Replays from the oldest new sample on, keeps whichever history is better, and returns the pattern then."""
-        replay, H = self._patterns.replay(pattern), self.plant.H
+        replay, H = self._patterns.replay(pattern), self._plant.H
         mean, means = self._priors[replay.oldest], {}
         for age in range(replay.oldest, -1, -1):
             means[age] = mean
@@ -187,7 +200,7 @@ class Estimator:
 
     def _predicted(self, mean: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Returns A x_hat + B u, shape (n,); an unstable plant's within the limit of its states."""
-        mean = self.plant.A.dot(mean) + self.plant.B.dot(u)
+        mean = self._plant.A.dot(mean) + self._plant.B.dot(u)
         return mean if self._limit is None else np.minimum(np.maximum(mean, -self._limit), self._limit)
 
     def _test_exactly(self, residual: np.ndarray, statistics: int) -> None:

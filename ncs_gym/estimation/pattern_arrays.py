@@ -69,7 +69,6 @@ class PatternArrays:
 
     def __init__(self, channel: Channel) -> None:
         self._first_age, self._columns = channel.delay, channel.jitter + 1
-        self._patterns = 0
         self.next, self.target, self.replay_from, self.new_age = (_unknown(_FIRST_CAPACITY) for _ in range(4))
         self.arrival = _unknown(self._columns, _FIRST_CAPACITY)
         self.accepted = np.zeros(_FIRST_CAPACITY, np.bool_)
@@ -81,19 +80,17 @@ class PatternArrays:
         array = getattr(self, table)
         return array if index is None else array[index]
 
-    def add_pattern(self, present: int, *, replays: bool) -> None:
-        """Adds a pattern with some statistics; whether there is something to replay."""
-        number = self._patterns
+    def add_pattern(self, number: int, present: int, *, replays: bool) -> None:
+        """Adds a pattern by its number, with some statistics; whether there is something to replay."""
         if number == len(self.next):
-            for name in ("next", "target", "replay_from", "new_age", "arrival"):
-                old = getattr(self, name)
-                setattr(self, name, np.concatenate([old, np.full_like(old, UNKNOWN)], axis=-1))
             for name in ("accepted", "used", "present"):
                 old = getattr(self, name)
                 setattr(self, name, np.concatenate([old, np.zeros_like(old)], axis=-1))
+            for name in ("target", "replay_from", "new_age", "arrival", "next"):  # "next" last: it tells the capacity
+                old = getattr(self, name)
+                setattr(self, name, np.concatenate([old, np.full_like(old, UNKNOWN)], axis=-1))
         self.present[number] = present
         self.target[number] = UNKNOWN if replays else number
-        self._patterns += 1
 
     def set_arrival(self, pattern: int, age: int, after: int) -> None:
         """Notes the pattern after a sample of some age arrived; other ages than the channel's are left out."""

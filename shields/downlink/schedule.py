@@ -26,6 +26,11 @@ class Schedule:
         """Starts an episode: the inputs of its first c steps are zero."""
         self._decided = deque([self._nothing] * self._lead)
 
+    def __copy__(self) -> Schedule:
+        twin = Schedule(self._lead, len(self._nothing))
+        twin._decided = self._decided.copy()
+        return twin
+
     def due(self, decided: list[float]) -> list[float]:
         """Adds the input decided at this step, and removes and returns the one that is to be applied at it."""
         self._decided.append(decided)
@@ -42,7 +47,7 @@ class VectorSchedule:
     """
 
     def __init__(self, lead: int, inputs: int, size: int) -> None:
-        self._decided = deque(np.zeros((inputs, size)) for _ in range(lead))
+        self._decided = [np.zeros((inputs, size)) for _ in range(lead)]
 
     def start(self, chosen: np.ndarray) -> None:
         """Starts episodes in some environments, given by a mask of shape (N,)."""
@@ -51,8 +56,8 @@ class VectorSchedule:
 
     def due(self, decided: np.ndarray) -> np.ndarray:
         """Adds the inputs decided at this step, (m, N), and removes and returns those that are to be applied at it."""
-        self._decided.append(decided.copy())
-        return self._decided.popleft()
+        due, *self._decided = *self._decided, decided.copy()  # at once: never one too many, whatever interrupts a step
+        return due
 
 
 def as_decided(info: dict[str, Any], decided: np.ndarray, due: np.ndarray | None) -> tuple[np.ndarray, Any]:

@@ -157,6 +157,7 @@ class Lookahead:
         stored = np.full((self.planner.horizon, plant.m), np.nan)
         if numbers is None or numbers.ndim != 2 or numbers.shape[1] != plant.m or len(numbers) > len(stored):
             return stored
+        numbers = numbers.copy()  # read once
         if (np.abs(numbers) <= plant.u_max).all():
             stored[: len(numbers)] = numbers
         return stored

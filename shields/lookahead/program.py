@@ -83,12 +83,13 @@ class PlanProgram:
             A, b, q = self._data(estimate, room, weighting, radius, proposed)
             if not (np.isfinite(b).all() and np.isfinite(A).all() and np.isfinite(q).all()):
                 return None
-            if self._solver is None:
-                self._solver = self._set_up()
-            self._solver.update(A=A, b=b, q=q)
-            plan = np.array(self._solver.solve().x, dtype=np.float64)
-        except Exception:  # whatever a solver does wrong, there is another plan or none
-            self._solver = None
+            solver, self._solver = self._set_up() if self._solver is None else self._solver, None
+            solver.update(A=A, b=b, q=q)
+            plan = np.array(solver.solve().x, dtype=np.float64)
+            self._solver = solver  # what did not come to its end is not used again
+        except (KeyboardInterrupt, SystemExit):
+            raise
+        except BaseException:  # whatever a solver does wrong (its panics are no Exceptions): another plan, or none
             return None
         usable = plan.shape == (self._length * self._m,) and np.isfinite(plan).all()
         return plan.reshape(self._length, self._m) * self._limits if usable else None

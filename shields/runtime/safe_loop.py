@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from enum import Enum, auto
-from typing import Any
+from functools import wraps
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from ncs_gym.downlink import Command, CommittedInputs, downlink_protocol
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
 from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.network.packet_reception import DiscardedPackets, as_packet
-from ncs_gym.validation import as_numbers, as_vector, shown
+from ncs_gym.validation import as_numbers, as_vector, setting, shown
 from shields.certificate import Certificate
 from shields.certificate_text import description_of_loop
 from shields.downlink.start_under_zero_input import starts_known
@@ -21,6 +22,9 @@ from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import LoopObservation
 from shields.runtime.monitored_filter import MonitoredFilter
 from shields.runtime.safety_filter import SafetyFilter
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 NOT_STARTED = "no episode is under way: call start"
 
@@ -32,6 +36,28 @@ class _Phase(Enum):
     STARTED = auto()
     RECEIVED = auto()
     DECIDED = auto()
+
+
+def _transaction(method: Callable[Concatenate[SafeLoop, P], T]) -> Callable[Concatenate[SafeLoop, P], T]:
+    """Makes calls of a method transactions: where one does not come to its end, nothing has happened.
+
+    While a call changes something the loop counts as stopped; so it stays if even the way back is interrupted.
+    """
+
+    @wraps(method)
+    def call(loop: SafeLoop, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        phase, discarded = loop._phase, loop._discarded
+        before = [(part, part.saved()) for part in (loop._estimator, loop._monitored, loop._inputs)]
+        try:
+            return method(loop, *args, **kwargs)
+        except BaseException:  # Ctrl-C, the timeout of a signal and panics of native code are no Exceptions
+            loop._phase = _Phase.STOPPED
+            for part, saved in before:
+                vars(part).update(saved)
+            loop._phase, loop._discarded = phase, discarded
+            raise
+
+    return call
 
 
 class SafeLoop:
@@ -54,6 +80,7 @@ class SafeLoop:
     state is proved to be in S at this step, `reason` why not, `print(loop)` both. What the loop cannot see is that the
     clock misses a step, that the actuator applies something else (unless it is told), or that packets carry wrong
     stamps. A certificate under a channel contract brings its error sets along. Not for use by several threads at once.
+    Where `start`, `receive` or `decide` is interrupted, by whatever it may be, nothing has happened: call it again.
 
     Behind a downlink that is late or loses commands, send `command` after each `decide` instead, and let an
     `ncs_gym.Actuator` apply what it holds (docs/contracts.md, "Both directions"). What is decided takes effect `lead`
@@ -81,6 +108,10 @@ class SafeLoop:
         ValueError: If a setting is of the wrong kind, or the channel rounds more coarsely than the contract allows.
     """
 
+    filter: SafetyFilter = setting("filter")
+    contract: ChannelContract | None = setting("contract")
+    lead: int = setting("lead")
+
     def __init__(
         self,
         certificate: Certificate,
@@ -91,22 +122,23 @@ class SafeLoop:
         downlink: Channel | None = None,
         downlink_contract: ChannelContract | None = None,
     ) -> None:
-        self.filter = SafetyFilter(certificate, plant, mode, horizon)
+        self._filter = SafetyFilter(certificate, plant, mode, horizon)
         if not isinstance(channel, Channel):
             raise ValueError(f"channel must be a Channel (its contract is the certificate's), got {shown(channel)}")
-        self.contract = certificate.contract
-        self._estimator = Estimator(plant, channel, patterns=arrival_patterns(plant, channel, self.contract))
+        self._contract = certificate.contract
+        self._estimator = Estimator(plant, channel, patterns=arrival_patterns(plant, channel, self._contract))
         protocol = downlink_protocol(downlink, downlink_contract)
-        self._monitored = MonitoredFilter(self.filter, protocol)
-        self.lead = self._monitored.lead
-        warn_of_broken_contract(self.contract, channel, self.lead, counts_losses=self.lead > 0)
-        self._inputs = CommittedInputs(self.lead, plant.m)
+        self._monitored = MonitoredFilter(self._filter, protocol)
+        self._lead = self._monitored.lead
+        warn_of_broken_contract(self._contract, channel, self._lead, counts_losses=self._lead > 0)
+        self._inputs = CommittedInputs(self._lead, plant.m)
         self._discarded = DiscardedPackets()
         self._phase = _Phase.STOPPED
 
     def __str__(self) -> str:
         return description_of_loop(self, self._phase is not _Phase.STOPPED)
 
+    @_transaction
     def start(self, x_hat0: Any, initial_set: Ellipsoid | np.ndarray | None = None) -> None:
         """Starts an episode at step 0; also how one is begun anew after the guarantee was lost.
 
@@ -120,21 +152,22 @@ class SafeLoop:
         Raises:
             ValueError: If an argument is not finite or does not fit the plant; nothing has changed then.
         """
-        n = self.filter.plant.n
-        mean = as_vector(x_hat0, n, f"x_hat0 = ({', '.join(self.filter.plant.state_names)})")
+        n = self._filter.plant.n
+        mean = as_vector(x_hat0, n, f"x_hat0 = ({', '.join(self._filter.plant.state_names)})")
         if initial_set is not None and not isinstance(initial_set, Ellipsoid):
             initial_set = as_vector(initial_set, n, "initial_set")
         if isinstance(initial_set, Ellipsoid) and initial_set.dim != n:
             raise ValueError(f"initial_set must have dimension {n}, got {initial_set.dim}")
-        known = starts_known(self.filter, initial_set, self.lead)
+        known = starts_known(self._filter, initial_set, self._lead)
         self._phase = _Phase.STOPPED
         self._estimator.reset(mean)
         self._discarded = DiscardedPackets()
         self._inputs.start()
-        earlier = [self._estimator.predicted(self._inputs.pending[:ahead]) for ahead in range(self.lead)]
+        earlier = [self._estimator.predicted(self._inputs.pending[:ahead]) for ahead in range(self._lead)]
         self._monitored.begin(self._report(), known, beliefs=earlier)
         self._phase = _Phase.STARTED
 
+    @_transaction
     def receive(self, packets: Iterable[Packet] = (), applied: Any = None) -> np.ndarray:
         """Returns the estimate at this control step, shape (n,): predicted from the last one, then corrected.
 
@@ -157,12 +190,12 @@ class SafeLoop:
             raise ValueError(
                 f"packets must be a list of Packet(stamp, measurement), empty if nothing arrived, got {shown(packets)}"
             )
-        arrived = [as_packet(each, self.filter.plant.p) for each in packets]
+        arrived = [as_packet(each, self._filter.plant.p) for each in packets]
         phase = self._require_started()
         if phase is _Phase.RECEIVED:
             raise RuntimeError("receive was called twice in a step: hand over all packets of a step in one call")
         if phase is _Phase.DECIDED:
-            self._phase = _Phase.STOPPED  # if something is raised in between, what is known is not consistent
+            self._phase = _Phase.STOPPED
             decided, due = np.array(self._monitored.decided), self._inputs.pop()
             told = due if applied is None else _as_input(applied, due.shape)
             self._estimator.advance(due if told is None else told, arrived)
@@ -172,6 +205,7 @@ class SafeLoop:
         self._phase = _Phase.RECEIVED
         return self.estimate
 
+    @_transaction
     def decide(self, proposed: Any) -> Decision:
         """Returns what to apply from now until the next step, and why.
 
@@ -184,6 +218,7 @@ class SafeLoop:
         """
         if self._require_started() is _Phase.DECIDED:
             raise RuntimeError("decide was called twice in a step: call receive in between, with the packets that came")
+        self._phase = _Phase.STOPPED
         decision = self._monitored.decide(self._clipped(proposed))
         self._inputs.commit(decision.input)
         self._phase = _Phase.DECIDED
@@ -200,7 +235,7 @@ class SafeLoop:
         return self._inputs.command(self.steps, self.episode)
 
     def step(self, proposed: Any, packets: Iterable[Packet] = (), applied: Any = None) -> Decision:
-        """Returns the decision at this control step: `receive`, then `decide`."""
+        """Returns the decision at this control step: `receive`, then `decide`, which is left if that is interrupted."""
         self.receive(packets, applied)
         return self.decide(proposed)
 
@@ -254,7 +289,7 @@ class SafeLoop:
 
     def _require_started(self) -> _Phase:
         if self._phase is _Phase.STOPPED:
-            raise RuntimeError("call start: there was none, or an earlier step failed half-way")
+            raise RuntimeError(NOT_STARTED)
         return self._phase
 
     def _report(self) -> LoopObservation:
@@ -263,13 +298,14 @@ class SafeLoop:
 
     def _belief(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimate and error shape of the time at which the next input takes effect."""
-        return self._estimator.predicted(self._inputs.pending[: self.lead])
+        return self._estimator.predicted(self._inputs.pending[: self._lead])
 
     def _clipped(self, proposed: Any) -> np.ndarray:
-        """Returns the proposal within the limits, shape (m,); as it is, or empty, where it is no finite input."""
-        plant, numbers = self.filter.plant, as_numbers(proposed)
+        """Returns a copy of the proposal within the limits, (m,); as it is, or empty, where it is no finite input."""
+        plant, numbers = self._filter.plant, as_numbers(proposed)
         if numbers is None:
             return np.empty(0)
+        numbers = numbers.copy()  # read once: another thread may write into it
         numbers = numbers.reshape(1) if numbers.ndim == 0 else numbers
         if numbers.shape != (plant.m,) or not np.isfinite(numbers).all():
             return numbers
@@ -279,6 +315,6 @@ class SafeLoop:
 def _as_input(applied: Any, shape: tuple[int, ...]) -> np.ndarray | None:
     """Returns the input reported by the actuator, shape (m,); None if it is none."""
     numbers = as_numbers(applied)
-    if numbers is not None and numbers.ndim == 0:
-        numbers = numbers.reshape(1)
+    if numbers is not None:
+        numbers = numbers.reshape(1).copy() if numbers.ndim == 0 else numbers.copy()
     return numbers if numbers is not None and numbers.shape == shape and np.isfinite(numbers).all() else None

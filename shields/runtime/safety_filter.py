@@ -117,8 +117,8 @@ class SafetyFilter(ReadOnlyArrays):
             stored: In mode "lookahead" the `plan` of the last decision, shape (k, m), if its input was applied and one
                 step has passed since. What is no plan of at most `horizon` inputs within the limits counts as none.
         """
-        known = _as_array(estimate), self.errors_of(error_shape), _as_array(input_proposed)
-        return self.decide_knowing(*known, stored)
+        x_hat, proposed = _as_array(estimate).copy(), _as_array(input_proposed).copy()  # read once
+        return self.decide_knowing(x_hat, self.errors_of(error_shape), proposed, stored)
 
     def decide_knowing(
         self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray, stored: Any = ()
@@ -202,8 +202,9 @@ class SafetyFilter(ReadOnlyArrays):
         key = shape.tobytes() if shape.shape == (self.plant.n, self.plant.n) else b""
         known = self._remembered.get(key)
         if known is None:
-            usable = shape if key else np.full((self.plant.n, self.plant.n), np.nan)
-            known = self.errors_of_many(usable[None]).single()
+            # Of what the key says: somebody may write into the shape.
+            usable = np.frombuffer(key) if key else np.full(self.plant.n**2, np.nan)
+            known = self.errors_of_many(usable.reshape(1, self.plant.n, self.plant.n)).single()
             if len(self._remembered) >= MOST_REMEMBERED:
                 self._remembered.clear()
             self._remembered[key] = known

@@ -9,9 +9,10 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 
+from ncs_gym.envs.spaces import read_actions
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network.contract import warn_of_broken_contract
-from ncs_gym.validation import as_number, shown
+from ncs_gym.validation import as_number, setting, shown
 from shields.certificate import Certificate
 from shields.downlink.schedule import VectorSchedule, as_decided, columns
 from shields.downlink.start_under_zero_input import first_observations, starts_known
@@ -29,7 +30,7 @@ from shields.runtime.monitored_filter import first_store
 from shields.runtime.one_step_test import norms
 from shields.runtime.predicted_errors import PredictedErrors
 from shields.runtime.safety_filter import SafetyFilter
-from shields.runtime.wrapper import certificate_for, environment_behind, hint_for
+from shields.runtime.wrapper import certificate_for, environment_behind, hint_for, premises_of, require_same
 
 REASONS = np.array(EXPLANATIONS, dtype=object)
 
@@ -63,6 +64,9 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             wrong.
     """
 
+    certificate: Certificate = setting("certificate")
+    filter: SafetyFilter = setting("filter")
+
     def __init__(
         self,
         env: VectorEnv,
@@ -72,39 +76,43 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         horizon: int | None = None,
     ) -> None:
         RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty, horizon=horizon)
-        refused = VectorActionWrapper, VectorSafetyShield
-        inner = self._inner = environment_behind(env, VectorWrapper, refused, NCSVectorEnv, hint_for(env))
+        inner = self._inner = self._environment_in(env)
         if env.single_action_space != inner.single_action_space:
             raise ValueError(f"a wrapper inside the shield changes the action space to {env.single_action_space}")
         VectorWrapper.__init__(self, env)
         self.penalty = as_number(penalty, "penalty", low=0.0)
         if certificate is not None and not isinstance(certificate, Certificate):
             raise ValueError(f"certificate must be a Certificate or None, got {shown(certificate)}")
-        self.certificate = (
+        self._certificate = (
             certificate_for(inner.plant, inner.certificate_contract) if certificate is None else certificate
         )
-        self.filter = SafetyFilter(self.certificate, inner.plant, mode, horizon)
-        self._monitor = GuaranteeMonitor(self.filter, inner.downlink)
+        self._filter = SafetyFilter(self._certificate, inner.plant, mode, horizon)
+        self._monitor = GuaranteeMonitor(self._filter, inner.downlink)
         self._lead = 0 if inner.downlink is None else inner.downlink.lead
-        warn_of_broken_contract(self.certificate.contract, inner.channel, self._lead)
-        self._start_known = starts_known(self.filter, inner.single.initial_set, self._lead)
+        warn_of_broken_contract(self._certificate.contract, inner.channel, self._lead)
+        self._start_known = starts_known(self._filter, inner.single.initial_set, self._lead)
         count, nothing = self.num_envs, np.zeros(self.num_envs, np.bool_)
         self._schedule = None if inner.downlink is None else VectorSchedule(self._lead, inner.plant.m, count)
         self._state = MonitorState(np.full(count, CODES[OTHER_STEPS]), nothing, nothing, np.zeros(count, np.int64))
         self._interventions = np.zeros(count, np.int64)
         # Plans stored in mode "lookahead", NaN beyond their ends.
-        self._stored = np.full((self.filter.horizon or 0, inner.plant.m, count), np.nan)
+        self._stored = np.full((self._filter.horizon or 0, inner.plant.m, count), np.nan)
         self._table: Any = None
         self._no_reason = np.full(count, "", dtype=object)
         self._no_reason.flags.writeable = False
         # What the clock reads while a step is under way: if it raises, the next does not follow from what is known.
         self._interrupted = Clock(np.full(count, -1), np.full(count, -1), -2)
         self._clock: Clock | None = None
+        self._made_for = premises_of(inner, inner.single)
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Starts episodes; see `NCSVectorEnv.reset`."""
+        """Starts episodes; see `NCSVectorEnv.reset`.
+
+        Raises:
+            ValueError: If what is wrapped is not any more what the shield was made for.
+        """
         before, self._clock = self._clock or self._interrupted, self._clock and self._interrupted
         try:
             # gymnasium's annotation leaves out the lists that its own vector environments take.
@@ -113,11 +121,13 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             if self._clock and all(np.array_equal(*pair) for pair in zip(before, self._read_clock(), strict=True)):
                 self._clock = before  # refused before anything moved
             raise
+        inner = self._environment_in(self.env)
+        require_same(self._made_for, premises_of(inner, inner.single))
         now = self._read_clock()
         restarted = now.episodes != before.episodes
         unmoved = (now.steps == before.steps) & (now.ticks == before.ticks)
         self._report = self._observed(info)
-        nothing, none = np.zeros((self.filter.plant.m, self.num_envs)), np.zeros(self.num_envs, np.bool_)
+        nothing, none = np.zeros((self._filter.plant.m, self.num_envs)), np.zeros(self.num_envs, np.bool_)
         idle = Decision(nothing, none, none, none, self._idle_margins(np.arange(self.num_envs)), none)
         kept = idle._replace(passed=self._state.inside)  # environments left alone keep what is proved of them
         kept_state = self._monitor.advance(self._state, kept, unmoved, ~none, self._report)
@@ -137,10 +147,10 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         """
         if self._clock is None:
             raise gym.error.ResetNeeded("call reset before the first step")
-        proposed = self._inner.inputs_of(actions)
-        decided = self.filter.decide_many(self._report.estimate, self._report.errors, proposed, self._stored)
-        if self.filter.mode != "monitor" and np.count_nonzero(decided.intervened):
-            actions = overridden(actions, decided, self.filter.plant.u_max)
+        actions, proposed = read_actions(self._filter.plant, actions, self.num_envs)
+        decided = self._filter.decide_many(self._report.estimate, self._report.errors, proposed, self._stored)
+        if self._filter.mode != "monitor" and np.count_nonzero(decided.intervened):
+            actions = overridden(actions, decided, self._filter.plant.u_max)
         before, self._clock = self._clock, self._interrupted
         observation, rewards, terminated, truncated, info = self.env.step(actions)
         now, state = self._read_clock(), self._state
@@ -168,9 +178,15 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         info = info | added | self._info(decided, proposed, self._state, self._interventions, self._report.age)
         return observation, rewards, terminated, truncated, info
 
+    @staticmethod
+    def _environment_in(env: VectorEnv) -> NCSVectorEnv:
+        """Returns the environment behind all wrappers, none of which may stand between it and a shield."""
+        refused = VectorActionWrapper, VectorSafetyShield
+        return environment_behind(env, VectorWrapper, refused, NCSVectorEnv, hint_for(env))
+
     def _observed(self, info: dict[str, Any]) -> LoopObservation:
         """Returns what decisions and the guarantee need of an info, as copies: callers may write into theirs."""
-        estimates = columns(info.get("estimate"), (self.num_envs, self.filter.plant.n))
+        estimates = columns(info.get("estimate"), (self.num_envs, self._filter.plant.n))
         errors = self._errors_of(self._inner.error_shapes[1])
         alarms = _alarms(info.get("assumption_violated"), self.num_envs)
         return LoopObservation(np.array(estimates, order="C"), errors, alarms, self._ages(info))
@@ -183,9 +199,9 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         """Returns what is known of the error shapes with these numbers in the environment's table."""
         table = self._inner.error_shapes[0]
         if table is not self._table:
-            self._table, self._known = table, self.filter.errors_of_many(table.shapes[:0])
+            self._table, self._known = table, self._filter.errors_of_many(table.shapes[:0])
         if len(table.shapes) > len(self._known.radius):
-            new = self.filter.errors_of_many(table.shapes[len(self._known.radius) :])
+            new = self._filter.errors_of_many(table.shapes[len(self._known.radius) :])
             self._known = self._known.followed_by(new)
         return self._known.of(np.asarray(numbers, np.intp))
 
@@ -193,13 +209,13 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         """Begins anew where episodes began, `begun` where nothing has moved since; shape (N,) each."""
         known, starts = [self._start_known] * self.num_envs, self._inner.starts
         for e in np.flatnonzero(restarted & ~np.isnan(starts[:, 0])).tolist():
-            known[e] = starts_known(self.filter, starts[e], self._lead)
+            known[e] = starts_known(self._filter, starts[e], self._lead)
         is_safe = np.array([each[-1].in_safe_set for each in known])
         if len(self._stored):
             self._stored[..., restarted] = np.nan
             for e in np.flatnonzero(restarted & ~is_safe).tolist():
                 estimate, errors = self._report.estimate[:, e].copy(), self._report.errors.of(np.array([e])).single()
-                plan, is_safe[e] = first_store(self.filter, estimate, errors, known[e][-1])
+                plan, is_safe[e] = first_store(self._filter, estimate, errors, known[e][-1])
                 self._stored[: len(plan), :, e] = plan
         started = self._monitor.start(is_safe, begun, self._report)
         both = zip(started, self._state, strict=True)
@@ -212,7 +228,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
     def _cover(self, chosen: np.ndarray, known: list[tuple[StartKnown, ...]]) -> None:
         """Takes in what is known of the steps before the first decisions take effect, where episodes began."""
         beliefs = [(mean, self._errors_of(numbers)) for mean, numbers in self._inner.beliefs(chosen)[:-1]]
-        earlier = first_observations(self.filter, [known[e] for e in chosen.tolist()], beliefs)
+        earlier = first_observations(self._filter, [known[e] for e in chosen.tolist()], beliefs)
         covered = self._monitor.cover(MonitorState(*(array[chosen] for array in self._state)), earlier)
         for kept, new in zip(self._state, covered, strict=True):
             kept[chosen] = new
@@ -230,8 +246,8 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         final, done = dict(info["final_info"]), np.flatnonzero(info["_final_info"])
         keys = "estimate", "input", "input_committed", "assumption_violated"
         ended = {key: np.asarray(final[key])[done] for key in keys}
-        errors = self.filter.errors_of_many(np.asarray(final["error_shape"])[done])
-        estimates = columns(ended["estimate"], (len(done), self.filter.plant.n))
+        errors = self._filter.errors_of_many(np.asarray(final["error_shape"])[done])
+        estimates = columns(ended["estimate"], (len(done), self._filter.plant.n))
         alarms = _alarms(ended["assumption_violated"], len(done))
         report = LoopObservation(estimates, errors, alarms, self._ages(final)[done])
         state = MonitorState(*(array[done] for array in state))
@@ -246,8 +262,8 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
     def _idle_margins(self, chosen: np.ndarray) -> np.ndarray:
         """Returns the margins of no input in some environments, shape (len(chosen),)."""
         with np.errstate(all="ignore"):
-            sets = self.filter.test.reachable(self._report.estimate[:, chosen], self._report.errors.of(chosen))
-            return sets.slack(np.zeros((self.filter.plant.m, len(chosen))))[1]
+            sets = self._filter.test.reachable(self._report.estimate[:, chosen], self._report.errors.of(chosen))
+            return sets.slack(np.zeros((self._filter.plant.m, len(chosen))))[1]
 
     def _read_clock(self) -> Clock:
         """Returns how often the environments moved until now."""

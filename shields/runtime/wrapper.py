@@ -13,9 +13,9 @@ from gymnasium.vector import VectorEnv
 from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, StickyAction
 
 from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv, NCSVectorEnv
-from ncs_gym.envs.env import applied_input
+from ncs_gym.envs.spaces import read_action
 from ncs_gym.network.contract import warn_of_broken_contract
-from ncs_gym.validation import as_number, as_numbers, shown
+from ncs_gym.validation import as_number, as_numbers, setting, shown
 from shields.certificate import Certificate
 from shields.downlink.start_under_zero_input import starts_known
 from shields.runtime.decisions import NO_PLAN
@@ -30,6 +30,9 @@ REFUSED = (gym.ActionWrapper, RepeatAction, StickyAction, MaxAndSkipObservation,
 
 # What the clock reads while a step is under way: if it raises, the next one does not follow from what is known.
 INTERRUPTED = (-1, -1)
+
+# What of an environment a shield's proof rests on.
+PREMISES = "plant", "channel", "contract", "downlink", "certificate_contract", "process", "initial_set"
 
 _synthesized: dict[tuple[str, ChannelContract | None], Certificate] = {}
 
@@ -77,6 +80,9 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             is wrong.
     """
 
+    certificate: Certificate = setting("certificate")
+    filter: SafetyFilter = setting("filter")
+
     def __init__(
         self,
         env: gym.Env,
@@ -86,26 +92,31 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         horizon: int | None = None,
     ) -> None:
         RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty, horizon=horizon)
-        inner = self._inner = environment_behind(env, gym.Wrapper, (*REFUSED, SafetyShield), NCSEnv, hint_for(env))
+        inner = self._inner = self._environment_in(env)
         if env.action_space != inner.action_space:
             raise ValueError(f"a wrapper inside the shield changes the action space to {env.action_space}")
         gym.Wrapper.__init__(self, env)
         self.penalty = as_number(penalty, "penalty", low=0.0)
         if certificate is not None and not isinstance(certificate, Certificate):
             raise ValueError(f"certificate must be a Certificate or None, got {shown(certificate)}")
-        self.certificate = (
+        self._certificate = (
             certificate_for(inner.plant, inner.certificate_contract) if certificate is None else certificate
         )
-        self.filter = SafetyFilter(self.certificate, inner.plant, mode, horizon)
-        self._monitored = MonitoredFilter(self.filter, inner.downlink)
-        warn_of_broken_contract(self.certificate.contract, inner.channel, self._monitored.lead)
+        self._filter = SafetyFilter(self._certificate, inner.plant, mode, horizon)
+        self._monitored = MonitoredFilter(self._filter, inner.downlink)
+        warn_of_broken_contract(self._certificate.contract, inner.channel, self._monitored.lead)
         self._clock: tuple[int, int] | None = None
         self._start: Any = None
         self._known: tuple[StartKnown, ...] = ()
         self._is_drawn = env.unwrapped.render_mode is not None
+        self._made_for = premises_of(inner, inner)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Starts an episode; see `NCSEnv.reset`."""
+        """Starts an episode; see `NCSEnv.reset`.
+
+        Raises:
+            ValueError: If what is wrapped is not any more what the shield was made for.
+        """
         before, self._clock = self._clock, self._clock and INTERRUPTED
         if self._is_drawn:
             self._annotate(None, 0, NO_PLAN, intervened=False)
@@ -115,14 +126,16 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             if self._read_clock() == before:  # refused before anything moved
                 self._clock = before
             raise
+        inner = self._environment_in(self.env)
+        require_same(self._made_for, premises_of(inner, inner))
         clock, report = self._read_clock(), self._observed(info)
         start = self._inner.start
         if start is not self._start:  # decided exactly, which takes longer than a step; starts are read-only
-            self._start, self._known = start, starts_known(self.filter, start, self._monitored.lead)
+            self._start, self._known = start, starts_known(self._filter, start, self._monitored.lead)
         self._monitored.begin(report, self._known, clock[1] == 0, self._inner.beliefs()[:-1])
         self._interventions = 0
-        u = np.zeros(self.filter.plant.m)
-        margin = self.filter.margin(report.estimate, info["error_shape"], u)
+        u = np.zeros(self._filter.plant.m)
+        margin = self._filter.margin(report.estimate, info["error_shape"], u)
         self._clock = clock
         return observation, info | self._info(u, u, margin, intervened=False)
 
@@ -135,14 +148,14 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         """
         if self._clock is None:
             raise gym.error.ResetNeeded("call reset before the first step")
-        proposed = applied_input(self.filter.plant, action)
+        action, proposed = read_action(self._filter.plant, action)  # what is tested is what is handed on
+        (episode, step), self._clock = self._clock, INTERRUPTED
         decision = self._monitored.decide(proposed)
-        if decision.intervened and self.filter.mode != "monitor":
-            action = (decision.input / self.filter.plant.u_max).astype(np.float32)
+        if decision.intervened and self._filter.mode != "monitor":
+            action = (decision.input / self._filter.plant.u_max).astype(np.float32)
         if self._is_drawn:
             count = self._interventions + decision.intervened
             self._annotate(proposed, count, decision.plan, intervened=decision.intervened)
-        (episode, step), self._clock = self._clock, INTERRUPTED
         observation, reward, terminated, truncated, info = self.env.step(action)
         clock = self._read_clock()
         committed = None if self._inner.downlink is None else as_numbers(info["input_committed"])
@@ -153,9 +166,14 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         info = info | self._info(proposed, decision.input, decision.margin, intervened=decision.intervened)
         return observation, float(reward) - self.penalty * decision.intervened, terminated, truncated, info
 
+    @staticmethod
+    def _environment_in(env: gym.Env) -> NCSEnv:
+        """Returns the environment behind all wrappers, none of which may stand between it and a shield."""
+        return environment_behind(env, gym.Wrapper, (*REFUSED, SafetyShield), NCSEnv, hint_for(env))
+
     def _observed(self, info: dict[str, Any]) -> LoopObservation:
         """Returns what the decision and the guarantee need of an info, as copies: callers may write into theirs."""
-        estimate, shape = as_numbers(info["estimate"]), self.filter.test.single[0]
+        estimate, shape = as_numbers(info["estimate"]), self._filter.test.single[0]
         estimate = np.full(shape, np.nan) if estimate is None or estimate.shape != shape else estimate.copy()
         alarm = info["assumption_violated"] not in (False,)
         return self._monitored.reported(estimate, info["error_shape"], alarm, self._inner.estimator.age)
@@ -167,19 +185,19 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
     def _annotate(self, proposed: np.ndarray | None, interventions: int, plan: np.ndarray, *, intervened: bool) -> None:
         """Tells the picture of the step that follows what the shield does in it."""
         note = Annotation(
-            safe_set=self.certificate.safe_set,
-            label=self.filter.mode,
+            safe_set=self._certificate.safe_set,
+            label=self._filter.mode,
             proposed=proposed,
             intervened=intervened,
             interventions=interventions,
-            protects=self.filter.mode != "monitor",
-            plan=None if self.filter.lookahead is None else plan.copy(),
+            protects=self._filter.mode != "monitor",
+            plan=None if self._filter.lookahead is None else plan.copy(),
         )
         self._inner.annotate(note)
 
     def _info(self, proposed: np.ndarray, applied: np.ndarray, margin: float, *, intervened: bool) -> dict[str, Any]:
         reason = self._monitored.reason
-        ahead = {} if self.filter.lookahead is None else {"shield_plan_length": self._monitored.plan_length}
+        ahead = {} if self._filter.lookahead is None else {"shield_plan_length": self._monitored.plan_length}
         return ahead | {
             "shield_intervened": intervened,
             "input_proposed": proposed.copy(),
@@ -210,6 +228,27 @@ def certificate_for(
 
         _synthesized[key] = synthesize(plant, contract=contract, progress=progress)
     return _synthesized[key]
+
+
+def premises_of(inner: NCSEnv | NCSVectorEnv, single: NCSEnv) -> dict[str, Any]:
+    """Returns what a shield's proof rests on, by name: an environment and its settings.
+
+    Args:
+        inner: The innermost environment.
+        single: Of a vector, the scalar environment with its settings; else the same.
+    """
+    premises = {name: getattr(single, name) for name in PREMISES}
+    of_vector = {f"{name} of the vector": getattr(inner, name, premises[name]) for name in PREMISES}
+    return {"environment": inner} | premises | of_vector
+
+
+def require_same(before: dict[str, Any], now: dict[str, Any]) -> None:
+    """Raises ValueError unless what `premises_of` returned for a shield is what it returns now."""
+    for name, value in before.items():
+        if now[name] is not value:
+            raise ValueError(
+                f"the {name} is not the one that the shield was made for: wrap the environment in a shield of its own"
+            )
 
 
 def hint_for(env: Any) -> str:

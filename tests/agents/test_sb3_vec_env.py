@@ -229,3 +229,13 @@ def test_evaluate_policy_counts_episodes_by_its_infos():
     returns, lengths = evaluate_policy(model, env, n_eval_episodes=7, return_episode_rewards=True)
     assert lengths == [20] * 7
     assert len(returns) == 7
+
+
+def test_actions_are_those_that_were_handed_over_whatever_is_written_into_them_later():
+    env = SB3VecEnv(gym.make_vec("ncs_gym/TruckTrailerCruise-v0", num_envs=2), info_keys=["input"])
+    env.reset()
+    actions = np.full((2, 1), 0.25, np.float32)
+    env.step_async(actions)
+    actions[:] = 1.0
+    _, _, _, infos = env.step_wait()
+    assert [info["input"] for info in infos] == [1.0, 1.0]  # a quarter of u_max = 4

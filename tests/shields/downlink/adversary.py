@@ -80,7 +80,7 @@ class UnawareVectorEnv(ExtremalVectorNoise):
 
     def __init__(self, *arguments: Any, **settings: Any) -> None:
         super().__init__(*arguments, **settings)
-        self.downlink, self.certificate_contract = None, self.contract
+        self._protocol, self._certificate_contract = None, self.contract
         self._downlink.belief = lambda: (self._estimator.mean, self._estimator.statistics)
 
 

@@ -56,7 +56,8 @@ UNSTABLE = Case(cart_pole(), Channel(loss=0.3, delay=1, max_consecutive_losses=1
 
 def shielded(mode="project", start=0.3, kind=NCSEnv, **settings):
     certificate = certificate_of(PLANT)
-    env = kind(PLANT, UPLINK, initial_set=Ellipsoid(start**2 * certificate.L), **({"downlink": KEPT} | settings))
+    usual = {"downlink": KEPT, "initial_set": Ellipsoid(start**2 * certificate.L)}
+    env = kind(PLANT, UPLINK, **(usual | settings))
     return SafetyShield(env, certificate, mode=mode)
 
 
@@ -81,8 +82,8 @@ def test_every_mode_keeps_its_guarantee(mode):
 def test_lookahead_keeps_guaranteed_states_in_the_box_under_attack():
     plan_lengths, outside = 0, 0
     for downlink in edges(2).values():
-        shield = shielded("lookahead", kind=ExtremalNoise, disturbance="adversarial", downlink=downlink)
-        shield.unwrapped.initial_set = box_ellipsoid(PLANT, 0.95)
+        start = {"initial_set": box_ellipsoid(PLANT, 0.95)}
+        shield = shielded("lookahead", kind=ExtremalNoise, disturbance="adversarial", downlink=downlink, **start)
         for seed in range(4):
             _, info = shield.reset(seed=seed)
             held, rng = info["shield_guaranteed"], np.random.default_rng(seed)

@@ -425,24 +425,6 @@ def test_step_is_receive_and_then_decide():
     np.testing.assert_array_equal(one.estimate, two.estimate)
 
 
-def test_interrupted_step_has_to_be_started_anew(monkeypatch):
-    loop = started()
-    loop.decide(0.0)
-
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(loop._estimator, "advance", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            loop.receive()
-    assert not loop.guaranteed
-    with pytest.raises(RuntimeError, match="half-way"):
-        loop.decide(0.0)
-    loop.start([0.0, 0.0])
-    assert loop.guaranteed
-
-
 def test_start_is_in_the_safe_set_only_if_estimate_or_set_say_so():
     loop, certificate = loop_of("truck"), certificate_of(LOOPS["truck"][0])
     edge = (1.0 - 1e-12) * certificate.safe_set.extreme_point([1.0, 0.4])

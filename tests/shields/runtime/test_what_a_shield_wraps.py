@@ -1,0 +1,113 @@
+"""A shield says at each reset whether what it was made for is what it wraps."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import VectorWrapper
+from gymnasium.wrappers import StickyAction
+
+from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearProcess, NCSEnv, NCSVectorEnv, truck_trailer
+from ncs_gym.downlink import downlink_protocol
+from shields import SafeLoop, SafetyShield, VectorSafetyShield
+from shields.runtime.guarantee import OTHER_STEPS
+from tests.certificates import certificate_of
+
+PLANT = truck_trailer(mass=4000.0)
+# How a setting is kept, and another one: what only somebody with a will to can change.
+CHANGED = {
+    "plant": ("_plant", truck_trailer(mass=4000.0)),
+    "channel": ("_channel", Channel(delay=4, quantization_step=0.5)),
+    "contract": ("_contract", ChannelContract(3)),
+    "certificate_contract": ("_certificate_contract", ChannelContract(3)),
+    "downlink": ("_protocol", downlink_protocol(Channel(delay=2), None)),
+    "process": ("_process_given", LinearProcess()),
+    "initial_set": ("_initial_set", Ellipsoid(3.0 * np.eye(2))),
+}
+
+
+def scalar(**settings):
+    return SafetyShield(NCSEnv(PLANT, **settings), certificate_of(PLANT))
+
+
+def vector(**settings):
+    return VectorSafetyShield(NCSVectorEnv(2, plant=PLANT, **settings), certificate_of(PLANT))
+
+
+def assert_refused(shield, name):
+    """A reset says what has changed; what goes on without one is not guaranteed."""
+    for _ in range(2):
+        with pytest.raises(ValueError, match=f"the {name}.* is not the one that the shield was made for"):
+            shield.reset()
+    *_, info = shield.step(np.zeros(shield.action_space.shape))
+    assert np.all(info["shield_reason"] == OTHER_STEPS)
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_changed_setting_is_said_at_the_next_reset(name):
+    shield = scalar()
+    shield.reset(seed=0)
+    setattr(shield.unwrapped, *CHANGED[name])
+    assert_refused(shield, name)
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_changed_setting_inside_a_vector_is_said_at_the_next_reset(name):
+    shield = vector()
+    shield.reset(seed=0)
+    setattr(shield.unwrapped.single, *CHANGED[name])
+    assert_refused(shield, name)
+
+
+@pytest.mark.parametrize("name", sorted(set(CHANGED) - {"process", "initial_set"}))
+def test_changed_setting_of_a_vector_is_said_at_the_next_reset(name):
+    shield = vector()
+    shield.reset(seed=0)
+    setattr(shield.unwrapped, *CHANGED[name])
+    assert_refused(shield, name)
+
+
+@pytest.mark.parametrize("shielded", [scalar, vector])
+def test_another_environment_in_place_of_the_wrapped_one_is_said_at_the_next_reset(shielded):
+    shield = shielded()
+    shield.reset(seed=0)
+    other = shielded().env
+    other.reset(seed=0)
+    shield.env = other
+    with pytest.raises(ValueError, match="the environment is not the one that the shield was made for"):
+        shield.reset()
+
+
+def test_wrapper_put_inside_after_wrapping_is_refused_at_the_next_reset():
+    shield = scalar()
+    shield.reset(seed=0)
+    shield.env = StickyAction(shield.env, 0.5)
+    with pytest.raises(ValueError, match="the shield must be inside StickyAction"):
+        shield.reset()
+    shield.env = gym.Wrapper(shield.env.env)  # that only looks
+    assert shield.reset()[1]["shield_guaranteed"]
+
+
+def test_wrapper_that_changes_a_setting_in_its_reset_is_found_at_the_next_one():
+    class Widens(VectorWrapper):
+        def reset(self, **keywords):
+            self.unwrapped.single._initial_set = Ellipsoid(3.0 * np.eye(2))
+            return self.env.reset(**keywords)
+
+    shield = VectorSafetyShield(Widens(NCSVectorEnv(2, plant=PLANT)), certificate_of(PLANT))
+    with pytest.raises(ValueError, match="the initial_set is not the one"):
+        shield.reset(seed=0)
+
+
+@pytest.mark.parametrize("name", ["certificate", "filter"])
+@pytest.mark.parametrize("shielded", [scalar, vector])
+def test_settings_of_a_shield_cannot_be_changed(shielded, name):
+    shield = shielded()
+    with pytest.raises(AttributeError, match=f"{name} is a setting of {type(shield).__name__}"):
+        setattr(shield, name, getattr(shield, name))
+
+
+@pytest.mark.parametrize("name", ["filter", "contract", "lead"])
+def test_settings_of_a_loop_cannot_be_changed(name):
+    loop = SafeLoop(certificate_of(PLANT), PLANT, Channel())
+    with pytest.raises(AttributeError, match=f"{name} is a setting of SafeLoop"):
+        setattr(loop, name, None)
