@@ -149,12 +149,25 @@ def test_certificate_of_an_earlier_version_and_another_processor_still_holds(fil
 
 
 def test_agent_and_finished_runs_of_one_processor_are_taken_by_another(tmp_path):
-    train = ("-m", "experiments", "train", "--env", "ncs_gym/BatchReactor-v0", "--steps", "512", "--episodes", "2")
-    train = (*train, "--out", tmp_path, "--agent.rollout", "16", "--agent.envs", "4", "--jobs", "1")
-    under("Haswell", *train)
+    compare = ("-m", "experiments", "compare", "--env", "ncs_gym/BatchReactor-v0", "--out", tmp_path, "--jobs", "1")
+    compare = (
+        *compare,
+        "--steps",
+        "64",
+        "--episodes",
+        "2",
+        "--seeds",
+        "1",
+        "--arms",
+        "shielded",
+        "--references",
+        "lqr",
+    )
+    compare = (*compare, "--ppo.envs", "4", "--ppo.rollout", "16", "--ppo.batch-size", "64")
+    under("Haswell", *compare)
     files = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("units/*.json")}
     assert files
-    under("Prescott", *train, wide=False)
+    under("Prescott", *compare, wide=False)
     assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("units/*.json")} == files
     (folder,) = {file.parent for file in tmp_path.rglob("model.zip")}
     load = f"from agents import Agent; print(Agent.load({str(folder)!r}).env)"
