@@ -4,23 +4,33 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from agents.results import Episode, TrainingPoint, Trajectory
+from agents.sharing.agent_file import require_names, write_files
 from experiments.errors import ResultsError
 from experiments.runs.provenance import json_digest
+from experiments.runs.stored_result import content_of, result_of
 from experiments.runs.training_run import RunResult, TrainingRun
+from ncs_gym.validation import MAX_QUOTED_LENGTH
 from shields.atomic_write import write_atomically
 
 _FORMAT = "ncs-gym unit 2"
+# What stands for a finished experiment, and what is drawn and listed of it: patterns where names depend on settings.
+_TABLES = ("episodes.parquet", "training.parquet", "sweep.parquet", "study.parquet")
+_FIGURES = ("scatter", "training", "episode", "phase", "violations", "return", "interventions", "states", "inputs")
+_MADE_OF_RESULTS = (
+    "summary.json",
+    "report.html",
+    *_TABLES,
+    *(f"figures/{name}.png" for name in (*_FIGURES, "trusting-*")),
+)
 
 
 def prepare_output(folder: Path) -> None:
     """Creates an output folder and removes an earlier summary, tables, figures and report, which belong together.
+
+    Files of other names are left where they are.
 
     Raises:
         OSError: If the folder cannot be written.
@@ -28,8 +38,7 @@ def prepare_output(folder: Path) -> None:
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     write_atomically(folder / ".writable", "")
     (folder / ".writable").unlink()
-    stale = (folder / "summary.json", folder / "report.html", *folder.glob("*.parquet"), *folder.glob("figures/*.png"))
-    for file in stale:
+    for file in [file for pattern in _MADE_OF_RESULTS for file in folder.glob(pattern)]:
         file.unlink(missing_ok=True)
 
 
@@ -52,15 +61,16 @@ class RunStore:
         """Writes the result of a run, its agent first, so that a stored result is complete.
 
         Raises:
+            AgentError: If a file has none of the names of an agent's.
             OSError: If a file cannot be written.
         """
+        require_names(result.files)
         self._path(run).unlink(missing_ok=True)  # an older result must not point to the newer agent
         models = self._folder / "models" / run.name
         if result.files:
             models.mkdir(exist_ok=True)
-        for name, content in result.files.items():
-            write_atomically(models / name, content)
-        content = _to_json(result)
+        write_files(models, result.files)
+        content = content_of(result)
         document = {"format": _FORMAT, "key": run.key, "sha256": json_digest(content), "result": content}
         write_atomically(self._path(run), json.dumps(document) + "\n")
 
@@ -68,7 +78,7 @@ class RunStore:
         """Returns the stored result of a run; None if there is none or if it belongs to other settings.
 
         Raises:
-            ResultsError: If a file is damaged.
+            ResultsError: If a file is damaged, or holds what no result of the run can be.
         """
         path = self._path(run)
         try:
@@ -78,12 +88,18 @@ class RunStore:
             content = document["result"]
             if document["sha256"] != json_digest(content):
                 raise ResultsError(f"{path} was altered: its checksum does not match; delete it to repeat the run")
-            return _from_json(content, self._files(run, content["files"])) if document["key"] == run.key else None
+            if document["key"] != run.key:
+                return None
+            result, digests = result_of(content, run)
+            return replace(result, files=self._files(run, digests))
         except FileNotFoundError:
             return None
         except ResultsError:
             raise
-        except (KeyError, TypeError, ValueError, RecursionError) as error:
+        except ValueError as error:
+            reason = " ".join(str(error).split())[:MAX_QUOTED_LENGTH]
+            raise ResultsError(f"{path} is damaged ({reason}); delete it to repeat the run") from error
+        except (KeyError, TypeError, RecursionError) as error:
             raise ResultsError(f"{path} is damaged; delete it to repeat the run") from error
 
     def _files(self, run: TrainingRun, digests: dict[str, str]) -> dict[str, bytes]:
@@ -99,39 +115,3 @@ class RunStore:
 
     def _path(self, run: TrainingRun) -> Path:
         return self._folder / "units" / f"{run.name}.json"
-
-
-def _to_json(result: RunResult) -> dict[str, Any]:
-    """Returns a result as JSON values: NaN is null, and files are represented by their checksums."""
-    content = asdict(result)
-    content["history"], content["episodes"] = _without_nan(content["history"]), _without_nan(content["episodes"])
-    content["conditions"] = {name: _without_nan(episodes) for name, episodes in content["conditions"].items()}
-    content["trajectory"] = {name: array.tolist() for name, array in content["trajectory"].items()}
-    content["files"] = {name: hashlib.sha256(file).hexdigest() for name, file in result.files.items()}
-    return content
-
-
-def _without_nan(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Returns entries with null in the place of NaN."""
-    return [{key: None if x != x else x for key, x in entry.items()} for entry in entries]
-
-
-def _from_json(content: dict[str, Any], files: dict[str, bytes]) -> RunResult:
-    """Returns the result that `_to_json` was given."""
-
-    def restored(entry: dict[str, Any]) -> dict[str, Any]:
-        return {key: float("nan") if x is None else x for key, x in entry.items()}
-
-    flags = ("intervened", "arrivals")
-    arrays = {name: np.array(x, np.bool_ if name in flags else float) for name, x in content["trajectory"].items()}
-    values = content | {
-        "history": [TrainingPoint(**restored(point)) for point in content["history"]],
-        "episodes": [Episode(**restored(episode)) for episode in content["episodes"]],
-        "conditions": {
-            name: [Episode(**restored(episode)) for episode in episodes]
-            for name, episodes in content["conditions"].items()
-        },
-        "trajectory": Trajectory(**arrays),
-        "files": files,
-    }
-    return RunResult(**values)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from experiments.errors import OtherResultsError
-from experiments.runs import claim_folder
+from experiments.runs import claim_folder as folder_of
 from experiments.settings import (
     CertifySettings,
     ChannelSettings,
@@ -18,6 +18,12 @@ from experiments.settings import (
     TrainSettings,
 )
 from experiments.settings.agent_overrides import PPOOverrides
+
+
+def claim_folder(command, settings):
+    """Claims a folder and gives it back."""
+    with folder_of(command, settings):
+        pass
 
 
 def finished(command, settings, file="summary.json"):
