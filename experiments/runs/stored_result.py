@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields
+from itertools import pairwise
 from typing import Any, TypeVar
 
 import numpy as np
@@ -103,7 +104,7 @@ def _history(content: Any, train_steps: int) -> list[TrainingPoint]:
 
     points = _listed(content, TrainingPoint, point, name)
     _require(bool(points) == bool(train_steps), name, points)
-    for before, after in zip(points, points[1:], strict=False):
+    for before, after in pairwise(points):
         grows = before.steps < after.steps
         falls = after.violation_steps < before.violation_steps or after.interventions < before.interventions
         _require(grows and not falls, name, after)

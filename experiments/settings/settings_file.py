@@ -23,7 +23,7 @@ def settings_json(command: str, settings: Any) -> dict[str, Any]:
     values = json.loads(json.dumps(asdict(settings), default=str))
     if isinstance(values.get("env"), str):
         values["env"] = _id_alone(values["env"])
-    if "envs" in values:
+    if isinstance(values.get("envs"), list):
         values["envs"] = [_id_alone(each) for each in values["envs"]]
     kept = {name: value for name, value in values.items() if name not in _OF_THE_CALL}
     return {"format": FORMAT, "command": command, "settings": kept}
