@@ -11,7 +11,7 @@ from experiments.attack.monte_carlo_batch import MonteCarloBatch
 from experiments.attack.safety_counts import SafetyCounts
 from experiments.errors import ResultsError
 from experiments.runs.provenance import json_digest
-from experiments.runs.stored_result import count_of
+from experiments.runs.run_store import count_of
 from ncs_gym.registration import EPISODE_STEPS
 from shields.atomic_write import write_atomically
 
