@@ -108,11 +108,11 @@ class RunStore:
             return None
         except ResultsError:
             raise
+        except (KeyError, TypeError, RecursionError, json.JSONDecodeError, UnicodeDecodeError) as error:
+            raise ResultsError(f"{path} is damaged; delete it to repeat the run") from error
         except ValueError as error:
             reason = " ".join(str(error).split())[:MAX_QUOTED_LENGTH]
-            raise ResultsError(f"{path} is damaged ({reason}); delete it to repeat the run") from error
-        except (KeyError, TypeError, RecursionError) as error:
-            raise ResultsError(f"{path} is damaged; delete it to repeat the run") from error
+            raise ResultsError(f"{path} is no result of its run ({reason}); delete it to repeat the run") from error
 
     def _files(self, run: TrainingRun, digests: dict[str, str]) -> dict[str, bytes]:
         """Returns the contents of the agent's files; ResultsError if one is missing or is not the one stored."""
