@@ -19,6 +19,7 @@ from filelock import FileLock, Timeout
 from experiments.errors import FolderInUseError, OtherResultsError, ResultsError
 from experiments.runs.experiment_setup import INCIDENTAL_SETTINGS
 from experiments.settings import save_settings, settings_json
+from experiments.settings.settings_file import FORMAT as SETTINGS_FORMAT
 
 # Files by which a folder is known to hold something finished.
 _FINISHED = ("summary.json", "certify.json", "units/*.json")
@@ -53,7 +54,8 @@ def claim_folder(command: str, settings: Any) -> Iterator[None]:
 
     Raises:
         FolderInUseError: If another command has the folder.
-        OtherResultsError: If the folder holds finished results of other settings, or of settings that cannot be read.
+        OtherResultsError: If the folder holds finished results of other settings, or of settings that cannot be read,
+            or a file `settings.json` of something else.
         ResultsError: If something in the folder is a link, or neither a file nor a folder.
         OSError: If the folder cannot be written.
     """
@@ -65,6 +67,8 @@ def claim_folder(command: str, settings: Any) -> Iterator[None]:
         patterns = (*_FINISHED, *_FINISHED_PARTS.get(command, ()))
         if not settings.force and any(file for pattern in patterns for file in folder.glob(pattern)):
             _require_same(folder, command, settings)
+        if not settings.force:
+            _require_own_settings(folder / "settings.json")
         save_settings(folder / "settings.json", command, settings)
         yield
 
@@ -129,6 +133,18 @@ def require_place(path: Path | None) -> None:
 def _system_error(number: int, path: Path) -> OSError:
     """Returns what the operating system would raise: a subclass of OSError that belongs to the number."""
     return OSError(number, os.strerror(number), str(path))
+
+
+def _require_own_settings(path: Path) -> None:
+    """Raises OtherResultsError if there is a file in the place of settings that holds something else."""
+    if not path.exists():
+        return
+    try:
+        is_own = json.loads(path.read_bytes())["format"] == SETTINGS_FORMAT
+    except (ValueError, KeyError, TypeError, RecursionError):
+        is_own = False
+    if not is_own:
+        raise OtherResultsError(f"{path} is none of ours: give another --out, or --force to replace it")
 
 
 def _require_same(folder: Path, command: str, settings: Any) -> None:

@@ -133,6 +133,15 @@ def test_settings_that_an_earlier_version_did_not_have_are_the_defaults(tmp_path
         claim_folder("train", TrainSettings(out=tmp_path, arm="lookahead", horizon=3))
 
 
+@pytest.mark.parametrize("content", [b"{}", b'{"editor.fontSize": 12} // comment', b"\xff", b"[" * 5000, b"3"])
+def test_settings_of_something_else_are_not_replaced(content, tmp_path):
+    (tmp_path / "settings.json").write_bytes(content)
+    with pytest.raises(OtherResultsError, match="none of ours: give another --out, or --force"):
+        claim_folder("compare", CompareSettings(out=tmp_path))
+    assert (tmp_path / "settings.json").read_bytes() == content
+    claim_folder("compare", CompareSettings(out=tmp_path, force=True))
+
+
 def hold(out, connection):
     """Has a folder until it is told to give it back."""
     with folder_of("compare", CompareSettings(out=out)):
