@@ -122,7 +122,10 @@ def _require_own_agents() -> None:
 
 
 def _sentence(error: Exception) -> str:
-    """Returns an error as one line; only unexpected errors show their type."""
+    """Returns an error as one line; only unexpected errors show their type.
+
+    What it quotes of a file is shown, and means nothing to a terminal.
+    """
     ours = type(error).__module__.partition(".")[0] == "experiments"
     expected = ours or isinstance(error, (ValueError, OSError, ImportError))
     if isinstance(error, OSError) and error.strerror:
@@ -130,7 +133,7 @@ def _sentence(error: Exception) -> str:
         text += f"; {_REMEDIES[error.errno]}" if error.errno in _REMEDIES else ""
     else:
         text = str(error) if expected else f"{type(error).__name__}: {error} (NCS_DEBUG=1 shows the traceback)"
-    return " ".join(text.split())
+    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in " ".join(text.split()))
 
 
 def _complain(sentence: str, code: int) -> int:

@@ -15,6 +15,10 @@ class OtherResultsError(ValueError):
     """An output folder holds finished results of other settings, which would be replaced."""
 
 
+class FolderInUseError(RuntimeError):
+    """Another command is writing to the output folder."""
+
+
 class RunError(RuntimeError):
     """A training run failed; the message names the run, the cause is the run's own error."""
 

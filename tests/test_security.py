@@ -1,8 +1,12 @@
 """What SECURITY.md says: nothing that is read runs code, nothing goes over the network."""
 
 import ast
+import hashlib
+import io
 import json
 import sys
+import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -11,7 +15,8 @@ from agents.agent import Agent
 from agents.control_loop import ControlLoop
 from agents.sharing.agent_file import AgentError, digest
 from agents.training import untrained
-from experiments.settings import CompareSettings, settings_json
+from experiments.__main__ import _parse
+from experiments.settings import CompareSettings, StudySettings, save_settings, settings_json
 from shields import Certificate, CertificateError
 from tests.command import assert_one_sentence, ncs
 
@@ -139,7 +144,16 @@ def test_settings_of_others_import_no_module(evil):
     assert_one_sentence(ncs("compare", "--config", "settings.json", cwd=evil), "unknown environment 'evil:Evil-v0'")
 
 
+@pytest.mark.parametrize("envs", [["evil:Evil-v0"], ["ncs_gym/CartPole-v0", "evil:Evil-v0"], [":Evil-v0"]])
+def test_settings_of_a_study_of_others_import_no_module(envs, evil):
+    content = settings_json("study", StudySettings())
+    content["settings"]["envs"] = envs
+    (evil / "settings.json").write_text(json.dumps(content))
+    assert_one_sentence(ncs("study", "--config", "settings.json", cwd=evil), "unknown environment", "Evil-v0")
+
+
 def test_settings_files_name_no_module():
+    assert settings_json("study", StudySettings(envs=("evil:Evil-v0",)))["settings"]["envs"] == ["Evil-v0"]
     assert settings_json("compare", CompareSettings(env="evil:Evil-v0"))["settings"]["env"] == "Evil-v0"
 
 
@@ -158,3 +172,87 @@ def test_certificates_that_are_none_are_refused(content, tmp_path):
     (tmp_path / "c.json").write_bytes(content)
     with pytest.raises(CertificateError):
         Certificate.load(tmp_path / "c.json")
+
+
+@pytest.mark.parametrize("out", ["../mine", "{root}/mine", "here/../../mine", "link"])
+def test_settings_of_others_write_to_no_folder_outside_unless_the_user_names_it(out, tmp_path):
+    here, mine = tmp_path / "here", tmp_path / "mine"
+    here.mkdir()
+    mine.mkdir()
+    (here / "link").symlink_to(mine)
+    out = out.format(root=tmp_path)
+    content = settings_json("compare", CompareSettings(smoke=True))
+    content["settings"]["out"] = out
+    (here / "theirs.json").write_text(json.dumps(content))
+    run = ncs("compare", "--config", "theirs.json", cwd=here)
+    assert_one_sentence(run, "lies neither here nor beside the file: give --out")
+    assert list(mine.iterdir()) == []
+    named = ncs("compare", "--config", "theirs.json", "--out", out, "--env", "unknown", cwd=here)
+    assert_one_sentence(named, "unknown environment 'unknown'")
+
+
+def test_settings_may_name_the_folder_that_they_lie_in(tmp_path, monkeypatch):
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    save_settings(tmp_path / "settings.json", "compare", CompareSettings(out=tmp_path))
+    monkeypatch.chdir(elsewhere)
+    assert _parse(["compare", "--config", str(tmp_path / "settings.json")]).out == tmp_path
+
+
+@pytest.mark.parametrize("change", [{"page": "mine.md"}, {"quote": ["mine.md"]}])
+def test_settings_of_others_write_no_page(change, tmp_path):
+    (tmp_path / "mine.md").write_text("<!-- ncs study: lead -->\n<!-- end -->\n")
+    content = settings_json("study", StudySettings(smoke=True))
+    content["settings"] |= change
+    (tmp_path / "theirs.json").write_text(json.dumps(content))
+    run = ncs("study", "--config", "theirs.json", cwd=tmp_path)
+    assert_one_sentence(run, "hold what ncs study does not take", next(iter(change)))
+    assert {path.name for path in tmp_path.iterdir()} == {"mine.md", "theirs.json"}
+
+
+def test_texts_in_files_mean_nothing_to_a_terminal(tmp_path):
+    content = settings_json("compare", CompareSettings()) | {"command": "\x1b]0;title\x07\x9b31m\u202e\u2028"}
+    (tmp_path / "theirs.json").write_text(json.dumps(content))
+    run = ncs("compare", "--config", "theirs.json", cwd=tmp_path)
+    assert_one_sentence(run, "holds settings of ncs", "x1b]0;title")
+    assert run.stderr.strip().isprintable()
+
+
+@pytest.fixture
+def agent(tmp_path):
+    """The folder of an agent."""
+    untrained(ControlLoop(env="ncs_gym/TruckTrailer-v0"), seed=0).save(tmp_path / "a" / "agent")
+    return tmp_path / "a" / "agent"
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../evil.pth", "/{root}/evil.pth", "..\\evil.pth", "C:\\evil.pth", "x" * 300, "e.pth", "../data", "x\0y"],
+)
+def test_members_of_the_weights_of_others_are_not_unpacked(name, agent, tmp_path):
+    data = io.BytesIO()
+    with zipfile.ZipFile(agent / "model.zip") as source, zipfile.ZipFile(data, "w") as target:
+        for member in source.namelist():
+            target.writestr(member, source.read(member))
+        target.writestr(name.replace("/{root}", str(tmp_path)), source.read("policy.pth"))
+    (agent / "model.zip").write_bytes(data.getvalue())
+    document = json.loads((agent / "agent.json").read_text())
+    document["agent"]["sha256_of_model"] = hashlib.sha256(data.getvalue()).hexdigest()
+    document["sha256"] = digest(document["agent"])
+    (agent / "agent.json").write_text(json.dumps(document))
+    before = {path for path in tmp_path.rglob("*")}
+    with suppress(AgentError):  # members that are no weights are not read at all
+        Agent.load(agent)
+    assert {path for path in tmp_path.rglob("*")} == before
+
+
+def test_saving_an_agent_over_links_replaces_the_links(agent, tmp_path):
+    loaded = Agent.load(agent)
+    for path in agent.iterdir():
+        (tmp_path / path.name).write_text("mine")
+        path.unlink()
+        path.symlink_to(tmp_path / path.name)
+    loaded.save(agent)
+    assert {path.name for path in tmp_path.iterdir() if path.is_file() and path.read_text() == "mine"} == {
+        path.name for path in agent.iterdir()
+    }

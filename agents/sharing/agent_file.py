@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from ncs_gym import Channel, GilbertElliott
+from ncs_gym.validation import shown
+from shields.atomic_write import write_atomically
 from shields.runtime.safety_filter import LONGEST_HORIZON, MODES
 
+# Files of an agent: no other name is read or written for one, whoever made the list of names.
+AGENT_FILES = ("model.zip", "agent.json")
 _FORMAT = "ncs-gym agent 1"
 
 
@@ -23,6 +28,33 @@ def document_of(content: dict[str, Any]) -> bytes:
     return (json.dumps(document, indent=1) + "\n").encode()
 
 
+def require_names(names: Iterable[str]) -> None:
+    """Returns if files of these names may belong to an agent.
+
+    Raises:
+        AgentError: If a name is none of `AGENT_FILES`; it may lead out of the agent's folder.
+    """
+    for name in names:
+        if name not in AGENT_FILES:
+            raise AgentError(f"an agent has no file of the name {shown(name)}, only {' and '.join(AGENT_FILES)}")
+
+
+def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Writes the files of an agent in a folder that exists.
+
+    Args:
+        folder: The folder.
+        files: Contents by name.
+
+    Raises:
+        AgentError: If a name is none of `AGENT_FILES`; nothing is written then.
+        OSError: If a file cannot be written.
+    """
+    require_names(files)
+    for name, content in files.items():
+        write_atomically(folder / name, content)
+
+
 def read_files(folder: str | Path) -> tuple[Path, dict[str, Any], bytes]:
     """Returns the folder of an agent, the content of its `agent.json` and its `model.zip`, whose checksums are right.
 
@@ -33,7 +65,7 @@ def read_files(folder: str | Path) -> tuple[Path, dict[str, Any], bytes]:
         AgentError: If a file is missing, damaged or of another format.
     """
     folder = Path(folder)
-    folder = folder.parent if folder.name in ("model.zip", "agent.json") else folder
+    folder = folder.parent if folder.name in AGENT_FILES else folder
     try:
         document, weights = json.loads((folder / "agent.json").read_bytes()), (folder / "model.zip").read_bytes()
     except OSError as error:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
-import os
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
+from typing import Any
 
 from experiments.attack.monte_carlo_batch import MonteCarloBatch
 from experiments.attack.safety_counts import SafetyCounts
 from experiments.errors import ResultsError
 from experiments.runs.provenance import json_digest
+from experiments.runs.run_store import count_of
+from ncs_gym.registration import EPISODE_STEPS
+from shields.atomic_write import write_atomically
 
 
 class CountsStore:
@@ -19,24 +22,26 @@ class CountsStore:
     Args:
         path: The file; created if it is missing.
         keys: Key of each case by its name; lines with other keys are kept and not read.
+        envs: Number of episodes in a batch.
 
     Attributes:
         counts: Counts of the finished batches.
 
     Raises:
-        ResultsError: If the file is damaged.
+        ResultsError: If the file is damaged, or holds what no batch can have counted.
         OSError: If the file cannot be read or written.
     """
 
-    def __init__(self, path: Path, keys: dict[str, str]) -> None:
-        self._path, self._keys = path, keys
+    def __init__(self, path: Path, keys: dict[str, str], envs: int) -> None:
+        self._path, self._keys, self._envs = path, keys, envs
         self.counts: dict[MonteCarloBatch, SafetyCounts] = {}
         content = path.read_bytes() if path.exists() else b""
         complete = content[: content.rfind(b"\n") + 1]
         for number, line in enumerate(complete.splitlines(), 1):
             self._read(number, line)
-        if complete != content:  # the process was killed while it was writing
-            os.truncate(path, len(complete))
+        # The process was killed while it was writing; or what is appended would go into another folder's file, too.
+        if complete != content or (path.exists() and path.stat().st_nlink > 1):
+            write_atomically(path, complete)
 
     def add(self, batch: MonteCarloBatch, counts: SafetyCounts) -> None:
         """Appends the counts of a batch.
@@ -54,7 +59,28 @@ class CountsStore:
             document = json.loads(line)
             if document.pop("sha256") != json_digest(document):
                 raise ValueError("checksum")
-            if document["key"] == self._keys.get(document["case"]):
-                self.counts[MonteCarloBatch(document["case"], document["index"])] = SafetyCounts(**document["tally"])
+            index = count_of(document["index"], "index")
+            if document["case"] in self._keys and document["key"] == self._keys[document["case"]]:
+                counts = _counts_of(document["tally"], self._envs)
+                self.counts[MonteCarloBatch(document["case"], index)] = counts
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ResultsError(f"line {number} of {self._path} was altered; delete it to repeat its batch") from error
+
+
+def _counts_of(content: dict[str, Any], envs: int) -> SafetyCounts:
+    """Returns the counts of a batch that stand in a file.
+
+    Raises:
+        ValueError: If a batch of so many episodes cannot have counted this.
+        TypeError: If entries are missing or unknown.
+    """
+    counts = SafetyCounts(**content)
+    steps, starts = envs * EPISODE_STEPS, ("episodes", "broken_episodes", "outside_starts")
+    for each in fields(counts):
+        if each.name != "level":
+            most = envs if each.name in starts else steps + envs * (each.name == "unproved")  # which counts starts, too
+            count_of(getattr(counts, each.name), each.name, high=most)
+    whole = (counts.steps, counts.episodes) == (steps, envs) and counts.lapsed_violations <= counts.lapsed
+    if not whole or type(counts.level) is not float or not counts.level >= 0.0:
+        raise ValueError("counts")
+    return counts

@@ -36,6 +36,7 @@ def certify(settings: CertifySettings) -> None:
             although the channels kept their contracts; with Gaussian noise, if more episodes did so than the bound on
             their probability allows.
         ResultsError: If the stored counts are damaged.
+        FolderInUseError: If another command is writing to the output folder.
         OtherResultsError: If the output folder holds finished results of other settings.
         ValueError: If there is no environment of the given id, the plant's file cannot be read, or nothing is
             claimed of an environment because its downlink promises nothing.
@@ -47,12 +48,17 @@ def certify(settings: CertifySettings) -> None:
     cases = campaign.cases()
     if campaign.shielded:
         _require_claims(cases)
-    claim_folder("certify", settings)
+    with claim_folder("certify", settings):
+        _certify_in_folder(settings, campaign, cases)
+
+
+def _certify_in_folder(settings: CertifySettings, campaign: Campaign, cases: dict[str, AttackCase]) -> None:
+    """Executes the batches that are missing, prints the table and writes the counts; raises as `certify` says."""
     certificates = _certificate_files(cases, settings.out / "certificates")
     keys = {case: f"{campaign.key} {Certificate.load(file).checksum}" for case, file in certificates.items()}
     if campaign.env is not None:  # what a module registers may change
         keys = {case: f"{key} {cases[case].channel} {cases[case].downlink}" for case, key in keys.items()}
-    store = CountsStore(settings.out / "tallies.jsonl", keys)
+    store = CountsStore(settings.out / "tallies.jsonl", keys, campaign.envs)
     batches = _batches(list(cases), settings.steps / campaign.batch_steps, campaign.kinds_of_batches)
     missing = {case: deque(each for each in planned if each not in store.counts) for case, planned in batches.items()}
     start, steps = time.perf_counter(), campaign.batch_steps * sum(map(len, missing.values()))

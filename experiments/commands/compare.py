@@ -46,6 +46,7 @@ def compare(settings: CompareSettings) -> None:
 
     Raises:
         ValueError: If a setting is out of range or a stored result is damaged.
+        FolderInUseError: If another command is writing to the output folder.
         OtherResultsError: If the output folder holds finished results of other settings.
         OSError: If the output folder cannot be written.
         CertificateError: If a given certificate does not verify.
@@ -55,7 +56,12 @@ def compare(settings: CompareSettings) -> None:
     """
     settings = _with_full_names(short_version(settings, **_SMOKE))
     setup = ExperimentSetup.of(settings.env, settings.channel, settings.certificate, settings.noise)
-    claim_folder("compare", settings.completed)
+    with claim_folder("compare", settings.completed):
+        _compare_in_folder(settings, setup)
+
+
+def _compare_in_folder(settings: CompareSettings, setup: ExperimentSetup) -> None:
+    """Executes what is missing, prints the table and writes the files."""
     prepare_output(settings.out)
     print(wrapped(setup.title), wrapped(settings.agent_line), sep="\n", flush=True)
     settings = settings.completed

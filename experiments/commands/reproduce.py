@@ -20,6 +20,7 @@ def reproduce(settings: ReproduceSettings) -> None:
 
     Raises:
         ValueError: If a setting is out of range.
+        FolderInUseError: If another command is writing to the output folder.
         OtherResultsError: If the output folder holds finished results of other settings.
         OSError: If the output folder cannot be written.
     """
@@ -28,7 +29,12 @@ def reproduce(settings: ReproduceSettings) -> None:
             raise ValueError(f"--{name} must be at least 1, got {getattr(settings, name)}")
     if settings.seed < 0:
         raise ValueError(f"--seed must be >= 0, got {settings.seed}")
-    claim_folder("reproduce", settings)
+    with claim_folder("reproduce", settings):
+        _reproduce_in_folder(settings)
+
+
+def _reproduce_in_folder(settings: ReproduceSettings) -> None:
+    """Simulates, prints the table and writes the files."""
     prepare_output(settings.out)
     with tqdm(total=3 * settings.starts, unit="start", mininterval=1.0) as bar:
         simulations = [simulate(design, settings, bar) for design in designs()]

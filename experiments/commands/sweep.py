@@ -66,6 +66,7 @@ def sweep(settings: SweepSettings) -> None:
 
     Raises:
         ValueError: If a setting is out of range, a channel impossible, or a stored result damaged.
+        FolderInUseError: If another command is writing to the output folder.
         OtherResultsError: If the output folder holds finished results of other settings.
         OSError: If the output folder cannot be written.
         CertificateError: If a given certificate does not verify.
@@ -82,7 +83,12 @@ def sweep(settings: SweepSettings) -> None:
     for name in settings.arms:
         Arm.of(name, settings.mode)
     setups = [_setup(settings, each) for each in points]
-    claim_folder("sweep", settings.completed)
+    with claim_folder("sweep", settings.completed):
+        _sweep_in_folder(settings, points, setups)
+
+
+def _sweep_in_folder(settings: SweepSettings, points: Sequence[_GridPoint], setups: Sequence[ExperimentSetup]) -> None:
+    """Executes what is missing, prints the table and writes the files."""
     prepare_output(settings.out)
     print(wrapped(settings.agent_line), flush=True)
     settings = settings.completed

@@ -22,6 +22,7 @@ def train(settings: TrainSettings) -> None:
 
     Raises:
         ValueError: If a setting is out of range or a stored result is damaged.
+        FolderInUseError: If another command is writing to the output folder.
         OtherResultsError: If the output folder holds finished results of other settings.
         OSError: If the output folder cannot be written.
         CertificateError: If a given certificate does not verify.
@@ -31,7 +32,12 @@ def train(settings: TrainSettings) -> None:
     settings = short_version(settings, **_SMOKE)
     Arm.of(settings.arm, settings.mode)
     setup = ExperimentSetup.of(settings.env, settings.channel, settings.certificate)
-    claim_folder("train", settings.completed)
+    with claim_folder("train", settings.completed):
+        _train_in_folder(settings, setup)
+
+
+def _train_in_folder(settings: TrainSettings, setup: ExperimentSetup) -> None:
+    """Trains and evaluates, prints the table and writes the files."""
     prepare_output(settings.out)
     print(wrapped(settings.agent_line), flush=True)
     settings = settings.completed

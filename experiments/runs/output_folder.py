@@ -1,17 +1,25 @@
-"""The output folder of a command: finished results in it are not replaced by those of other settings."""
+"""The output folder of a command: its own for as long as it runs, and finished results in it are not replaced.
+
+It may have been made by somebody else. Nothing in it may lead elsewhere, so that writing to it writes nowhere else.
+"""
 
 from __future__ import annotations
 
 import errno
 import json
 import os
+import warnings
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from experiments.errors import OtherResultsError
+from filelock import FileLock, Timeout
+
+from experiments.errors import FolderInUseError, OtherResultsError, ResultsError
 from experiments.runs.experiment_setup import INCIDENTAL_SETTINGS
 from experiments.settings import save_settings, settings_json
+from experiments.settings.settings_file import FORMAT as SETTINGS_FORMAT
 
 # Files by which a folder is known to hold something finished.
 _FINISHED = ("summary.json", "certify.json", "units/*.json")
@@ -25,12 +33,17 @@ _GROWING = {
     "sweep": ("seeds", "arms", "losses", "delays", "quantization_steps", "burst_lengths", "downlink_losses"),
     "certify": ("steps",),
 }
+# Whoever holds the lock of this file has the folder. It is the operating system's: it ends with the process.
+_LOCK = ".lock"
+# What the operating system says where there are no locks.
+_NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
 # Differences that a message lists, and characters of each value.
 _MOST_LISTED, _MOST_CHARACTERS = 3, 40
 
 
-def claim_folder(command: str, settings: Any) -> None:
-    """Creates the output folder of a command and writes `settings.json` in it.
+@contextmanager
+def claim_folder(command: str, settings: Any) -> Iterator[None]:
+    """Creates the output folder of a command and writes `settings.json` in it; no other command has it meanwhile.
 
     A folder with finished results is taken only if they have the same settings, apart from those that change no result,
     or if the new ones contain them: more seeds or arms, a larger grid of `ncs sweep`, more steps of `ncs certify`.
@@ -40,15 +53,62 @@ def claim_folder(command: str, settings: Any) -> None:
         settings: Its complete settings; with `force` the folder is taken in any case.
 
     Raises:
-        OtherResultsError: If the folder holds finished results of other settings, or of settings that cannot be read.
+        FolderInUseError: If another command has the folder.
+        OtherResultsError: If the folder holds finished results of other settings, or of settings that cannot be read,
+            or a file `settings.json` of something else.
+        ResultsError: If something in the folder is a link, or neither a file nor a folder.
         OSError: If the folder cannot be written.
     """
     folder: Path = settings.out
-    patterns = (*_FINISHED, *_FINISHED_PARTS.get(command, ()))
-    if not settings.force and any(file for pattern in patterns for file in folder.glob(pattern)):
-        _require_same(folder, command, settings)
+    if folder.is_dir():
+        _require_own_entries(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    save_settings(folder / "settings.json", command, settings)
+    with _locked(folder):
+        patterns = (*_FINISHED, *_FINISHED_PARTS.get(command, ()))
+        if not settings.force and any(file for pattern in patterns for file in folder.glob(pattern)):
+            _require_same(folder, command, settings)
+        if not settings.force:
+            _require_own_settings(folder / "settings.json")
+        save_settings(folder / "settings.json", command, settings)
+        yield
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Has a folder for this process alone; where the file system knows no locks, a warning says that it has not.
+
+    Raises:
+        FolderInUseError: If another process has it.
+        OSError: If the folder cannot be written.
+    """
+    lock = FileLock(folder / _LOCK, fallback_to_soft=False)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout as error:
+        raise FolderInUseError(f"another command is writing to {folder}: wait for it, or give another --out") from error
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise _system_error(error.errno or errno.EIO, folder) from error
+        warnings.warn(f"the file system of {folder} has no locks: start no second command in it", stacklevel=1)
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # Windows removes no file that is open: there it stays
+            (folder / _LOCK).unlink()  # while the lock is held: whoever waits for this file finds that it has gone
+        lock.release()
+
+
+def _require_own_entries(folder: Path) -> None:
+    """Raises ResultsError unless everything below a folder is a file or a folder that lies there itself."""
+    advice, place = "remove it, or give another --out", os.path.realpath(folder)
+    for entry in os.scandir(folder):
+        path = Path(entry)
+        if entry.is_symlink() or os.path.realpath(path) != os.path.join(place, entry.name):
+            raise ResultsError(f"{path} is a link, and what is written there would be written elsewhere: {advice}")
+        if entry.is_dir():
+            _require_own_entries(path)
+        elif not entry.is_file():
+            raise ResultsError(f"{path} is neither a file nor a folder: {advice}")
 
 
 def require_place(path: Path | None) -> None:
@@ -75,12 +135,26 @@ def _system_error(number: int, path: Path) -> OSError:
     return OSError(number, os.strerror(number), str(path))
 
 
+def _require_own_settings(path: Path) -> None:
+    """Raises OtherResultsError if there is a file in the place of settings that holds something else."""
+    if not path.exists():
+        return
+    try:
+        is_own = json.loads(path.read_bytes())["format"] == SETTINGS_FORMAT
+    except (ValueError, KeyError, TypeError, RecursionError):
+        is_own = False
+    if not is_own:
+        raise OtherResultsError(f"{path} is none of ours: give another --out, or --force to replace it")
+
+
 def _require_same(folder: Path, command: str, settings: Any) -> None:
     """Raises OtherResultsError if the results in a folder are not those of a command with these settings."""
     advice = "give another --out, or --force to replace them"
     try:
         document = json.loads((folder / "settings.json").read_bytes())
-        kept_command, kept = document["command"], dict(document["settings"])
+        kept_command, kept = document["command"], document["settings"]
+        if not isinstance(kept, dict):
+            raise TypeError("settings")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise OtherResultsError(
             f"{folder} holds finished results, and no settings.json that says of what: {advice}"

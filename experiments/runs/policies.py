@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from agents.evaluation import Policy as VectorPolicy
+from agents.sharing.agent_file import AgentError, write_files
 from experiments.baselines import controller
 from ncs_gym import NCSEnv, SetpointTracking, SpeedTracking
 from ncs_gym.envs.env import ncs_env
@@ -48,7 +49,6 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
     if name == "greedy":
         return lambda observation, info: _greedy_action(env, observation, info["estimate"])
     from agents.agent import Agent  # imports torch
-    from agents.sharing.agent_file import AgentError
 
     agent = Agent.load(agent_folder(Path(name)))
     if agent.env != env_id:
@@ -69,8 +69,7 @@ def agent_of(run: TrainingRun) -> Agent | None:
         from agents.agent import Agent  # imports torch
 
         with TemporaryDirectory() as folder:
-            for name, content in run.agent_files.items():
-                (Path(folder) / name).write_bytes(content)
+            write_files(Path(folder), run.agent_files)
             return Agent.load(folder)
     if run.policy_kind != "untrained":
         return None

@@ -14,17 +14,24 @@ from ncs_gym.validation import MAX_QUOTED_LENGTH, shown
 from shields.atomic_write import write_atomically
 
 FORMAT = "ncs-gym settings 1"
-# Settings of one call, which a file neither keeps nor gives.
-_OF_THE_CALL = ("config", "force")
+# Settings of one call, which a file neither keeps nor gives: files outside the output folder are the user's to name.
+_OF_THE_CALL = ("config", "force", "page", "quote")
 
 
 def settings_json(command: str, settings: Any) -> dict[str, Any]:
     """Returns a command's settings as JSON values; of an environment "module:id" the id alone."""
     values = json.loads(json.dumps(asdict(settings), default=str))
     if isinstance(values.get("env"), str):
-        values["env"] = values["env"].rpartition(":")[2]  # a file names no module to import
+        values["env"] = _id_alone(values["env"])
+    if isinstance(values.get("envs"), list):
+        values["envs"] = [_id_alone(each) for each in values["envs"]]
     kept = {name: value for name, value in values.items() if name not in _OF_THE_CALL}
     return {"format": FORMAT, "command": command, "settings": kept}
+
+
+def _id_alone(env_id: str) -> str:
+    """Returns the id of "module:id": a file names no module to import."""
+    return env_id.rpartition(":")[2]
 
 
 def save_settings(path: Path, command: str, settings: Any) -> None:
@@ -57,11 +64,19 @@ def config_defaults(arguments: list[str], command: str, kind: type) -> tuple[Any
         raise SettingsError(f"--config is given {len(found.config)} times")
     if not found.config[0]:
         raise SettingsError("--config needs a file")
-    return _load(Path(found.config[0]), command, kind), others
+    names_folder = any(each.partition("=")[0] == "--out" for each in others)
+    return _load(Path(found.config[0]), command, kind, names_folder), others
 
 
-def _load(path: Path, command: str, kind: type) -> Any:
-    """Returns the settings in a file; raises SettingsError as `config_defaults` says."""
+def _load(path: Path, command: str, kind: type, names_folder: bool) -> Any:
+    """Returns the settings in a file; raises SettingsError as `config_defaults` says.
+
+    Args:
+        path: The file.
+        command: Name of the command.
+        kind: Dataclass of the command's settings.
+        names_folder: Whether the user names the output folder; otherwise it is that of the file.
+    """
     try:
         document = json.loads(path.read_bytes())
     except OSError as error:
@@ -72,17 +87,28 @@ def _load(path: Path, command: str, kind: type) -> Any:
         raise SettingsError(f"{path} is not of format {FORMAT!r}")
     if document.get("command") != command or not isinstance(document.get("settings"), dict):
         raise SettingsError(f"{path} holds settings of ncs {document.get('command')}, not of ncs {command}")
-    env_id = document["settings"].get("env")
-    if isinstance(env_id, str) and ":" in env_id:
-        raise SettingsError(
-            f"unknown environment {shown(env_id)}: settings in a file import no module; let {path} name the id alone, "
-            "and give --env module:id if you trust the module"
-        )
+    values = document["settings"]
+    envs = values.get("envs")
+    for env_id in (values.get("env"), *(envs if isinstance(envs, list) else ())):
+        if isinstance(env_id, str) and env_id != _id_alone(env_id):
+            raise SettingsError(
+                f"unknown environment {shown(env_id)}: settings in a file import no module; let {path} name the id "
+                "alone, and give --env module:id if you trust the module"
+            )
     try:
-        return _from_json(document["settings"], kind)
+        settings = _from_json(values, kind)
+        if not names_folder and not _is_near(settings.out, path):
+            raise ValueError(f"out = {shown(str(settings.out))} lies neither here nor beside the file: give --out")
+        return settings
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         reason = " ".join(str(error).split())[:MAX_QUOTED_LENGTH]
         raise SettingsError(f"settings {path} hold what ncs {command} does not take: {reason}") from error
+
+
+def _is_near(folder: Path, path: Path) -> bool:
+    """Returns whether an output folder lies in the working folder, or is the one that the file of settings lies in."""
+    place = folder.resolve()
+    return place.is_relative_to(Path.cwd().resolve()) or place == path.parent.resolve()
 
 
 def _from_json(value: Any, kind: Any, name: str = "") -> Any:

@@ -26,7 +26,7 @@ from shields.atomic_write import write_atomically
 # Budget of `--smoke`: enough to pass through every part.
 _SMOKE = {"seeds": 2, "budget": 0.01, "episodes": 4, "channel_episodes": 1}
 # Folder of the sweep of channels below that of its environment, and settings that say nothing of results.
-_CHANNELS, _INCIDENTAL = "channels", (*INCIDENTAL_SETTINGS, "page", "quote", "smoke")
+_CHANNELS, _INCIDENTAL = "channels", (*INCIDENTAL_SETTINGS, "smoke")
 
 
 def study(settings: StudySettings) -> None:
@@ -34,6 +34,7 @@ def study(settings: StudySettings) -> None:
 
     Raises:
         ValueError: If a setting is out of range, a page quotes no table, or a stored result is damaged.
+        FolderInUseError: If another command is writing to the output folder.
         OtherResultsError: If the output folder holds finished results of other settings.
         OSError: If a file cannot be read or written.
         Infeasible: If no certificate is found.
@@ -43,7 +44,12 @@ def study(settings: StudySettings) -> None:
     settings = short_version(settings, **_SMOKE)
     for path in settings.quote:
         require_marks(path.read_text("utf-8"))
-    claim_folder("study", settings)
+    with claim_folder("study", settings):
+        _study_in_folder(settings)
+
+
+def _study_in_folder(settings: StudySettings) -> None:
+    """Executes what is missing, prints the tables and writes the files."""
     prepare_output(settings.out)
     parts = {short_name(env): _comparison_settings(settings, env) for env in settings.envs}
     comparisons, channels = {}, {}

@@ -186,11 +186,15 @@ class SafeLoop:
             RuntimeError: If `start` was not called, or nothing was decided since the last call.
             ValueError: If what is given is no packet for this plant; nothing has changed then.
         """
-        if isinstance(packets, Packet) or not isinstance(packets, Iterable):
+        try:
+            given = None if isinstance(packets, Packet) else iter(packets)
+        except TypeError:  # also of an array that has no dimension
+            given = None
+        if given is None:
             raise ValueError(
                 f"packets must be a list of Packet(stamp, measurement), empty if nothing arrived, got {shown(packets)}"
             )
-        arrived = [as_packet(each, self._filter.plant.p) for each in packets]
+        arrived = [as_packet(each, self._filter.plant.p) for each in given]
         phase = self._require_started()
         if phase is _Phase.RECEIVED:
             raise RuntimeError("receive was called twice in a step: hand over all packets of a step in one call")

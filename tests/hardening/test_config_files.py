@@ -10,24 +10,10 @@ from hypothesis import strategies as st
 from experiments.settings import CompareSettings, SweepSettings
 from experiments.settings.settings_file import FORMAT, settings_json
 from tests.command import assert_one_sentence, ncs
+from tests.fuzz import JSON_VALUES as JSON
 from tests.fuzz import examples
 
 GOOD = {"compare": CompareSettings(), "sweep": SweepSettings()}
-VALUES = (
-    st.none()
-    | st.booleans()
-    | st.integers()
-    | st.floats()
-    | st.text(max_size=6)
-    | st.sampled_from(
-        ["--help", "-h", "7", "0.5", " 7", "None", "True", "PPO", "unshielded", "--seed=3", "\x00", "\ud800"]
-    )
-)
-JSON = st.recursive(
-    VALUES,
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=6), inner, max_size=3),
-    max_leaves=5,
-)
 NAMES = sorted(
     {*settings_json("compare", CompareSettings())["settings"], "no-smoke", "smoke=", "x", "ppo.gamma", "--seed"}
 )

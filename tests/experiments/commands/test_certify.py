@@ -311,20 +311,20 @@ def test_exits_of_lookahead_are_allowed_and_violations_are_not(tmp_path, small, 
 
 def test_damaged_counts_are_refused(tmp_path):
     path = tmp_path / "tallies.jsonl"
-    store = CountsStore(path, {"case": "key"})
+    store = CountsStore(path, {"case": "key"}, 4)
     for index in range(3):
-        store.add(MonteCarloBatch("case", index), SafetyCounts(steps=index, episodes=1))
+        store.add(MonteCarloBatch("case", index), SafetyCounts(steps=800, episodes=4, exits=index))
     whole = path.read_bytes()
-    assert CountsStore(path, {"case": "key"}).counts == store.counts
-    assert CountsStore(path, {"case": "other", "else": "key"}).counts == {}
+    assert CountsStore(path, {"case": "key"}, 4).counts == store.counts
+    assert CountsStore(path, {"case": "other", "else": "key"}, 4).counts == {}
     second = whole.splitlines(keepends=True)[1]
     start = whole.index(second)
     for position in range(start, start + len(second) - 1):
         path.write_bytes(whole[:position] + bytes([whole[position] ^ 1]) + whole[position + 1 :])
         with pytest.raises(ResultsError, match=r"line [23] of .* was altered"):
-            CountsStore(path, {"case": "key"})
+            CountsStore(path, {"case": "key"}, 4)
     path.write_bytes(whole + b'{"sha256": "torn')
-    assert CountsStore(path, {"case": "key"}).counts == store.counts
+    assert CountsStore(path, {"case": "key"}, 4).counts == store.counts
     assert path.read_bytes() == whole
 
 

@@ -229,7 +229,13 @@ def test_results_are_grouped_by_arm_in_the_order_of_runs():
 def test_folder_is_made_and_an_earlier_summary_removed(tmp_path):
     (tmp_path / "units").mkdir()
     (tmp_path / "figures").mkdir()
-    for name in ("summary.json", "report.html", "episodes.parquet", "figures/old.png"):
+    for name in (
+        "summary.json",
+        "report.html",
+        "episodes.parquet",
+        "figures/episode.png",
+        "figures/trusting-CartPole-v0.png",
+    ):
         (tmp_path / name).write_text("{}")
     prepare_output(tmp_path)
     assert not any((tmp_path / "figures").iterdir())

@@ -1,13 +1,18 @@
-"""Finished results are not replaced by those of other settings, unless it is asked for."""
+"""Finished results are not replaced by those of other settings, unless it is asked for; one command has a folder."""
 
+import errno
 import json
+import multiprocessing
+import os
+import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from experiments.errors import OtherResultsError
-from experiments.runs import claim_folder
+from experiments.errors import FolderInUseError, OtherResultsError
+from experiments.runs import claim_folder as folder_of
 from experiments.settings import (
     CertifySettings,
     ChannelSettings,
@@ -18,6 +23,13 @@ from experiments.settings import (
     TrainSettings,
 )
 from experiments.settings.agent_overrides import PPOOverrides
+from tests.command import assert_one_sentence, ncs
+
+
+def claim_folder(command, settings):
+    """Claims a folder and gives it back."""
+    with folder_of(command, settings):
+        pass
 
 
 def finished(command, settings, file="summary.json"):
@@ -119,3 +131,96 @@ def test_settings_that_an_earlier_version_did_not_have_are_the_defaults(tmp_path
     claim_folder("train", TrainSettings(out=tmp_path))
     with pytest.raises(OtherResultsError, match="horizon null, now 3"):
         claim_folder("train", TrainSettings(out=tmp_path, arm="lookahead", horizon=3))
+
+
+@pytest.mark.parametrize("content", [b"{}", b'{"editor.fontSize": 12} // comment', b"\xff", b"[" * 5000, b"3"])
+def test_settings_of_something_else_are_not_replaced(content, tmp_path):
+    (tmp_path / "settings.json").write_bytes(content)
+    with pytest.raises(OtherResultsError, match="none of ours: give another --out, or --force"):
+        claim_folder("compare", CompareSettings(out=tmp_path))
+    assert (tmp_path / "settings.json").read_bytes() == content
+    claim_folder("compare", CompareSettings(out=tmp_path, force=True))
+
+
+def hold(out, connection):
+    """Has a folder until it is told to give it back."""
+    with folder_of("compare", CompareSettings(out=out)):
+        connection.send("has it")
+        connection.recv()
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """A process that has the folder `tmp_path`, and what it listens to."""
+    context = multiprocessing.get_context("spawn")
+    here, there = context.Pipe()
+    process = context.Process(target=hold, args=(tmp_path, there))
+    process.start()
+    there.close()
+    assert here.recv() == "has it"
+    yield process, here
+    process.kill()
+    process.join()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        *(["compare", "--smoke"], ["train", "--smoke"], ["sweep", "--smoke"], ["study", "--smoke"]),
+        *(["certify", "--steps", "1"], ["reproduce"], ["compare", "--smoke", "--force"]),
+    ],
+)
+def test_folder_that_another_command_has_is_refused(arguments, holder, tmp_path):
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    run = ncs(*arguments, "--out", tmp_path)
+    assert_one_sentence(run, f"another command is writing to {tmp_path}", "give another --out")
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_folder_is_free_again_when_its_command_ends_and_nothing_is_left_of_the_lock(holder, tmp_path):
+    process, here = holder
+    settings = CompareSettings(out=tmp_path)
+    with pytest.raises(FolderInUseError):
+        claim_folder("compare", settings)
+    here.send("end")
+    process.join()
+    assert [path.name for path in tmp_path.iterdir()] == ["settings.json"]
+    claim_folder("compare", settings)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_folder_is_free_again_when_its_command_is_killed_or_interrupted(number, holder, tmp_path):
+    process, _ = holder
+    os.kill(process.pid, number)
+    process.join()
+    claim_folder("compare", CompareSettings(out=tmp_path))
+    assert [path.name for path in tmp_path.iterdir()] == ["settings.json"]
+
+
+def test_a_failure_gives_the_folder_back(tmp_path):
+    for error in (ValueError, KeyboardInterrupt):
+        with pytest.raises(error), folder_of("compare", CompareSettings(out=tmp_path)):
+            raise error
+        assert [path.name for path in tmp_path.iterdir()] == ["settings.json"]
+
+
+def test_the_lock_is_no_file_that_stays(tmp_path):
+    (tmp_path / ".lock").write_text("of a process that was killed")
+    claim_folder("compare", CompareSettings(out=tmp_path))
+
+
+def test_a_study_has_its_folder_and_those_of_its_parts(tmp_path):
+    with folder_of("study", StudySettings(out=tmp_path)):
+        claim_folder("compare", CompareSettings(out=tmp_path / "CartPole-v0"))
+        with pytest.raises(FolderInUseError):
+            claim_folder("study", StudySettings(out=tmp_path))
+
+
+def test_file_system_without_locks_is_pointed_out(tmp_path, monkeypatch):
+    def no_locks(*arguments):
+        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+
+    monkeypatch.setattr(sys.modules["filelock"].FileLock, "_acquire_native", no_locks, raising=True)
+    with pytest.warns(UserWarning, match="has no locks: start no second command in it"):
+        claim_folder("compare", CompareSettings(out=tmp_path))
+    assert (tmp_path / "settings.json").exists()

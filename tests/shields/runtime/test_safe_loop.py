@@ -318,7 +318,7 @@ def test_what_the_caller_keeps_is_its_own():
     assert loop.guaranteed
 
 
-@pytest.mark.parametrize("packets", [None, Packet(1, np.zeros(2)), 0.5])
+@pytest.mark.parametrize("packets", [None, Packet(1, np.zeros(2)), 0.5, np.array(1.0)])
 def test_what_is_no_list_of_packets_is_refused_before_anything_moves(packets):
     loop = started(channel=Channel())
     loop.decide(0.0)
