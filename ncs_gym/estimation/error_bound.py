@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
-from typing import Literal, overload
+from typing import Any, Literal, overload
 
 import numpy as np
 from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov
@@ -209,7 +209,7 @@ def _unconditional_set(plant: LinearPlant) -> ErrorSet:
 
     slowest = max(radius**2, 1e-6)
     margin = 1e-4 * (1.0 - slowest)
-    best = minimize_scalar(size, bounds=(slowest + margin, 1.0 - margin), method="bounded", options={"xatol": margin})
+    best: Any = minimize_scalar(size, bounds=(slowest + margin, 1.0 - margin), method="bounded", options={"xatol": margin})
     rate = 1.0 - float(exact.rounded(1.0 - best.x, RATE_DIGITS))
     scaled = GROWTH * _smallest_solution(A, D, first, rate)
     _check(scaled, A, D, first, rate)

@@ -61,7 +61,7 @@ def test_trusting_lookahead_is_caught_leaving_the_box_and_lookahead_is_not():
     trusting = replace(reactor, filter=partial(filtered, name="trusting:lookahead", certificate=certificate))
     lookahead = replace(reactor, shield=ShieldSettings(certificate, "lookahead"))
     violating = [
-        sum(episode.violation_steps for episode in evaluate(loop, policy, 4, 7).episodes)
+        sum(episode.violation_steps for episode in evaluate(loop, policy, 12, 7).episodes)
         for loop in (trusting, lookahead)
     ]
     assert violating[0] >= 3  # an episode ends at its first violation
