@@ -19,7 +19,7 @@ from shields.paper.optimization_problem import solve_op
 from shields.verification.rational_matrix import add, multiply, quadratic, rational, to_float, transpose
 
 CASE = PaperExample()
-# Clarabel stops at a relative gap of 1e-8, at which a maximizer is known to the square root of that; K has entries of 2.
+# Clarabel stops at a relative gap of 1e-8, where a maximizer is known to its square root; the entries of K are about 2.
 SOLVER = 2.0 * 1e-8**0.5
 
 
