@@ -8,19 +8,24 @@ digits of float64, so that rounding it gives the same numbers almost everywhere.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from ncs_gym import exact
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem
+from shields.synthesis.initial_designs import VOLUME_TOLERANCE, multiplier_triple
 from shields.synthesis.invariant_set_program import InvariantSetProgram
 from shields.synthesis.multipliers import best_input_multipliers, best_multipliers, with_best_multipliers
 from shields.verification import ACTION_ROUNDING
 
 # Digits of the search's set, and steps of the logarithms of ratios of its multipliers: more where few do not suffice.
 _SEARCHED_DIGITS, _SEARCHED_STEPS = (2, 3, 4), (0.1, 0.01, 0.001)
+# The multipliers lx and le / (1 - lx), and mu, that are tried where the found set nearly fills the box.
+_FULL_BOX_MULTIPLIERS, _FULL_BOX_INPUTS = ((0.85, 0.3), (0.92, 0.1), (0.97, 0.2)), 0.8
+# A design may have this much less log det L than the one that was found.
+_LARGEST_LOSS = 1e-4
 # Digits of the final set and gain, relative to their own extents, and step of the final multipliers.
 _DIGITS, _STEP = 7, 0.01
 # Final multipliers are taken if they add this much to log det L.
@@ -47,12 +52,10 @@ def in_round_numbers(problem: DesignProblem, found: CandidateDesign, slack: floa
         found: The design of a search.
         slack: Relative tightening of the conditions.
     """
-    for digits, step in zip(_SEARCHED_DIGITS, _SEARCHED_STEPS, strict=True):
-        inputs = np.clip(np.round(found.inputs, digits), 10.0**-digits, 1.0 - 10.0**-digits)
-        near = replace(found, multipliers=_in_proportion(found.multipliers, step), inputs=inputs)
-        design = _with_largest_set_and_gain(problem, replace(near, L=_rounded_shape(found.L, digits)), slack)
+    for coarse in _coarse_designs(found):
+        design = _with_largest_set_and_gain(problem, coarse, slack)
         design = design and _with_largest_set_and_gain(problem, design, slack)
-        if design is None:
+        if design is None or design.log_det < found.log_det - _LARGEST_LOSS:
             continue
         tuned, _ = best_multipliers(problem, problem.error_shapes, design.L, design.K, design.multipliers)
         inputs = np.round(best_input_multipliers(problem.error_shapes, design.L, design.K), 3)
@@ -62,6 +65,18 @@ def in_round_numbers(problem: DesignProblem, found: CandidateDesign, slack: floa
             design = again
         return with_best_multipliers(problem, design, problem.error_shapes)
     return None
+
+
+def _coarse_designs(found: CandidateDesign) -> Iterator[CandidateDesign]:
+    """Yields designs near one that was found, in few digits first; where the box is full, nearly any multipliers do."""
+    if -found.log_det < VOLUME_TOLERANCE:
+        inputs = np.full(len(found.inputs), _FULL_BOX_INPUTS)
+        for multipliers in _FULL_BOX_MULTIPLIERS:
+            yield replace(found, L=np.eye(len(found.L)), multipliers=multiplier_triple(*multipliers), inputs=inputs)
+    for digits, step in zip(_SEARCHED_DIGITS, _SEARCHED_STEPS, strict=True):
+        inputs = np.clip(np.round(found.inputs, digits), 10.0**-digits, 1.0 - 10.0**-digits)
+        multipliers = _in_proportion(found.multipliers, step)
+        yield replace(found, L=_rounded_shape(found.L, digits), multipliers=multipliers, inputs=inputs)
 
 
 def _rounded_shape(shape: np.ndarray, digits: int) -> np.ndarray:
