@@ -17,6 +17,8 @@ from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
 # Bits of ball arithmetic to begin with, and at most: a ball that is still ambiguous there holds a tie of two floats.
 FIRST_PRECISION, LAST_PRECISION = 128, 4096
+# Beyond these powers of two the nearest float64 is zero, or there is none.
+SMALLEST, LARGEST = arb(2) ** -1080, arb(2) ** 1025
 
 
 def product(*factors: np.ndarray) -> np.ndarray:
@@ -67,17 +69,26 @@ def _exponent(size: float) -> int:
 
 
 def largest_eigenvalue(symmetric: np.ndarray) -> float:
-    """Returns the largest eigenvalue of a symmetric float matrix, shape (n, n), rounded once."""
-    if np.count_nonzero(symmetric) == np.count_nonzero(np.diag(symmetric)):
-        return float(np.diag(symmetric).max())
-    whole, denominator = _rational(symmetric).numer_denom()
-    polynomial = whole.charpoly()
+    """Returns the smallest float64 that no eigenvalue of a semidefinite float matrix, shape (n, n), exceeds."""
+    low, high = float(np.diag(symmetric).max()), math.nextafter(total(np.diag(symmetric)), math.inf)
+    matrix = _rational(symmetric)
+    if _bounds(low, matrix):
+        return low
+    while low < (middle := 0.5 * (low + high)) < high:
+        low, high = (low, middle) if _bounds(middle, matrix) else (middle, high)
+    return high
 
-    def largest_root() -> list[Any]:
-        roots = [root.real for root, _ in polynomial.complex_roots()]
-        return [reduce(lambda left, right: left.max(right), roots) / arb(denominator)]
 
-    return nearest(largest_root)[0]
+def _bounds(number: float, matrix: Any) -> bool:
+    """Returns whether no eigenvalue of a symmetric rational matrix exceeds a number.
+
+    Those of number I - matrix are not negative exactly if the coefficients of its characteristic polynomial alternate.
+    """
+    size = matrix.nrows()
+    identity = fmpq_mat(size, size, [int(i == j) for i in range(size) for j in range(size)])
+    whole, _ = (_as_rational(number) * identity - matrix).numer_denom()
+    coefficients = reversed(whole.charpoly().coeffs())
+    return all(entry * (-1) ** power >= 0 for power, entry in enumerate(coefficients))
 
 
 def exponential(generator: np.ndarray, time: float) -> np.ndarray:
@@ -100,7 +111,7 @@ def nearest(balls: Callable[[], list[Any]]) -> list[float]:
         with ctx.workprec(precision):
             numbers = balls()
             if all(number.is_finite() for number in numbers):
-                ends = [[_nearest_to(end(number).fmpq()) for number in numbers] for end in (arb.lower, arb.upper)]
+                ends = [[_nearest_to_end(end(number)) for number in numbers] for end in (arb.lower, arb.upper)]
                 if ends[0] == ends[1]:
                     return ends[0]
                 if precision >= LAST_PRECISION:
@@ -108,6 +119,19 @@ def nearest(balls: Callable[[], list[Any]]) -> list[float]:
         if precision >= LAST_PRECISION:
             raise OverflowError("a number cannot be enclosed closely enough")
         precision *= 2
+
+
+def _nearest_to_end(end: Any) -> float:
+    """Returns the float64 next to the end of a ball, which as a rational number might fill the memory.
+
+    Raises:
+        OverflowError: If it is too large for one.
+    """
+    if abs(end) < SMALLEST:
+        return 0.0
+    if abs(end) > LARGEST:
+        raise OverflowError("a number is too large for a float64")
+    return _nearest_to(end.fmpq())
 
 
 def _tie(low: float, high: float) -> float:

@@ -197,8 +197,8 @@ def _unconditional_set(plant: LinearPlant) -> ErrorSet:
             "the estimator error_set=certified_error_set(plant, contract) with the channel's contract"
         )
     # In coordinates z = T^-1 x, with W = (T T')^-1, the weight is the identity and units do not matter.
-    T = np.linalg.cholesky(np.linalg.inv(plant.weight))
-    inverse, identity = np.linalg.inv(T), np.eye(plant.n)
+    inverse, identity = np.linalg.cholesky(plant.weight).T, np.eye(plant.n)
+    T = np.linalg.inv(inverse)
     A = inverse @ plant.A @ T
     D = inverse @ plant.disturbance.shape @ inverse.T
     D = D + THICKENING * float(np.trace(D)) / plant.n * identity

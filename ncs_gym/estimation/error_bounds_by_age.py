@@ -144,8 +144,8 @@ def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsBy
         contract: The channel's promise.
     """
     # Coordinates z = T^-1 x with W = (T T')^-1, so that units do not matter.
-    T = np.linalg.cholesky(np.linalg.inv(_cost(plant)))
-    inverse = np.linalg.inv(T)
+    inverse = np.linalg.cholesky(_cost(plant)).T
+    T = np.linalg.inv(inverse)
     A, H = inverse @ plant.A @ T, plant.H @ T
     D = inverse @ plant.disturbance.shape @ inverse.T
     D = D + 1e-9 * float(np.trace(D)) / plant.n * np.eye(plant.n)
@@ -186,8 +186,8 @@ def _cost(plant: LinearPlant) -> np.ndarray:
     if plant.error_gain is not None:
         K = plant.error_gain / plant.u_max[:, None]
         return plant.weight + NAMED_ANSWER * K.T @ K
-    T = np.linalg.cholesky(np.linalg.inv(plant.weight))
-    inverse = np.linalg.inv(T)
+    inverse = np.linalg.cholesky(plant.weight).T
+    T = np.linalg.inv(inverse)
     K = regulator_gain(inverse @ plant.A @ T, inverse @ plant.B * plant.u_max, EFFORT, DECAY)
     if K is None:
         return plant.weight

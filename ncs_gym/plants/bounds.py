@@ -14,7 +14,7 @@ from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.remainder import Remainder, as_remainder
 from ncs_gym.uncertainty.shape_matrices import outer_sum
-from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_KEPT, TruncatedGaussian, truncation_energy
+from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_DELTA, SMALLEST_KEPT, TruncatedGaussian, truncation_energy
 from ncs_gym.validation import ReadOnlyArrays, as_covariance, as_number, read_only
 
 # Relative growth of every hard bound, so that rounding in sampling and quantizing stays inside (theory.md section 1).
@@ -23,8 +23,6 @@ INFLATION = 1.0 + 1e-9
 FLAT_INFLATION = 1e-12
 # No disturbance set is thinner than this, in squared half-widths of the safe box.
 THINNEST = 1e-19
-# Smaller truncation levels have no finite quantile in float64.
-SMALLEST_DELTA = 1e-12
 # Simulating a step in float64 rounds; the disturbance bound has room for that up to this many half-widths out.
 SIMULATED_REACH = 100.0
 
@@ -189,7 +187,7 @@ class HardBounds(ReadOnlyArrays):
     @cached_property
     def initial_error(self) -> Ellipsoid:
         """Holds the error of the first estimate, shape (n, n), with slack for rounding."""
-        return Ellipsoid(INFLATION * self.nominal_initial_error.shape + self.estimate_rounding)
+        return Ellipsoid(inflated(self.nominal_initial_error.shape) + self.estimate_rounding)
 
     @cached_property
     def estimate_rounding(self) -> np.ndarray:

@@ -25,6 +25,8 @@ ANGLE, RATE = 0.25, 1.5
 # Relative room for the rounding of the environment's own arithmetic in float64, and for what it rounds to float32: the
 # torque, 3 / (m l^2), and the product of both (a float32 scalar times a Python number is a float32).
 ROUNDING, TORQUE_ROUNDING = 1e-9, 3.0 * 2.0**-24
+# At least this much of the fastest rate: the sums of a step are rounded in float64.
+STEP_ROUNDING = 1e-14
 # What the proof is about.
 PROVED_FOR = ("A", "B", "box", "u_max", "dt", "remainder")
 
@@ -104,7 +106,8 @@ def pendulum(gravity: float = GRAVITY, mass: float = MASS, length: float = LENGT
             "with the proved remainder; use a larger mass or length, or ncs_gym.linear_model"
         )
     slope = STEP * pull * 0.5 * (1.0 + ratio)
-    left_out = STEP * (pull * ANGLE * 0.5 * (1.0 - ratio) + gain * TORQUE * TORQUE_ROUNDING) * (1.0 + ROUNDING)
+    left_out = STEP * (pull * ANGLE * 0.5 * (1.0 - ratio) + gain * TORQUE * TORQUE_ROUNDING)
+    left_out = max(left_out * (1.0 + ROUNDING), left_out + STEP_ROUNDING * fastest)
     direction = np.array([[STEP], [1.0]])
     settings = {
         "A": np.array([[1.0, STEP], [0.0, 1.0]]) + slope * np.outer(direction, [1.0, 0.0]),

@@ -44,7 +44,7 @@ def as_bound(value: Any, size: int, name: str) -> Ellipsoid:
         return value
     if _is_pair(value):
         E = as_matrix(value[0], (size, None), f"{name}: E of d = E w")
-        return _around_box(E, _as_sizes(value[1], E.shape[1], f"{name}: w of d = E w"))
+        return _around_box(E, _as_sizes(value[1], E.shape[1], f"{name}: w of d = E w"), name)
     sizes = as_setting(value)
     if sizes is None or sizes.ndim > 1:
         raise ValueError(
@@ -52,7 +52,7 @@ def as_bound(value: Any, size: int, name: str) -> Ellipsoid:
             f"d = E w (a covariance has an argument of its own), got {shown(value)}"
         )
     widths = _as_sizes(value, size, name)
-    return Ellipsoid(np.diag(np.square(widths))) if sizes.ndim == 0 else _around_box(np.eye(size), widths)
+    return Ellipsoid(np.diag(np.square(widths))) if sizes.ndim == 0 else _around_box(np.eye(size), widths, name)
 
 
 def sample_box(bound: Ellipsoid, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
@@ -107,7 +107,9 @@ def _as_sizes(value: Any, size: int, name: str) -> np.ndarray:
     return np.broadcast_to(sizes, (size,))
 
 
-def _around_box(E: np.ndarray, widths: np.ndarray) -> Ellipsoid:
+def _around_box(E: np.ndarray, widths: np.ndarray, name: str) -> Ellipsoid:
     """Returns q E diag(w^2) E' around {E s : |s_i| <= w_i}, q the number of nonzero w_i."""
     scaled = E * widths
+    if ((E != 0.0) & (widths != 0.0) & (np.abs(scaled) < SMALLEST_SIZE)).any():
+        raise ValueError(f"{name}: the entries of E diag(w) must be 0 or at least {SMALLEST_SIZE:g} in size")
     return Ellipsoid(np.count_nonzero(widths) * exact.product(scaled, scaled.T))

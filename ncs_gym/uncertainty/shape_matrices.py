@@ -53,9 +53,10 @@ def outer_sum(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.n
     """
     a = np.sqrt(max(exact.total(weight * first), 0.0))
     b = np.sqrt(max(exact.total(weight * second), 0.0))
-    if b == 0.0:
+    if not (first.any() and second.any()):
         return first + second
-    nu = min(max(a / (a + b), SMALLEST_MULTIPLIER), 1.0 - SMALLEST_MULTIPLIER)
+    share = a / (a + b) if a + b > 0.0 else 0.5  # traces may underflow
+    nu = min(max(share, SMALLEST_MULTIPLIER), 1.0 - SMALLEST_MULTIPLIER)
     return first / nu + second / (1.0 - nu)
 
 

@@ -15,7 +15,6 @@ from shields.synthesis.initial_designs import (
 )
 from shields.synthesis.invariant_set_program import InvariantSetProgram, max_slack_gain
 from shields.synthesis.multipliers import best_input_multipliers, best_multipliers, with_best_multipliers
-from shields.synthesis.round_numbers import in_round_numbers
 
 # Some plants still gain 1 % of volume per alternation after ten of them.
 _ALTERNATIONS = 40
@@ -48,7 +47,7 @@ def largest_set(problem: DesignProblem, slack: float, report: ProgressCallback) 
             if step < _SMALLEST_STEP:
                 break
         best = better
-    return in_round_numbers(problem, best, slack) or with_best_gain(problem, best)
+    return best
 
 
 def _alternate(

@@ -23,6 +23,7 @@ from shields.synthesis.design_problem import CandidateDesign, DesignProblem, des
 from shields.synthesis.diagnosis import infeasibility, with_feasible_bounds
 from shields.synthesis.max_margin_gain import max_margin_gain
 from shields.synthesis.multipliers import best_input_multipliers, best_multipliers, with_best_multipliers
+from shields.synthesis.round_numbers import in_round_numbers
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from shields.synthesis.share_of_box import share_of_box
 from shields.verification import Report, verify
@@ -132,15 +133,19 @@ def _largest_certificate(plant: LinearPlant, contract: ChannelContract | None, p
 
     try:
         for slack in _SLACKS:
-            design = largest_set(problem, slack, report)
-            if design is None:
+            found = largest_set(problem, slack, report)
+            if found is None:
                 break
-            report("exact verification", design)
-            certificate = _certificate(plant, problem, design, errors, slack)
-            verification = verify(certificate, plant)
-            if verification.valid:
-                return _with_tolerated_scale(certificate, problem)
-            failure = _failed_verification(verification)
+            for finished in (in_round_numbers(problem, found, slack), found):
+                if finished is None:
+                    continue
+                design = with_best_gain(problem, finished) if finished is found else finished
+                report("exact verification", design)
+                certificate = _certificate(plant, problem, design, errors, slack)
+                verification = verify(certificate, plant)
+                if verification.valid:
+                    return _with_tolerated_scale(certificate, problem)
+                failure = _failed_verification(verification)
     except KeyboardInterrupt as interrupt:
         stage, design = reached
         best = design and _certificate(plant, problem, with_best_gain(problem, design), errors, slack)
@@ -259,4 +264,4 @@ def _multipliers(problem: DesignProblem, design: CandidateDesign, lam_e: float) 
 
 def _rounded_down(multipliers: tuple[float, float, float]) -> tuple[float, ...]:
     """Returns multipliers of few digits, so much smaller that rounding cannot lift lx + le + ld above 1."""
-    return tuple(exact.rounded((1.0 - 2e-12) * np.array(multipliers), _DIGITS).tolist())
+    return tuple(float(exact.rounded((1.0 - 1e-11) * multiplier, _DIGITS)) for multiplier in multipliers)

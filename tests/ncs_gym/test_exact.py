@@ -62,8 +62,11 @@ def test_tie_between_two_floats_goes_to_the_even_one_and_what_is_unknown_is_an_e
 
 
 def test_model_that_explodes_within_a_step_is_one_sentence():
-    with pytest.raises(ValueError, match="grows beyond all numbers within a step of 1e\\+06 s: give a smaller dt"):
-        zero_order_hold(np.array([[1.0]]), np.array([[1.0]]), 1e6)
+    for size in (1e3, 1e13, 1e20):
+        with pytest.raises(ValueError, match="grows beyond all numbers within a step of 1 s: give a smaller dt"):
+            zero_order_hold(np.array([[size]]), np.array([[1.0]]), 1.0)
+        A, B = zero_order_hold(np.array([[-size]]), np.array([[1.0]]), 1.0)
+        assert (A.item(), B.item()) == (0.0, 1.0 / size)  # as rational numbers these would fill the memory
 
 
 @pytest.mark.parametrize("n", [1, 2, 4])
@@ -74,6 +77,9 @@ def test_largest_eigenvalue_is_numpys_to_its_rounding(n):
     assert exact.largest_eigenvalue(symmetric) == pytest.approx(np.linalg.eigvalsh(symmetric)[-1], rel=1e-12)
     assert exact.largest_eigenvalue(np.diag([1.0, 3.0, 2.0])) == 3.0
     assert exact.largest_eigenvalue(np.array([[2.0, 1.0], [1.0, 2.0]])) == 3.0
+    close = np.array([[2.0, 0.0, 0.0], [0.0, 2.0, 1e-300], [0.0, 1e-300, 2.0]])
+    assert exact.largest_eigenvalue(close) == np.nextafter(2.0, 3.0)
+    assert exact.largest_eigenvalue(np.zeros((2, 2))) == 0.0
 
 
 def test_rounding_keeps_digits_of_the_largest_number():

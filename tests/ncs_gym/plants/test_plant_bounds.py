@@ -14,6 +14,7 @@ from ncs_gym import BoxDisturbance, Ellipsoid, Estimator, LinearPlant, NoNoiseWa
 from ncs_gym.plants import description
 from ncs_gym.processes import inverted_pendulum, nonlinear_cart_pole, pendulum
 from ncs_gym.uncertainty.disturbance_settings import BY_NAME, as_disturbance
+from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
 
 BOUNDS = {"disturbance_bound": 0.01, "sensor_bound": 0.02, "initial_bound": 0.03}
 SETS = {"disturbance_bound": "disturbance", "sensor_bound": "sensor_error", "initial_bound": "initial_error"}
@@ -228,3 +229,21 @@ def test_assumptions_name_what_is_zero_and_what_is_truncated():
     assert "Gaussian" not in nothing
     (sentence,) = truck_trailer(delta=0.01).assumptions
     assert "99 % (delta = 0.01) of process_noise_cov, measurement_noise_cov, initial_cov, not the rest" in sentence
+
+
+@pytest.mark.parametrize("delta", [float("nan"), 0, -1.0, None, [0.05], "x"])
+def test_truncation_level_of_a_registered_plant_is_one_sentence(delta):
+    with pytest.raises(ValueError, match=r"delta must be a number >= 1e-12 and <= 0\.999"):
+        ncs_gym.cart_pole(delta=delta)
+
+
+def test_directions_so_small_that_their_square_is_zero_are_refused():
+    with pytest.raises(ValueError, match="sensor_bound: the entries of E diag"):
+        plain(sensor_bound=([[1e-200], [1e-200]], 1.0))
+
+
+def test_first_error_along_an_oblique_line_is_held_in_rational_arithmetic():
+    for ratio in np.random.default_rng(0).uniform(-2.0, 2.0, 200):
+        bound = plain(initial_bound=([[1.0], [ratio]], 1.0)).initial_error
+        line = rational(np.array([[1.0], [ratio]]))
+        assert is_positive_semidefinite(subtract(rational(bound.shape), congruence(line, rational(np.ones((1, 1))))))

@@ -6,8 +6,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import ChannelContract, LinearPlant, certified_error_set, truck_trailer
+from ncs_gym import ChannelContract, LinearPlant, certified_error_set, exact, truck_trailer
 from shields import Infeasible, SafetyShield, synthesize
+from shields.synthesis.alternating_optimization import largest_set
+from shields.synthesis.design_problem import design_problem
+from shields.synthesis.round_numbers import in_round_numbers
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from tests.plants import random_plant
 from tests.verdicts import verified
@@ -244,3 +247,22 @@ def test_solver_whose_answers_are_a_little_wrong_gives_no_false_certificate(monk
     except Infeasible:
         return
     assert verified(certificate, plant).valid
+
+
+@pytest.mark.parametrize(("a", "b", "contract"), [(0.0, 1.0, None), (0.5, 0.0, None), (0.5, 1e-6, None), (0.0, 1.0, 2)])
+def test_gain_that_hardly_matters_leaves_positive_multipliers(a, b, contract):
+    """The multiplier of an error that no input answers to is tiny, and must not be rounded to zero."""
+    bounds = {"disturbance_bound": 0.1, "sensor_bound": 0.003, "initial_bound": 0.01}
+    plant = LinearPlant(A=[[a]], B=[[b]], u_max=1.0, dt=0.1, box=[1.0], **bounds)
+    certificate = synthesize(plant, contract=contract and ChannelContract(contract))
+    assert certificate.provenance["volume_of_box_ellipsoid"] > 0.9999
+
+
+def test_design_in_round_numbers_loses_next_to_nothing():
+    for env_id in ("ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0", "ncs_gym/Pendulum-v0"):
+        env = gym.make(env_id).unwrapped
+        problem, _ = design_problem(env.plant, env.certificate_contract)
+        found = largest_set(problem, 1e-6, lambda stage, design: None)
+        rounded = in_round_numbers(problem, found, 1e-6)
+        assert rounded.log_det > found.log_det - 1e-4
+        np.testing.assert_allclose(rounded.K, exact.rounded(rounded.K, 8, axis=1), rtol=0, atol=1e-12)
