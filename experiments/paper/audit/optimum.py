@@ -10,7 +10,7 @@ from experiments.paper.audit.claim import PRINTED_DIGITS, Claim, Defect, Verdict
 from experiments.paper.audit.constraints import misread_alpha
 from experiments.paper.paper_example import PaperExample
 from shields.paper.bounds import PaperBounds
-from shields.paper.reduced_problem import ReducedProblem
+from shields.paper.optimization_problem import OptimizationProblem
 
 
 def optimum_claim(example: PaperExample) -> Claim:
@@ -57,10 +57,11 @@ def optimum(example: PaperExample, u_max: float, *, with_misread_margin: bool = 
     if not with_misread_margin:
         rho = 1.0 / example.kappa
     bounds = PaperBounds(example.kappa, rho, epsilon_up, example.epsilon, misread_alpha(example))
-    found = ReducedProblem(plant).largest_set(bounds, with_margin=with_misread_margin, with_error=with_misread_margin)
+    problem = OptimizationProblem(plant)
+    found = problem.solution(bounds, with_margin=with_misread_margin, with_error=with_misread_margin)
     if found is None:
         raise ArithmeticError(f"the solver found no optimum of OP at u_max = {u_max:g}")
-    return found
+    return found.L, found.K
 
 
 def _text(L: np.ndarray, K: np.ndarray) -> str:

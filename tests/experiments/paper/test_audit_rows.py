@@ -15,7 +15,7 @@ from experiments.paper.audit.theorems import ONLY_IF, contracts, equivalence_cla
 from experiments.paper.paper_example import PaperExample
 from ncs_gym import BoxDisturbance, truck_trailer
 from shields.paper.bounds import PaperModel
-from shields.paper.optimization_problem import solve_op
+from shields.paper.optimization_problem import OptimizationProblem
 from shields.verification.rational_matrix import add, multiply, quadratic, rational, to_float, transpose
 
 CASE = PaperExample()
@@ -72,8 +72,9 @@ def test_gain_that_is_the_optimum_at_the_printed_limit_would_hold():
 def test_tail_at_delta_makes_op_feasible_and_the_printed_tail_does_not():
     plant, point = truck_trailer(), (0.9, 1.035)
     tail = -2.0 * np.log(0.95)  # the chi-square quantile of two degrees of freedom in closed form
-    assert solve_op(plant, PaperModel(plant, quantile=tail).at(*point)) is not None
-    assert solve_op(plant, PaperModel(plant).at(*point)) is None
+    problem = OptimizationProblem(plant)
+    assert problem.solution(PaperModel(plant, quantile=tail).at(*point)) is not None
+    assert problem.solution(PaperModel(plant).at(*point)) is None
 
 
 def test_largest_error_is_undecided_exactly_between_the_two_readings():
