@@ -10,7 +10,7 @@ from experiments.attack import monte_carlo_batch
 from experiments.attack.attack_cases import AttackCase, attack_cases
 from experiments.attack.campaign import Campaign
 from experiments.attack.counts_store import CountsStore
-from experiments.attack.gaussian_table import gaussian_table, require_within
+from experiments.attack.counts_table import gaussian_table, require_within
 from experiments.attack.monte_carlo_batch import MonteCarloBatch, run_batch
 from experiments.attack.safety_counts import SafetyCounts
 from experiments.commands import certify as command
