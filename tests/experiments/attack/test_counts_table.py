@@ -1,4 +1,4 @@
-"""The tables of `ncs certify` fit into a terminal and say all that was counted."""
+"""The tables of `ncs attack` fit into a terminal and say all that was counted."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""`ncs certify`: attacks shielded control loops by Monte Carlo simulation with worst-case disturbances."""
+"""`ncs attack`: attacks shielded control loops by Monte Carlo simulation with worst-case disturbances."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from shields.atomic_write import write_atomically
 from shields.runtime.safety_filter import DEFAULT_HORIZON
 
 
-def certify(settings: CertifySettings) -> None:
-    """Runs `ncs certify`.
+def attack(settings: CertifySettings) -> None:
+    """Runs `ncs attack`.
 
     Raises:
         SafetyBroken: If a shielded state left S or its box (in mode "lookahead": its box), or a proof did not hold,
@@ -48,12 +48,12 @@ def certify(settings: CertifySettings) -> None:
     cases = campaign.cases()
     if campaign.shielded:
         _require_claims(cases)
-    with claim_folder("certify", settings):
-        _certify_in_folder(settings, campaign, cases)
+    with claim_folder("certify", settings):  # the name of the command in files
+        _attack_in_folder(settings, campaign, cases)
 
 
-def _certify_in_folder(settings: CertifySettings, campaign: Campaign, cases: dict[str, AttackCase]) -> None:
-    """Executes the batches that are missing, prints the table and writes the counts; raises as `certify` says."""
+def _attack_in_folder(settings: CertifySettings, campaign: Campaign, cases: dict[str, AttackCase]) -> None:
+    """Executes the batches that are missing, prints the table and writes the counts; raises as `attack` says."""
     certificates = _certificate_files(cases, settings.out / "certificates")
     keys = {case: f"{campaign.key} {Certificate.load(file).checksum}" for case, file in certificates.items()}
     if campaign.env is not None:  # what a module registers may change
