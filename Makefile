@@ -64,7 +64,6 @@ benchmark: $(INSTALLED) $(RAY_INSTALLED)
 	$(BIN)/python benchmarks/verification.py
 	$(BIN)/python benchmarks/numerical_trust.py
 	$(BIN)/python benchmarks/environment_speed.py
-	$(BIN)/python benchmarks/optimization_problem_grid.py
 	$(BIN)/python benchmarks/rendering.py
 	$(BIN)/python benchmarks/ppo_settings.py
 	$(BIN)/python benchmarks/ray_overhead.py

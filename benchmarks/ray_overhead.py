@@ -15,12 +15,14 @@ import time
 import tracemalloc
 import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
 
 from agents.settings import PPOSettings
 from experiments.backends import ray_backend, ray_cluster
+from experiments.backends.job import Job
 from experiments.runs import RunStore, TrainingRun, execute_run, versions
 from experiments.settings import BackendSettings, SweepSettings
 from ncs_gym.envs.env import ncs_env
@@ -36,14 +38,16 @@ def through_ray(function, runs: list[TrainingRun], store: RunStore | None = None
     def execute(some: list[TrainingRun]) -> int:
         collected = set()
 
-        def keep(run: TrainingRun, result) -> None:
+        def keep(job: Job, result) -> None:
+            run = of_job[job]
             collected.add(run.index)
             if store is not None:
                 store.save(run, result)
 
+        of_job = {Job(run.name, run.total_steps, partial(execute_run, run)): run for run in some}
         ray_cluster.execute_submitted(
-            some,
-            lambda run: task.remote(expected, pickle.dumps(run)),
+            of_job,
+            lambda job: task.remote(expected, pickle.dumps(job.work)),
             ray_backend._finished,
             ray_backend._result,
             ray_backend._cancel,

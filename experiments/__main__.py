@@ -34,10 +34,12 @@ COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
     "render": ("RenderSettings", "experiments.commands.render:render", {"render": ("pygame",)}),
     "synthesize": ("SynthesizeSettings", "experiments.commands.synthesize:synthesize", {}),
     "verify": ("VerifySettings", "experiments.commands.verify:verify", {}),
-    "certify": ("CertifySettings", "experiments.commands.certify:certify", {}),
+    "attack": ("CertifySettings", "experiments.commands.attack:attack", {}),
     "audit": ("AuditSettings", "experiments.commands.audit:audit", {}),
     "reproduce": ("ReproduceSettings", "experiments.commands.reproduce:reproduce", {}),
 }
+# Other names of commands.
+_ALIASES = {"certify": "attack"}
 
 
 def main() -> None:
@@ -76,6 +78,8 @@ def _parse(arguments: list[str]) -> object:
     from experiments import settings
     from experiments.settings.help_levels import at_help_level
 
+    if arguments:
+        arguments = [_ALIASES.get(arguments[0], arguments[0]), *arguments[1:]]
     kinds = {name: getattr(settings, kind) for name, (kind, _, _) in COMMANDS.items()}
     arguments, kinds = at_help_level(arguments, kinds)
     command, rest = "".join(arguments[:1]), arguments[1:]

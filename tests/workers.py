@@ -57,6 +57,5 @@ def no_worker_processes() -> Iterator[None]:
     with (
         mock.patch("experiments.backends.worker_processes.ProcessPoolExecutor", _Executor),
         mock.patch("experiments.backends.worker_processes.SyncManager", _Manager),
-        mock.patch("experiments.attack.campaign_execution.ProcessPoolExecutor", _Executor),
     ):
         yield

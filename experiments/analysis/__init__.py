@@ -10,7 +10,7 @@ from experiments.analysis.statistics import (
     stratified_interval,
 )
 from experiments.analysis.summary import arm_summary, paired_differences, summarize_arm
-from experiments.analysis.text_table import text_table
+from experiments.analysis.terminal_text import text_table
 
 __all__ = [
     "all_pairs",

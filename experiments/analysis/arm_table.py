@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from math import floor, log10
 from typing import Any
 
-from experiments.analysis.text_table import text_table
+from experiments.analysis.terminal_text import text_table
 
 _HEADERS = (
     ("", "training:", "", "evaluation:", "", "", "", ""),

@@ -50,18 +50,7 @@ def bootstrap_interval(
         values: Independent values.
         statistic: Function of an array of resampled values and the `axis` over which it is computed.
     """
-    if len(values) < 2:
-        return None
-    result = bootstrap(
-        (np.asarray(values),),
-        statistic,
-        n_resamples=RESAMPLES,
-        batch=_BATCH,
-        confidence_level=CONFIDENCE,
-        method="percentile",
-        rng=np.random.default_rng(0),
-    )
-    return float(result.confidence_interval.low), float(result.confidence_interval.high)
+    return _percentile_interval([values], statistic, _BATCH)
 
 
 def stratified_interval(
@@ -76,9 +65,26 @@ def stratified_interval(
         strata: Values of the runs in each environment.
         statistic: Function of an array of resampled values and the `axis` over which it is computed.
     """
+
+    def of_all(*resampled: np.ndarray, axis: int) -> float:
+        return statistic(np.concatenate(resampled, axis=axis), axis=axis)
+
+    return _percentile_interval(strata, of_all, RESAMPLES)
+
+
+def _percentile_interval(
+    strata: Sequence[Sequence[float]], statistic: Callable[..., float], batch: int
+) -> tuple[float, float] | None:
+    """Returns the interval of a function of the resampled strata and an `axis`; None for fewer than two values."""
     if not strata or min(map(len, strata)) < 2:
         return None
-    rng = np.random.default_rng(0)
-    drawn = [rng.choice(np.asarray(values, np.float64), (RESAMPLES, len(values))) for values in strata]
-    low, high = np.quantile(statistic(np.hstack(drawn), axis=1), [0.5 - CONFIDENCE / 2.0, 0.5 + CONFIDENCE / 2.0])
-    return float(low), float(high)
+    found = bootstrap(
+        [np.asarray(values, np.float64) for values in strata],
+        statistic,
+        n_resamples=RESAMPLES,
+        batch=batch,
+        confidence_level=CONFIDENCE,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    ).confidence_interval
+    return float(found.low), float(found.high)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from experiments.analysis.text_table import text_table
+from experiments.analysis.terminal_text import text_table
 from experiments.runs.arms import Arm
 
 # Two lines of the header of what a point of the grid fixes, by its key.

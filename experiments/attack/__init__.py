@@ -1,4 +1,4 @@
-"""The Monte Carlo campaign behind `ncs certify`: worst-case disturbances and hostile agents against shielded loops."""
+"""The Monte Carlo campaign behind `ncs attack`: worst-case disturbances and hostile agents against shielded loops."""
 
 from experiments.attack.attack_cases import AttackCase
 from experiments.attack.campaign import Campaign

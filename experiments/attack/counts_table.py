@@ -1,12 +1,14 @@
-"""The counts of a campaign as a table: of the shields that keep S, and of mode "lookahead", which keeps the box."""
+"""The counts of a campaign as tables, and whether they are what the shield, or the bound on Gaussian noise, claims."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from experiments.analysis.text_table import text_table
+from experiments.analysis.escapes import rounded_up
+from experiments.analysis.terminal_text import text_table
 from experiments.attack.monte_carlo_batch import SETTLING_STEPS
 from experiments.attack.safety_counts import SafetyCounts
+from experiments.errors import SafetyBroken
 
 # Text of a column by the two lines of its header.
 _Columns = dict[tuple[str, str], Callable[[SafetyCounts], str]]
@@ -52,6 +54,10 @@ failed: episodes that left the box; p <: upper end of the exact 95 % interval of
 margin: smallest 1 - |c_j x| from step {SETTLING_STEPS} on;
 planned: steps with inputs of a certified plan in store; overridden: steps that the shield changed"""
 
+GAUSSIAN_LEGEND = """failed: episodes that left S or the box; interval: the exact 95 % interval of their probability;
+bound: the union bound on it over all draws of noise, for the shielded loop;
+a bound of 1 says nothing (--delta makes it small)"""
+
 # What the channels of `attack_cases` do.
 _CHANNELS = {
     "its channel": "the environment's own",
@@ -95,3 +101,43 @@ def counts_table(counts: Mapping[str, SafetyCounts], *, looks_ahead: bool) -> st
 
 def _row(name: str, counts: SafetyCounts, columns: _Columns) -> list[str]:
     return [name, *(text_of(counts) for text_of in columns.values())]
+
+
+def gaussian_table(counts: Mapping[str, SafetyCounts], limits: Mapping[str, float]) -> str:
+    """Returns the observed exits of each case, their exact interval and the bound on their probability, as text."""
+    rows = [["case", "episodes", "failed", "interval", "bound"]]
+    for name, case in counts.items():
+        low, high = case.interval
+        numbers = f"{case.episodes:,}", f"{case.broken_episodes:,}"
+        rows.append([name, *numbers, f"[{low:.1e}, {high:.1e}]", rounded_up(limits[name])])
+    return text_table(rows, rules=(1,))
+
+
+def require_within(counts: Mapping[str, SafetyCounts], limits: Mapping[str, float]) -> None:
+    """Returns if no case's exact interval lies above its bound.
+
+    Raises:
+        SafetyBroken: If one does: then the bound does not hold, or there is an error of one in forty per case.
+    """
+    for name, case in counts.items():
+        if case.interval[0] > limits[name]:
+            raise SafetyBroken(
+                f"{name}: {case.broken_episodes:,} of {case.episodes:,} episodes left S, more than the bound "
+                f"{rounded_up(limits[name])} on their probability allows"
+            )
+
+
+def require_safe(total: SafetyCounts, *, looks_ahead: bool) -> None:
+    """Returns if the shield kept what it claims in every step.
+
+    Args:
+        total: Counts of all cases.
+        looks_ahead: Whether the shield was that of mode "lookahead", which does not claim to stay in S.
+
+    Raises:
+        SafetyBroken: If it did not.
+    """
+    exits = 0 if looks_ahead else total.exits
+    if exits or total.violations or total.unproved:
+        outside_set = "" if looks_ahead else f"{exits:,} steps outside S, "
+        raise SafetyBroken(f"{outside_set}{total.violations:,} outside the box, {total.unproved:,} without a proof")

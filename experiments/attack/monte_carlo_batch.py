@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
@@ -34,13 +35,19 @@ class MonteCarloBatch:
     index: int
 
 
-def run_batch(campaign: Campaign, batch: MonteCarloBatch, certificate: Path) -> SafetyCounts:
+def run_batch(
+    campaign: Campaign,
+    batch: MonteCarloBatch,
+    certificate: Path,
+    on_progress: Callable[[int], object] = lambda steps: None,
+) -> SafetyCounts:
     """Returns the counts of a batch, the same in any process and after any other batch.
 
     Args:
         campaign: Settings of the campaign.
         batch: The batch.
         certificate: File with the certificate of the batch's case.
+        on_progress: Called with the number of steps taken since its last call.
 
     Raises:
         CertificateError: If the certificate is damaged or does not verify for the case's plant.
@@ -72,6 +79,7 @@ def run_batch(campaign: Campaign, batch: MonteCarloBatch, certificate: Path) -> 
         if step >= SETTLING_STEPS:
             level = float(np.nan_to_num(reached, nan=np.inf).max(initial=0.0, where=claimed))
             counts += SafetyCounts(level=level)
+        on_progress(campaign.envs)
     return counts + SafetyCounts(broken_episodes=int(broken.sum()))
 
 

@@ -1,20 +1,53 @@
-"""Executes the training runs of an experiment that were not finished before."""
+"""Executes the jobs of an experiment, and keeps its results so that it goes on where it was interrupted."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from tqdm import tqdm
 
 from experiments.backends import worker_processes
-from experiments.runs import RunResult, RunStore, TrainingRun
+from experiments.backends.job import Job, OnResult
+from experiments.runs import RunResult, RunStore, TrainingRun, execute_run
 from experiments.settings import BackendSettings
 
 # Period of the progress bar on a terminal and in a file [s].
 _TERMINAL_PERIOD, _FILE_PERIOD = 0.5, 20.0
+
+
+def execute(jobs: Sequence[Job], settings: BackendSettings, on_result: OnResult, *, counted: str | None = None) -> None:
+    """Executes jobs, with a progress bar on stderr; the first failure stops the others and is raised.
+
+    Args:
+        jobs: Jobs with different names.
+        settings: Where they are executed.
+        on_result: Called here with each job and its result when it is finished.
+        counted: What the steps belong to, in front of the bar; None if there is only one thing.
+
+    Raises:
+        RunError: If a job fails.
+        ClusterError: If a cluster cannot execute the jobs.
+    """
+    period = _TERMINAL_PERIOD if sys.stderr.isatty() else _FILE_PERIOD
+    with tqdm(
+        total=sum(job.steps for job in jobs),
+        desc=counted,
+        unit="step",
+        unit_scale=True,
+        mininterval=period,
+        miniters=0,
+        file=sys.stderr,
+    ) as bar:
+        if settings.engine == "ray":
+            from experiments.backends import ray_backend  # needs the extra "ray"
+
+            ray_backend.execute_all(jobs, settings, on_result, bar.update)
+        else:
+            worker_processes.execute_all(jobs, settings.jobs, on_result, bar.update)
 
 
 def results_of(runs: Sequence[TrainingRun], folder: Path, settings: BackendSettings) -> list[RunResult]:
@@ -31,50 +64,30 @@ def results_of(runs: Sequence[TrainingRun], folder: Path, settings: BackendSetti
         ClusterError: If a cluster cannot execute the runs.
         OSError: If the folder cannot be written.
     """
-    if len({run.name for run in runs}) < len(runs):
+    by_name = {run.name: run for run in runs}
+    if len(by_name) < len(runs):
         raise ValueError("two training runs have the same name")
     store = RunStore(folder)
     results = {run.name: _without_files(result) for run in runs if (result := store.load(run)) is not None}
     missing = [run for run in runs if run.name not in results]
     if results:
         print(f"{len(results)} of {len(runs)} runs were finished before", file=sys.stderr)
-    if not missing:
-        return [results[run.name] for run in runs]
-    counted = "training and evaluation" if any(run.trains for run in missing) else "evaluation"
-    with progress_bar(sum(run.total_steps for run in missing), counted) as bar:
 
-        def keep(run: TrainingRun, result: RunResult) -> None:
-            store.save(run, result)
-            results[run.name] = _without_files(result)
-            bar.write(f"{run.name}: {_described(result)}", file=sys.stderr)
+    def keep(job: Job, result: RunResult) -> None:
+        store.save(by_name[job.name], result)
+        results[job.name] = _without_files(result)
+        tqdm.write(f"{job.name}: {_described(result)}", file=sys.stderr)
 
-        if settings.engine == "ray":
-            from experiments.backends import ray_backend  # needs the extra "ray"
-
-            ray_backend.execute_all(missing, settings, keep, bar.update)
-        else:
-            jobs = min(settings.jobs, len(missing))
-            worker_processes.execute_all(missing, jobs, keep, bar.update, folder / "tensorboard")
+    if missing:
+        logs = folder / "tensorboard" if settings.engine == "local" else None  # nodes do not write into the folder
+        jobs = [_job(run, logs and logs / run.name) for run in missing]
+        counted = "training and evaluation" if any(run.trains for run in missing) else "evaluation"
+        execute(jobs, settings, keep, counted=counted)
     return [results[run.name] for run in runs]
 
 
-def progress_bar(total_steps: int, counted: str | None = None) -> tqdm:
-    """Returns a progress bar of simulated steps on stderr.
-
-    Args:
-        total_steps: Number of steps in all.
-        counted: What the steps belong to, in front of the bar; None if there is only one thing.
-    """
-    period = _TERMINAL_PERIOD if sys.stderr.isatty() else _FILE_PERIOD
-    return tqdm(
-        total=total_steps,
-        desc=counted,
-        unit="step",
-        unit_scale=True,
-        mininterval=period,
-        miniters=0,
-        file=sys.stderr,
-    )
+def _job(run: TrainingRun, log_folder: Path | None) -> Job:
+    return Job(run.name, run.total_steps, partial(execute_run, run, log_folder=log_folder))
 
 
 def _described(result: RunResult) -> str:

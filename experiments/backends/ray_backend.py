@@ -1,4 +1,4 @@
-"""Executes training runs on a Ray cluster. Scheduling and retries are Ray's; the driver alone writes results."""
+"""Executes jobs on a Ray cluster. Scheduling and retries are Ray's; the driver alone writes results."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from typing import Any
 import ray  # pyright: ignore[reportMissingImports]
 from ray.exceptions import LocalRayletDiedError, RayError, RayTaskError  # pyright: ignore[reportMissingImports]
 
+from experiments.backends.job import Job, OnResult
 from experiments.backends.ray_cluster import execute_submitted, portable_task, require_answer
 from experiments.errors import ClusterError, RunError
-from experiments.runs import RunResult, TrainingRun, versions
+from experiments.runs import versions
 from experiments.settings import BackendSettings
 from experiments.settings.backend import OWN_CLUSTER
 
@@ -29,22 +30,19 @@ _SOURCE_FOLDER = Path(__file__).resolve().parents[2]
 
 
 def execute_all(
-    runs: Sequence[TrainingRun],
-    settings: BackendSettings,
-    on_result: Callable[[TrainingRun, RunResult], None],
-    on_progress: Callable[[int], object],
+    jobs: Sequence[Job], settings: BackendSettings, on_result: OnResult, on_progress: Callable[[int], object]
 ) -> None:
-    """Executes all runs; the first failure stops the others and is raised.
+    """Executes all jobs; the first failure stops the others and is raised.
 
     Args:
-        runs: Training runs.
-        settings: Address of the cluster and resources of a run.
-        on_result: Called with every run and its result when it is finished.
+        jobs: The jobs.
+        settings: Address of the cluster and resources of a job.
+        on_result: Called with every job and its result when it is finished.
         on_progress: Called with the number of steps taken since its last call.
 
     Raises:
         ClusterError: If the cluster cannot be reached, is too small, or has other versions.
-        RunError: If a run fails, or its workers die more often than Ray retries.
+        RunError: If a job fails, or its workers die more often than Ray retries.
     """
     expected = versions()
 
@@ -52,14 +50,16 @@ def execute_all(
         on_progress(0)
         return _finished(references)
 
-    def collect(run: TrainingRun, result: RunResult) -> None:
-        on_result(run, result)
-        on_progress(run.total_steps)
+    def collect(job: Job, result: Any) -> None:
+        on_result(job, result)
+        on_progress(job.steps)
 
     with _connected(settings.ray_address):
         _require_large_node(settings)
         task = _remote(portable_task(), settings)
-        execute_submitted(runs, lambda run: task.remote(expected, pickle.dumps(run)), wait, _result, _cancel, collect)
+        execute_submitted(
+            jobs, lambda job: task.remote(expected, pickle.dumps(job.work)), wait, _result, _cancel, collect
+        )
 
 
 @contextmanager
@@ -122,8 +122,8 @@ def _finished(references: list[Any]) -> list[Any]:
     return ray.wait(references, num_returns=len(references), timeout=0, fetch_local=False)[0] if finished else []
 
 
-def _result(run: TrainingRun, reference: Any) -> RunResult:
-    """Returns the result of a finished run.
+def _result(job: Job, reference: Any) -> Any:
+    """Returns the result of a finished job.
 
     Raises:
         ClusterError: If the node that executed it has other versions, or Ray has ended here.
@@ -134,15 +134,15 @@ def _result(run: TrainingRun, reference: Any) -> RunResult:
     except RayTaskError as error:
         if isinstance(error.cause, ClusterError):
             raise error.cause from error
-        raise RunError.of(run.name, error.cause) from error
+        raise RunError.of(job.name, error.cause) from error
     except LocalRayletDiedError as error:
         raise ClusterError("Ray has ended on this machine: the same command goes on from what is stored") from error
     except RayError as error:
         lost = f"its worker died, {RETRIES} retries included ({type(error).__name__})"
-        raise RunError(f"run {run.name}: {lost}") from error
+        raise RunError(f"run {job.name}: {lost}") from error
 
 
 def _cancel(references: list[Any]) -> None:
-    """Stops runs at once, also those that are being executed."""
+    """Stops jobs at once, also those that are being executed."""
     for reference in references:
         ray.cancel(reference, force=True)

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 
-from experiments.analysis.wrapped_text import terminal_width, wrapped
+from experiments.analysis.terminal_text import terminal_width, wrapped
 from experiments.paper.audit import Claim, Verdict, audited_claims, defects
 from experiments.paper.paper_example import PaperExample
 from experiments.runs import require_place

@@ -15,11 +15,11 @@ from experiments.analysis.arm_table import condition_text, decimals_of, summary_
 from experiments.analysis.escapes import escape_sentences, escape_summary
 from experiments.analysis.parquet_tables import write_tables
 from experiments.analysis.summary import arm_summary, covered_fraction, paired_differences
-from experiments.analysis.wrapped_text import wrapped
+from experiments.analysis.terminal_text import wrapped
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.plots.comparison_figures import comparison_figures
-from experiments.report.comparison import comparison_report
+from experiments.report import comparison_report
 from experiments.runs import (
     Arm,
     ExperimentSetup,

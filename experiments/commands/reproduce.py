@@ -7,7 +7,7 @@ from dataclasses import asdict
 
 from tqdm import tqdm
 
-from experiments.analysis.text_table import text_table
+from experiments.analysis.terminal_text import text_table
 from experiments.paper.reproduction import Outcome, designs, simulate
 from experiments.paper.reproduction_figures import reproduction_figures
 from experiments.runs import claim_folder, prepare_output

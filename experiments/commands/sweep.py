@@ -12,11 +12,11 @@ from typing import Any
 from experiments.analysis.parquet_tables import parquet
 from experiments.analysis.summary import summarize_arm
 from experiments.analysis.sweep_table import sweep_table
-from experiments.analysis.wrapped_text import wrapped
+from experiments.analysis.terminal_text import wrapped
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.plots.heatmaps import sweep_figures
-from experiments.report.sweep import sweep_report
+from experiments.report import sweep_report
 from experiments.runs import Arm, ExperimentSetup, RunResult, by_arm, claim_folder, prepare_output
 from experiments.settings import ChannelSettings, SweepSettings
 from shields.atomic_write import write_atomically

@@ -6,7 +6,7 @@ import json
 
 from experiments.analysis.arm_table import summary_text
 from experiments.analysis.summary import arm_summary
-from experiments.analysis.wrapped_text import wrapped
+from experiments.analysis.terminal_text import wrapped
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.runs import Arm, ExperimentSetup, RunResult, claim_folder, prepare_output

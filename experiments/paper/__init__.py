@@ -1,7 +1,7 @@
 """Liu et al. by their own numbers: the printed example, the audit of the claims, and Section 5 simulated.
 
-`counterexample` and `sets` look for steps that leave a set and confirm them in exact arithmetic; `kalman_filter` is the
-filter of the paper, which the rest of this project does not use.
+`audit` lists the claims; `counterexample` looks for steps that leave a set and confirms them in exact arithmetic, and
+`late_packets` has the filter of the paper, which the rest of this project does not use.
 """
 
 from experiments.paper.audit import Claim, Verdict, audited_claims, defects

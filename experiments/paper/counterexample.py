@@ -1,4 +1,4 @@
-"""Looks for a state, disturbance and error that leave a set in one step, and confirms it exactly."""
+"""Steps that leave a set, looked for in floating point and confirmed in exact arithmetic, and proofs that none does."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from operator import itemgetter
 
 import numpy as np
 
-from experiments.paper.sets import Ball, Box, Segment
 from ncs_gym import Ellipsoid
 from shields.verification.rational_matrix import (
+    Matrix,
     add,
     congruence,
     is_positive_semidefinite,
@@ -28,6 +28,67 @@ _INSIDE = 1.0 - 1e-9
 # Digits that a step is shown with, if it leaves the set with these alone.
 _DECIMALS = 4
 _STARTS, _ASCENT_STEPS = 200, 200
+
+
+@dataclass(frozen=True)
+class Ball:
+    """{z : z'z <= squared_radius}, the set Delta(squared_radius) of (3)."""
+
+    squared_radius: float
+
+    def extreme_point(self, slope: np.ndarray) -> np.ndarray:
+        """Returns the point farthest along a slope, shape (n,)."""
+        length = np.linalg.norm(slope)
+        return self.squared_radius**0.5 * slope / length if length > 0.0 else np.zeros_like(slope)
+
+    def contains(self, point: np.ndarray) -> bool:
+        """Returns whether a point, shape (n,), lies inside, in exact arithmetic."""
+        return _squared(point) <= Fraction(self.squared_radius)
+
+    def exact_shape(self, n: int) -> Matrix:
+        """Returns P with {z : a'z <= sqrt(a'Pa) for all a} the set, as rational numbers."""
+        return scale(Fraction(self.squared_radius), rational(np.eye(n)))
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """{t vector : t^2 vector'vector <= squared_radius}, for a vector of shape (n,)."""
+
+    vector: np.ndarray
+    squared_radius: float
+
+    def extreme_point(self, slope: np.ndarray) -> np.ndarray:
+        """Returns the point farthest along a slope, shape (n,)."""
+        end = (self.squared_radius / (self.vector @ self.vector)) ** 0.5 * self.vector
+        return end if end @ slope >= 0.0 else -end
+
+    def contains(self, point: np.ndarray) -> bool:
+        """Returns whether a point, shape (n,), lies within the ends of the segment, in exact arithmetic.
+
+        The rounding of a point next to the line is not looked at.
+        """
+        return _squared(point) <= Fraction(self.squared_radius)
+
+    def exact_shape(self, n: int) -> Matrix:
+        """Returns P with {z : a'z <= sqrt(a'Pa) for all a} the set, as rational numbers."""
+        factor = Fraction(self.squared_radius) / _squared(self.vector)
+        entries = [Fraction(float(entry)) for entry in self.vector]
+        return [[factor * left * right for right in entries] for left in entries]
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """{z : |z_i| <= half_widths_i}, for half-widths of shape (n,)."""
+
+    half_widths: np.ndarray
+
+    def extreme_point(self, slope: np.ndarray) -> np.ndarray:
+        """Returns the point farthest along a slope, shape (n,)."""
+        return np.where(slope >= 0.0, self.half_widths, -self.half_widths)
+
+    def contains(self, point: np.ndarray) -> bool:
+        """Returns whether a point, shape (n,), lies inside; comparing floats is exact."""
+        return bool((np.abs(point) <= self.half_widths).all())
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,3 +178,82 @@ def _leaves(closed: np.ndarray, M: np.ndarray, x: np.ndarray, d: np.ndarray, e: 
     exact_x, exact_d, exact_e, exact_M = (rational(value) for value in (x, d, e, M))
     following = add(multiply(exact_x, transpose(rational(closed))), exact_d, exact_e)
     return quadratic(exact_x, exact_M) <= 1 < quadratic(following, exact_M)
+
+
+def contracts(closed: np.ndarray, M: np.ndarray) -> bool:
+    """Returns whether (A+BK)'M(A+BK) <= M, which is (C1) at kappa = 1, in exact arithmetic."""
+    exact_M = rational(M)
+    return is_positive_semidefinite(subtract(exact_M, congruence(transpose(rational(closed)), exact_M)))
+
+
+def _squared(point: np.ndarray) -> Fraction:
+    """Returns z'z exactly."""
+    return sum((Fraction(float(entry)) ** 2 for entry in point), Fraction(0))
+
+
+@dataclass(frozen=True)
+class OnlyIfExample:
+    """A set, a closed loop and bounds on which to try the "only if" of Theorem 5, in rational numbers.
+
+    Attributes:
+        M: Matrix of the set {x : x'Mx <= 1}.
+        closed_loop: A + B K.
+        radius: The square root of gamma, and of epsilon.
+        state: A state x of the set, a row, whose image shows how large kappa must be for (Cond.A).
+        witness: A point z with z'Mz <= that kappa, a row, from which d + e along `outwards` leave the set.
+        outwards: Unit vector, a row.
+        weight: Weight of the closed loop's image in the ellipsoid around the sum, in (0, 1).
+    """
+
+    M: Matrix
+    closed_loop: Matrix
+    radius: Fraction
+    state: Matrix
+    witness: Matrix
+    outwards: Matrix
+    weight: Fraction
+
+    @property
+    def is_invariant(self) -> bool:
+        """Whether the set is proved invariant: the sum of the image of the set and of d + e lies in it.
+
+        d + e fills the ball of twice the radius, and the sum lies in the ellipsoid of shape
+        image / weight + ball / (1 - weight), for each weight; M is diagonal, and so is inverted exactly.
+        """
+        size = len(self.M)
+        shape = [[1 / self.M[i][i] if i == j else Fraction(0) for j in range(size)] for i in range(size)]
+        identity = [[Fraction(i == j) for j in range(size)] for i in range(size)]
+        image = scale(1 / self.weight, congruence(self.closed_loop, shape))
+        ball = scale((2 * self.radius) ** 2 / (1 - self.weight), identity)
+        return is_positive_semidefinite(subtract(subtract(shape, image), ball))
+
+    @property
+    def least_kappa(self) -> Fraction:
+        """The kappa that (Cond.A) needs at least, from `state`."""
+        image = multiply(self.state, transpose(self.closed_loop))
+        return quadratic(image, self.M) / quadratic(self.state, self.M)
+
+    @property
+    def witness_level(self) -> Fraction:
+        """(z + d + e)'M(z + d + e) at the witness of (Cond.B)."""
+        return quadratic(add(self.witness, scale(2 * self.radius, self.outwards)), self.M)
+
+    @property
+    def breaks_condition(self) -> bool:
+        """Whether every kappa that meets (Cond.A) breaks (Cond.B)."""
+        return quadratic(self.witness, self.M) <= self.least_kappa and self.witness_level > 1
+
+
+def _diagonal(first: Fraction, second: Fraction) -> Matrix:
+    return [[first, Fraction(0)], [Fraction(0), second]]
+
+
+ONLY_IF = OnlyIfExample(
+    M=_diagonal(Fraction(1), Fraction(100)),
+    closed_loop=_diagonal(Fraction(9, 10), Fraction(0)),
+    radius=Fraction(1, 50),
+    state=[[Fraction(1), Fraction(0)]],
+    witness=[[Fraction(0), Fraction(9, 100)]],
+    outwards=[[Fraction(0), Fraction(1)]],
+    weight=Fraction(5, 6),
+)

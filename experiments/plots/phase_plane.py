@@ -8,9 +8,10 @@ import matplotlib
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from scipy.linalg import null_space, orth
+from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from experiments.plots.arm_style import ArmStyle
-from experiments.plots.ellipsoid_projection import projected_box, projected_ellipsoid
 from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below, with_unit
 from experiments.runs.arms import ResultsByArm
 from ncs_gym import LinearPlant
@@ -21,6 +22,8 @@ _COLUMNS = 4
 # The view is the projection of box and safe set, enlarged by this factor; states farther away are left out.
 _VIEW = 3.0
 _INK = "#222222"
+# Directions whose projection is shorter than this lie across the plane.
+_FLAT = 1e-9
 
 
 def phase_figure(plant: LinearPlant, certificate: Certificate, arms: ResultsByArm) -> CaptionedFigure:
@@ -121,3 +124,40 @@ def _name_axes(panels: Any, plant: LinearPlant, plane: tuple[int, int], count: i
         lowest = at + columns >= count
         label(panel, x if lowest else "", y if at % columns == 0 else "", panel.get_title())
         panel.tick_params(labelbottom=lowest)
+
+
+def projected_ellipsoid(shape: np.ndarray, plane: tuple[int, int], points: int = 361) -> np.ndarray:
+    """Returns the outline of the projection of {x : x' shape^-1 x <= 1} on two coordinates, shape (points, 2).
+
+    The projection of an ellipsoid is the ellipse whose shape is the block of the two coordinates.
+
+    Args:
+        shape: Shape of the ellipsoid, positive definite, shape (n, n).
+        plane: The two coordinates.
+        points: Number of points of the outline.
+    """
+    angle = np.linspace(0.0, 2.0 * np.pi, points)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    return (np.linalg.cholesky(shape[np.ix_(plane, plane)]) @ circle).T
+
+
+def projected_box(rows: np.ndarray, plane: tuple[int, int]) -> np.ndarray | None:
+    """Returns the outline of the projection of {x : |c_j x| <= 1}, closed, shape (corners + 1, 2); None if unbounded.
+
+    Args:
+        rows: Rows c_j, shape (k, n).
+        plane: The two coordinates.
+    """
+    pick = np.eye(rows.shape[1])[list(plane)]
+    free = null_space(rows)
+    if free.size and np.abs(pick @ free).max() > _FLAT:
+        return None
+    # Along unlimited directions the box is a prism over these coordinates, in which it is bounded.
+    basis = orth(rows.T)
+    walls = rows @ basis
+    sides = np.vstack([np.column_stack([sign * walls, -np.ones(len(walls))]) for sign in (1.0, -1.0)])
+    if basis.shape[1] == 1:
+        return None
+    corners = HalfspaceIntersection(sides, np.zeros(basis.shape[1])).intersections @ basis.T @ pick.T
+    hull = corners[ConvexHull(corners).vertices]
+    return np.vstack([hull, hull[:1]])

@@ -1,4 +1,4 @@
-"""Renders the templates of the reports; everything that a template inserts is escaped."""
+"""The reports of `ncs compare` and `ncs sweep`, and the templates; everything that a template inserts is escaped."""
 
 from __future__ import annotations
 
@@ -21,7 +21,42 @@ _PNG_WIDTH = slice(16, 20)
 _ALGORITHM_SETTINGS = {"PPO": "ppo", "TRPO": "ppo", "A2C": "a2c"}
 
 
-def render_report(
+def comparison_report(
+    summary: dict[str, Any], verification: Report, figures: dict[str, bytes], findings: list[str]
+) -> str:
+    """Returns the page: tables, findings, figures, certificate and settings; opens offline.
+
+    Args:
+        summary: Content of summary.json.
+        verification: Exact verification of the certificate.
+        figures: PNG files by caption.
+        findings: Sentences to print under the first table.
+    """
+    return _rendered(
+        "comparison.html.j2",
+        f"Safe learning on {summary['settings']['env']}",
+        "compare",
+        summary,
+        verification,
+        figures,
+        runs=max(arm["runs"] for arm in summary["arms"].values()),
+        findings=findings,
+    )
+
+
+def sweep_report(summary: dict[str, Any], verification: Report, figures: dict[str, bytes]) -> str:
+    """Returns the page: figures, a table of every channel and arm, certificate and settings; opens offline.
+
+    Args:
+        summary: Content of summary.json.
+        verification: Exact verification of the certificate.
+        figures: PNG files by caption.
+    """
+    title = f"Channels of {summary['settings']['env']}"
+    return _rendered("sweep.html.j2", title, "sweep", summary, verification, figures)
+
+
+def _rendered(
     template: str,
     title: str,
     command: str,

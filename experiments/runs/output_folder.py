@@ -46,7 +46,7 @@ def claim_folder(command: str, settings: Any) -> Iterator[None]:
     """Creates the output folder of a command and writes `settings.json` in it; no other command has it meanwhile.
 
     A folder with finished results is taken only if they have the same settings, apart from those that change no result,
-    or if the new ones contain them: more seeds or arms, a larger grid of `ncs sweep`, more steps of `ncs certify`.
+    or if the new ones contain them: more seeds or arms, a larger grid of `ncs sweep`, more steps of `ncs attack`.
 
     Args:
         command: Name of the command.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from experiments.analysis.text_table import text_table
+from experiments.analysis.terminal_text import text_table
 from experiments.study.channel_sweep import FILTERS_BY_COUNT
 from experiments.study.study_summary import MEASURES, SOUND_ARMS
 

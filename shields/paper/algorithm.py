@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterator
 from ncs_gym import LinearPlant
 from ncs_gym.validation import as_number
 from shields.paper.bounds import SMALLEST_GAP, PaperBounds, PaperModel
-from shields.paper.optimization_problem import OPSolution, solve_op
-from shields.paper.reduced_problem import ReducedProblem
+from shields.paper.optimization_problem import OPSolution, OptimizationProblem
 
 # Relative tightening of every constraint, so that what the solver returns meets the printed ones in exact arithmetic.
 _SLACK = 1e-7
@@ -59,18 +58,20 @@ def search_grid(
     """
     if search not in ("first", "largest"):
         raise ValueError(f"search must be 'first' or 'largest', got {search!r}")
-    problem = ReducedProblem(plant)
-    points = _feasible_points(plant, problem, dkappa, drho)
+    problem = OptimizationProblem(plant)
+    found = (problem.solution(bounds, slack=_SLACK) for bounds in _feasible_points(plant, problem, dkappa, drho))
+    solutions = (solution for solution in found if solution is not None)
     if search == "largest":
-        points = sorted(points, key=problem.largest_log_det, reverse=True)
-    for bounds in points:
-        solution = solve_op(plant, bounds, slack=_SLACK)
-        if solution is not None and accept(solution):
+        solutions = sorted(solutions, key=lambda solution: solution.log_det, reverse=True)
+    for solution in solutions:
+        if accept(solution):
             return solution
     raise LookupError("OP has no solution on the grid")
 
 
-def _feasible_points(plant: LinearPlant, problem: ReducedProblem, dkappa: float, drho: float) -> Iterator[PaperBounds]:
+def _feasible_points(
+    plant: LinearPlant, problem: OptimizationProblem, dkappa: float, drho: float
+) -> Iterator[PaperBounds]:
     """Yields the constants of OP at the grid points where it is feasible with some slack in (C2)."""
     model = PaperModel(plant)
     for kappa, rho in kappa_rho_grid(dkappa, drho):

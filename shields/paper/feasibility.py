@@ -9,7 +9,7 @@ import numpy as np
 
 from ncs_gym import LinearPlant
 from shields.paper.bounds import SMALLEST_GAP, PaperBounds, PaperModel
-from shields.paper.reduced_problem import ReducedProblem
+from shields.paper.optimization_problem import OptimizationProblem
 
 # The domain {0 < kappa < 1, 1 <= rho < 1 / kappa} is scanned at these kappa and these fractions of the way from 1 to
 # 1 / kappa, which are denser near rho = 1.
@@ -25,7 +25,7 @@ _REDUCTION, _ATTEMPTS = 0.99, 20
 _CONFIRMED_POINTS = 100
 
 # Scans of the last few plants by their dynamics, since one takes seconds: who changes bounds asks for them again.
-_known_scans: dict[tuple, list[tuple[float, float, float]]] = {}
+_known_scans: dict[tuple, tuple[OptimizationProblem, list[tuple[float, float, float]]]] = {}
 _MAX_KNOWN_SCANS = 4
 
 
@@ -60,8 +60,9 @@ class FeasibilityScan:
         if key not in _known_scans:
             if len(_known_scans) == _MAX_KNOWN_SCANS:
                 del _known_scans[next(iter(_known_scans))]
-            _known_scans[key] = _scanned(ReducedProblem(plant))
-        self._points = _known_scans[key]
+            problem = OptimizationProblem(plant)
+            _known_scans[key] = problem, _scanned(problem)
+        self._problem, self._points = _known_scans[key]
 
     def best(self, plant: LinearPlant, model: PaperModel | None = None) -> Feasibility:
         """Returns the point of largest ratio for a plant with the scanned dynamics and bounds of its own.
@@ -82,10 +83,10 @@ class FeasibilityScan:
             plant: The plant whose uncertainty counts.
             model: Constants of OP; those of the plant by default.
         """
-        problem, model, best = ReducedProblem(plant), model or PaperModel(plant), 0.0
+        model, best = model or PaperModel(plant), 0.0
         for point in self._ranked(plant, model)[:_CONFIRMED_POINTS]:
             bounds = model.at(point.kappa, point.rho)
-            best = max(best, problem.largest_eigenvalue(bounds) / bounds.alpha if bounds.alpha > 0.0 else np.inf)
+            best = max(best, self._problem.largest_eigenvalue(bounds) / bounds.alpha if bounds.alpha > 0.0 else np.inf)
             if best >= 1.0:
                 break
         return best
@@ -121,7 +122,7 @@ class FeasibilityScan:
         return 0.0
 
 
-def _scanned(problem: ReducedProblem) -> list[tuple[float, float, float]]:
+def _scanned(problem: OptimizationProblem) -> list[tuple[float, float, float]]:
     """Returns the points (kappa, rho) at which (C1) has a solution, each with its largest lambda_min(L).
 
     A smaller rho only restricts L further ((C7) is the one constraint with rho in it, the error being left out), so the

@@ -1,12 +1,11 @@
-"""The tables of `ncs certify` fit into a terminal and say all that was counted."""
+"""The tables of `ncs attack` fit into a terminal and say all that was counted."""
 
 from dataclasses import replace
 
 import pytest
 
 from experiments.attack.attack_cases import attack_cases
-from experiments.attack.counts_table import counts_table
-from experiments.attack.gaussian_table import GAUSSIAN_LEGEND, gaussian_table
+from experiments.attack.counts_table import GAUSSIAN_LEGEND, counts_table, gaussian_table
 from experiments.attack.safety_counts import SafetyCounts
 
 LONG_CAMPAIGN = SafetyCounts(

@@ -5,6 +5,7 @@ import socket
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -126,7 +127,10 @@ def test_waiting_for_nothing_goes_on_waiting():
 
 
 def test_worker_returns_what_the_run_returns_here(run):
-    result, expected = _execute_on_node(versions(), pickle.dumps(run)), execute_run(run, lambda steps: None)
+    result, expected = (
+        _execute_on_node(versions(), pickle.dumps(partial(execute_run, run))),
+        execute_run(run, lambda steps: None),
+    )
     assert result.episodes == expected.episodes
     assert (result.trajectory.states == expected.trajectory.states).all()
 

@@ -3,15 +3,17 @@
 import threading
 import time
 from dataclasses import replace
+from functools import partial
 from queue import Queue
 
 import pytest
 
 from agents.settings import PPOSettings
 from experiments.backends.execution import results_of
+from experiments.backends.job import Job
 from experiments.backends.worker_processes import _execute, execute_all
 from experiments.errors import RunStopped
-from experiments.runs.training_run import TrainingRun
+from experiments.runs.training_run import TrainingRun, execute_run
 from experiments.settings import BackendSettings
 
 
@@ -33,19 +35,23 @@ def endless(certificate):
     )
 
 
+def job_of(run):
+    return Job(run.name, 0, partial(execute_run, run))
+
+
 def test_a_run_told_to_stop_gives_up_at_its_next_report(endless):
     reports, stop = Queue(), threading.Event()
     stop.set()
     with pytest.raises(RunStopped, match="zero-input-0"):
-        _execute(endless, None, reports, stop)
+        _execute(job_of(endless), reports, stop)
     assert reports.empty()
 
 
 def test_the_first_failure_stops_the_others_and_is_the_one_reported(endless):
     broken = replace(endless, arm="broken", env="ncs_gym/Nowhere-v0")
-    begin, kept = time.monotonic(), []
+    begin, kept, jobs = time.monotonic(), [], [job_of(run) for run in (endless, broken)]
     with pytest.raises(Exception, match="Nowhere") as caught:
-        execute_all([endless, broken], 2, lambda run, result: kept.append(run), lambda steps: None)
+        execute_all(jobs, 2, lambda job, result: kept.append(job), lambda steps: None)
     assert not isinstance(caught.value, RunStopped)
     assert kept == []
     assert time.monotonic() - begin < 300.0

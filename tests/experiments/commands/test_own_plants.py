@@ -51,7 +51,7 @@ def test_certificate_for_a_registered_plant_is_made_and_verified(folder):
 
 
 def test_own_plant_is_attacked_behind_every_kind_of_channel(folder, without_workers):
-    run = ncs("certify", *ENV, "--steps", 1, "--envs", 8, "--out", "c", cwd=folder)
+    run = ncs("attack", *ENV, "--steps", 1, "--envs", 8, "--out", "c", cwd=folder)
     assert run.returncode == 0, run.stderr
     document = json.loads((folder / "c" / "certify.json").read_text())
     kinds = ("its channel", "perfect", "blackout", "bursts", "overtaking")
@@ -59,7 +59,7 @@ def test_own_plant_is_attacked_behind_every_kind_of_channel(folder, without_work
     assert document["total"]["steps"] == 5 * 3 * 8 * 200
     assert document["total"]["exits"] == document["total"]["unproved"] == 0
     assert document["total"]["interventions"] > 0
-    assert_one_sentence(ncs("certify", "--env", "own_plants:Plants/Other-v0", cwd=folder), "Plants/Other-v0")
+    assert_one_sentence(ncs("attack", "--env", "own_plants:Plants/Other-v0", cwd=folder), "Plants/Other-v0")
 
 
 def test_own_plant_is_trained_in_and_evaluated_by_its_id(folder, without_workers):
@@ -141,7 +141,7 @@ def test_plant_of_a_file_is_attacked_behind_channels_that_use_its_contract_up(tm
     contract = ("--max-age", 2, "--quantization-step", 0.001)
     for given, kinds in (((), ("perfect", "blackout", "bursts", "overtaking")), (contract, ("late", "rare"))):
         folder = f"of {len(kinds)}"
-        run = ncs("certify", *asked, *given, "--out", folder, cwd=tmp_path)
+        run = ncs("attack", *asked, *given, "--out", folder, cwd=tmp_path)
         assert run.returncode == 0, run.stderr
         document = json.loads((tmp_path / folder / "certify.json").read_text())
         assert list(document["cases"]) == [f"plant.json, {kind}" for kind in kinds]
@@ -156,14 +156,14 @@ def test_another_plant_in_the_same_file_is_attacked_anew(tmp_path, without_worke
     totals = []
     for seed in (3, 5):
         random_plant(seed, 3, 2).save(tmp_path / "plant.json")
-        run = ncs("certify", *asked, cwd=tmp_path)
+        run = ncs("attack", *asked, cwd=tmp_path)
         assert run.returncode == 0, run.stderr
         assert "per second" in run.stdout
         totals.append(json.loads((tmp_path / "c" / "certify.json").read_text())["total"])
     assert totals[0] != totals[1]
 
 
-@pytest.mark.parametrize("command", [("synthesize",), ("verify", "certificate.json"), ("certify",)])
+@pytest.mark.parametrize("command", [("synthesize",), ("verify", "certificate.json"), ("attack",)])
 def test_plant_of_a_file_is_no_environment(command, tmp_path, certificate):
     certificate.save(tmp_path / "certificate.json")
     both = ncs(*command, "--plant", "p.json", "--env", "ncs_gym/TruckTrailer-v0", cwd=tmp_path)

@@ -7,15 +7,24 @@ import cvxpy as cp
 import numpy as np
 import pytest
 
-from experiments.paper.audit import Verdict
-from experiments.paper.audit.case_study import box_claim, box_is_invariant, disturbance_claim, farthest_without_input
-from experiments.paper.audit.error_bounds import error_claims
-from experiments.paper.audit.optimum import optimum, optimum_claim
-from experiments.paper.audit.theorems import ONLY_IF, contracts, equivalence_claim, least_contracting_gain, margin_claim
+from experiments.paper.audit import (
+    Verdict,
+    box_is_invariant,
+    demonstration,
+    design,
+    disturbance_set,
+    equivalence,
+    farthest_without_input,
+    least_contracting_gain,
+    margin_at_one,
+    optimum,
+    simulated_error,
+)
+from experiments.paper.counterexample import ONLY_IF, contracts
 from experiments.paper.paper_example import PaperExample
 from ncs_gym import BoxDisturbance, truck_trailer
 from shields.paper.bounds import PaperModel
-from shields.paper.optimization_problem import solve_op
+from shields.paper.optimization_problem import OptimizationProblem
 from shields.verification.rational_matrix import add, multiply, quadratic, rational, to_float, transpose
 
 CASE = PaperExample()
@@ -67,21 +76,22 @@ def test_printed_design_is_the_optimum_for_an_input_limit_of_six():
 
 def test_gain_that_is_the_optimum_at_the_printed_limit_would_hold():
     L, K = optimum(CASE, 4.0)
-    claim = optimum_claim(replace(CASE, K=K, M=np.linalg.inv(L)))
+    claim = design(replace(CASE, K=K, M=np.linalg.inv(L)))
     assert (claim.verdict, claim.defect) == (Verdict.HOLDS, "")
 
 
 def test_tail_at_delta_makes_op_feasible_and_the_printed_tail_does_not():
     plant, point = truck_trailer(), (0.9, 1.035)
     tail = -2.0 * np.log(0.95)  # the chi-square quantile of two degrees of freedom in closed form
-    assert solve_op(plant, PaperModel(plant, quantile=tail).at(*point)) is not None
-    assert solve_op(plant, PaperModel(plant).at(*point)) is None
+    problem = OptimizationProblem(plant)
+    assert problem.solution(PaperModel(plant, quantile=tail).at(*point)) is not None
+    assert problem.solution(PaperModel(plant).at(*point)) is None
 
 
 def test_largest_error_is_undecided_exactly_between_the_two_readings():
     verdicts = []
     for largest in (2e-4, 0.0017, 0.0095):
-        *_, claim = error_claims(replace(CASE, largest_error=largest))
+        claim = simulated_error(replace(CASE, largest_error=largest))
         verdicts.append(claim.verdict)
         assert bool(claim.defect) is (claim.verdict == Verdict.FAILS)
     assert verdicts == [Verdict.HOLDS, Verdict.UNDECIDED, Verdict.FAILS]
@@ -97,7 +107,7 @@ def test_reduced_gain_contracts_exactly_and_no_smaller_one_does():
 
 
 def test_gain_and_step_that_the_row_about_the_margin_shows_are_those_it_confirms():
-    text = margin_claim(CASE).computed
+    text = margin_at_one(CASE).computed
     factor = float(text.split("With ")[1].split(" K")[0])
     closed = CASE.A + factor * CASE.B @ CASE.K
     assert contracts(closed, CASE.M)
@@ -108,8 +118,8 @@ def test_gain_and_step_that_the_row_about_the_margin_shows_are_those_it_confirms
 
 
 def test_margin_at_one_is_right_without_disturbance():
-    assert margin_claim(CASE).verdict == Verdict.FAILS
-    claim = margin_claim(replace(CASE, disturbance=BoxDisturbance((0.0, 0.0))))
+    assert margin_at_one(CASE).verdict == Verdict.FAILS
+    claim = margin_at_one(replace(CASE, disturbance=BoxDisturbance((0.0, 0.0))))
     assert (claim.verdict, claim.defect) == (Verdict.UNDECIDED, "")
 
 
@@ -135,7 +145,7 @@ def test_only_if_verdict_follows_the_example(change, is_invariant, breaks_condit
     example = replace(ONLY_IF, **change)
     assert (example.is_invariant, example.breaks_condition) == (is_invariant, breaks_condition)
     expected = Verdict.FAILS if is_invariant and breaks_condition else Verdict.UNDECIDED
-    assert equivalence_claim(example).verdict == expected
+    assert equivalence(CASE, example).verdict == expected
 
 
 def test_witness_lies_where_every_kappa_reaches():
@@ -144,7 +154,7 @@ def test_witness_lies_where_every_kappa_reaches():
 
 
 def test_ball_and_box_are_compared_by_area():
-    claim = disturbance_claim(CASE)
+    claim = disturbance_set(CASE)
     assert f"{100 * 0.04 * 0.02 / (np.pi * 5e-4):.0f} %" in claim.computed
     assert "[-0.02, 0.02] x [-0.01, 0.01]" in claim.printed
 
@@ -160,4 +170,4 @@ def test_whole_box_is_invariant_without_input_and_a_wider_plant_leaves_it():
     assert (reached > bounds - 0.01).all()
     wider = replace(CASE, A=1.15 * CASE.A)
     assert not box_is_invariant(wider)
-    assert box_claim(wider).verdict == Verdict.UNDECIDED
+    assert demonstration(wider).verdict == Verdict.UNDECIDED

@@ -3,10 +3,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from experiments.paper.audit.invariance import invariance_claims
-from experiments.paper.counterexample import stays_inside, worst_step
+from experiments.paper.audit import invariance
+from experiments.paper.counterexample import Ball, Box, Segment, stays_inside, worst_step
 from experiments.paper.paper_example import PaperExample
-from experiments.paper.sets import Ball, Box, Segment
 
 CASE = PaperExample()
 BOX = Box(CASE.disturbance_half_widths)
@@ -35,7 +34,7 @@ def test_counterexample_is_one_in_exact_arithmetic_with_a_disturbance_of_the_pri
 
 
 def test_row_about_every_error_uses_the_printed_box():
-    text = next(invariance_claims(CASE)).computed
+    text = invariance(CASE).computed
     d = [float(v) for v in text.split("d = [")[1].split("]")[0].split(",")]
     assert (np.abs(d) <= [0.02, 0.01]).all()
 

@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
 
-from experiments.paper.audit import Verdict
-from experiments.paper.audit.case_study import sensor_claim
-from experiments.paper.audit.late_packets import discarded, largest_error, late_packet_claim, replayed, taken_as_current
-from experiments.paper.kalman_filter import DefinitionThreeFilter
+from experiments.paper.audit import Verdict, late_packets, sensor
+from experiments.paper.late_packets import Definition1Filter, discarded, largest_error, replayed, taken_as_current
 from experiments.paper.paper_example import PaperExample
 
 CASE = PaperExample()
@@ -28,7 +26,7 @@ def textbook_filter(mean):
 def test_filter_is_the_textbook_filter_where_a_late_packet_is_current_or_discarded(takes_late):
     rng = np.random.default_rng(0)
     mean = np.array([[1.0], [-0.5]])
-    ours = DefinitionThreeFilter(CASE, PLANT, mean.copy(), takes_late=takes_late)
+    ours = Definition1Filter(CASE, PLANT, mean.copy(), takes_late=takes_late)
     textbook, samples = textbook_filter(mean), []
     for step in range(30):
         samples.append(rng.standard_normal((2, 1)))
@@ -41,7 +39,7 @@ def test_filter_is_the_textbook_filter_where_a_late_packet_is_current_or_discard
 
 
 def test_filter_corrects_only_the_episodes_in_which_a_packet_arrives():
-    ours = DefinitionThreeFilter(CASE, PLANT, np.ones((2, 2)), takes_late=True)
+    ours = Definition1Filter(CASE, PLANT, np.ones((2, 2)), takes_late=True)
     ours.advance(np.zeros((1, 2)), np.full((2, 2), 5.0), [(0, np.array([True, False]))])
     predicted = (PLANT.A + PLANT.B @ CASE.K) @ np.ones(2)
     np.testing.assert_allclose(ours.mean[:, 1], predicted)
@@ -56,11 +54,11 @@ def test_late_packets_taken_as_current_break_the_bound_and_the_replaying_filter_
 
 
 def test_claim_would_hold_with_a_larger_epsilon():
-    assert late_packet_claim(CASE).verdict == Verdict.UNDECIDED
-    assert late_packet_claim(replace(CASE, epsilon=0.1)).verdict == Verdict.HOLDS
+    assert late_packets(CASE).verdict == Verdict.UNDECIDED
+    assert late_packets(replace(CASE, epsilon=0.1)).verdict == Verdict.HOLDS
 
 
 def test_the_noise_that_is_not_printed_does_not_decide():
-    low, high = (float(part) for part in sensor_claim(CASE).computed.rsplit(" is ", 1)[1].split(" to "))
+    low, high = (float(part) for part in sensor(CASE).computed.rsplit(" is ", 1)[1].split(" to "))
     assert CASE.epsilon < low < high
     assert largest_error(CASE, taken_as_current, noise_variance=1e-3) == pytest.approx(low, abs=6e-4)

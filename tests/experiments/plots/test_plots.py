@@ -10,9 +10,8 @@ from scipy.optimize import linprog
 
 from experiments.plots.arm_style import ARM_COLORS_AND_MARKERS, ArmStyle
 from experiments.plots.comparison_figures import comparison_figures
-from experiments.plots.ellipsoid_projection import projected_box, projected_ellipsoid
 from experiments.plots.figure_style import thousands
-from experiments.plots.phase_plane import _plane, phase_figure
+from experiments.plots.phase_plane import _plane, phase_figure, projected_box, projected_ellipsoid
 from experiments.plots.scatter import scatter_figure
 from experiments.plots.time_series import _shown_arms, episode_figure
 from experiments.plots.training_curves import _RATE_WINDOW, _common_steps, _rates, training_figure

@@ -123,10 +123,10 @@ def test_stored_file_is_data_only(store, run, tmp_path):
 def test_finished_runs_are_not_run_again(store, run, result, tmp_path, monkeypatch, capsys):
     ran = []
 
-    def record(runs, jobs, on_result, on_progress, log_folder):
-        for one in runs:
-            ran.append(one.name)
-            on_result(one, replace(result, index=one.index))
+    def record(jobs, workers, on_result, on_progress):
+        for job in jobs:
+            ran.append(job.name)
+            on_result(job, replace(result, index=2))
 
     monkeypatch.setattr("experiments.backends.worker_processes.execute_all", record)
     missing = replace(run, index=2)

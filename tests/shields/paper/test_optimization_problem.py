@@ -1,41 +1,64 @@
+import cvxpy as cp
 import numpy as np
 import pytest
 
 from ncs_gym import LinearPlant, truck_trailer
 from shields.paper.algorithm import kappa_rho_grid, search_grid
 from shields.paper.bounds import PaperModel
-from shields.paper.optimization_problem import solve_op
-from shields.paper.reduced_problem import ReducedProblem
+from shields.paper.optimization_problem import OptimizationProblem
 
 SMALL = truck_trailer(gamma=1e-6, process_noise_cov=1e-6 * np.eye(2))
 POINTS = [(k, 1.0 + (1.0 / k - 1.0) * s) for k in (0.8, 0.86, 0.9, 0.94, 0.98) for s in (0.0, 0.05, 0.3, 0.8)]
 
 
+def reduced(plant, bounds):
+    """The largest log det L of OP with U and tau eliminated by hand, in the plant's own units; None without one."""
+    n, m = plant.n, plant.m
+    L, F, beta = cp.Variable((n, n), symmetric=True), cp.Variable((m, n)), cp.Variable()
+    closed, identity, zero = plant.A @ L + plant.B @ F, np.eye(n), np.zeros((n, n))
+    quotient = bounds.alpha**2 / bounds.epsilon_up * identity
+    constraints = [
+        cp.bmat([[bounds.kappa * L, closed.T], [closed, L]]) >> 0,
+        L >> bounds.alpha * identity,
+        cp.diag(plant.C @ L @ plant.C.T) <= 1.0,
+        L >> beta * identity,
+        L << bounds.rho * beta * identity,
+    ]
+    for i, limit in enumerate(plant.u_max):
+        row, half = F[i : i + 1, :], np.array([[limit**2 / 2.0]])
+        constraints.append(cp.bmat([[half, row, row], [row.T, L, zero], [row.T, zero, quotient]]) >> 0)
+    problem = cp.Problem(cp.Maximize(cp.log_det(L)), constraints)
+    problem.solve(solver=cp.CLARABEL)
+    return problem.value if problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) else None
+
+
+@pytest.mark.filterwarnings("ignore:Solution may be inaccurate")
 @pytest.mark.parametrize(("kappa", "rho"), POINTS)
-def test_reduced_problem_agrees_with_op_as_printed(kappa, rho):
-    bounds = PaperModel(SMALL).at(kappa, rho)
-    printed = solve_op(SMALL, bounds)
-    reduced = ReducedProblem(SMALL)
-    assert (reduced.largest_eigenvalue(bounds) >= bounds.alpha) is (printed is not None)
-    log_det = reduced.largest_log_det(bounds)
-    assert np.isfinite(log_det) is np.bool_(printed is not None)
+def test_op_as_printed_agrees_with_a_program_without_its_auxiliary_variables(kappa, rho):
+    bounds, problem = PaperModel(SMALL).at(kappa, rho), OptimizationProblem(SMALL)
+    printed, expected = problem.solution(bounds), reduced(SMALL, bounds)
+    assert (printed is None) is (expected is None)
+    assert (problem.largest_eigenvalue(bounds) >= bounds.alpha) is (printed is not None)
     if printed is not None:
-        assert log_det == pytest.approx(printed.log_det, abs=1e-5)
+        assert printed.log_det == pytest.approx(expected, abs=1e-5)
 
 
 def test_a_point_is_solved_the_same_whatever_was_solved_before():
-    reduced, bounds = ReducedProblem(SMALL), [PaperModel(SMALL).at(*point) for point in POINTS]
-    forwards = [reduced.largest_log_det(each) for each in bounds]
-    backwards = [reduced.largest_log_det(each) for each in reversed(bounds)][::-1]
-    assert forwards == backwards
+    problem, bounds = OptimizationProblem(SMALL), [PaperModel(SMALL).at(*point) for point in POINTS]
+
+    def found(each):
+        solution = problem.solution(each)
+        return problem.largest_eigenvalue(each), solution and (solution.L.tobytes(), solution.K.tobytes())
+
+    assert [found(each) for each in bounds] == [found(each) for each in reversed(bounds)][::-1]
 
 
 def test_log_det_and_eigenvalue_of_a_known_solution():
     # One state without dynamics: L <= 1 by the box, whatever K is, in units in which the box is 2 wide to each side.
     plant = LinearPlant(A=[[0.0]], B=[[1.0]], box=[[0.5]], u_max=1.0, dt=0.1, gamma=1e-9, process_noise_cov=[[1e-9]])
     bounds = PaperModel(plant).at(0.5, 1.5)
-    assert ReducedProblem(plant).largest_eigenvalue(bounds) == pytest.approx(4.0, rel=1e-6)
-    assert ReducedProblem(plant).largest_log_det(bounds) == pytest.approx(np.log(4.0), abs=1e-6)
+    assert OptimizationProblem(plant).largest_eigenvalue(bounds) == pytest.approx(4.0, rel=1e-6)
+    assert OptimizationProblem(plant).solution(bounds).log_det == pytest.approx(np.log(4.0), abs=1e-6)
 
 
 def test_solution_meets_the_printed_constraints():
@@ -57,7 +80,7 @@ def test_several_inputs_share_one_auxiliary_matrix():
         process_noise_cov=1e-7 * np.eye(2), measurement_noise_cov=1e-6 * np.eye(2), initial_cov=1e-7 * np.eye(2),
     )  # fmt: skip
     bounds = PaperModel(plant).at(0.7, 1.2)
-    assert ReducedProblem(plant).largest_log_det(bounds) == pytest.approx(solve_op(plant, bounds).log_det, abs=1e-5)
+    assert OptimizationProblem(plant).solution(bounds).log_det == pytest.approx(reduced(plant, bounds), abs=1e-5)
 
 
 def test_grid_walks_as_printed_and_skips_where_the_bound_is_infinite():
@@ -73,12 +96,12 @@ def test_steps_that_do_not_move_are_refused(steps):
 
 def test_first_feasible_pair_wins():
     first = search_grid(SMALL).bounds
-    model, reduced = PaperModel(SMALL), ReducedProblem(SMALL)
+    model, problem = PaperModel(SMALL), OptimizationProblem(SMALL)
     for kappa, rho in kappa_rho_grid(0.02, 0.05):
         bounds = model.at(kappa, rho)
         if (kappa, rho) == (first.kappa, first.rho):
             break
-        assert reduced.largest_eigenvalue(bounds) < bounds.alpha * (1 + 1e-6)
+        assert problem.largest_eigenvalue(bounds) < bounds.alpha * (1 + 1e-6)
 
 
 def test_largest_search_is_no_smaller_than_the_first_and_than_any_point_of_the_grid():
@@ -86,17 +109,17 @@ def test_largest_search_is_no_smaller_than_the_first_and_than_any_point_of_the_g
     grid = {"dkappa": 0.03, "drho": 0.08}
     first, largest = search_grid(plant, **grid), search_grid(plant, search="largest", **grid)
     assert largest.log_det > first.log_det + 0.1
-    model, reduced = PaperModel(plant), ReducedProblem(plant)
-    volumes = [reduced.largest_log_det(model.at(kappa, rho)) for kappa, rho in list(kappa_rho_grid(**grid))[::5]]
-    assert largest.log_det >= max(volumes) - 1e-5
+    model, problem = PaperModel(plant), OptimizationProblem(plant)
+    others = [problem.solution(model.at(kappa, rho)) for kappa, rho in list(kappa_rho_grid(**grid))[::5]]
+    assert largest.log_det >= max(other.log_det for other in others if other is not None) - 1e-5
 
 
 def test_what_is_monotone():
     # alpha, eps and eps_up grow with rho; lambda_min(L) without the communication error grows with kappa and with rho.
-    model, reduced = PaperModel(SMALL), ReducedProblem(SMALL)
+    model, problem = PaperModel(SMALL), OptimizationProblem(SMALL)
 
     def eigenvalue(bounds):
-        return max(reduced.largest_eigenvalue(bounds, with_error=False), 0.0)
+        return max(problem.largest_eigenvalue(bounds, with_error=False), 0.0)
 
     for kappa in (0.85, 0.9, 0.95):
         bounds = [model.at(kappa, rho) for rho in np.linspace(1.0, 0.999 / kappa, 8)]
@@ -113,19 +136,12 @@ def test_unknown_search_is_refused():
         search_grid(SMALL, search="best")
 
 
-def test_largest_set_is_the_solution_of_op_as_printed():
-    bounds = PaperModel(SMALL).at(0.9, 1.05)
-    printed, found = solve_op(SMALL, bounds), ReducedProblem(SMALL).largest_set(bounds)
-    np.testing.assert_allclose(found[0], printed.L, atol=1e-3)
-    np.testing.assert_allclose(found[1], printed.K, atol=5e-3)
-    assert np.linalg.slogdet(found[0])[1] == pytest.approx(ReducedProblem(SMALL).largest_log_det(bounds), abs=1e-5)
-
-
-def test_largest_set_without_the_margin_exists_where_op_has_none():
+def test_set_without_the_margin_exists_where_op_has_none():
     plant = truck_trailer()
-    bounds, reduced = PaperModel(plant).at(0.9, 1.05), ReducedProblem(truck_trailer())
-    assert reduced.largest_set(bounds) is None
-    L, K = reduced.largest_set(bounds, with_margin=False, with_error=False)
+    bounds, problem = PaperModel(plant).at(0.9, 1.05), OptimizationProblem(plant)
+    assert problem.solution(bounds) is None
+    found = problem.solution(bounds, with_margin=False, with_error=False)
+    L, K = found.L, found.K
     assert np.linalg.eigvalsh(L)[0] < bounds.alpha
     closed = plant.A + plant.B @ K
     assert np.linalg.eigvalsh(0.9 * L - closed @ L @ closed.T)[0] >= -1e-6

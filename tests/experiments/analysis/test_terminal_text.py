@@ -2,7 +2,7 @@
 
 import pytest
 
-from experiments.analysis.wrapped_text import wrapped
+from experiments.analysis.terminal_text import wrapped
 
 SENTENCE = "The sentence of a well-known length goes on and on. " * 8
 

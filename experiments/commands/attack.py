@@ -1,26 +1,26 @@
-"""`ncs certify`: attacks shielded control loops by Monte Carlo simulation with worst-case disturbances."""
+"""`ncs attack`: attacks shielded control loops by Monte Carlo simulation with worst-case disturbances."""
 
 from __future__ import annotations
 
 import json
 import math
 import time
-from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 from tqdm import tqdm
 
-from experiments.attack import MonteCarloBatch, SafetyCounts
+from experiments.attack import MonteCarloBatch, SafetyCounts, run_batch
 from experiments.attack.attack_cases import AttackCase
 from experiments.attack.campaign import Campaign
-from experiments.attack.campaign_execution import execute_batches
 from experiments.attack.counts_store import CountsStore
-from experiments.attack.counts_table import counts_table
-from experiments.attack.gaussian_table import GAUSSIAN_LEGEND, gaussian_table, require_within
-from experiments.errors import SafetyBroken
+from experiments.attack.counts_table import GAUSSIAN_LEGEND, counts_table, gaussian_table, require_safe, require_within
+from experiments.backends.execution import execute
+from experiments.backends.job import Job
 from experiments.runs import claim_folder, versions
-from experiments.settings import CertifySettings
+from experiments.settings import BackendSettings, CertifySettings
 from experiments.settings.certificates import changed_contract
 from ncs_gym.downlink import downlink_protocol
 from shields import Certificate
@@ -28,8 +28,8 @@ from shields.atomic_write import write_atomically
 from shields.runtime.safety_filter import DEFAULT_HORIZON
 
 
-def certify(settings: CertifySettings) -> None:
-    """Runs `ncs certify`.
+def attack(settings: CertifySettings) -> None:
+    """Runs `ncs attack`.
 
     Raises:
         SafetyBroken: If a shielded state left S or its box (in mode "lookahead": its box), or a proof did not hold,
@@ -48,20 +48,20 @@ def certify(settings: CertifySettings) -> None:
     cases = campaign.cases()
     if campaign.shielded:
         _require_claims(cases)
-    with claim_folder("certify", settings):
-        _certify_in_folder(settings, campaign, cases)
+    with claim_folder("certify", settings):  # the name of the command in files
+        _attack_in_folder(settings, campaign, cases)
 
 
-def _certify_in_folder(settings: CertifySettings, campaign: Campaign, cases: dict[str, AttackCase]) -> None:
-    """Executes the batches that are missing, prints the table and writes the counts; raises as `certify` says."""
+def _attack_in_folder(settings: CertifySettings, campaign: Campaign, cases: dict[str, AttackCase]) -> None:
+    """Executes the batches that are missing, prints the table and writes the counts; raises as `attack` says."""
     certificates = _certificate_files(cases, settings.out / "certificates")
     keys = {case: f"{campaign.key} {Certificate.load(file).checksum}" for case, file in certificates.items()}
     if campaign.env is not None:  # what a module registers may change
         keys = {case: f"{key} {cases[case].channel} {cases[case].downlink}" for case, key in keys.items()}
     store = CountsStore(settings.out / "tallies.jsonl", keys, campaign.envs)
     batches = _batches(list(cases), settings.steps / campaign.batch_steps, campaign.kinds_of_batches)
-    missing = {case: deque(each for each in planned if each not in store.counts) for case, planned in batches.items()}
-    start, steps = time.perf_counter(), campaign.batch_steps * sum(map(len, missing.values()))
+    missing = [each for planned in batches.values() for each in planned if each not in store.counts]
+    start, steps = time.perf_counter(), campaign.batch_steps * len(missing)
     execute_batches(campaign, missing, certificates, store, settings.jobs)
     seconds = time.perf_counter() - start
     counts = {case: sum((store.counts[each] for each in planned), SafetyCounts()) for case, planned in batches.items()}
@@ -82,7 +82,35 @@ def _certify_in_folder(settings: CertifySettings, campaign: Campaign, cases: dic
     if campaign.shielded and campaign.gaussian:
         require_within(counts, limits)
     elif campaign.shielded:
-        _require_safe(total, campaign)
+        require_safe(total, looks_ahead=campaign.looks_ahead)
+
+
+def execute_batches(
+    campaign: Campaign,
+    missing: Sequence[MonteCarloBatch],
+    certificates: Mapping[str, Path],
+    store: CountsStore,
+    workers: int,
+) -> None:
+    """Executes batches in worker processes, and stores the counts of each that is finished.
+
+    Args:
+        campaign: Settings of the campaign.
+        missing: Batches to execute; a worker prepares a case once for all batches of it in a row.
+        certificates: File with the certificate of each case.
+        store: Store of the counts.
+        workers: Number of worker processes.
+
+    Raises:
+        RunError: If a batch fails.
+        OSError: If the counts cannot be written.
+    """
+    jobs = {}
+    for batch in missing:
+        work = partial(run_batch, campaign, batch, certificates[batch.case])
+        jobs[Job(f"{batch.case}, batch {batch.index}", campaign.batch_steps, work)] = batch
+    if jobs:
+        execute(list(jobs), BackendSettings(jobs=workers), lambda job, counts: store.add(jobs[job], counts))
 
 
 def _campaign(settings: CertifySettings) -> Campaign:
@@ -114,18 +142,6 @@ def _require_claims(cases: dict[str, AttackCase]) -> None:
                 f"{name}: nothing is claimed behind a downlink without a contract, so that there is nothing to attack; "
                 "give it max_consecutive_losses, or the environment downlink_contract=ChannelContract(c)"
             )
-
-
-def _require_safe(total: SafetyCounts, campaign: Campaign) -> None:
-    """Returns if the shield kept what it claims in every step.
-
-    Raises:
-        SafetyBroken: If it did not.
-    """
-    left_set = total.exits > 0 and not campaign.looks_ahead
-    if left_set or total.violations or total.unproved:
-        outside_set = "" if campaign.looks_ahead else f"{total.exits:,} steps outside S, "
-        raise SafetyBroken(f"{outside_set}{total.violations:,} outside the box, {total.unproved:,} without a proof")
 
 
 def _certificate_files(cases: dict[str, AttackCase], folder: Path) -> dict[str, Path]:

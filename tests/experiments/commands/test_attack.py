@@ -1,4 +1,4 @@
-"""The campaign behind `ncs certify`: exact under any split, resumable, and able to see a failure."""
+"""The campaign behind `ncs attack`: exact under any split, resumable, and able to see a failure."""
 
 import json
 from dataclasses import replace
@@ -10,11 +10,11 @@ from experiments.attack import monte_carlo_batch
 from experiments.attack.attack_cases import AttackCase, attack_cases
 from experiments.attack.campaign import Campaign
 from experiments.attack.counts_store import CountsStore
-from experiments.attack.gaussian_table import gaussian_table, require_within
+from experiments.attack.counts_table import gaussian_table, require_within
 from experiments.attack.monte_carlo_batch import MonteCarloBatch, run_batch
 from experiments.attack.safety_counts import SafetyCounts
-from experiments.commands import certify as command
-from experiments.commands.certify import certify
+from experiments.commands import attack as command
+from experiments.commands.attack import attack
 from experiments.errors import OtherResultsError, ResultsError, SafetyBroken
 from experiments.settings.certificates import CertifySettings
 from ncs_gym import truck_trailer
@@ -22,6 +22,7 @@ from ncs_gym.network.contract import contract_of
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from shields import Certificate
 from shields import certify as smaller_set
+from tests.command import ncs
 from tests.workers import no_worker_processes
 
 CAMPAIGN = Campaign(seed=0, random_plants=1, envs=32, shielded=True)
@@ -175,7 +176,7 @@ def test_gaussian_nature_attains_what_is_bounded_and_draws_the_rest(tmp_path):
 def test_counts_of_gaussian_noise_lie_within_the_bound_and_do_not_end_with_an_error(
     tmp_path, small, capsys, without_workers
 ):
-    certify(settings(tmp_path, noise="gaussian", delta=1e-4))
+    attack(settings(tmp_path, noise="gaussian", delta=1e-4))
     printed = capsys.readouterr().out
     rows = [line for line in printed.partition("interval")[2].splitlines() if line.startswith("TruckTrailer")]
     assert [row.split()[-1] for row in rows] == ["0.031", "0.041"]
@@ -220,48 +221,48 @@ def document(folder):
 
 
 def test_results_do_not_depend_on_worker_processes(tmp_path, small, capsys):
-    certify(settings(tmp_path / "two", jobs=2))
+    attack(settings(tmp_path / "two", jobs=2))
     table = capsys.readouterr().out
     assert any(line.startswith("all  ") for line in table.splitlines())
     with no_worker_processes():
-        certify(settings(tmp_path / "none"))
+        attack(settings(tmp_path / "none"))
     assert document(tmp_path / "none") == document(tmp_path / "two")
     assert document(tmp_path / "none")["total"]["steps"] == 6 * 16 * 200
 
 
 def test_interrupted_campaign_goes_on(tmp_path, small, capsys, without_workers):
-    certify(settings(tmp_path))
+    attack(settings(tmp_path))
     whole = document(tmp_path)
     log = tmp_path / "tallies.jsonl"
     lines = log.read_bytes().splitlines(keepends=True)
     log.write_bytes(b"".join(lines[:2]) + lines[2][:40])  # killed while it wrote the third
-    certify(settings(tmp_path))
+    attack(settings(tmp_path))
     assert document(tmp_path) == whole
     assert len(log.read_bytes().splitlines()) == 6
     capsys.readouterr()
-    certify(settings(tmp_path))  # all there
+    attack(settings(tmp_path))  # all there
     assert "per second" not in capsys.readouterr().out
-    certify(settings(tmp_path, steps=6 * 16 * 200 + 1))
+    attack(settings(tmp_path, steps=6 * 16 * 200 + 1))
     assert document(tmp_path)["total"]["steps"] == 7 * 16 * 200
     assert len(log.read_bytes().splitlines()) == 7
     finished = (tmp_path / "certify.json").read_bytes()
     for changes in ({"steps": 1}, {"mode": "switch"}):
         with pytest.raises(OtherResultsError, match=next(iter(changes))):
-            certify(settings(tmp_path, **changes))
+            attack(settings(tmp_path, **changes))
         assert (tmp_path / "certify.json").read_bytes() == finished
-    certify(settings(tmp_path, force=True))
+    attack(settings(tmp_path, force=True))
     assert document(tmp_path) == whole
     assert len(log.read_bytes().splitlines()) == 7
 
 
 def test_another_certificate_makes_stored_counts_void(tmp_path, small, without_workers):
-    certify(settings(tmp_path))
+    attack(settings(tmp_path))
     first = document(tmp_path)["cases"]
     for file in (tmp_path / "certificates").iterdir():
         certificate = Certificate.load(file)
         if certificate.fingerprint == truck_trailer().fingerprint:
             smaller_set(truck_trailer(), 0.95 * certificate.L, certificate.K).save(file)
-    certify(settings(tmp_path))
+    attack(settings(tmp_path))
     assert len((tmp_path / "tallies.jsonl").read_bytes().splitlines()) == 9
     second = document(tmp_path)["cases"]
     assert second[CRUISE] == first[CRUISE]
@@ -278,9 +279,9 @@ def test_a_shield_that_fails_ends_with_an_error(tmp_path, small, monkeypatch, ca
     )
     monkeypatch.setattr(command, "_batches", lambda names, count, least: {CRUISE: [MonteCarloBatch(CRUISE, 0)]})
     with pytest.raises(SafetyBroken, match="2 steps outside S, 0 outside the box, 0 without a proof"):
-        certify(settings(tmp_path))
+        attack(settings(tmp_path))
     assert "-1.0e-01" in capsys.readouterr().out
-    certify(settings(tmp_path / "watching", unshielded=True))
+    attack(settings(tmp_path / "watching", unshielded=True))
 
 
 def test_exits_of_lookahead_are_allowed_and_violations_are_not(tmp_path, small, monkeypatch, capsys):
@@ -293,7 +294,7 @@ def test_exits_of_lookahead_are_allowed_and_violations_are_not(tmp_path, small, 
 
     monkeypatch.setattr(command, "_batches", lambda names, count, least: {CRUISE: [MonteCarloBatch(CRUISE, 0)]})
     monkeypatch.setattr(command, "execute_batches", executed())
-    certify(settings(tmp_path / "kept", mode="lookahead"))
+    attack(settings(tmp_path / "kept", mode="lookahead"))
     head, *lines = capsys.readouterr().out.splitlines()
     assert head == "3,200 steps, 200 in each episode"
     cells = ["16", "3", "0.1%", "0", "0", "2.1e-01", "2.5e-01", "50.0%", "0.0%"]
@@ -306,7 +307,7 @@ def test_exits_of_lookahead_are_allowed_and_violations_are_not(tmp_path, small, 
     ):
         monkeypatch.setattr(command, "execute_batches", executed(**more))
         with pytest.raises(SafetyBroken, match=f"^{words}"):
-            certify(settings(tmp_path / words, mode="lookahead"))
+            attack(settings(tmp_path / words, mode="lookahead"))
 
 
 def test_damaged_counts_are_refused(tmp_path):
@@ -376,3 +377,14 @@ def test_settings_that_contradict_each_other_are_refused(changes, words, tmp_pat
 def test_the_certificate_of_a_case_fits_its_plant_and_contract():
     case = AttackCase(truck_trailer(), attack_cases(0, 1)[CRUISE].channel)
     assert case.certificate.fingerprint == truck_trailer().fingerprint
+
+
+def test_earlier_name_of_the_command_is_the_same_command(tmp_path, small, without_workers):
+    for name in ("attack", "certify"):
+        run = ncs(name, "--steps", 1, "--random-plants", 1, "--envs", 16, "--out", tmp_path / "out")
+        assert run.returncode == 0, run.stderr
+    assert "per second" not in run.stdout  # all there, in the folder of the other name
+    helps = [ncs(name, "--help").stdout for name in ("attack", "certify")]
+    assert helps[0] == helps[1]
+    assert "ncs attack" in helps[0]
+    assert "certify" not in ncs("--help").stdout
