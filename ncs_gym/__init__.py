@@ -11,8 +11,7 @@ from ncs_gym.network.escape_probability import escape_probability
 from ncs_gym.plant_registration import register_plant
 from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
-from ncs_gym.plants.description import NoNoiseWarning
-from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.plants.linear_plant import LinearPlant, NoNoiseWarning
 from ncs_gym.plants.truck_trailer import truck_trailer
 from ncs_gym.processes import FunctionProcess, GymProcess, LinearProcess, Process, linear_model
 from ncs_gym.registration import register_all
