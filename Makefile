@@ -6,6 +6,8 @@ OUT ?= runs/compare
 # Where torch comes from; empty for pip's own index, whose torch for Linux brings gigabytes of libraries for graphics cards.
 # Without them: make TORCH_INDEX=https://download.pytorch.org/whl/cpu
 TORCH_INDEX ?=
+# Instructions of processors that numpy chooses when it starts.
+WIDE := AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR AVX2 FMA3 X86_V4 X86_V3
 PACKAGES := ncs_gym shields agents experiments
 INSTALLED := $(VENV)/.installed
 DOCS_INSTALLED := $(VENV)/.installed-docs
@@ -13,7 +15,7 @@ AUDIT_INSTALLED := $(VENV)/.installed-audit
 ZOO_INSTALLED := $(VENV)/.installed-rl-zoo
 RAY_INSTALLED := $(VENV)/.installed-ray
 
-.PHONY: compare study test coverage coverage-report test-slow lint types benchmark docs audit clean
+.PHONY: compare study test test-other-processor coverage coverage-report test-slow lint types benchmark docs audit clean
 
 compare: $(INSTALLED)
 	$(BIN)/ncs compare --out $(OUT)
@@ -24,6 +26,11 @@ study: $(INSTALLED)
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest -n auto --dist worksteal $(TEST_FLAGS)
+
+# What proves, verifies and decides, once more with other kernels of linear algebra and without wide instructions (x86).
+test-other-processor: $(INSTALLED)
+	OPENBLAS_CORETYPE=Prescott NPY_DISABLE_CPU_FEATURES='$(WIDE)' $(BIN)/python -m pytest -n auto --dist worksteal \
+		tests/ncs_gym/estimation tests/ncs_gym/plants tests/ncs_gym/uncertainty tests/shields tests/hardening
 
 # The suite, and the share of lines and branches it runs, by package. Tracing takes half as much time again.
 coverage: $(INSTALLED)

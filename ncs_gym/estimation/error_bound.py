@@ -209,7 +209,8 @@ def _unconditional_set(plant: LinearPlant) -> ErrorSet:
 
     slowest = max(radius**2, 1e-6)
     margin = 1e-4 * (1.0 - slowest)
-    best: Any = minimize_scalar(size, bounds=(slowest + margin, 1.0 - margin), method="bounded", options={"xatol": margin})
+    bounds, options = (slowest + margin, 1.0 - margin), {"xatol": margin}
+    best: Any = minimize_scalar(size, bounds=bounds, method="bounded", options=options)
     rate = 1.0 - float(exact.rounded(1.0 - best.x, RATE_DIGITS))
     scaled = GROWTH * _smallest_solution(A, D, first, rate)
     _check(scaled, A, D, first, rate)

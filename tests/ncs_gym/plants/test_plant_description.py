@@ -86,7 +86,7 @@ def changed(change):
             changed(lambda plant: plant.update(sensor_bound={"radius": 1})),
             'a bound in the file of a plant must be .*"shape"',
         ),
-        (changed(lambda plant: plant.update(sensor_bound={"shape": [[-1]]})), "shape_matrix must be positive semidefinite"),
+        (changed(lambda plant: plant.update(sensor_bound={"shape": [[-1]]})), "must be positive semidefinite"),
     ],
 )
 def test_wrong_files_are_refused_in_one_sentence(write, words, tmp_path):
