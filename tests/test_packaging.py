@@ -29,10 +29,7 @@ LAYERS = {
         {"estimation", "rendering"},
         {"downlink"},
         {"envs"},
-        {"json_settings"},
-        {"scenario"},
         {"registration"},
-        {"plant_registration"},
     ),
     "shields": (
         {"errors", "atomic_write"},

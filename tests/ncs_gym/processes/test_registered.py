@@ -119,7 +119,7 @@ def test_wrong_json_value_is_refused(fields, message):
 def test_missing_extra_is_named_in_one_sentence(monkeypatch):
     inverted = IDS[2]
     monkeypatch.setattr("ncs_gym.processes.mujoco_pendulum.find_spec", lambda name: None)
-    monkeypatch.setattr("ncs_gym.scenario.find_spec", lambda name: None)
+    monkeypatch.setattr("ncs_gym.registration.find_spec", lambda name: None)
     assert inverted in gym.registry
     assert inverted not in registered_ids()
     assert needing_extras() == [inverted]
