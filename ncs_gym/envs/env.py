@@ -22,6 +22,7 @@ from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.packet_transmission import ChannelState
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import LinearProcess, Process
+from ncs_gym.processes.simulation import PlantSimulation
 from ncs_gym.rendering import Annotation, Renderer
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.tasks.task import Task
@@ -184,7 +185,9 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         truncated = self._noise == "truncated"
         self._process_given = LinearProcess() if process is None else expect(process, Process, "process")
         allowed = self._allow_assumption_violation
-        self._process = self._process_given.simulation(plant, self._disturbance, allowed, truncated=truncated)
+        self._process = PlantSimulation(
+            plant, self._disturbance, allowed, truncated=truncated, process=self._process_given
+        )
         self._horizon = as_count(horizon, "horizon", low=1, high=LONGEST_HORIZON)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)
         steps = self._horizon + self._downlink.lead
@@ -300,7 +303,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._violations += cost
         constraints = values, cost, self._violations
         self._belief = self._downlink.belief()
-        known, alarm = self._estimator, self._estimator.alarm or self._process.alarm
+        known, alarm = self._estimator, bool(self._estimator.alarm or self._process.alarm)
         return loop_info(known, self._belief, self._contract, self._state, inputs, arrived, constraints, alarm)
 
 

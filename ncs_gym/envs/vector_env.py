@@ -24,6 +24,7 @@ from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.packet_transmission import VectorChannelState
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.processes.simulation import PlantSimulation
 from ncs_gym.tasks.task import Task
 from ncs_gym.validation import as_count, setting, shown
 
@@ -89,8 +90,9 @@ class NCSVectorEnv(VectorEnv):
         bounds = single.observation_space.low, single.observation_space.high
         self._low, self._high = (np.asarray(bound, dtype=np.float64)[:, None] for bound in bounds)
         allowed, truncated = single.allow_assumption_violation, single.noise == "truncated"
-        simulation = single.process.simulation
-        self._process = simulation(self._plant, single.disturbance, allowed, self.num_envs, truncated=truncated)
+        self._process = PlantSimulation(
+            self._plant, single.disturbance, allowed, self.num_envs, truncated=truncated, process=single.process
+        )
         self._protocol, self._certificate_contract = single.downlink, single.certificate_contract
         patterns = arrival_patterns(self._plant, self._channel, self._certificate_contract)
         self._estimator = VectorEstimator(self._plant, patterns, self.num_envs)
