@@ -27,7 +27,6 @@ LAYERS = {
         {"uncertainty", "plants"},
         {"network", "tasks", "processes"},
         {"estimation", "rendering"},
-        {"downlink"},
         {"envs"},
         {"registration"},
     ),

@@ -22,8 +22,8 @@ from ncs_gym import (
     exact,
     truck_trailer,
 )
-from ncs_gym.downlink import downlink_protocol
 from ncs_gym.envs.env import ncs_env
+from ncs_gym.network import downlink_protocol
 from ncs_gym.registration import ENVIRONMENTS, EPISODE_STEPS, loaded_truck_trailer
 from shields import Certificate
 from shields.runtime.wrapper import certificate_for
@@ -122,7 +122,7 @@ def _env_cases(name: str, env: NCSEnv, *, all_channels: bool = False) -> dict[st
     """Returns the cases of an environment: its own channel, those that use its contract up, and all kinds if asked."""
     channels = {"its channel": env.channel} | ({} if env.contract is None else _extremes(env.contract))
     channels |= _CHANNELS if all_channels else {}
-    protocol = env.downlink
+    protocol = env.downlink_protocol
     downlink = (None, None) if protocol is None else (protocol.channel, protocol.contract)
     cases = {
         kind: AttackCase(env.plant, channel, env.contract, env.process, *downlink) for kind, channel in channels.items()
