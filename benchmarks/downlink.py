@@ -20,7 +20,7 @@ import numpy as np
 from experiments.baselines import controller
 from experiments.plots.figure_style import STYLE, CaptionedFigure
 from ncs_gym import Actuator, Channel
-from ncs_gym.downlink import CommittedInputs
+from ncs_gym.network import CommittedInputs
 from shields import VectorSafetyShield
 from shields.runtime.wrapper import certificate_for
 

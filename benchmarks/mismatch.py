@@ -32,18 +32,18 @@ MASSES = (0.5, 0.8, 0.9, 0.95, 0.99, 1.0, 1.01, 1.05, 1.1, 1.2, 1.5, 2.0)
 
 def largest_step_outside(plant: Any, process: Any, rng: np.random.Generator) -> float:
     """Largest gauge of x+ - A x - B u in E(D) over samples of box x limits, corners among them."""
-    body = process.body(plant, None)
+    moving = process.opened(plant, None)
     widths = np.concatenate([plant.half_widths, plant.u_max])
     largest = 0.0
     for number in range(SAMPLES):
         point = widths * rng.uniform(-1.0, 1.0, len(widths))
         point = widths * np.sign(point) if number % 2 else point
         x, u = point[: plant.n], point[plant.n :]
-        if body.terminated or body.truncated:
-            body.start(rng, x, None)
-        moved = body.step(body.write(x), u)
-        largest = max(largest, plant.disturbance.gauge(moved - plant.A @ x - plant.B @ u))
-    body.close()
+        if moving.terminated or moving.truncated:
+            moving.start(rng, x, None)
+        x_next = moving.step(plant, moving.write(x), u)
+        largest = max(largest, plant.disturbance.gauge(x_next - plant.A @ x - plant.B @ u))
+    moving.close()
     return largest
 
 

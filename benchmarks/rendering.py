@@ -9,14 +9,14 @@ import gymnasium as gym
 import numpy as np
 
 import ncs_gym  # noqa: F401
-from ncs_gym.registration import ENTRY_POINTS
+from ncs_gym.registration import ENVIRONMENTS
 
 FRAMES, REPEATS = 200, 5
 
 
 def main() -> None:
     print(f"{'environment':<38}{'step [ms]':>10}{'picture [ms]':>14}{'pictures/s':>12}")
-    for env_id in ENTRY_POINTS:
+    for env_id in ENVIRONMENTS:
         if env_id == "ncs_gym/LinearNCS-v0":
             continue
         try:

@@ -1,21 +1,19 @@
 """Plants behind imperfect networks as Gymnasium environments; importing registers the ids."""
 
-from ncs_gym.downlink import Actuator, Command
 from ncs_gym.envs.env import NCSEnv
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlantError, certified_error_set
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet
 from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
+from ncs_gym.network.downlink import Actuator, Command
 from ncs_gym.network.escape_probability import escape_probability
-from ncs_gym.plant_registration import register_plant
 from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
-from ncs_gym.plants.description import NoNoiseWarning
-from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.plants.linear_plant import LinearPlant, NoNoiseWarning
 from ncs_gym.plants.truck_trailer import truck_trailer
 from ncs_gym.processes import FunctionProcess, GymProcess, LinearProcess, Process, linear_model
-from ncs_gym.registration import register_all
+from ncs_gym.registration import register_all, register_plant
 from ncs_gym.rendering import Annotation
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.tasks.setpoint_tracking import SetpointTracking

@@ -1,15 +1,22 @@
-"""The registered environments: the only place with numbers."""
+"""The registered environments: one table of them, the only place with numbers, and the factory that makes them."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+from ncs_gym.envs.env import NCSEnv
+from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network.channel import Channel
-from ncs_gym.network.contract import contract_of
+from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
 from ncs_gym.plants.linear_plant import LinearPlant
@@ -18,26 +25,171 @@ from ncs_gym.processes import (
     CartPoleProcess,
     InvertedPendulumProcess,
     PendulumProcess,
+    Process,
     inverted_pendulum,
     nonlinear_cart_pole,
     pendulum,
 )
-from ncs_gym.scenario import EPISODE_STEPS, Scenario, VectorScenario
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.tasks.setpoint_tracking import SetpointTracking
 from ncs_gym.tasks.speed_tracking import SpeedTracking
-from ncs_gym.uncertainty.bounded_disturbances import BoxDisturbance
+from ncs_gym.tasks.task import Task
+from ncs_gym.uncertainty.bounded_disturbances import BoxDisturbance, SinusoidDisturbance
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
+from ncs_gym.validation import as_count, shown
+
+# Steps per episode of every registered environment (Liu et al. Section 5).
+EPISODE_STEPS = 200
+# What a dictionary of fields stands for in the settings that may be JSON values, as `EnvSpec.to_json` makes them of the
+# objects; several classes are told apart by the names of their fields.
+_JSON_SETTINGS: dict[str, tuple[type, ...]] = {
+    "channel": (Channel,),
+    "task": (Regulation, SpeedTracking, SetpointTracking),
+    "disturbance": (BoxDisturbance, SinusoidDisturbance),
+    "initial_set": (Ellipsoid,),
+    "contract": (ChannelContract,),
+    "process": (CartPoleProcess, PendulumProcess, InvertedPendulumProcess),
+    "downlink": (Channel,),
+    "downlink_contract": (ChannelContract,),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Factory:
+    """Makes a registered environment from its defaults, alone or many at once.
+
+    Attributes:
+        plant: Makes the default plant; None if the user has to give one.
+        channel: Default channel, whose contract is that of the default plant.
+        task: Default task.
+        box: Default disturbance where it suits the plant; "ball" elsewhere.
+        terminates: Whether a violation ends the episode by default: an unstable plant does not come back.
+        start: Radius of the disc of starts, for plants of two states; None and elsewhere: `NCSEnv`'s default.
+        process: What really moves, whose fields a dictionary may hold; None for the plant's own equations.
+        extra: Extra that installs the module of this name, which the process needs; empty for none.
+        downlink: Default downlink; None for an ideal one.
+        is_vector: Whether it makes vector environments.
+    """
+
+    plant: Callable[[], LinearPlant] | None
+    channel: Channel
+    task: Task
+    box: BoxDisturbance | None = None
+    terminates: bool = False
+    start: float | None = None
+    process: Process | None = None
+    extra: str = ""
+    downlink: Channel | None = None
+    is_vector: bool = False
+
+    def __call__(self, **settings: Any) -> NCSEnv | NCSVectorEnv:
+        """Returns the environment; see `settings` for the keywords, `NCSVectorEnv` for more of them.
+
+        Raises:
+            ValueError: If there is no default plant and none is given, or a setting is wrong.
+        """
+        return (NCSVectorEnv if self.is_vector else NCSEnv)(**self.settings(**settings))
+
+    def settings(self, *, plant: LinearPlant | str | os.PathLike[str] | None = None, **given: Any) -> dict[str, Any]:
+        """Returns the arguments of `NCSEnv`.
+
+        Settings may be JSON values, so that an `EnvSpec` may: dictionaries of fields (`Channel(**channel)`), a
+        disturbance by its name, a plant by the path of a file that `LinearPlant.save` wrote.
+
+        Args:
+            plant: The plant; None for the default one.
+            given: Other arguments of `NCSEnv`; None stands for the default where there is one.
+
+        Raises:
+            ValueError: If there is no default plant and none is given, or a JSON value is wrong.
+        """
+        if isinstance(plant, (str, os.PathLike)):
+            plant = LinearPlant.load(Path(plant))
+        own: dict[str, Any] = {
+            "channel": self.channel,
+            "task": self.task,
+            "terminate_on_violation": self.terminates,
+            "downlink": self.downlink,
+            "process": self.process,
+            "horizon": EPISODE_STEPS,
+        }
+        kinds = _JSON_SETTINGS if self.process is None else _JSON_SETTINGS | {"process": (type(self.process),)}
+        if plant is None:
+            if self.plant is None:
+                raise ValueError(
+                    "this environment has no plant of its own: give plant=LinearPlant(...), or register_plant it"
+                )
+            plant, own["contract"] = self.plant(), contract_of(self.channel)
+        own |= {"plant": plant, "disturbance": self._disturbance(plant)}
+        if self.start is not None and getattr(plant, "n", 0) == 2:
+            own["initial_set"] = Ellipsoid(self.start**2 * np.eye(2))
+        for name, value in given.items():
+            if name in kinds or name == "terminate_on_violation":
+                if value is not None:
+                    own[name] = _from_json(value, kinds[name], name) if name in kinds else value
+            else:
+                own[name] = value
+        return own
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """What gymnasium asks of an entry point before it is called: a vector environment draws nothing."""
+        return NCSEnv.metadata | ({"render_modes": []} if self.is_vector else {})
+
+    @property
+    def is_installed(self) -> bool:
+        """Whether what the process needs is installed."""
+        return not self.extra or find_spec(self.extra) is not None
+
+    def _disturbance(self, plant: Any) -> Any:
+        if self.box is None or not isinstance(plant, LinearPlant) or self.box.check(plant) or self.box.excess(plant):
+            return "ball"
+        return self.box
+
+
+def _from_json(value: Any, kinds: tuple[type, ...], name: str) -> Any:
+    """Returns the object whose fields a dictionary holds; a value that is no dictionary as it is.
+
+    Args:
+        value: The value of a setting.
+        kinds: Dataclasses that a dictionary may hold the fields of.
+        name: Name of the setting.
+
+    Raises:
+        ValueError: If the dictionary holds the fields of none of them, or of several, or a wrong value.
+    """
+    if not isinstance(value, dict):
+        return value
+    names = {kind: {entry.name for entry in fields(kind)} for kind in kinds}
+    fitting = [kind for kind in kinds if set(value) <= names[kind]]
+    try:
+        if len(fitting) == 1:
+            return fitting[0](**value)
+    except TypeError:  # a field without a default is missing
+        pass
+    known = " or ".join(f"a {kind.__name__} ({', '.join(sorted(names[kind]))})" for kind in kinds)
+    raise ValueError(f"{name} must be the settings of {known}, got {shown(value)}")
+
 
 # The four impairments of Liu et al. Section 5, all at once.
 CASE_STUDY_CHANNEL = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
 # The disturbance box of Liu et al. Section 5 [m, m/s]; its corner has squared length gamma = 5e-4.
 CASE_STUDY_BOX = BoxDisturbance((0.02, 0.01))
 
-# Liu et al. Section 5: 1000 kg, dt 0.5 s, gamma 5e-4, Q = P0 = R = 1e-4 I (the paper prints no R), delta 0.05; starts
-# uniformly in the disc of radius 1.9.
-TRUCK_TRAILER = Scenario(
-    plant=truck_trailer, channel=CASE_STUDY_CHANNEL, task=Regulation(), box=CASE_STUDY_BOX, start=1.9
-)
+# Throttle commands that go over a mobile network, too, are one step late (0.5 s, what a busy one takes at worst) and as
+# lossy as samples, but never more than two in a row are lost. Inputs are committed 3 steps ahead.
+CRUISE_DOWNLINK = Channel(loss=0.3, delay=1, max_consecutive_losses=2)
+# One sample per step that is 1 to 2 steps late; 20 % are lost, never more than two in a row: no sample in use is older
+# than 4 steps. Measurements are rounded to 1e-4 of their units.
+CART_POLE_CHANNEL = Channel(loss=0.2, delay=1, jitter=1, max_consecutive_losses=2, quantization_step=1e-4)
+# Motor commands go back over the same radio as the samples: 1 to 2 steps late (20 to 40 ms, a wireless network shared
+# with others), 20 % lost, never more than two in a row. Inputs are committed 4 steps ahead.
+CART_POLE_DOWNLINK = replace(CART_POLE_CHANNEL, quantization_step=0.0)
+CART_POLE_TASK = SetpointTracking(output=np.array([1.0, 0.0, 0.0, 0.0]), reach=2.0, width=2.0, change_probability=0.02)
+# A sample per step, one step late; 20 % are lost, never more than two in a row: none in use is older than 3 steps.
+BATCH_REACTOR_CHANNEL = Channel(loss=0.2, delay=1, max_consecutive_losses=2, quantization_step=1e-3)
+# A sample per step; 30 % are lost, never more than two in a row.
+PENDULUM_CHANNEL = Channel(loss=0.3, max_consecutive_losses=2)
 
 
 def loaded_truck_trailer() -> LinearPlant:
@@ -47,108 +199,81 @@ def loaded_truck_trailer() -> LinearPlant:
 
 # The loaded trailer on the same coupling, noise and channel; the truck follows a random speed profile and starts within
 # 0.2 of rest of the coupling.
-TRUCK_TRAILER_CRUISE = Scenario(
+_CRUISE = Factory(
     plant=loaded_truck_trailer, channel=CASE_STUDY_CHANNEL, task=SpeedTracking(), box=CASE_STUDY_BOX, start=0.2
 )
+_CART_POLE = Factory(plant=cart_pole, channel=CART_POLE_CHANNEL, task=CART_POLE_TASK, terminates=True)
 
-# The same truck with its controller elsewhere: throttle commands go over a mobile network, too. They are one step late
-# (0.5 s, what a busy one takes at worst) and as lossy as samples, but never more than two in a row are lost. Inputs are
-# committed 3 steps ahead.
-CRUISE_DOWNLINK = Channel(loss=0.3, delay=1, max_consecutive_losses=2)
-TRUCK_TRAILER_CRUISE_TWO_WAY = replace(TRUCK_TRAILER_CRUISE, downlink=CRUISE_DOWNLINK)
-
-# Any plant of the user's, behind a perfect channel unless given.
-LINEAR_NCS = Scenario(plant=None, channel=Channel(), task=Regulation())
-
-# One sample per step that is 1 to 2 steps late; 20 % are lost, never more than two in a row: no sample in use is older
-# than 4 steps. Measurements are rounded to 1e-4 of their units.
-CART_POLE_CHANNEL = Channel(loss=0.2, delay=1, jitter=1, max_consecutive_losses=2, quantization_step=1e-4)
-CART_POLE = Scenario(
-    plant=cart_pole,
-    channel=CART_POLE_CHANNEL,
-    task=SetpointTracking(output=np.array([1.0, 0.0, 0.0, 0.0]), reach=2.0, width=2.0, change_probability=0.02),
-    contract=contract_of(CART_POLE_CHANNEL),
-    terminates=True,
-)
-
-# Motor commands go back over the same radio as the samples: 1 to 2 steps late (20 to 40 ms, a wireless network shared
-# with others), 20 % lost, never more than two in a row. Inputs are committed 4 steps ahead.
-CART_POLE_DOWNLINK = replace(CART_POLE_CHANNEL, quantization_step=0.0)
-CART_POLE_TWO_WAY = replace(CART_POLE, downlink=CART_POLE_DOWNLINK)
-
-# A sample per step, one step late; 20 % are lost, never more than two in a row: none in use is older than 3 steps.
-BATCH_REACTOR_CHANNEL = Channel(loss=0.2, delay=1, max_consecutive_losses=2, quantization_step=1e-3)
-BATCH_REACTOR = Scenario(
-    plant=batch_reactor,
-    channel=BATCH_REACTOR_CHANNEL,
-    task=SetpointTracking(output=np.array([0.0, 1.0, 0.0, 0.0]), reach=1.0, width=1.0, change_probability=0.05),
-    contract=contract_of(BATCH_REACTOR_CHANNEL),
-    terminates=True,
-)
-
-# Gymnasium's `Pendulum-v1` inside. A sample per step; 30 % are lost, never more than two in a row.
-PENDULUM_CHANNEL = Channel(loss=0.3, max_consecutive_losses=2)
-PENDULUM = Scenario(
-    plant=pendulum,
-    channel=PENDULUM_CHANNEL,
-    task=SetpointTracking(output=np.array([1.0, 0.0]), reach=0.15, width=0.15, change_probability=0.02),
-    contract=contract_of(PENDULUM_CHANNEL),
-    terminates=True,
-    process=PendulumProcess(),
-)
-
-# Gymnasium's MuJoCo environment `InvertedPendulum-v5` inside, behind the same channel.
-INVERTED_PENDULUM = Scenario(
-    plant=inverted_pendulum,
-    channel=PENDULUM_CHANNEL,
-    task=SetpointTracking(output=np.array([1.0, 0.0, 0.0, 0.0]), reach=0.6, width=0.6, change_probability=0.02),
-    contract=contract_of(PENDULUM_CHANNEL),
-    terminates=True,
-    process=InvertedPendulumProcess(),
-    extra="mujoco",
-)
-
-# The nonlinear equations of the cart-pole behind the channel of CART_POLE, with its task, box and limits.
-CART_POLE_NONLINEAR = Scenario(
-    plant=nonlinear_cart_pole,
-    channel=CART_POLE_CHANNEL,
-    task=CART_POLE.task,
-    contract=contract_of(CART_POLE_CHANNEL),
-    terminates=True,
-    process=CartPoleProcess(),
-)
-
-ENTRY_POINTS = {
-    "ncs_gym/TruckTrailer-v0": "TRUCK_TRAILER",
-    "ncs_gym/TruckTrailerCruise-v0": "TRUCK_TRAILER_CRUISE",
-    "ncs_gym/TruckTrailerCruiseTwoWay-v0": "TRUCK_TRAILER_CRUISE_TWO_WAY",
-    "ncs_gym/LinearNCS-v0": "LINEAR_NCS",
-    "ncs_gym/CartPole-v0": "CART_POLE",
-    "ncs_gym/CartPoleTwoWay-v0": "CART_POLE_TWO_WAY",
-    "ncs_gym/BatchReactor-v0": "BATCH_REACTOR",
-    "ncs_gym/Pendulum-v0": "PENDULUM",
-    "ncs_gym/InvertedPendulum-v0": "INVERTED_PENDULUM",
-    "ncs_gym/CartPoleNonlinear-v0": "CART_POLE_NONLINEAR",
+# By id. The entry point of "ncs_gym/CartPole-v0" is `ncs_gym.registration:CART_POLE`, which `__getattr__` finds.
+ENVIRONMENTS = {
+    # Liu et al. Section 5: 1000 kg, dt 0.5 s, gamma 5e-4, Q = P0 = R = 1e-4 I (the paper prints no R), delta 0.05;
+    # starts uniformly in the disc of radius 1.9.
+    "ncs_gym/TruckTrailer-v0": Factory(
+        plant=truck_trailer, channel=CASE_STUDY_CHANNEL, task=Regulation(), box=CASE_STUDY_BOX, start=1.9
+    ),
+    "ncs_gym/TruckTrailerCruise-v0": _CRUISE,
+    # The same truck with its controller elsewhere.
+    "ncs_gym/TruckTrailerCruiseTwoWay-v0": replace(_CRUISE, downlink=CRUISE_DOWNLINK),
+    # Any plant of the user's, behind a perfect channel unless given.
+    "ncs_gym/LinearNCS-v0": Factory(plant=None, channel=Channel(), task=Regulation()),
+    "ncs_gym/CartPole-v0": _CART_POLE,
+    "ncs_gym/CartPoleTwoWay-v0": replace(_CART_POLE, downlink=CART_POLE_DOWNLINK),
+    "ncs_gym/BatchReactor-v0": Factory(
+        plant=batch_reactor,
+        channel=BATCH_REACTOR_CHANNEL,
+        task=SetpointTracking(output=np.array([0.0, 1.0, 0.0, 0.0]), reach=1.0, width=1.0, change_probability=0.05),
+        terminates=True,
+    ),
+    # Gymnasium's `Pendulum-v1` inside.
+    "ncs_gym/Pendulum-v0": Factory(
+        plant=pendulum,
+        channel=PENDULUM_CHANNEL,
+        task=SetpointTracking(output=np.array([1.0, 0.0]), reach=0.15, width=0.15, change_probability=0.02),
+        terminates=True,
+        process=PendulumProcess(),
+    ),
+    # Gymnasium's MuJoCo environment `InvertedPendulum-v5` inside.
+    "ncs_gym/InvertedPendulum-v0": Factory(
+        plant=inverted_pendulum,
+        channel=PENDULUM_CHANNEL,
+        task=SetpointTracking(output=np.array([1.0, 0.0, 0.0, 0.0]), reach=0.6, width=0.6, change_probability=0.02),
+        terminates=True,
+        process=InvertedPendulumProcess(),
+        extra="mujoco",
+    ),
+    # The nonlinear equations of the cart-pole.
+    "ncs_gym/CartPoleNonlinear-v0": replace(_CART_POLE, plant=nonlinear_cart_pole, process=CartPoleProcess()),
 }
+_LINEAR_NCS = "ncs_gym/LinearNCS-v0"
 
 
-TRUCK_TRAILER_VECTOR = VectorScenario(TRUCK_TRAILER)
-TRUCK_TRAILER_CRUISE_VECTOR = VectorScenario(TRUCK_TRAILER_CRUISE)
-TRUCK_TRAILER_CRUISE_TWO_WAY_VECTOR = VectorScenario(TRUCK_TRAILER_CRUISE_TWO_WAY)
-LINEAR_NCS_VECTOR = VectorScenario(LINEAR_NCS)
-CART_POLE_VECTOR = VectorScenario(CART_POLE)
-CART_POLE_TWO_WAY_VECTOR = VectorScenario(CART_POLE_TWO_WAY)
-BATCH_REACTOR_VECTOR = VectorScenario(BATCH_REACTOR)
-PENDULUM_VECTOR = VectorScenario(PENDULUM)
-INVERTED_PENDULUM_VECTOR = VectorScenario(INVERTED_PENDULUM)
-CART_POLE_NONLINEAR_VECTOR = VectorScenario(CART_POLE_NONLINEAR)
+def _entry_point(env_id: str) -> str:
+    """Returns the name of an environment among the entry points of this module: CART_POLE of "ncs_gym/CartPole-v0"."""
+    return re.sub("(?<=[a-z])(?=[A-Z])", "_", env_id.removeprefix("ncs_gym/").removesuffix("-v0")).upper()
+
+
+_BY_ENTRY_POINT = {_entry_point(env_id): factory for env_id, factory in ENVIRONMENTS.items()}
+
+
+def __getattr__(name: str) -> Factory:
+    """Returns the factory at an entry point: CART_POLE, or CART_POLE_VECTOR for many environments at once."""
+    factory = _BY_ENTRY_POINT.get(name.removesuffix("_VECTOR"))
+    if factory is None:
+        raise AttributeError(f"module {__name__} has no attribute {name}")
+    return replace(factory, is_vector=name.endswith("_VECTOR"))
+
+
+def _entry_points(env_id: str) -> dict[str, Any]:
+    """Returns where gymnasium finds the factories of an environment of this module."""
+    entry_point = f"{__name__}:{_entry_point(env_id)}"
+    return {"entry_point": entry_point, "vector_entry_point": f"{entry_point}_VECTOR"}
 
 
 def register_all() -> None:
     """Registers the ids with gymnasium; `import ncs_gym` calls it."""
-    for env_id, name in ENTRY_POINTS.items():
+    for env_id in ENVIRONMENTS:
         if env_id not in gym.registry:
-            gym.register(id=env_id, max_episode_steps=EPISODE_STEPS, **entry_points_of(name))
+            gym.register(id=env_id, max_episode_steps=EPISODE_STEPS, **_entry_points(env_id))
 
 
 def registered_ids() -> list[str]:
@@ -156,17 +281,71 @@ def registered_ids() -> list[str]:
 
     An environment whose extra is not installed is not among them.
     """
-    scenarios = {env_id: globals()[name] for env_id, name in ENTRY_POINTS.items()}
-    own = [env_id for env_id, each in scenarios.items() if each.plant is not None and each.is_installed]
-    entry_point = entry_points_of("LINEAR_NCS")["entry_point"]
+    own = [env_id for env_id, each in ENVIRONMENTS.items() if each.plant is not None and each.is_installed]
+    entry_point = _entry_points(_LINEAR_NCS)["entry_point"]
     return own + [spec.id for spec in gym.registry.values() if spec.entry_point == entry_point and spec.kwargs]
 
 
 def needing_extras() -> list[str]:
     """Returns the ids of this module's environments whose extra is not installed: `gym.make` says which one."""
-    return [env_id for env_id, name in ENTRY_POINTS.items() if not globals()[name].is_installed]
+    return [env_id for env_id, each in ENVIRONMENTS.items() if not each.is_installed]
 
 
-def entry_points_of(name: str) -> dict[str, Any]:
-    """Returns where gymnasium finds a scenario of this module and its vector environment."""
-    return {"entry_point": f"{__name__}:{name}", "vector_entry_point": f"{__name__}:{name}_VECTOR"}
+def register_plant(
+    env_id: str,
+    plant: LinearPlant | str | os.PathLike[str],
+    *,
+    channel: Channel | dict[str, Any] | None = None,
+    task: Task | dict[str, Any] | None = None,
+    contract: ChannelContract | dict[str, Any] | None = None,
+    max_episode_steps: int = EPISODE_STEPS,
+    **settings: Any,
+) -> None:
+    """Registers a plant as a Gymnasium environment, scalar and vectorized, with a time limit.
+
+    With this in a module `tank.py`:
+
+        import numpy as np
+        from ncs_gym import Channel, LinearPlant, register_plant
+
+        plant = LinearPlant(
+            A=[[0.98, 0.04], [0.0, 0.95]],  # levels of two tanks, deviations from the set point [m]
+            B=[[0.0], [0.05]],  # valve [l/s]
+            box=[0.3, 0.5],  # |x_1| <= 0.3 m, |x_2| <= 0.5 m at every step
+            u_max=2.0,
+            dt=1.0,
+            disturbance_bound=[0.001, 0.002],  # largest change per step by what is not modeled [m]
+            sensor_bound=0.01,
+            initial_bound=0.01,
+        )
+        register_plant("Plants/Tanks-v0", plant, channel=Channel(loss=0.3, delay=2))
+
+    the id works wherever Gymnasium's do, and for the commands (which import the module before the colon):
+
+        gym.make("tank:Plants/Tanks-v0")
+        gym.make_vec("tank:Plants/Tanks-v0", num_envs=64)
+        ncs compare --env tank:Plants/Tanks-v0
+
+    Args:
+        env_id: Id, such as "Plants/Tanks-v0".
+        plant: The plant, or the path of a file that `LinearPlant.save` wrote: with a path the spec is JSON.
+        channel: The network; a perfect one by default.
+        task: The reward; `Regulation` by default.
+        contract: What the channel promises; by default that of the channel if the plant is unstable, else none.
+        max_episode_steps: Steps after which an episode is truncated.
+        settings: Other keywords of `NCSEnv`: `process`, `disturbance`, `noise`, `initial_set`,
+            `terminate_on_violation` and `allow_assumption_violation`.
+
+    Raises:
+        UnstablePlantError: If the plant is not Schur stable and there is no contract.
+        TypeError: If a keyword is unknown.
+        ValueError: If a setting is wrong, or the id is that of an environment of this package.
+    """
+    if env_id in ENVIRONMENTS:
+        raise ValueError(f"{env_id} is an environment of this package: register the plant under an id of its own")
+    steps = as_count(max_episode_steps, "max_episode_steps", low=1)
+    given = {"channel": channel, "task": task, "contract": contract} | settings
+    given = {name: value for name, value in given.items() if value is not None}
+    given |= {"plant": plant if isinstance(plant, LinearPlant) else os.path.abspath(plant), "horizon": steps}
+    ENVIRONMENTS[_LINEAR_NCS](**given)  # wrong settings are noticed here rather than when the first environment is made
+    gym.register(id=env_id, max_episode_steps=steps, kwargs=given, **_entry_points(_LINEAR_NCS))

@@ -27,12 +27,8 @@ LAYERS = {
         {"uncertainty", "plants"},
         {"network", "tasks", "processes"},
         {"estimation", "rendering"},
-        {"downlink"},
         {"envs"},
-        {"json_settings"},
-        {"scenario"},
         {"registration"},
-        {"plant_registration"},
     ),
     "shields": (
         {"errors", "atomic_write"},

@@ -22,9 +22,9 @@ from ncs_gym import (
     exact,
     truck_trailer,
 )
-from ncs_gym.downlink import downlink_protocol
 from ncs_gym.envs.env import ncs_env
-from ncs_gym.registration import ENTRY_POINTS, EPISODE_STEPS, loaded_truck_trailer
+from ncs_gym.network import downlink_protocol
+from ncs_gym.registration import ENVIRONMENTS, EPISODE_STEPS, loaded_truck_trailer
 from shields import Certificate
 from shields.runtime.wrapper import certificate_for
 
@@ -35,9 +35,9 @@ _CHANNELS = {
     "bursts": Channel(loss=GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.1), send_period=2, quantization_step=0.01),
     "overtaking": Channel(loss=0.2, quantization_step=0.01, send_period=2, delay=1, jitter=3),
 }
-# Scenarios left out unless one is asked for: the first has no plant of its own, other environments are stepped one by
-# one in the others.
-_LEFT_OUT = ("LINEAR_NCS", "PENDULUM", "INVERTED_PENDULUM")
+# Left out unless one is asked for: the first has no plant of its own, other environments are stepped one by one in the
+# others.
+_LEFT_OUT = tuple(f"ncs_gym/{name}-v0" for name in ("LinearNCS", "Pendulum", "InvertedPendulum"))
 # Numbers of states, inputs and measurements of the random plants, in turn.
 _SIZES = ((2, 1, 2), (2, 2, 1), (3, 2, 3), (4, 1, 4))
 
@@ -98,8 +98,8 @@ def attack_cases(seed: int, random_plants: int, env_id: str | None = None) -> di
         env = registered_env(env_id)
         return _env_cases(module_and_id(env_id)[1], env, all_channels=env.contract is None)
     found = {}
-    for registered, name in ENTRY_POINTS.items():
-        if name not in _LEFT_OUT:
+    for registered in ENVIRONMENTS:
+        if registered not in _LEFT_OUT:
             found |= _env_cases(registered.removeprefix("ncs_gym/"), ncs_env(gym.make(registered)))
     plants = {"TruckTrailer-v0": truck_trailer(), "TruckTrailerCruise-v0": loaded_truck_trailer()}
     plants |= {f"random plant {index}": _random_plant(seed, index) for index in range(random_plants)}
@@ -122,7 +122,7 @@ def _env_cases(name: str, env: NCSEnv, *, all_channels: bool = False) -> dict[st
     """Returns the cases of an environment: its own channel, those that use its contract up, and all kinds if asked."""
     channels = {"its channel": env.channel} | ({} if env.contract is None else _extremes(env.contract))
     channels |= _CHANNELS if all_channels else {}
-    protocol = env.downlink
+    protocol = env.downlink_protocol
     downlink = (None, None) if protocol is None else (protocol.channel, protocol.contract)
     cases = {
         kind: AttackCase(env.plant, channel, env.contract, env.process, *downlink) for kind, channel in channels.items()

@@ -22,7 +22,7 @@ from experiments.backends.job import Job
 from experiments.runs import claim_folder, versions
 from experiments.settings import BackendSettings, CertifySettings
 from experiments.settings.certificates import changed_contract
-from ncs_gym.downlink import downlink_protocol
+from ncs_gym.network import downlink_protocol
 from shields import Certificate
 from shields.atomic_write import write_atomically
 from shields.runtime.safety_filter import DEFAULT_HORIZON

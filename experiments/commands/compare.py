@@ -144,8 +144,8 @@ def _escapes(
     """
     env = ncs_env(ControlLoop(env=setup.env, channel=setup.channel, noise=setup.noise).single())
     steps = gym.spec(setup.env).max_episode_steps or 1
-    downlink = env.downlink
-    lead, is_promised = (0, True) if downlink is None else (downlink.lead, downlink.contract is not None)
+    protocol = env.downlink_protocol
+    lead, is_promised = (0, True) if protocol is None else (protocol.lead, protocol.contract is not None)
     known = starts_known(SafetyFilter(setup.certificate, env.plant), env.initial_set, lead)
     begins_inside = is_promised and all(each.in_safe_set for each in known)
     bound = escape_probability(env.plant, env.channel, steps) if begins_inside else 1.0

@@ -111,7 +111,7 @@ class ExperimentSetup:
         own = registered_env(self.env)
         text = (own.channel if self.channel is None else self.channel).description
         if own.downlink is not None:
-            text += f" Commands: {(self.downlink or own.downlink.channel).description}"
+            text += f" Commands: {(self.downlink or own.downlink).description}"
         return {"plant": str(self.plant), "channel": text}
 
     def training_run(self, settings: LearningSettings, arm_name: str, index: int, grid_point: str = "") -> TrainingRun:
@@ -172,4 +172,4 @@ def _downlink_of(env: NCSEnv, env_id: str) -> Channel:
     """
     if env.downlink is None:
         raise ValueError(f"{env_id} has an ideal downlink, which loses nothing: choose an environment with a downlink")
-    return env.downlink.channel
+    return env.downlink

@@ -8,8 +8,6 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
-from ncs_gym.downlink.loop import Inputs, downlink_of, no_inputs
-from ncs_gym.downlink.protocol import DownlinkProtocol
 from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.reset_options import start_option
 from ncs_gym.envs.settings import expect, loop_contracts, require_suitable, starting_set
@@ -19,9 +17,11 @@ from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
+from ncs_gym.network.downlink import DownlinkProtocol, DownlinkState, Inputs, no_inputs
 from ncs_gym.network.packet_transmission import ChannelState
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import LinearProcess, Process
+from ncs_gym.processes.simulation import PlantSimulation
 from ncs_gym.rendering import Annotation, Renderer
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.tasks.task import Task
@@ -114,7 +114,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             settings guarantee.
 
     Attributes:
-        downlink: How commands are sent, with c as its `lead`; None for an ideal downlink.
+        downlink_protocol: How commands are sent over the downlink, with c as its `lead`; None for an ideal downlink.
         certificate_contract: Contract that a certificate for this environment rests on: `contract` with c steps added.
         steps: Steps taken in this episode.
         episodes: Episodes begun.
@@ -143,7 +143,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     horizon: int = setting("horizon")
     noise: str = setting("noise")
     process: Process = setting("process", "_process_given")
-    downlink: DownlinkProtocol | None = setting("downlink", "_protocol")
+    downlink: Channel | None = setting("downlink")
+    downlink_protocol: DownlinkProtocol | None = setting("downlink_protocol", "_protocol")
 
     def __init__(
         self,
@@ -176,18 +177,21 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self.renderer = None if render_mode is None else Renderer(plant, self._task, render_mode, RENDER_FPS)
         contracts = loop_contracts(plant, self._channel, contract, downlink, downlink_contract)
         self._contract, self._protocol, self._certificate_contract = contracts
+        self._downlink = downlink
         patterns = arrival_patterns(plant, self._channel, self._certificate_contract)
         self._error_set = patterns.recursion.error_set
         self._estimator = Estimator(plant, self._channel, patterns=patterns)
-        self._downlink = downlink_of(self._protocol, self._estimator)
+        self._downlink_state = DownlinkState(self._protocol, plant.m)
         self._noise = as_noise(noise, plant)
         truncated = self._noise == "truncated"
         self._process_given = LinearProcess() if process is None else expect(process, Process, "process")
         allowed = self._allow_assumption_violation
-        self._process = self._process_given.simulation(plant, self._disturbance, allowed, truncated=truncated)
+        self._process = PlantSimulation(
+            plant, self._disturbance, allowed, truncated=truncated, process=self._process_given
+        )
         self._horizon = as_count(horizon, "horizon", low=1, high=LONGEST_HORIZON)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)
-        steps = self._horizon + self._downlink.lead
+        steps = self._horizon + len(self._pending)
         self.observation_space = observation_space(plant, self._task, self._error_set, self._initial_set, steps)
         self._low, self._high = self.observation_space.low, self.observation_space.high
         self.steps = self.episodes = 0
@@ -218,7 +222,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._disturbance_memory = self._process.begin(rng)
         self._channel_state = ChannelState(self._channel, rng)
         self._estimator.reset(self._state + self._process.first_error(rng))
-        self._downlink.begin(rng)
+        self._downlink_state.begin(rng, self._estimator.episode)
         self.steps = 0
         self.episodes += 1
         self._violations = 0.0
@@ -240,7 +244,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             raise gym.error.ResetNeeded("call reset: there was none, or an earlier step failed half-way")
         self._consistent = False
         rng = self.np_random
-        inputs = self._downlink.exchange(rng, self.steps, decided)
+        inputs = self._downlink_state.exchange(rng, self.steps, decided)
         u = inputs.applied
         self._state = self._process.advance(rng, self._state, u, self.steps, self._disturbance_memory)
         self._task_state = self._task.advance(rng, self._plant, self._task_state, u)
@@ -278,7 +282,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def beliefs(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Returns estimate and error shape of now and of every step until the next decision takes effect."""
-        return self._downlink.beliefs()
+        return [self._estimator.predicted(self._pending[:ahead]) for ahead in range(len(self._pending) + 1)]
 
     def close(self) -> None:
         """Closes the window and the process."""
@@ -286,11 +290,22 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         if self.renderer is not None:
             self.renderer.close()
 
+    @property
+    def _pending(self) -> tuple[np.ndarray, ...]:
+        """The inputs of the steps until the next decision takes effect."""
+        return self._downlink_state.committed.pending
+
+    def _predicted_estimate(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns estimate, (n,), and error shape, (n, n), of the time at which the next decision takes effect."""
+        return self._estimator.predicted(self._pending)
+
     def _drawn_start(self, rng: np.random.Generator) -> np.ndarray:
         return (1.0 - SAMPLE_ROUNDING) * self._initial_set.sample(rng)
 
     def _observation(self) -> np.ndarray:
-        task_state = self._downlink.predicted(self._task, self._task_state)
+        task_state = self._task_state
+        for u in self._pending:
+            task_state = self._task.predict(self._plant, task_state, u)
         entries = np.concatenate([self._belief[0], self._task.observe(task_state)])
         return np.minimum(np.maximum(entries, self._low), self._high).astype(np.float32)
 
@@ -299,8 +314,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         cost = 1.0 if max(values.tolist()) > 0.0 else 0.0
         self._violations += cost
         constraints = values, cost, self._violations
-        self._belief = self._downlink.belief()
-        known, alarm = self._estimator, self._estimator.alarm or self._process.alarm
+        self._belief = self._predicted_estimate()
+        known, alarm = self._estimator, bool(self._estimator.alarm or self._process.alarm)
         return loop_info(known, self._belief, self._contract, self._state, inputs, arrived, constraints, alarm)
 
 

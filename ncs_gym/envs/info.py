@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym.downlink.loop import Inputs
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.contract import ChannelContract
+from ncs_gym.network.downlink import Inputs
 
 
 def loop_info(

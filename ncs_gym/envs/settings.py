@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any, TypeVar
 
-from ncs_gym.downlink.protocol import DownlinkProtocol, downlink_protocol
 from ncs_gym.envs.spaces import default_initial_set
 from ncs_gym.estimation.error_bound import UnstablePlantError
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract, contract_of
+from ncs_gym.network.downlink import DownlinkProtocol, downlink_protocol
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.tasks.task import Task
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid

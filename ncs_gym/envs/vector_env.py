@@ -9,9 +9,6 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from ncs_gym.downlink.loop import Inputs, no_inputs
-from ncs_gym.downlink.protocol import DownlinkProtocol
-from ncs_gym.downlink.vector_loop import vector_downlink_of
 from ncs_gym.envs.env import SAMPLE_ROUNDING, NCSEnv, RenderModeError
 from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.reset_options import vector_reset_options
@@ -22,8 +19,10 @@ from ncs_gym.estimation.error_statistics_table import StatisticsTable
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
+from ncs_gym.network.downlink import DownlinkProtocol, Inputs, VectorDownlinkState, no_inputs
 from ncs_gym.network.packet_transmission import VectorChannelState
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.processes.simulation import PlantSimulation
 from ncs_gym.tasks.task import Task
 from ncs_gym.validation import as_count, setting, shown
 
@@ -60,7 +59,8 @@ class NCSVectorEnv(VectorEnv):
     contract: ChannelContract | None = setting("contract")
     certificate_contract: ChannelContract | None = setting("certificate_contract")
     error_set: ErrorSet = setting("error_set")
-    downlink: DownlinkProtocol | None = setting("downlink", "_protocol")
+    downlink: Channel | None = setting("downlink")
+    downlink_protocol: DownlinkProtocol | None = setting("downlink_protocol", "_protocol")
     max_episode_steps: int | None = setting("max_episode_steps")
     autoreset_mode: AutoresetMode = setting("autoreset_mode")
 
@@ -89,13 +89,15 @@ class NCSVectorEnv(VectorEnv):
         bounds = single.observation_space.low, single.observation_space.high
         self._low, self._high = (np.asarray(bound, dtype=np.float64)[:, None] for bound in bounds)
         allowed, truncated = single.allow_assumption_violation, single.noise == "truncated"
-        simulation = single.process.simulation
-        self._process = simulation(self._plant, single.disturbance, allowed, self.num_envs, truncated=truncated)
-        self._protocol, self._certificate_contract = single.downlink, single.certificate_contract
+        self._process = PlantSimulation(
+            self._plant, single.disturbance, allowed, self.num_envs, truncated=truncated, process=single.process
+        )
+        self._downlink, self._protocol = single.downlink, single.downlink_protocol
+        self._certificate_contract = single.certificate_contract
         patterns = arrival_patterns(self._plant, self._channel, self._certificate_contract)
         self._estimator = VectorEstimator(self._plant, patterns, self.num_envs)
-        self._downlink = vector_downlink_of(self._protocol, self._estimator, self.num_envs)
-        self._belief = self._downlink.belief()
+        self._downlink_state = VectorDownlinkState(self._protocol, self._plant.m, self.num_envs)
+        self._belief = self._predicted_estimates()
         self._state = np.zeros((self._plant.n, self.num_envs))
         self._violations, self._done = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
         self.steps, self.episodes = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, np.int64)
@@ -112,7 +114,8 @@ class NCSVectorEnv(VectorEnv):
 
     def beliefs(self, chosen: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Returns what `NCSEnv.beliefs` does for some environments, by index: estimates (n, k), `error_shapes`."""
-        return self._downlink.beliefs(chosen)
+        pending = self._downlink_state.committed.pending
+        return [self._estimator.predicted(pending[:ahead], chosen) for ahead in range(len(pending) + 1)]
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
@@ -155,7 +158,7 @@ class NCSVectorEnv(VectorEnv):
         if some_done and self._autoreset_mode is AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded("some episodes are over: reset them with options={'reset_mask': ...}")
         self._consistent = False
-        inputs = self._downlink.exchange(self.np_random, self.steps, u)
+        inputs = self._downlink_state.exchange(self.np_random, self.steps, u)
         applied, committed, missing = inputs
         arrived = self._advance(applied)
         reward = self._task.reward_many(self._plant, self._task_state, self._state, applied)
@@ -237,10 +240,14 @@ class NCSVectorEnv(VectorEnv):
             self._channel_state.begin(rng, mask)
         self._state[:, mask] = states
         self._estimator.begin(mask, states + first_errors)
-        self._downlink.begin(rng, mask)
+        self._downlink_state.begin(rng, mask)
         self.steps[mask], self._violations[mask], self._done[mask] = 0, 0.0, False
         self.episodes[mask] += 1
         self.starts[mask] = known
+
+    def _predicted_estimates(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns estimates, (n, N), and numbers of error statistics, (N,), of the times of the next effects."""
+        return self._estimator.predicted(self._downlink_state.committed.pending)
 
     def _first(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns states that episodes start at, and the errors of their first estimates, shape (n, count) each."""
@@ -250,7 +257,9 @@ class NCSVectorEnv(VectorEnv):
 
     def _observation(self) -> np.ndarray:
         """Returns the observations, shape (N, n + extra)."""
-        task_state = self._downlink.predicted(self._task, self._task_state)
+        task_state = self._task_state
+        for u in self._downlink_state.committed.pending:
+            task_state = self._task.predict_many(self._plant, task_state, u)
         entries = np.concatenate([self._belief[0], self._task.observe_many(task_state)])
         observation = np.empty(entries.shape, np.float32)
         np.minimum(np.maximum(entries, self._low), self._high, out=observation, casting="same_kind")
@@ -261,7 +270,7 @@ class NCSVectorEnv(VectorEnv):
         values = self._plant.constraint_values(self._state)
         cost = (np.maximum.reduce(values) > 0.0).astype(np.float64)
         self._violations = self._violations + (cost if counted is None else cost * counted)
-        self._belief = self._downlink.belief()
+        self._belief = self._predicted_estimates()
         table, numbers = self.error_shapes
         belief = self._belief[0], table.shapes.take(numbers, axis=0)
         constraints = values, cost, self._violations.copy()

@@ -57,6 +57,7 @@ class ArrivalPatterns:
         self._next: list[int] = []
         self._arrivals: dict[tuple[int, int], int] = {}
         self._replays: dict[int, Replay] = {}
+        self._ahead: dict[int, np.ndarray] = {}  # by number of steps, then by number of the statistics
         self._lock = threading.RLock()
         # Weak, or an estimator that never moves on from this graph would keep all that came after it.
         self._successor: weakref.ref[ArrivalPatterns] | None = None
@@ -136,6 +137,21 @@ class ArrivalPatterns:
             for _ in range(steps):
                 statistics = self.table.predicted(statistics)
         return statistics
+
+    def predicted_many(self, statistics: np.ndarray, steps: int) -> np.ndarray:
+        """Returns what `predicted` does for many statistics, given and returned by their numbers, shape (N,)."""
+        if steps == 0:
+            return statistics
+        known = self._ahead.get(steps, np.full(0, UNKNOWN))
+        if (count := len(self.table.statistics)) > len(known):
+            known = self._ahead[steps] = np.concatenate([known, np.full(count, UNKNOWN)])
+        ahead = known.take(statistics)
+        unknown = ahead == UNKNOWN
+        if unknown.any():
+            for number in np.unique(statistics[unknown]).tolist():
+                known[number] = self.predicted(number, steps)
+            ahead = known.take(statistics)
+        return ahead
 
     def statistics_of(self, pattern: int) -> int:
         """Returns the number of the statistics of the present estimate."""

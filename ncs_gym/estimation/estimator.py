@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -147,7 +147,7 @@ class Estimator:
         if self._patterns.is_full:
             self._patterns, (self._pattern,) = self._patterns.keeping(np.array([self._pattern]))
 
-    def predicted(self, inputs: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def predicted(self, inputs: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimate, shape (n,), and error shape, (n, n), after the next steps, given their inputs, (m,) each.
 
         It is what `advance` makes of the present belief with these inputs and without packets: the error then lies in

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -76,11 +76,21 @@ class VectorEstimator:
         if arrivals:
             self._replay()
 
-    def predicted(self, mean: np.ndarray, inputs: Iterable[np.ndarray]) -> np.ndarray:
-        """Returns what the next steps make of estimates, shape (n, N), given their inputs, shape (m, N) each."""
+    def predicted(
+        self, inputs: Sequence[np.ndarray], chosen: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Returns estimates, (n, N), and numbers of error statistics, (N,), after the next steps.
+
+        Args:
+            inputs: The inputs of these steps, shape (m, N) each.
+            chosen: Indices of the environments that count, all by default.
+        """
+        mean, statistics = self.mean, self.statistics
+        if chosen is not None:
+            mean, statistics, inputs = mean[:, chosen], statistics[chosen], [u[:, chosen] for u in inputs]
         for u in inputs:
             mean = self._predicted(mean, u)
-        return mean
+        return mean, self.patterns.predicted_many(statistics, len(inputs))
 
     def _follow(
         self,

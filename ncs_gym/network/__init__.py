@@ -1,25 +1,32 @@
-"""The network between sensor and controller.
+"""The network between sensor and controller, and between controller and actuator.
 
 `channel` has the settings (packet loss, quantization, transmission period, delay and jitter), `packet_transmission`
 what happens to packets during an episode, `contract` what a channel guarantees about the age of samples,
 `packet_reception` which packets a receiver can use, and `escape_probability` says how likely Gaussian noise is to leave
-its bounds, given how many samples a channel takes.
+its bounds, given how many samples a channel takes. `downlink` is the way of the commands, with the inputs that are
+committed ahead.
 """
 
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet
 from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
+from ncs_gym.network.downlink import Actuator, Command, CommittedInputs, DownlinkProtocol, downlink_protocol
 from ncs_gym.network.escape_probability import escape_probability
 from ncs_gym.network.packet_reception import DiscardedPackets
 from ncs_gym.network.packet_transmission import ChannelState
 
 __all__ = [
+    "Actuator",
     "BrokenContractWarning",
     "Channel",
     "ChannelContract",
     "ChannelState",
+    "Command",
+    "CommittedInputs",
     "DiscardedPackets",
+    "DownlinkProtocol",
     "GilbertElliott",
     "Packet",
     "contract_of",
+    "downlink_protocol",
     "escape_probability",
 ]

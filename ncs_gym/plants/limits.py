@@ -2,83 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any
 
 import numpy as np
 
 from ncs_gym.validation import LARGEST_NUMBER, SMALLEST_NUMBER, as_matrix, as_numbers, as_setting, as_vector, shown
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
 # The constant of x+ = A x + B u + c may differ by this from what an equilibrium needs, relative to its terms.
 EQUILIBRIUM_PRECISION = 1e-12
-
-
-class OperatingPoint:
-    """Mixin of `LinearPlant`: the operating point that deviations are counted from."""
-
-    H: np.ndarray
-    operating_state: np.ndarray
-    operating_input: np.ndarray
-
-    if TYPE_CHECKING:
-
-        def __init__(self, **settings: Any) -> None: ...
-
-    @classmethod
-    def around(
-        cls,
-        *,
-        A: ArrayLike,
-        B: ArrayLike,
-        state_limits: tuple[ArrayLike, ArrayLike],
-        input_limits: tuple[ArrayLike, ArrayLike],
-        operating_state: ArrayLike | None = None,
-        operating_input: ArrayLike | None = None,
-        **settings: Any,
-    ) -> Self:
-        """Returns the plant in deviations from an equilibrium, with the largest symmetric limits inside those given.
-
-        Args:
-            A: State matrix of x+ = A x + B u + c, shape (n, n).
-            B: Input matrix, shape (n, m).
-            state_limits: Pair (low, high) around x0, each a number or shape (n,); infinite where there is no limit.
-            input_limits: Pair (low, high) around u0, each a number or shape (m,).
-            operating_state: x0 with A x0 + B u0 + c = x0, shape (n,); zero by default.
-            operating_input: u0, shape (m,); zero by default.
-            settings: Other arguments of `LinearPlant`, in deviations; and `offset`, c, zero by default. Of a model that
-                is linearized at (x0, u0), c is x0 - A x0 - B u0.
-
-        Raises:
-            ValueError: If (x0, u0) is no equilibrium or not strictly between the limits, or an argument is wrong.
-        """
-        point = operating_state, operating_input
-        return cls(**_arguments_around(A, B, point, (state_limits, input_limits), settings))
-
-    def to_deviation(self, value: ArrayLike, of: str = "state") -> np.ndarray:
-        """Returns a physical state, input or output as its deviation from the operating point.
-
-        Args:
-            value: Shape (n,), (m,) or (p,).
-            of: "state", "input" or "output"; the output at the operating point is H x0.
-
-        Raises:
-            ValueError: If `of` is none of these, or the value no finite vector of its size.
-        """
-        center = self._operating_value(of)
-        return _as_point(value, len(center), f"the {of}") - center
-
-    def from_deviation(self, value: ArrayLike, of: str = "state") -> np.ndarray:
-        """Returns the physical state, input or output of a deviation; the inverse of `to_deviation`."""
-        center = self._operating_value(of)
-        return _as_point(value, len(center), f"the {of}") + center
-
-    def _operating_value(self, of: str) -> np.ndarray:
-        values = {"state": self.operating_state, "input": self.operating_input, "output": self.H @ self.operating_state}
-        if not isinstance(of, str) or of not in values:
-            raise ValueError(f"of must be one of {list(values)}, got {shown(of)}")
-        return values[of]
 
 
 def as_box_rows(value: Any, n: int) -> np.ndarray:
@@ -175,10 +106,10 @@ def as_operating_point(value: Any, size: int, name: str) -> np.ndarray:
     Raises:
         ValueError: If it is no finite vector of this size.
     """
-    return np.zeros(size) if value is None else _as_point(value, size, name)
+    return np.zeros(size) if value is None else as_point(value, size, name)
 
 
-def _as_point(value: Any, size: int, name: str) -> np.ndarray:
+def as_point(value: Any, size: int, name: str) -> np.ndarray:
     """Returns a vector, shape (size,); a number stands for a vector of one entry.
 
     Raises:
@@ -244,10 +175,10 @@ def _require_equilibrium(
     )
 
 
-def _arguments_around(
+def arguments_around(
     A: Any, B: Any, point: tuple[Any, Any], limits: tuple[Any, Any], settings: dict[str, Any]
 ) -> dict[str, Any]:
-    """Returns the arguments of `LinearPlant` of `OperatingPoint.around`.
+    """Returns the arguments of `LinearPlant` of `LinearPlant.around`.
 
     Raises:
         ValueError: If the point is no equilibrium between the limits, or an argument does not fit.

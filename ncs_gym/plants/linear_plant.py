@@ -1,26 +1,48 @@
-"""The linear plant: its equations, its limits, and what is declared of everything uncertain about it."""
+"""The linear plant: its equations, its limits, what is declared of everything uncertain about it, and its hard bounds.
+
+Proofs take the bounds, so they are the same numbers on every machine (`ncs_gym.exact`).
+"""
 
 from __future__ import annotations
 
+import functools
+import hashlib
+import json
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import MISSING, dataclass, field, fields, replace
+from difflib import get_close_matches
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from pathlib import Path
+from textwrap import fill
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 
-from ncs_gym.plants import description, limits, statespace
-from ncs_gym.plants.arguments import explains_arguments
-from ncs_gym.plants.bounds import FLAT_INFLATION, INFLATION, SIMULATED_REACH, SMALLEST_DELTA, HardBounds
+from ncs_gym import exact
+from ncs_gym.plants import limits, statespace
+from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.uncertainty.remainder import Remainder
+from ncs_gym.uncertainty.remainder import Remainder, as_remainder
+from ncs_gym.uncertainty.shape_matrices import outer_sum
+from ncs_gym.uncertainty.truncated_gaussian import (
+    SMALLEST_DELTA,
+    SMALLEST_KEPT,
+    TruncatedGaussian,
+    truncation_energy,
+)
 from ncs_gym.validation import (
     FILLED_IN_LATER,
     SMALLEST_NUMBER,
+    ReadOnlyArrays,
+    as_count,
+    as_covariance,
     as_matrix,
     as_names,
     as_number,
+    as_setting,
     read_only,
     shown,
 )
@@ -30,15 +52,97 @@ if TYPE_CHECKING:
 
     from ncs_gym.uncertainty.declared_bound import Bound
 
-__all__ = ["FLAT_INFLATION", "INFLATION", "SIMULATED_REACH", "SMALLEST_DELTA", "LinearPlant"]
-
+# Relative growth of every hard bound, so that rounding in sampling and quantizing stays inside (theory.md section 1).
+INFLATION = 1.0 + 1e-9
+# The same for directions in which a bound is flat: growth of its diagonal alone.
+FLAT_INFLATION = 1e-12
+# No disturbance set is thinner than this, in squared half-widths of the safe box.
+THINNEST = 1e-19
+# Simulating a step in float64 rounds; the disturbance bound has room for that up to this many half-widths out.
+SIMULATED_REACH = 100.0
 # An unstable plant that nobody holds runs away no further than this many half-widths: what lies beyond ends in NaN.
 FARTHEST = 1e30
+# Rows of the box keep inputs under way within this many times their limits. They never leave those, so the rows only
+# bound the safe set: closer ones would forbid inputs near their limit, farther ones enlarge the set by little.
+STORED_INPUT_REACH = 4.0
+LONGEST_INPUT_DELAY = 100
+_FORMAT = "ncs-gym plant 1"
+# The kinds of uncertainty: what a plant without it assumes, and the arguments that declare it.
+_KINDS = {
+    "disturbances": ("no disturbance acts on the plant", "disturbance_bound, gamma or process_noise_cov"),
+    "sensor noise": ("the sensors measure without noise", "sensor_bound or measurement_noise_cov"),
+    "the first estimate": ("the first estimate is exact", "initial_bound or initial_cov"),
+}
+# Columns of the description: where its texts begin, and where they end.
+_INDENT, _WIDTH = 16, 110
+# Fingerprints that registered plants had on various processors (x86) before the last digits of their A and B were the
+# same on all. A certificate or an agent with one of them belongs to the plant of today: what a certificate claims is
+# verified for the numbers of today anyway.
+FORMER_FINGERPRINTS = {
+    "177ea6db2c10f489ba3cd8ac4f550bcba49144e95e7f714551d3193871f948aa": (
+        "29a79af5f1181432d4aca2f00608251d0cfb5c931d2b1a52891c5b2d9711428f",
+        "0801c535bdcaf0781d2a22bc8a29c98232f10983aa974ee6bac5e9f24a90641a",
+    ),
+    "498d4365ce1b7c82e8f7f72490b2a6c638d5352be9511f604179d9a100d7ef23": (
+        "8cda9ead9750b9177572854dc51856bf866c023a0b01c027ee5eb2f738d8e58e",
+    ),
+    "415231d06116184e751fb423e7ade624ca1ad7836c81f9771432b20dd787acc9": (
+        "f2b8bd930f5e99a5a9d28b4772529b90353f9aa7f25ff42faccba8ea4d57c035",
+        "86b5c2b604b005e58a232ddc738542f67b4c446fbe09604c0cf962bc97d98a27",
+        "8459ffddb8aaa5f05a0e5ba4b8616159be91f91f7e2cb2ffc8c8046995f84857",
+        "c974ed748068a35ed2252e443207b1358d503b36034e0aef9b5e7a97595d133f",
+    ),
+    "11e922056fbb24d3d032ed327673ae50290bf75cf5c5fc440c8722b0392ba0d2": (
+        "5018bfaf7f890619cef0f066443a308c7c06b6a919636a9eb9683fac9ddb82b8",
+        "a6809c736123d225310210aa0dd031fa7fab9c41717255e634cd8747afb62b61",
+        "bd2535e8ea23d725f6ec2c7cb813bf3fad707b51fa0ebeb590185825c9c26c7a",
+        "621a5733e36d75366467c7f7cbb6cd4e379fde42b93b98eb8adf8052934d0a6a",
+    ),
+}
+# Stands for a space at which no line ends.
+_UNBROKEN = "\N{NO-BREAK SPACE}"
+
+
+class NoNoiseWarning(UserWarning):
+    """Nothing is given for an uncertainty, so that the plant assumes there is none; a bound of 0 says so on purpose."""
+
+
+Kind = TypeVar("Kind", bound=type)
+
+
+def explains_arguments(kind: Kind) -> Kind:
+    """Makes the constructor of a dataclass explain which arguments are unknown or missing, and what to give for C=.
+
+    C= means two things to two people: limits, and an output matrix.
+    """
+    constructor: Any = kind
+    construct: Callable[..., None] = constructor.__init__
+    needed = {entry.name: entry.default is MISSING and entry.default_factory is MISSING for entry in fields(kind)}
+
+    @functools.wraps(construct)
+    def __init__(self: Any, **settings: Any) -> None:
+        if "C" in settings:
+            raise ValueError(
+                "C= is not an argument: pass box=... for the limits |c_j x| <= 1 (rows, or half-widths of the states), "
+                "H=... for the output matrix of a state-space model"
+            )
+        for name in settings:
+            if name not in needed:
+                close = get_close_matches(name, needed, n=1)
+                hint = f": did you mean {close[0]}=" if close else ""
+                raise TypeError(f"{name}= is not an argument of {kind.__name__}{hint}")
+        missing = [f"{name}=" for name, is_needed in needed.items() if is_needed and name not in settings]
+        if missing:
+            raise TypeError(f"{kind.__name__} needs {' and '.join(missing)}")
+        construct(self, **settings)
+
+    constructor.__init__ = __init__
+    return kind
 
 
 @explains_arguments
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LinearPlant(HardBounds, limits.OperatingPoint):
+class LinearPlant(ReadOnlyArrays):
     """x+ = A x + B u + d, y = H x + v, with limits and bounds (theory.md section 1).
 
     All of it is in deviations from an operating point, (0, 0) unless given. What is declared of the uncertainties adds
@@ -152,10 +256,60 @@ class LinearPlant(HardBounds, limits.OperatingPoint):
             for field_name, default in ((f"{name}_names", names), (f"{name}_units", ("",) * size)):
                 self._set(field_name, as_names(getattr(self, field_name), default, field_name))
         self._make_arrays_read_only()
-        description.warn_of_no_noise(is_given)
+        _warn_of_no_noise(is_given)
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
+
+    def _check_declared(self) -> tuple[bool, bool, bool]:
+        """Checks what is declared of disturbances, sensor noise and first estimate; returns for which anything is."""
+        self._set("gamma", as_number(self.gamma, "gamma", low=0.0))
+        self._set("delta", as_number(self.delta, "delta", low=SMALLEST_DELTA, high=1.0 - SMALLEST_KEPT))
+        declared = (
+            ("process_noise_cov", "disturbance_bound", self.n),
+            ("measurement_noise_cov", "sensor_bound", self.p),
+            ("initial_cov", "initial_bound", self.n),
+        )
+        is_given = [any(getattr(self, name) is not None for name in names) for *names, _ in declared]
+        for covariance, bound, size in declared:
+            value = getattr(self, covariance)
+            self._set(covariance, np.zeros((size, size)) if value is None else as_covariance(value, size, covariance))
+            if (value := getattr(self, bound)) is not None:
+                self._set(bound, as_bound(value, size, bound))
+        if (remainder := as_remainder(self.remainder, self.n)) is not None:
+            remainder = remainder.of_model({name: getattr(self, name) for name in ("A", "B", "box", "u_max", "dt")})
+        self._set("remainder", remainder)
+        return is_given[0] or self.gamma > 0.0 or remainder is not None, is_given[1], is_given[2]
+
+    @classmethod
+    def around(
+        cls,
+        *,
+        A: ArrayLike,
+        B: ArrayLike,
+        state_limits: tuple[ArrayLike, ArrayLike],
+        input_limits: tuple[ArrayLike, ArrayLike],
+        operating_state: ArrayLike | None = None,
+        operating_input: ArrayLike | None = None,
+        **settings: Any,
+    ) -> Self:
+        """Returns the plant in deviations from an equilibrium, with the largest symmetric limits inside those given.
+
+        Args:
+            A: State matrix of x+ = A x + B u + c, shape (n, n).
+            B: Input matrix, shape (n, m).
+            state_limits: Pair (low, high) around x0, each a number or shape (n,); infinite where there is no limit.
+            input_limits: Pair (low, high) around u0, each a number or shape (m,).
+            operating_state: x0 with A x0 + B u0 + c = x0, shape (n,); zero by default.
+            operating_input: u0, shape (m,); zero by default.
+            settings: Other arguments of `LinearPlant`, in deviations; and `offset`, c, zero by default. Of a model that
+                is linearized at (x0, u0), c is x0 - A x0 - B u0.
+
+        Raises:
+            ValueError: If (x0, u0) is no equilibrium or not strictly between the limits, or an argument is wrong.
+        """
+        point = operating_state, operating_input
+        return cls(**limits.arguments_around(A, B, point, (state_limits, input_limits), settings))
 
     @classmethod
     def from_statespace(cls, sys: Any, dt: float | None = None, *, input_delay: int = 0, **settings: Any) -> Self:
@@ -178,7 +332,56 @@ class LinearPlant(HardBounds, limits.OperatingPoint):
         if len(given) == 1:
             raise ValueError(f"{given.pop()} is given alone: give state_limits and input_limits, or box and u_max")
         plant = cls.around(**arguments) if given else cls(**arguments)
-        return plant if input_delay == 0 else cls(**statespace.delayed_arguments(plant, input_delay))
+        return plant if input_delay == 0 else plant._delayed(input_delay)
+
+    def _delayed(self, input_delay: int) -> Self:
+        """Returns the plant whose inputs take effect some steps later.
+
+        Its state is (x, u_{k-d}, .., u_{k-1}), the oldest input first. Disturbances and first errors are those of x
+        alone.
+
+        Raises:
+            ValueError: If the delay is no such number, or the first error is given by a covariance.
+        """
+        delay = as_count(input_delay, "input_delay", low=1, high=LONGEST_INPUT_DELAY)
+        if np.any(self.initial_cov):
+            raise ValueError(
+                "with input_delay the first error must be given by initial_bound: that of initial_cov is a ball in all "
+                "states, and inputs under way are known"
+            )
+        n, m, stored = self.n, self.m, self.m * delay
+        A = np.zeros((n + stored, n + stored))
+        A[:n, :n], A[:n, n : n + m] = self.A, self.B
+        A[n:-m, n + m :] = np.eye(stored - m)
+        box = np.zeros((len(self.C) + stored, n + stored))
+        box[: len(self.C), :n] = self.C
+        box[len(self.C) :, n:] = np.diag(np.tile(1.0 / (STORED_INPUT_REACH * self.u_max), delay))
+        ages = [f"{age} step{'s' * (age > 1)} ago" for age in range(delay, 0, -1)]
+        disturbance = self.disturbance_bound
+        if self.gamma > 0.0:  # one bound for both: the ball of gamma would reach the inputs under way
+            ball = Ellipsoid(self.gamma * np.eye(n))
+            disturbance = _ellipsoid_around_sum(ball, disturbance, self.relative_weight)
+        # The further states of a model move as they should: inputs under way keep their limits.
+        remainder = self.remainder
+        if remainder is not None:
+            remainder = replace(remainder, bound=Ellipsoid(np.pad(remainder.bound.shape, (0, stored))))
+        return replace(
+            self,
+            A=A,
+            B=np.concatenate([np.zeros((n + stored - m, m)), np.eye(m)]),
+            box=box,
+            gamma=0.0,
+            H=np.pad(self.H, ((0, 0), (0, stored))),
+            process_noise_cov=np.pad(self.process_noise_cov, (0, stored)),
+            initial_cov=np.zeros((n + stored, n + stored)),
+            disturbance_bound=_padded(disturbance, stored),
+            initial_bound=_padded(self.initial_bound, stored),
+            remainder=remainder,
+            error_gain=None if self.error_gain is None else np.pad(self.error_gain, ((0, 0), (0, stored))),
+            operating_state=np.concatenate([self.operating_state, np.tile(self.operating_input, delay)]),
+            state_names=[*self.state_names, *(f"{name} of {age}" for age in ages for name in self.input_names)],
+            state_units=[*self.state_units, *tuple(self.input_units) * delay],
+        )
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
@@ -187,7 +390,25 @@ class LinearPlant(HardBounds, limits.OperatingPoint):
         Raises:
             ValueError: If the file is missing or not that of a plant, or an argument is wrong.
         """
-        return cls(**description.read_plant(path, cls))
+        try:
+            document = json.loads(Path(path).read_text(encoding="utf-8"))
+        except (OSError, TypeError, ValueError, RecursionError) as error:
+            reason = getattr(error, "strerror", None) or "it is not valid JSON"
+            raise ValueError(f"cannot read the plant in {shown(path)}: {reason}") from error
+        content = document.get("plant") if isinstance(document, dict) and document.get("format") == _FORMAT else None
+        if not isinstance(content, dict):
+            raise ValueError(f"{shown(path)} is not a plant of format {_FORMAT!r}")
+        names = {entry.name: entry.default is MISSING for entry in fields(cls)}
+        missing = [name for name, is_needed in names.items() if is_needed and name not in content]
+        unknown = [name for name in content if name not in names and name != "C"]
+        if (missing and "C" not in content) or unknown:
+            wrong = f"it lacks {', '.join(missing)}" if missing else f"{shown(unknown)} are no arguments of LinearPlant"
+            raise ValueError(f"{shown(path)} is not the file of a plant: {wrong}")
+        arguments = {name: _from_json(value) for name, value in content.items()}
+        box = as_setting(arguments.get("box"))
+        if box is not None:
+            arguments["box"] = box  # an array: `save` wrote computed rows
+        return cls(**arguments)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a JSON file in which every number is exact.
@@ -195,15 +416,48 @@ class LinearPlant(HardBounds, limits.OperatingPoint):
         Raises:
             OSError: If the file cannot be written.
         """
-        description.write_plant(self, path)
+        content = {entry.name: _as_json(getattr(self, entry.name)) for entry in fields(self)}
+        document = {"format": _FORMAT, "plant": content}
+        Path(path).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
     def __str__(self) -> str:
-        return description.describe(self)
+        return _describe(self)
 
     @property
     def assumptions(self) -> tuple[str, ...]:
         """What a certificate takes for granted beyond the numbers of the bounds, in sentences."""
-        return description.assumptions_of(self)
+        first = [self.initial_cov, *([] if self.initial_bound is None else [self.initial_bound.shape])]
+        zero = (
+            not np.any(self.nominal_disturbance.shape),
+            not np.any(self.nominal_sensor_error.shape),
+            not any(np.any(part) for part in first),
+        )
+        assumed = [
+            f"It is assumed that {text}." for (text, _), is_zero in zip(_KINDS.values(), zero, strict=True) if is_zero
+        ]
+        covariances = ("process_noise_cov", "measurement_noise_cov", "initial_cov")
+        truncated = [name for name in covariances if np.any(getattr(self, name))]
+        if truncated:
+            kept = f"{100.0 * (1.0 - self.delta):.6g} % (delta = {self.delta:g}) of {', '.join(truncated)}"
+            assumed.append(f"Gaussian noise is truncated: the bounds hold {kept}, not the rest.")
+        if self.remainder is not None:
+            assumed.append(self.remainder.sentence)
+        return tuple(assumed)
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return self.A.shape[0]
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return self.B.shape[1]
+
+    @property
+    def p(self) -> int:
+        """Number of outputs."""
+        return self.H.shape[0]
 
     @cached_property
     def without_remainder(self) -> LinearPlant:
@@ -231,12 +485,349 @@ class LinearPlant(HardBounds, limits.OperatingPoint):
 
         It is the same on every machine: these numbers are given, or rounded once (`ncs_gym.exact`).
         """
-        return description.fingerprint_of(self)
+        digest = hashlib.sha256()
+        for name in ("A", "B", "C", "H", "u_max", "process_noise_cov", "measurement_noise_cov", "initial_cov"):
+            array = getattr(self, name)
+            digest.update(f"{name}{array.shape}".encode() + array.astype("<f8").tobytes())
+        digest.update(np.array([self.dt, self.gamma, self.delta], dtype="<f8").tobytes())
+        if self.error_gain is not None:
+            digest.update(self.error_gain.astype("<f8").tobytes())
+        for name in ("disturbance_bound", "sensor_bound", "initial_bound", "operating_state", "operating_input"):
+            value = getattr(self, name)
+            array = value.shape if isinstance(value, Ellipsoid) else value
+            if array is not None and np.any(array):  # a plant without them keeps the fingerprint it always had
+                digest.update(name.encode() + array.astype("<f8").tobytes())
+        if self.remainder is not None:
+            digest.update(
+                f"remainder{self.remainder.proved}".encode() + self.remainder.bound.shape.astype("<f8").tobytes()
+            )
+        return digest.hexdigest()
 
     def has_fingerprint(self, fingerprint: str) -> bool:
-        """Returns whether a fingerprint is this plant's, of today or of earlier versions that kept it elsewhere."""
-        return description.has_fingerprint(self, fingerprint)
+        """Returns whether a fingerprint is this plant's, or one that it had before (`FORMER_FINGERPRINTS`)."""
+        return fingerprint == self.fingerprint or fingerprint in FORMER_FINGERPRINTS.get(self.fingerprint, ())
 
     def constraint_values(self, state: np.ndarray) -> np.ndarray:
         """Returns |c_j x| - 1 for each row of the safe box, shape (k,) or (k, N); positive is violated."""
         return abs(self.C.dot(state)) - 1.0
+
+    def to_deviation(self, value: ArrayLike, of: str = "state") -> np.ndarray:
+        """Returns a physical state, input or output as its deviation from the operating point.
+
+        Args:
+            value: Shape (n,), (m,) or (p,).
+            of: "state", "input" or "output"; the output at the operating point is H x0.
+
+        Raises:
+            ValueError: If `of` is none of these, or the value no finite vector of its size.
+        """
+        center = self._operating_value(of)
+        return limits.as_point(value, len(center), f"the {of}") - center
+
+    def from_deviation(self, value: ArrayLike, of: str = "state") -> np.ndarray:
+        """Returns the physical state, input or output of a deviation; the inverse of `to_deviation`."""
+        center = self._operating_value(of)
+        return limits.as_point(value, len(center), f"the {of}") + center
+
+    def _operating_value(self, of: str) -> np.ndarray:
+        values = {"state": self.operating_state, "input": self.operating_input, "output": self.H @ self.operating_state}
+        if not isinstance(of, str) or of not in values:
+            raise ValueError(f"of must be one of {list(values)}, got {shown(of)}")
+        return values[of]
+
+    @property
+    def remainder_bound(self) -> Ellipsoid | None:
+        """What holds the remainder of a model, shape (n, n); None if there is none."""
+        return None if self.remainder is None else self.remainder.bound
+
+    @cached_property
+    def weight(self) -> np.ndarray:
+        """Positive definite W, shape (n, n), that measures ellipsoids in units of the safe box: C'C, regularized."""
+        gram = exact.product(self.C.T, self.C)
+        squares = np.diag(gram)
+        return read_only(gram + 1e-6 * np.diag(squares + exact.total(squares) / self.n * (squares == 0.0)))
+
+    @cached_property
+    def _box_shape(self) -> np.ndarray:
+        """The inverse of `weight`, shape (n, n): that of the ellipsoid {x : x'Wx <= 1}."""
+        return exact.inverse(self.weight)
+
+    @cached_property
+    def relative_weight(self) -> np.ndarray:
+        """W in units of its largest entry, shape (n, n): the identity exactly if the box is a cube."""
+        return read_only(self.weight / self.weight.max())
+
+    @cached_property
+    def half_widths(self) -> np.ndarray:
+        """Half-widths of the ellipsoid {x : x'Wx <= 1} around the safe box' center, shape (n,)."""
+        return read_only(np.sqrt(np.diag(self._box_shape)))
+
+    @cached_property
+    def process_noise(self) -> TruncatedGaussian:
+        """w ~ N(0, Q) truncated at chi2_{n,1-delta}."""
+        return TruncatedGaussian(self.process_noise_cov, truncation_energy(self.delta, self.n))
+
+    @cached_property
+    def sensor_noise(self) -> TruncatedGaussian:
+        """v ~ N(0, R) truncated at chi2_{p,1-delta}; what lies in `sensor_bound` is added to it."""
+        return TruncatedGaussian(self.measurement_noise_cov, truncation_energy(self.delta, self.p))
+
+    @cached_property
+    def initial_noise(self) -> TruncatedGaussian:
+        """e_0 ~ N(0, P0) truncated at chi2_{n,1-delta}; what lies in `initial_bound` is added to it."""
+        return TruncatedGaussian(self.initial_cov, truncation_energy(self.delta, self.n))
+
+    @cached_property
+    def disturbance(self) -> Ellipsoid:
+        """D, shape (n, n): holds declared disturbances, truncated process noise, remainder, rounding of a simulation.
+
+        It is larger than `allowed_disturbance` by what holds that plus E(F), F = n diag(r^2), with r the rounding of
+        A x + B u + d for x up to SIMULATED_REACH half-widths out: (1+s/4) allowed + (1+4/s) F, s the inflation.
+        """
+        return Ellipsoid(inflated(self.nominal_disturbance.shape) + self._rounding_room)
+
+    @cached_property
+    def allowed_disturbance(self) -> Ellipsoid:
+        """What a disturbance may use of D: the rest is for the rounding of a simulation, shape (n, n)."""
+        nominal = self.nominal_disturbance.shape
+        return Ellipsoid(0.5 * (nominal + inflated(nominal)) + 0.5 * self._rounding_room)
+
+    @cached_property
+    def _rounding_room(self) -> np.ndarray:
+        """What D gains for rounding, shape (n, n)."""
+        reach = SIMULATED_REACH * self.half_widths
+        rounding = exact.product(np.abs(self.A), reach) + exact.product(np.abs(self.B), self.u_max) + reach
+        rounding *= (self.n + self.m + 2) * np.finfo(float).eps
+        return THINNEST * self._box_shape + 10.0 * self.n / (INFLATION - 1.0) * np.diag(np.square(rounding))
+
+    @cached_property
+    def nominal_disturbance(self) -> Ellipsoid:
+        """D before inflation: where extremal disturbances are drawn, so that their rounding stays inside E(D)."""
+        ball = Ellipsoid(self.gamma * np.eye(self.n))
+        noisy = _ellipsoid_around_sum(ball, self.process_noise.bound, self.relative_weight)
+        declared = _ellipsoid_around_sum(noisy, self.disturbance_bound, self.relative_weight)
+        return _ellipsoid_around_sum(declared, self.remainder_bound, self.relative_weight)
+
+    @cached_property
+    def nominal_sensor_error(self) -> Ellipsoid:
+        """Holds the sensor noise v before inflation, shape (p, p): the truncated noise plus `sensor_bound`."""
+        return _ellipsoid_around_sum(self.sensor_noise.bound, self.sensor_bound, np.eye(self.p))
+
+    @cached_property
+    def sensor_error(self) -> Ellipsoid:
+        """Holds the sensor noise v, shape (p, p), without the channel's quantizer (see `sensor_error_with`)."""
+        return Ellipsoid(inflated(self.nominal_sensor_error.shape))
+
+    def sensor_error_with(self, quantization_step: float) -> Ellipsoid:
+        """Returns N, shape (p, p): sensor noise plus the ball of squared radius p q^2/4 around a quantizer's box."""
+        ball = Ellipsoid(self.p * quantization_step**2 / 4.0 * np.eye(self.p))
+        return Ellipsoid(inflated(_ellipsoid_around_sum(ball, self.nominal_sensor_error, np.eye(self.p)).shape))
+
+    @cached_property
+    def initial_radius_squared(self) -> float:
+        """r0^2 = lambda_max(P0) chi2_{n,1-delta}: the truncated first error is no longer than r0."""
+        return max(exact.largest_eigenvalue(self.initial_noise.bound.shape), 0.0)
+
+    @cached_property
+    def nominal_initial_error(self) -> Ellipsoid:
+        """Holds the error of the first estimate before inflation, shape (n, n): the ball of r0 plus `initial_bound`."""
+        ball = Ellipsoid(self.initial_radius_squared * np.eye(self.n))
+        return _ellipsoid_around_sum(ball, self.initial_bound, self.relative_weight)
+
+    @cached_property
+    def initial_error(self) -> Ellipsoid:
+        """Holds the error of the first estimate, shape (n, n), with slack for rounding."""
+        return Ellipsoid(inflated(self.nominal_initial_error.shape) + self.estimate_rounding)
+
+    @cached_property
+    def estimate_rounding(self) -> np.ndarray:
+        """Room for the rounding of x_hat up to SIMULATED_REACH half-widths out, shape (n, n), next to an inflation."""
+        rounding = 4.0 * np.finfo(float).eps * SIMULATED_REACH * self.half_widths
+        return read_only(2.0 * self.n / (INFLATION - 1.0) * np.diag(np.square(rounding)))
+
+    @cached_property
+    def kalman_covariances(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Covariances (Q, R, P0) from which a Kalman filter picks its gains, shapes (n, n), (p, p), (n, n).
+
+        Q + gamma I (Liu et al. Definition 1), where a declared disturbance counts as the ball of gamma does; sensor
+        noise and first errors that are bounded count with the covariance of a uniform draw, P / (dim + 2).
+        """
+        Q = self.process_noise_cov + self.gamma * np.eye(self.n)
+        R, P0 = self.measurement_noise_cov, self.initial_cov
+        if self.disturbance_bound is not None:
+            Q = Q + self.disturbance_bound.shape
+        if self.remainder is not None:
+            Q = Q + self.remainder.bound.shape
+        if self.sensor_bound is not None:
+            R = R + self.sensor_bound.shape / (self.p + 2)
+        if self.initial_bound is not None:
+            P0 = P0 + self.initial_bound.shape / (self.n + 2)
+        return read_only(Q), read_only(R), read_only(P0)
+
+    def sample_sensor_noise(
+        self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True
+    ) -> np.ndarray:
+        """Returns v, shape (p,) or (count, p): noise, truncated or not, plus a uniform point of `sensor_bound`."""
+        return _plus_uniform(self.sensor_noise.sample(rng, count, truncated=truncated), self.sensor_bound, rng, count)
+
+    def sample_initial_error(
+        self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True
+    ) -> np.ndarray:
+        """Returns x_hat_0 - x_0, shape (n,) or (count, n): noise as above plus a uniform point of `initial_bound`."""
+        return _plus_uniform(self.initial_noise.sample(rng, count, truncated=truncated), self.initial_bound, rng, count)
+
+
+def _plus_uniform(
+    samples: np.ndarray, bound: Ellipsoid | None, rng: np.random.Generator, count: int | None
+) -> np.ndarray:
+    """Returns samples, shape (n,) or (count, n), plus uniform points of a bound; none are drawn of a point."""
+    return samples if bound is None or not np.any(bound.shape) else samples + bound.sample(rng, count)
+
+
+def inflated(shape: np.ndarray) -> np.ndarray:
+    """Returns a slightly larger bound, also in directions in which it is flat: room for the rounding of its entries."""
+    return INFLATION * shape + FLAT_INFLATION * np.diag(np.diag(shape))
+
+
+def _ellipsoid_around_sum(first: Ellipsoid, second: Ellipsoid | None, weight: np.ndarray) -> Ellipsoid:
+    """Returns an ellipsoid around the sum, of the smallest tr(W P); where one of them is a point or None, the other."""
+    if second is None or not np.any(second.shape):
+        return first
+    return Ellipsoid(outer_sum(first.shape, second.shape, weight)) if np.any(first.shape) else second
+
+
+def _padded(bound: Ellipsoid | None, zeros: int) -> Ellipsoid | None:
+    """Returns a bound of the same entries and of some more that are zero."""
+    return None if bound is None else Ellipsoid(np.pad(bound.shape, (0, zeros)))
+
+
+def inputs_under_way(plant: LinearPlant) -> int:
+    """Returns how many of the last states are inputs under way, as those of an `input_delay` are; 0 of most plants.
+
+    These are states (u_{k-d}, .., u_{k-1}) of a plant that the input itself reaches only as the newest of them.
+    """
+    n, m = plant.n, plant.m
+    if n <= m or plant.A[-m:].any() or not np.array_equal(plant.B, np.eye(n)[:, -m:]):
+        return 0
+    stored = m
+    while stored + m < n and np.array_equal(plant.A[-stored - m : -stored], np.eye(n)[n - stored :][:m]):
+        stored += m
+    return stored
+
+
+def _warn_of_no_noise(is_given: tuple[bool, bool, bool]) -> None:
+    """Warns in one sentence of kinds of uncertainty for which nothing is given.
+
+    Args:
+        is_given: Whether anything is given, even zero, for disturbances, sensor noise and the first estimate.
+    """
+    missing = {kind: text for (kind, text), given in zip(_KINDS.items(), is_given, strict=True) if not given}
+    if missing:
+        assumed = ", and ".join(f"that {sentence} (give {names})" for sentence, names in missing.values())
+        message = f"nothing is given for {' and '.join(missing)}: every certificate will assume {assumed}"
+        warnings.warn(f"{message}; a bound of 0 says so on purpose", NoNoiseWarning, stacklevel=_frames_inside())
+
+
+def _describe(plant: LinearPlant) -> str:
+    """Returns the limits, the bounds and the assumptions of a plant for people, with units."""
+    counts = ((plant.n, "state"), (plant.m, "input"), (plant.p, "output"))
+    sizes = ", ".join(f"{count} {name}{'s' * (count != 1)}" for count, name in counts)
+    radius = f"spectral radius {plant.spectral_radius:.6g}"
+    stable = f"stable ({radius})"
+    unstable = f"not stable ({radius}): a certificate needs a contract of the channel"
+    extents = {
+        "disturbance": (np.sqrt(np.diag(plant.disturbance.shape)), plant.state_names, plant.state_units),
+        "sensor noise": (np.sqrt(np.diag(plant.sensor_error.shape)), *_outputs(plant)),
+        "first error": (np.sqrt(np.diag(plant.initial_error.shape)), plant.state_names, plant.state_units),
+    }
+    lines = {
+        "linear plant": [f"{sizes}, a step every {plant.dt:g} s"],
+        "dynamics": [stable if plant.spectral_radius < 1.0 else unstable],
+        "safe box": [row_limit(plant, row) for row in plant.C],
+        "input limits": [
+            _between(name, limit, center, unit)
+            for name, limit, center, unit in zip(
+                plant.input_names, plant.u_max, plant.operating_input, plant.input_units, strict=True
+            )
+        ],
+    }
+    for title, (sizes_of, names, units) in extents.items():
+        parts = [f"{name} up to {_sized(*each)}" for name, *each in zip(names, sizes_of, units, strict=True)]
+        lines[title] = [", ".join(part.replace(" ", _UNBROKEN) for part in parts)]
+    lines["assumptions"] = list(plant.assumptions)
+    shown_lines = (
+        fill(text, _WIDTH, initial_indent=f"{title if number == 0 else '':<{_INDENT}}", subsequent_indent=" " * _INDENT)
+        for title, texts in lines.items()
+        for number, text in enumerate(texts)
+    )
+    return "\n".join(shown_lines).replace(_UNBROKEN, " ")
+
+
+def _as_json(value: Any) -> Any:
+    """Returns a field of a plant as a JSON value."""
+    if isinstance(value, Ellipsoid):
+        return {"shape": value.shape.tolist()}
+    if isinstance(value, Remainder):
+        return {entry.name: _as_json(getattr(value, entry.name)) for entry in fields(value)}
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def _from_json(value: Any) -> Any:
+    """Returns an argument of `LinearPlant` given as a JSON value; an object is an ellipsoid's shape."""
+    if not isinstance(value, dict) or "proved" in value:  # a remainder's
+        return value
+    if set(value) != {"shape"}:
+        raise ValueError(
+            f'a bound in the file of a plant must be a number, a list or {{"shape": ...}}, got {shown(value)}'
+        )
+    return Ellipsoid(value["shape"])
+
+
+def _frames_inside() -> int:
+    """Returns the stack level, seen from `_warn_of_no_noise`, of the code outside this package that made the plant."""
+    frame, level = sys._getframe(1), 1
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith(
+        ("ncs_gym.plants.", "dataclasses")
+    ):
+        frame, level = frame.f_back, level + 1
+    return level
+
+
+def _sized(size: float, unit: str) -> str:
+    """Returns a size with its unit."""
+    return f"{size:.4g} {unit}".rstrip()
+
+
+def _between(name: str, limit: float, center: float, unit: str) -> str:
+    """Returns the limits of a quantity around its operating point."""
+    if center == 0.0:
+        return f"|{name}| <= {_sized(limit, unit)}"
+    return f"{center - limit:.6g} <= {name} <= {_sized(center + limit, unit)} (operating point {center:.6g})"
+
+
+def row_limit(plant: LinearPlant, row: np.ndarray) -> str:
+    """Returns what a row of the safe box limits."""
+    limited = np.flatnonzero(row).tolist()
+    if len(limited) == 1:
+        i = limited[0]
+        size = 1.0 / abs(row[i])
+        return _between(plant.state_names[i], size, plant.operating_state[i], plant.state_units[i])
+    terms = " ".join(f"{row[i]:+.4g} {_deviation(plant, i)}" for i in limited)
+    return f"|{terms.removeprefix('+')}| <= 1"
+
+
+def _deviation(plant: LinearPlant, i: int) -> str:
+    """Returns the name of a state's deviation from the operating point."""
+    center = plant.operating_state[i]
+    return f"({plant.state_names[i]} {-center:+.6g})" if center else plant.state_names[i]
+
+
+def _outputs(plant: LinearPlant) -> tuple[list[str], list[str]]:
+    """Returns the names and units of the outputs: those of the states that are measured alone, else y1, y2."""
+    names, units = [], []
+    for j, row in enumerate(plant.H):
+        measured = np.flatnonzero(row)
+        alone = len(measured) == 1 and row[measured[0]] == 1.0
+        names.append(plant.state_names[measured[0]] if alone else f"y{j + 1}")
+        units.append(plant.state_units[measured[0]] if alone else "")
+    return names, units

@@ -1,28 +1,17 @@
-"""State-space models from elsewhere: sampled exactly, with their bounds, and with inputs that take effect later."""
+"""Models in continuous time and from elsewhere: sampled exactly, as arguments of `LinearPlant`."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.uncertainty.remainder import Remainder
-from ncs_gym.uncertainty.shape_matrices import outer_sum
 from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
-from ncs_gym.validation import as_count, as_matrix, as_number, shown
-
-if TYPE_CHECKING:
-    from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.validation import as_matrix, as_number, shown
 
 # Durations of steps that differ by less than this are the same.
 SAME_STEP = 1e-9
-# Rows of the box keep inputs under way within this many times their limits. They never leave those, so the rows only
-# bound the safe set: closer ones would forbid inputs near their limit, farther ones enlarge the set by little.
-STORED_INPUT_REACH = 4.0
-LONGEST_INPUT_DELAY = 100
 
 
 def zero_order_hold(A: np.ndarray, B: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
@@ -122,72 +111,6 @@ def sampled_arguments(sys: Any, dt: float | None, settings: dict[str, Any]) -> d
     return {"A": A, "B": B, "H": H, "dt": dt} | settings
 
 
-def delayed_arguments(plant: LinearPlant, input_delay: int) -> dict[str, Any]:
-    """Returns the arguments of the plant whose inputs take effect some steps later.
-
-    Its state is (x, u_{k-d}, .., u_{k-1}), the oldest input first. Disturbances and first errors are those of x alone.
-
-    Args:
-        plant: The plant without delay.
-        input_delay: d, steps, at least 1.
-
-    Raises:
-        ValueError: If the delay is no such number, or the first error is given by a covariance.
-    """
-    delay = as_count(input_delay, "input_delay", low=1, high=LONGEST_INPUT_DELAY)
-    if np.any(plant.initial_cov):
-        raise ValueError(
-            "with input_delay the first error must be given by initial_bound: that of initial_cov is a ball in all "
-            "states, and inputs under way are known"
-        )
-    n, m, stored = plant.n, plant.m, plant.m * delay
-    A = np.zeros((n + stored, n + stored))
-    A[:n, :n], A[:n, n : n + m] = plant.A, plant.B
-    A[n:-m, n + m :] = np.eye(stored - m)
-    B = np.concatenate([np.zeros((n + stored - m, m)), np.eye(m)])
-    box = np.zeros((len(plant.C) + stored, n + stored))
-    box[: len(plant.C), :n] = plant.C
-    box[len(plant.C) :, n:] = np.diag(np.tile(1.0 / (STORED_INPUT_REACH * plant.u_max), delay))
-    names = [f"{name} of {age} step{'s' * (age > 1)} ago" for age in range(delay, 0, -1) for name in plant.input_names]
-    return {
-        "A": A,
-        "B": B,
-        "box": box,
-        "u_max": plant.u_max,
-        "dt": plant.dt,
-        "H": np.pad(plant.H, ((0, 0), (0, stored))),
-        "process_noise_cov": np.pad(plant.process_noise_cov, (0, stored)),
-        "measurement_noise_cov": plant.measurement_noise_cov,
-        "initial_cov": np.zeros((n + stored, n + stored)),
-        "delta": plant.delta,
-        "disturbance_bound": _padded(_unknown_disturbance(plant), stored),
-        "remainder": _padded_remainder(plant.remainder, stored),
-        "sensor_bound": plant.sensor_bound,
-        "initial_bound": _padded(plant.initial_bound, stored),
-        "error_gain": None if plant.error_gain is None else np.pad(plant.error_gain, ((0, 0), (0, stored))),
-        "operating_state": np.concatenate([plant.operating_state, np.tile(plant.operating_input, delay)]),
-        "operating_input": plant.operating_input,
-        "state_names": [*plant.state_names, *names],
-        "state_units": [*plant.state_units, *tuple(plant.input_units) * delay],
-        "input_names": plant.input_names,
-        "input_units": plant.input_units,
-    }
-
-
-def inputs_under_way(plant: LinearPlant) -> int:
-    """Returns how many of the last states are inputs under way, as those of `delayed_arguments` are; 0 of most plants.
-
-    These are states (u_{k-d}, .., u_{k-1}) of a plant that the input itself reaches only as the newest of them.
-    """
-    n, m = plant.n, plant.m
-    if n <= m or plant.A[-m:].any() or not np.array_equal(plant.B, np.eye(n)[:, -m:]):
-        return 0
-    stored = m
-    while stored + m < n and np.array_equal(plant.A[-stored - m : -stored], np.eye(n)[n - stored :][:m]):
-        stored += m
-    return stored
-
-
 def _matrices(sys: Any) -> tuple[Any, Any, Any, Any, Any]:
     """Returns A, B, C, D and the sampling time of a model: 0 or None in continuous time, True if it is unknown.
 
@@ -206,23 +129,3 @@ def _matrices(sys: Any) -> tuple[Any, Any, Any, Any, Any]:
             f"(A, B, C, D) or (A, B, C, D, dt), got {shown(sys)}"
         )
     return model.A, model.B, model.C, model.D, getattr(model, "dt", None)
-
-
-def _unknown_disturbance(plant: LinearPlant) -> Ellipsoid | None:
-    """Returns what holds the ball of gamma plus the declared disturbances; None if there is neither."""
-    ball, declared = plant.gamma * np.eye(plant.n), plant.disturbance_bound
-    if declared is None or not np.any(ball):
-        return declared if not np.any(ball) else Ellipsoid(ball)
-    return Ellipsoid(outer_sum(ball, declared.shape, plant.relative_weight))
-
-
-def _padded_remainder(remainder: Remainder | None, zeros: int) -> Remainder | None:
-    """Returns the remainder of a model whose further states move as they should: inputs under way keep their limits."""
-    if remainder is None:
-        return None
-    return replace(remainder, bound=Ellipsoid(np.pad(remainder.bound.shape, (0, zeros))))
-
-
-def _padded(bound: Ellipsoid | None, zeros: int) -> Ellipsoid | None:
-    """Returns a bound of the same entries and of some more that are zero."""
-    return None if bound is None else Ellipsoid(np.pad(bound.shape, (0, zeros)))

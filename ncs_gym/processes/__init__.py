@@ -5,12 +5,11 @@ plant's disturbance bound.
 """
 
 from ncs_gym.processes.cart_pole_process import CartPoleProcess, nonlinear_cart_pole
-from ncs_gym.processes.function_process import FunctionProcess
 from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
 from ncs_gym.processes.gym_process import GymProcess
 from ncs_gym.processes.linearization import linear_model
 from ncs_gym.processes.mujoco_pendulum import InvertedPendulumProcess, inverted_pendulum
-from ncs_gym.processes.process import LinearProcess, Process
+from ncs_gym.processes.process import FunctionProcess, LinearProcess, Process
 
 __all__ = [
     "CartPoleProcess",

@@ -5,17 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 
 from ncs_gym.plants.cart_pole import GRAVITY, cart_pole
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.processes.body_simulation import Body
-from ncs_gym.processes.function_process import FunctionBody
 from ncs_gym.processes.linearization import linear_model
 from ncs_gym.processes.process import Process
-from ncs_gym.validation import as_number
+from ncs_gym.validation import as_number, shown
 
 # Steps of the integrator in one control step: at 0.01 s its error is far below the rounding of an action.
 SUBSTEPS = 2
@@ -44,6 +42,7 @@ class CartPoleProcess(Process):
     cart_mass: float = 1.0
     pole_mass: float = 0.1
     length: float = 0.5
+    vectorized: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         for name in ("cart_mass", "pole_mass", "length"):
@@ -53,25 +52,31 @@ class CartPoleProcess(Process):
         """Returns the process with another mass."""
         return replace(self, pole_mass=factor * self.pole_mass)
 
-    def body(self, plant: LinearPlant, size: int | None) -> Body:
-        """Returns the integrator of the equations over the plant's step.
+    def opened(self, plant: LinearPlant, size: int | None) -> Process:
+        """Returns the process itself.
 
         Raises:
             ValueError: If the plant does not have the cart-pole's four states and one input.
         """
         if (plant.n, plant.m) != (4, 1):
             raise ValueError(f"the cart-pole has 4 states and 1 input, the plant {plant.n} and {plant.m}")
-        return FunctionBody(lambda state, u: self._advanced(state, u, plant.dt), vectorized=True)
+        return self
 
-    def _advanced(self, state: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
-        """Returns the state a step later, shape (4,) or (4, N)."""
-        h = dt / SUBSTEPS
+    def step(self, plant: LinearPlant, state: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Returns the state a step of the plant later, shape (4,) or (4, N).
+
+        Raises:
+            ValueError: If it is not finite.
+        """
+        h = plant.dt / SUBSTEPS
         for _ in range(SUBSTEPS):
             first = self._rate(state, u)
             second = self._rate(state + 0.5 * h * first, u)
             third = self._rate(state + 0.5 * h * second, u)
             fourth = self._rate(state + h * third, u)
             state = state + h / 6.0 * (first + 2.0 * (second + third) + fourth)
+        if not np.isfinite(state).all():
+            raise ValueError(f"the process must return a finite next state, got {shown(state.tolist())}")
         return state
 
     def _rate(self, state: np.ndarray, u: np.ndarray) -> np.ndarray:

@@ -11,7 +11,6 @@ from flint import arb
 
 from ncs_gym import exact
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.processes.body_simulation import Body
 from ncs_gym.processes.gym_process import GymProcess
 from ncs_gym.processes.process import Process
 from ncs_gym.uncertainty.declared_bound import as_bound
@@ -56,9 +55,9 @@ class PendulumProcess(Process):
         """Returns the process with another mass."""
         return replace(self, mass=factor * self.mass)
 
-    def body(self, plant: LinearPlant, size: int | None) -> Body:
+    def opened(self, plant: LinearPlant, size: int | None) -> Process:
         """Returns the opened environments."""
-        return GymProcess(self._make, read_state=_read, write_state=_write).body(plant, size)
+        return GymProcess(self._make, read_state=_read, write_state=_write).opened(plant, size)
 
     def _make(self) -> gym.Env:
         env: Any = gym.make("Pendulum-v1", g=self.gravity, disable_env_checker=True).unwrapped

@@ -11,7 +11,6 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.processes.body_simulation import Body
 from ncs_gym.processes.process import Process
 from ncs_gym.validation import as_setting, shown
 
@@ -57,23 +56,23 @@ class GymProcess(Process):
             if not callable(value) and (value is not None or name in ("make", "read_state")):
                 raise ValueError(f"GymProcess: {name} must be a function, got {shown(value)}")
 
-    def body(self, plant: LinearPlant, size: int | None) -> Body:
+    def opened(self, plant: LinearPlant, size: int | None) -> Process:
         """Returns the opened environments.
 
         Raises:
             ValueError: If they do not fit the plant, or `make` returns the same one again.
         """
         if size is None:
-            return GymBody(self, plant)
-        bodies = [GymBody(self, plant) for _ in range(size)]
-        if len({id(each.env.unwrapped) for each in bodies}) < size:
+            return OpenedEnv(self, plant)
+        inner = [OpenedEnv(self, plant) for _ in range(size)]
+        if len({id(each.env.unwrapped) for each in inner}) < size:
             raise ValueError(
                 "GymProcess: make must return a fresh environment at every call, not one that it returned before"
             )
-        return _GymBodies(bodies)
+        return _OpenedEnvs(inner)
 
 
-class GymBody(Body):
+class OpenedEnv(Process):
     """One inner environment at run time.
 
     Args:
@@ -128,7 +127,7 @@ class GymBody(Body):
         self._has_started, self.terminated, self.truncated = True, False, False
         return self._read_state() if self._write is None else self.write(state)
 
-    def step(self, state: np.ndarray, u: np.ndarray) -> np.ndarray:  # noqa: D102
+    def step(self, plant: LinearPlant, state: np.ndarray, u: np.ndarray) -> np.ndarray:  # noqa: D102
         if self.terminated or self.truncated:
             raise gym.error.ResetNeeded("the process inside has ended its episode: call reset")
         write = self._write_action
@@ -177,39 +176,39 @@ class GymBody(Body):
         return np.array(state)
 
 
-class _GymBodies(Body):
+class _OpenedEnvs(Process):
     """Inner environments of a vector, stepped one after the other.
 
     Args:
-        bodies: One for each environment.
+        inner: One for each environment.
     """
 
-    def __init__(self, bodies: list[GymBody]) -> None:
-        self._bodies = bodies
-        self.is_written = bodies[0].is_written
-        self.terminated = np.zeros(len(bodies), np.bool_)
-        self.truncated = np.zeros(len(bodies), np.bool_)
+    def __init__(self, inner: list[OpenedEnv]) -> None:
+        self.inner = inner
+        self.is_written = inner[0].is_written
+        self.terminated = np.zeros(len(inner), np.bool_)
+        self.truncated = np.zeros(len(inner), np.bool_)
 
     def start(self, rng: np.random.Generator, state: np.ndarray, chosen: np.ndarray | None) -> np.ndarray:
-        numbers = np.arange(len(self._bodies)) if chosen is None else chosen
-        started = [self._bodies[e].start(rng, x, None) for e, x in zip(numbers.tolist(), state.T, strict=True)]
+        numbers = np.arange(len(self.inner)) if chosen is None else chosen
+        started = [self.inner[e].start(rng, x, None) for e, x in zip(numbers.tolist(), state.T, strict=True)]
         self.terminated[numbers] = self.truncated[numbers] = False
         return np.array(started).T
 
-    def step(self, state: np.ndarray, u: np.ndarray) -> np.ndarray:
-        moved = state.copy()  # an episode that has ended stands still until its reset
+    def step(self, plant: LinearPlant, state: np.ndarray, u: np.ndarray) -> np.ndarray:
+        x_next = state.copy()  # an episode that has ended stands still until its reset
         for e in np.flatnonzero(~(self.terminated | self.truncated)).tolist():
-            body = self._bodies[e]
-            moved[:, e] = body.step(state[:, e], u[:, e])
-            self.terminated[e], self.truncated[e] = body.terminated, body.truncated
-        return moved
+            each = self.inner[e]
+            x_next[:, e] = each.step(plant, state[:, e], u[:, e])
+            self.terminated[e], self.truncated[e] = each.terminated, each.truncated
+        return x_next
 
     def write(self, state: np.ndarray) -> np.ndarray:
         written = state.copy()
         for e in np.flatnonzero(~(self.terminated | self.truncated)).tolist():
-            written[:, e] = self._bodies[e].write(state[:, e])
+            written[:, e] = self.inner[e].write(state[:, e])
         return written
 
     def close(self) -> None:
-        for body in self._bodies:
-            body.close()
+        for each in self.inner:
+            each.close()

@@ -9,13 +9,11 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.processes.body_simulation import Body
-from ncs_gym.processes.function_process import FunctionProcess
-from ncs_gym.processes.linear_fit import fitted_matrices, surrounding_shape
-from ncs_gym.processes.process import LinearProcess, Process
+from ncs_gym.processes.process import FunctionProcess, LinearProcess, Process
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.remainder import Remainder
+from ncs_gym.uncertainty.shape_matrices import rounded_up
 from ncs_gym.validation import as_count, as_matrix, as_number, as_vector, shown
 
 # Fresh samples that check a bound, as a fraction of those that it was found with.
@@ -24,6 +22,17 @@ HELD_OUT = 0.25
 ROUNDING = 1e-9
 # Steps that are taken twice before a bound counts as proved.
 REPEATED = 50
+# Rounds of reweighting: the largest remainder settles to about a percent.
+ROUNDS = 60
+# The ellipsoid around the samples is at most this much larger than the smallest one, in squared radii.
+EXCESS = 0.01
+MOST_UPDATES = 10_000
+# Directions in which less than this fraction of the largest extent is left out, mostly by rounding, get that much.
+THINNEST = 1e-4
+# No sample loses all of its weight.
+SMALLEST_WEIGHT = 1e-9
+# Results keep this many digits, so that other machines find the same numbers.
+DIGITS = 9
 
 
 class _Steps(NamedTuple):
@@ -113,28 +122,29 @@ def _steps_of(
     n, m = len(common["box"]), len(common["u_max"])
     quiet = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.0)
     frame = LinearPlant(A=np.zeros((n, n)), B=np.zeros((n, m)), **common, **quiet)
-    body = process.body(frame, None)
+    moving = process.opened(frame, None)
     try:
-        if not body.is_written:
+        if not moving.is_written:
             raise ValueError("a linear model needs steps from chosen states: give GymProcess write_state")
-        origin = _first_step(body, n, m)
-        drawn = _sampled(body, frame, count, rng)
-        fresh = _sampled(body, frame, max(int(HELD_OUT * count), 100), rng)
-        again = _moved(body, drawn.states[:, :REPEATED], drawn.inputs[:, :REPEATED], rng)
+        origin = _first_step(moving, frame)
+        drawn = _sampled(moving, frame, count, rng)
+        fresh = _sampled(moving, frame, max(int(HELD_OUT * count), 100), rng)
+        again = _moved(moving, frame, drawn.states[:, :REPEATED], drawn.inputs[:, :REPEATED], rng)
         spread = float(np.max(np.abs(again - drawn.moved[:, :REPEATED]) / frame.half_widths[:, None]))
         return drawn, fresh, origin, spread
     finally:
-        body.close()
+        moving.close()
 
 
-def _first_step(body: Body, n: int, m: int) -> np.ndarray:
+def _first_step(moving: Process, frame: LinearPlant) -> np.ndarray:
     """Returns f(0, 0), shape (n,).
 
     Raises:
         ValueError: If the process takes no state of n entries with m inputs.
     """
+    n, m = frame.n, frame.m
     try:
-        return body.step(body.write(np.zeros(n)), np.zeros(m))
+        return moving.step(frame, moving.write(np.zeros(n)), np.zeros(m))
     except (IndexError, TypeError, ValueError) as error:
         raise ValueError(
             f"the process cannot move a state of {n} {'entry' if n == 1 else 'entries'} (as box has) with {m} "
@@ -142,26 +152,28 @@ def _first_step(body: Body, n: int, m: int) -> np.ndarray:
         ) from error
 
 
-def _sampled(body: Body, frame: LinearPlant, count: int, rng: np.random.Generator) -> _Steps:
+def _sampled(moving: Process, frame: LinearPlant, count: int, rng: np.random.Generator) -> _Steps:
     """Returns steps from random points of box x limits; half of them have coordinates on the boundary."""
     widths = np.concatenate([frame.half_widths, frame.u_max])[:, None]
     points = rng.uniform(-1.0, 1.0, (len(widths), count))
     at_end = rng.random(points.shape) < np.where(np.arange(count) % 2 == 0, 0.0, rng.random(count))
     points = widths * np.where(at_end, np.sign(points), points)
     states, inputs = points[: frame.n], points[frame.n :]
-    return _Steps(states, inputs, _moved(body, states, inputs, rng))
+    return _Steps(states, inputs, _moved(moving, frame, states, inputs, rng))
 
 
-def _moved(body: Body, states: np.ndarray, inputs: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _moved(
+    moving: Process, frame: LinearPlant, states: np.ndarray, inputs: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
     """Returns the next states, shape (n, N), after states (n, N) with inputs (m, N)."""
-    if body.is_vectorized:
-        return body.step(states, inputs)
-    moved = np.empty_like(states)
+    if moving.vectorized:
+        return moving.step(frame, states, inputs)
+    x_next = np.empty_like(states)
     for each in range(states.shape[1]):
-        if body.terminated or body.truncated:
-            body.start(rng, states[:, each], None)
-        moved[:, each] = body.step(body.write(states[:, each]), inputs[:, each])
-    return moved
+        if moving.terminated or moving.truncated:
+            moving.start(rng, states[:, each], None)
+        x_next[:, each] = moving.step(frame, moving.write(states[:, each]), inputs[:, each])
+    return x_next
 
 
 def _left_out(A: np.ndarray, B: np.ndarray, steps: _Steps) -> np.ndarray:
@@ -228,3 +240,66 @@ def _bearable(remainder: Remainder, widths: np.ndarray) -> Remainder:
             "the box in one step: shrink the box, the input limits or dt"
         )
     return remainder
+
+
+def fitted_matrices(
+    states: np.ndarray, inputs: np.ndarray, moved: np.ndarray, widths: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns A and B for which the largest remainder of the samples, in half-widths of the box, is nearly smallest.
+
+    Lawson's algorithm: least squares again and again, each sample weighted with its remainders so far.
+
+    Args:
+        states: Shape (n, N).
+        inputs: Shape (m, N).
+        moved: Next states, shape (n, N).
+        widths: Half-widths of the box, shape (n,).
+    """
+    regressors = np.concatenate([states, inputs]).T
+    targets = (moved / widths[:, None]).T
+    weights, best, smallest = np.ones(len(targets)), None, np.inf
+    for _ in range(ROUNDS):
+        root = np.sqrt(weights)[:, None]
+        matrix = np.linalg.lstsq(root * regressors, root * targets, rcond=None)[0]
+        sizes = np.linalg.norm(targets - regressors @ matrix, axis=1)
+        if sizes.max() < smallest:
+            best, smallest = matrix, sizes.max()
+        weights = weights * (sizes + SMALLEST_WEIGHT * sizes.max() + np.finfo(float).tiny)
+        weights /= weights.sum()
+    if best is None:
+        raise ValueError("the sampled steps are not finite: no linear model fits them")
+    fitted = np.round(best * widths, DIGITS).T
+    return fitted[:, : len(states)], fitted[:, len(states) :]
+
+
+def surrounding_shape(points: np.ndarray, widths: np.ndarray) -> np.ndarray:
+    """Returns P, shape (n, n), of nearly the smallest ellipsoid E(P) around points and their negatives.
+
+    Khachiyan's algorithm in the principal axes of the points; an axis without extent gets a little of it.
+
+    Args:
+        points: Shape (N, n).
+        widths: Half-widths of the box, shape (n,): the unit of each entry.
+    """
+    scaled = points / widths
+    if not np.any(scaled):
+        return np.zeros((len(widths), len(widths)))
+    axes = np.linalg.svd(scaled, full_matrices=False)[2]
+    coordinates = scaled @ axes.T
+    extents = np.abs(coordinates).max(axis=0)
+    extents = np.maximum(extents, THINNEST * extents.max())
+    whitened = np.concatenate([coordinates / extents, np.eye(len(widths))])
+    n, weights = len(widths), np.full(len(whitened), 1.0 / len(whitened))
+    for _ in range(MOST_UPDATES):
+        moments = whitened.T @ (weights[:, None] * whitened)
+        sizes = np.einsum("ij,jk,ik->i", whitened, np.linalg.inv(moments), whitened)
+        farthest = int(sizes.argmax())
+        if sizes[farthest] <= n * (1.0 + EXCESS):
+            break
+        step = (sizes[farthest] / n - 1.0) / (sizes[farthest] - 1.0) if n > 1 else 1.0
+        weights *= 1.0 - step
+        weights[farthest] += step
+    moments = whitened.T @ (weights[:, None] * whitened)
+    sizes = np.einsum("ij,jk,ik->i", whitened, np.linalg.inv(moments), whitened)
+    factor = widths[:, None] * axes.T * extents
+    return rounded_up(sizes.max() * factor @ moments @ factor.T, DIGITS)

@@ -12,7 +12,6 @@ import gymnasium as gym
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.processes.body_simulation import Body
 from ncs_gym.processes.gym_process import GymProcess
 from ncs_gym.processes.linearization import linear_model
 from ncs_gym.processes.process import Process
@@ -45,7 +44,7 @@ class InvertedPendulumProcess(Process):
         """Returns the process with another mass."""
         return replace(self, mass_factor=factor * self.mass_factor)
 
-    def body(self, plant: LinearPlant, size: int | None) -> Body:
+    def opened(self, plant: LinearPlant, size: int | None) -> Process:
         """Returns the opened environments.
 
         Raises:
@@ -55,7 +54,7 @@ class InvertedPendulumProcess(Process):
             raise ModuleNotFoundError(
                 "InvertedPendulum-v5 needs MuJoCo: in a clone of ncs-gym, pip install -e '.[mujoco]'"
             )
-        return GymProcess(self._make, read_state=_read, write_state=_write).body(plant, size)
+        return GymProcess(self._make, read_state=_read, write_state=_write).opened(plant, size)
 
     def _make(self) -> gym.Env:
         env: Any = gym.make("InvertedPendulum-v5", disable_env_checker=True).unwrapped

@@ -1,32 +1,67 @@
-"""What really moves, as a setting of the environment."""
+"""What really moves: the plant's own equations, a function, or (`gym_process`) another environment."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.processes.body_simulation import Body, BodySimulation
-from ncs_gym.processes.simulation import PlantSimulation
-from ncs_gym.uncertainty.disturbance import Disturbance
+from ncs_gym.validation import as_flag, as_setting, shown
 
 
-class Process(ABC):
+class Process:
     """What really moves; the plant is the certified model of it (docs/beyond_linear.md).
 
-    Settings without run-time state: one object may serve any number of environments.
+    A process is a setting: one object may serve any number of environments. What keeps something at run time returns
+    another process from `opened`, which belongs to a single environment, or to a vector of them.
+
+    Attributes:
+        vectorized: Whether `step` takes any number of states and inputs at once.
+        is_written: Whether it can be put into a state, so that episodes start where the environment says and
+            disturbances of the plant can act.
+        terminated, truncated: Whether it ended the episode by itself; arrays (N,) for many environments.
     """
 
-    @abstractmethod
-    def body(self, plant: LinearPlant, size: int | None) -> Body:
+    vectorized: bool = False
+    is_written: bool = True
+    terminated: Any = False
+    truncated: Any = False
+
+    def opened(self, plant: LinearPlant, size: int | None) -> Process:
         """Returns what moves in one environment (None) or in `size` of them.
 
         Raises:
             ValueError: If the process does not fit the plant.
         """
+        return self
+
+    def start(self, rng: np.random.Generator, state: np.ndarray, chosen: np.ndarray | None) -> np.ndarray:
+        """Starts episodes, and returns the states that they start in.
+
+        Args:
+            rng: Source of randomness.
+            state: Where to start, shape (n,), or (n, k) for k chosen environments.
+            chosen: Numbers of these environments, shape (k,); None without that axis.
+        """
+        return state
+
+    def step(self, plant: LinearPlant, state: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Returns the next state without disturbance, shape (n,) or (n, N), for inputs (m,) or (m, N).
+
+        Raises:
+            ValueError: If it is one of those that move only once they are `opened`.
+        """
+        raise ValueError(f"a {type(self).__name__} moves only once it is opened")
+
+    def write(self, state: np.ndarray) -> np.ndarray:
+        """Puts everything that has not ended into a state, shape (n,) or (n, N), and returns what is read back."""
+        return state
+
+    def close(self) -> None:
+        """Closes what was opened."""
 
     def with_mass(self, factor: float) -> Process:
         """Returns the process with another mass, for experiments in which the model is wrong.
@@ -39,38 +74,50 @@ class Process(ABC):
         """
         raise ValueError(f"a {type(self).__name__} has no mass to change")
 
-    def simulation(
-        self,
-        plant: LinearPlant,
-        disturbance: Disturbance,
-        allow_assumption_violation: bool,
-        size: int | None = None,
-        *,
-        truncated: bool = True,
-    ) -> PlantSimulation:
-        """Returns the process with its sensors and disturbances; see `PlantSimulation` for the arguments."""
-        body = self.body(plant, size)
-        return BodySimulation(body, plant, disturbance, allow_assumption_violation, size, truncated=truncated)
-
 
 @dataclass(frozen=True)
 class LinearProcess(Process):
     """The plant's own equations and disturbances: the certified model is the truth."""
 
-    def body(self, plant: LinearPlant, size: int | None) -> Body:
-        """Returns the equations alone."""
-        return _LinearBody(plant)
-
-    def simulation(self, *arguments: Any, **keywords: Any) -> PlantSimulation:
-        """Returns the simulation of the plant's equations, which needs no body."""
-        return PlantSimulation(*arguments, **keywords)
+    def step(self, plant: LinearPlant, state: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Returns A x + B u."""
+        return plant.A.dot(state) + plant.B.dot(u)
 
 
-class _LinearBody(Body):
-    """x+ = A x + B u."""
+@dataclass(frozen=True)
+class FunctionProcess(Process):
+    """x+ = f(x, u) + d for a function f; the plant's declared disturbances without its remainder act on top.
 
-    def __init__(self, plant: LinearPlant) -> None:
-        self._plant = plant
+    Attributes:
+        function: Returns x+ of shape (n,), given x of shape (n,) and u of shape (m,) [physical units].
+        vectorized: Whether it also takes arrays (n, N) and (m, N) of many environments, and returns (n, N).
 
-    def step(self, state: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return self._plant.A.dot(state) + self._plant.B.dot(u)
+    Raises:
+        ValueError: If the function is none, or `vectorized` no truth value.
+    """
+
+    function: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    vectorized: bool = False
+
+    def __post_init__(self) -> None:
+        if not callable(self.function):
+            raise ValueError(f"the process must be a function (x, u) -> x+, got {shown(self.function)}")
+        object.__setattr__(self, "vectorized", as_flag(self.vectorized, "vectorized"))
+
+    def step(self, plant: LinearPlant, state: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Returns what the function returns, for all environments at once or for one after the other.
+
+        Raises:
+            ValueError: If that is not finite, or of another shape than the state.
+        """
+        if state.ndim > 1 and not self.vectorized:
+            columns = [self._checked(x, v) for x, v in zip(state.T.copy(), u.T.copy(), strict=True)]
+            return np.array(columns).T
+        return self._checked(state.copy(), u.copy())
+
+    def _checked(self, state: np.ndarray, u: np.ndarray) -> np.ndarray:
+        value = self.function(state, u)
+        x_next = as_setting(value)
+        if x_next is None or x_next.shape != state.shape or not np.isfinite(x_next).all():
+            raise ValueError(f"the process must return a finite next state of shape {state.shape}, got {shown(value)}")
+        return x_next

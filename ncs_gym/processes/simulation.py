@@ -1,4 +1,4 @@
-"""The plant's own equations with noise and disturbances, simulated for one environment or for many."""
+"""What really moves, with the noise, the disturbances and the sensors of the plant, in one environment or in many."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.processes.process import LinearProcess, Process
 from ncs_gym.uncertainty.disturbance import Disturbance, checked, checked_many
 from ncs_gym.uncertainty.disturbance_settings import stays_inside
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
@@ -44,23 +45,27 @@ class BlockSampler:
 
 
 class PlantSimulation:
-    """x+ = A x + B u + d and y = H x + v, simulated; the last axis of every array is the environment.
+    """x+ = f(x, u) + d and y = H x + v, simulated; the last axis of every array is the environment.
+
+    Beside a process other than the plant's own equations, d is within what the plant declares beside its remainder, and
+    nothing if that is nothing, or if the process cannot be put into a state: what the plant declares is then its own.
 
     Args:
-        plant: The plant with its bounds.
+        plant: The plant with its bounds, the certified model of what moves.
         disturbance: What acts on it; process noise is added unless it replaces that.
         allow_assumption_violation: Let disturbances outside the certified bound pass instead of raising.
         size: Number of environments; None for one without that axis.
         truncated: Whether process noise, sensor noise and first errors are truncated; False draws Gaussian ones.
+        process: What moves; the plant's own equations by default.
 
     Attributes:
-        terminated, truncated: Whether the process ended the episode by itself, which these equations never do.
-        alarm: Whether the process moved in a way that the model excludes, which these equations never do.
-    """
+        plant: The plant whose noise and disturbances are drawn: without the remainder beside another process.
+        alarm: Whether x+ - A x - B u lay outside E(D) in a step of this episode, so that no proof about the model is
+            one about the process; shape (N,) for many environments.
 
-    terminated: Any = False
-    truncated: Any = False
-    alarm: Any = False
+    Raises:
+        ValueError: If the process does not fit the plant, or a disturbance of the user's cannot act on it.
+    """
 
     def __init__(
         self,
@@ -70,16 +75,35 @@ class PlantSimulation:
         size: int | None = None,
         *,
         truncated: bool = True,
+        process: Process | None = None,
     ) -> None:
-        self.plant, self.disturbance, self.size, self._truncated = plant, disturbance, size, truncated
+        given = LinearProcess() if process is None else process
+        self.process, self._is_linear = given.opened(plant, size), isinstance(given, LinearProcess)
+        self.plant, self._model = plant if self._is_linear else plant.without_remainder, plant
+        self.disturbance, self.size, self._truncated = disturbance, size, truncated
         self._allow = allow_assumption_violation
         self._limit = plant.state_limit if np.isfinite(plant.state_limit).all() else None
         if size is not None and self._limit is not None:
             self._limit = self._limit[:, None]
         self._is_drawn_ahead = disturbance.memoryless and disturbance.vectorized
         self._trusted = stays_inside(disturbance)
+        if not self._trusted and not self.process.is_written:
+            raise ValueError("a disturbance of your own can act only on a process with write_state: give it one")
+        acts = not self._trusted or bool(np.any(self.plant.nominal_disturbance.shape))
+        self._is_disturbed = self.process.is_written and acts
         self.sensor_noise = BlockSampler(self._draw_sensor_noise, size)
         self.process_noise = BlockSampler(self._draw_process_noise, size)
+        self.alarm: Any = False if size is None else np.zeros(size, np.bool_)
+
+    @property
+    def terminated(self) -> Any:
+        """Whether the process ended the episode, a bool or shape (N,)."""
+        return self.process.terminated
+
+    @property
+    def truncated(self) -> Any:
+        """Whether the process cut the episode off, a bool or shape (N,)."""
+        return self.process.truncated
 
     def _draw_process_noise(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Returns process noise, and the disturbance where it depends on nothing but chance, shape (n, count)."""
@@ -145,9 +169,18 @@ class PlantSimulation:
         Args:
             rng: Source of randomness.
             state: Where it is to start, shape (n,).
-            initial: The set that this was drawn from; None for a given state.
+            initial: The set that this was drawn from; None for a given state. A start elsewhere, where the process
+                itself went, is known as the state itself.
+
+        Raises:
+            ValueError: If the process cannot start at a given state.
         """
-        return state, read_only(state) if initial is None else initial
+        self._require_written(initial)
+        started = self.process.start(rng, state, None)
+        self.alarm = False
+        if initial is not None and (started is state or initial.contains(started)):
+            return started, initial
+        return started, read_only(started)
 
     def start_many(
         self, rng: np.random.Generator, states: np.ndarray, initial: Ellipsoid | None, mask: np.ndarray
@@ -157,8 +190,21 @@ class PlantSimulation:
         Returns:
             The first states, shape (n, k), and what is known of them, shape (k, n): a row of NaN for a state in the
             initial set, the state itself for another one.
+
+        Raises:
+            ValueError: If the process cannot start at given states.
         """
-        return states, np.full(states.T.shape, np.nan) if initial is not None else states.T
+        self._require_written(initial)
+        started = self.process.start(rng, states, np.flatnonzero(mask))
+        self.alarm = self.alarm & ~mask
+        known = started.T.copy()
+        if initial is not None:
+            known[... if started is states else initial.gauge(known) <= 1.0] = np.nan
+        return started, known
+
+    def _require_written(self, initial: Ellipsoid | None) -> None:
+        if initial is None and not self.process.is_written:
+            raise ValueError("this process cannot start at a given state: give its GymProcess write_state")
 
     def begin(self, rng: np.random.Generator, count: int | None = None) -> Any:
         """Returns what the disturbance keeps for an episode, or for `count` of them along the last axis."""
@@ -177,11 +223,24 @@ class PlantSimulation:
             memory: What `begin` returned.
 
         Raises:
-            ValueError: If a disturbance lies outside its bound and that is not allowed.
+            ValueError: If a disturbance lies outside its bound and that is not allowed, or the process cannot move.
         """
-        nominal = self.plant.A.dot(state) + self.plant.B.dot(u)
-        moved = nominal + self.draw_disturbance(rng, nominal, steps, memory)
-        return moved if self._limit is None else np.minimum(np.maximum(moved, -self._limit), self._limit)
+        nominal = self._model.A.dot(state) + self._model.B.dot(u)
+        if self._is_linear:
+            return self._limited(nominal + self.draw_disturbance(rng, nominal, steps, memory))
+        x_next = self.process.step(self._model, state, u)
+        if self._is_disturbed:
+            x_next = x_next + self.draw_disturbance(rng, x_next, steps, memory)
+        if self.process.is_written:
+            x_next = self._limited(x_next)
+        if self._is_disturbed:
+            x_next = self.process.write(x_next)
+        gauge = self._model.disturbance.gauge((x_next - nominal).T)  # NaN where it overflows
+        self.alarm = self.alarm | np.logical_not(gauge <= 1.0)
+        return x_next
+
+    def _limited(self, state: np.ndarray) -> np.ndarray:
+        return state if self._limit is None else np.minimum(np.maximum(state, -self._limit), self._limit)
 
     def draw_disturbance(self, rng: np.random.Generator, nominal: np.ndarray, steps: Any, memory: Any) -> np.ndarray:
         """Returns process noise and disturbance, of the shape of A x + B u."""
@@ -193,7 +252,8 @@ class PlantSimulation:
         return self._sum(d, None if source.replaces_process_noise else self.process_noise.next(rng), self.size)
 
     def close(self) -> None:
-        """Closes what the process opened: nothing here."""
+        """Closes what the process opened."""
+        self.process.close()
 
     def measure(self, rng: np.random.Generator, state: np.ndarray) -> np.ndarray:
         """Returns y = H x + v, shape (p,) or (p, size)."""

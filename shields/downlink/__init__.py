@@ -4,7 +4,7 @@
 was decided is applied when its step comes.
 """
 
-from shields.downlink.schedule import Schedule, VectorSchedule, as_decided
+from shields.downlink.schedule import as_decided
 from shields.downlink.start_under_zero_input import first_observations, known_inside, starts_known
 
-__all__ = ["Schedule", "VectorSchedule", "as_decided", "first_observations", "known_inside", "starts_known"]
+__all__ = ["as_decided", "first_observations", "known_inside", "starts_known"]

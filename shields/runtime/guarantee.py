@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym import Ellipsoid
-from ncs_gym.downlink import DownlinkProtocol
-from ncs_gym.plants.linear_plant import SIMULATED_REACH
-from ncs_gym.plants.statespace import inputs_under_way
+from ncs_gym.network import DownlinkProtocol
+from ncs_gym.plants.linear_plant import SIMULATED_REACH, inputs_under_way
 from shields.runtime.decisions import Decision
 from shields.runtime.one_step_test import FARTHEST
 from shields.runtime.predicted_errors import PredictedErrors

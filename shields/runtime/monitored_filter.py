@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym.downlink import DownlinkProtocol
-from shields.downlink.schedule import Schedule
+from ncs_gym.network import CommittedInputs, DownlinkProtocol
 from shields.downlink.start_under_zero_input import known_inside
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, LoopObservation, MonitorState, StartKnown
@@ -40,7 +39,7 @@ class MonitoredFilter:
         self.filter = safety_filter
         self.lead = 0 if downlink is None else downlink.lead
         self._monitor = GuaranteeMonitor(safety_filter, downlink)
-        self._schedule = None if downlink is None else Schedule(self.lead, safety_filter.plant.m)
+        self._schedule = None if downlink is None else CommittedInputs(self.lead, safety_filter.plant.m)
         self.report: LoopObservation
         self._state: MonitorState
         self._decision: Decision
@@ -104,7 +103,7 @@ class MonitoredFilter:
         on_time, taken = True, applied
         if self._schedule is not None:
             due, taken = self._schedule.due(self.decided), committed
-            on_time = applied is not None and applied.tolist() == due
+            on_time = applied is not None and applied.tolist() == due.tolist()
         same_input = taken is not None and taken.tolist() == self.decided
         if not (moved_once and same_input and on_time):  # what is stored was certified for other states
             self._stored = self._stored[:0]

@@ -10,8 +10,8 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 import numpy as np
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid, Estimator, LinearPlant, Packet
-from ncs_gym.downlink import Command, CommittedInputs, downlink_protocol
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
+from ncs_gym.network import Command, CommittedInputs, downlink_protocol
 from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.network.packet_reception import DiscardedPackets, as_packet
 from ncs_gym.validation import as_numbers, as_vector, setting, shown

@@ -11,10 +11,11 @@ from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 
 from ncs_gym.envs.spaces import read_actions
 from ncs_gym.envs.vector_env import NCSVectorEnv
+from ncs_gym.network import CommittedInputs
 from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.validation import as_number, setting, shown
 from shields.certificate import Certificate
-from shields.downlink.schedule import VectorSchedule, as_decided, columns
+from shields.downlink.schedule import as_decided, columns
 from shields.downlink.start_under_zero_input import first_observations, starts_known
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import (
@@ -87,12 +88,14 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             certificate_for(inner.plant, inner.certificate_contract) if certificate is None else certificate
         )
         self._filter = SafetyFilter(self._certificate, inner.plant, mode, horizon)
-        self._monitor = GuaranteeMonitor(self._filter, inner.downlink)
-        self._lead = 0 if inner.downlink is None else inner.downlink.lead
+        self._monitor = GuaranteeMonitor(self._filter, inner.downlink_protocol)
+        self._lead = 0 if inner.downlink_protocol is None else inner.downlink_protocol.lead
         warn_of_broken_contract(self._certificate.contract, inner.channel, self._lead)
         self._start_known = starts_known(self._filter, inner.single.initial_set, self._lead)
         count, nothing = self.num_envs, np.zeros(self.num_envs, np.bool_)
-        self._schedule = None if inner.downlink is None else VectorSchedule(self._lead, inner.plant.m, count)
+        self._schedule = (
+            None if inner.downlink_protocol is None else CommittedInputs(self._lead, (inner.plant.m, count))
+        )
         self._state = MonitorState(np.full(count, CODES[OTHER_STEPS]), nothing, nothing, np.zeros(count, np.int64))
         self._interventions = np.zeros(count, np.int64)
         # Plans stored in mode "lookahead", NaN beyond their ends.

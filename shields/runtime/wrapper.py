@@ -32,7 +32,7 @@ REFUSED = (gym.ActionWrapper, RepeatAction, StickyAction, MaxAndSkipObservation,
 INTERRUPTED = (-1, -1)
 
 # What of an environment a shield's proof rests on.
-PREMISES = "plant", "channel", "contract", "downlink", "certificate_contract", "process", "initial_set"
+PREMISES = "plant", "channel", "contract", "downlink_protocol", "certificate_contract", "process", "initial_set"
 
 _synthesized: dict[tuple[str, ChannelContract | None], Certificate] = {}
 
@@ -103,7 +103,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             certificate_for(inner.plant, inner.certificate_contract) if certificate is None else certificate
         )
         self._filter = SafetyFilter(self._certificate, inner.plant, mode, horizon)
-        self._monitored = MonitoredFilter(self._filter, inner.downlink)
+        self._monitored = MonitoredFilter(self._filter, inner.downlink_protocol)
         warn_of_broken_contract(self._certificate.contract, inner.channel, self._monitored.lead)
         self._clock: tuple[int, int] | None = None
         self._start: Any = None
@@ -158,7 +158,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             self._annotate(proposed, count, decision.plan, intervened=decision.intervened)
         observation, reward, terminated, truncated, info = self.env.step(action)
         clock = self._read_clock()
-        committed = None if self._inner.downlink is None else as_numbers(info["input_committed"])
+        committed = None if self._inner.downlink_protocol is None else as_numbers(info["input_committed"])
         moved_once = clock == (episode, step + 1)
         self._monitored.advance(as_numbers(info["input"]), moved_once, self._observed(info), committed)
         self._interventions += decision.intervened

@@ -12,7 +12,7 @@ import numpy as np
 
 from ncs_gym import ErrorSet, LinearPlant, exact
 from ncs_gym.network.contract import ChannelContract
-from ncs_gym.plants.bounds import inflated
+from ncs_gym.plants.linear_plant import inflated
 from ncs_gym.validation import shown
 from shields.certificate import Certificate
 from shields.certificate_text import size_of

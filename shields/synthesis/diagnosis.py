@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, Remainder
-from ncs_gym.plants.description import row_limit
+from ncs_gym.plants.linear_plant import row_limit
 from shields.errors import Infeasible
 from shields.synthesis.design_problem import DesignProblem, design_problem
 from shields.synthesis.initial_designs import SUFFICIENT_MARGIN

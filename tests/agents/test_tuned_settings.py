@@ -7,10 +7,10 @@ import pytest
 from agents import tuned_settings, tuned_steps
 from agents.settings import PPOSettings
 from agents.tuned.entries import _entries
-from ncs_gym.registration import ENTRY_POINTS, needing_extras, registered_ids
+from ncs_gym.registration import ENVIRONMENTS, needing_extras, registered_ids
 
 FILE = Path(__file__).resolve().parents[2] / "agents" / "tuned" / "ppo.json"
-OWN = [env_id for env_id in ENTRY_POINTS if env_id in {*registered_ids(), *needing_extras()}]
+OWN = [env_id for env_id in ENVIRONMENTS if env_id in {*registered_ids(), *needing_extras()}]
 
 
 @pytest.mark.parametrize("env_id", OWN)

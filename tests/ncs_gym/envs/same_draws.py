@@ -83,10 +83,10 @@ class ScriptedEnv(NCSEnv):
         self._disturbance_memory = np.copy(many._disturbance_memory[..., index])[()]
         self._channel_state = ChannelState(self.channel, np.random.default_rng(0))
         self._channel_state._loss_state = LossState(*(kept[index] for kept in many._channel_state._loss_state))
-        self._downlink.begin(np.random.default_rng(0))
+        self._downlink_state.begin(np.random.default_rng(0))
         if self.downlink is not None:
-            states = many._downlink._channel_state._loss_state
-            self._downlink.in_flight._loss_state = LossState(*(kept[index] for kept in states))
+            states = many._downlink_state._channel_state._loss_state
+            self._downlink_state.in_flight._loss_state = LossState(*(kept[index] for kept in states))
         self.np_random = ScriptedGenerator()
 
     def replay(self, action: np.ndarray) -> tuple:
@@ -134,7 +134,7 @@ def scalar_versions(many: NCSVectorEnv, kind: type[ScriptedEnv] = ScriptedEnv) -
     settings = {name: getattr(single, name) for name in names}
     settings["allow_assumption_violation"] = single.allow_assumption_violation
     if single.downlink is not None:
-        settings |= {"downlink": single.downlink.channel, "downlink_contract": single.downlink.contract}
+        settings |= {"downlink": single.downlink, "downlink_contract": single.downlink_protocol.contract}
     singles = [kind(**settings) for _ in range(many.num_envs)]
     for index, each in enumerate(singles):
         each.follow(many, index)

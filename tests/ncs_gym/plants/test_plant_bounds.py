@@ -11,7 +11,7 @@ import pytest
 
 import ncs_gym
 from ncs_gym import BoxDisturbance, Ellipsoid, Estimator, LinearPlant, NoNoiseWarning, truck_trailer
-from ncs_gym.plants import description
+from ncs_gym.plants import linear_plant
 from ncs_gym.processes import inverted_pendulum, nonlinear_cart_pole, pendulum
 from ncs_gym.uncertainty.disturbance_settings import BY_NAME, as_disturbance
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
@@ -83,7 +83,7 @@ REGISTERED = {
 def test_registered_plants_keep_their_fingerprints(make):
     plant, (today, *former) = make(), REGISTERED[make]
     assert plant.fingerprint.startswith(today)
-    known = (plant.fingerprint, *description.FORMER_FINGERPRINTS.get(plant.fingerprint, ()))
+    known = (plant.fingerprint, *linear_plant.FORMER_FINGERPRINTS.get(plant.fingerprint, ()))
     assert [each[:12] for each in known] == [today, *former]
     assert all(plant.has_fingerprint(each) for each in known)
     assert not any(replace(plant, dt=2.0 * plant.dt, remainder=None).has_fingerprint(each) for each in known)

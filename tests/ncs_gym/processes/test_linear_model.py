@@ -6,7 +6,7 @@ import pytest
 
 from ncs_gym import Ellipsoid, FunctionProcess, GymProcess, LinearProcess, linear_model
 from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
-from ncs_gym.processes.linear_fit import surrounding_shape
+from ncs_gym.processes.linearization import surrounding_shape
 
 QUIET = {"disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
 BOX, TORQUE, STEP = [0.25, 1.5], 2.0, 0.05
@@ -192,14 +192,16 @@ def test_pendulum_without_a_length_is_refused(name):
 @pytest.mark.parametrize("mass", [1.0, 0.7, 1.4634146])
 def test_proved_bound_holds_what_the_environment_rounds_to_float32(mass):
     """A float32 torque times 3 / (m l^2) is a float32: gain, torque and product round at the edge of the box."""
-    plant, body = pendulum(mass=mass), PendulumProcess(mass=mass).body(pendulum(mass=mass), None)
+    plant = pendulum(mass=mass)
+    inner = PendulumProcess(mass=mass).opened(plant, None)
     rng, largest = np.random.default_rng(0), 0.0
     for u in rng.uniform(1.0, TORQUE, 3_000):
         state = np.array([-0.25, 0.0])
         for torque in (u, -u):
-            left_out = body.step(body.write(state), np.array([torque])) - plant.A @ state - plant.B[:, 0] * torque
+            x_next = inner.step(plant, inner.write(state), np.array([torque]))
+            left_out = x_next - plant.A @ state - plant.B[:, 0] * torque
             largest = max(largest, plant.disturbance.gauge(left_out))
-    body.close()
+    inner.close()
     assert 0.999 < largest <= 1.0
 
 

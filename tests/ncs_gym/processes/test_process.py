@@ -95,7 +95,7 @@ def test_function_with_the_plants_equations_moves_like_the_plant(vectorized):
 def test_inner_environment_is_started_where_the_loop_says():
     env = NCSEnv(plant(disturbance_bound=0.0), process=INNER, initial_set=Ellipsoid(0.09 * np.eye(2)))
     _, info = env.reset(seed=1)
-    inner = env._process._body.env
+    inner = env._process.process.env
     np.testing.assert_array_equal(inner.state, info["state"])
     assert np.abs(info["state"]).max() > 0.05  # further than its own resets
     assert env.start is env.initial_set
@@ -113,7 +113,7 @@ def test_inner_seeds_come_from_the_seed_of_the_loop():
         env = NCSEnv(plant(), process=INNER)
         env.reset(seed=seed)
         env.reset()
-        return env._process._body.env.seeds
+        return env._process.process.env.seeds
 
     assert seeds(3) == seeds(3) != seeds(4)
     assert len(set(seeds(3))) == 2
@@ -125,7 +125,7 @@ def test_without_write_state_episodes_start_where_the_inner_reset_leaves_it():
     known = set()
     for seed in range(20):
         _, info = env.reset(seed=seed)
-        np.testing.assert_array_equal(env._process._body.env.state, info["state"])
+        np.testing.assert_array_equal(env._process.process.env.state, info["state"])
         inside = env.initial_set.contains(info["state"])
         known.add(inside)
         assert (env.start is env.initial_set) == inside
@@ -164,9 +164,9 @@ def test_inner_ends_in_a_vector_restart_that_environment_alone(mode):
     assert many.episodes.tolist() == [1, 2]
     assert np.abs(info["state"]).max() < 0.2
     assert not info["assumption_violated"].any()
-    inner = many._process._bodies if hasattr(many._process, "_bodies") else many._process._body._bodies
+    inner = many._process.process.inner
     many.close()
-    assert all(body.env.closed for body in inner)
+    assert all(each.env.closed for each in inner)
 
 
 def test_vector_of_inner_environments_moves_like_single_ones():
@@ -189,7 +189,7 @@ def test_disturbances_act_on_what_is_written_and_only_there():
         before = info["state"]
         *_, info = env.step(still)
         assert (np.abs(info["state"] - linear(before, np.zeros(1))).max() > 1e-6) == moves
-        np.testing.assert_array_equal(env._process._body.env.state, info["state"])
+        np.testing.assert_array_equal(env._process.process.env.state, info["state"])
 
 
 def test_remainder_is_left_to_the_process():

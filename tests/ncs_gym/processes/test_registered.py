@@ -119,7 +119,7 @@ def test_wrong_json_value_is_refused(fields, message):
 def test_missing_extra_is_named_in_one_sentence(monkeypatch):
     inverted = IDS[2]
     monkeypatch.setattr("ncs_gym.processes.mujoco_pendulum.find_spec", lambda name: None)
-    monkeypatch.setattr("ncs_gym.scenario.find_spec", lambda name: None)
+    monkeypatch.setattr("ncs_gym.registration.find_spec", lambda name: None)
     assert inverted in gym.registry
     assert inverted not in registered_ids()
     assert needing_extras() == [inverted]
@@ -129,18 +129,20 @@ def test_missing_extra_is_named_in_one_sentence(monkeypatch):
 
 
 def test_cart_pole_has_the_linear_one_as_its_tangent():
-    plant, body = ncs_gym.cart_pole(), CartPoleProcess().body(ncs_gym.cart_pole(), None)
-    step = 1e-6
+    plant, step = ncs_gym.cart_pole(), 1e-6
+
+    def moved(state, u):
+        return CartPoleProcess().step(plant, state, u)
+
     for column, direction in enumerate(np.eye(4)):
-        slope = (body.step(step * direction, np.zeros(1)) - body.step(-step * direction, np.zeros(1))) / (2.0 * step)
+        slope = (moved(step * direction, np.zeros(1)) - moved(-step * direction, np.zeros(1))) / (2.0 * step)
         np.testing.assert_allclose(slope, plant.A[:, column], atol=1e-8)
-    slope = (body.step(np.zeros(4), np.full(1, step)) - body.step(np.zeros(4), np.full(1, -step))) / (2.0 * step)
+    slope = (moved(np.zeros(4), np.full(1, step)) - moved(np.zeros(4), np.full(1, -step))) / (2.0 * step)
     np.testing.assert_allclose(slope, plant.B[:, 0], atol=1e-8)
 
 
 def test_cart_pole_keeps_its_energy_without_a_force():
-    process = CartPoleProcess()
-    body = process.body(ncs_gym.cart_pole(), None)
+    process, plant = CartPoleProcess(), ncs_gym.cart_pole()
 
     def energy(state):
         _, speed, angle, rate = state
@@ -151,7 +153,7 @@ def test_cart_pole_keeps_its_energy_without_a_force():
     state = np.array([0.0, 0.3, 0.2, -1.0])
     before = energy(state)
     for _ in range(100):
-        state = body.step(state, np.zeros(1))
+        state = process.step(plant, state, np.zeros(1))
     assert abs(state[2]) > 1.0  # it has fallen
     np.testing.assert_allclose(energy(state), before, rtol=1e-5)
 

@@ -17,7 +17,7 @@ from gymnasium.wrappers import RecordVideo
 from stable_baselines3.common.env_util import make_vec_env
 
 from ncs_gym import Annotation, Channel, Ellipsoid, LinearPlant
-from ncs_gym.registration import ENTRY_POINTS, needing_extras
+from ncs_gym.registration import ENVIRONMENTS, needing_extras
 from ncs_gym.rendering import PacketRecord, theme
 from ncs_gym.rendering.episode_record import RECENT_STEPS
 from ncs_gym.rendering.renderer import _Picture
@@ -25,7 +25,7 @@ from shields import SafetyShield
 from tests.plants import random_plant
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
-DRAWN = [env_id for env_id in ENTRY_POINTS if env_id not in needing_extras()]
+DRAWN = [env_id for env_id in ENVIRONMENTS if env_id not in needing_extras()]
 OWN = [env_id for env_id in DRAWN if "Linear" not in env_id]
 SAFE_SET = Ellipsoid(4.0 * np.eye(2))
 

@@ -79,7 +79,7 @@ class ExtremalNoise(NCSEnv):
         start = (1 - 1e-12) * self.initial_set.sample_boundary(self.np_random)
         _, info = super().reset(options={"state": start})
         self.estimator.reset(start + self.plant.initial_noise.bound.sample_boundary(self.np_random))
-        self._belief = self._downlink.belief()
+        self._belief = self._predicted_estimate()
         info["estimate"] = self._belief[0].copy()
         info["estimation_error"] = self.estimator.belief.mean - start
         return self._observation(), info

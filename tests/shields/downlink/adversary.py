@@ -81,7 +81,7 @@ class UnawareVectorEnv(ExtremalVectorNoise):
     def __init__(self, *arguments: Any, **settings: Any) -> None:
         super().__init__(*arguments, **settings)
         self._protocol, self._certificate_contract = None, self.contract
-        self._downlink.belief = lambda: (self._estimator.mean, self._estimator.statistics)
+        self._predicted_estimates = lambda: (self._estimator.mean, self._estimator.statistics)
 
 
 @dataclass
@@ -112,7 +112,7 @@ def attack(
     """Runs environments under attack; fails if a shield that knows its downlink ever doubts its proof."""
     certificate = case.certificate
     env = case.env(count, policy, kind=ExtremalVectorNoise if aware else UnawareVectorEnv)
-    lead = env.single.downlink.lead
+    lead = env.single.downlink_protocol.lead
     shield = VectorSafetyShield(env, certificate, mode)
     _, info = shield.reset(seed=seed)
     rng, outcome = np.random.default_rng(seed), Outcome()

@@ -55,13 +55,13 @@ def test_a_shield_that_ignores_the_downlink_fails_under_the_same_attack(name):
 
 def test_runs_of_losses_are_exactly_as_long_as_promised():
     env = case("cruise", "runs", lead=3).env(5, "random")
-    assert env.downlink.lead == 3
+    assert env.downlink_protocol.lead == 3
     env.reset(seed=0)
     newest = []
     for _ in range(40):
         *_, info = env.step(np.ones((5, 1)))
         assert not info["downlink_broken"].any()
-        newest.append(env.steps - 1 - env._downlink._newest)
+        newest.append(env.steps - 1 - env._downlink_state._newest)
     assert np.max(newest[4:]) == 3  # with one loss more nothing in the buffer would be for now
     assert set(np.ravel(newest[4:])) == {0, 1, 2, 3}
 

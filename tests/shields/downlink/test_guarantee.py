@@ -18,9 +18,10 @@ from ncs_gym import (
     cart_pole,
     truck_trailer,
 )
+from ncs_gym.network import CommittedInputs
 from ncs_gym.network.packet_transmission import ChannelState
 from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
-from shields.downlink import Schedule, starts_known
+from shields.downlink import starts_known
 from shields.runtime.guarantee import (
     EXPLANATIONS,
     FAR_OUT,
@@ -316,7 +317,7 @@ def test_what_is_predicted_must_be_nearer_than_what_is_observed_now():
         seen = LoopObservation(distance * PLANT.half_widths, errors, False)
         return EXPLANATIONS[monitor.reasons(monitor.start(True, True, seen))]
 
-    lately = shielded().unwrapped.downlink
+    lately = shielded().unwrapped.downlink_protocol
     assert [reason(distance, None) for distance in (49.0, 51.0, 99.0, 101.0)] == ["", "", "", FAR_OUT]
     assert [reason(distance, lately) for distance in (49.0, 51.0)] == ["", FAR_OUT]
 
@@ -324,7 +325,7 @@ def test_what_is_predicted_must_be_nearer_than_what_is_observed_now():
 def test_a_large_error_is_put_down_to_old_samples_once_they_are_older_than_the_sensors_contract_allows():
     """The certificate counts the steps of both channels, the age of a sample those of its own alone."""
     shield = SafetyFilter(UNSTABLE.certificate, UNSTABLE.plant)
-    monitor = GuaranteeMonitor(shield, UNSTABLE.env(1, "random").single.downlink)
+    monitor = GuaranteeMonitor(shield, UNSTABLE.env(1, "random").single.downlink_protocol)
     n, allowed = UNSTABLE.plant.n, UNSTABLE.contract.max_age
     assert UNSTABLE.certificate.contract.max_age == allowed + 2
     largest = np.linalg.eigvalsh(UNSTABLE.certificate.error_shapes).max()
@@ -543,7 +544,7 @@ def test_actuator_takes_the_newest_command_of_its_episode_and_repeats_nothing():
 
 
 def test_a_schedule_hands_out_what_was_decided_c_steps_ago():
-    schedule = Schedule(2, 1)
+    schedule = CommittedInputs(2, 1)
     assert [schedule.due([float(k)]) for k in range(1, 5)] == [[0.0], [0.0], [1.0], [2.0]]
     schedule.start()
     assert schedule.due([9.0]) == [0.0]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid, NCSVectorEnv, truck_trailer
-from ncs_gym.downlink.loop import no_inputs
+from ncs_gym.network.downlink import no_inputs
 from shields import SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import LATE_INPUT, NOT_KNOWN_INSIDE
 from tests.certificates import certificate_of

@@ -7,7 +7,7 @@ from gymnasium.vector import VectorWrapper
 from gymnasium.wrappers import StickyAction
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearProcess, NCSEnv, NCSVectorEnv, truck_trailer
-from ncs_gym.downlink import downlink_protocol
+from ncs_gym.network import downlink_protocol
 from shields import SafeLoop, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import OTHER_STEPS
 from tests.certificates import certificate_of

@@ -7,7 +7,7 @@ import pytest
 
 from experiments.runs import ExperimentSetup
 from ncs_gym import LinearPlant, cart_pole, truck_trailer
-from ncs_gym.plants.statespace import inputs_under_way
+from ncs_gym.plants.linear_plant import inputs_under_way
 from shields import verify
 from shields.certificate_text import size_of
 from shields.synthesis.share_of_box import share_of_box
