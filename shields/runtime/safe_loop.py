@@ -17,11 +17,11 @@ from ncs_gym.network.packet_reception import DiscardedPackets, as_packet
 from ncs_gym.validation import as_numbers, as_vector, setting, shown
 from shields.certificate import Certificate
 from shields.certificate_text import description_of_loop
-from shields.downlink.start_under_zero_input import starts_known
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import LoopObservation
 from shields.runtime.monitored_filter import MonitoredFilter
 from shields.runtime.safety_filter import SafetyFilter
+from shields.runtime.starts import starts_known
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -20,7 +20,7 @@ from ncs_gym import (
 )
 from ncs_gym.network.packet_transmission import ChannelState
 from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
-from shields.downlink import Schedule, starts_known
+from shields.downlink import Schedule
 from shields.runtime.guarantee import (
     EXPLANATIONS,
     FAR_OUT,
@@ -33,6 +33,7 @@ from shields.runtime.guarantee import (
     GuaranteeMonitor,
     LoopObservation,
 )
+from shields.runtime.starts import starts_known
 from shields.verification.rational_matrix import (
     congruence,
     is_positive_semidefinite,

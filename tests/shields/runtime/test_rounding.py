@@ -10,8 +10,7 @@ import pytest
 from ncs_gym import Channel, LinearPlant, NCSEnv
 from shields import CertificateError, Infeasible, SafetyFilter, SafetyShield, synthesize
 from shields.runtime.guarantee import FAR_OUT, NOT_KNOWN_INSIDE
-from shields.runtime.one_step_test import OneStepTest, certified_root
-from shields.runtime.predicted_errors import predicted_errors
+from shields.runtime.one_step import OneStepTest, certified_root, predicted_errors
 from shields.runtime.safety_filter import require_computable
 from shields.verification.rational_matrix import (
     congruence,
