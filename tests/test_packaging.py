@@ -35,9 +35,8 @@ LAYERS = {
         {"plant_registration"},
     ),
     "shields": (
-        {"errors", "atomic_write"},
-        {"proof_data"},
-        {"certificate_file", "certificate_text"},
+        {"errors", "atomic_write", "certificate_text"},
+        {"json_documents"},
         {"certificate"},
         {"verification", "paper", "synthesis"},
         {"runtime", "downlink"},
