@@ -16,7 +16,7 @@ import time
 import numpy as np
 from lookahead import CASES, CVXPY, ENVS, WARM, PlainProgram, shielded, timed
 
-from shields.runtime.predicted_errors import PredictedErrors
+from shields.runtime.one_step import PredictedErrors
 from shields.runtime.safety_filter import SafetyFilter
 
 # Environments of every step whose decisions are timed one by one.

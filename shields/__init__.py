@@ -8,9 +8,8 @@ keep any agent inside the safe set.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from shields.certificate import Certificate
+from shields.certificate import Certificate, Multipliers, Proof, Updates
 from shields.errors import CertificateError, Infeasible
-from shields.proof_data import Multipliers
 from shields.runtime import Decision, SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.verification import Condition, Report, verify
 
@@ -24,10 +23,12 @@ __all__ = [
     "Decision",
     "Infeasible",
     "Multipliers",
+    "Proof",
     "Report",
     "SafeLoop",
     "SafetyFilter",
     "SafetyShield",
+    "Updates",
     "VectorSafetyShield",
     "certify",
     "synthesize",

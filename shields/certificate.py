@@ -1,26 +1,132 @@
-"""The certificate: an invariant ellipsoid, its gain and the numbers that prove it."""
+"""The certificate: an invariant ellipsoid, its gain, and a list of proofs, one per error set; and its file."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ncs_gym import ChannelContract, Ellipsoid
-from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_number, read_only, shown
-from shields import certificate_file
-from shields.certificate_text import description_of
+from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_number, as_setting, read_only, shown
+from shields.certificate_text import (
+    METHODS,
+    assumptions_of,
+    contract_text,
+    counted,
+    interruption_of,
+    numbers_text,
+    size_of,
+    table,
+    tolerance_of,
+)
 from shields.errors import CertificateError
-from shields.proof_data import CertifiedProof, ContractProof, Multipliers, PaperConstants
+from shields.json_documents import document_of, read_content, write_document
 
+_FORMAT = "ncs-gym certificate 2"
 # The fields that a certificate of each method has besides L and K, and that one of the other method must not have.
 _FIELDS = {
-    "certified": ("Sigma", "D", "multipliers"),
+    "certified": ("proofs", "D", "rounding"),
     "paper": ("kappa", "rho", "epsilon", "epsilon_up"),
 }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Multipliers:
+    """The S-procedure multipliers of the conditions of theory.md section 3, all without unit.
+
+    Attributes:
+        error: Multiplier lam_e of the error set's condition (E1), in (0, 1).
+        state: Multiplier lx of the state in the invariance condition (I), > 0.
+        estimate: Multiplier le of the estimation error in (I), > 0.
+        disturbance: Multiplier ld of the disturbance in (I), > 0; lx + le + ld <= 1.
+        inputs: Multipliers mu_i of the input limits (U), one per input, in (0, 1).
+        rounding: Multiplier s of D_u, the disturbance set enlarged by the rounding of actions to float32, > 0.
+    """
+
+    error: float
+    state: float
+    estimate: float
+    disturbance: float
+    inputs: tuple[float, ...]
+    rounding: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Proof(ReadOnlyArrays):
+    """Why u = K x_hat keeps the state in S, and the input within its limits, for every estimation error in one set.
+
+    Under a channel contract there is one for every age of the newest sample, without one a single proof.
+
+    Attributes:
+        Sigma: Shape of the error set, (n, n).
+        rate: Multiplier lam of (E1), under a contract of (C1): without a sample the error is in the next set.
+        shares: Multipliers lx, le, ld of state, estimation error and disturbance in (I), shape (3,).
+        inputs: Multipliers mu_i of the input limits (U), shape (m,).
+    """
+
+    Sigma: np.ndarray
+    rate: float
+    shares: np.ndarray
+    inputs: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Raises CertificateError if a field is of the wrong kind; the ranges of multipliers are verified."""
+        try:
+            object.__setattr__(self, "Sigma", as_matrix(self.Sigma, (None, None), "Sigma"))
+            object.__setattr__(self, "rate", float(_as_array(self.rate, (), "the rate of an error set")))
+            object.__setattr__(self, "shares", _as_array(self.shares, (3,), "the multipliers of (I)"))
+            object.__setattr__(self, "inputs", _as_array(self.inputs, (None,), "the multipliers of (U)"))
+        except (TypeError, ValueError) as error:
+            raise CertificateError(f"not a certificate: {error}") from error
+        self._make_arrays_read_only()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Updates(ReadOnlyArrays):
+    """How samples lead estimation errors of every age back into the first error set: (C2) of theory.md section 6.
+
+    Attributes:
+        contract: What the channel promises: the newest sample is at most h steps old.
+        last: Shape of the set after that of the largest age, Sigma_{h+1}, (n, n).
+        gains: Gains T_j of updates of errors in the sets 1..h+1, shape (h+1, n, p).
+        shares: Multipliers mu_j of these updates, shape (h+1,).
+        noise: N, the shape of the set of sensor noise and quantization error, (p, p).
+    """
+
+    contract: ChannelContract
+    last: np.ndarray
+    gains: np.ndarray
+    shares: np.ndarray
+    noise: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Raises CertificateError if the shapes are inconsistent or a number is not finite."""
+        try:
+            if not isinstance(self.contract, ChannelContract):
+                raise ValueError("its contract is no ChannelContract")
+            steps = self.contract.max_age + 1
+            last, noise = as_matrix(self.last, (None, None), "last"), as_matrix(self.noise, (None, None), "noise")
+            expected = {"gains": (steps, len(last), len(noise)), "shares": (steps,)}
+            arrays = {name: _as_array(getattr(self, name), shape, name) for name, shape in expected.items()}
+            if not np.isfinite(arrays["gains"]).all():
+                raise ValueError("its gains must be finite")
+        except (TypeError, ValueError) as error:
+            raise CertificateError(f"not a certificate: {error}") from error
+        for name, array in (arrays | {"last": last, "noise": noise}).items():
+            object.__setattr__(self, name, array)
+        self._make_arrays_read_only()
+
+
+class PaperConstants(NamedTuple):
+    """What a certificate of method "paper" is verified with, besides L and K; see `Certificate`."""
+
+    kappa: float
+    rho: float
+    epsilon: float
+    epsilon_up: float
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -33,10 +139,11 @@ class Certificate(ReadOnlyArrays):
     Attributes:
         L: Shape of the safe set, (n, n) [squares of the states' units]; S = E(L).
         K: Gain of the fallback input u = K x_hat, shape (m, n) [input per state].
-        Sigma: Shape of the certified error set, (n, n), under a contract that of the largest age; None for "paper".
-        D: Shape of the disturbance set that the proof assumes, (n, n); None for "paper".
-        multipliers: Multipliers of the conditions, under a contract those of the largest age; None for "paper".
-        ages: Error sets and multipliers for every age that a channel contract allows; None without a contract.
+        proofs: One for each error set: under a channel contract for the ages 0..h of the newest sample, otherwise a
+            single one; none for "paper".
+        D: Shape of the disturbance set that the proofs assume, (n, n); None for "paper".
+        rounding: Multiplier s of D_u, which is D enlarged by the rounding of actions to float32; None for "paper".
+        updates: What a channel contract adds to the proofs; None without a contract.
         method: Method of the synthesis, "certified" or "paper".
         fingerprint: Fingerprint of the plant that the certificate belongs to.
         kappa: Contraction factor of OP; this and the next three are None unless the method is "paper".
@@ -48,10 +155,10 @@ class Certificate(ReadOnlyArrays):
 
     L: np.ndarray
     K: np.ndarray
-    Sigma: np.ndarray | None = None
+    proofs: tuple[Proof, ...] = ()
     D: np.ndarray | None = None
-    multipliers: Multipliers | None = None
-    ages: ContractProof | None = None
+    rounding: float | None = None
+    updates: Updates | None = None
     method: str
     fingerprint: str
     kappa: float | None = None
@@ -64,12 +171,17 @@ class Certificate(ReadOnlyArrays):
         """Raises CertificateError if a field is missing, belongs to the other method, or is of the wrong kind."""
         try:
             self._check_fields()
-            n = len(np.atleast_2d(self.L))
-            matrices = {"L": n, "K": None} | ({"Sigma": n, "D": n} if self.method == "certified" else {})
-            for name, rows in matrices.items():
-                object.__setattr__(self, name, as_matrix(getattr(self, name), (rows, n), name))
-            for name in _FIELDS["paper"] if self.method == "paper" else ():
-                object.__setattr__(self, name, as_number(getattr(self, name), name))
+            L = as_matrix(self.L, (None, None), "L")
+            n = len(L)
+            object.__setattr__(self, "L", as_matrix(L, (n, n), "L"))
+            object.__setattr__(self, "K", as_matrix(self.K, (None, n), "K"))
+            if self.method == "paper":
+                for name in _FIELDS["paper"]:
+                    object.__setattr__(self, name, as_number(getattr(self, name), name))
+            else:
+                object.__setattr__(self, "D", as_matrix(self.D, (n, n), "D"))
+                object.__setattr__(self, "rounding", float(_as_array(self.rounding, (), "rounding")))
+                self._check_error_sets(n)
         except (TypeError, ValueError) as error:
             raise CertificateError(f"not a certificate: {error}") from error
         self._make_arrays_read_only()
@@ -79,24 +191,25 @@ class Certificate(ReadOnlyArrays):
         if self.method not in ("certified", "paper"):
             raise ValueError(f"its method must be 'certified' or 'paper', got {shown(self.method)}")
         other = "paper" if self.method == "certified" else "certified"
-        wrong = [name for name in _FIELDS[self.method] if getattr(self, name) is None]
-        wrong += [name for name in _FIELDS[other] if getattr(self, name) is not None]
+        given = {name for names in _FIELDS.values() for name in names if getattr(self, name) is not None}
+        given -= set() if self.proofs else {"proofs"}
+        wrong = [name for name in _FIELDS[self.method] if name not in given]
+        wrong += [name for name in _FIELDS[other] if name in given]
         if not (isinstance(self.provenance, dict) and isinstance(self.fingerprint, str)):
             raise ValueError("its provenance must be a dict, and its fingerprint a text")
         if wrong:
             raise ValueError(f"one of method {self.method!r} has other entries: {', '.join(wrong)}")
-        if self.ages is not None and self.method == "paper":
-            raise ValueError("one of method 'paper' has no proof by age")
+        if self.updates is not None and self.method == "paper":
+            raise ValueError("one of method 'paper' has no channel contract")
 
-    def proof(self) -> CertifiedProof:
-        """Returns the numbers with which the conditions of theory.md section 3 are verified.
-
-        Raises:
-            CertificateError: If the method is "paper", which has none.
-        """
-        if self.Sigma is None or self.D is None or self.multipliers is None:
-            raise CertificateError(f"a certificate of method {self.method!r} has no error set to verify")
-        return CertifiedProof(self.Sigma, self.D, self.multipliers, self.ages)
+    def _check_error_sets(self, n: int) -> None:
+        """Raises ValueError unless there is a proof for every age, and all error sets have n dimensions."""
+        object.__setattr__(self, "proofs", tuple(self.proofs))
+        ages = 1 if self.updates is None else self.updates.contract.max_age + 1
+        if len(self.proofs) != ages:
+            raise ValueError(f"it must have {ages} proofs, one per error set, got {len(self.proofs)}")
+        for Sigma in (*(proof.Sigma for proof in self.proofs), *self.next_error_shapes):
+            as_matrix(Sigma, (n, n), "Sigma")
 
     def constants(self) -> PaperConstants:
         """Returns the constants with which the constraints of OP are verified.
@@ -107,6 +220,16 @@ class Certificate(ReadOnlyArrays):
         if self.kappa is None or self.rho is None or self.epsilon is None or self.epsilon_up is None:
             raise CertificateError(f"a certificate of method {self.method!r} has no constants of OP to verify")
         return PaperConstants(self.kappa, self.rho, self.epsilon, self.epsilon_up)
+
+    def disturbances(self) -> tuple[np.ndarray, float]:
+        """Returns D and s, with which the conditions of theory.md section 3 are verified.
+
+        Raises:
+            CertificateError: If the method is "paper", which has no error set.
+        """
+        if self.D is None or self.rounding is None:
+            raise CertificateError(f"a certificate of method {self.method!r} has no error set to verify")
+        return self.D, self.rounding
 
     @cached_property
     def M(self) -> np.ndarray:
@@ -122,19 +245,44 @@ class Certificate(ReadOnlyArrays):
     @property
     def contract(self) -> ChannelContract | None:
         """The channel contract that it assumes; None without one."""
-        return None if self.ages is None else self.ages.sets.contract
+        return None if self.updates is None else self.updates.contract
+
+    @property
+    def Sigma(self) -> np.ndarray | None:
+        """Shape of the error set, (n, n), under a contract that of the largest age; None for "paper"."""
+        return self.proofs[-1].Sigma if self.proofs else None
+
+    @property
+    def multipliers(self) -> Multipliers | None:
+        """The multipliers of the proof, under a contract those of the largest age; None for "paper"."""
+        if not self.proofs or self.rounding is None:
+            return None
+        last = self.proofs[-1]
+        lx, le, ld = last.shares.tolist()
+        return Multipliers(
+            error=last.rate,
+            state=lx,
+            estimate=le,
+            disturbance=ld,
+            inputs=tuple(last.inputs.tolist()),
+            rounding=self.rounding,
+        )
 
     @cached_property
     def error_set(self) -> Ellipsoid | None:
         """The certified error set E(Sigma); None for method "paper"."""
         return None if self.Sigma is None else Ellipsoid(self.Sigma)
 
-    @property
+    @cached_property
     def error_shapes(self) -> np.ndarray:
         """The shapes of all error sets for which K x_hat keeps the state in S, (k, n, n); k = 0 for method "paper"."""
-        if self.ages is not None:
-            return self.ages.sets.shapes[:-1]
-        return np.empty((0, *self.L.shape)) if self.Sigma is None else self.Sigma[None]
+        return read_only(np.array([proof.Sigma for proof in self.proofs]).reshape(-1, *self.L.shape))
+
+    @property
+    def next_error_shapes(self) -> list[np.ndarray]:
+        """Shapes of the sets in which errors of each proof's set are one step later, if no sample comes."""
+        last = self.proofs[-1].Sigma if self.updates is None else self.updates.last
+        return [*(proof.Sigma for proof in self.proofs[1:]), last]
 
     @cached_property
     def checksum(self) -> str:
@@ -144,7 +292,7 @@ class Certificate(ReadOnlyArrays):
     @property
     def document(self) -> dict[str, Any]:
         """The content of the certificate's file: the format's name, the checksum and the fields, as JSON values."""
-        return certificate_file.document_of({entry.name: getattr(self, entry.name) for entry in fields(self)})
+        return document_of("certificate", _FORMAT, _content_of(self))
 
     def __eq__(self, other: object) -> bool:
         return self.checksum == other.checksum if isinstance(other, Certificate) else NotImplemented
@@ -153,7 +301,21 @@ class Certificate(ReadOnlyArrays):
         return hash(self.checksum)
 
     def __str__(self) -> str:
-        return description_of(self)
+        (m, n), recorded = self.K.shape, self.provenance
+        rows = [
+            ("method", METHODS[self.method]),
+            ("plant", f"{counted(n, 'state')}, {counted(m, 'input')}, fingerprint {self.fingerprint[:16]}"),
+            ("safe set", f"x'Mx <= 1, that reaches |x_i| <= {numbers_text(np.sqrt(np.diag(self.L)))}"),
+            ("size", size_of(recorded)),
+            ("fallback", "u = K x_hat"),
+            ("contract", contract_text(self.method, self.contract)),
+            ("tolerance", tolerance_of(recorded)),
+            ("assumes", assumptions_of(recorded)),
+            ("interrupted", interruption_of(recorded)),
+        ]
+        return table(
+            "Certificate of a robust control invariant set; shields.verify(certificate, plant) checks it", rows
+        )
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a JSON file in which every float is exact; a reader never sees a partial file.
@@ -161,7 +323,7 @@ class Certificate(ReadOnlyArrays):
         Raises:
             OSError: If the file cannot be written.
         """
-        certificate_file.write(path, self.document)
+        write_document(path, self.document)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Certificate:
@@ -170,4 +332,97 @@ class Certificate(ReadOnlyArrays):
         Raises:
             CertificateError: If the file is missing, not a certificate, truncated or altered.
         """
-        return cls(**certificate_file.read(path, [entry.name for entry in fields(cls)]))
+        try:
+            content = read_content(path, "certificate", _FORMAT)
+        except ValueError as error:
+            raise CertificateError(str(error)) from error
+        try:
+            return cls(**_fields_of(content))
+        except CertificateError:
+            raise
+        except (KeyError, TypeError, ValueError) as error:
+            raise CertificateError(f"{path} is not a certificate: an entry is missing or of a wrong kind") from error
+
+
+def _content_of(certificate: Certificate) -> dict[str, Any]:
+    """Returns what the file of a certificate says, as JSON values.
+
+    Under a contract the arrays of all ages stand in `ages`, and those of the largest age are repeated before.
+    """
+    c, last = certificate, certificate.multipliers
+    return {
+        "L": c.L.tolist(),
+        "K": c.K.tolist(),
+        "Sigma": None if c.Sigma is None else c.Sigma.tolist(),
+        "D": None if c.D is None else c.D.tolist(),
+        "multipliers": None if last is None else asdict(last),
+        "ages": None if c.updates is None else _content_by_age(c.proofs, c.updates),
+        "method": c.method,
+        "fingerprint": c.fingerprint,
+        "kappa": c.kappa,
+        "rho": c.rho,
+        "epsilon": c.epsilon,
+        "epsilon_up": c.epsilon_up,
+        "provenance": c.provenance,
+    }
+
+
+def _content_by_age(proofs: tuple[Proof, ...], updates: Updates) -> dict[str, Any]:
+    return {
+        "contract": asdict(updates.contract),
+        "sets": {
+            "shapes": [*(proof.Sigma.tolist() for proof in proofs), updates.last.tolist()],
+            "rates": [proof.rate for proof in proofs],
+            "gains": updates.gains.tolist(),
+            "shares": updates.shares.tolist(),
+            "noise": updates.noise.tolist(),
+        },
+        "shares": [proof.shares.tolist() for proof in proofs],
+        "inputs": [proof.inputs.tolist() for proof in proofs],
+    }
+
+
+def _fields_of(content: dict[str, Any]) -> dict[str, Any]:
+    """Returns the fields of a certificate from the content of its file.
+
+    Raises:
+        KeyError, TypeError, ValueError: If an entry is missing, of a wrong kind, or contradicts another one.
+    """
+    names = ("L", "K", "D", "method", "fingerprint", *_FIELDS["paper"], "provenance")
+    fields = {name: content[name] for name in names}
+    Sigma, ages = content["Sigma"], content["ages"]
+    if content["multipliers"] is None:
+        if Sigma is not None or ages is not None:
+            raise ValueError("error sets without multipliers")
+        return fields
+    stated = Multipliers(**content["multipliers"])
+    fields["rounding"] = stated.rounding
+    own = Sigma, stated.error, [stated.state, stated.estimate, stated.disturbance], stated.inputs
+    if ages is None:
+        return fields | {"proofs": _proofs([own])}
+    sets = ages["sets"]
+    *shapes, last = sets["shapes"]
+    rows = list(zip(shapes, sets["rates"], ages["shares"], ages["inputs"], strict=True))
+    if list(own) != list(rows[-1]):
+        raise ValueError("what is repeated of the largest age differs")
+    contract = ChannelContract(**ages["contract"])
+    updates = Updates(contract=contract, last=last, gains=sets["gains"], shares=sets["shares"], noise=sets["noise"])
+    return fields | {"proofs": _proofs(rows), "updates": updates}
+
+
+def _proofs(rows: list[tuple[Any, Any, Any, Any]]) -> tuple[Proof, ...]:
+    return tuple(Proof(Sigma=Sigma, rate=rate, shares=shares, inputs=inputs) for Sigma, rate, shares, inputs in rows)
+
+
+def _as_array(value: Any, shape: tuple[int | None, ...], name: str) -> np.ndarray:
+    """Returns numbers, finite or not, as a float64 array of a shape, in which None stands for any length.
+
+    Raises:
+        ValueError: If it has another shape or is no numbers; texts of digits and truth values are none.
+    """
+    array = as_setting(value)
+    if array is None or array.ndim != len(shape):
+        raise ValueError(f"{name} must be numbers of shape {shape}, got {shown(value)}")
+    if any(want not in (None, have) for have, want in zip(array.shape, shape, strict=True)):
+        raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
+    return array

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from shields.certificate import Certificate
+from typing import Any
 
 
 class CertificateError(ValueError):
@@ -16,10 +13,10 @@ class SynthesisInterrupted(KeyboardInterrupt):
     """The synthesis was interrupted; the message says what it had reached.
 
     Attributes:
-        certificate: Certificate of the largest set so far, which verifies exactly; None if there is none yet.
+        certificate: `Certificate` of the largest set so far, which verifies exactly; None if there is none yet.
     """
 
-    def __init__(self, message: str, certificate: Certificate | None = None) -> None:
+    def __init__(self, message: str, certificate: Any = None) -> None:
         super().__init__(message)
         self.certificate = certificate
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from numpy._core._multiarray_umath import __cpu_features__
 
@@ -47,6 +49,13 @@ def certificate_of(plant: LinearPlant, contract: ChannelContract | None = None) 
     if key not in _certificates:
         _certificates[key] = _read_or_synthesized(plant, contract)
     return _certificates[key]
+
+
+def with_proof(certificate: Certificate, age: int = -1, **changes: Any) -> Certificate:
+    """A certificate whose proof for an age of the newest sample, by default for the largest, has other fields."""
+    proofs = list(certificate.proofs)
+    proofs[age] = replace(proofs[age], **changes)
+    return replace(certificate, proofs=tuple(proofs))
 
 
 def _read_or_synthesized(plant: LinearPlant, contract: ChannelContract | None) -> Certificate:

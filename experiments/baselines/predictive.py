@@ -6,9 +6,9 @@ import numpy as np
 
 from ncs_gym import LinearPlant
 from shields import Certificate
-from shields.lookahead.prediction import Prediction
-from shields.lookahead.program import PlanProgram
-from shields.runtime.one_step_test import OneStepTest
+from shields.runtime.backup_plans.plan_check import Prediction
+from shields.runtime.backup_plans.program import PlanProgram
+from shields.runtime.one_step import OneStepTest
 from shields.verification import require_valid
 
 # Steps that are looked ahead.

@@ -35,7 +35,7 @@ from ncs_gym import escape_probability
 from ncs_gym.envs.env import ncs_env
 from shields import SafetyFilter
 from shields.atomic_write import write_atomically
-from shields.downlink import starts_known
+from shields.runtime.starts import starts_known
 
 # Budget of `--smoke`: enough to pass through every part.
 _SMOKE = {"steps": 4_096, "episodes": 10, "seeds": 2}

@@ -7,14 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ncs_gym import Ellipsoid
 from ncs_gym.network import DownlinkProtocol
 from ncs_gym.plants.linear_plant import SIMULATED_REACH, inputs_under_way
 from shields.runtime.decisions import Decision
-from shields.runtime.one_step_test import FARTHEST
-from shields.runtime.predicted_errors import PredictedErrors
+from shields.runtime.one_step import FARTHEST, PredictedErrors
 from shields.runtime.safety_filter import MARGIN, SafetyFilter
-from shields.verification.starts import starts_in_box, starts_inside
 
 ALARM = "a measurement contradicts the assumed bounds"
 OTHER_INPUT = "the input applied is not the one decided"
@@ -68,18 +65,6 @@ class LoopObservation(NamedTuple):
     errors: PredictedErrors
     alarm: Any
     age: Any = 0
-
-
-class StartKnown(NamedTuple):
-    """What is known of the start of an episode before any estimate.
-
-    Attributes:
-        in_safe_set: Whether every possible start lies in S.
-        in_box: Whether every possible start lies in the safe box.
-    """
-
-    in_safe_set: bool
-    in_box: bool
 
 
 class GuaranteeMonitor:
@@ -239,11 +224,3 @@ def _first(broken: Any, condition: Any, explanation: str) -> Any:
     if condition is False or not np.count_nonzero(condition):  # the usual case
         return broken
     return broken + (broken == 0) * condition * CODES[explanation]
-
-
-def start_known(safety_filter: SafetyFilter, initial: Ellipsoid | np.ndarray | None) -> StartKnown:
-    """Returns what is known of starts in an ellipsoid E(P), of one state, shape (n,), or of any (None)."""
-    if initial is None:
-        return StartKnown(False, False)
-    inside = starts_inside(safety_filter.certificate, initial)
-    return StartKnown(inside, inside or starts_in_box(safety_filter.plant, initial))

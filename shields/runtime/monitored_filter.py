@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.network import CommittedInputs, DownlinkProtocol
-from shields.downlink.start_under_zero_input import known_inside
 from shields.runtime.decisions import Decision
-from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, LoopObservation, MonitorState, StartKnown
-from shields.runtime.predicted_errors import PredictedErrors
-from shields.runtime.safety_filter import MARGIN, SafetyFilter
+from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor, LoopObservation, MonitorState
+from shields.runtime.safety_filter import SafetyFilter
+from shields.runtime.starts import StartKnown, first_store, known_inside
 
 
 class MonitoredFilter:
@@ -123,26 +122,3 @@ class MonitoredFilter:
     def reason(self) -> str:
         """Why the state is not proved safe now; empty while it is."""
         return EXPLANATIONS[self._monitor.reasons(self._state, self.report.age)]
-
-
-def first_store(
-    safety_filter: SafetyFilter, estimate: np.ndarray, errors: PredictedErrors, known: StartKnown
-) -> tuple[np.ndarray, bool]:
-    """Returns what is stored before the first decision, shape (k, m), and whether the state is proved safe.
-
-    The state is that at which the first decision takes effect, without a downlink the start.
-
-    It is where it is known to be in S; in mode "lookahead" also where it is known to be in the box, by what starts are
-    possible or by the estimate, and a first plan is certified.
-
-    Args:
-        safety_filter: Decides.
-        estimate: x_hat_0, shape (n,).
-        errors: What is known of Sigma_0.
-        known: What is known of the start.
-    """
-    lookahead = safety_filter.lookahead
-    if lookahead is None or known.in_safe_set or safety_filter.test.knows_inside(estimate, errors, MARGIN):
-        return np.empty((0, safety_filter.plant.m)), known.in_safe_set
-    plan = safety_filter.first_plan(estimate, errors)
-    return plan, len(plan) > 0 and (known.in_box or lookahead.knows_in_box(estimate, errors))

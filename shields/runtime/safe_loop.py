@@ -16,12 +16,12 @@ from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.network.packet_reception import DiscardedPackets, as_packet
 from ncs_gym.validation import as_numbers, as_vector, setting, shown
 from shields.certificate import Certificate
-from shields.certificate_text import description_of_loop
-from shields.downlink.start_under_zero_input import starts_known
+from shields.certificate_text import contract_text, counted, size_of, table
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import LoopObservation
 from shields.runtime.monitored_filter import MonitoredFilter
 from shields.runtime.safety_filter import SafetyFilter
+from shields.runtime.starts import starts_known
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -136,7 +136,22 @@ class SafeLoop:
         self._phase = _Phase.STOPPED
 
     def __str__(self) -> str:
-        return description_of_loop(self, self._phase is not _Phase.STOPPED)
+        certificate, mode, horizon = self._filter.certificate, self._filter.mode, self._filter.horizon
+        fingerprint = f"of the plant with fingerprint {certificate.fingerprint[:16]}"
+        age = f"the newest sample is {counted(self.measurement_age, 'step')} old"
+        if self._contract is not None and self.measurement_age > self._contract.max_age - self._lead:
+            age += ", older than the contract allows"
+        proved = "the state stays in the box" if mode == "lookahead" else "the state is in S"
+        is_started = self._phase is not _Phase.STOPPED
+        rows = [
+            ("mode", mode if horizon is None else f"{mode}, horizon {counted(horizon, 'step')}"),
+            ("certificate", ", ".join(filter(None, (fingerprint, size_of(certificate.provenance))))),
+            ("contract", contract_text(certificate.method, self._contract, self._lead)),
+            ("downlink", f"inputs take effect {counted(self._lead, 'step')} after the decision" if self._lead else ""),
+            ("step", f"{self.steps} of episode {self.episode}, {age}" if is_started else ""),
+            ("guaranteed", f"yes: {proved}" if self.guaranteed else f"no: {self.reason}"),
+        ]
+        return table("Safe loop: estimator, safety filter and monitor of the guarantee", rows)
 
     @_transaction
     def start(self, x_hat0: Any, initial_set: Ellipsoid | np.ndarray | None = None) -> None:

@@ -12,12 +12,18 @@ from ncs_gym import LinearPlant
 from ncs_gym.validation import ReadOnlyArrays, as_count, as_numbers, read_only, shown
 from shields.certificate import Certificate
 from shields.runtime.decisions import FALLBACK, INVALID, PROJECTED, REASONS, SAFE, UNSAFE, Decision
-from shields.runtime.one_step_test import MOST_INPUTS_WITH_VERTICES, OneStepTest, ReachableSets, require_computable
-from shields.runtime.predicted_errors import PredictedErrors, predicted_errors
+from shields.runtime.one_step import (
+    MOST_INPUTS_WITH_VERTICES,
+    OneStepTest,
+    PredictedErrors,
+    ReachableSets,
+    predicted_errors,
+    require_computable,
+)
 from shields.verification import ACTION_ROUNDING, require_valid
 
 if TYPE_CHECKING:
-    from shields.lookahead import Lookahead
+    from shields.runtime.backup_plans import Lookahead
 
 MODES = ("project", "switch", "boundary", "monitor", "lookahead")
 # Longest plan of mode "lookahead", in steps, where none is given, and the longest there is.
@@ -92,7 +98,7 @@ class SafetyFilter(ReadOnlyArrays):
             if self.horizon is not None:
                 raise ValueError(f'horizon is for mode "lookahead", mode {self.mode!r} takes none')
             return None
-        from shields.lookahead import Lookahead  # the solver, which other modes do without
+        from shields.runtime.backup_plans import Lookahead  # the solver, which other modes do without
 
         given = DEFAULT_HORIZON if self.horizon is None else self.horizon
         horizon = as_count(given, "horizon", low=1, high=LONGEST_HORIZON)

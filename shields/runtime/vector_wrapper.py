@@ -16,7 +16,6 @@ from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.validation import as_number, setting, shown
 from shields.certificate import Certificate
 from shields.downlink.schedule import as_decided, columns
-from shields.downlink.start_under_zero_input import first_observations, starts_known
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import (
     CODES,
@@ -25,12 +24,10 @@ from shields.runtime.guarantee import (
     GuaranteeMonitor,
     LoopObservation,
     MonitorState,
-    StartKnown,
 )
-from shields.runtime.monitored_filter import first_store
-from shields.runtime.one_step_test import norms
-from shields.runtime.predicted_errors import PredictedErrors
+from shields.runtime.one_step import PredictedErrors, norms
 from shields.runtime.safety_filter import SafetyFilter
+from shields.runtime.starts import StartKnown, first_observations, first_store, starts_known
 from shields.runtime.wrapper import certificate_for, environment_behind, hint_for, premises_of, require_same
 
 REASONS = np.array(EXPLANATIONS, dtype=object)

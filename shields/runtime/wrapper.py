@@ -17,11 +17,11 @@ from ncs_gym.envs.spaces import read_action
 from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.validation import as_number, as_numbers, setting, shown
 from shields.certificate import Certificate
-from shields.downlink.start_under_zero_input import starts_known
 from shields.runtime.decisions import NO_PLAN
-from shields.runtime.guarantee import LoopObservation, StartKnown
+from shields.runtime.guarantee import LoopObservation
 from shields.runtime.monitored_filter import MonitoredFilter
 from shields.runtime.safety_filter import SafetyFilter
+from shields.runtime.starts import StartKnown, starts_known
 
 T = TypeVar("T")
 

@@ -14,10 +14,9 @@ from ncs_gym import ErrorSet, LinearPlant, exact
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import inflated
 from ncs_gym.validation import shown
-from shields.certificate import Certificate
+from shields.certificate import Certificate, Proof, Updates
 from shields.certificate_text import size_of
 from shields.errors import Infeasible, SynthesisInterrupted
-from shields.proof_data import ContractProof, Multipliers
 from shields.synthesis.alternating_optimization import largest_set, with_best_gain
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem, design_problem
 from shields.synthesis.diagnosis import infeasibility, with_feasible_bounds
@@ -211,20 +210,13 @@ def _certificate(
     extents = np.array([float(exact.rounded(extent, 1)) for extent in np.sqrt(np.diag(L))])
     units = np.outer(extents, extents)
     L, K = np.round(L / units, _DIGITS) * units, exact.rounded(K, _DIGITS, axis=1)
-    ages = None
-    if errors.ages is not None:
-        by_age = [with_best_multipliers(problem, design, Sigma[None]) for Sigma in problem.error_shapes]
-        multipliers = np.array([_rounded_down(each.multipliers) for each in by_age])
-        inputs = np.array([each.inputs for each in by_age])
-        ages = ContractProof(sets=errors.ages, multipliers=multipliers, inputs=inputs)
-        design = by_age[-1]
     return Certificate(
         L=L,
         K=K,
-        Sigma=errors.Sigma,
         D=inflated(plant.disturbance.shape),
-        multipliers=_multipliers(problem, design, errors.rate),
-        ages=ages,
+        rounding=problem.rounding,
+        proofs=_proofs(problem, design, errors),
+        updates=_updates(errors),
         method="certified",
         fingerprint=plant.fingerprint,
         provenance={
@@ -255,13 +247,29 @@ def _description(plant: LinearPlant, L: np.ndarray, volume: float) -> dict[str, 
     return description
 
 
-def _multipliers(problem: DesignProblem, design: CandidateDesign, lam_e: float) -> Multipliers:
-    """Returns a design's multipliers as a certificate has them, with those of the error set and of the rounding."""
-    lx, le, ld = _rounded_down(design.multipliers)
-    inputs = tuple(float(mu) for mu in design.inputs)
-    return Multipliers(error=lam_e, state=lx, estimate=le, disturbance=ld, inputs=inputs, rounding=problem.rounding)
+def _proofs(problem: DesignProblem, design: CandidateDesign, errors: ErrorSet) -> tuple[Proof, ...]:
+    """Returns a proof per error set, with the multipliers that suit it best."""
+    if errors.ages is None:
+        sets = [(errors.Sigma, errors.rate, design)]
+    else:
+        designs = [with_best_multipliers(problem, design, Sigma[None]) for Sigma in problem.error_shapes]
+        sets = zip(errors.ages.shapes[:-1], errors.ages.rates.tolist(), designs, strict=True)
+    return tuple(
+        Proof(Sigma=Sigma, rate=rate, shares=_rounded_down(each.multipliers), inputs=each.inputs)
+        for Sigma, rate, each in sets
+    )
 
 
-def _rounded_down(multipliers: tuple[float, float, float]) -> tuple[float, ...]:
+def _updates(errors: ErrorSet) -> Updates | None:
+    """Returns what a channel contract adds to the proofs; None without one."""
+    sets = errors.ages
+    if sets is None:
+        return None
+    return Updates(
+        contract=sets.contract, last=sets.shapes[-1], gains=sets.gains, shares=sets.multipliers, noise=sets.noise
+    )
+
+
+def _rounded_down(multipliers: tuple[float, float, float]) -> np.ndarray:
     """Returns multipliers of few digits, so much smaller that rounding cannot lift lx + le + ld above 1."""
-    return tuple(float(exact.rounded((1.0 - 1e-11) * multiplier, _DIGITS)) for multiplier in multipliers)
+    return np.array([float(exact.rounded((1.0 - 1e-11) * each, _DIGITS)) for each in multipliers])

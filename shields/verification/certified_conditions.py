@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
-from typing import NamedTuple
 
 import numpy as np
 
 from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
-from shields.certificate import Certificate
-from shields.proof_data import CertifiedProof, ContractProof
+from shields.certificate import Certificate, Updates
 from shields.verification.conditions import Condition, flag, matrix_condition, scalar_condition
 from shields.verification.rational_matrix import (
     Matrix,
@@ -34,65 +32,60 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> list[C
 
     Unless the multipliers are in their ranges, only their conditions are returned: the others prove nothing then.
     """
-    proof = certificate.proof()
-    conditions = list(_multiplier_conditions(proof))
+    conditions = list(_multiplier_conditions(certificate))
     if all(condition.holds for condition in conditions):
-        conditions += _bound_conditions(proof, plant)
-        ages = proof.ages
-        conditions += _error_conditions(proof, plant) if ages is None else _age_conditions(proof, ages, plant)
-        conditions += _safe_set_conditions(certificate, proof, plant)
+        conditions += _bound_conditions(certificate, plant)
+        conditions += _error_conditions(certificate, plant)
+        conditions += _safe_set_conditions(certificate, plant)
     return conditions
 
 
-def multipliers_fit(proof: CertifiedProof, plant: LinearPlant) -> bool:
-    """Returns whether a proof has one multiplier per input, and under a contract gains of the plant's shape."""
-    if len(proof.multipliers.inputs) != plant.m:
-        return False
-    if proof.ages is None:
-        return True
-    return proof.ages.sets.gains.shape[1:] == (plant.n, plant.p) and proof.ages.inputs.shape[1] == plant.m
+def multipliers_fit(certificate: Certificate, plant: LinearPlant) -> bool:
+    """Returns whether every proof has a multiplier per input, and under a contract gains of the plant's shape."""
+    updates = certificate.updates
+    gains_fit = updates is None or updates.gains.shape[1:] == (plant.n, plant.p)
+    return gains_fit and all(len(proof.inputs) == plant.m for proof in certificate.proofs)
 
 
-def _multiplier_conditions(proof: CertifiedProof) -> Iterator[Condition]:
+def _multiplier_conditions(certificate: Certificate) -> Iterator[Condition]:
     """Checks the ranges of all multipliers."""
-    ages, rounding = proof.ages, proof.multipliers.rounding
-    rates = [proof.multipliers.error] if ages is None else [*ages.sets.rates, *ages.sets.multipliers]
-    proofs = _invariance_proofs(proof)
-    inputs = [mu for each in proofs for mu in each.inputs]
-    triples = [[float(multiplier) for multiplier in each.multipliers] for each in proofs]
-    finite = bool(np.isfinite([*rates, *inputs, rounding]).all() and np.isfinite(triples).all())
+    proofs, (_, rounding) = certificate.proofs, certificate.disturbances()
+    fractions = [each for proof in proofs for each in (proof.rate, *proof.inputs)]
+    if certificate.updates is not None:
+        fractions += certificate.updates.shares.tolist()
+    finite = bool(np.isfinite([*fractions, rounding]).all() and np.isfinite([proof.shares for proof in proofs]).all())
     yield flag("multipliers: finite", finite)
     if not finite:
         return
-    inside = all(0.0 < multiplier < 1.0 for multiplier in (*rates, *inputs))
+    inside = all(0.0 < multiplier < 1.0 for multiplier in fractions)
     yield flag("multipliers: 0 < lam_e < 1 and 0 < mu_i < 1", inside)
-    exact = [[Fraction(multiplier) for multiplier in triple] for triple in triples]
-    positive = min(*(min(triple) for triple in exact), Fraction(rounding)) > 0
+    exact = [[Fraction(share) for share in proof.shares.tolist()] for proof in proofs]
+    positive = min(*(min(shares) for shares in exact), Fraction(rounding)) > 0
     yield flag("multipliers: lx, le, ld, s > 0", positive)
-    smallest_slack = min(1 - sum(triple, Fraction(0)) for triple in exact)
-    yield scalar_condition("multipliers: lx + le + ld <= 1", smallest_slack)
+    smallest_margin = min(1 - sum(shares, Fraction(0)) for shares in exact)
+    yield scalar_condition("multipliers: lx + le + ld <= 1", smallest_margin)
 
 
-def _bound_conditions(proof: CertifiedProof, plant: LinearPlant) -> Iterator[Condition]:
+def _bound_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
     """Checks that D, N and r0^2 I contain what theory.md section 1 says they contain."""
     ball = scale(Fraction(plant.gamma), rational(np.eye(plant.n)))
     noise = scale(Fraction(plant.process_noise.energy), rational(plant.process_noise_cov))
     weight = rational(plant.relative_weight)
     required = _with_declared(_sum_bound(ball, noise, weight), plant.disturbance_bound, weight)
     required = _with_declared(required, plant.remainder_bound, weight)
-    bound = rational(plant.disturbance.shape)
+    bound, (D, _) = rational(plant.disturbance.shape), certificate.disturbances()
     yield matrix_condition("D: the plant's holds the disturbance and the process noise", subtract(bound, required))
-    yield matrix_condition("D: the certificate's holds the plant's", subtract(rational(proof.D), bound))
+    yield matrix_condition("D: the certificate's holds the plant's", subtract(rational(D), bound))
     identity = rational(np.eye(plant.p))
     sensor = scale(Fraction(plant.sensor_noise.energy), rational(plant.measurement_noise_cov))
     sensor = _with_declared(sensor, plant.sensor_bound, identity)
-    if proof.ages is None:
+    if certificate.updates is None:
         yield matrix_condition("N: holds the sensor noise", subtract(rational(plant.sensor_error.shape), sensor))
     else:
-        step = Fraction(proof.ages.sets.contract.quantization_step)
+        step = Fraction(certificate.updates.contract.quantization_step)
         required = _sum_bound(scale(plant.p * step * step / 4, identity), sensor, identity)
-        slack = subtract(rational(proof.ages.sets.noise), required)
-        yield matrix_condition("N: holds the sensor noise and the quantization error", slack)
+        difference = subtract(rational(certificate.updates.noise), required)
+        yield matrix_condition("N: holds the sensor noise and the quantization error", difference)
     first = _first_error(plant, weight)
     yield matrix_condition(
         "r0: holds the error of the first estimate", subtract(rational(plant.initial_error.shape), first)
@@ -116,83 +109,56 @@ def _first_error(plant: LinearPlant, weight: Matrix) -> Matrix:
     return add(scale(1 / nu, noise), scale(1 / (1 - nu), declared))
 
 
-def _error_conditions(proof: CertifiedProof, plant: LinearPlant) -> Iterator[Condition]:
-    """Checks (E0) and (E1): the estimation error starts in E(Sigma) and never leaves it."""
-    Sigma, D = rational(proof.Sigma), rational(proof.D)
-    lam = Fraction(proof.multipliers.error)
-    yield matrix_condition("(E0) Sigma - r0^2 I >= 0", subtract(Sigma, rational(plant.initial_error.shape)))
-    predicted = add(scale(1 / lam, congruence(rational(plant.A), Sigma)), scale(1 / (1 - lam), D))
-    yield matrix_condition("(E1) Sigma - A Sigma A'/lam_e - D/(1-lam_e) >= 0", subtract(Sigma, predicted))
+def _error_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
+    """Checks (E0) and (E1), or (C0), (C1) and (C2): the estimation error is always in the set of its age."""
+    D, A = rational(certificate.disturbances()[0]), rational(plant.A)
+    shapes = [rational(proof.Sigma) for proof in certificate.proofs]
+    next_shapes = [rational(shape) for shape in certificate.next_error_shapes]
+    is_by_age = certificate.updates is not None
+    name = "(C0) Sigma_0 - r0^2 I >= 0" if is_by_age else "(E0) Sigma - r0^2 I >= 0"
+    yield matrix_condition(name, subtract(shapes[0], rational(plant.initial_error.shape)))
+    for j, (proof, Sigma, following) in enumerate(zip(certificate.proofs, shapes, next_shapes, strict=True)):
+        lam = Fraction(proof.rate)
+        predicted = add(scale(1 / lam, congruence(A, Sigma)), scale(1 / (1 - lam), D))
+        by_age = f"(C1) Sigma_{j + 1} - A Sigma_{j} A'/lam - D/(1-lam) >= 0"
+        name = by_age if is_by_age else "(E1) Sigma - A Sigma A'/lam_e - D/(1-lam_e) >= 0"
+        yield matrix_condition(name, subtract(following, predicted))
+    if certificate.updates is not None:
+        yield from _update_conditions(certificate.updates, shapes[0], next_shapes, plant)
 
 
-def _age_conditions(proof: CertifiedProof, ages: ContractProof, plant: LinearPlant) -> Iterator[Condition]:
-    """Checks (C0), (C1) and (C2): under the contract the error at every age stays in the set of that age."""
-    sets, identity = ages.sets, rational(np.eye(plant.n))
-    A, H, D, N = (rational(matrix) for matrix in (plant.A, plant.H, proof.D, sets.noise))
-    shapes = [rational(shape) for shape in sets.shapes]
-    yield flag("Sigma is the set of the largest age, with its multipliers", _repeats_last_age(proof, ages))
-    yield matrix_condition("(C0) Sigma_0 - r0^2 I >= 0", subtract(shapes[0], rational(plant.initial_error.shape)))
-    for j, lam in enumerate(map(Fraction, sets.rates)):
-        predicted = add(scale(1 / lam, congruence(A, shapes[j])), scale(1 / (1 - lam), D))
-        name = f"(C1) Sigma_{j + 1} - A Sigma_{j} A'/lam - D/(1-lam) >= 0"
-        yield matrix_condition(name, subtract(shapes[j + 1], predicted))
-    for j, (gain, mu) in enumerate(zip(sets.gains, map(Fraction, sets.multipliers), strict=True), start=1):
-        T = rational(gain)
-        kept = congruence(subtract(identity, multiply(T, H)), shapes[j])
+def _update_conditions(
+    updates: Updates, first: Matrix, shapes: Sequence[Matrix], plant: LinearPlant
+) -> Iterator[Condition]:
+    """Checks (C2): an update leads errors in the set of any age, Sigma_1 .. Sigma_{h+1}, into the first set."""
+    identity, H, N = rational(np.eye(plant.n)), rational(plant.H), rational(updates.noise)
+    for j, (Sigma, gain, share) in enumerate(zip(shapes, updates.gains, updates.shares, strict=True), start=1):
+        T, mu = rational(gain), Fraction(float(share))
+        kept = congruence(subtract(identity, multiply(T, H)), Sigma)
         updated = add(scale(1 / mu, kept), scale(1 / (1 - mu), congruence(T, N)))
         name = f"(C2) Sigma_0 - (I-TH) Sigma_{j} (I-TH)'/mu - T N T'/(1-mu) >= 0"
-        yield matrix_condition(name, subtract(shapes[0], updated))
+        yield matrix_condition(name, subtract(first, updated))
 
 
-def _repeats_last_age(proof: CertifiedProof, ages: ContractProof) -> bool:
-    """Returns whether the certificate's own Sigma and multipliers are those of the contract's largest age."""
-    last = proof.multipliers
-    return (
-        np.array_equal(proof.Sigma, ages.sets.shapes[ages.sets.contract.max_age])
-        and bool(last.error == ages.sets.rates[-1])
-        and (last.state, last.estimate, last.disturbance) == tuple(ages.multipliers[-1])
-        and tuple(last.inputs) == tuple(ages.inputs[-1])
-    )
-
-
-class _InvarianceProof(NamedTuple):
-    """The multipliers (lx, le, ld) and mu that prove (I) and (U) for one error set E(Sigma)."""
-
-    label: str
-    Sigma: np.ndarray
-    multipliers: Sequence[float]
-    inputs: Sequence[float]
-
-
-def _invariance_proofs(proof: CertifiedProof) -> list[_InvarianceProof]:
-    """Returns one proof per error set: a single one, or under a contract one per age."""
-    own, ages = proof.multipliers, proof.ages
-    if ages is None:
-        return [_InvarianceProof("", proof.Sigma, (own.state, own.estimate, own.disturbance), own.inputs)]
-    rows = zip(ages.sets.shapes[:-1], ages.multipliers, ages.inputs, strict=True)
-    return [_InvarianceProof(f" at age {j}", *row) for j, row in enumerate(rows)]
-
-
-def _safe_set_conditions(certificate: Certificate, proof: CertifiedProof, plant: LinearPlant) -> Iterator[Condition]:
+def _safe_set_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
     """Checks (I), (S), (U): the safe set is invariant and in the box, and the fallback respects the input limits."""
     L, K, B = rational(certificate.L), rational(certificate.K), rational(plant.B)
     yield matrix_condition("L > 0", L, strict=True)
-    BK = multiply(B, K)
-    D_u = _with_action_rounding(rational(proof.D), B, plant.u_max, Fraction(proof.multipliers.rounding))
+    BK, (D, s) = multiply(B, K), certificate.disturbances()
+    D_u = _with_action_rounding(rational(D), B, plant.u_max, Fraction(s))
     closed_loop = congruence(add(rational(plant.A), BK), L)
     for j, row in enumerate(plant.C):
         yield scalar_condition(f"(S) c_{j + 1} L c_{j + 1}' <= 1", 1 - quadratic(rational(row), L))
-    for each in _invariance_proofs(proof):
-        Sigma = rational(each.Sigma)
-        lx, le, ld = (Fraction(float(multiplier)) for multiplier in each.multipliers)
+    for age, proof in enumerate(certificate.proofs):
+        label = "" if certificate.updates is None else f" at age {age}"
+        Sigma, (lx, le, ld) = rational(proof.Sigma), map(Fraction, proof.shares.tolist())
         successors = add(scale(1 / lx, closed_loop), scale(1 / le, congruence(BK, Sigma)), scale(1 / ld, D_u))
-        name = f"(I) L - (A+BK) L (A+BK)'/lx - BK Sigma K'B'/le - D_u/ld >= 0{each.label}"
+        name = f"(I) L - (A+BK) L (A+BK)'/lx - BK Sigma K'B'/le - D_u/ld >= 0{label}"
         yield matrix_condition(name, subtract(L, successors))
-        for i, (limit, multiplier) in enumerate(zip(plant.u_max, each.inputs, strict=True)):
-            mu = Fraction(float(multiplier))
+        for i, (limit, mu) in enumerate(zip(plant.u_max, map(Fraction, proof.inputs.tolist()), strict=True)):
             used = quadratic([K[i]], L) / mu + quadratic([K[i]], Sigma) / (1 - mu)
             allowed = (Fraction(float(limit)) * (1 - ACTION_ROUNDING)) ** 2
-            yield scalar_condition(f"(U) input {i + 1} stays within u_max (1 - 2^-24){each.label}", allowed - used)
+            yield scalar_condition(f"(U) input {i + 1} stays within u_max (1 - 2^-24){label}", allowed - used)
 
 
 def _with_action_rounding(D: Matrix, B: Matrix, u_max: np.ndarray, s: Fraction) -> Matrix:

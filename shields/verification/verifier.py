@@ -95,7 +95,7 @@ def _rational_conditions(certificate: Certificate, plant: LinearPlant) -> list[C
         conditions.append(flag("shapes: L (n, n), K (m, n)", fits))
         conditions += paper_conditions(certificate, plant) if fits else []
     else:
-        fits = fits and multipliers_fit(certificate.proof(), plant)
+        fits = fits and multipliers_fit(certificate, plant)
         conditions.append(flag("shapes: L (n, n), K (m, n), one input multiplier per input", fits))
         conditions += certified_conditions(certificate, plant) if fits else []
     return conditions

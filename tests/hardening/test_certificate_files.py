@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ncs_gym import ChannelContract, LinearPlant
 from shields import Certificate, CertificateError
-from shields.certificate_file import _digest
+from shields.json_documents import digest
 from tests.certificates import certificate_of
 from tests.fuzz import examples
 from tests.verdicts import verified
@@ -112,7 +112,7 @@ def forged(content, path):
     """The certificate in a file with a fitting checksum; None if it is refused."""
     text = json.dumps(content)
     literal = json.loads(text, parse_float=str, parse_int=str)
-    path.write_text(json.dumps({"format": "ncs-gym certificate 2", "sha256": _digest(literal), "certificate": content}))
+    path.write_text(json.dumps({"format": "ncs-gym certificate 2", "sha256": digest(literal), "certificate": content}))
     return loaded_from(path)
 
 
@@ -133,14 +133,13 @@ def assert_true(certificate, plant):
         moved = support(closed @ L @ closed.T, a) + support(gain @ Sigma @ gain.T, a) + D
         assert (moved <= room * support(L, a)).all()
         assert (support(L, K) + support(Sigma, K) <= room * plant.u_max).all()
-    shapes = [certificate.Sigma, certificate.Sigma] if certificate.ages is None else certificate.ages.sets.shapes
+    shapes = [certificate.error_shapes[0], *certificate.next_error_shapes]
     assert (support(plant.initial_error.shape, a) <= room * support(shapes[0], a)).all()
     for older, newer in zip(shapes[1:], shapes[:-1], strict=True):
         assert (support(plant.A @ newer @ plant.A.T, a) + D <= room * support(older, a)).all()
-    if certificate.ages is not None:
-        sets = certificate.ages.sets
-        noise = plant.sensor_error_with(sets.contract.quantization_step).shape
-        for shape, T in zip(shapes[1:], sets.gains, strict=True):
+    if certificate.updates is not None:
+        noise = plant.sensor_error_with(certificate.contract.quantization_step).shape
+        for shape, T in zip(shapes[1:], certificate.updates.gains, strict=True):
             kept = np.eye(2) - T @ plant.H
             updated = support(kept @ shape @ kept.T, a) + support(T @ noise @ T.T, a)
             assert (updated <= room * support(shapes[0], a)).all()

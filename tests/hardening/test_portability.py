@@ -223,18 +223,17 @@ def reordered(certificate, plant, order):
         **bounds,
         **names,
     )
-    ages = certificate.ages
-    if ages is not None:
-        sets = replace(ages.sets, shapes=ages.sets.shapes[:, order][:, :, order], gains=ages.sets.gains[:, order])
-        ages = replace(ages, sets=sets)
+    updates = certificate.updates
+    if updates is not None:
+        updates = replace(updates, last=updates.last[square], gains=updates.gains[:, order])
     return (
         replace(
             certificate,
             L=certificate.L[square],
             K=certificate.K[:, order],
-            Sigma=certificate.Sigma[square],
+            proofs=tuple(replace(proof, Sigma=proof.Sigma[square]) for proof in certificate.proofs),
             D=certificate.D[square],
-            ages=ages,
+            updates=updates,
             fingerprint=turned.fingerprint,
         ),
         turned,

@@ -11,7 +11,7 @@ from flint import arb, ctx, fmpq
 
 from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian
-from shields.proof_data import ContractProof
+from shields.certificate import Updates
 from shields.verification.conditions import Condition
 from shields.verification.flint.exact import at_least_zero, definite, identity, is_so, matrix, number
 
@@ -33,12 +33,12 @@ class Part(NamedTuple):
     size: float
 
 
-def bound_conditions(D: Any, ages: ContractProof | None, plant: LinearPlant) -> Iterator[Condition]:
+def bound_conditions(D: Any, updates: Updates | None, plant: LinearPlant) -> Iterator[Condition]:
     """Checks D, the plant's own sets, and N of a contract, against what the plant declares.
 
     Args:
         D: Exact shape of the certificate's disturbance set, (n, n).
-        ages: The proof under a contract, if there is one.
+        updates: What a contract adds to the proofs, if there is one.
         plant: The plant.
     """
     weight, quantizer = plant.relative_weight, np.eye(plant.p)
@@ -49,13 +49,13 @@ def bound_conditions(D: Any, ages: ContractProof | None, plant: LinearPlant) -> 
     yield _holds_sum("D: the plant's holds the disturbance and the process noise", own, disturbed)
     yield definite("D: the certificate's holds the plant's", D - own)
     sensed = [_noise(plant.sensor_noise, quantizer), _declared(plant.sensor_bound, quantizer)]
-    if ages is None:
+    if updates is None:
         yield _holds_sum("N: holds the sensor noise", matrix(plant.sensor_error.shape), sensed)
     else:
-        step = number(ages.sets.contract.quantization_step)
+        step = number(updates.contract.quantization_step)
         box = plant.p * step * step / 4 * identity(plant.p)  # in the ball around the box of |v_i| <= step/2
         sensed.append(_part(box, quantizer))
-        yield _holds_sum("N: holds the sensor noise and the quantization error", matrix(ages.sets.noise), sensed)
+        yield _holds_sum("N: holds the sensor noise and the quantization error", matrix(updates.noise), sensed)
     radius = _part(number(plant.initial_radius_squared) * identity(plant.n), weight).size
     first = [_noise(plant.initial_noise, weight)._replace(size=radius), _declared(plant.initial_bound, weight)]
     yield _holds_sum("r0: holds the error of the first estimate", matrix(plant.initial_error.shape), first)

@@ -102,7 +102,7 @@ def test_lookahead_is_attacked_in_and_outside_the_safe_set_and_keeps_the_box(fil
 
 
 def test_lookahead_that_leaves_the_box_is_counted(files, monkeypatch):
-    from shields.lookahead.plan_test import PlanTest
+    from shields.runtime.backup_plans.plan_check import PlanTest
 
     known = PlanTest.tightenings_of
     monkeypatch.setattr(

@@ -119,7 +119,7 @@ def test_plant_of_a_file_is_certified(tmp_path):
     random_plant(3, 3, 2).save(tmp_path / "plant.json")
     made = ncs("synthesize", "--plant", "plant.json", cwd=tmp_path)
     assert made.returncode == 0, made.stderr
-    assert Certificate.load(tmp_path / "certificate.json").ages is None
+    assert Certificate.load(tmp_path / "certificate.json").contract is None
     checked = ncs("verify", "certificate.json", "--plant", "plant.json", "--out", "v.json", cwd=tmp_path)
     assert checked.stdout.endswith("\ncertificate.json verifies\n")
     assert json.loads((tmp_path / "v.json").read_text())["env"] == "plant.json"
@@ -129,7 +129,7 @@ def test_plant_of_a_file_under_a_contract(tmp_path):
     random_plant(3, 3, 2).save(tmp_path / "plant.json")
     asked = ("--plant", "plant.json", "--max-age", 2, "--quantization-step", 0.001)
     assert ncs("synthesize", *asked, cwd=tmp_path).returncode == 0
-    contract = Certificate.load(tmp_path / "certificate.json").ages.sets.contract
+    contract = Certificate.load(tmp_path / "certificate.json").contract
     assert (contract.max_age, contract.quantization_step) == (2, 0.001)
     alone = ncs("synthesize", "--plant", "plant.json", "--quantization-step", 0.001, cwd=tmp_path)
     assert_one_sentence(alone, "give --max-age, too")

@@ -62,7 +62,7 @@ class Case:
     ) -> Any:
         """Environments whose starts, first errors, noise and disturbances lie on the boundaries of their sets."""
         certificate = self.certificate
-        contract = None if certificate.ages is None else certificate.ages.sets.contract
+        contract = certificate.contract
         return kind(
             count,
             plant=self.plant,

@@ -21,7 +21,6 @@ from ncs_gym import (
 from ncs_gym.network import CommittedInputs
 from ncs_gym.network.packet_transmission import ChannelState
 from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
-from shields.downlink import starts_known
 from shields.runtime.guarantee import (
     EXPLANATIONS,
     FAR_OUT,
@@ -34,6 +33,7 @@ from shields.runtime.guarantee import (
     GuaranteeMonitor,
     LoopObservation,
 )
+from shields.runtime.starts import starts_known
 from shields.verification.rational_matrix import (
     congruence,
     is_positive_semidefinite,

@@ -7,8 +7,8 @@ import pytest
 from ncs_gym import Channel, NCSEnv, cart_pole
 from ncs_gym.network.contract import contract_of
 from shields import SafeLoop, SafetyShield
-from shields.lookahead import plan_test
-from shields.lookahead.tightening import tightenings
+from shields.runtime.backup_plans import plan_check as plan_test
+from shields.runtime.backup_plans.plan_check import tightenings
 from shields.runtime.guarantee import NOT_KNOWN_INSIDE, OLD_SAMPLE, OTHER_INPUT
 from tests.certificates import certificate_of
 from tests.shields.lookahead.adversary import CASES, OUTSIDE, WeakestPoint, attack, box_ellipsoid, case, extremal_env

@@ -10,8 +10,8 @@ import pytest
 from ncs_gym import Ellipsoid
 from ncs_gym.uncertainty.shape_matrices import outer_sum
 from shields import SafetyFilter
-from shields.lookahead import planner, program
-from shields.lookahead.candidates import closed_loop
+from shields.runtime.backup_plans import planner, program
+from shields.runtime.backup_plans.planner import closed_loop
 from shields.runtime.decisions import REASONS
 from tests.certificates import certificate_of
 from tests.shields.lookahead.adversary import STABLE, UNSTABLE, case

@@ -5,8 +5,8 @@ import pytest
 
 from ncs_gym import Ellipsoid, NCSEnv, NCSVectorEnv
 from shields import SafetyFilter, SafetyShield, VectorSafetyShield
-from shields.lookahead.planner import Plans
-from shields.verification.starts import starts_in_box
+from shields.runtime.backup_plans.planner import Plans
+from shields.runtime.starts import starts_in_box
 from tests.certificates import certificate_of
 from tests.shields.lookahead.adversary import box_ellipsoid, case
 

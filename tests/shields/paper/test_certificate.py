@@ -78,12 +78,12 @@ def test_altered_certificate_is_rejected_for_the_right_constraint(paper, change,
 
 
 def test_entries_of_the_other_method_are_refused(paper, certificate):
-    with pytest.raises(CertificateError, match="Sigma"):
-        replace(paper, Sigma=np.eye(2))
+    with pytest.raises(CertificateError, match="proofs, D"):
+        replace(paper, proofs=certificate.proofs, D=np.eye(2))
     with pytest.raises(CertificateError, match="kappa"):
         replace(certificate, kappa=0.9)
-    with pytest.raises(CertificateError, match="multipliers"):
-        replace(certificate, multipliers=None)
+    with pytest.raises(CertificateError, match="proofs"):
+        replace(certificate, proofs=())
     with pytest.raises(CertificateError, match="method must be"):
         replace(paper, method="magic")
 

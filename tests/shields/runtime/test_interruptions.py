@@ -9,7 +9,7 @@ import pytest
 
 from ncs_gym import Channel, Ellipsoid, NCSEnv, NCSVectorEnv, Packet, truck_trailer
 from shields import SafeLoop, SafetyShield, VectorSafetyShield
-from shields.lookahead.planner import Planner, Plans
+from shields.runtime.backup_plans.planner import Planner, Plans
 from shields.runtime.safe_loop import NOT_STARTED
 from shields.runtime.safety_filter import MODES
 from tests.certificates import certificate_of

@@ -10,8 +10,7 @@ import pytest
 from ncs_gym import Channel, LinearPlant, NCSEnv
 from shields import CertificateError, Infeasible, SafetyFilter, SafetyShield, synthesize
 from shields.runtime.guarantee import FAR_OUT, NOT_KNOWN_INSIDE
-from shields.runtime.one_step_test import OneStepTest, certified_root
-from shields.runtime.predicted_errors import predicted_errors
+from shields.runtime.one_step import OneStepTest, certified_root, predicted_errors
 from shields.runtime.safety_filter import require_computable
 from shields.verification.rational_matrix import (
     congruence,
@@ -21,7 +20,7 @@ from shields.verification.rational_matrix import (
     scale,
     subtract,
 )
-from tests.certificates import certificate_of
+from tests.certificates import certificate_of, with_proof
 
 SINGULAR = np.array([[0.5, -0.3], [0.25, -0.15]])
 
@@ -188,7 +187,7 @@ def test_gain_too_large_for_float64_is_refused(monkeypatch, certificate, loaded)
 
 def test_gain_may_be_as_large_as_float64_computes_it_accurately(certificate, loaded):
     # A quarter of a float32 step of the limit, against n + 2 roundings of sums of |K| |x_hat|.
-    thin = replace(certificate, Sigma=certificate.Sigma * [[1.0, 0.1], [0.1, 0.01]])
+    thin = with_proof(certificate, Sigma=certificate.Sigma * [[1.0, 0.1], [0.1, 0.01]])
     extent = np.sqrt(np.diag(thin.L)) + np.sqrt(np.diag(thin.Sigma))
     assert extent[0] > 1.05 * extent[1] or extent[1] > 1.05 * extent[0]
     largest = 0.25 * 2.0**-24 * 4.0 / (4 * 2.0**-52 * extent.sum())

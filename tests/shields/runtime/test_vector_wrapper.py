@@ -15,10 +15,9 @@ from shields.runtime.guarantee import (
     OTHER_STEPS,
     GuaranteeMonitor,
     LoopObservation,
-    start_known,
 )
-from shields.runtime.monitored_filter import first_store
 from shields.runtime.safety_filter import MODES
+from shields.runtime.starts import first_store, start_known
 from shields.runtime.vector_wrapper import Clock, _moved, overridden
 from tests import arrays
 from tests.certificates import certificate_of

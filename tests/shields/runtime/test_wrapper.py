@@ -33,6 +33,7 @@ from shields.runtime.guarantee import (
     OTHER_STEPS,
 )
 from shields.runtime.safety_filter import SafetyFilter
+from tests.certificates import with_proof
 from tests.plants import random_plant
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -454,7 +455,7 @@ def test_forged_packet_is_noticed(certificate):
 def test_error_ellipsoid_outside_the_certified_one_is_reported(certificate, loaded):
     # A certificate for better sensors at the start, whose Sigma is smaller than the running ellipsoid may become.
     env = shielded(certificate, channel=Channel(loss=1.0))
-    smaller = replace(certificate, Sigma=0.3 * certificate.Sigma)
+    smaller = with_proof(certificate, Sigma=0.3 * certificate.Sigma)
     object.__setattr__(env.filter, "certificate", smaller)
     infos = play(env, full, 30, seed=0)
     assert infos[0]["shield_guaranteed"]

@@ -8,8 +8,8 @@ import pytest
 
 from ncs_gym import ChannelContract, cart_pole
 from shields import Certificate, synthesize
-from shields.certificate_file import _digest
-from tests.certificates import certificate_of
+from shields.json_documents import digest
+from tests.certificates import certificate_of, with_proof
 
 
 @pytest.fixture
@@ -35,16 +35,21 @@ def test_what_is_loaded_equals_what_was_saved(certificate, by_age, tmp_path):
 
 
 def test_any_other_last_digit_makes_another_certificate(certificate, by_age):
-    for name in ("L", "K", "Sigma", "D"):
-        array = getattr(certificate, name).copy()
-        array.flat[0] = np.nextafter(array.flat[0], 1.0)
-        assert replace(certificate, **{name: array}) != certificate, name
-    moved = replace(certificate.multipliers, state=np.nextafter(certificate.multipliers.state, 0.0))
-    assert replace(certificate, multipliers=moved) != certificate
-    gains = by_age.ages.sets.gains.copy()
-    gains.flat[-1] = np.nextafter(gains.flat[-1], 1.0)
-    ages = replace(by_age.ages, sets=replace(by_age.ages.sets, gains=gains))
-    assert replace(by_age, ages=ages) != by_age
+    def moved(array, place=0):
+        array = np.array(array)
+        array.flat[place] = np.nextafter(array.flat[place], 1.0)
+        return array
+
+    for name in ("L", "K", "D"):
+        assert replace(certificate, **{name: moved(getattr(certificate, name))}) != certificate, name
+    for each in (certificate, by_age):
+        for age, proof in enumerate(each.proofs):
+            for name in ("Sigma", "rate", "shares", "inputs"):
+                assert with_proof(each, age, **{name: moved(getattr(proof, name))}) != each, (age, name)
+        assert replace(each, rounding=moved(each.rounding)) != each
+    for name in ("last", "gains", "shares", "noise"):
+        updates = replace(by_age.updates, **{name: moved(getattr(by_age.updates, name), -1)})
+        assert replace(by_age, updates=updates) != by_age, name
     assert replace(certificate, fingerprint="0" * 64) != certificate
 
 
@@ -53,7 +58,7 @@ def test_files_without_today_s_records_load_and_are_saved_byte_by_byte(path):
     for name in ("share_of_box", "tolerated_scale", "assumptions"):
         document["certificate"]["provenance"].pop(name, None)
     literal = json.loads(json.dumps(document["certificate"]), parse_float=str, parse_int=str)
-    document["sha256"] = _digest(literal)
+    document["sha256"] = digest(literal)
     path.write_text(json.dumps(document, indent=1) + "\n")
     before = path.read_bytes()
     loaded = Certificate.load(path)

@@ -28,7 +28,6 @@ MAY_IMPORT = {
     "ncs_gym",
     "ncs_gym.uncertainty.truncated_gaussian",
     "shields.certificate",
-    "shields.proof_data",
     "shields.verification.conditions",
 }
 

@@ -7,7 +7,7 @@ import pytest
 from ncs_gym import Ellipsoid, truck_trailer
 from shields import CertificateError, synthesize
 from shields.verification import require_valid
-from tests.certificates import certificate_of
+from tests.certificates import certificate_of, with_proof
 from tests.plants import random_plant
 from tests.verdicts import verified
 
@@ -17,7 +17,15 @@ def broken(certificate, plant) -> list[str]:
 
 
 def with_multipliers(certificate, **change):
-    return replace(certificate, multipliers=replace(certificate.multipliers, **change))
+    moved = replace(certificate.multipliers, **change)
+    shares = moved.state, moved.estimate, moved.disturbance
+    changed = with_proof(certificate, rate=moved.error, shares=shares, inputs=moved.inputs)
+    return replace(changed, rounding=moved.rounding)
+
+
+def of_three_states(certificate):
+    proofs = (replace(certificate.proofs[0], Sigma=np.eye(3)),)
+    return replace(certificate, L=np.eye(3), K=np.ones((1, 3)), D=np.eye(3), proofs=proofs)
 
 
 def test_synthesized_certificate_is_valid(certificate, loaded):
@@ -34,8 +42,8 @@ MUTATIONS = {
     "shrunken L": (lambda c: replace(c, L=0.002 * c.L), ["(I)"]),
     "wrong sign of K": (lambda c: replace(c, K=-40.0 * c.K - 1.0), ["(I)", "(U)"]),
     "large K": (lambda c: replace(c, K=c.K + 4.0), ["(I)", "(U)"]),
-    "shrunken Sigma": (lambda c: replace(c, Sigma=0.5 * c.Sigma), ["(E1)"]),
-    "tiny Sigma": (lambda c: replace(c, Sigma=1e-4 * c.Sigma), ["(E0)", "(E1)"]),
+    "shrunken Sigma": (lambda c: with_proof(c, Sigma=0.5 * c.Sigma), ["(E1)"]),
+    "tiny Sigma": (lambda c: with_proof(c, Sigma=1e-4 * c.Sigma), ["(E0)", "(E1)"]),
     "small D": (lambda c: replace(c, D=0.9 * c.D), ["D:"]),
     "D a hair too small": (lambda c: replace(c, D=(1 - 1.1e-9) * c.D), ["D: the certificate's"]),
     "denormal multiplier": (lambda c: with_multipliers(c, state=1e-320), ["(I)"]),
@@ -61,7 +69,7 @@ MUTATIONS = {
     "flat L": (lambda c: replace(c, L=np.diag([3.9, 0.0])), ["L > 0", "(I)"]),
     "negative L": (lambda c: replace(c, L=-c.L), ["L > 0", "(I)"]),
     "other plant": (lambda c: replace(c, fingerprint="0" * 64), ["plant"]),
-    "other size": (lambda c: replace(c, L=np.eye(3), K=np.ones((1, 3)), Sigma=np.eye(3), D=np.eye(3)), ["shapes"]),
+    "other size": (lambda c: of_three_states(c), ["shapes"]),
 }
 
 

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.validation import as_numbers
-from shields.lookahead.planner import Planner, Plans
+from shields.runtime.backup_plans.planner import Planner, Plans
 from shields.runtime.decisions import INVALID, PLANNED, PROJECTED, REASONS, SAFE, STORED, Decision
-from shields.runtime.one_step_test import OneStepTest, ReachableSets, norms
-from shields.runtime.predicted_errors import PredictedErrors
+from shields.runtime.one_step import OneStepTest, PredictedErrors, ReachableSets, norms
 
 
 class Lookahead:

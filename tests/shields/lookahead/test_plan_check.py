@@ -10,10 +10,9 @@ import pytest
 from ncs_gym import Ellipsoid, LinearPlant, batch_reactor, cart_pole, truck_trailer
 from ncs_gym.network.contract import ChannelContract
 from shields import SafetyFilter
-from shields.lookahead import PlanTest, Prediction
-from shields.lookahead.tightening import Tightening
-from shields.runtime.one_step_test import OneStepTest
-from shields.runtime.predicted_errors import SMALLEST_RADIUS
+from shields.runtime.backup_plans import PlanTest, Prediction
+from shields.runtime.backup_plans.plan_check import Tightening
+from shields.runtime.one_step import SMALLEST_RADIUS, OneStepTest
 from shields.runtime.safety_filter import MARGIN
 from shields.verification.rational_matrix import multiply, quadratic, rational
 from tests.certificates import certificate_of

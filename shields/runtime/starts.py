@@ -1,18 +1,83 @@
-"""What is known of the states x_0 .. x_c before the first decision of an episode takes effect: the inputs are zero."""
+"""What is known of the states before the first decision of an episode takes effect.
+
+Starts are decided in exact arithmetic. Behind a downlink the inputs of the first c steps are zero, and what is known of
+x_1 .. x_c follows from that.
+"""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.estimation.set_membership import enlarged_by_rounding
 from ncs_gym.uncertainty.shape_matrices import outer_sum
-from shields.runtime.guarantee import LoopObservation, StartKnown, start_known
-from shields.runtime.predicted_errors import PredictedErrors
+from shields.certificate import Certificate
+from shields.runtime.guarantee import LoopObservation
+from shields.runtime.one_step import PredictedErrors
 from shields.runtime.safety_filter import MARGIN, SafetyFilter
+from shields.verification.rational_matrix import (
+    is_positive_semidefinite,
+    multiply,
+    quadratic,
+    rational,
+    subtract,
+    transpose,
+)
 
 # Relative rounding of one step of a center, per dimension.
 CENTER_ROUNDING = 8.0 * float(np.finfo(float).eps)
+
+
+class StartKnown(NamedTuple):
+    """What is known of the start of an episode before any estimate.
+
+    Attributes:
+        in_safe_set: Whether every possible start lies in S.
+        in_box: Whether every possible start lies in the safe box.
+    """
+
+    in_safe_set: bool
+    in_box: bool
+
+
+def starts_inside(certificate: Certificate, initial: Ellipsoid | np.ndarray) -> bool:
+    """Returns whether all possible starts lie in S, decided in exact arithmetic.
+
+    Args:
+        certificate: Gives S = E(L).
+        initial: An ellipsoid E(P), inside S exactly if L - P >= 0; or a single state, shape (n,), inside S exactly if
+            [1, x'; x, L] >= 0.
+    """
+    L = rational(certificate.L)
+    if isinstance(initial, Ellipsoid):
+        return is_positive_semidefinite(subtract(L, rational(initial.shape)))
+    state = rational(initial)[0]
+    one = rational(np.ones(1))[0]
+    return is_positive_semidefinite([one + state] + [[x, *row] for x, row in zip(state, L, strict=True)])
+
+
+def starts_in_box(plant: LinearPlant, initial: Ellipsoid | np.ndarray) -> bool:
+    """Returns whether all possible starts lie in the safe box, decided in exact arithmetic.
+
+    Args:
+        plant: Gives the rows c_i.
+        initial: An ellipsoid E(P), in the box exactly if c_i P c_i' <= 1 for all rows; or a single state, shape (n,).
+    """
+    rows = rational(plant.C)
+    if isinstance(initial, Ellipsoid):
+        shape = rational(initial.shape)
+        return all(quadratic([row], shape) <= 1 for row in rows)
+    return all(abs(product) <= 1 for (product,) in multiply(rows, transpose(rational(initial))))
+
+
+def start_known(safety_filter: SafetyFilter, initial: Ellipsoid | np.ndarray | None) -> StartKnown:
+    """Returns what is known of starts in an ellipsoid E(P), of one state, shape (n,), or of any (None)."""
+    if initial is None:
+        return StartKnown(False, False)
+    inside = starts_inside(safety_filter.certificate, initial)
+    return StartKnown(inside, inside or starts_in_box(safety_filter.plant, initial))
 
 
 def starts_known(
@@ -82,6 +147,29 @@ def first_observations(
         no_alarm = np.zeros(len(known), np.bool_)
         found.append((np.array(inside, np.bool_), LoopObservation(estimates, errors, no_alarm)))
     return found
+
+
+def first_store(
+    safety_filter: SafetyFilter, estimate: np.ndarray, errors: PredictedErrors, known: StartKnown
+) -> tuple[np.ndarray, bool]:
+    """Returns what is stored before the first decision, shape (k, m), and whether the state is proved safe.
+
+    The state is that at which the first decision takes effect, without a downlink the start.
+
+    It is where it is known to be in S; in mode "lookahead" also where it is known to be in the box, by what starts are
+    possible or by the estimate, and a first plan is certified.
+
+    Args:
+        safety_filter: Decides.
+        estimate: x_hat_0, shape (n,).
+        errors: What is known of Sigma_0.
+        known: What is known of the start.
+    """
+    lookahead = safety_filter.lookahead
+    if lookahead is None or known.in_safe_set or safety_filter.test.knows_inside(estimate, errors, MARGIN):
+        return np.empty((0, safety_filter.plant.m)), known.in_safe_set
+    plan = safety_filter.first_plan(estimate, errors)
+    return plan, len(plan) > 0 and (known.in_box or lookahead.knows_in_box(estimate, errors))
 
 
 def _in_box(safety_filter: SafetyFilter, center: np.ndarray, errors: PredictedErrors) -> bool:

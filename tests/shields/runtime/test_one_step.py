@@ -7,8 +7,7 @@ from scipy.optimize import minimize_scalar
 
 from ncs_gym import Ellipsoid, truck_trailer
 from shields import SafetyFilter
-from shields.runtime.one_step_test import OneStepTest
-from shields.runtime.predicted_errors import predicted_errors
+from shields.runtime.one_step import OneStepTest, predicted_errors
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 
@@ -141,7 +140,7 @@ def test_smallest_slack_is_that_of_the_worst_input(case, monkeypatch):
         smallest = sets.smallest_slack().item()
         assert (sets.slack(inputs.T)[0] >= smallest - 1e-12).all()
         assert sets.slack(corners.T)[0].min() == pytest.approx(smallest, abs=1e-12)
-        monkeypatch.setattr("shields.runtime.one_step_test.LARGEST_BLOCK", 1)
+        monkeypatch.setattr("shields.runtime.one_step.LARGEST_BLOCK", 1)
         assert sets.smallest_slack().item() == pytest.approx(smallest, abs=1e-12)
         monkeypatch.undo()
 

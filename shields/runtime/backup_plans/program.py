@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import csc_matrix
 
 from ncs_gym.validation import read_only
-from shields.lookahead.prediction import Prediction
+from shields.runtime.backup_plans.plan_check import Prediction
 from shields.verification import ACTION_ROUNDING
 
 # Its types are not declared.

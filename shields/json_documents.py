@@ -1,0 +1,61 @@
+"""JSON documents that say what they are: the name of their format, the checksum of their content, and the content."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from shields.atomic_write import write_atomically
+
+
+def digest(content: Any) -> str:
+    """Returns the SHA-256 of JSON values, whatever the order of their keys."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def with_literal_numbers(text: str) -> Any:
+    """Returns the values of a JSON text with every number as the text of its digits, so that a digest counts each."""
+    return json.loads(text, parse_float=str, parse_int=str)
+
+
+def document_of(kind: str, format_name: str, content: Any) -> dict[str, Any]:
+    """Returns the document of some content, whose checksum counts every digit.
+
+    Args:
+        kind: What the content is, the key of the document that holds it.
+        format_name: Name of the format, with its version.
+        content: JSON values.
+    """
+    literal = with_literal_numbers(json.dumps(content))
+    return {"format": format_name, "sha256": digest(literal), kind: content}
+
+
+def write_document(path: str | os.PathLike[str], document: dict[str, Any]) -> None:
+    """Writes a document; a reader never sees a part of it.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    write_atomically(Path(path), json.dumps(document, indent=1) + "\n")
+
+
+def read_content(path: str | os.PathLike[str], kind: str, format_name: str) -> Any:
+    """Returns the content of the document in a file, after comparing its checksum; for arguments see `document_of`.
+
+    Raises:
+        ValueError: If the file is missing, no JSON, of another kind or format, or altered; the message says which.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+        document, literal = json.loads(text), with_literal_numbers(text)
+    except (OSError, TypeError, ValueError, RecursionError) as error:
+        reason = getattr(error, "strerror", None) or "it is not valid JSON"
+        raise ValueError(f"cannot read {kind} {path}: {reason}") from error
+    if not isinstance(document, dict) or document.get("format") != format_name or kind not in document:
+        raise ValueError(f"{path} is not a file of format {format_name!r}")
+    if document.get("sha256") != digest(literal[kind]):
+        raise ValueError(f"{kind} {path} was altered: its checksum does not match")
+    return document[kind]

@@ -1,0 +1,303 @@
+"""Which backup plans are certified: inputs that keep every possible state in the box and end in the safe set.
+
+`Prediction` says what the plant does within N steps, `Tightening` how far errors and disturbances reach around that,
+which depends on Sigma_k alone, and `PlanTest` decides. Arrays count environments on their first axis.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
+from ncs_gym.validation import read_only
+from shields.runtime.one_step import SMALLEST_RADIUS, OneStepTest, predicted_errors
+
+# Error shapes whose tightenings are remembered; they recur, since they depend only on what arrived when.
+MOST_REMEMBERED = 4096
+
+
+class PlanTest:
+    """Whether a plan u_0..u_{j-1} is certified (docs/lookahead.md).
+
+    With c_0 = x_hat and c_{i+1} = A c_i + B u_i it is if |c c_i| + rho_i(c) <= 1 for the rows c of the box and i =
+    1..j-1, which is the exact condition for every possible x_{k+i} to lie in the box, and c_j + E(Sigma_pred,j) lies in
+    S by the one-step test's condition. Then x_{k+j} is in S, hence in the box. For j = 1 it is the one-step test.
+
+    Args:
+        prediction: Of the plant.
+        margin: By which the test must be passed, in units of the box and of S.
+
+    Attributes:
+        prediction: The same.
+    """
+
+    def __init__(self, prediction: Prediction, margin: float) -> None:
+        self.prediction, self._margin = prediction, margin
+        plant, ends = prediction.plant, prediction.ends
+        self._rows = plant.C
+        sizes = np.abs(plant.C) @ prediction.size_free
+        self._row_rounding = (prediction.rounding[:, None, None] * sizes).reshape(-1, plant.n).T
+        self._end_rounding = np.array([end.rounding * end.columns for end in ends]).T
+        # Where in the table the tightenings of a shape are.
+        self._remembered: dict[bytes, int] = {}
+        self._table = tightenings(prediction, np.empty((0, plant.n, plant.n)))
+
+    def tightenings_of(self, shapes: np.ndarray) -> Tightening:
+        """Returns the tightenings of error shapes Sigma_k, shape (E, n, n); remembered, since shapes recur."""
+        shapes = np.ascontiguousarray(shapes)
+        keys = [shape.tobytes() for shape in shapes]
+        new = {key: e for e, key in enumerate(keys) if key not in self._remembered}
+        if len(self._remembered) + len(new) > MOST_REMEMBERED:
+            self._remembered.clear()
+            new = {key: e for e, key in enumerate(keys)}
+        if new:
+            found = tightenings(self.prediction, shapes[list(new.values())])
+            known = [part[: len(self._remembered)] for part in self._table]
+            self._table = Tightening(*(np.concatenate(pair) for pair in zip(known, found, strict=True)))
+            self._remembered |= {key: len(self._remembered) + e for e, key in enumerate(new)}
+        numbers = [self._remembered[key] for key in keys]
+        return Tightening(*(part[numbers] for part in self._table))
+
+    def tightening_alone(self, shape: np.ndarray) -> Tightening:
+        """Returns what `tightenings_of` does for a single error shape, (n, n)."""
+        number = self._remembered.get(shape.tobytes())
+        if number is None:
+            return Tightening(*(part[0] for part in self.tightenings_of(shape[None])))
+        return Tightening(*(part[number] for part in self._table))
+
+    @np.errstate(all="ignore")  # what is not finite is not certified
+    def room(self, estimates: np.ndarray, tightening: Tightening) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the largest |c_i c_j|, shape (E, N, k), and |T G c_j|, shape (E, N), that pass; NaN for no usable.
+
+        Of a single estimate, shape (n,), and a single tightening, without the first axis.
+        """
+        size = np.abs(estimates)
+        rounding = (size @ self._row_rounding).reshape(tightening.room.shape)
+        box = tightening.room - rounding - self._margin
+        radius = tightening.radius - size @ self._end_rounding  # far below zero for estimates that are too far out
+        return box, np.where(radius >= SMALLEST_RADIUS, radius - self._margin, np.nan)
+
+    def judged(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns c_i c_j, shape (N, k, E, P), and T G c_j, shape (N, n, E, P): sums over long last axes are fast.
+
+        Args:
+            estimates: x_hat, shape (E, n).
+            tightening: Of the error shapes of each.
+            plans: Inputs, shape (E, P, N, m) [physical units].
+        """
+        centers = self.prediction.centers(estimates, plans)
+        steps, n, count, number = centers.shape
+        values = self._rows @ centers.reshape(steps, n, -1)
+        weighting = tightening.weighting.transpose(1, 2, 3, 0)[..., None]
+        weighted = weighting[:, :, 0] * centers[:, 0, None]
+        for i in range(1, n):
+            weighted += weighting[:, :, i] * centers[:, i, None]
+        return values.reshape(steps, -1, count, number), weighted
+
+    @np.errstate(all="ignore")
+    def certified(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray) -> np.ndarray:
+        """Returns which first parts of plans are certified: those of 1..N inputs, shape (E, P, N).
+
+        Args:
+            estimates: x_hat, shape (E, n).
+            tightening: Of the error shapes of each.
+            plans: Inputs, shape (E, P, N, m) [physical units].
+        """
+        box, radius = self.room(estimates, tightening)
+        values, weighted = self.judged(estimates, tightening, plans)
+        kept = _kept(values, weighted, box.transpose(1, 2, 0)[..., None], radius.T[..., None])
+        return kept.transpose(1, 2, 0) & self._within_limits(plans)
+
+    @np.errstate(all="ignore")
+    def certified_alone(self, estimate: np.ndarray, tightening: Tightening, plans: np.ndarray) -> np.ndarray:
+        """Returns what `certified` does for one estimate, shape (n,), and its plans, (P, N, m): shape (P, N)."""
+        box, radius = self.room(estimate, tightening)
+        centers = self.prediction.centers_alone(estimate, plans)
+        kept = _kept(self._rows @ centers, tightening.weighting @ centers, box[..., None], radius[:, None])
+        return kept.T & self._within_limits(plans)
+
+    def _within_limits(self, plans: np.ndarray) -> np.ndarray:
+        """Returns whether the first j inputs of plans, shape (..., N, m), are within the limits, shape (..., N)."""
+        allowed = np.all(np.abs(plans) <= self.prediction.plant.u_max, axis=-1)
+        return np.logical_and.accumulate(allowed, axis=-1)
+
+    @np.errstate(all="ignore")
+    def knows_in_box(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
+        """Returns whether |c_i x_hat| + sqrt(c_i Sigma_k c_i') <= 1 for all rows, which proves that x is in the box."""
+        rows, extents = self.prediction.plant.C, np.sqrt(np.diag(error_shape))
+        rounding = float(self.prediction.rounding[0])
+        size = np.abs(rows) @ extents
+        reach = np.sqrt(np.maximum(((rows @ error_shape) * rows).sum(axis=1), 0.0) + rounding * size**2)
+        reach = reach + np.abs(rows @ estimate) + rounding * (np.abs(rows) @ np.abs(estimate))
+        return bool((reach <= 1.0 - self._margin).all())
+
+
+def _kept(values: np.ndarray, weighted: np.ndarray, box: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Returns whether centers c_1..c_{j-1} are far enough inside the box, and c_j inside S, shape (N, ...).
+
+    Args:
+        values: c_i c_j, shape (N, k, ...) with axes of estimates and plans last, as in all others.
+        weighted: T G c_j, shape (N, n, ...).
+        box: Largest |c_i c_j|, shape (N, k, ...).
+        radius: Largest |T G c_j|, shape (N, ...).
+    """
+    inside = np.all(np.abs(values) <= box, axis=1)
+    kept = np.asarray(np.sqrt((weighted * weighted).sum(axis=1)) <= radius)
+    kept[1:] &= np.logical_and.accumulate(inside[:-1], axis=0)
+    return kept
+
+
+class Prediction:
+    """The centers c_0 = x_hat, c_{j+1} = A c_j + B u_j of the states that can be reached, j = 1..N.
+
+    Products in float64 are off by at most `rounding` times the same products of absolute values: powers of A take j
+    roundings of n-term sums, the sum over the inputs m terms per step.
+
+    Args:
+        first: The one-step test, which gives the plant and the norm of S.
+        steps: N.
+
+    Attributes:
+        plant: The plant.
+        steps: N.
+        free: A^j, shape (N, n, n).
+        forced: Block rows [A^{j-1} B, ..., B, 0, ...], shape (N, n, N m).
+        size_free: |A|^j, shape (N, n, n).
+        size_forced: sum_{i<j} |A|^i |B| u_max, shape (N, n).
+        rounding: Relative rounding after j steps, shape (N,).
+        ends: The test of section "One step" for what is reached at j: c_j + E(Sigma_pred,j) lies in S; N of them.
+    """
+
+    def __init__(self, first: OneStepTest, steps: int) -> None:
+        plant, n, m = first.plant, first.plant.n, first.plant.m
+        self.plant, self.steps = plant, steps
+        powers, sizes = [np.eye(n)], [np.eye(n)]
+        for _ in range(steps):
+            powers.append(plant.A @ powers[-1])
+            sizes.append(np.abs(plant.A) @ sizes[-1])
+        self.free, self.size_free = read_only(np.array(powers[1:])), read_only(np.array(sizes[1:]))
+        effects = np.array([power @ plant.B for power in powers[:-1]])
+        forced = np.zeros((steps, n, steps, m))
+        for j in range(steps):
+            forced[j, :, : j + 1] = effects[j::-1].transpose(1, 0, 2)
+        self.forced = read_only(forced.reshape(steps, n, steps * m))
+        pushes = np.array([size @ np.abs(plant.B) @ plant.u_max for size in sizes[:-1]])
+        self.size_forced = read_only(np.cumsum(pushes, axis=0))
+        self.rounding = read_only(8.0 * (n + m) * (np.arange(1, steps + 1) + 2.0) * float(np.finfo(float).eps))
+        self.ends = tuple(EndTest(first, self, j) for j in range(steps))
+        self._free = np.ascontiguousarray(self.free.reshape(steps * n, n))
+        self._forced = np.ascontiguousarray(self.forced.reshape(steps * n, steps * m))
+
+    def centers(self, estimates: np.ndarray, plans: np.ndarray) -> np.ndarray:
+        """Returns c_1..c_N, shape (N, n, E, P).
+
+        Args:
+            estimates: x_hat, shape (E, n).
+            plans: Inputs of P plans for each, shape (E, P, N, m) [physical units]; zero beyond a plan's end.
+        """
+        count, number = plans.shape[:2]
+        pushed = (self._forced @ plans.reshape(count * number, -1).T).reshape(-1, count, number)
+        moved = (self._free @ estimates.T)[..., None] + pushed
+        return moved.reshape(self.steps, self.plant.n, count, number)
+
+    def centers_alone(self, estimate: np.ndarray, plans: np.ndarray) -> np.ndarray:
+        """Returns what `centers` does for one estimate, shape (n,), and its plans, (P, N, m): shape (N, n, P)."""
+        pushed = self._forced @ plans.reshape(len(plans), -1).T
+        return (self._free.dot(estimate)[:, None] + pushed).reshape(self.steps, -1, len(plans))
+
+
+class EndTest(OneStepTest):
+    """The one-step test of the plant that takes j+1 steps at once: A^{j+1}, and what disturbances add up to.
+
+    E(Q_0) + ... + E(Q_j) lies inside E(sum_i Q_i / w_i) for weights w_i > 0 of sum 1; w_i proportional to sqrt(tr Q_i)
+    makes the trace smallest, also together with the estimation error that `predicted_errors` adds.
+
+    Args:
+        first: The one-step test.
+        prediction: Matrices of all steps.
+        index: j.
+    """
+
+    def __init__(self, first: OneStepTest, prediction: Prediction, index: int) -> None:
+        plant, steps = first.plant, index + 1
+        n, m = plant.n, plant.m
+        self.plant, self.single, self.limits = plant, first.single, first.limits
+        self.root, self.own_columns = first.root, first.own_columns
+        size = np.abs(self.root)
+        self.rounding = float((16.0 * (n + m) * (steps + 2) + 4.0 * n * n) * np.finfo(float).eps)
+        self.moved = read_only(self.root @ prediction.free[index])
+        self.effect = read_only(self.root @ prediction.forced[index])
+        self.columns = read_only(np.linalg.norm(size @ prediction.size_free[index], axis=0))
+        self.pushed = float(np.linalg.norm(size @ prediction.size_forced[index]))
+        extents = np.sqrt(np.diag(plant.disturbance.shape))
+        parts = []
+        for i in range(steps):
+            root = self.root @ prediction.free[i - 1] if i else self.root
+            reach = size @ prediction.size_free[i - 1] if i else size
+            room = self.rounding * float(np.linalg.norm(reach, axis=0) @ extents) ** 2
+            parts.append(root @ plant.disturbance.shape @ root.T + room * np.eye(n))
+        widths = np.sqrt([np.trace(part) for part in parts])
+        widths = np.maximum(widths, SMALLEST_MULTIPLIER * widths.max())
+        D = sum(part * (widths.sum() / width) for part, width in zip(parts, widths, strict=True))
+        D = (1.0 + self.rounding) * np.asarray(D)
+        self.D = read_only(0.5 * (D + D.T))
+
+
+class Tightening(NamedTuple):
+    """What errors and disturbances leave of the box and of S, for E error shapes (no first axis: a single one).
+
+    Attributes:
+        room: 1 - rho_j(c_i) less the rounding that does not depend on the estimate, shape (E, N, k) for the k rows c_i
+            of the box; NaN for an unusable shape.
+        weighting: T G, shape (E, N, n, n), with T of `PredictedErrors` after j steps: c_j is far enough inside S if
+            |T G c_j| is at most the radius.
+        radius: 1 - h less the rounding that does not depend on the estimate, shape (E, N); NaN for an unusable shape.
+    """
+
+    room: np.ndarray
+    weighting: np.ndarray
+    radius: np.ndarray
+
+
+@np.errstate(all="ignore")  # what overflows leaves no room
+def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
+    """Returns the exact support of what is reached at c_j, for every row of the box, and the end's ellipsoid.
+
+    rho_j(a) = sqrt(a' A^j Sigma_k A^j' a) + sum_{i<j} sqrt(a' A^i D A^i' a), rounded outward: with |S_pq| <= s_p s_q a
+    computed b'Sb is off by at most a relative rounding of (|b|'s)^2, the powers in b included.
+
+    Args:
+        prediction: Of the plant.
+        shapes: Sigma_k, shape (E, n, n).
+    """
+    plant, rounding = prediction.plant, prediction.rounding[:, None]
+    rows, sizes = plant.C @ prediction.free, np.abs(plant.C) @ prediction.size_free
+    earlier = np.concatenate([plant.C[None], rows[:-1]])
+    earlier_sizes = np.concatenate([np.abs(plant.C)[None], sizes[:-1]])
+    disturbed = np.cumsum(_supports(earlier, earlier_sizes, plant.disturbance.shape[None], rounding)[0], axis=0)
+    symmetric = 0.5 * (shapes + shapes.swapaxes(1, 2))
+    reach = (_supports(rows, sizes, symmetric, rounding) + disturbed) * (1.0 + rounding)
+    pushed = rounding * (prediction.size_forced @ np.abs(plant.C).T)
+    nothing = np.empty((0, *shapes.shape[1:]))
+    errors = [predicted_errors(end, shapes, nothing) for end in prediction.ends]
+    radius = np.stack([each.radius for each in errors], axis=1)
+    unusable = np.where(np.isnan(radius).any(axis=1), np.nan, 0.0)
+    weightings = np.stack([each.weighting.transpose(2, 0, 1) for each in errors], axis=1) @ prediction.ends[0].root
+    return Tightening(1.0 - reach - pushed + unusable[:, None, None], weightings, radius)
+
+
+def _supports(rows: np.ndarray, sizes: np.ndarray, shapes: np.ndarray, rounding: np.ndarray) -> np.ndarray:
+    """Returns upper bounds of sqrt(b'Sb) for rows b, shape (E, N, k).
+
+    Args:
+        rows: b, shape (N, k, n).
+        sizes: |b| before any cancellation, shape (N, k, n).
+        shapes: S, shape (E, n, n).
+        rounding: Relative to products of absolute values, shape (N, 1).
+    """
+    extents = np.sqrt(np.abs(np.diagonal(shapes, axis1=1, axis2=2)))
+    squares = ((rows @ shapes[:, None]) * rows).sum(axis=-1)
+    size = (sizes @ extents[:, None, :, None])[..., 0]
+    return np.sqrt(np.maximum(squares, 0.0) + rounding * size**2)
