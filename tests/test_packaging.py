@@ -44,8 +44,8 @@ LAYERS = {
         {"lookahead"},
     ),
     "agents": (
-        {"settings", "results", "sb3_vec_env", "loop_wrappers"},
-        {"control_loop"},
+        {"settings", "results", "sb3_vec_env"},
+        {"loop"},
         {"algorithms", "callbacks", "evaluation", "sharing", "tuned"},
         {"agent"},
         {"training"},
