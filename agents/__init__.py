@@ -1,6 +1,6 @@
 """Training and evaluation of stable-baselines3 agents in control loops of plant, network and shield.
 
-A `ControlLoop` says which environment, channel and shield an agent works in; `train` returns a trained `Agent` and what
+A `LoopConfig` says which environment, settings and shield an agent works in; `train` returns a trained `Agent` and what
 happened on the way, `evaluate` plays episodes and counts violations of the true state. `SB3VecEnv` and `SafetyCallback`
 also serve training code of your own. What needs stable-baselines3 or torch (the extra `train`) is imported when it is
 first asked for.
@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from agents.agent import Agent
     from agents.callbacks import DualAscentCallback, EvaluationCallback, SafetyCallback
-    from agents.control_loop import ControlLoop, ShieldSettings
     from agents.evaluation import evaluate
+    from agents.loop import ControlLoop, LoopConfig, ShieldSettings
     from agents.results import Episode, Evaluation, TrainingPoint, Trajectory
     from agents.sb3_vec_env import SB3VecEnv
     from agents.settings import A2CSettings, LagrangianSettings, OffPolicySettings, PPOSettings
@@ -31,6 +31,7 @@ __all__ = [
     "Evaluation",
     "EvaluationCallback",
     "LagrangianSettings",
+    "LoopConfig",
     "OffPolicySettings",
     "PPOSettings",
     "SB3VecEnv",
@@ -48,7 +49,7 @@ __all__ = [
 _MODULES = {
     "agent": ("Agent",),
     "callbacks": ("DualAscentCallback", "EvaluationCallback", "SafetyCallback"),
-    "control_loop": ("ControlLoop", "ShieldSettings"),
+    "loop": ("ControlLoop", "LoopConfig", "ShieldSettings"),
     "evaluation": ("evaluate",),
     "results": ("Episode", "Evaluation", "TrainingPoint", "Trajectory"),
     "sb3_vec_env": ("SB3VecEnv",),

@@ -16,12 +16,11 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.algorithms import ALGORITHMS, build_model
-from agents.control_loop import ControlLoop, ShieldSettings
-from agents.loop_wrappers import with_gain
+from agents.loop import LoopConfig, ShieldSettings, with_gain
 from agents.results import Evaluation
 from agents.sb3_vec_env import SB3VecEnv
 from agents.settings import AgentSettings
-from agents.sharing.agent_file import AgentError, channel_from_json, document_of, read_files, shield_from_json
+from agents.sharing.agent_file import AgentError, document_of, read_files, shield_from_json
 from agents.sharing.model_card import card_text
 from ncs_gym import Channel, LinearPlant
 from shields.atomic_write import write_atomically
@@ -211,9 +210,9 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
     if algorithm not in ALGORITHMS:
         raise AgentError(f"the agent is of an unknown algorithm, {algorithm!r}")
     settings = ALGORITHMS[algorithm][1](**content["settings"])
-    channel = channel_from_json(content["channel"])
+    loop = LoopConfig(env=env_id, kwargs={"channel": content["channel"]})
     shield_mode, horizon = shield_from_json(content.get("shield"))
-    model = build_model(algorithm, SB3VecEnv(ControlLoop(env=env_id, channel=channel).vector(1)), settings, seed=0)
+    model = build_model(algorithm, SB3VecEnv(loop.vector(1)), settings, seed=0)
     _, parameters, _ = load_from_zip_file(io.BytesIO(weights), load_data=False, device="cpu")
     model.set_parameters(parameters, exact_match=True, device="cpu")
     numbers = content["normalization"]
@@ -231,7 +230,7 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         algorithm=algorithm,
         settings=settings,
         env=env_id,
-        channel=channel,
+        channel=loop.channel,
         model=model,
         normalization=Normalization(mean, variance, float(numbers["epsilon"]), float(numbers["clip"])),
         residual_gain=gain,

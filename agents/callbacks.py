@@ -9,9 +9,8 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
-from agents.control_loop import ControlLoop
 from agents.evaluation import evaluate
-from agents.loop_wrappers import CostPenalty, with_gain
+from agents.loop import CostPenalty, LoopConfig, with_gain
 from agents.results import TrainingPoint
 from agents.sb3_vec_env import SB3VecEnv
 from agents.settings import LagrangianSettings
@@ -141,7 +140,7 @@ class EvaluationCallback(BaseCallback):
         episodes: Episodes of each evaluation, played side by side.
     """
 
-    def __init__(self, loop: ControlLoop, seed: int, episodes: int = 20) -> None:
+    def __init__(self, loop: LoopConfig, seed: int, episodes: int = 20) -> None:
         super().__init__()
         self._loop, self._seed, self._episodes = loop, seed, episodes
         self._due = 0

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.control_loop import ControlLoop
+from agents.loop import LoopConfig
 from agents.results import Episode, Evaluation, Trajectory
 from ncs_gym import NCSVectorEnv
 from ncs_gym.envs.env import ncs_env
@@ -23,7 +23,7 @@ Policy = Callable[[np.ndarray, dict[str, Any]], np.ndarray]
 
 
 def evaluate(
-    loop: ControlLoop,
+    loop: LoopConfig,
     policy: Policy,
     episodes: int,
     seed: int,
@@ -65,7 +65,7 @@ class _Rollout:
         level_matrix: M, shape (n, n), or None.
     """
 
-    def __init__(self, loop: ControlLoop, count: int, level_matrix: np.ndarray | None) -> None:
+    def __init__(self, loop: LoopConfig, count: int, level_matrix: np.ndarray | None) -> None:
         # Episodes that end early are stepped on without being counted: the others' random numbers stay the same.
         prototype = ncs_env(loop.single())
         self._terminates = prototype.terminate_on_violation

@@ -14,8 +14,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from agents.agent import Agent, Normalization
 from agents.algorithms import build_model, checked_settings
 from agents.callbacks import DualAscentCallback, EvaluationCallback, SafetyCallback
-from agents.control_loop import ControlLoop
-from agents.loop_wrappers import CostPenalty
+from agents.loop import CostPenalty, LoopConfig
 from agents.results import TrainingPoint
 from agents.sb3_vec_env import SB3VecEnv
 from agents.settings import AgentSettings, OffPolicySettings
@@ -41,7 +40,7 @@ class TrainingResult:
 
 
 def train(
-    loop: ControlLoop,
+    loop: LoopConfig,
     steps: int,
     seed: int,
     algorithm: str = "PPO",
@@ -89,16 +88,14 @@ def train(
     )
 
 
-def untrained(loop: ControlLoop, seed: int, algorithm: str = "PPO", settings: AgentSettings | None = None) -> Agent:
+def untrained(loop: LoopConfig, seed: int, algorithm: str = "PPO", settings: AgentSettings | None = None) -> Agent:
     """Returns an agent with the random weights that training starts from; arguments and errors as for `train`."""
     settings = checked_settings(algorithm, settings)
     env = VecNormalize(SB3VecEnv(loop.vector(1)), training=False)
     return _agent(loop, algorithm, settings, build_model(algorithm, env, settings, seed), env)
 
 
-def _agent(
-    loop: ControlLoop, algorithm: str, settings: AgentSettings, model: BaseAlgorithm, env: VecNormalize
-) -> Agent:
+def _agent(loop: LoopConfig, algorithm: str, settings: AgentSettings, model: BaseAlgorithm, env: VecNormalize) -> Agent:
     return Agent(
         algorithm=algorithm,
         settings=settings,

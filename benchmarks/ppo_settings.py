@@ -18,11 +18,11 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
-from agents import ControlLoop, PPOSettings, SB3VecEnv, evaluate
+from agents import LoopConfig, PPOSettings, SB3VecEnv, evaluate
 from agents.agent import Normalization
 from agents.algorithms import build_model
 
-CRUISE = ControlLoop(env="ncs_gym/TruckTrailerCruise-v0")
+CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
 # Whether the environments of an arm are scalar, and its settings; None stands for the defaults of stable-baselines3.
 ARMS = {
     "stable-baselines3, scalar": (True, None),

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import gymnasium as gym
 
+from agents.loop import LoopConfig, ShieldSettings
 from agents.settings import PPOSettings
 from experiments.backends import ray_backend, ray_cluster
 from experiments.backends.job import Job
@@ -74,16 +75,17 @@ def example(episodes: int) -> TrainingRun:
     """A small run that trains."""
     certificate = synthesize(ncs_env(gym.make(ENV)).plant)
     settings = PPOSettings(envs=4)
+    loop = LoopConfig(env=ENV, shield=ShieldSettings(certificate, "project"))
     return TrainingRun(
         arm="shielded",
         policy_kind="trained",
-        env=ENV,
+        training_loop=loop,
+        loop=loop,
         seed=0,
         index=0,
         steps=4096,
         episodes=episodes,
         certificate=certificate,
-        mode="project",
         algorithm="PPO",
         settings=settings,
     )

@@ -23,7 +23,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from agents import ControlLoop, PPOSettings, ShieldSettings, evaluate, train
+from agents import LoopConfig, PPOSettings, ShieldSettings, evaluate, train
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.registration import registered_ids
 from shields.runtime.wrapper import certificate_for
@@ -62,10 +62,10 @@ SPACE: dict[str, tuple[Any, ...]] = {
 }
 
 
-def shielded_loop(env_id: str) -> ControlLoop:
+def shielded_loop(env_id: str) -> LoopConfig:
     """The environment behind the shield of a synthesized certificate."""
     env = ncs_env(gym.make(env_id))
-    return ControlLoop(env=env_id, shield=ShieldSettings(certificate_for(env.plant, env.certificate_contract)))
+    return LoopConfig(env=env_id, shield=ShieldSettings(certificate_for(env.plant, env.certificate_contract)))
 
 
 def steps_of(env_id: str) -> int:
@@ -79,12 +79,12 @@ def seeds_of(experiment_seed: int, index: int) -> tuple[int, int]:
     return int(first >> 1), int(second >> 1)
 
 
-def mean_return(loop: ControlLoop, policy: Callable[..., np.ndarray], seed: int, episodes: int = EPISODES) -> float:
+def mean_return(loop: LoopConfig, policy: Callable[..., np.ndarray], seed: int, episodes: int = EPISODES) -> float:
     """Mean return of a policy over the episodes of a seed."""
     return float(np.mean([each.episode_return for each in evaluate(loop, policy, episodes, seed).episodes]))
 
 
-def trained_return(loop: ControlLoop, settings: PPOSettings, steps: int, experiment_seed: int, index: int) -> float:
+def trained_return(loop: LoopConfig, settings: PPOSettings, steps: int, experiment_seed: int, index: int) -> float:
     """Mean return of an agent after its training."""
     training_seed, evaluation_seed = seeds_of(experiment_seed, index)
     agent = train(loop, steps, training_seed, settings=settings).agent
@@ -112,7 +112,7 @@ class Results:
     def _key(entry: dict[str, Any]) -> str:
         return json.dumps({name: entry[name] for name in ("env", "settings", "steps", "run")}, sort_keys=True)
 
-    def of(self, loop: ControlLoop, settings: PPOSettings, steps: int, run: int) -> float:
+    def of(self, loop: LoopConfig, settings: PPOSettings, steps: int, run: int) -> float:
         """The return of a training, which is run unless it was before."""
         entry = {"env": loop.env, "settings": asdict(settings), "steps": steps, "run": run}
         if (key := self._key(entry)) not in self._known:

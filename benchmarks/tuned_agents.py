@@ -21,7 +21,7 @@ import numpy as np
 from linear_controllers import LinearController, linear_controllers
 from tune_agents import EPISODES, SEARCH_SEED, mean_return, seeds_of, shielded_loop
 
-from agents import ControlLoop, PPOSettings, train, tuned_settings, tuned_steps
+from agents import LoopConfig, PPOSettings, train, tuned_settings, tuned_steps
 from experiments.analysis.statistics import mean_interval
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.registration import registered_ids
@@ -37,14 +37,14 @@ def random_actions(inputs: int, seed: int) -> Policy:
     return lambda observations, infos: rng.uniform(-1.0, 1.0, (len(observations), inputs))
 
 
-def best_linear(loop: ControlLoop) -> LinearController:
+def best_linear(loop: LoopConfig) -> LinearController:
     """The best linear controller on the first evaluation seed of the search."""
     env, seed = ncs_env(gym.make(loop.env)), seeds_of(SEARCH_SEED, 0)[1]
     candidates = linear_controllers(env.plant, env.task)
     return max(candidates, key=lambda each: mean_return(loop, each.policy(env.plant), seed))
 
 
-def policies(loop: ControlLoop, with_defaults: bool) -> dict[str, Callable[[int], Policy]]:
+def policies(loop: LoopConfig, with_defaults: bool) -> dict[str, Callable[[int], Policy]]:
     """What makes the policy of a seed, by name."""
     env, linear = ncs_env(gym.make(loop.env)), best_linear(loop)
     plant, entries = env.plant, env.observation_space.shape[0] - env.plant.n
@@ -57,7 +57,7 @@ def policies(loop: ControlLoop, with_defaults: bool) -> dict[str, Callable[[int]
     return found | {each.name: lambda seed, each=each: each.policy(plant) for each in (certified, linear)}
 
 
-def trained(loop: ControlLoop, settings: PPOSettings, steps: int, seed: int) -> Policy:
+def trained(loop: LoopConfig, settings: PPOSettings, steps: int, seed: int) -> Policy:
     """An agent after its training."""
     agent = train(loop, steps, seed, settings=settings).agent
     return lambda observations, infos: agent.act(observations)

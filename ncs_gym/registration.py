@@ -126,7 +126,7 @@ class Factory:
         for name, value in given.items():
             if name in kinds or name == "terminate_on_violation":
                 if value is not None:
-                    own[name] = _from_json(value, kinds[name], name) if name in kinds else value
+                    own[name] = from_json(value, kinds[name], name) if name in kinds else value
             else:
                 own[name] = value
         return own
@@ -147,7 +147,7 @@ class Factory:
         return self.box
 
 
-def _from_json(value: Any, kinds: tuple[type, ...], name: str) -> Any:
+def from_json(value: Any, kinds: tuple[type, ...], name: str) -> Any:
     """Returns the object whose fields a dictionary holds; a value that is no dictionary as it is.
 
     Args:

@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from agents.control_loop import ControlLoop
+from agents.loop import LoopConfig
 from agents.settings import PPOSettings
 from agents.training import train
 from ncs_gym import Channel, ChannelContract, GilbertElliott, LinearPlant
@@ -81,7 +81,7 @@ def synthesized() -> dict[str, str]:
 def trained(seed: int, steps: int) -> dict[str, str]:
     """Every weight of an agent."""
     settings = PPOSettings(envs=4, rollout=32, batch_size=64, epochs=2)
-    model = train(ControlLoop(env=f"ncs_gym/{IDS[1]}"), steps, seed, settings=settings).agent.model
+    model = train(LoopConfig(env=f"ncs_gym/{IDS[1]}"), steps, seed, settings=settings).agent.model
     weights = {name: value.detach().numpy() for name, value in model.policy.state_dict().items()}
     return {"PPO": digest_of(weights)}
 

@@ -38,8 +38,8 @@ LAYERS = {
         {"runtime", "downlink"},
     ),
     "agents": (
-        {"settings", "results", "sb3_vec_env", "loop_wrappers"},
-        {"control_loop"},
+        {"settings", "results", "sb3_vec_env"},
+        {"loop"},
         {"algorithms", "callbacks", "evaluation", "sharing", "tuned"},
         {"agent"},
         {"training"},

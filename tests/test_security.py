@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from agents.agent import Agent
-from agents.control_loop import ControlLoop
+from agents.loop import LoopConfig
 from agents.sharing.agent_file import AgentError, digest
 from agents.training import untrained
 from experiments.__main__ import _parse
@@ -158,7 +158,7 @@ def test_settings_files_name_no_module():
 
 
 def test_agents_of_others_import_no_module(evil):
-    untrained(ControlLoop(env="ncs_gym/TruckTrailer-v0"), seed=0).save(evil)
+    untrained(LoopConfig(env="ncs_gym/TruckTrailer-v0"), seed=0).save(evil)
     document = json.loads((evil / "agent.json").read_text())
     document["agent"]["env"] = "evil:Evil-v0"
     document["sha256"] = digest(document["agent"])
@@ -221,7 +221,7 @@ def test_texts_in_files_mean_nothing_to_a_terminal(tmp_path):
 @pytest.fixture
 def agent(tmp_path):
     """The folder of an agent."""
-    untrained(ControlLoop(env="ncs_gym/TruckTrailer-v0"), seed=0).save(tmp_path / "a" / "agent")
+    untrained(LoopConfig(env="ncs_gym/TruckTrailer-v0"), seed=0).save(tmp_path / "a" / "agent")
     return tmp_path / "a" / "agent"
 
 

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from ncs_gym import Channel, GilbertElliott
 from ncs_gym.validation import shown
 from shields.atomic_write import write_atomically
 from shields.runtime.safety_filter import LONGEST_HORIZON, MODES
@@ -83,15 +82,6 @@ def read_files(folder: str | Path) -> tuple[Path, dict[str, Any], bytes]:
     if hashlib.sha256(weights).hexdigest() != content.get("sha256_of_model"):
         raise AgentError(f"{folder / 'model.zip'} was altered: its checksum does not match")
     return folder, content, weights
-
-
-def channel_from_json(content: dict[str, Any] | None) -> Channel | None:
-    """Returns the channel whose `dataclasses.asdict` is `content`."""
-    if content is None:
-        return None
-    loss = content["loss"]
-    settings: dict[str, Any] = content | {"loss": GilbertElliott(**loss) if isinstance(loss, dict) else loss}
-    return Channel(**settings)
 
 
 def shield_from_json(content: dict[str, Any] | None) -> tuple[str | None, int | None]:

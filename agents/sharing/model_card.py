@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from agents.control_loop import ShieldSettings
+from agents.loop import ShieldSettings
 from agents.results import Evaluation
 from agents.settings import AgentSettings
 from ncs_gym import Channel
@@ -19,10 +19,10 @@ The weights are in `model.zip`, everything else in `agent.json`. Nothing is unpi
 forgery.
 
 ```python
-from agents import Agent, ControlLoop{imports}
+from agents import Agent, LoopConfig{imports}
 
 agent = Agent.load(".")
-loop = ControlLoop(env=agent.env, channel=agent.channel{shield})
+loop = LoopConfig(env=agent.env, kwargs={{"channel": agent.channel}}{shield})
 ```
 """
 

@@ -4,6 +4,6 @@ None of them comes with a proof under estimation errors, so none reports `shield
 """
 
 from experiments.baselines.controllers import CONTROLLERS, controller
-from experiments.baselines.estimate_filter import FILTERS, EstimateFilter, filtered
+from experiments.baselines.estimate_filter import FILTERS, EstimateFilter, EstimateFilterSettings
 
-__all__ = ["CONTROLLERS", "FILTERS", "EstimateFilter", "controller", "filtered"]
+__all__ = ["CONTROLLERS", "FILTERS", "EstimateFilter", "EstimateFilterSettings", "controller"]

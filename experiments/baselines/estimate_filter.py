@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -77,17 +78,32 @@ class EstimateFilter(VectorWrapper):
         return observation, rewards - self.penalty * intervened, terminated, truncated, info
 
 
-def filtered(
-    env: VectorEnv, name: str, certificate: Certificate, penalty: float = 0.0, horizon: int | None = None
-) -> EstimateFilter:
-    """Returns a vector environment behind the filter of a name in `FILTERS`; "trusting:lookahead" takes a horizon.
+@dataclass(frozen=True)
+class EstimateFilterSettings:
+    """Settings of a filter around a vector environment, which calling it puts there (`LoopConfig.filter`).
 
-    Raises:
-        ValueError: If its innermost environment is not an `NCSVectorEnv`.
-        CertificateError: If the certificate does not verify for the environment's plant.
+    Attributes:
+        name: A name in `FILTERS`.
+        certificate: Certificate of the safe set; it is verified when the filter is built.
+        penalty: Subtracted from the reward per intervention.
+        horizon: Longest plan [steps], for a filter that plans; None for its default.
     """
-    given = {} if horizon is None else {"horizon": horizon}
-    return EstimateFilter(env, FILTERS[name](certificate, _environment_behind(env).plant, **given), penalty)
+
+    name: str
+    certificate: Certificate
+    penalty: float = 0.0
+    horizon: int | None = None
+
+    def __call__(self, env: VectorEnv) -> EstimateFilter:
+        """Returns the environment behind the filter.
+
+        Raises:
+            ValueError: If its innermost environment is not an `NCSVectorEnv`.
+            CertificateError: If the certificate does not verify for the environment's plant.
+        """
+        given = {} if self.horizon is None else {"horizon": self.horizon}
+        rule = FILTERS[self.name](self.certificate, _environment_behind(env).plant, **given)
+        return EstimateFilter(env, rule, self.penalty)
 
 
 def _environment_behind(env: VectorEnv) -> NCSVectorEnv:

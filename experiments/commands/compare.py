@@ -10,7 +10,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from agents.control_loop import ControlLoop
+from agents.loop import LoopConfig
 from experiments.analysis.arm_table import condition_text, decimals_of, summary_text
 from experiments.analysis.escapes import escape_sentences, escape_summary
 from experiments.analysis.parquet_tables import write_tables
@@ -22,18 +22,22 @@ from experiments.plots.comparison_figures import comparison_figures
 from experiments.report import comparison_report
 from experiments.runs import (
     Arm,
-    ExperimentSetup,
     RunResult,
     TrainingRun,
     by_arm,
+    certificate_of,
     claim_folder,
+    experiment_provenance,
+    loop_config,
     prepare_output,
+    run_of_arm,
 )
 from experiments.runs.arms import is_shield
+from experiments.runs.experiment import certificate_line
 from experiments.settings import CompareSettings
 from ncs_gym import escape_probability
 from ncs_gym.envs.env import ncs_env
-from shields import SafetyFilter
+from shields import Certificate, SafetyFilter, verify
 from shields.atomic_write import write_atomically
 from shields.runtime.starts import starts_known
 
@@ -55,23 +59,29 @@ def compare(settings: CompareSettings) -> None:
         ClusterError: If a cluster cannot execute the runs.
     """
     settings = _with_full_names(short_version(settings, **_SMOKE))
-    setup = ExperimentSetup.of(settings.env, settings.channel, settings.certificate, settings.noise)
+    loop = loop_config(settings.env, settings.channel, noise=settings.noise)
+    certificate = certificate_of(loop, settings.certificate)
     with claim_folder("compare", settings.completed):
-        _compare_in_folder(settings, setup)
+        _compare_in_folder(settings, loop, certificate)
 
 
-def _compare_in_folder(settings: CompareSettings, setup: ExperimentSetup) -> None:
+def _compare_in_folder(settings: CompareSettings, loop: LoopConfig, certificate: Certificate) -> None:
     """Executes what is missing, prints the table and writes the files."""
     prepare_output(settings.out)
-    print(wrapped(setup.title), wrapped(settings.agent_line), sep="\n", flush=True)
+    plant = ncs_env(loop.single()).plant
+    verification = verify(certificate, plant)
+    print(wrapped(certificate_line(certificate, verification)), wrapped(settings.agent_line), sep="\n", flush=True)
     settings = settings.completed
-    runs = _training_runs(settings, setup)
+    runs = _training_runs(settings, loop, certificate)
     results = results_of(runs, settings.out, settings)
-    summary = _summary(settings, setup, runs, results)
+    summary = _summary(settings, loop, certificate, runs, results)
     findings = _findings(summary)
     if "gaussian_noise" in summary:
         findings += escape_sentences(summary["gaussian_noise"])
-    _write(settings.out, summary, results, setup, findings)
+    figures = comparison_figures(plant, certificate, summary, by_arm(results))
+    certificate.save(settings.out / "certificate.json")
+    page = comparison_report(summary, verification, dict(figures.values()), findings)
+    _write(settings.out, summary, results, figures, page)
     count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
     trained = max(arm["train_steps"] for arm in summary["arms"].values())
     print(f"\n{settings.env}: {count} and {trained:,} training steps per arm, {settings.episodes} episodes per run\n")
@@ -102,24 +112,31 @@ def _tables(summary: dict[str, Any]) -> str:
     return "\n\n".join([summary_text(arms, references), *others])
 
 
-def _training_runs(settings: CompareSettings, setup: ExperimentSetup) -> list[TrainingRun]:
+def _training_runs(settings: CompareSettings, loop: LoopConfig, certificate: Certificate) -> list[TrainingRun]:
     """Returns the runs of every arm and of the reference policies, those that train first because they take longer."""
     names = settings.arms + settings.references
-    runs = [setup.training_run(settings, name, index) for index in range(settings.seeds) for name in names]
+    runs = [run_of_arm(settings, loop, certificate, name, index) for index in range(settings.seeds) for name in names]
     return sorted(runs, key=lambda run: run.policy_kind != "trained")
 
 
 def _summary(
-    settings: CompareSettings, setup: ExperimentSetup, runs: Sequence[TrainingRun], results: Sequence[RunResult]
+    settings: CompareSettings,
+    loop: LoopConfig,
+    certificate: Certificate,
+    runs: Sequence[TrainingRun],
+    results: Sequence[RunResult],
 ) -> dict[str, Any]:
     """Returns the content of summary.json."""
-    results_by_arm, modes = by_arm(results), {run.arm: run.mode for run in runs}
+    results_by_arm = by_arm(results)
+    modes = {name: Arm.of(name, settings.mode).mode for name in results_by_arm}
 
     def arm(name: str) -> dict[str, Any]:
         fixed = Arm.of(name).policy not in ("trained", "untrained")
         return arm_summary(results_by_arm[name], modes[name], fixed_policy=fixed)
 
-    gaussian = {"gaussian_noise": _escapes(setup, modes, results_by_arm)} if settings.noise == "gaussian" else {}
+    gaussian = {}
+    if settings.noise == "gaussian":
+        gaussian["gaussian_noise"] = _escapes(loop, certificate, modes, results_by_arm)
     baseline = "unshielded" if "unshielded" in settings.arms else settings.arms[0]
     return {
         "arms": {name: arm(name) for name in settings.arms},
@@ -130,11 +147,14 @@ def _summary(
         },
         "units": {run.name: run.key for run in runs},
         "seeds": {run.index: {"training": run.training_seed, "evaluation": run.evaluation_seed} for run in runs},
-    } | (gaussian | setup.provenance("compare", settings))
+    } | (gaussian | experiment_provenance("compare", settings, loop, certificate))
 
 
 def _escapes(
-    setup: ExperimentSetup, modes: dict[str, str | None], results_by_arm: Mapping[str, Sequence[RunResult]]
+    loop: LoopConfig,
+    certificate: Certificate,
+    modes: dict[str, str | None],
+    results_by_arm: Mapping[str, Sequence[RunResult]],
 ) -> dict[str, Any]:
     """Returns the bound on the probability that an episode leaves the safe set, and how often shielded arms did.
 
@@ -142,11 +162,11 @@ def _escapes(
     takes effect; where not all do, it is 1. Mode "lookahead" may leave that
     set on purpose and is not listed.
     """
-    env = ncs_env(ControlLoop(env=setup.env, channel=setup.channel, noise=setup.noise).single())
-    steps = gym.spec(setup.env).max_episode_steps or 1
+    env = ncs_env(loop.single())
+    steps = gym.spec(loop.env).max_episode_steps or 1
     protocol = env.downlink_protocol
     lead, is_promised = (0, True) if protocol is None else (protocol.lead, protocol.contract is not None)
-    known = starts_known(SafetyFilter(setup.certificate, env.plant), env.initial_set, lead)
+    known = starts_known(SafetyFilter(certificate, env.plant), env.initial_set, lead)
     begins_inside = is_promised and all(each.in_safe_set for each in known)
     bound = escape_probability(env.plant, env.channel, steps) if begins_inside else 1.0
     shielded = [name for name, mode in modes.items() if is_shield(mode) and mode != "lookahead"]
@@ -196,15 +216,12 @@ def _findings(summary: dict[str, Any]) -> list[str]:
 
 
 def _write(
-    out: Path, summary: dict[str, Any], results: Sequence[RunResult], setup: ExperimentSetup, findings: list[str]
+    out: Path, summary: dict[str, Any], results: Sequence[RunResult], figures: dict[str, tuple[str, bytes]], page: str
 ) -> None:
-    """Writes every file; summary.json comes last, so that it stands for a complete experiment."""
-    figures = comparison_figures(setup.plant, setup.certificate, summary, by_arm(results))
+    """Writes tables, figures and report; summary.json comes last, so that it stands for a complete experiment."""
     for name, (_, png) in figures.items():
         write_atomically(out / "figures" / f"{name}.png", png)
-    setup.certificate.save(out / "certificate.json")
     names = ("settings", "seeds", "plant", "certificate", "certificate_file", "versions")
     write_tables(out, results, {name: summary[name] for name in names})
-    page = comparison_report(summary, setup.verification, dict(figures.values()), findings)
     write_atomically(out / "report.html", page)
     write_atomically(out / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")

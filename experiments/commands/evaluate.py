@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from agents import evaluation
-from agents.control_loop import ControlLoop, ShieldSettings
+from agents.loop import LoopConfig, ShieldSettings
 from experiments.analysis.arm_table import summary_text
 from experiments.analysis.summary import arm_summary
 from experiments.commands import short_version
-from experiments.runs import ExperimentSetup, RunResult, require_place, versions
+from experiments.runs import RunResult, certificate_of, require_place, versions
 from experiments.runs.environments import module_and_id, registered_env
 from experiments.runs.policies import agent_folder, certificate_file
-from experiments.settings import EvaluateSettings
+from experiments.settings import EvaluateSettings, changed_channel
 from experiments.settings.steps import require_horizon
 from ncs_gym.envs.env import ncs_env
 from shields.atomic_write import write_atomically
@@ -40,19 +40,20 @@ def evaluate(settings: EvaluateSettings) -> None:
     settings = short_version(settings, **_SMOKE)
     require_place(settings.out)
     folder = agent_folder(settings.model)
-    agent, env_id = _agent_and_env(folder, settings.env)
-    own = ncs_env(ControlLoop(env=agent.env, channel=agent.channel).single()).channel
-    channel = settings.channel.applied_to(own) or agent.channel
+    agent = _agent(folder, settings.env)
+    loop = LoopConfig(env=agent.env, kwargs={"channel": agent.channel})
+    if (changed := changed_channel(ncs_env(loop.single()).channel, settings.channel)) is not None:
+        loop = loop.with_kwargs(channel=changed)
     mode = _mode(settings, agent)
     horizon = (settings.horizon or agent.horizon) if mode == "lookahead" else None
-    setup = ExperimentSetup.of(env_id, channel, settings.certificate or certificate_file(folder))
-    shield = None if mode is None else ShieldSettings(setup.certificate, mode, horizon=horizon)
+    certificate = certificate_of(loop, settings.certificate or certificate_file(folder))
+    shield = None if mode is None else ShieldSettings(certificate, mode, horizon=horizon)
     evaluated = evaluation.evaluate(
-        ControlLoop(env=agent.env, channel=channel, shield=shield),
+        replace(loop, shield=shield),
         lambda observations, infos: agent.act(observations),
         settings.episodes,
         settings.seed,
-        setup.certificate.M,
+        certificate.M,
     )
     shield_name = mode or "none"
     result = RunResult(shield_name, 0, 0, 0, 0, [], evaluated.episodes, evaluated.trajectory, {})
@@ -63,20 +64,20 @@ def evaluate(settings: EvaluateSettings) -> None:
         content = {
             "arms": arms,
             "env": agent.env,
-            "channel": asdict(channel) if channel else None,
+            "channel": loop.channel and asdict(loop.channel),
             "horizon": shield and shield.horizon,
             "episodes": settings.episodes,
             "seed": settings.seed,
             "model": {"folder": str(folder), "sha256": agent.checksum},
-            "plant": setup.plant.fingerprint,
-            "certificate": setup.certificate.checksum,
+            "plant": ncs_env(loop.single()).plant.fingerprint,
+            "certificate": certificate.checksum,
             "versions": versions(),
         }
         write_atomically(settings.out, json.dumps(content, indent=1) + "\n")
 
 
-def _agent_and_env(folder: Path, env_id: str | None) -> tuple[Agent, str]:
-    """Returns the agent in a folder, and the id of the environment that it acts in.
+def _agent(folder: Path, env_id: str | None) -> Agent:
+    """Returns the agent in a folder.
 
     Args:
         folder: The agent's folder.
@@ -91,10 +92,11 @@ def _agent_and_env(folder: Path, env_id: str | None) -> tuple[Agent, str]:
     if env_id is not None:
         registered_env(env_id)
     agent = Agent.load(folder)
-    env_id = env_id or agent.env
-    if module_and_id(env_id)[1] != agent.env:
+    if env_id is None:
+        registered_env(agent.env)
+    elif module_and_id(env_id)[1] != agent.env:
         raise ValueError(f"the agent in {folder} was trained in {agent.env}, not in {env_id}")
-    return agent, env_id
+    return agent
 
 
 def _mode(settings: EvaluateSettings, agent: Agent) -> str | None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
 
+from agents.loop import LoopConfig
 from experiments.analysis.parquet_tables import parquet
 from experiments.analysis.summary import summarize_arm
 from experiments.analysis.sweep_table import sweep_table
@@ -17,8 +18,20 @@ from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.plots.heatmaps import sweep_figures
 from experiments.report import sweep_report
-from experiments.runs import Arm, ExperimentSetup, RunResult, by_arm, claim_folder, prepare_output
-from experiments.settings import ChannelSettings, SweepSettings
+from experiments.runs import (
+    Arm,
+    RunResult,
+    by_arm,
+    certificate_of,
+    claim_folder,
+    experiment_provenance,
+    loop_config,
+    prepare_output,
+    run_of_arm,
+)
+from experiments.settings import Assignments, SweepSettings
+from ncs_gym.envs.env import ncs_env
+from shields import Certificate, Report, verify
 from shields.atomic_write import write_atomically
 
 # Budget of `--smoke`, and the sides of the grid of which it takes the first and the last value.
@@ -54,11 +67,19 @@ class _GridPoint:
         downlink = "" if self.downlink_loss is None else f"-down{self.downlink_loss}"
         return f"loss{self.loss}-delay{self.delay}{quantization}-burst{self.burst_length}{mass}{downlink}"
 
-    def channel(self, base: ChannelSettings) -> ChannelSettings:
+    def channel(self, base: Assignments) -> Assignments:
         """Returns the changes of the environment's channel that make this point's channel."""
-        bursts = None if self.burst_length == 0.0 or self.loss == 0.0 else self.burst_length
-        quantization = base.quantization_step if self.quantization_step is None else self.quantization_step
-        return replace(base, loss=self.loss, delay=self.delay, quantization_step=quantization, burst_length=bursts)
+        changes = base | {"loss": self.loss, "delay": self.delay}
+        if self.quantization_step is not None:
+            changes["quantization_step"] = self.quantization_step
+        if self.burst_length != 0.0 and self.loss != 0.0:
+            changes["burst_length"] = self.burst_length
+        return changes
+
+    def loop(self, settings: SweepSettings) -> LoopConfig:
+        """Returns the control loop with the channels and the mass of this point."""
+        channel = self.channel(settings.channel)
+        return loop_config(settings.env, channel, mass_factor=self.mass_factor, downlink_loss=self.downlink_loss)
 
 
 def sweep(settings: SweepSettings) -> None:
@@ -78,23 +99,29 @@ def sweep(settings: SweepSettings) -> None:
     settings = short_version(settings, **_SMOKE, **ends)
     points = _grid_points(settings)
     for name in ("loss", "delay", "burst_length"):
-        if getattr(settings.channel, name) is not None:
-            raise ValueError(f"--channel.{name.replace('_', '-')} is a side of the grid: give its values there")
+        if settings.channel.get(name) is not None:
+            raise ValueError(f"--channel {name} is a side of the grid: give its values there")
     for name in settings.arms:
         Arm.of(name, settings.mode)
-    setups = [_setup(settings, each) for each in points]
+    loops = [point.loop(settings) for point in points]
+    certificates = [certificate_of(loop, settings.certificate) for loop in loops]
     with claim_folder("sweep", settings.completed):
-        _sweep_in_folder(settings, points, setups)
+        _sweep_in_folder(settings, points, loops, certificates)
 
 
-def _sweep_in_folder(settings: SweepSettings, points: Sequence[_GridPoint], setups: Sequence[ExperimentSetup]) -> None:
+def _sweep_in_folder(
+    settings: SweepSettings,
+    points: Sequence[_GridPoint],
+    loops: Sequence[LoopConfig],
+    certificates: Sequence[Certificate],
+) -> None:
     """Executes what is missing, prints the table and writes the files."""
     prepare_output(settings.out)
     print(wrapped(settings.agent_line), flush=True)
     settings = settings.completed
     runs = [
-        setup.training_run(settings, name, index, grid_point=point.name)
-        for point, setup in zip(points, setups, strict=True)
+        run_of_arm(settings, loop, certificate, name, index, grid_point=point.name)
+        for point, loop, certificate in zip(points, loops, certificates, strict=True)
         for index in range(settings.seeds)
         for name in settings.arms
     ]
@@ -105,23 +132,15 @@ def _sweep_in_folder(settings: SweepSettings, points: Sequence[_GridPoint], setu
         "cells": [asdict(point) | {"arms": _arms(part)} for point, part in zip(points, parts, strict=True)],
         "units": {run.name: run.key for run in runs},
         "seeds": {run.index: {"training": run.training_seed, "evaluation": run.evaluation_seed} for run in runs},
-    } | setups[0].provenance("sweep", settings)
+    }
+    origin = experiment_provenance("sweep", settings, loops[0], certificates[0])
     rows = [row for point, part in zip(points, parts, strict=True) for row in _rows(point, part)]
-    _write(settings, summary, rows, setups[0])
+    certificates[0].save(settings.out / "certificate.json")
+    write_atomically(settings.out / "sweep.parquet", parquet(rows, origin))
+    _write(settings, summary | origin, verify(certificates[0], ncs_env(loops[0].single()).plant))
     count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
     print(f"{settings.env}: {count} per arm and channel\n", sweep_table(summary["cells"]), sep="\n")
     print(f"files: {settings.out}")
-
-
-def _setup(settings: SweepSettings, point: _GridPoint) -> ExperimentSetup:
-    """Returns the environment with the channels of a point, and a certificate for it."""
-    return ExperimentSetup.of(
-        settings.env,
-        point.channel(settings.channel),
-        settings.certificate,
-        mass_factor=point.mass_factor,
-        downlink_loss=point.downlink_loss,
-    )
 
 
 def _grid_points(settings: SweepSettings) -> list[_GridPoint]:
@@ -146,15 +165,13 @@ def _grid_points(settings: SweepSettings) -> list[_GridPoint]:
     return [_GridPoint(*point) for point in product(*sides.values())]
 
 
-def _write(settings: SweepSettings, summary: dict[str, Any], rows: list[dict], setup: ExperimentSetup) -> None:
-    """Writes every file; summary.json comes last, so that it stands for a complete experiment."""
+def _write(settings: SweepSettings, summary: dict[str, Any], verification: Report) -> None:
+    """Writes figures and report; summary.json comes last, so that it stands for a complete experiment."""
     out: Path = settings.out
     figures = sweep_figures(summary, settings.arms)
     for name, (_, png) in figures.items():
         write_atomically(out / "figures" / f"{name}.png", png)
-    setup.certificate.save(out / "certificate.json")
-    write_atomically(out / "sweep.parquet", parquet(rows, setup.provenance("sweep", settings)))
-    write_atomically(out / "report.html", sweep_report(summary, setup.verification, dict(figures.values())))
+    write_atomically(out / "report.html", sweep_report(summary, verification, dict(figures.values())))
     write_atomically(out / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
 
 

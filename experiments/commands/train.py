@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import json
 
+from agents.loop import LoopConfig
 from experiments.analysis.arm_table import summary_text
 from experiments.analysis.summary import arm_summary
 from experiments.analysis.terminal_text import wrapped
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
-from experiments.runs import Arm, ExperimentSetup, RunResult, claim_folder, prepare_output
+from experiments.runs import (
+    Arm,
+    RunResult,
+    certificate_of,
+    claim_folder,
+    experiment_provenance,
+    loop_config,
+    prepare_output,
+    run_of_arm,
+)
 from experiments.settings import BackendSettings, TrainSettings
+from shields import Certificate
 from shields.atomic_write import write_atomically
 
 # Budget of `--smoke`.
@@ -31,21 +42,22 @@ def train(settings: TrainSettings) -> None:
     """
     settings = short_version(settings, **_SMOKE)
     Arm.of(settings.arm, settings.mode)
-    setup = ExperimentSetup.of(settings.env, settings.channel, settings.certificate)
+    loop = loop_config(settings.env, settings.channel)
+    certificate = certificate_of(loop, settings.certificate)
     with claim_folder("train", settings.completed):
-        _train_in_folder(settings, setup)
+        _train_in_folder(settings, loop, certificate)
 
 
-def _train_in_folder(settings: TrainSettings, setup: ExperimentSetup) -> None:
+def _train_in_folder(settings: TrainSettings, loop: LoopConfig, certificate: Certificate) -> None:
     """Trains and evaluates, prints the table and writes the files."""
     prepare_output(settings.out)
     print(wrapped(settings.agent_line), flush=True)
     settings = settings.completed
-    run = setup.training_run(settings, settings.arm, 0)
+    run = run_of_arm(settings, loop, certificate, settings.arm, 0)
     results = results_of([run], settings.out, BackendSettings(jobs=1))
-    arms = {settings.arm: arm_summary(results, run.mode, fixed_policy=True)}
-    setup.certificate.save(settings.out / "certificate.json")
-    content = {"arms": arms} | setup.provenance("train", settings)
+    arms = {settings.arm: arm_summary(results, Arm.of(settings.arm, settings.mode).mode, fixed_policy=True)}
+    certificate.save(settings.out / "certificate.json")
+    content = {"arms": arms} | experiment_provenance("train", settings, loop, certificate)
     write_atomically(settings.out / "summary.json", json.dumps(content, indent=1) + "\n")
     print(f"{results[0].train_steps:,} training steps, {settings.episodes:,} episodes\n")
     print(summary_text(arms, {}), *_hints(results[0], is_smoke=settings.smoke), sep="\n")

@@ -1,7 +1,7 @@
-"""The unit of work: a training run, the setup it takes place in, and the store of finished results."""
+"""The unit of work: a training run, the control loop it takes place in, and the store of finished results."""
 
 from experiments.runs.arms import Arm, by_arm
-from experiments.runs.experiment_setup import ExperimentSetup
+from experiments.runs.experiment import certificate_of, experiment_provenance, loop_config, run_of_arm
 from experiments.runs.output_folder import claim_folder, require_place
 from experiments.runs.provenance import versions
 from experiments.runs.run_store import RunStore, prepare_output
@@ -9,14 +9,17 @@ from experiments.runs.training_run import RunResult, TrainingRun, execute_run
 
 __all__ = [
     "Arm",
-    "ExperimentSetup",
     "RunResult",
     "RunStore",
     "TrainingRun",
     "by_arm",
+    "certificate_of",
     "claim_folder",
     "execute_run",
+    "experiment_provenance",
+    "loop_config",
     "prepare_output",
     "require_place",
+    "run_of_arm",
     "versions",
 ]

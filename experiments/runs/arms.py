@@ -1,16 +1,23 @@
-"""The arms of a comparison by name."""
+"""The arms of a comparison: one table of names, and what each makes of a control loop."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
-from experiments.baselines import CONTROLLERS, FILTERS
+from agents.loop import LoopConfig, ShieldSettings
+from experiments.baselines import CONTROLLERS, FILTERS, EstimateFilterSettings
 from experiments.runs.training_run import PolicyKind, RunResult
+from experiments.settings import LearningSettings
+from ncs_gym.envs.env import ncs_env
+from shields import Certificate
 from shields.runtime.safety_filter import MODES
 
 _SHIELD_MODES = tuple(mode for mode in MODES if mode != "monitor")
-PENALTY_SUFFIX, RESIDUAL_SUFFIX, TEST_SUFFIX = "+penalty", "+residual", " at test"
+# Modes whose filter plans ahead.
+_PLANNING = ("lookahead", "trusting:lookahead")
+_PENALIZED, _RESIDUAL = "penalized", "+residual"
 _KNOWN_ARMS = (
     "unshielded, monitor, penalized, penalized:WEIGHT, lagrangian, FILTER, 'FILTER at test', FILTER+penalty, each also "
     "with +residual; CONTROLLER and CONTROLLER+FILTER, with FILTER one of shielded, shielded:MODE, "
@@ -29,9 +36,9 @@ class Arm:
     Attributes:
         name: Name of the arm.
         mode: Mode of the shield, or name of another filter in `FILTERS`; None for neither.
+        policy: What acts: "trained" for a trained agent.
         penalizes_interventions: Whether the training reward is reduced per intervention.
         penalizes_violations: Whether the training reward is reduced per violating step.
-        policy: What acts: "trained" for a trained agent.
         violation_weight: Price of a violating step; None for that of the settings.
         adapts_penalty: Whether that price is adapted during training.
         filters_training: Whether shield or filter act in training too.
@@ -39,10 +46,10 @@ class Arm:
     """
 
     name: str
-    mode: str | None
+    mode: str | None = None
+    policy: PolicyKind = "trained"
     penalizes_interventions: bool = False
     penalizes_violations: bool = False
-    policy: PolicyKind = "trained"
     violation_weight: float | None = None
     adapts_penalty: bool = False
     filters_training: bool = True
@@ -59,16 +66,15 @@ class Arm:
         Raises:
             ValueError: If the name is unknown.
         """
-        spaced = name
-        for words in (TEST_SUFFIX, *CONTROLLERS):
-            spaced = spaced.replace(words.replace(" ", "-"), words)
-        kind = spaced.removesuffix(RESIDUAL_SUFFIX)
-        found = _controller(kind, mode) if kind == spaced else None
-        found = found or _trained(kind, mode)
-        if found is None:
-            hint = " (several are separated by spaces)" if "," in name else ""
-            raise ValueError(f"unknown arm {name!r}{hint}; known are {_KNOWN_ARMS}")
-        return replace(found, name=spaced, is_residual=kind != spaced)
+        known, kind = _arms(mode), name.replace(" ", "-")
+        if kind in known:
+            return known[kind]
+        kind, colon, weight = kind.removesuffix(_RESIDUAL).partition(":")
+        if kind == _PENALIZED and colon and _is_weight(weight):
+            kind += _RESIDUAL if name.endswith(_RESIDUAL) else ""
+            return replace(known[kind], name=name, violation_weight=float(weight))
+        hint = " (several are separated by spaces)" if "," in name else ""
+        raise ValueError(f"unknown arm {name!r}{hint}; known are {_KNOWN_ARMS}")
 
     @property
     def is_shielded(self) -> bool:
@@ -79,6 +85,38 @@ class Arm:
     def is_trained(self) -> bool:
         """Whether an agent is trained."""
         return self.policy == "trained"
+
+    def loops(
+        self, loop: LoopConfig, certificate: Certificate, settings: LearningSettings
+    ) -> tuple[LoopConfig, LoopConfig]:
+        """Returns the control loop that the arm's policies are trained in, and the one that they are evaluated in.
+
+        Args:
+            loop: The bare control loop.
+            certificate: Certificate of the shield or filter, which also gives the gain of residual agents.
+            settings: Horizon and penalties.
+        """
+        horizon = settings.horizon if self.mode in _PLANNING else None
+
+        def filtered(penalty: float = 0.0) -> LoopConfig:
+            if self.mode is None:
+                return loop
+            if self.mode in FILTERS:
+                return replace(loop, filter=EstimateFilterSettings(self.mode, certificate, penalty, horizon))
+            return replace(loop, shield=ShieldSettings(certificate, self.mode, penalty, horizon))
+
+        training = filtered(settings.intervention_penalty * self.penalizes_interventions)
+        if not self.filters_training:
+            training = loop
+        if self.adapts_penalty:
+            training = replace(training, lagrangian=settings.lagrangian)
+        elif self.penalizes_violations:
+            given = self.violation_weight
+            training = replace(training, violation_penalty=settings.violation_penalty if given is None else given)
+        if self.is_residual:
+            u_max = ncs_env(loop.single()).plant.u_max
+            training = replace(training, residual_gain=certificate.K / u_max[:, None])
+        return training, filtered()
 
 
 def is_shield(mode: str | None) -> bool:
@@ -92,44 +130,34 @@ def by_arm(results: Sequence[RunResult]) -> ResultsByArm:
     return {name: sorted((r for r in results if r.arm == name), key=lambda r: r.index) for name in names}
 
 
-def _controller(name: str, mode: str) -> Arm | None:
-    """Returns the arm of a policy that is not trained, alone or behind a filter; None if this is no name of one."""
-    for policy in (*CONTROLLERS, "untrained"):
-        if name == policy:
-            return Arm(name, None, policy=policy)  # type: ignore[arg-type]
-        if name.startswith(f"{policy}+") and (own := _mode(name.removeprefix(f"{policy}+"), mode)) is not None:
-            return Arm(name, own, policy=policy)  # type: ignore[arg-type]
-    return None
+@cache
+def _arms(mode: str) -> dict[str, Arm]:
+    """Returns all arms, but for the weights of "penalized", by their names with hyphens.
+
+    Args:
+        mode: Mode of the shield of arms that name none.
+    """
+    filters = {"shielded": mode} | {f"shielded:{each}": each for each in _SHIELD_MODES}
+    filters |= {name: name for name in ("lookahead", *FILTERS)}
+    trained = list(_trained_arms(filters))
+    arms = [*trained, *(replace(arm, name=arm.name + _RESIDUAL, is_residual=True) for arm in trained)]
+    policies: tuple[PolicyKind, ...] = (*CONTROLLERS, "untrained")  # type: ignore[assignment]
+    for policy in policies:
+        arms += [Arm(policy, policy=policy)]
+        arms += [Arm(f"{policy}+{name}", own, policy) for name, own in filters.items()]
+    return {arm.name.replace(" ", "-"): arm for arm in arms}
 
 
-def _trained(name: str, mode: str) -> Arm | None:
-    """Returns the arm of a trained agent; None if this is no name of one."""
-    if name in ("unshielded", "monitor"):
-        return Arm(name, None if name == "unshielded" else "monitor")
-    if name == "lagrangian":
-        return Arm(name, None, penalizes_violations=True, adapts_penalty=True)
-    kind, colon, weight = name.partition(":")
-    if kind == "penalized":
-        if colon and not _is_weight(weight):
-            return None
-        return Arm(name, None, penalizes_violations=True, violation_weight=float(weight) if colon else None)
-    if name.endswith(TEST_SUFFIX):
-        kind = name.removesuffix(TEST_SUFFIX)
-        own = _mode("shielded" if kind == "shield" else kind, mode)
-        return None if own is None else Arm(name, own, filters_training=False)
-    kind = name.removesuffix(PENALTY_SUFFIX)
-    own = _mode(kind, mode)
-    return None if own is None else Arm(name, own, penalizes_interventions=kind != name)
-
-
-def _mode(name: str, mode: str) -> str | None:
-    """Returns the mode that the name of a filter stands for; None if this is no name of one."""
-    if name in FILTERS or name == "lookahead":
-        return name
-    kind, colon, own = name.partition(":")
-    if kind != "shielded" or (colon and own not in _SHIELD_MODES):
-        return None
-    return own or mode
+def _trained_arms(filters: dict[str, str]) -> Iterator[Arm]:
+    yield Arm("unshielded")
+    yield Arm("monitor", "monitor")
+    yield Arm(_PENALIZED, penalizes_violations=True)
+    yield Arm("lagrangian", penalizes_violations=True, adapts_penalty=True)
+    for name, mode in filters.items():
+        yield Arm(name, mode)
+        yield Arm(f"{name}+penalty", mode, penalizes_interventions=True)
+    for name, mode in (filters | {"shield": filters["shielded"]}).items():
+        yield Arm(f"{name} at test", mode, filters_training=False)
 
 
 def _is_weight(text: str) -> bool:

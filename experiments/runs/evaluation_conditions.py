@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 
-from agents.control_loop import ControlLoop
+from agents.loop import LoopConfig
 from ncs_gym import Channel, ChannelContract, GilbertElliott
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.network import contract_of
@@ -35,7 +35,7 @@ def other_conditions(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for each in names if (name := condition_named(each)) != AS_TRAINED))
 
 
-def under(condition: str, loop: ControlLoop) -> ControlLoop:
+def under(condition: str, loop: LoopConfig) -> LoopConfig:
     """Returns a control loop under a condition; everything else stays the same.
 
     Args:
@@ -84,13 +84,13 @@ def _more_loss(loss: float | GilbertElliott) -> float | GilbertElliott:
     return 0.5 * (1.0 + loss)
 
 
-def _on_worse_channel(loop: ControlLoop) -> ControlLoop:
+def _on_worse_channel(loop: LoopConfig) -> LoopConfig:
     env = ncs_env(loop.single())
-    return replace(loop, channel=worse_channel(env.channel, env.contract))
+    return loop.with_kwargs(channel=asdict(worse_channel(env.channel, env.contract)))
 
 
-_CHANGES: dict[str, Callable[[ControlLoop], ControlLoop]] = {
-    "worst-case disturbance": lambda loop: replace(loop, disturbance="adversarial"),
+_CHANGES: dict[str, Callable[[LoopConfig], LoopConfig]] = {
+    "worst-case disturbance": lambda loop: loop.with_kwargs(disturbance="adversarial"),
     "worse channel": _on_worse_channel,
-    "gaussian": lambda loop: replace(loop, noise="gaussian"),
+    "gaussian": lambda loop: loop.with_kwargs(noise="gaussian"),
 }

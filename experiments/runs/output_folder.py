@@ -17,7 +17,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from experiments.errors import FolderInUseError, OtherResultsError, ResultsError
-from experiments.runs.experiment_setup import INCIDENTAL_SETTINGS
+from experiments.runs.experiment import INCIDENTAL_SETTINGS
 from experiments.settings import save_settings, settings_json
 from experiments.settings.settings_file import FORMAT as SETTINGS_FORMAT
 

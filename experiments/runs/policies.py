@@ -1,23 +1,14 @@
-"""Policies by name: some that need no training, and trained agents from a folder or from the files of a run."""
+"""Policies of single environments by name: some that need no training, and trained agents from a folder."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from agents.evaluation import Policy as VectorPolicy
-from agents.sharing.agent_file import AgentError, write_files
-from experiments.baselines import controller
+from agents.sharing.agent_file import AgentError
 from ncs_gym import NCSEnv, SetpointTracking, SpeedTracking
-from ncs_gym.envs.env import ncs_env
-
-if TYPE_CHECKING:
-    from agents.agent import Agent
-    from experiments.runs.training_run import TrainingRun
 
 UNTRAINED_POLICIES = ("greedy", "zero", "random")
 # Agents that a message names.
@@ -54,40 +45,6 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
     if agent.env != env_id:
         raise AgentError(f"the agent in {name} was trained in {agent.env}, not in {env_id}")
     return lambda observation, info: agent.act(observation[None])[0]
-
-
-def agent_of(run: TrainingRun) -> Agent | None:
-    """Returns the agent that a run does not train: the one whose files it has, or one with its initial weights.
-
-    Returns:
-        None for a run with a policy that is no agent.
-
-    Raises:
-        AgentError: If the files are no agent of an environment that is registered here.
-    """
-    if run.agent_files:
-        from agents.agent import Agent  # imports torch
-
-        with TemporaryDirectory() as folder:
-            write_files(Path(folder), run.agent_files)
-            return Agent.load(folder)
-    if run.policy_kind != "untrained":
-        return None
-    from agents.training import untrained
-
-    return untrained(run.loop, run.training_seed, run.algorithm, run.settings)
-
-
-def vector_policy(run: TrainingRun, agent: Agent | None) -> VectorPolicy:
-    """Returns what acts in the evaluation of a run: its agent, or its controller, which begins anew.
-
-    Args:
-        run: The run.
-        agent: Agent that the run trained or has otherwise (`agent_of`); None for a controller.
-    """
-    if agent is not None:
-        return lambda observations, infos: agent.act(observations)
-    return controller(run.policy_kind, ncs_env(run.loop.single()), run.certificate.K, run.evaluation_seed)
 
 
 def agent_folder(folder: Path) -> Path:

@@ -5,26 +5,28 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
-from functools import partial
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, Literal
 
 import gymnasium as gym
 import numpy as np
 
-from agents.control_loop import ControlLoop, ShieldSettings
-from agents.evaluation import evaluate
+from agents.evaluation import Policy, evaluate
+from agents.loop import LoopConfig
 from agents.results import Episode, TrainingPoint, Trajectory
-from agents.settings import AgentSettings, LagrangianSettings, OffPolicySettings
-from experiments.baselines import FILTERS, filtered
+from agents.settings import AgentSettings, OffPolicySettings
+from agents.sharing.agent_file import write_files
+from experiments.baselines import controller
 from experiments.runs.environments import import_module, module_digest
 from experiments.runs.evaluation_conditions import AS_TRAINED, under
-from experiments.runs.policies import agent_of, vector_policy
 from experiments.runs.provenance import json_digest, versions
-from ncs_gym import Channel
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate
+
+if TYPE_CHECKING:
+    from agents.agent import Agent
 
 PolicyKind = Literal["trained", "untrained", "zero input", "K x_hat", "random", "proportional", "lqr"]
 
@@ -37,26 +39,16 @@ class TrainingRun:
         arm: Name of the arm that the run belongs to.
         policy_kind: "trained" is a trained agent; "untrained" an agent with its initial weights; the others are
             controllers (`experiments.baselines.CONTROLLERS`).
-        env: Id of a registered environment.
-        module: Module of the user's that registers it, imported where the run is executed; empty for none.
-        channel: Channel that replaces the environment's own; None keeps it.
-        downlink: Channel that replaces the environment's own downlink; None keeps it.
-        noise: "truncated", or "gaussian" for noise without a bound.
-        process: Fields of the process that replace the environment's own, JSON values; None keeps it.
+        training_loop: Control loop that the policy is trained in, with its penalties.
+        loop: Control loop that the policy is evaluated in.
+        module: Module of the user's that registers the environment, imported where the run is executed; empty for none.
         seed: Seed of the experiment.
         index: Number of the run within its arm; runs with equal index are paired across arms.
         steps: Training steps.
         episodes: Evaluation episodes.
-        certificate: Certificate of the shield, which also defines x'Mx.
+        certificate: Certificate of shield or filter, which also defines x'Mx and the gain of controllers.
         certificate_basis: What the certificate was synthesized from, in words; empty for one that was given. Its last
             digits may depend on the machine, and a run that another machine finished is still the same run.
-        mode: Mode of the shield, or name of another filter; None for neither.
-        horizon: Longest plan of modes that look ahead [steps]; None in other modes, and for the default.
-        filters_training: Whether shield or filter act in training too.
-        intervention_penalty: Subtracted from the training reward per intervention.
-        violation_penalty: Subtracted from the training reward per violating step.
-        lagrangian: How that penalty is adapted during training; None for a fixed one.
-        is_residual: Whether the agent adds to the action of u = K x_hat.
         conditions: Conditions that the policy is evaluated under besides that of its training.
         algorithm: Name of the learning algorithm, a key of `agents.algorithms`.
         settings: Settings of the learning algorithm.
@@ -66,25 +58,15 @@ class TrainingRun:
 
     arm: str
     policy_kind: PolicyKind
-    env: str
+    training_loop: LoopConfig
+    loop: LoopConfig
     module: str = ""
-    channel: Channel | None = None
-    downlink: Channel | None = None
-    noise: str = "truncated"
-    process: dict[str, Any] | None = None
     seed: int
     index: int
     steps: int
     episodes: int
     certificate: Certificate
     certificate_basis: str = ""
-    mode: str | None
-    horizon: int | None = None
-    filters_training: bool = True
-    intervention_penalty: float = 0.0
-    violation_penalty: float = 0.0
-    lagrangian: LagrangianSettings | None = None
-    is_residual: bool = False
     conditions: tuple[str, ...] = ()
     algorithm: str
     settings: AgentSettings
@@ -102,35 +84,6 @@ class TrainingRun:
         return "-".join(filter(None, (self.grid_point, self.arm, str(self.index)))).replace(" ", "-").replace(":", "-")
 
     @property
-    def loop(self) -> ControlLoop:
-        """Control loop that the policy is evaluated in, with the penalties of its training."""
-        shield, wrapper = None, None
-        if self.mode in FILTERS:
-            own = {"certificate": self.certificate, "penalty": self.intervention_penalty, "horizon": self.horizon}
-            wrapper = partial(filtered, name=self.mode, **own)
-        elif self.mode is not None:
-            shield = ShieldSettings(self.certificate, self.mode, self.intervention_penalty, self.horizon)
-        return ControlLoop(
-            env=self.env,
-            channel=self.channel,
-            downlink=self.downlink,
-            shield=shield,
-            filter=wrapper,
-            violation_penalty=self.violation_penalty,
-            noise=self.noise,
-            process=self.process,
-            lagrangian=self.lagrangian,
-        )
-
-    @property
-    def training_loop(self) -> ControlLoop:
-        """Control loop that the policy is trained in."""
-        loop = self.loop if self.filters_training else replace(self.loop, shield=None, filter=None)
-        if not self.is_residual:
-            return loop
-        return replace(loop, residual_gain=self.certificate.K / ncs_env(loop.single()).plant.u_max[:, None])
-
-    @property
     def training_seed(self) -> int:
         """Seed of the training environments and of the networks; the same in all arms."""
         return self._seeds()[0]
@@ -144,13 +97,13 @@ class TrainingRun:
     def key(self) -> str:
         """SHA-256 of everything the result depends on: all settings, this project's source and versions of packages."""
         names = set(self.__dataclass_fields__) - {"certificate", "certificate_basis", "grid_point", "module"}
+        certificate = self.certificate_basis or self.certificate.checksum
         content = {name: getattr(self, name) for name in names}
         content |= {
             "module": module_digest(self.module),
-            "certificate": self.certificate_basis or self.certificate.checksum,
-            "channel": self.channel and asdict(self.channel),
-            "downlink": self.downlink and asdict(self.downlink),
-            "lagrangian": self.lagrangian and asdict(self.lagrangian),
+            "certificate": certificate,
+            "training_loop": _described(self.training_loop, certificate),
+            "loop": _described(self.loop, certificate),
             "agent_files": {name: hashlib.sha256(file).hexdigest() for name, file in self.agent_files.items()},
         }
         return json_digest(content | {"settings": asdict(self.settings), "versions": versions()})
@@ -158,7 +111,7 @@ class TrainingRun:
     @property
     def total_steps(self) -> int:
         """Training steps, in whole rollouts, and evaluation steps."""
-        evaluation = self.episodes * (gym.spec(self.env).max_episode_steps or 1) * (1 + len(self.conditions))
+        evaluation = self.episodes * (gym.spec(self.loop.env).max_episode_steps or 1) * (1 + len(self.conditions))
         if not self.trains:
             return evaluation
         steps_per_env = 1 if isinstance(self.settings, OffPolicySettings) else self.settings.rollout
@@ -199,6 +152,15 @@ class RunResult:
     conditions: dict[str, list[Episode]] = field(default_factory=dict)
 
 
+def _described(loop: LoopConfig, certificate: str) -> dict[str, Any]:
+    """Returns a control loop as JSON values, what belongs to the certificate under the name given to that."""
+    values = {each.name: getattr(loop, each.name) for each in fields(loop)}
+    for name in ("shield", "filter"):
+        values[name] = values[name] and vars(values[name]) | {"certificate": certificate}
+    residual = loop.residual_gain is not None
+    return values | {"lagrangian": loop.lagrangian and asdict(loop.lagrangian), "residual_gain": residual}
+
+
 def execute_run(run: TrainingRun, on_progress: Callable[[int], None], log_folder: Path | None = None) -> RunResult:
     """Returns the result of a training run; only TensorBoard's events are written.
 
@@ -224,10 +186,10 @@ def execute_run(run: TrainingRun, on_progress: Callable[[int], None], log_folder
             log_folder=log_folder,
             on_progress=on_progress,
         )
-    agent = trained.agent if trained else agent_of(run)
+    agent = trained.agent if trained else _agent_of(run)
     evaluations = {}
     for condition in (AS_TRAINED, *run.conditions):
-        loop, policy = under(condition, run.loop), vector_policy(run, agent)  # a random policy begins anew each time
+        loop, policy = under(condition, run.loop), _policy(run, agent)  # a random policy begins anew each time
         evaluations[condition] = evaluate(
             loop, policy, run.episodes, run.evaluation_seed, run.certificate.M, on_progress
         )
@@ -244,3 +206,32 @@ def execute_run(run: TrainingRun, on_progress: Callable[[int], None], log_folder
         files=trained.agent.files() if trained else {},
         conditions={condition: each.episodes for condition, each in evaluations.items()},
     )
+
+
+def _agent_of(run: TrainingRun) -> Agent | None:
+    """Returns the agent that a run does not train: the one whose files it has, or one with its initial weights.
+
+    Returns:
+        None for a run with a policy that is no agent.
+
+    Raises:
+        AgentError: If the files are no agent of an environment that is registered here.
+    """
+    if run.agent_files:
+        from agents.agent import Agent  # imports torch
+
+        with TemporaryDirectory() as folder:
+            write_files(Path(folder), run.agent_files)
+            return Agent.load(folder)
+    if run.policy_kind != "untrained":
+        return None
+    from agents.training import untrained
+
+    return untrained(run.loop, run.training_seed, run.algorithm, run.settings)
+
+
+def _policy(run: TrainingRun, agent: Agent | None) -> Policy:
+    """Returns what acts in the evaluation of a run: an agent, or for None the run's controller, which begins anew."""
+    if agent is not None:
+        return lambda observations, infos: agent.act(observations)
+    return controller(run.policy_kind, ncs_env(run.loop.single()), run.certificate.K, run.evaluation_seed)

@@ -1,5 +1,6 @@
 """What each command can be told: frozen dataclasses that the parser turns into flags, and the file that keeps them."""
 
+from experiments.settings.assignments import Assignments
 from experiments.settings.backend import BackendSettings
 from experiments.settings.certificates import (
     AuditSettings,
@@ -8,7 +9,7 @@ from experiments.settings.certificates import (
     SynthesizeSettings,
     VerifySettings,
 )
-from experiments.settings.channel import ChannelSettings
+from experiments.settings.channel import changed_channel
 from experiments.settings.learning import (
     CompareSettings,
     EvaluateSettings,
@@ -20,10 +21,10 @@ from experiments.settings.settings_file import config_defaults, save_settings, s
 from experiments.settings.study import StudySettings, SweepSettings
 
 __all__ = [
+    "Assignments",
     "AuditSettings",
     "BackendSettings",
     "CertifySettings",
-    "ChannelSettings",
     "CompareSettings",
     "EvaluateSettings",
     "LearningSettings",
@@ -34,6 +35,7 @@ __all__ = [
     "SynthesizeSettings",
     "TrainSettings",
     "VerifySettings",
+    "changed_channel",
     "config_defaults",
     "save_settings",
     "settings_json",

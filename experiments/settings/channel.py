@@ -1,54 +1,36 @@
-"""Settings of the channel: changes of an environment's own channel."""
+"""Changes of an environment's own channel, given by name."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from typing import Any
 
 from ncs_gym import Channel, GilbertElliott
 
 
-@dataclass(frozen=True, kw_only=True)
-class ChannelSettings:
-    """Changes of the environment's own channel; None keeps a value.
+def changed_channel(own: Channel, changes: Mapping[str, Any]) -> Channel | None:
+    """Returns an environment's own channel with changes; None for no changes.
 
-    Attributes:
-        loss: Probability that a packet is lost.
-        burst_length: Mean number of packets lost in a row (Gilbert-Elliott); losses are independent without it
-            (a mean of 1 / (1 - loss)).
-        delay: Delay of every packet [steps].
-        jitter: Largest extra random delay [steps].
-        send_period: Transmission period [steps].
-        quantization_step: Measurements are quantized to multiples of this step.
-        max_consecutive_losses: Longest run of lost packets that the channel allows.
+    Args:
+        own: The environment's own channel.
+        changes: Fields of `Channel` by name; None keeps a value. `burst_length` is the mean number of packets lost in a
+            row (Gilbert-Elliott); losses are independent without it (a mean of 1 / (1 - loss)).
+
+    Raises:
+        ValueError: If a name is unknown or a value out of range, or bursts are asked for without a loss probability.
     """
-
-    loss: float | None = None
-    burst_length: float | None = None
-    delay: int | None = None
-    jitter: int | None = None
-    send_period: int | None = None
-    quantization_step: float | None = None
-    max_consecutive_losses: int | None = None
-
-    def applied_to(self, own: Channel) -> Channel | None:
-        """Returns the environment's own channel with the changes; None for no changes.
-
-        Raises:
-            ValueError: If a value is out of range, or bursts are asked for without a loss probability.
-        """
-        names = ("delay", "jitter", "send_period", "quantization_step", "max_consecutive_losses")
-        changes = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        loss = own.loss if self.loss is None else self.loss
-        if self.burst_length is not None:
-            if isinstance(loss, GilbertElliott):
-                raise ValueError(
-                    "--channel.burst-length needs --channel.loss: the environment's own losses come in bursts"
-                )
-            period = own.send_period if self.send_period is None else self.send_period
-            loss = _bursts(loss, self.burst_length, period)
-        if loss != own.loss:
-            changes["loss"] = loss
-        return replace(own, **changes) if changes else None
+    given = {name: value for name, value in changes.items() if value is not None}
+    known = [each.name for each in fields(Channel)]
+    for name in given.keys() - {*known, "burst_length"}:
+        raise ValueError(f"--channel {name}: a channel has no such setting; known are {', '.join(known)}, burst_length")
+    if (length := given.pop("burst_length", None)) is not None:
+        loss = given.get("loss", own.loss)
+        if isinstance(loss, GilbertElliott):
+            raise ValueError("--channel burst_length needs loss, too: the environment's own losses come in bursts")
+        given["loss"] = _bursts(loss, length, given.get("send_period", own.send_period))
+    changed = replace(own, **given)
+    return None if changed == own else changed
 
 
 def _bursts(loss: float, length: float, send_period: int = 1) -> GilbertElliott:

@@ -18,8 +18,8 @@ from experiments.settings.agent_overrides import (
     default_steps,
     described_settings,
 )
+from experiments.settings.assignments import Assignments
 from experiments.settings.backend import BackendSettings
-from experiments.settings.channel import ChannelSettings
 from experiments.settings.steps import OptionalStepCount, require_horizon
 
 Algorithm = Literal["PPO", "A2C", "SAC", "TD3", "TRPO", "TQC", "CrossQ"]
@@ -46,7 +46,8 @@ class LearningSettings:
         intervention_penalty: Subtracted from the training reward per intervention, in arms with "+penalty".
         violation_penalty: Subtracted from the training reward per violating step, in the arm "penalized".
         certificate: Certificate file to use instead of synthesizing one.
-        channel: Changes of the environment's channel.
+        channel: Changes of the environment's channel: loss, burst_length (mean number of packets lost in a row), delay,
+            jitter and send_period [steps], quantization_step, max_consecutive_losses.
         ppo: Settings of PPO and TRPO; what is not given is tuned for the environment (agents/tuned), or the default.
         a2c: Settings of A2C.
         off_policy: Settings of SAC, TD3, TQC and CrossQ.
@@ -67,7 +68,7 @@ class LearningSettings:
     intervention_penalty: float = 0.1
     violation_penalty: float = 1.0
     certificate: Path | None = None
-    channel: ChannelSettings = field(default_factory=ChannelSettings)
+    channel: Assignments = field(default_factory=dict)
     ppo: PPOOverrides = field(default_factory=PPOOverrides)
     a2c: A2COverrides = field(default_factory=A2COverrides)
     off_policy: OffPolicyOverrides = field(default_factory=OffPolicyOverrides)
@@ -198,7 +199,7 @@ class EvaluateSettings:
         episodes: Number of evaluation episodes.
         seed: Seed of the episodes.
         certificate: Certificate file to use instead of that of the training, or of synthesizing one.
-        channel: Changes of the channel that the agent was trained with.
+        channel: Changes of the channel that the agent was trained with, by the names that `ncs compare` lists.
         smoke: Evaluate a few episodes only, to see that everything works.
         out: File for the summary (JSON).
     """
@@ -210,7 +211,7 @@ class EvaluateSettings:
     episodes: int = 200
     seed: int = 0
     certificate: Path | None = None
-    channel: ChannelSettings = field(default_factory=ChannelSettings)
+    channel: Assignments = field(default_factory=dict)
     smoke: bool = False
     out: Path | None = None
 

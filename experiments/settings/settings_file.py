@@ -131,6 +131,8 @@ def _from_json(value: Any, kind: Any, name: str = "") -> Any:
     if origin in (Union, types.UnionType):
         chosen = types.NoneType if value is None else next(each for each in parameters if each is not types.NoneType)
         return _from_json(value, chosen, name)
+    if origin is dict and isinstance(value, dict):
+        return {key: _plain(each, f"{name}.{key}") for key, each in value.items()}
     if origin is tuple and isinstance(value, list):
         return tuple(_from_json(each, parameters[0], name) for each in value)
     if kind is Path and isinstance(value, str):
@@ -142,3 +144,16 @@ def _from_json(value: Any, kind: Any, name: str = "") -> Any:
     if kind is float and type(value) in (int, float) and float(value) == value:  # not NaN, not rounded
         return float(value)
     raise TypeError(f"{name} = {json.dumps(value)}")
+
+
+def _plain(value: Any, name: str) -> Any:
+    """Returns a JSON value without NaN and infinity.
+
+    Raises:
+        TypeError: If there is one in it; the message names the field.
+    """
+    try:
+        json.dumps(value, allow_nan=False)
+    except ValueError as error:
+        raise TypeError(f"{name} = {json.dumps(value)}") from error
+    return value

@@ -9,10 +9,19 @@ from typing import Any
 from experiments.analysis.statistics import clopper_pearson
 from experiments.backends.execution import results_of
 from experiments.errors import ResultsError
-from experiments.runs import Arm, ExperimentSetup, RunResult, RunStore, TrainingRun, by_arm
+from experiments.runs import (
+    Arm,
+    RunResult,
+    RunStore,
+    TrainingRun,
+    by_arm,
+    certificate_of,
+    loop_config,
+    run_of_arm,
+)
 from experiments.runs.environments import registered_env
 from experiments.runs.evaluation_conditions import AS_TRAINED
-from experiments.settings import ChannelSettings, CompareSettings
+from experiments.settings import Assignments, CompareSettings, changed_channel
 
 # The filters, in pairs without and with the error set, by the count in the rows that tells whether they do what they
 # are for: the first keep S, the others may leave it and keep the box.
@@ -44,6 +53,11 @@ class _Point:
         """Name of the point in file names."""
         return f"{self.side.replace('_', '-')}{self.value:g}"
 
+    @property
+    def change(self) -> Assignments:
+        """The change of the environment's channel."""
+        return {self.side: int(self.value) if self.side == "delay" else self.value}
+
 
 def trained_agents(settings: CompareSettings) -> dict[str, AgentFiles]:
     """Returns the agents that a finished comparison trained behind filters of the sweep, by the filter's name.
@@ -58,12 +72,13 @@ def trained_agents(settings: CompareSettings) -> dict[str, AgentFiles]:
         Infeasible: If no certificate is found.
         ResultsError: If the agents are missing or damaged.
     """
-    setup, store = ExperimentSetup.of(settings.env, settings.channel, settings.certificate), RunStore(settings.out)
+    loop, store = loop_config(settings.env, settings.channel), RunStore(settings.out)
+    certificate = certificate_of(loop, settings.certificate)
     arms = {Arm.of(name, settings.mode).name for name in settings.arms}
     agents: dict[str, AgentFiles] = {}
     count = min(settings.seeds, MOST_AGENTS)
     for name in (each for each in SWEPT_FILTERS if each in arms):
-        runs = [setup.training_run(settings.completed, name, index) for index in range(count)]
+        runs = [run_of_arm(settings.completed, loop, certificate, name, index) for index in range(count)]
         agents[name] = [_files(store, run) for run in runs]
     return agents
 
@@ -112,26 +127,23 @@ def _points(env_id: str) -> list[_Point]:
     points = [_Point(side, value) for side, values in sides.items() for value in values]
     if env.contract is None:
         return points
-    return [point for point in points if env.contract.is_kept_by(_changed(point).applied_to(own) or own)]
-
-
-def _changed(point: _Point) -> ChannelSettings:
-    """Returns the change of the environment's channel at a point."""
-    if point.side == "delay":
-        return ChannelSettings(delay=int(point.value))
-    return ChannelSettings(loss=point.value) if point.side == "loss" else ChannelSettings(quantization_step=point.value)
+    return [point for point in points if env.contract.is_kept_by(changed_channel(own, point.change) or own)]
 
 
 def _runs(point: _Point, settings: CompareSettings, agents: Mapping[str, AgentFiles]) -> list[TrainingRun]:
     """Returns the runs at a point; nothing is trained in them."""
-    setup = ExperimentSetup.of(settings.env, _changed(point), settings.certificate)
-    runs = [setup.training_run(settings, f"lqr+{name}", 0, grid_point=point.name) for name in SWEPT_FILTERS]
+    loop = loop_config(settings.env, point.change)
+    certificate = certificate_of(loop, settings.certificate)
+
+    def run(settings: CompareSettings, name: str, index: int) -> TrainingRun:
+        return run_of_arm(settings, loop, certificate, name, index, grid_point=point.name)
+
+    runs = [run(settings, f"lqr+{name}", 0) for name in SWEPT_FILTERS]
     for name, each in agents.items():
         chosen = each[: settings.episodes]
         part = replace(settings, episodes=-(-settings.episodes // len(chosen)))
         for index, files in enumerate(chosen):
-            run = setup.training_run(part, name, index, grid_point=point.name)
-            runs.append(replace(run, agent_files=files))
+            runs.append(replace(run(part, name, index), agent_files=files))
     return runs
 
 

@@ -13,7 +13,7 @@ from experiments.analysis.parquet_tables import parquet
 from experiments.commands import short_version
 from experiments.commands.compare import compare
 from experiments.runs import claim_folder, prepare_output, versions
-from experiments.runs.experiment_setup import INCIDENTAL_SETTINGS
+from experiments.runs.experiment import INCIDENTAL_SETTINGS
 from experiments.settings import BackendSettings, CompareSettings, StudySettings, settings_json
 from experiments.settings.study import short_name
 from experiments.study.channel_sweep import channel_sweep, trained_agents

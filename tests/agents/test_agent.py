@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from agents.agent import Agent, Normalization
-from agents.control_loop import ControlLoop, ShieldSettings
 from agents.evaluation import evaluate
+from agents.loop import LoopConfig, ShieldSettings
 from agents.settings import OffPolicySettings, PPOSettings
 from agents.sharing.agent_file import AgentError, digest
 from agents.training import train
@@ -26,7 +26,7 @@ SETTINGS = {
 
 
 def trained(algorithm="PPO", channel=None):
-    return train(ControlLoop(env=CRUISE, channel=channel), 512, 1, algorithm, SETTINGS[algorithm]).agent
+    return train(LoopConfig(env=CRUISE, kwargs={"channel": channel}), 512, 1, algorithm, SETTINGS[algorithm]).agent
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def test_observations_that_are_not_finite_are_refused(agent, value):
 
 def test_shared_folder_has_the_agent_its_shield_and_a_card(agent, certificate, tmp_path):
     shield = ShieldSettings(certificate, "switch")
-    loop = ControlLoop(env=CRUISE, shield=shield)
+    loop = LoopConfig(env=CRUISE, shield=shield)
     evaluation = evaluate(loop, lambda seen, _: np.ones((len(seen), 1), np.float32), episodes=3, seed=1)
     shared = tmp_path / "new" / "folder"
     agent.save(shared, shield, evaluation)
@@ -128,7 +128,7 @@ def test_certificate_of_another_plant_is_not_saved(agent, tmp_path):
 
 def test_saved_agent_keeps_the_shield_it_was_trained_behind(certificate, tmp_path):
     assert (trained().shield_mode, trained().horizon) == (None, None)
-    loop = ControlLoop(env=CRUISE, shield=ShieldSettings(certificate, "lookahead", horizon=3))
+    loop = LoopConfig(env=CRUISE, shield=ShieldSettings(certificate, "lookahead", horizon=3))
     result = train(loop, 512, 1, "PPO", SETTINGS["PPO"])
     assert result.violation_steps == 0 < result.interventions
     result.agent.save(tmp_path)
@@ -156,7 +156,7 @@ def test_normalization_is_that_of_training():
 
     from agents import SB3VecEnv
 
-    env = VecNormalize(SB3VecEnv(ControlLoop(env=CRUISE).vector(4)))
+    env = VecNormalize(SB3VecEnv(LoopConfig(env=CRUISE).vector(4)))
     env.reset()
     for _ in range(50):
         env.step(np.ones((4, 1), np.float32))

@@ -4,11 +4,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.control_loop import ControlLoop, ShieldSettings
 from agents.evaluation import _SEED_STREAM, evaluate
+from agents.loop import LoopConfig, ShieldSettings
 from tests.certificates import certificate_of
 
-CRUISE = ControlLoop(env="ncs_gym/TruckTrailerCruise-v0")
+CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
 
 
 def zero(observations, infos):
@@ -29,7 +29,7 @@ def scalar(monkeypatch):
     spec = copy.deepcopy(gym.spec(CRUISE.env))
     spec.id, spec.vector_entry_point = "Scalar-v0", None
     monkeypatch.setitem(gym.registry, "Scalar-v0", spec)
-    return ControlLoop(env="Scalar-v0")
+    return LoopConfig(env="Scalar-v0")
 
 
 def test_it_counts_what_a_plain_loop_counts(certificate):
@@ -59,7 +59,7 @@ def test_it_counts_what_a_plain_loop_counts(certificate):
 
 
 def test_environments_without_a_vector_one_are_played_alike(scalar, shield):
-    for loop in (scalar, ControlLoop(env=scalar.env, shield=shield)):
+    for loop in (scalar, LoopConfig(env=scalar.env, shield=shield)):
         played = evaluate(loop, throttle, 4, 0, shield.certificate.M)
         shielded = loop.shield is not None
         assert [record.steps for record in played.episodes] == [200] * 4
@@ -69,8 +69,8 @@ def test_environments_without_a_vector_one_are_played_alike(scalar, shield):
 
 
 def test_it_is_guaranteed_behind_a_shield_and_leaves_penalties_out(shield):
-    free = evaluate(ControlLoop(env=CRUISE.env, shield=shield), throttle, 3, 0)
-    penalized = ControlLoop(
+    free = evaluate(LoopConfig(env=CRUISE.env, shield=shield), throttle, 3, 0)
+    penalized = LoopConfig(
         env=CRUISE.env, shield=ShieldSettings(shield.certificate, penalty=1.0), violation_penalty=1.0
     )
     assert free.episodes == evaluate(penalized, throttle, 3, 0).episodes or np.isnan(free.episodes[0].largest_level)
@@ -85,7 +85,7 @@ def test_it_is_guaranteed_behind_a_shield_and_leaves_penalties_out(shield):
 
 def test_arms_have_common_random_numbers(shield):
     bare = evaluate(CRUISE, zero, 5, 7).episodes
-    shielded = evaluate(ControlLoop(env=CRUISE.env, shield=shield), zero, 5, 7).episodes
+    shielded = evaluate(LoopConfig(env=CRUISE.env, shield=shield), zero, 5, 7).episodes
     assert [record.episode_return for record in bare] == [record.episode_return for record in shielded]
     others = evaluate(CRUISE, zero, 5, 8).episodes
     assert not {record.episode_return for record in bare} & {record.episode_return for record in others}
@@ -93,14 +93,14 @@ def test_arms_have_common_random_numbers(shield):
 
 def test_episode_that_ends_early_changes_nothing_for_the_others():
     env = "ncs_gym/CartPole-v0"
-    loop = ControlLoop(env=env, shield=ShieldSettings(certificate_of(*_of(env)), "project"))
+    loop = LoopConfig(env=env, shield=ShieldSettings(certificate_of(*_of(env)), "project"))
 
     def push_the_first(observations, infos):
         actions = np.zeros((len(observations), 1), np.float32)
         actions[0] = 1.0
         return actions
 
-    bare = ControlLoop(env=env)
+    bare = LoopConfig(env=env)
     pushed, quiet = (evaluate(bare, policy, 4, 0).episodes for policy in (push_the_first, zero))
     assert pushed[0].steps < 200
     assert pushed[0].violation_steps == 1

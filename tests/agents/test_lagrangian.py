@@ -7,20 +7,19 @@ import pytest
 
 from agents.agent import Agent
 from agents.callbacks import DualAscentCallback
-from agents.control_loop import ControlLoop
-from agents.loop_wrappers import CostPenalty, ResidualActions
+from agents.loop import CostPenalty, LoopConfig, ResidualActions
 from agents.settings import LagrangianSettings, PPOSettings
 from agents.sharing.agent_file import AgentError
 from agents.training import train
 
-CRUISE = ControlLoop(env="ncs_gym/TruckTrailerCruise-v0")
+CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
 TINY = PPOSettings(envs=4, rollout=50, batch_size=200, epochs=1, width=8)
 GAIN = np.array([[0.4, -0.3]])
 
 
 def raised(settings, rollouts, env_id=CRUISE.env):
     """The multiplier after rollouts, each given by its number of steps in two environments and its violating steps."""
-    priced = CostPenalty(ControlLoop(env=env_id).vector(2), settings.multiplier)
+    priced = CostPenalty(LoopConfig(env=env_id).vector(2), settings.multiplier)
     callback, multipliers = DualAscentCallback(settings, priced), []
 
     class Quiet:
@@ -62,7 +61,7 @@ def test_multiplier_moves_at_every_rollout_although_all_episodes_end_in_the_same
     monkeypatch.setattr(
         DualAscentCallback, "_on_rollout_end", lambda self: (original(self), prices.append(self._priced.penalty))
     )
-    loop = ControlLoop(env=CRUISE.env, lagrangian=LagrangianSettings())
+    loop = LoopConfig(env=CRUISE.env, lagrangian=LagrangianSettings())
     train(loop, 32 * 20 * 6, 0, settings=replace(TINY, envs=32, rollout=20, batch_size=640))
     assert len(prices) == 6  # 120 of an episode's 200 steps
     assert len(set(prices)) > 3
@@ -85,7 +84,7 @@ def test_training_raises_the_price_of_what_the_agent_violates(monkeypatch):
         made.append(self)
 
     monkeypatch.setattr(DualAscentCallback, "_on_rollout_end", noted)
-    loop = ControlLoop(env=CRUISE.env, lagrangian=LagrangianSettings(learning_rate=0.5))
+    loop = LoopConfig(env=CRUISE.env, lagrangian=LagrangianSettings(learning_rate=0.5))
     result = train(loop, 1600, 0, settings=TINY)
     assert result.violation_steps > 0
     # Rollouts are as long as an episode, 200 steps in all.
@@ -107,7 +106,7 @@ def test_residual_action_is_added_to_the_gain_and_clipped():
 
 
 def test_residual_agent_is_trained_saved_and_loaded_with_its_gain(tmp_path):
-    loop = ControlLoop(env=CRUISE.env, residual_gain=GAIN)
+    loop = LoopConfig(env=CRUISE.env, residual_gain=GAIN)
     agent = train(loop, 400, 0, settings=TINY).agent
     observations = np.random.default_rng(0).uniform(-0.1, 0.1, (20, 3)).astype(np.float32)
     part = agent.model.predict(agent.normalization(observations), deterministic=True)[0]

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from gymnasium.vector import VectorWrapper
 
-from agents.control_loop import ControlLoop, ShieldSettings
+from agents.loop import LoopConfig, ShieldSettings
 from agents.sb3_vec_env import _EPISODE_KEYS
 from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
 from agents.training import train, untrained
 
-CRUISE = ControlLoop(env="ncs_gym/TruckTrailerCruise-v0")
+CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
 TINY = PPOSettings(envs=4, rollout=64, batch_size=128, epochs=2)
 TINY_A2C = A2CSettings(envs=4, rollout=8)
 TINY_REPLAY = OffPolicySettings(envs=4, gradient_steps=1, batch_size=32, buffer_size=1000, learning_starts=64)
@@ -19,7 +19,7 @@ TINY_REPLAY = OffPolicySettings(envs=4, gradient_steps=1, batch_size=32, buffer_
 
 @pytest.fixture(scope="module")
 def shielded(certificate):
-    return ControlLoop(env=CRUISE.env, shield=ShieldSettings(certificate))
+    return LoopConfig(env=CRUISE.env, shield=ShieldSettings(certificate))
 
 
 def test_same_seed_trains_the_same_agent():
@@ -56,10 +56,10 @@ def test_single_environments_are_counted_alike(certificate, monkeypatch):
     spec = copy.deepcopy(gym.spec(CRUISE.env))
     spec.id, spec.vector_entry_point = "Scalar-v0", None
     monkeypatch.setitem(gym.registry, "Scalar-v0", spec)
-    result = train(ControlLoop(env="Scalar-v0", shield=ShieldSettings(certificate)), 1024, 0, settings=TINY)
+    result = train(LoopConfig(env="Scalar-v0", shield=ShieldSettings(certificate)), 1024, 0, settings=TINY)
     assert result.violation_steps == 0
     assert result.interventions > 20
-    assert train(ControlLoop(env="Scalar-v0"), 1024, 0, settings=TINY).violation_steps > 0
+    assert train(LoopConfig(env="Scalar-v0"), 1024, 0, settings=TINY).violation_steps > 0
 
 
 def test_shielded_training_has_no_violation_and_counts_interventions(shielded):
@@ -69,7 +69,7 @@ def test_shielded_training_has_no_violation_and_counts_interventions(shielded):
 
 
 def test_monitored_training_is_the_unshielded_one_and_counts_what_the_shield_would_do(certificate):
-    monitored = ControlLoop(env=CRUISE.env, shield=ShieldSettings(certificate, "monitor"))
+    monitored = LoopConfig(env=CRUISE.env, shield=ShieldSettings(certificate, "monitor"))
     one, other = train(monitored, 1024, 0, settings=TINY), train(CRUISE, 1024, 0, settings=TINY)
     observations = np.random.default_rng(0).standard_normal((20, 3))
     np.testing.assert_array_equal(one.agent.act(observations), other.agent.act(observations))
@@ -78,7 +78,7 @@ def test_monitored_training_is_the_unshielded_one_and_counts_what_the_shield_wou
 
 
 def test_violation_penalty_changes_what_is_learned():
-    penalized = ControlLoop(env=CRUISE.env, violation_penalty=5.0)
+    penalized = LoopConfig(env=CRUISE.env, violation_penalty=5.0)
     one, other = train(penalized, 1024, 0, settings=TINY), train(CRUISE, 1024, 0, settings=TINY)
     observations = np.random.default_rng(0).standard_normal((20, 3))
     assert (one.agent.act(observations) != other.agent.act(observations)).any()
@@ -180,7 +180,7 @@ def test_mean_correction_is_that_of_every_step(certificate):
             if key == "safety/mean_correction":
                 recorded.append(value)
 
-    loop = ControlLoop(env=CRUISE.env, shield=ShieldSettings(certificate))
+    loop = LoopConfig(env=CRUISE.env, shield=ShieldSettings(certificate))
     model = PPO("MlpPolicy", SB3VecEnv(Recorder(loop.vector(4))), n_steps=64, batch_size=128, n_epochs=1, device="cpu")
     model.set_logger(Recording(None, []))
     model.learn(512, callback=SafetyCallback())
@@ -249,8 +249,8 @@ def test_eval_callback_reports_success_on_both_kinds_of_environment(certificate,
         return np.load(log / "evaluations.npz")["successes"]
 
     shield = ShieldSettings(certificate)
-    vector = SB3VecEnv(ControlLoop(env=CRUISE.env, shield=shield).vector(2))
-    scalar = make_vec_env(lambda: ControlLoop(env=CRUISE.env, shield=shield).single(), n_envs=2, seed=0)
+    vector = SB3VecEnv(LoopConfig(env=CRUISE.env, shield=shield).vector(2))
+    scalar = make_vec_env(lambda: LoopConfig(env=CRUISE.env, shield=shield).single(), n_envs=2, seed=0)
     for env in (vector, scalar):
         assert successes(env).all()
 

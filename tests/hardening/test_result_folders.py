@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from agents.loop import LoopConfig, ShieldSettings
 from agents.settings import PPOSettings
 from agents.sharing.agent_file import AgentError
 from experiments.analysis.arm_table import summary_text
@@ -20,10 +21,9 @@ from experiments.attack.monte_carlo_batch import MonteCarloBatch
 from experiments.attack.safety_counts import SafetyCounts
 from experiments.errors import ResultsError
 from experiments.runs import claim_folder, prepare_output
-from experiments.runs.policies import agent_of
 from experiments.runs.provenance import json_digest
 from experiments.runs.run_store import RunStore
-from experiments.runs.training_run import TrainingRun, execute_run
+from experiments.runs.training_run import TrainingRun, _agent_of, execute_run
 from experiments.settings import CertifySettings, CompareSettings
 from tests.command import assert_one_sentence, ncs
 from tests.fuzz import JSON_VALUES, examples
@@ -47,16 +47,17 @@ NAMES += [
 
 @pytest.fixture(scope="module")
 def run(certificate):
+    loop = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0", shield=ShieldSettings(certificate, "project"))
     return TrainingRun(
         arm="shielded",
         policy_kind="trained",
-        env="ncs_gym/TruckTrailerCruise-v0",
+        training_loop=loop,
+        loop=loop,
         seed=0,
         index=0,
         steps=256,
         episodes=2,
         certificate=certificate,
-        mode="project",
         conditions=("gaussian",),
         algorithm="PPO",
         settings=PPOSettings(envs=2, rollout=64, batch_size=64, epochs=1, width=8),
@@ -114,7 +115,7 @@ def test_files_of_other_names_are_not_written(name, run, result, tmp_path, monke
     monkeypatch.setattr("tempfile.tempdir", str(inside))
     before = everything_in(tmp_path)
     with pytest.raises(AgentError, match="an agent has no file of the name"):
-        agent_of(replace(run, agent_files={**result.files, name: b"print('mine')"}))
+        _agent_of(replace(run, agent_files={**result.files, name: b"print('mine')"}))
     with pytest.raises(AgentError, match="an agent has no file of the name"):
         store.save(run, replace(result, files={name: b"print('mine')", **result.files}))
     assert everything_in(tmp_path) == before
@@ -269,7 +270,7 @@ def assert_refused_or_usable(data, folder, run):
         return
     finally:
         file_of(folder, run).write_bytes(before)
-    arms = {run.arm: arm_summary([result], run.mode, fixed_policy=False)}
+    arms = {run.arm: arm_summary([result], "project", fixed_policy=False)}
     json.dumps(arms, allow_nan=False)
     summary_text(arms, {})
     write_tables(folder, [result], {})

@@ -9,7 +9,7 @@ from agents.results import Episode
 from experiments.analysis.escapes import escape_sentences, escape_summary, rounded_up
 from experiments.analysis.statistics import clopper_pearson
 from experiments.commands.compare import _escapes, _findings
-from experiments.runs.experiment_setup import ExperimentSetup
+from experiments.runs.experiment import certificate_of, loop_config, run_of_arm
 from experiments.runs.training_run import execute_run
 from experiments.settings import CompareSettings
 from ncs_gym import Channel, LinearPlant, escape_probability, register_plant
@@ -52,17 +52,18 @@ def test_printed_bound_is_no_smaller_than_the_bound(bound, text):
 
 @pytest.fixture(scope="module")
 def setup():
-    return ExperimentSetup.of("Tests/Tight-v0", None, noise="gaussian")
+    loop = loop_config("Tests/Tight-v0", noise="gaussian")
+    return loop, certificate_of(loop)
 
 
 def test_comparison_under_gaussian_noise_plays_it_and_states_the_bound(setup):
     settings = CompareSettings(env="Tests/Tight-v0", noise="gaussian", episodes=600)
-    run = replace(setup.training_run(settings, "shielded", 0), policy_kind="zero input")
+    run = replace(run_of_arm(settings, *setup, "shielded", 0), policy_kind="zero input")
     assert run.loop.single().unwrapped.noise == run.loop.vector(2).unwrapped.single.noise == "gaussian"
-    bounded = replace(run, noise="truncated")
+    bounded = replace(run, loop=run.loop.with_kwargs(noise=None))
     assert run.key != bounded.key
     result = execute_run(run, lambda steps: None)
-    summary = _escapes(setup, {"shielded": run.mode, "monitor": "monitor"}, {"shielded": [result]})
+    summary = _escapes(*setup, {"shielded": "project", "monitor": "monitor"}, {"shielded": [result]})
     assert summary["escape_probability"] == escape_probability(PLANT, CHANNEL, STEPS) == pytest.approx(STEPS * 2e-3)
     arm = summary["arms"]["shielded"]
     assert 0.5 < arm["episodes_outside_set"] / arm["episodes"] / summary["escape_probability"] <= 1.0

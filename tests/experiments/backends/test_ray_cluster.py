@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from agents.loop import LoopConfig
 from agents.settings import PPOSettings
 from experiments.backends import ray_cluster
 from experiments.backends.execution import results_of
@@ -21,16 +22,17 @@ from experiments.settings import BackendSettings
 
 @pytest.fixture(scope="module")
 def run(certificate):
+    loop = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
     return TrainingRun(
         arm="unshielded",
         policy_kind="zero input",
-        env="ncs_gym/TruckTrailerCruise-v0",
+        training_loop=loop,
+        loop=loop,
         seed=0,
         index=0,
         steps=64,
         episodes=1,
         certificate=certificate,
-        mode=None,
         algorithm="PPO",
         settings=PPOSettings(),
     )

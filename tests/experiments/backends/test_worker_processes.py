@@ -8,6 +8,7 @@ from queue import Queue
 
 import pytest
 
+from agents.loop import LoopConfig
 from agents.settings import PPOSettings
 from experiments.backends.execution import results_of
 from experiments.backends.job import Job
@@ -20,16 +21,17 @@ from experiments.settings import BackendSettings
 @pytest.fixture(scope="module")
 def endless(certificate):
     """A run that would run for hours."""
+    loop = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
     return TrainingRun(
         arm="zero input",
         policy_kind="zero input",
-        env="ncs_gym/TruckTrailerCruise-v0",
+        training_loop=loop,
+        loop=loop,
         seed=0,
         index=0,
         steps=0,
         episodes=10_000_000,
         certificate=certificate,
-        mode=None,
         algorithm="PPO",
         settings=PPOSettings(),
     )
@@ -48,7 +50,7 @@ def test_a_run_told_to_stop_gives_up_at_its_next_report(endless):
 
 
 def test_the_first_failure_stops_the_others_and_is_the_one_reported(endless):
-    broken = replace(endless, arm="broken", env="ncs_gym/Nowhere-v0")
+    broken = replace(endless, arm="broken", loop=LoopConfig(env="ncs_gym/Nowhere-v0"))
     begin, kept, jobs = time.monotonic(), [], [job_of(run) for run in (endless, broken)]
     with pytest.raises(Exception, match="Nowhere") as caught:
         execute_all(jobs, 2, lambda job, result: kept.append(job), lambda steps: None)

@@ -1,15 +1,14 @@
 """Filters that take the estimate for the truth: what they keep, what they lose, and that they promise nothing."""
 
 from dataclasses import replace
-from functools import partial
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.control_loop import ControlLoop, ShieldSettings
 from agents.evaluation import evaluate
-from experiments.baselines import FILTERS, controller, filtered
+from agents.loop import LoopConfig, ShieldSettings
+from experiments.baselines import FILTERS, EstimateFilterSettings, controller
 from experiments.baselines.predictive import PredictiveFilter
 from experiments.baselines.trusting import TrustingFilter
 from ncs_gym.envs.env import ncs_env
@@ -35,13 +34,13 @@ def cases(certificate, loaded):
 
 def played(certificate, **filters):
     """The proportional controller on the cruise, always with the same seed."""
-    loop = ControlLoop(env=CRUISE, **filters)
+    loop = LoopConfig(env=CRUISE, **filters)
     policy = controller("proportional", ncs_env(loop.single()), certificate.K, 0)
     return evaluate(loop, policy, 20, 7, certificate.M).episodes
 
 
 def test_trusting_filter_is_caught_leaving_the_safe_set_and_the_shield_is_not(certificate):
-    trusted = played(certificate, filter=partial(filtered, name="trusting", certificate=certificate))
+    trusted = played(certificate, filter=EstimateFilterSettings("trusting", certificate))
     shielded = played(certificate, shield=ShieldSettings(certificate))
     assert sum(episode.largest_level > 1.0 for episode in trusted) >= 3
     assert sum(episode.violation_steps for episode in trusted) >= 3
@@ -54,11 +53,11 @@ def test_trusting_filter_is_caught_leaving_the_safe_set_and_the_shield_is_not(ce
 
 
 def test_trusting_lookahead_is_caught_leaving_the_box_and_lookahead_is_not():
-    reactor = ControlLoop(env="ncs_gym/BatchReactor-v0")
+    reactor = LoopConfig(env="ncs_gym/BatchReactor-v0")
     env = ncs_env(reactor.single())
     certificate = certificate_of(env.plant, env.contract)
     policy = controller("lqr", env, certificate.K, 0)
-    trusting = replace(reactor, filter=partial(filtered, name="trusting:lookahead", certificate=certificate))
+    trusting = replace(reactor, filter=EstimateFilterSettings("trusting:lookahead", certificate))
     lookahead = replace(reactor, shield=ShieldSettings(certificate, "lookahead"))
     violating = [
         sum(episode.violation_steps for episode in evaluate(loop, policy, 12, 7).episodes)
@@ -70,7 +69,7 @@ def test_trusting_lookahead_is_caught_leaving_the_box_and_lookahead_is_not():
 
 @pytest.mark.parametrize("name", FILTERS)
 def test_no_filter_speaks_of_a_guarantee(name, certificate):
-    envs = filtered(gym.make_vec(CRUISE, num_envs=2), name, certificate)
+    envs = EstimateFilterSettings(name, certificate)(gym.make_vec(CRUISE, num_envs=2))
     _, info = envs.reset(seed=0)
     *_, after = envs.step(np.ones((2, 1), np.float32))
     for keys in (info, after):
@@ -174,15 +173,15 @@ def test_what_is_not_changed_is_passed_on_bit_for_bit_and_a_reset_counts_nothing
         return [envs.step(np.full((3, 1), 0.1, np.float32)) for _ in range(14)]
 
     for bare, behind in zip(
-        steps(lambda envs: envs), steps(partial(filtered, name="trusting", certificate=certificate)), strict=True
+        steps(lambda envs: envs), steps(EstimateFilterSettings("trusting", certificate)), strict=True
     ):
         np.testing.assert_array_equal(bare[0], behind[0])
         np.testing.assert_array_equal(bare[1], behind[1])
         np.testing.assert_array_equal(behind[4]["shield_correction"], 0.0)
         assert not behind[4]["shield_intervened"].any()
 
-    envs = filtered(gym.make_vec(CRUISE, num_envs=2, max_episode_steps=3), "trusting", certificate, penalty=2.0)
-    free = filtered(gym.make_vec(CRUISE, num_envs=2, max_episode_steps=3), "trusting", certificate)
+    envs = EstimateFilterSettings("trusting", certificate, 2.0)(gym.make_vec(CRUISE, num_envs=2, max_episode_steps=3))
+    free = EstimateFilterSettings("trusting", certificate)(gym.make_vec(CRUISE, num_envs=2, max_episode_steps=3))
     for each in (envs, free):
         each.reset(seed=1, options={"state": 0.95 * np.linalg.cholesky(certificate.L)[:, 0]})
     overridden = 0
@@ -198,4 +197,4 @@ def test_what_is_not_changed_is_passed_on_bit_for_bit_and_a_reset_counts_nothing
 
 def test_only_an_environment_with_an_estimate_can_be_filtered(certificate):
     with pytest.raises(ValueError, match="needs an NCSVectorEnv"):
-        filtered(gym.make_vec("CartPole-v1", num_envs=1), "psf", certificate)
+        EstimateFilterSettings("psf", certificate)(gym.make_vec("CartPole-v1", num_envs=1))

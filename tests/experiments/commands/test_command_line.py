@@ -434,7 +434,7 @@ def test_help_has_two_levels(command):
     for flag in later:
         assert flag not in first.stdout
         assert flag in everything.stdout
-    for flag in ("--env", "--steps", "--mode", "--channel.loss", "--smoke", "--force", "--help"):
+    for flag in ("--env", "--steps", "--mode", "--channel", "--smoke", "--force", "--help"):
         assert flag in first.stdout
         assert flag in everything.stdout
     assert "--help-all" in first.stdout
@@ -497,7 +497,7 @@ def test_usage_errors_are_the_parsers(arguments, words):
         (["sweep", "--losses", "0.1", "0.1"], ["--losses must be different"]),
         (["sweep", "--downlink-losses", "0.1"], ["has an ideal downlink, which loses nothing"]),
         (["sweep", "--losses", "0.9", "--burst-lengths", "2"], ["bursts of mean length 2"]),
-        (["sweep", "--channel.loss", "0.5"], ["--channel.loss is a side of the grid"]),
+        (["sweep", "--channel.loss", "0.5"], ["--channel loss is a side of the grid"]),
         (
             ["sweep", "--env", "ncs_gym/BatchReactor-v0", "--quantization-steps", "0.1"],
             ["rounds to 0.1, the contract allows 0.001"],

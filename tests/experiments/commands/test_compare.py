@@ -4,55 +4,54 @@ import numpy as np
 import pytest
 
 from agents import tuned_settings
+from agents.loop import LoopConfig
 from agents.results import Episode
 from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
 from experiments.analysis.arm_table import _rows
 from experiments.analysis.summary import covered_fraction, paired_differences, summarize_arm
 from experiments.commands.compare import _findings, _training_runs
 from experiments.runs.arms import Arm, by_arm
-from experiments.runs.experiment_setup import ExperimentSetup
 from experiments.runs.run_store import prepare_output
 from experiments.runs.training_run import RunResult
 from experiments.settings import CompareSettings
 from experiments.settings.agent_overrides import A2COverrides, OffPolicyOverrides, PPOOverrides
-from shields import verify
 
 ALL_ARMS = ("unshielded", "monitor", "penalized", "shielded", "shielded:switch+penalty", "shielded:boundary")
 
 
-@pytest.fixture(scope="module")
-def setup(certificate, loaded):
-    return ExperimentSetup("ncs_gym/TruckTrailerCruise-v0", None, loaded, certificate, verify(certificate, loaded))
+CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 
 
-def runs_of(setup, **change):
-    return _training_runs(CompareSettings(**change), setup)
+def runs_of(certificate, **change):
+    return _training_runs(CompareSettings(**change), LoopConfig(env=CRUISE), certificate)
 
 
-def test_runs_with_equal_numbers_are_paired_across_arms_and_differ_from_each_other(setup):
+def test_runs_with_equal_numbers_are_paired_across_arms_and_differ_from_each_other(certificate):
     seeds: dict = {}
-    for run in runs_of(setup, arms=ALL_ARMS):
+    for run in runs_of(certificate, arms=ALL_ARMS):
         seeds.setdefault(run.index, set()).add((run.training_seed, run.evaluation_seed))
     assert {len(pairs) for pairs in seeds.values()} == {1}
     flat = [number for pairs in seeds.values() for pair in pairs for number in pair]
     assert len(set(flat)) == len(flat) == 6
 
 
-def test_another_seed_draws_everything_anew(setup):
-    first, second = ({run.training_seed for run in runs_of(setup, seed=seed)} for seed in (0, 1))
+def test_another_seed_draws_everything_anew(certificate):
+    first, second = ({run.training_seed for run in runs_of(certificate, seed=seed)} for seed in (0, 1))
     assert not first & second
 
 
 @pytest.mark.parametrize("seed", [0, 10**9, 2**63])
-def test_any_seed_is_usable(setup, seed):
-    for run in runs_of(setup, seed=seed):
+def test_any_seed_is_usable(certificate, seed):
+    for run in runs_of(certificate, seed=seed):
         assert 0 <= run.training_seed < 2**31
         assert 0 <= run.evaluation_seed < 2**31
 
 
-def test_each_arm_has_its_shield_and_its_penalties(setup):
-    chosen = runs_of(setup, arms=ALL_ARMS, seeds=1, mode="switch", intervention_penalty=0.3, violation_penalty=2.0)
-    loops = {run.arm: run.loop for run in chosen}
+def test_each_arm_has_its_shield_and_its_penalties(certificate):
+    chosen = runs_of(
+        certificate, arms=ALL_ARMS, seeds=1, mode="switch", intervention_penalty=0.3, violation_penalty=2.0
+    )
+    loops = {run.arm: run.training_loop for run in chosen}
     modes = {name: loop.shield and loop.shield.mode for name, loop in loops.items()}
     assert modes == {
         "unshielded": None,
@@ -73,17 +72,20 @@ def test_each_arm_has_its_shield_and_its_penalties(setup):
     assert {name for name, loop in loops.items() if loop.violation_penalty == 2.0} == {"penalized"}
 
 
-def test_lookahead_is_an_arm_by_two_names_and_alone_takes_the_horizon(setup):
+def test_lookahead_is_an_arm_by_two_names_and_alone_takes_the_horizon(certificate):
     arms = ("unshielded", "monitor", "shielded", "lookahead", "lookahead+penalty", "shielded:lookahead")
-    loops = {run.arm: run.loop for run in runs_of(setup, arms=arms, seeds=1, horizon=4, intervention_penalty=0.3)}
+    loops = {
+        run.arm: run.training_loop
+        for run in runs_of(certificate, arms=arms, seeds=1, horizon=4, intervention_penalty=0.3)
+    }
     for name in arms[3:]:
         assert (loops[name].shield.mode, loops[name].shield.horizon) == ("lookahead", 4)
         assert loops[name].shield.penalty == (0.3 if name.endswith("+penalty") else 0.0)
     for name in set(loops) - set(arms[3:]):
         assert loops[name].shield is None or loops[name].shield.horizon is None
-    by_mode = runs_of(setup, arms=("shielded",), seeds=1, mode="lookahead")
+    by_mode = runs_of(certificate, arms=("shielded",), seeds=1, mode="lookahead")
     assert (by_mode[0].loop.shield.mode, by_mode[0].loop.shield.horizon) == ("lookahead", 6)
-    keys = {runs_of(setup, arms=("lookahead",), seeds=1, horizon=horizon)[0].key for horizon in (None, 4, 5)}
+    keys = {runs_of(certificate, arms=("lookahead",), seeds=1, horizon=horizon)[0].key for horizon in (None, 4, 5)}
     assert len(keys) == 3
 
 
@@ -120,10 +122,10 @@ def test_unknown_arms_are_refused(name):
     ("algo", "settings"),
     [("PPO", PPOSettings), ("TRPO", PPOSettings), ("A2C", A2CSettings), ("SAC", OffPolicySettings)],
 )
-def test_settings_reach_every_run(setup, algo, settings):
+def test_settings_reach_every_run(certificate, algo, settings):
     given = {"ppo": PPOOverrides(envs=3), "a2c": A2COverrides(envs=3), "off_policy": OffPolicyOverrides(envs=3)}
-    expected = replace(tuned_settings(setup.env) if algo == "PPO" else settings(), envs=3)
-    for run in runs_of(setup, steps=7, episodes=9, algo=algo, **given):
+    expected = replace(tuned_settings(CRUISE) if algo == "PPO" else settings(), envs=3)
+    for run in runs_of(certificate, steps=7, episodes=9, algo=algo, **given):
         assert (run.steps, run.episodes, run.algorithm, run.settings) == (7, 9, algo, expected)
 
 

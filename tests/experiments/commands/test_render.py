@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from agents.control_loop import ControlLoop
+from agents.loop import LoopConfig
 from agents.training import untrained
 from experiments.commands.render import render
 from experiments.runs.policies import _greedy_action, policy_by_name
@@ -29,7 +29,7 @@ def certificate_file(certificate, tmp_path_factory):
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
     """A saved agent that has learned nothing."""
-    folder, agent = tmp_path_factory.mktemp("model"), untrained(ControlLoop(env=CRUISE), seed=0)
+    folder, agent = tmp_path_factory.mktemp("model"), untrained(LoopConfig(env=CRUISE), seed=0)
     agent.save(folder)
     return folder, agent
 

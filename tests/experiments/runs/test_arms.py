@@ -3,20 +3,19 @@
 import numpy as np
 import pytest
 
-from agents.control_loop import CostPenalty
-from agents.loop_wrappers import ResidualActions
+from agents.loop import CostPenalty, LoopConfig, ResidualActions
 from agents.settings import LagrangianSettings
 from experiments.baselines import EstimateFilter
-from experiments.runs import Arm, ExperimentSetup
+from experiments.runs import Arm, certificate_of, loop_config, run_of_arm
 from experiments.settings import CompareSettings
 from experiments.settings.agent_overrides import PPOOverrides
-from shields import VectorSafetyShield, verify
+from shields import VectorSafetyShield
 
 
 @pytest.fixture(scope="module")
-def run_of(certificate, loaded):
-    setup = ExperimentSetup("ncs_gym/TruckTrailerCruise-v0", None, loaded, certificate, verify(certificate, loaded))
-    return lambda name, **settings: setup.training_run(CompareSettings(**settings), name, 0)
+def run_of(certificate):
+    loop = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
+    return lambda name, **settings: run_of_arm(CompareSettings(**settings), loop, certificate, name, 0)
 
 
 def layers(env):
@@ -72,7 +71,7 @@ def test_unknown_arms_are_refused_with_those_that_are_known(name):
 
 def test_weight_of_a_penalty_may_be_part_of_the_name(run_of):
     weights = {name: run_of(name, violation_penalty=3.0) for name in ("penalized", "penalized:0.1", "penalized:1e-2")}
-    assert [run.violation_penalty for run in weights.values()] == [3.0, 0.1, 0.01]
+    assert [run.training_loop.violation_penalty for run in weights.values()] == [3.0, 0.1, 0.01]
     assert {run.arm for run in weights.values()} == set(weights)
 
 
@@ -89,12 +88,12 @@ def test_filter_at_test_is_not_there_in_training(run_of):
 def test_lagrangian_has_its_settings_and_starts_at_its_multiplier(run_of):
     settings = LagrangianSettings(multiplier=0.5, cost_limit=2.0)
     run = run_of("lagrangian", lagrangian=settings)
-    assert run.lagrangian == settings
+    assert run.training_loop.lagrangian == settings
     envs = run.training_loop.vector(2)
     assert (layers(envs), envs.penalty) == ([CostPenalty], 0.5)
-    assert layers(run.loop.without_penalties.vector(2)) == []
+    assert layers(run.loop.vector(2)) == []
     assert run.key != run_of("lagrangian").key
-    assert run_of("unshielded", lagrangian=settings).lagrangian is None
+    assert run_of("unshielded", lagrangian=settings).training_loop.lagrangian is None
 
 
 def test_residual_agents_add_to_the_certified_gain_outside_of_the_filter(run_of, certificate, loaded):
@@ -119,12 +118,10 @@ def test_predictive_filter_acts_on_trained_agents_in_training_or_at_test_alone()
     from experiments.runs import execute_run
 
     tiny = PPOOverrides(envs=2, rollout=64, batch_size=64, epochs=1, width=8)
-    settings, setup = (
-        CompareSettings(steps=512, episodes=2, ppo=tiny),
-        ExperimentSetup.of("ncs_gym/BatchReactor-v0", None),
-    )
+    settings, loop = CompareSettings(steps=512, episodes=2, ppo=tiny), loop_config("ncs_gym/BatchReactor-v0")
+    certificate = certificate_of(loop)
     unshielded, filtered, at_test = (
-        execute_run(setup.training_run(settings, name, 0), lambda steps: None)
+        execute_run(run_of_arm(settings, loop, certificate, name, 0), lambda steps: None)
         for name in ("unshielded", "psf", "psf at test")
     )
     assert [each.train_interventions > 0 for each in (unshielded, filtered, at_test)] == [False, True, False]

@@ -7,27 +7,22 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.control_loop import ControlLoop
+from agents.loop import LoopConfig
 from experiments.analysis.arm_table import condition_text, summary_text
 from experiments.analysis.summary import arm_summary
-from experiments.runs import ExperimentSetup, RunStore, execute_run
+from experiments.runs import RunStore, execute_run, run_of_arm
 from experiments.runs.evaluation_conditions import condition_named, other_conditions, under, worse_channel
 from experiments.settings import CompareSettings
 from ncs_gym import AdversarialDisturbance, Channel, ChannelContract, GilbertElliott
 from ncs_gym.envs.env import ncs_env
-from shields import verify
 
 CRUISE, CART_POLE, REACTOR = (f"ncs_gym/{name}-v0" for name in ("TruckTrailerCruise", "CartPole", "BatchReactor"))
 ALL = ("worst-case disturbance", "worse channel", "gaussian")
 
 
-@pytest.fixture(scope="module")
-def setup(certificate, loaded):
-    return ExperimentSetup(CRUISE, None, loaded, certificate, verify(certificate, loaded))
-
-
-def run_of(setup, name, conditions=ALL, episodes=8):
-    return setup.training_run(CompareSettings(conditions=conditions, episodes=episodes), name, 0)
+def run_of(certificate, name, conditions=ALL, episodes=8):
+    settings = CompareSettings(conditions=conditions, episodes=episodes)
+    return run_of_arm(settings, LoopConfig(env=CRUISE), certificate, name, 0)
 
 
 def test_names_take_hyphens_and_the_condition_of_training_is_no_other_one():
@@ -38,7 +33,7 @@ def test_names_take_hyphens_and_the_condition_of_training_is_no_other_one():
 
 
 def test_each_condition_changes_one_thing_in_both_kinds_of_environment():
-    loop = ControlLoop(env=CRUISE)
+    loop = LoopConfig(env=CRUISE)
     assert under("as trained", loop) is loop
     for single in (lambda x: ncs_env(x.single()), lambda x: x.vector(2).unwrapped.single):
         own = single(loop)
@@ -72,18 +67,21 @@ def test_worse_channel_uses_what_the_contract_leaves_and_bursts_get_denser():
 
 
 @pytest.fixture(scope="module")
-def results(setup):
+def results(certificate):
     names = ("proportional", "proportional+trusting", "proportional+shielded", "random")
-    return {name: execute_run(run_of(setup, name), lambda steps: None) for name in names}
+    return {name: execute_run(run_of(certificate, name), lambda steps: None) for name in names}
 
 
-def test_conditions_are_stored_beside_the_evaluation_as_trained(setup, results, tmp_path):
-    run, result = run_of(setup, "proportional+shielded"), results["proportional+shielded"]
+def test_conditions_are_stored_beside_the_evaluation_as_trained(certificate, results, tmp_path):
+    run, result = run_of(certificate, "proportional+shielded"), results["proportional+shielded"]
     assert tuple(result.conditions) == ALL
-    alone = execute_run(run_of(setup, "proportional+shielded", ()), lambda steps: None)
+    alone = execute_run(run_of(certificate, "proportional+shielded", ()), lambda steps: None)
     assert (alone.episodes, alone.conditions) == (result.episodes, {})
     for condition, episodes in result.conditions.items():
-        assert episodes == execute_run(run_of(setup, run.arm, (condition,)), lambda steps: None).conditions[condition]
+        assert (
+            episodes
+            == execute_run(run_of(certificate, run.arm, (condition,)), lambda steps: None).conditions[condition]
+        )
         assert episodes != result.episodes
     store = RunStore(tmp_path)
     store.save(run, result)
@@ -104,8 +102,8 @@ def test_shield_holds_where_the_filter_that_trusts_the_estimate_breaks(results):
     assert all(each.guaranteed for each in results["proportional+shielded"].conditions["worst-case disturbance"])
 
 
-def test_random_policy_acts_alike_under_every_condition(setup):
-    run = run_of(setup, "random", ("as trained",))
+def test_random_policy_acts_alike_under_every_condition(certificate):
+    run = run_of(certificate, "random", ("as trained",))
     first, again = (execute_run(run, lambda steps: None).trajectory.inputs for _ in range(2))
     np.testing.assert_array_equal(first, again)
 

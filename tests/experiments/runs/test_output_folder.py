@@ -15,7 +15,6 @@ from experiments.errors import FolderInUseError, OtherResultsError
 from experiments.runs import claim_folder as folder_of
 from experiments.settings import (
     CertifySettings,
-    ChannelSettings,
     CompareSettings,
     ReproduceSettings,
     StudySettings,
@@ -47,7 +46,7 @@ def finished(command, settings, file="summary.json"):
         ("compare", CompareSettings, {"seeds": 2}, r"\(seeds 3, now 2\)"),
         ("compare", CompareSettings, {"arms": ("shielded",)}, "arms"),
         ("compare", CompareSettings, {"noise": "gaussian"}, "noise"),
-        ("compare", CompareSettings, {"channel": ChannelSettings(loss=0.5)}, r"\(channel.loss null, now 0.5\)"),
+        ("compare", CompareSettings, {"channel": {"loss": 0.5}}, r"\(channel.loss null, now 0.5\)"),
         ("compare", CompareSettings, {"ppo": PPOOverrides(width=8)}, "ppo.width"),
         ("compare", CompareSettings, {"seed": 1, "seeds": 1, "steps": 1, "episodes": 1}, r"; \.\.\.\)"),
         ("train", TrainSettings, {"arm": "unshielded"}, "arm"),

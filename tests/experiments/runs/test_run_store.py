@@ -4,8 +4,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents.settings import PPOSettings
+from agents.loop import LoopConfig, ShieldSettings
+from agents.settings import LagrangianSettings, PPOSettings
 from experiments.backends.execution import results_of
+from experiments.baselines import EstimateFilterSettings
 from experiments.errors import ResultsError
 from experiments.runs.run_store import RunStore
 from experiments.runs.training_run import TrainingRun, execute_run
@@ -14,16 +16,17 @@ from experiments.settings import BackendSettings
 
 @pytest.fixture(scope="module")
 def run(certificate):
+    loop = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0", shield=ShieldSettings(certificate, "switch"))
     return TrainingRun(
         arm="shielded:switch+penalty",
         policy_kind="trained",
-        env="ncs_gym/TruckTrailerCruise-v0",
+        training_loop=loop,
+        loop=loop,
         seed=0,
         index=1,
         steps=256,
         episodes=2,
         certificate=certificate,
-        mode="switch",
         algorithm="PPO",
         settings=PPOSettings(envs=2, rollout=64, batch_size=64, epochs=1, width=8),
     )
@@ -53,10 +56,35 @@ def test_stored_result_comes_back_exactly(store, run, result):
 
 @pytest.mark.parametrize(
     "change",
-    [{"seed": 1}, {"steps": 257}, {"mode": "project"}, {"settings": PPOSettings()}, {"violation_penalty": 0.5}],
+    [{"seed": 1}, {"steps": 257}, {"settings": PPOSettings()}, {"certificate_basis": "another plant"}],
 )
 def test_result_of_other_settings_is_not_taken(store, run, change):
     assert store.load(replace(run, **change)) is None
+
+
+@pytest.mark.parametrize("loop", ["loop", "training_loop"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"violation_penalty": 0.5},
+        {"kwargs": {"noise": "gaussian"}},
+        {"kwargs": {"channel": {"loss": {"p_good_to_bad": 0.1, "p_bad_to_good": 0.5}}}},
+        {"lagrangian": LagrangianSettings()},
+        {"residual_gain": np.ones((1, 2))},
+        {"shield": None},
+    ],
+)
+def test_result_of_another_control_loop_is_not_taken(store, run, loop, change):
+    other = replace(getattr(run, loop), **change)
+    assert store.load(replace(run, **{loop: other})) is None
+
+
+def test_result_behind_another_shield_is_not_taken(store, run, certificate):
+    for change in ({"mode": "project"}, {"penalty": 0.5}, {"mode": "lookahead", "horizon": 4}):
+        other = replace(run.loop, shield=replace(run.loop.shield, **change))
+        assert store.load(replace(run, loop=other)) is None
+    filtered = replace(run.loop, shield=None, filter=EstimateFilterSettings("psf", certificate))
+    assert store.load(replace(run, loop=filtered)) is None
 
 
 def test_result_of_another_certificate_or_version_is_not_taken(store, run, certificate, monkeypatch):

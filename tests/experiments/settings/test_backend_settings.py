@@ -3,7 +3,7 @@ import sys
 import pytest
 
 from experiments.__main__ import COMMANDS, _run
-from experiments.runs.experiment_setup import INCIDENTAL_SETTINGS
+from experiments.runs.experiment import INCIDENTAL_SETTINGS
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings
 from experiments.settings.learning import CompareSettings

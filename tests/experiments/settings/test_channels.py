@@ -1,9 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from experiments.commands.sweep import _grid_points
-from experiments.runs import ExperimentSetup
-from experiments.settings.channel import ChannelSettings, _bursts
+from experiments.runs import certificate_of, loop_config, run_of_arm
+from experiments.settings.channel import _bursts, changed_channel
 from experiments.settings.study import SweepSettings
 from ncs_gym import Channel, ChannelContract, GilbertElliott
 from ncs_gym.envs.env import ncs_env
@@ -15,12 +17,12 @@ OWN = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
 
 
 def test_nothing_asked_for_changes_nothing():
-    assert ChannelSettings().applied_to(OWN) is None
-    assert ChannelSettings(loss=0.3).applied_to(OWN) is None
+    assert changed_channel(OWN, {}) is None
+    assert changed_channel(OWN, {"loss": 0.3, "delay": None}) is None
 
 
 def test_what_is_asked_for_replaces_the_environments_own():
-    changed = ChannelSettings(loss=0.1, delay=0, max_consecutive_losses=4).applied_to(OWN)
+    changed = changed_channel(OWN, {"loss": 0.1, "delay": 0, "max_consecutive_losses": 4})
     expected = Channel(loss=0.1, quantization_step=0.05, send_period=2, delay=0, max_consecutive_losses=4)
     assert changed == expected
 
@@ -51,12 +53,19 @@ def test_impossible_bursts_are_refused(loss, length):
         _bursts(loss, length)
 
 
+def test_unknown_name_is_refused_with_those_that_are_known():
+    with pytest.raises(
+        ValueError, match=r"--channel lag: a channel has no such setting; known are loss, .*burst_length"
+    ):
+        changed_channel(OWN, {"lag": 3})
+
+
 def test_bursts_need_a_loss_probability():
     own = Channel(loss=GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.5))
-    with pytest.raises(ValueError, match=r"--channel\.loss"):
-        ChannelSettings(burst_length=3.0).applied_to(own)
-    assert ChannelSettings(burst_length=3.0, loss=0.2).applied_to(own).loss == _bursts(0.2, 3.0)
-    assert ChannelSettings(burst_length=3.0).applied_to(OWN).loss == _bursts(0.3, 3.0, 2)
+    with pytest.raises(ValueError, match="--channel burst_length needs loss"):
+        changed_channel(own, {"burst_length": 3.0})
+    assert changed_channel(own, {"burst_length": 3.0, "loss": 0.2}).loss == _bursts(0.2, 3.0)
+    assert changed_channel(OWN, {"burst_length": 3.0}).loss == _bursts(0.3, 3.0, 2)
 
 
 def test_grid_is_the_product_of_its_sides():
@@ -64,12 +73,8 @@ def test_grid_is_the_product_of_its_sides():
     points = _grid_points(settings)
     assert len(points) == len({point.name for point in points}) == 8
     lossless, *_, last = points
-    assert lossless.channel(ChannelSettings(jitter=1)) == ChannelSettings(
-        loss=0.0, delay=1, quantization_step=0.1, jitter=1
-    )
-    assert last.channel(ChannelSettings()) == ChannelSettings(
-        loss=0.5, delay=1, quantization_step=0.2, burst_length=3.0
-    )
+    assert lossless.channel({"jitter": 1}) == {"loss": 0.0, "delay": 1, "quantization_step": 0.1, "jitter": 1}
+    assert last.channel({}) == {"loss": 0.5, "delay": 1, "quantization_step": 0.2, "burst_length": 3.0}
 
 
 def test_masses_are_a_side_of_the_grid():
@@ -77,12 +82,14 @@ def test_masses_are_a_side_of_the_grid():
     points = _grid_points(settings)
     assert [point.mass_factor for point in points] == [0.9, 1.0, 1.1]
     assert len({point.name for point in points}) == 3
-    setup = ExperimentSetup.of("ncs_gym/Pendulum-v0", points[0].channel(ChannelSettings()), mass_factor=0.9)
-    run = setup.training_run(settings.completed, "shielded", 0)
+    loop = points[0].loop(replace(settings, env="ncs_gym/Pendulum-v0"))
+    run = run_of_arm(settings.completed, loop, certificate_of(loop), "shielded", 0)
     assert ncs_env(run.loop.single()).process == PendulumProcess(mass=0.9)
-    assert run.certificate.checksum == certificate_for(setup.plant, ChannelContract(2)).checksum  # the model's
+    assert (
+        run.certificate.checksum == certificate_for(ncs_env(loop.single()).plant, ChannelContract(2)).checksum
+    )  # the model's
     with pytest.raises(ValueError, match="a LinearProcess has no mass to change"):
-        ExperimentSetup.of("ncs_gym/TruckTrailer-v0", None, mass_factor=0.9)
+        loop_config("ncs_gym/TruckTrailer-v0", mass_factor=0.9)
 
 
 @pytest.mark.parametrize("change", [{"losses": ()}, {"delays": (1, 1)}, {"arms": ("shielded", "shielded")}])

@@ -5,7 +5,7 @@ import pytest
 
 from experiments.__main__ import _parse
 from experiments.errors import SettingsError
-from experiments.settings import ChannelSettings, CompareSettings, SweepSettings, config_defaults, save_settings
+from experiments.settings import CompareSettings, SweepSettings, config_defaults, save_settings
 from experiments.settings.agent_overrides import PPOOverrides
 
 
@@ -21,7 +21,7 @@ from experiments.settings.agent_overrides import PPOOverrides
                 violation_penalty=0.1 + 0.2,
                 algo="SAC",
                 smoke=True,
-                channel=ChannelSettings(loss=1e-3, delay=4),
+                channel={"loss": 1e-3, "delay": 4},
                 ppo=PPOOverrides(learning_rate=1e-5, log_std=-1.5),
             ),
         ),

@@ -7,11 +7,10 @@ import pytest
 
 from experiments.backends.execution import results_of
 from experiments.errors import ResultsError
-from experiments.runs import ExperimentSetup, execute_run
-from experiments.settings import CompareSettings
+from experiments.runs import certificate_of, execute_run, loop_config, run_of_arm
+from experiments.settings import CompareSettings, changed_channel
 from experiments.settings.agent_overrides import PPOOverrides
 from experiments.study.channel_sweep import SWEPT_CONDITIONS, SWEPT_FILTERS, channel_sweep, trained_agents
-from experiments.study.channel_sweep import _changed as changed
 from experiments.study.channel_sweep import _points as points_of
 from experiments.study.study_figures import sweep_figure
 from experiments.study.study_tables import channels_table
@@ -43,8 +42,11 @@ def trained(tmp_path_factory):
         jobs=1,
         out=out,
     )
-    setup = ExperimentSetup.of(CRUISE, None)
-    runs = [setup.training_run(settings.completed, name, index) for name in SWEPT_FILTERS for index in range(2)]
+    loop = loop_config(CRUISE)
+    certificate = certificate_of(loop)
+    runs = [
+        run_of_arm(settings.completed, loop, certificate, name, index) for name in SWEPT_FILTERS for index in range(2)
+    ]
     with no_worker_processes():
         results = results_of(runs, out, settings)
     return settings, results, trained_agents(settings)
@@ -114,7 +116,8 @@ def test_agents_are_those_that_the_comparison_left(trained):
 
 def test_a_run_with_an_agent_trains_nothing_and_is_another_with_another_agent(trained):
     settings, _, agents = trained
-    run = ExperimentSetup.of(CRUISE, None).training_run(settings, "shielded", 0)
+    loop = loop_config(CRUISE)
+    run = run_of_arm(settings, loop, certificate_of(loop), "shielded", 0)
     first, second = (replace(run, agent_files=files) for files in agents["shielded"])
     assert len({run.key, first.key, second.key}) == 3
     assert first.total_steps == run.episodes * 200 < run.total_steps
@@ -158,7 +161,7 @@ def test_channels_that_break_the_contract_are_left_out():
     env = ncs_env(gym.make(REACTOR))
     kept = points_of(REACTOR)
     assert kept
-    assert all(env.contract.is_kept_by(changed(point).applied_to(env.channel) or env.channel) for point in kept)
+    assert all(env.contract.is_kept_by(changed_channel(env.channel, point.change) or env.channel) for point in kept)
     too_late = replace(kept[0], side="delay", value=float(env.contract.max_age + 1))
     assert too_late.name not in {point.name for point in kept}
-    assert not env.contract.is_kept_by(changed(too_late).applied_to(env.channel))
+    assert not env.contract.is_kept_by(changed_channel(env.channel, too_late.change))

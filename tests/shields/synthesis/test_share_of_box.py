@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.runs import ExperimentSetup
+from experiments.runs.experiment import certificate_line
 from ncs_gym import LinearPlant, cart_pole, truck_trailer
 from ncs_gym.plants.linear_plant import inputs_under_way
 from shields import verify
@@ -88,7 +88,7 @@ def test_operating_point_shifts_nothing(certificate, loaded):
 
 
 def test_first_line_of_an_experiment_says_both_shares(certificate, loaded):
-    setup = ExperimentSetup("ncs_gym/TruckTrailerCruise-v0", None, loaded, certificate, verify(certificate, loaded))
+    line = certificate_line(certificate, verify(certificate, loaded))
     share = np.sqrt(np.linalg.det(certificate.L)) * np.pi / 16.0  # the box is 4 by 4
-    assert f"({100 * share:.4g} % of the safe box's volume, 99.97 % of the volume of the largest" in setup.title
-    assert setup.title.startswith("certificate: 17 conditions hold")
+    assert f"({100 * share:.4g} % of the safe box's volume, 99.97 % of the volume of the largest" in line
+    assert line.startswith("certificate: 17 conditions hold")

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from agents.control_loop import ControlLoop, CostPenalty, ShieldSettings
+from agents.loop import ControlLoop, CostPenalty, LoopConfig, ShieldSettings
 from ncs_gym import Channel
 from shields import SafetyShield, VectorSafetyShield
 
@@ -9,7 +9,7 @@ CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 
 
 def test_it_shields_only_if_asked(certificate):
-    bare, shielded = ControlLoop(env=CRUISE), ControlLoop(env=CRUISE, shield=ShieldSettings(certificate, "switch", 0.5))
+    bare, shielded = LoopConfig(env=CRUISE), LoopConfig(env=CRUISE, shield=ShieldSettings(certificate, "switch", 0.5))
     assert not isinstance(bare.single(), SafetyShield)
     assert not isinstance(bare.vector(2), VectorSafetyShield)
     assert (shielded.single().penalty, shielded.single().filter.mode) == (0.5, "switch")
@@ -18,16 +18,16 @@ def test_it_shields_only_if_asked(certificate):
 
 @pytest.mark.parametrize(("given", "horizon"), [(4, 4), (None, 6)])
 def test_horizon_of_lookahead_reaches_both_kinds_of_environment(certificate, given, horizon):
-    loop = ControlLoop(env=CRUISE, shield=ShieldSettings(certificate, "lookahead", horizon=given))
+    loop = LoopConfig(env=CRUISE, shield=ShieldSettings(certificate, "lookahead", horizon=given))
     for env in (loop.single(), loop.vector(2), loop.without_penalties.vector(2)):
         assert (env.filter.mode, env.filter.horizon) == ("lookahead", horizon)
     with pytest.raises(ValueError, match="horizon"):
-        ControlLoop(env=CRUISE, shield=ShieldSettings(certificate, "project", horizon=4)).single()
+        LoopConfig(env=CRUISE, shield=ShieldSettings(certificate, "project", horizon=4)).single()
 
 
 def test_bare_certificate_is_refused_before_training(certificate):
     with pytest.raises(ValueError, match=r"^shield must be ShieldSettings\(certificate\), got Certificate$"):
-        ControlLoop(env="ncs_gym/TruckTrailerCruise-v0", shield=certificate)
+        LoopConfig(env="ncs_gym/TruckTrailerCruise-v0", shield=certificate)
 
 
 def test_unknown_mode_is_refused_before_training(certificate):
@@ -37,18 +37,18 @@ def test_unknown_mode_is_refused_before_training(certificate):
 
 def test_shield_and_filter_are_not_mixed(certificate):
     with pytest.raises(ValueError, match="give either a shield or a filter"):
-        ControlLoop(env="ncs_gym/TruckTrailerCruise-v0", shield=ShieldSettings(certificate), filter=lambda envs: envs)
+        LoopConfig(env="ncs_gym/TruckTrailerCruise-v0", shield=ShieldSettings(certificate), filter=lambda envs: envs)
 
 
 def test_channel_reaches_both_kinds_of_environment():
-    loop = ControlLoop(env=CRUISE, channel=Channel(delay=7))
+    loop = LoopConfig(env=CRUISE, kwargs={"channel": Channel(delay=7)})
     assert loop.single().unwrapped.channel.delay == loop.vector(2).unwrapped.channel.delay == 7
 
 
 @pytest.mark.parametrize("autoreset", ["NextStep", "SameStep"])
 def test_every_violating_step_has_its_penalty(autoreset):
     def played(penalty):
-        envs = ControlLoop(env=CRUISE, violation_penalty=penalty).vector(3, autoreset_mode=autoreset)
+        envs = LoopConfig(env=CRUISE, violation_penalty=penalty).vector(3, autoreset_mode=autoreset)
         envs.reset(seed=0)
         steps = [envs.step(np.ones((3, 1), np.float32)) for _ in range(201)]
         if autoreset == "NextStep":
@@ -64,7 +64,29 @@ def test_every_violating_step_has_its_penalty(autoreset):
 
 
 def test_loop_without_penalties_has_the_environments_own_rewards(certificate):
-    loop = ControlLoop(env=CRUISE, shield=ShieldSettings(certificate, penalty=1.0), violation_penalty=2.0)
+    loop = LoopConfig(env=CRUISE, shield=ShieldSettings(certificate, penalty=1.0), violation_penalty=2.0)
     assert isinstance(loop.vector(1), CostPenalty)
     assert not isinstance(loop.without_penalties.vector(1), CostPenalty)
     assert loop.without_penalties.shield.penalty == 0.0
+
+
+def test_former_name_takes_the_environments_keyword_arguments_beside_its_own(certificate):
+    shield, channel = ShieldSettings(certificate, "switch"), Channel(delay=7)
+    with pytest.warns(DeprecationWarning, match="ControlLoop is now LoopConfig"):
+        former = ControlLoop(env=CRUISE, channel=channel, downlink=None, noise="gaussian", shield=shield)
+    assert vars(former) == vars(LoopConfig(env=CRUISE, kwargs={"channel": channel, "noise": "gaussian"}, shield=shield))
+    assert former.single().unwrapped.noise == "gaussian"
+
+
+def test_changed_arguments_are_those_of_the_changed_loop_alone():
+    loop = LoopConfig(env=CRUISE, kwargs={"channel": {"delay": 7}})
+    changed = loop.with_kwargs(channel=None, noise="gaussian")
+    assert (changed.kwargs, changed.channel) == ({"noise": "gaussian"}, None)
+    assert (loop.kwargs, loop.channel) == ({"channel": {"delay": 7}}, Channel(delay=7))
+
+
+def test_loop_replaces_the_downlink():
+    env = "ncs_gym/TruckTrailerCruiseTwoWay-v0"
+    assert LoopConfig(env=env).single().unwrapped.downlink_protocol.lead == 3
+    loop = LoopConfig(env=env, kwargs={"downlink": Channel(delay=1)})
+    assert loop.single().unwrapped.downlink_protocol.lead == loop.vector(2).unwrapped.downlink_protocol.lead == 1

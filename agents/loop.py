@@ -1,0 +1,193 @@
+"""The control loop an agent works in: an environment with its settings, its shield and the penalty of a violation."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import SyncVectorEnv, VectorEnv, VectorWrapper
+
+from agents.settings import LagrangianSettings
+from ncs_gym import Channel
+from ncs_gym.registration import from_json
+from ncs_gym.validation import shown
+from shields import Certificate, SafetyShield, VectorSafetyShield
+from shields.runtime.safety_filter import DEFAULT_HORIZON, MODES
+
+
+@dataclass(frozen=True)
+class ShieldSettings:
+    """Settings of the shield around an environment.
+
+    Attributes:
+        certificate: Certificate of the safe set; it is verified when the shield is built.
+        mode: Mode of `SafetyShield`: "project", "lookahead", "switch", "boundary" or "monitor".
+        penalty: Subtracted from the reward for every intervention.
+        horizon: Longest plan of mode "lookahead" [steps]; None becomes the shield's default there.
+    """
+
+    certificate: Certificate
+    mode: str = "project"
+    penalty: float = 0.0
+    horizon: int | None = None
+
+    def __post_init__(self) -> None:
+        """Checks the mode, and gives a horizon that is not given its default, so that whoever keeps it keeps a number.
+
+        Raises:
+            ValueError: If the mode is unknown.
+        """
+        if self.mode not in MODES:
+            raise ValueError(f"mode must be one of {list(MODES)}, got {shown(self.mode)}")
+        if self.mode == "lookahead" and self.horizon is None:
+            object.__setattr__(self, "horizon", DEFAULT_HORIZON)
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of `SafetyShield` and `VectorSafetyShield` after the environment."""
+        return {name: getattr(self, name) for name in ("certificate", "mode", "penalty", "horizon")}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LoopConfig:
+    """A registered environment, and everything that stands between it and an agent.
+
+    Attributes:
+        env: A registered environment id.
+        kwargs: Keyword arguments of the environment (`gym.make(env, **kwargs)`), JSON values or the objects that they
+            stand for: `{"channel": {"loss": 0.5}}` or `{"channel": Channel(loss=0.5)}`. None keeps the id's own.
+        shield: Settings of the shield; None applies the agent's actions as they are.
+        filter: Puts another safety filter around vector environments, in place of a shield.
+        violation_penalty: Subtracted from the reward of every step whose true state violates the safe box, in vector
+            environments, which agents are trained in.
+        lagrangian: How the violation penalty is adapted in training, instead of a fixed one.
+        residual_gain: Normalized gain, shape (m, n), to whose action an agent in training adds its own.
+
+    Raises:
+        ValueError: If the shield is something else than its settings, or another filter is given beside it.
+    """
+
+    env: str
+    kwargs: Mapping[str, Any] = field(default_factory=dict)
+    shield: ShieldSettings | None = None
+    filter: Callable[[VectorEnv], VectorEnv] | None = None
+    violation_penalty: float = 0.0
+    lagrangian: LagrangianSettings | None = None
+    residual_gain: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        """Refuses what is not the settings of a shield, a bare certificate say, before anything is trained with it."""
+        if self.shield is not None and not isinstance(self.shield, ShieldSettings):
+            raise ValueError(f"shield must be ShieldSettings(certificate), got {type(self.shield).__name__}")
+        if self.shield is not None and self.filter is not None:
+            raise ValueError("give either a shield or a filter: two of them would override each other")
+        given = {name: value for name, value in self.kwargs.items() if value is not None}
+        object.__setattr__(self, "kwargs", given)
+
+    def with_kwargs(self, **changes: Any) -> LoopConfig:
+        """Returns the same loop with other keyword arguments of the environment; None goes back to the id's own."""
+        return replace(self, kwargs={**self.kwargs, **changes})
+
+    @property
+    def channel(self) -> Channel | None:
+        """Channel that replaces the one of the id; None where the id's own is kept."""
+        return from_json(self.kwargs.get("channel"), (Channel,), "channel")
+
+    @property
+    def without_penalties(self) -> LoopConfig:
+        """The same loop as it is evaluated: with the environment's own rewards, the policy's actions being complete."""
+        shield = self.shield and replace(self.shield, penalty=0.0)
+        return replace(self, shield=shield, violation_penalty=0.0, lagrangian=None, residual_gain=None)
+
+    def single(self, **settings: Any) -> gym.Env:
+        """Returns one environment, without the penalty of a violation; `settings` are passed to `gym.make`."""
+        env = gym.make(self.env, **{**self.kwargs, **settings})
+        return env if self.shield is None else SafetyShield(env, **self.shield.arguments)
+
+    def vector(self, count: int, **settings: Any) -> VectorEnv:
+        """Returns `count` environments: the id's own vector environment, or gymnasium's of single environments."""
+        if gym.spec(self.env).vector_entry_point is None:
+            envs: Any = SyncVectorEnv([lambda: self.single(**settings)] * count)
+        else:
+            envs = gym.make_vec(self.env, num_envs=count, **{**self.kwargs, **settings})
+            if self.shield is not None:
+                envs = VectorSafetyShield(envs, **self.shield.arguments)
+        if self.filter is not None:
+            envs = self.filter(envs)
+        if self.residual_gain is not None:
+            envs = ResidualActions(envs, self.residual_gain)
+        if self.lagrangian is not None:
+            return CostPenalty(envs, self.lagrangian.multiplier)
+        return CostPenalty(envs, self.violation_penalty) if self.violation_penalty else envs
+
+
+def ControlLoop(*, env: str, **settings: Any) -> LoopConfig:
+    """Returns a `LoopConfig`, by its former name: some keyword arguments of the environment stand beside its fields.
+
+    Args:
+        env: A registered environment id.
+        settings: Fields of `LoopConfig`, or channel, downlink, noise, disturbance and process of the environment.
+    """
+    warnings.warn("ControlLoop is now LoopConfig(env=..., kwargs={...})", DeprecationWarning, stacklevel=2)
+    of_env = ("channel", "downlink", "noise", "disturbance", "process")
+    kwargs = {name: settings.pop(name) for name in of_env if name in settings}
+    return LoopConfig(env=env, kwargs=kwargs, **settings)
+
+
+class CostPenalty(VectorWrapper):
+    """Subtracts a penalty from the reward of every step after which the true state violates the safe box.
+
+    Args:
+        env: A vector environment with `cost` in its infos.
+        penalty: Subtracted per violating step; may be changed while an agent is trained.
+    """
+
+    def __init__(self, env: VectorEnv, penalty: float) -> None:
+        super().__init__(env)
+        self.penalty = penalty
+
+    def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Steps the environments; the cost of an episode's last step is read from its final info."""
+        observation, rewards, terminated, truncated, info = self.env.step(actions)
+        cost, done = info["cost"], terminated | truncated
+        if "final_info" in info:
+            cost = np.where(done, info["final_info"]["cost"], cost)
+        return observation, rewards - self.penalty * cost, terminated, truncated, info
+
+
+class ResidualActions(VectorWrapper):
+    """Applies u = gain x_hat plus the agent's part, clipped to the limits (residual policies, Silver et al. 2018).
+
+    Args:
+        env: A vector environment whose observations begin with the estimate.
+        gain: Normalized gain, shape (m, n): the input in units of its limit for an estimate in physical units.
+    """
+
+    def __init__(self, env: VectorEnv, gain: np.ndarray) -> None:
+        super().__init__(env)
+        self.gain = gain
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        """Starts episodes."""
+        self._observation, info = self.env.reset(**options)
+        return self._observation, info
+
+    def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Steps the environments with the sum of both parts."""
+        self._observation, *rest = self.env.step(with_gain(self.gain, self._observation, actions))
+        return (self._observation, *rest)  # type: ignore[return-value]
+
+
+def with_gain(gain: np.ndarray, observations: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """Returns actions (N, m) that add u = gain x_hat to an agent's, within the limits.
+
+    Args:
+        gain: Normalized gain, shape (m, n).
+        observations: Shape (N, entries), the first n of which are the estimate.
+        actions: The agent's part, shape (N, m).
+    """
+    return np.clip(observations[:, : gain.shape[1]] @ gain.T + actions, -1.0, 1.0).astype(np.float32)
