@@ -132,6 +132,8 @@ def _sentence(error: Exception) -> str:
 
     What it quotes of a file is shown, and means nothing to a terminal.
     """
+    from ncs_gym.validation import printable
+
     ours = type(error).__module__.partition(".")[0] == "experiments"
     expected = ours or isinstance(error, (ValueError, OSError, ImportError))
     if isinstance(error, OSError) and error.strerror:
@@ -139,7 +141,7 @@ def _sentence(error: Exception) -> str:
         text += f"; {_REMEDIES[error.errno]}" if error.errno in _REMEDIES else ""
     else:
         text = str(error) if expected else f"{type(error).__name__}: {error} (NCS_DEBUG=1 shows the traceback)"
-    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in " ".join(text.split()))
+    return printable(" ".join(text.split()))
 
 
 def _complain(sentence: str, code: int) -> int:

@@ -65,6 +65,17 @@ def read_only(array: np.ndarray) -> np.ndarray:
     return frozen
 
 
+def frozen(array: np.ndarray) -> np.ndarray:
+    """Returns the array itself, which nobody may write to any more."""
+    array.flags.writeable = False
+    return array
+
+
+def printable(text: str) -> str:
+    """Returns a text that means nothing to a terminal: characters that are not printed are escaped."""
+    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
+
+
 def as_numbers(value: Any) -> np.ndarray | None:
     """Returns `value` as a float64 array; None for what is not real numbers, whatever it raises when asked."""
     if type(value) is np.ndarray and value.dtype == np.float64:

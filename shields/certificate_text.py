@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import ChannelContract
+from ncs_gym.validation import printable
 
 _WIDTH, _INDENT = 110, 14
 METHODS = {
@@ -44,7 +45,7 @@ def table(title: str, rows: list[tuple[str, str]]) -> str:
     for name, text in rows:
         if text:
             first = f"  {name}".ljust(_INDENT)
-            lines.append(textwrap.fill(text, _WIDTH, initial_indent=first, subsequent_indent=indent))
+            lines.append(textwrap.fill(printable(text), _WIDTH, initial_indent=first, subsequent_indent=indent))
     return "\n".join(lines)
 
 

@@ -7,6 +7,7 @@ import json
 import sys
 import zipfile
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from agents.loop import LoopConfig
 from agents.sharing.agent_file import AgentError, digest
 from agents.training import untrained
 from experiments.__main__ import _parse
-from experiments.settings import CompareSettings, StudySettings, save_settings, settings_json
+from experiments.settings import CompareSettings, StudySettings, config_defaults, save_settings, settings_json
 from shields import Certificate, CertificateError
 from tests.command import assert_one_sentence, ncs
 
@@ -256,3 +257,21 @@ def test_saving_an_agent_over_links_replaces_the_links(agent, tmp_path):
     assert {path.name for path in tmp_path.iterdir() if path.is_file() and path.read_text() == "mine"} == {
         path.name for path in agent.iterdir()
     }
+
+
+def test_settings_of_others_choose_no_cluster(tmp_path):
+    document = settings_json("compare", CompareSettings())
+    document["settings"] |= {"engine": "ray", "ray_address": "203.0.113.1:6379", "steps": 128}
+    (tmp_path / "settings.json").write_text(json.dumps(document))
+    settings, _ = config_defaults(
+        ["--config", str(tmp_path / "settings.json"), "--out", "x"], "compare", CompareSettings
+    )
+    assert (settings.engine, settings.ray_address, settings.steps) == ("local", "local", 128)
+
+
+def test_texts_in_a_certificate_mean_nothing_to_a_terminal(certificate):
+    assumptions = {"assumptions": ["\x1b[2J\x1b]0;title\x07all conditions hold", "\ud800"]}
+    text = str(replace(certificate, provenance=certificate.provenance | assumptions))
+    assert "\\x1b[2J" in text
+    assert "\\ud800" in text
+    assert all(each.isprintable() or each == "\n" for each in text)

@@ -16,6 +16,8 @@ from shields.atomic_write import write_atomically
 FORMAT = "ncs-gym settings 1"
 # Settings of one call, which a file neither keeps nor gives: files outside the output folder are the user's to name.
 _OF_THE_CALL = ("config", "force", "page", "quote")
+# Where runs are executed is kept in a file and not taken from it: a file of others must not connect to a cluster.
+_OF_THE_MACHINE = ("engine", "ray_address", "ray_wait", "cpus_per_run", "gpus_per_run")
 
 
 def settings_json(command: str, settings: Any) -> dict[str, Any]:
@@ -87,7 +89,7 @@ def _load(path: Path, command: str, kind: type, names_folder: bool) -> Any:
         raise SettingsError(f"{path} is not of format {FORMAT!r}")
     if document.get("command") != command or not isinstance(document.get("settings"), dict):
         raise SettingsError(f"{path} holds settings of ncs {document.get('command')}, not of ncs {command}")
-    values = document["settings"]
+    values = {name: value for name, value in document["settings"].items() if name not in _OF_THE_MACHINE}
     envs = values.get("envs")
     for env_id in (values.get("env"), *(envs if isinstance(envs, list) else ())):
         if isinstance(env_id, str) and env_id != _id_alone(env_id):

@@ -8,6 +8,7 @@ import numpy as np
 
 from ncs_gym.estimation.innovation_test import InnovationTest
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
+from ncs_gym.validation import frozen, read_only
 
 # Number of what is not worked out yet.
 UNKNOWN = -1
@@ -60,13 +61,16 @@ class StatisticsTable:
         self._shapes = np.zeros((_FIRST_CAPACITY, plant.n, plant.n))
         self.gains = np.zeros((plant.n, plant.p, _FIRST_CAPACITY))
         self.quick_tests = np.zeros((plant.p, plant.p, _FIRST_CAPACITY))
-        self._add(recursion.first)  # NO_SAMPLE, which no other statistics are equal to
+        covariance, shape, age = recursion.first
+        self._add(
+            ErrorStatistics(read_only(covariance), read_only(shape), age)
+        )  # NO_SAMPLE, which no other statistics are equal to
         self._updates[NO_SAMPLE] = NumberedUpdate(NO_SAMPLE, self.gains[..., 0].copy(), self.quick_tests[..., 0].copy())
 
     @property
     def shapes(self) -> np.ndarray:
-        """The error shapes Sigma_k by number, shape (count, n, n)."""
-        return self._shapes[: len(self.statistics)]
+        """The error shapes Sigma_k by number, shape (count, n, n), read-only: many estimators share them."""
+        return frozen(self._shapes[: len(self.statistics)])
 
     def age_matters(self, age: int) -> bool:
         """Returns whether an age is told apart from all larger ones."""
@@ -78,7 +82,7 @@ class StatisticsTable:
         age = min(age, self._oldest)
         key = covariance.tobytes(), shape.tobytes(), age
         if key not in self._numbers:
-            self._numbers[key] = self._add(ErrorStatistics(covariance, shape, age))
+            self._numbers[key] = self._add(ErrorStatistics(read_only(covariance), read_only(shape), age))
         return self._numbers[key]
 
     def predicted(self, number: int) -> int:

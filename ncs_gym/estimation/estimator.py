@@ -13,7 +13,7 @@ from ncs_gym.estimation.error_bound import ErrorSet, require_error_set
 from ncs_gym.estimation.error_statistics_table import NO_SAMPLE, UNKNOWN
 from ncs_gym.network.channel import Channel, Packet
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.validation import setting
+from ncs_gym.validation import frozen, setting
 
 
 class Belief(NamedTuple):
@@ -106,7 +106,7 @@ class Estimator:
         """Forgets everything but a first estimate, shape (n,)."""
         self.step = self.age = 0
         self.alarm = False
-        self.mean = np.array(mean, dtype=np.float64)
+        self.mean = frozen(np.array(mean, dtype=np.float64))
         self._pattern = self._patterns.root
         # By age: means before updates, inputs that led there, and samples.
         self._priors: deque[np.ndarray] = deque(maxlen=self._buffer + 1)
@@ -136,7 +136,7 @@ class Estimator:
         self.step += 1
         self.age += 1
         u = np.array(u, dtype=np.float64)
-        self.mean = self._predicted(self.mean, u)
+        self.mean = frozen(self._predicted(self.mean, u))
         self._priors.appendleft(self.mean)
         self._inputs.appendleft(u)
         self._samples.appendleft(None)
@@ -191,7 +191,7 @@ class Estimator:
             if age > 0:
                 mean = self._predicted(mean, self._inputs[age - 1])
         if replay.accepted:
-            self.mean = mean
+            self.mean = frozen(mean)
             for age, prior in means.items():
                 self._priors[age] = prior
         if replay.new_age != UNKNOWN:

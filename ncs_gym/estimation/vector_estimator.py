@@ -15,6 +15,7 @@ from ncs_gym.estimation.innovation_test import ALARM_TOLERANCE
 from ncs_gym.estimation.pattern_arrays import NO_REPLAY
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.minkowski_sum import outside_sum_in_axes
+from ncs_gym.validation import frozen
 
 
 class VectorEstimator:
@@ -52,6 +53,7 @@ class VectorEstimator:
         """Starts episodes in some environments with first estimates, shape (n, count)."""
         self.mean = self.mean.copy()  # the old array is kept as a mean before an update
         self.mean[:, chosen] = mean
+        frozen(self.mean)
         self.age[chosen], self.alarm[chosen], self.pattern[chosen] = 0, False, self.patterns.root
 
     def advance(self, u: np.ndarray, samples: np.ndarray | None, arrivals: list[tuple[int, np.ndarray]]) -> None:
@@ -64,7 +66,7 @@ class VectorEstimator:
         """
         if self.patterns.is_full:
             self.patterns, self.pattern = self.patterns.keeping(self.pattern)
-        self.mean = self._predicted(self.mean, u)
+        self.mean = frozen(self._predicted(self.mean, u))
         self._priors.appendleft(self.mean)
         self._inputs.appendleft(u)
         self._samples.appendleft(samples)
@@ -140,7 +142,7 @@ class VectorEstimator:
                 residual = samples - H.dot(mean)
                 self._monitor(residual, statistics)
                 mean = mean + np.einsum("ijk,jk->ik", self.patterns.table.gains.take(statistics, axis=2), residual)
-        self.mean = np.where(accepted, mean, self.mean)
+        self.mean = frozen(np.where(accepted, mean, self.mean))
         self.age = np.where(new_age == UNKNOWN, self.age, new_age)
         self.pattern = target
 

@@ -90,3 +90,19 @@ def test_every_process_is_looked_at_here():
     own = (each for each in Process.__subclasses__() if each.__module__.startswith("ncs_gym."))
     kinds = {each for each in own if is_dataclass(each)}  # the others are what a process opened
     assert kinds == {type(process) for process in PROCESSES.values()}
+
+
+def test_what_estimators_share_cannot_be_written_to():
+    """Shapes in other units, made in place, once changed those of every environment with the same plant."""
+    env = gym.make("ncs_gym/CartPole-v0").unwrapped
+    many = gym.make_vec("ncs_gym/CartPole-v0", num_envs=3).unwrapped
+    for each in (env, many):
+        each.reset(seed=0)
+        for _ in range(20):
+            each.step(each.action_space.sample())
+    estimator = env.estimator
+    for array in (estimator.shape, estimator.mean, many.error_shapes[0].shapes):
+        with pytest.raises(ValueError, match="read-only"):
+            array *= 1e-4
+    estimator.belief.mean[:] = 0.0  # a copy
+    assert estimator.mean.any()
