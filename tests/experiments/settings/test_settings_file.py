@@ -27,10 +27,7 @@ from experiments.settings.agent_overrides import PPOOverrides
         ),
         ("sweep", SweepSettings(losses=(0.0, 1 / 3), quantization_steps=(0.05,))),
         ("sweep", SweepSettings()),
-        (
-            "sweep",
-            SweepSettings(engine="ray", ray_address="head:6379", cpus_per_run=0.5, gpus_per_run=2.0, ray_wait=60.0),
-        ),
+        ("sweep", SweepSettings(jobs=5)),
     ],
 )
 def test_settings_come_back_exactly(command, settings, tmp_path):
