@@ -91,7 +91,7 @@ class PredictiveFilter:
         if plan is None:
             return None
         plan = np.clip(plan, -plant.u_max, plant.u_max)
-        centers = self._prediction.centers_alone(estimate, plan[None])[..., 0]
+        centers = self._prediction.centers(estimate[None], plan[None, None])[..., 0, 0]
         missed = max(np.abs(centers[:-1] @ plant.C.T).max(), np.linalg.norm(self._root @ centers[-1]))
         return plan if missed <= 1.0 + TOLERANCE else None
 

@@ -155,14 +155,14 @@ class ReachableSets(NamedTuple):
             worst = np.minimum(worst, self.radius - farthest)
         return worst
 
-    def closest(self, inputs: np.ndarray, reserve: float) -> np.ndarray:
-        """Returns the inputs within the limits, shape (m, N), closest to given ones with a slack of `reserve`.
+    def closest(self, inputs: np.ndarray, margin: float) -> np.ndarray:
+        """Returns the inputs within the limits, shape (m, N), closest to given ones with a slack of `margin`.
 
         NaN where there is none.
         """
         effect = (self.weighting[:, :, None] * self.test.effect[:, :, None]).sum(axis=1)
         offset = (self.weighting * self.offset).sum(axis=1)
-        return closest_admissible(inputs, offset, effect, self.radius - reserve, self.test.plant.u_max)
+        return closest_admissible(inputs, offset, effect, self.radius - margin, self.test.plant.u_max)
 
 
 class ReachableSet(NamedTuple):
@@ -186,11 +186,11 @@ class ReachableSet(NamedTuple):
         weighted = self.weighting.dot(center)
         return self.radius - float(weighted.dot(weighted)) ** 0.5, self.radius - float(center.dot(center)) ** 0.5
 
-    def closest(self, u: float, reserve: float) -> float:
+    def closest(self, u: float, margin: float) -> float:
         """Returns what `ReachableSets.closest` does for plants with a single input."""
         effect, offset = self.weighting.dot(self.test.effect[:, 0]), self.weighting.dot(self.offset)
         form = (float(effect.dot(effect)), float(effect.dot(offset)), float(offset.dot(offset)))
-        return closest_on_line(u, *form, self.radius - reserve, self.test.limits[0])
+        return closest_on_line(u, *form, self.radius - margin, self.test.limits[0])
 
 
 class PredictedErrors(NamedTuple):

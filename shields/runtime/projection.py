@@ -89,7 +89,7 @@ def closest_on_lines(wanted: Any, a: Any, b: Any, c: Any, radius: Any, limit: An
 
 
 def closest_on_line(wanted: float, a: float, b: float, c: float, radius: float, limit: float) -> float:
-    """Returns what `closest_on_lines` does for Python numbers and a >= 0, in a fifth of the time."""
+    """Returns what `closest_on_lines` does for Python numbers and a >= 0: a shielded step takes 4 to 7 % less."""
     excess = c - radius * radius
     discriminant = b * b - a * excess
     if a > 0.0 and radius >= 0.0 and discriminant >= 0.0:

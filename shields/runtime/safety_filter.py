@@ -106,7 +106,7 @@ class SafetyFilter(ReadOnlyArrays):
         return Lookahead(self.test, self.certificate.K, horizon, MARGIN)
 
     @cached_property
-    def reserve(self) -> float:
+    def projection_margin(self) -> float:
         """The slack a projected input needs: the margin, and what rounding the action to float32 can move x+."""
         effect = float(np.linalg.norm(self.test.effect, axis=0) @ self.plant.u_max)
         return 2.0 * MARGIN + float(ACTION_ROUNDING) * effect
@@ -158,7 +158,7 @@ class SafetyFilter(ReadOnlyArrays):
             return self.lookahead.keep_alone(estimate, errors, proposed, margin)
         if self.mode != "project" or self.plant.m > 1:
             return None
-        closest = np.array([_expressible_number(alone.closest(proposed.item(), self.reserve), self.test.limits[0])])
+        closest = self._expressible(np.array([alone.closest(proposed.item(), self.projection_margin)]))
         slack, margin = alone.slack(closest)
         if not slack >= MARGIN:  # neither NaN
             return None
@@ -248,7 +248,7 @@ class SafetyFilter(ReadOnlyArrays):
         """Puts the closest input that passes, where there is one, in the place of some of those decided."""
         if some.size:
             sets = sets.some(some)
-            closest = self._expressible(sets.closest(decided.input[:, some], self.reserve))
+            closest = self._expressible(sets.closest(decided.input[:, some], self.projection_margin))
             slack, margin = sets.slack(closest)
             found = slack >= MARGIN
             some = some[found]
@@ -283,11 +283,6 @@ class SafetyFilter(ReadOnlyArrays):
         """Returns the nearest u_max * float32 actions, shape (m, N) or (m,)."""
         limits = self.plant.u_max if inputs.ndim == 1 else self.plant.u_max[:, None]
         return limits * np.minimum(np.maximum(inputs / limits, -1.0), 1.0).astype(np.float32)
-
-
-def _expressible_number(u: float, limit: float) -> float:
-    """Returns what `SafetyFilter._expressible` does for a single input, in a fifth of the time."""
-    return limit * float(np.float32(min(max(u / limit, -1.0), 1.0)))
 
 
 def _as_array(value: Any) -> np.ndarray:

@@ -60,19 +60,9 @@ class PlanTest:
         numbers = [self._remembered[key] for key in keys]
         return Tightening(*(part[numbers] for part in self._table))
 
-    def tightening_alone(self, shape: np.ndarray) -> Tightening:
-        """Returns what `tightenings_of` does for a single error shape, (n, n)."""
-        number = self._remembered.get(shape.tobytes())
-        if number is None:
-            return Tightening(*(part[0] for part in self.tightenings_of(shape[None])))
-        return Tightening(*(part[number] for part in self._table))
-
     @np.errstate(all="ignore")  # what is not finite is not certified
     def room(self, estimates: np.ndarray, tightening: Tightening) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the largest |c_i c_j|, shape (E, N, k), and |T G c_j|, shape (E, N), that pass; NaN for no usable.
-
-        Of a single estimate, shape (n,), and a single tightening, without the first axis.
-        """
+        """Returns the largest |c_i c_j|, shape (E, N, k), and |T G c_j|, shape (E, N), that pass; NaN for no usable."""
         size = np.abs(estimates)
         rounding = (size @ self._row_rounding).reshape(tightening.room.shape)
         box = tightening.room - rounding - self._margin
@@ -109,14 +99,6 @@ class PlanTest:
         values, weighted = self.judged(estimates, tightening, plans)
         kept = _kept(values, weighted, box.transpose(1, 2, 0)[..., None], radius.T[..., None])
         return kept.transpose(1, 2, 0) & self._within_limits(plans)
-
-    @np.errstate(all="ignore")
-    def certified_alone(self, estimate: np.ndarray, tightening: Tightening, plans: np.ndarray) -> np.ndarray:
-        """Returns what `certified` does for one estimate, shape (n,), and its plans, (P, N, m): shape (P, N)."""
-        box, radius = self.room(estimate, tightening)
-        centers = self.prediction.centers_alone(estimate, plans)
-        kept = _kept(self._rows @ centers, tightening.weighting @ centers, box[..., None], radius[:, None])
-        return kept.T & self._within_limits(plans)
 
     def _within_limits(self, plans: np.ndarray) -> np.ndarray:
         """Returns whether the first j inputs of plans, shape (..., N, m), are within the limits, shape (..., N)."""
@@ -202,11 +184,6 @@ class Prediction:
         moved = (self._free @ estimates.T)[..., None] + pushed
         return moved.reshape(self.steps, self.plant.n, count, number)
 
-    def centers_alone(self, estimate: np.ndarray, plans: np.ndarray) -> np.ndarray:
-        """Returns what `centers` does for one estimate, shape (n,), and its plans, (P, N, m): shape (N, n, P)."""
-        pushed = self._forced @ plans.reshape(len(plans), -1).T
-        return (self._free.dot(estimate)[:, None] + pushed).reshape(self.steps, -1, len(plans))
-
 
 class EndTest(OneStepTest):
     """The one-step test of the plant that takes j+1 steps at once: A^{j+1}, and what disturbances add up to.
@@ -246,7 +223,7 @@ class EndTest(OneStepTest):
 
 
 class Tightening(NamedTuple):
-    """What errors and disturbances leave of the box and of S, for E error shapes (no first axis: a single one).
+    """What errors and disturbances leave of the box and of S, for E error shapes.
 
     Attributes:
         room: 1 - rho_j(c_i) less the rounding that does not depend on the estimate, shape (E, N, k) for the k rows c_i

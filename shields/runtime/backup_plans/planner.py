@@ -79,7 +79,7 @@ class Planner:
             proposed: Shape (m,).
         """
         plans = self._continued(estimate, proposed)
-        certified = self.test.certified_alone(estimate, self.test.tightening_alone(shape), plans)
+        certified = self.test.certified(estimate[None], self.test.tightenings_of(shape[None]), plans[None])[0]
         which = int(certified.any(axis=1).argmax())
         length = int(certified[which].argmax()) + 1
         return plans[which, :length] if certified[which, length - 1] else None

@@ -182,7 +182,7 @@ def test_inputs_beyond_their_limits_are_not_certified(case):
     assert certified[:2].any()
 
 
-def test_a_single_estimate_is_judged_as_in_a_batch(case):
+def test_an_estimate_alone_is_judged_as_in_a_batch(case):
     plant, certificate, test = case
     rng = np.random.default_rng(6)
     estimates, shapes, _ = beliefs(plant, certificate, rng, 200)
@@ -192,7 +192,8 @@ def test_a_single_estimate_is_judged_as_in_a_batch(case):
         values[rng.integers(200, size=3)] = broken
     many = test.certified(estimates, test.tightenings_of(shapes), plans)
     for x_hat, shape, several, expected in zip(estimates, shapes, plans, many, strict=True):
-        np.testing.assert_array_equal(test.certified_alone(x_hat, test.tightening_alone(shape), several), expected)
+        alone = test.certified(x_hat[None], test.tightenings_of(shape[None]), several[None])[0]
+        np.testing.assert_array_equal(alone, expected)
     assert many.any(axis=(0, 1)).all()
     assert not many.all(axis=(0, 1)).any()
 
@@ -407,9 +408,8 @@ def test_tightenings_are_remembered_and_do_not_depend_on_the_batch(case):
     together = fresh.tightenings_of(np.concatenate([shapes, shapes[:2]]))
     for e, shape in enumerate((*shapes, *shapes[:2])):
         alone = PlanTest(test.prediction, MARGIN).tightenings_of(shape[None])
-        single = fresh.tightening_alone(shape), PlanTest(test.prediction, MARGIN).tightening_alone(shape)
+        again = fresh.tightenings_of(shape[None])
         for name in Tightening._fields:
             np.testing.assert_allclose(getattr(together, name)[e], getattr(alone, name)[0], rtol=1e-12, atol=1e-12)
-            np.testing.assert_array_equal(getattr(single[0], name), getattr(together, name)[e])
-            np.testing.assert_array_equal(getattr(single[1], name), getattr(alone, name)[0])
+            np.testing.assert_array_equal(getattr(again, name)[0], getattr(together, name)[e])
     assert len(fresh._remembered) == 6

@@ -3,10 +3,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_array
 
-from ncs_gym import LinearPlant
-from shields import SafetyFilter
-from shields.runtime import projection, safety_filter
-from tests.certificates import certificate_of
+from shields.runtime import projection
 
 
 def closest_admissible(wanted, offset, effect, radius, limit):
@@ -262,11 +259,3 @@ def test_out_of_reach_is_none():
     assert closest_on_line(0.0, 1.0, -5.0, 25.0, 1.0, 1.0) is None  # beyond the limit
     assert closest_on_line(0.0, 0.0, 0.0, 25.0, 1.0, 1.0) is None  # the input moves nothing
     assert closest_on_line(0.3, 0.0, 0.0, 0.5, 1.0, 1.0) == 0.3
-
-
-def test_a_single_input_is_rounded_as_many_are():
-    plant = LinearPlant(A=[[0.9]], B=[[1.0]], box=[1.0], u_max=0.3, dt=0.1, disturbance_bound=0.01, initial_bound=0.0)
-    shield = SafetyFilter(certificate_of(plant), plant)
-    inputs = np.concatenate([np.random.default_rng(0).uniform(-0.4, 0.4, 1000), [0.0, -0.0, 0.3, -0.3, np.inf, np.nan]])
-    single = [safety_filter._expressible_number(u, 0.3) for u in inputs.tolist()]
-    np.testing.assert_array_equal(single, shield._expressible(inputs[None])[0])
