@@ -20,7 +20,7 @@ class FolderInUseError(RuntimeError):
 
 
 class RunError(RuntimeError):
-    """A training run failed; the message names the run, the cause is the run's own error."""
+    """A training run, or a batch of an attack, failed; the message names it, the cause is its own error."""
 
     @classmethod
     def of(cls, name: str, error: BaseException) -> RunError:

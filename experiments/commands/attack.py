@@ -42,6 +42,7 @@ def attack(settings: CertifySettings) -> None:
             claimed of an environment because its downlink promises nothing.
         Infeasible: If there is no certificate for the plant.
         CertificateError: If a certificate in the folder is damaged.
+        RunError: If a batch fails.
         OSError: If the folder cannot be written.
     """
     campaign = _campaign(settings)

@@ -15,7 +15,7 @@ from experiments.attack.monte_carlo_batch import MonteCarloBatch, run_batch
 from experiments.attack.safety_counts import SafetyCounts
 from experiments.commands import attack as command
 from experiments.commands.attack import attack
-from experiments.errors import OtherResultsError, ResultsError, SafetyBroken
+from experiments.errors import OtherResultsError, ResultsError, RunError, SafetyBroken
 from experiments.settings.certificates import CertifySettings
 from ncs_gym import truck_trailer
 from ncs_gym.network.contract import contract_of
@@ -253,6 +253,22 @@ def test_interrupted_campaign_goes_on(tmp_path, small, capsys, without_workers):
     attack(settings(tmp_path, force=True))
     assert document(tmp_path) == whole
     assert len(log.read_bytes().splitlines()) == 7
+
+
+def test_batch_that_fails_is_named_and_what_is_finished_is_kept(tmp_path, small, monkeypatch, without_workers):
+    monkeypatch.setattr(command, "run_batch", fails_for_the_cruise)
+    with pytest.raises(RunError, match=f"^run {CRUISE}, batch 1: no memory") as error:
+        attack(settings(tmp_path))
+    assert isinstance(error.value.__cause__, ValueError)
+    stored = [json.loads(line) for line in (tmp_path / "tallies.jsonl").read_bytes().splitlines()]
+    assert {(line["case"], line["index"]) for line in stored} >= {(CRUISE, 0), (CRUISE, 2)}
+    assert not (tmp_path / "certify.json").exists()
+
+
+def fails_for_the_cruise(campaign, batch, certificate, on_progress):
+    if batch == MonteCarloBatch(CRUISE, 1):
+        raise ValueError("no memory")
+    return run_batch(campaign, batch, certificate, on_progress)
 
 
 def test_another_certificate_makes_stored_counts_void(tmp_path, small, without_workers):
