@@ -93,7 +93,6 @@ def test_values_in_a_file_are_no_flags(values, tmp_path):
         ({"channel": {"loss": float("nan")}}, "channel.loss = NaN"),
         ({"ppo": {"discount": 2.0}}, "discount must be in"),
         ({"steps": 0}, "--steps must be at least 1"),
-        ({"ray_address": "auto"}, "--ray-address is a setting of --engine ray"),
     ],
 )
 def test_wrong_values_in_a_file_are_named(values, words, tmp_path):
