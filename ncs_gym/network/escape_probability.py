@@ -5,15 +5,10 @@ from __future__ import annotations
 from fractions import Fraction
 
 import numpy as np
-from scipy.special import chdtrc
 
 from ncs_gym.network.channel import Channel
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian
 from ncs_gym.validation import as_count, shown
-
-# Relative error that a chi-square tail probability computed in float64 does not exceed.
-TAIL_ROUNDING = 1e-10
 
 
 def escape_probability(plant: LinearPlant, channel: Channel, steps: int) -> float:
@@ -40,20 +35,8 @@ def escape_probability(plant: LinearPlant, channel: Channel, steps: int) -> floa
     count = as_count(steps, "steps", low=0)
     noises = plant.process_noise, plant.sensor_noise, plant.initial_noise
     draws = count, count // channel.send_period, 1
-    exact = Fraction(0)
-    for noise, number in zip(noises, draws, strict=True):
-        exact += number * _escape(noise, plant.delta)
+    # Each truncation cuts off at most delta (`truncation_energy`); a covariance of fewer dimensions leaves less often.
+    drawn = sum(number for noise, number in zip(noises, draws, strict=True) if np.any(noise.covariance))
+    exact = drawn * Fraction(plant.delta)
     bound = float(min(exact, Fraction(1)))
     return bound if bound >= min(exact, 1) else float(np.nextafter(bound, np.inf))
-
-
-def _escape(noise: TruncatedGaussian, delta: float) -> Fraction:
-    """Returns a bound on the probability that an untruncated draw lies outside the ellipsoid of a truncated one.
-
-    It is delta, unless rounding 1 - delta made the ellipsoid a little smaller (which shows for the smallest delta). A
-    singular covariance has fewer degrees of freedom, and leaves less often.
-    """
-    if not np.any(noise.covariance):
-        return Fraction(0)
-    tail = float(chdtrc(len(noise.covariance), noise.energy))
-    return max(Fraction(delta), Fraction(tail) * (1 + Fraction(TAIL_ROUNDING)) if tail > delta else Fraction(0))

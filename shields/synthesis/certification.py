@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
@@ -135,10 +135,7 @@ def _largest_certificate(plant: LinearPlant, contract: ChannelContract | None, p
             found = largest_set(problem, slack, report)
             if found is None:
                 break
-            for finished in (in_round_numbers(problem, found, slack), found):
-                if finished is None:
-                    continue
-                design = with_best_gain(problem, finished) if finished is found else finished
+            for design in _finished(problem, found, slack):
                 report("exact verification", design)
                 certificate = _certificate(plant, problem, design, errors, slack)
                 verification = verify(certificate, plant)
@@ -150,6 +147,14 @@ def _largest_certificate(plant: LinearPlant, contract: ChannelContract | None, p
         best = design and _certificate(plant, problem, with_best_gain(problem, design), errors, slack)
         raise _interrupted(plant, stage, best) from interrupt
     raise failure or _with_hints(infeasibility(problem), plant, contract, progress)
+
+
+def _finished(problem: DesignProblem, found: CandidateDesign, slack: float) -> Iterator[CandidateDesign]:
+    """Yields a design of the search in round numbers, if there is one, and then with the gain of most slack."""
+    rounded = in_round_numbers(problem, found, slack)
+    if rounded is not None:
+        yield rounded
+    yield with_best_gain(problem, found)
 
 
 def _with_hints(

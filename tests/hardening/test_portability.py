@@ -26,7 +26,7 @@ from shields.verification.rational_matrix import add, congruence, is_positive_se
 from tests.certificates import ROOT, certificate_of
 from tests.verdicts import verified
 
-pytestmark = pytest.mark.skipif(
+on_x86 = pytest.mark.skipif(
     platform.machine() not in ("x86_64", "AMD64"), reason="only x86 has kernels that can be chosen"
 )
 
@@ -109,11 +109,13 @@ def own_plants():
     return {name: derived(plant) for name, (plant, _) in all_plants().items()}
 
 
+@on_x86
 @pytest.mark.parametrize(("kernels", "wide"), [("Haswell", True), ("SkylakeX", True), ("Prescott", False)])
 def test_plants_and_their_bounds_are_the_same_numbers(kernels, wide):
     assert json.loads(under(kernels, *call(print_plants), wide=wide)) == own_plants()
 
 
+@on_x86
 def test_certificate_made_here_verifies_under_other_kernels(tmp_path):
     for name in IDS:
         env = gym.make(f"ncs_gym/{name}-v0").unwrapped
@@ -123,6 +125,7 @@ def test_certificate_made_here_verifies_under_other_kernels(tmp_path):
     assert under("Haswell", *call(print_verdicts, tmp_path)) == expected
 
 
+@on_x86
 @pytest.mark.slow
 @pytest.mark.parametrize("maker", KERNELS)
 def test_certificates_of_every_plant_verify_under_all_kernels(tmp_path, maker):
@@ -148,6 +151,7 @@ def test_certificate_of_an_earlier_version_and_another_processor_still_holds(fil
     assert not verified(certificate, other).valid
 
 
+@on_x86
 def test_agent_and_finished_runs_of_one_processor_are_taken_by_another(tmp_path):
     compare = ("-m", "experiments", "compare", "--env", "ncs_gym/BatchReactor-v0", "--out", tmp_path, "--jobs", "1")
     compare = (
