@@ -23,7 +23,7 @@ _REMEDIES = {
     errno.ENOSPC: "make room and start the command again, which keeps what is finished",
     errno.EDQUOT: "make room and start the command again, which keeps what is finished",
 }
-_TRAINING = {"train": ("stable_baselines3", "torch", "tensorboard", "pyarrow", "jinja2")}
+_TRAINING = {"train": ("stable_baselines3", "torch", "tensorboard", "pandas", "pyarrow", "jinja2")}
 # The settings and the function of each command, and the packages that it needs of each extra.
 COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
     "compare": ("CompareSettings", "experiments.commands.compare:compare", _TRAINING),

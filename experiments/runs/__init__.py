@@ -2,9 +2,9 @@
 
 from experiments.runs.arms import Arm, by_arm
 from experiments.runs.experiment import certificate_of, experiment_provenance, loop_config, run_of_arm
-from experiments.runs.output_folder import claim_folder, require_place
+from experiments.runs.output_folder import claim_folder, prepare_output, require_place, write_results
 from experiments.runs.provenance import versions
-from experiments.runs.run_store import RunStore, prepare_output
+from experiments.runs.run_store import RunStore
 from experiments.runs.training_run import RunResult, TrainingRun, execute_run
 
 __all__ = [
@@ -22,4 +22,5 @@ __all__ = [
     "require_place",
     "run_of_arm",
     "versions",
+    "write_results",
 ]

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from agents.results import Episode, TrainingPoint, Trajectory
-from experiments.analysis.summary import paired_differences, summarize_arm
+from experiments.analysis.episodes import episodes_table
+from experiments.analysis.summary import arm_summary, paired_differences
 from experiments.runs.arms import Arm
 from experiments.runs.training_run import RunResult
 
@@ -60,15 +61,15 @@ def summary_of(results: dict[str, list[RunResult]], **settings: Any) -> dict[str
 
     def arm(name: str) -> dict[str, Any]:
         mode = Arm.of(name, "project").mode
-        return {"mode": mode, "shielded": mode not in (None, "monitor")} | summarize_arm(
-            results[name], fixed_policy=False
-        )
+        summary = arm_summary(episodes_table(results[name]), mode, fixed_policy=False)
+        return summary | {"shielded": mode not in (None, "monitor")}
 
     baseline = next(iter(results))
+    episodes = episodes_table(run for runs in results.values() for run in runs)
     return {
         "arms": {name: arm(name) for name in results},
         "references": {},
-        "paired_differences": {"baseline": baseline, "arms": paired_differences(results, baseline)},
+        "paired_differences": {"baseline": baseline, "arms": paired_differences(episodes, baseline)},
     } | provenance(arms=list(results), **settings)
 
 

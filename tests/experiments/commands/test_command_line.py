@@ -334,9 +334,10 @@ def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path, without_worke
     summary = json.loads((out / "summary.json").read_text())
     assert [(cell["loss"], cell["burst_length"]) for cell in summary["cells"]] == [(0.5, 0), (0.5, 3)]
     assert all(cell["arms"]["shielded"]["eval_violation_steps"] == 0 for cell in summary["cells"])
-    rows = pq.read_table(out / "sweep.parquet").to_pylist()
-    assert len(rows) == 4
-    assert {"loss", "delay", "burst_length", "arm", "run", "eval_violating_episodes"} <= set(rows[0])
+    rows = pq.read_table(out / "episodes.parquet").to_pylist()
+    assert len(rows) == 4 * 3
+    assert {"loss", "delay", "burst_length", "arm", "run", "violating"} <= set(rows[0])
+    assert {(row["quantization_step"], row["burst_length"]) for row in rows} == {(None, 0.0), (None, 3.0)}
     assert {path.name for path in (out / "figures").iterdir()} >= {"violations.png", "interventions.png", "return.png"}
     assert "data:image/png;base64," in (out / "report.html").read_text()
     before = digests(out)

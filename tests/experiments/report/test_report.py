@@ -56,8 +56,6 @@ def comparison(*names, runs=3, figures=None, findings=(), change=None, **setting
 
 def swept(*names, seeds=1, mode="project", change=None, **settings):
     arms = summary_of({name: [run(name, i, **(change or {})) for i in range(seeds)] for name in names})["arms"]
-    for arm in arms.values():
-        del arm["mode"], arm["shielded"]  # a sweep's summary has none
     channels = [(0.0, 0, None, 1.0, None), (0.6, 4, 0.05, 2.0, 1.5)]
     sides = ("loss", "delay", "quantization_step", "burst_length", "mass_factor")
     cells = [dict(zip(sides, channel, strict=True)) | {"arms": arms} for channel in channels]
