@@ -21,7 +21,7 @@ DECLARED = {
     **{"A": 0.01 * np.eye(2), "B": [[1e-3], [0.0]], "u_max": 1.0, "dt": 0.1, "delta": 2e-3},
     **{"process_noise_cov": 0.1 * np.eye(2), "sensor_bound": 1e-3, "initial_bound": 1e-3},
 }
-RADIUS = np.sqrt(LinearPlant(box=[1.0, 1.0], **DECLARED).disturbance.shape[0, 0])
+RADIUS = np.sqrt(LinearPlant(box=[1.0, 1.0], **DECLARED).disturbance.shape_matrix[0, 0])
 PLANT, CHANNEL, STEPS = LinearPlant(box=2 * [1.02 * RADIUS], **DECLARED), Channel(loss=0.3), 60
 register_plant("Tests/Tight-v0", PLANT, channel=CHANNEL, max_episode_steps=STEPS)
 
