@@ -185,7 +185,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
     def _annotate(self, proposed: np.ndarray | None, interventions: int, plan: np.ndarray, *, intervened: bool) -> None:
         """Tells the picture of the step that follows what the shield does in it."""
         note = Annotation(
-            safe_set=self._certificate.safe_set,
+            safe_set=self._filter.kept_set,
             label=self._filter.mode,
             proposed=proposed,
             intervened=intervened,
