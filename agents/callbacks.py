@@ -21,7 +21,7 @@ _MAX_POINTS = 200
 # The policy is evaluated about this often.
 _EVALUATIONS = 10
 # Infos of single environments that are counted.
-_COUNTED = ("cost", "shield_intervened", "shield_correction")
+_COUNTED = ("cost", "shield_intervened", "shield_correction", "shield_guaranteed")
 
 
 class SafetyCallback(BaseCallback):
@@ -30,7 +30,8 @@ class SafetyCallback(BaseCallback):
     The counts come from the info of every step, whereas `Monitor` only sees the last step of each episode. The callback
     works with any stable-baselines3 algorithm, on `SB3VecEnv` and on single environments. TensorBoard gets
     `safety/violation_rate` and `safety/intervention_rate` (per step since the last log), `safety/mean_correction` (the
-    mean norm of applied minus proposed input since the last log, with a shield) and `safety/violation_steps` (total).
+    mean norm of applied minus proposed input since the last log, with a shield), `safety/guaranteed_rate` (steps after
+    which the state is proved safe, since the last log, with a shield) and `safety/violation_steps` (total).
 
     Args:
         on_progress: Called with the number of steps taken since its last call.
@@ -47,6 +48,7 @@ class SafetyCallback(BaseCallback):
         self._on_progress = on_progress
         self.violation_steps = self.interventions = 0
         self._corrections: float | None = None
+        self._guaranteed: int | None = None
 
     def _on_training_start(self) -> None:
         self._interval = self.locals["total_timesteps"] // _MAX_POINTS
@@ -57,6 +59,8 @@ class SafetyCallback(BaseCallback):
         self.interventions += int(np.sum(batch.get("shield_intervened", 0)))
         if "shield_correction" in batch:
             self._corrections = (self._corrections or 0.0) + float(np.sum(batch["shield_correction"]))
+        if "shield_guaranteed" in batch:
+            self._guaranteed = (self._guaranteed or 0) + int(np.sum(batch["shield_guaranteed"]))
         return True
 
     def _on_rollout_end(self) -> None:
@@ -77,6 +81,9 @@ class SafetyCallback(BaseCallback):
         if self._corrections is not None:
             self.logger.record("safety/mean_correction", self._corrections / taken)
             self._corrections = 0.0
+        if self._guaranteed is not None:
+            self.logger.record("safety/guaranteed_rate", self._guaranteed / taken)
+            self._guaranteed = 0
         returns = [episode["r"] for episode in self.model.ep_info_buffer or ()]
         mean = float(np.mean(returns)) if returns else float("nan")
         self.history.append(TrainingPoint(self.num_timesteps, mean, self.violation_steps, self.interventions))

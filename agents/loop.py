@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import gymnasium as gym
@@ -16,6 +16,7 @@ from ncs_gym import Channel
 from ncs_gym.registration import from_json
 from ncs_gym.validation import shown
 from shields import Certificate, SafetyShield, VectorSafetyShield
+from shields.runtime.lost_guarantee import LostGuarantee
 from shields.runtime.safety_filter import DEFAULT_HORIZON, MODES
 
 
@@ -28,28 +29,31 @@ class ShieldSettings:
         mode: Mode of `SafetyShield`: "project", "lookahead", "switch", "boundary" or "monitor".
         penalty: Subtracted from the reward for every intervention.
         horizon: Longest plan of mode "lookahead" [steps]; None becomes the shield's default there.
+        on_unproved: What the shield does where the state is not proved safe: "ignore", "warn" or "raise".
     """
 
     certificate: Certificate
     mode: str = "project"
     penalty: float = 0.0
     horizon: int | None = None
+    on_unproved: str = "warn"
 
     def __post_init__(self) -> None:
         """Checks the mode, and gives a horizon that is not given its default, so that whoever keeps it keeps a number.
 
         Raises:
-            ValueError: If the mode is unknown.
+            ValueError: If the mode is unknown, or what is to be done where nothing is proved.
         """
         if self.mode not in MODES:
             raise ValueError(f"mode must be one of {list(MODES)}, got {shown(self.mode)}")
+        LostGuarantee(self.on_unproved)
         if self.mode == "lookahead" and self.horizon is None:
             object.__setattr__(self, "horizon", DEFAULT_HORIZON)
 
     @property
     def arguments(self) -> dict[str, Any]:
         """Arguments of `SafetyShield` and `VectorSafetyShield` after the environment."""
-        return {name: getattr(self, name) for name in ("certificate", "mode", "penalty", "horizon")}
+        return {name: getattr(self, name) for name in [each.name for each in fields(self)]}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -174,7 +174,7 @@ def report(name: str, horizon: int, count: int) -> str:
 
 def shielded(name: str, mode: str, horizon: int, **settings) -> VectorSafetyShield:
     env = gym.make_vec(f"ncs_gym/{name}-v0", num_envs=ENVS, **settings)
-    return VectorSafetyShield(env, mode=mode, horizon=horizon if mode == "lookahead" else None)
+    return VectorSafetyShield(env, mode=mode, horizon=horizon if mode == "lookahead" else None, on_unproved="ignore")
 
 
 def driven(env, act, steps: int) -> tuple[float, ...]:

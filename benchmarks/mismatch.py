@@ -51,7 +51,7 @@ def attacked(env: Any, process: Any, certificate: Any, episodes: int, seed: int)
     """First steps, one per episode, of leaving S or the box and of both alarms; inf for never."""
     settings = {"plant": env.plant, "channel": env.channel, "contract": env.contract, "process": process}
     many = WorstCaseVectorEnv(episodes, certificate, **settings)
-    shield, rng = VectorSafetyShield(many, certificate), np.random.default_rng(seed)
+    shield, rng = VectorSafetyShield(many, certificate, on_unproved="ignore"), np.random.default_rng(seed)
     _, info = shield.reset(seed=seed)
     agents = HostileAgents(episodes, env.plant, certificate, rng)
     root = np.linalg.inv(np.linalg.cholesky(certificate.L))

@@ -43,7 +43,8 @@ def row(name: str, mode: str | None, seconds: float) -> list[float]:
     """Returns the steps per second of one environment and of `COUNT`, behind a mode of the shield; none if None."""
     single, many = gym.make(f"ncs_gym/{name}"), gym.make_vec(f"ncs_gym/{name}", num_envs=COUNT)
     if mode is not None:
-        single, many = SafetyShield(single, mode=mode), VectorSafetyShield(many, mode=mode)
+        given = {"mode": mode, "on_unproved": "ignore"}
+        single, many = SafetyShield(single, **given), VectorSafetyShield(many, **given)
     return [steps_per_second(single, 1, seconds), steps_per_second(many, COUNT, seconds)]
 
 

@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from shields.certificate import Certificate, Multipliers, Proof, Updates
-from shields.errors import CertificateError, Infeasible
+from shields.errors import CertificateError, GuaranteeLostError, GuaranteeLostWarning, Infeasible
 from shields.runtime import Decision, SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.verification import Condition, Report, verify
 
@@ -21,6 +21,8 @@ __all__ = [
     "CertificateError",
     "Condition",
     "Decision",
+    "GuaranteeLostError",
+    "GuaranteeLostWarning",
     "Infeasible",
     "Multipliers",
     "Proof",

@@ -9,6 +9,17 @@ class CertificateError(ValueError):
     """A certificate is damaged, belongs to another plant, or does not verify."""
 
 
+class GuaranteeLostError(RuntimeError):
+    """The state of a shielded loop is not proved safe, and `on_unproved="raise"` asks for an error.
+
+    The step has happened: the loop can go on, and the same reason is not raised again in this episode.
+    """
+
+
+class GuaranteeLostWarning(UserWarning):
+    """The state of a shielded loop is not proved safe; said once per episode and reason."""
+
+
 class SynthesisInterrupted(KeyboardInterrupt):
     """The synthesis was interrupted; the message says what it had reached.
 

@@ -162,8 +162,7 @@ def _shields(campaign: Campaign, case: str, certificate: Path) -> dict[str, Vect
     if campaign.looks_ahead:
         other = env if campaign.gaussian else WorstCaseVectorEnv(campaign.envs, loaded, pushes_to_box=True, **settings)
         envs = {"to the box": other, "out of S": env}
-        return {
-            name: VectorSafetyShield(each, loaded, "lookahead", horizon=campaign.horizon) for name, each in envs.items()
-        }
+        planning = {"mode": "lookahead", "horizon": campaign.horizon, "on_unproved": "ignore"}
+        return {name: VectorSafetyShield(each, loaded, **planning) for name, each in envs.items()}
     modes = (campaign.mode,) if campaign.mode else SHIELD_MODES if campaign.shielded else ("monitor",)
-    return {mode: VectorSafetyShield(env, loaded, mode) for mode in modes}
+    return {mode: VectorSafetyShield(env, loaded, mode, on_unproved="ignore") for mode in modes}

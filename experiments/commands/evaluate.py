@@ -48,7 +48,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     mode = _mode(settings, agent)
     horizon = (settings.horizon or agent.horizon) if mode == "lookahead" else None
     certificate = certificate_of(loop, settings.certificate or certificate_file(folder))
-    shield = None if mode is None else ShieldSettings(certificate, mode, horizon=horizon)
+    shield = None if mode is None else ShieldSettings(certificate, mode, horizon=horizon, on_unproved="ignore")
     evaluated = evaluation.evaluate(
         replace(loop, shield=shield),
         lambda observations, infos: agent.act(observations),

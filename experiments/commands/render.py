@@ -71,7 +71,9 @@ class _EpisodeRenderer:
         inner.renderer.scale = settings.scale or (1 if settings.out.suffix == ".gif" else 2)
         self._policy = policy_by_name(settings.policy, env_id, inner, settings.seed)
         if mode != "none":
-            self._env = SafetyShield(self._env, certificate, mode=mode, horizon=settings.horizon)
+            on_unproved = "ignore" if mode == "monitor" else "warn"  # a monitor overrides nothing
+            given = {"mode": mode, "horizon": settings.horizon, "on_unproved": on_unproved}
+            self._env = SafetyShield(self._env, certificate, **given)
         self._observation, self._info = self._env.reset(seed=settings.seed)
         self.is_over, self._steps = False, 0
 

@@ -3,8 +3,8 @@
 `one_step` decides whether an input passes, `projection` finds the closest one that does, `backup_plans` the plans of
 mode "lookahead", and `safety_filter` makes the decision (`decisions`: what it says). `guarantee` follows whether the
 proof of safety holds, from what `starts` knows of the first states. All are written for arrays whose last axis counts
-environments. `monitored_filter` is filter and guarantee for one control loop; `safe_loop` puts it into a real loop,
-`wrapper` and `vector_wrapper` put it around Gymnasium environments.
+environments. `lost_guarantee` says where the proof ends. `monitored_filter` is filter and guarantee for one control
+loop; `safe_loop` puts it into a real loop, `wrapper` and `vector_wrapper` put it around Gymnasium environments.
 """
 
 from shields.runtime.decisions import Decision

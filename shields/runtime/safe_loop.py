@@ -17,8 +17,10 @@ from ncs_gym.network.packet_reception import DiscardedPackets, as_packet
 from ncs_gym.validation import as_numbers, as_vector, setting, shown
 from shields.certificate import Certificate
 from shields.certificate_text import contract_text, counted, size_of, table
+from shields.errors import GuaranteeLostError, GuaranteeLostWarning
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import LoopObservation
+from shields.runtime.lost_guarantee import LostGuarantee
 from shields.runtime.monitored_filter import MonitoredFilter
 from shields.runtime.safety_filter import SafetyFilter
 from shields.runtime.starts import starts_known
@@ -41,15 +43,18 @@ class _Phase(Enum):
 def _transaction(method: Callable[Concatenate[SafeLoop, P], T]) -> Callable[Concatenate[SafeLoop, P], T]:
     """Makes calls of a method transactions: where one does not come to its end, nothing has happened.
 
-    While a call changes something the loop counts as stopped; so it stays if even the way back is interrupted.
+    While a call changes something the loop counts as stopped; so it stays if even the way back is interrupted. That the
+    guarantee is lost is said when all has happened, and takes nothing back.
     """
 
     @wraps(method)
     def call(loop: SafeLoop, /, *args: P.args, **kwargs: P.kwargs) -> T:
         phase, discarded = loop._phase, loop._discarded
-        before = [(part, part.saved()) for part in (loop._estimator, loop._monitored, loop._inputs)]
+        before = [(part, part.saved()) for part in (loop._estimator, loop._monitored, loop._inputs, loop._lost)]
         try:
             return method(loop, *args, **kwargs)
+        except (GuaranteeLostError, GuaranteeLostWarning):  # the latter where warnings are errors
+            raise
         except BaseException:  # Ctrl-C, the timeout of a signal and panics of native code are no Exceptions
             loop._phase = _Phase.STOPPED
             for part, saved in before:
@@ -95,6 +100,9 @@ class SafeLoop:
         horizon: Longest plan of mode "lookahead", in steps; see `SafetyFilter`.
         downlink: The channel from here to the actuator; None if what is decided is applied at once.
         downlink_contract: What is assumed of it; by default what its settings guarantee.
+        on_unproved: What `start` and `receive` do, once per episode and reason, where the state is not proved safe:
+            "warn" with a `GuaranteeLostWarning`, "raise" a `GuaranteeLostError`, "ignore" for who reads `guaranteed`.
+            When one is raised, the call has come to its end: go on with `decide`.
 
     Attributes:
         filter: Makes the decisions.
@@ -121,10 +129,12 @@ class SafeLoop:
         horizon: int | None = None,
         downlink: Channel | None = None,
         downlink_contract: ChannelContract | None = None,
+        on_unproved: str = "warn",
     ) -> None:
         self._filter = SafetyFilter(certificate, plant, mode, horizon)
         if not isinstance(channel, Channel):
             raise ValueError(f"channel must be a Channel (its contract is the certificate's), got {shown(channel)}")
+        self._lost = LostGuarantee(on_unproved)
         self._contract = certificate.contract
         self._estimator = Estimator(plant, channel, patterns=arrival_patterns(plant, channel, self._contract))
         protocol = downlink_protocol(downlink, downlink_contract)
@@ -166,6 +176,7 @@ class SafeLoop:
 
         Raises:
             ValueError: If an argument is not finite or does not fit the plant; nothing has changed then.
+            GuaranteeLostError: If the state is not proved safe and that is to be raised; the episode has begun then.
         """
         n = self._filter.plant.n
         mean = as_vector(x_hat0, n, f"x_hat0 = ({', '.join(self._filter.plant.state_names)})")
@@ -181,6 +192,8 @@ class SafeLoop:
         earlier = [self._estimator.predicted(self._inputs.pending[:ahead]) for ahead in range(self._lead)]
         self._monitored.begin(self._report(), known, beliefs=earlier)
         self._phase = _Phase.STARTED
+        self._lost.begin()
+        self._lost.tell_of(self.reason)
 
     @_transaction
     def receive(self, packets: Iterable[Packet] = (), applied: Any = None) -> np.ndarray:
@@ -200,6 +213,7 @@ class SafeLoop:
         Raises:
             RuntimeError: If `start` was not called, or nothing was decided since the last call.
             ValueError: If what is given is no packet for this plant; nothing has changed then.
+            GuaranteeLostError: If the state is not proved safe and that is to be raised; all has been received then.
         """
         try:
             given = None if isinstance(packets, Packet) else iter(packets)
@@ -222,7 +236,9 @@ class SafeLoop:
         oldest = self._estimator.channel.longest_delay
         self._discarded = self._discarded.with_those_of(arrived, self.steps, self.episode, oldest)
         self._phase = _Phase.RECEIVED
-        return self.estimate
+        estimate = self.estimate
+        self._lost.tell_of(self.reason)
+        return estimate
 
     @_transaction
     def decide(self, proposed: Any) -> Decision:
@@ -254,7 +270,11 @@ class SafeLoop:
         return self._inputs.command(self.steps, self.episode)
 
     def step(self, proposed: Any, packets: Iterable[Packet] = (), applied: Any = None) -> Decision:
-        """Returns the decision at this control step: `receive`, then `decide`, which is left if that is interrupted."""
+        """Returns the decision at this control step: `receive`, then `decide`, which is left if that is interrupted.
+
+        Raises:
+            GuaranteeLostError: As from `receive`; `decide` is left then.
+        """
         self.receive(packets, applied)
         return self.decide(proposed)
 

@@ -26,6 +26,7 @@ from shields.runtime.guarantee import (
     LoopObservation,
     MonitorState,
 )
+from shields.runtime.lost_guarantee import LostGuarantee
 from shields.runtime.one_step import PredictedErrors, norms
 from shields.runtime.safety_filter import SafetyFilter
 from shields.runtime.starts import StartKnown, first_observations, first_store, starts_known
@@ -55,6 +56,8 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         mode: "project", "lookahead", "switch", "boundary" or "monitor"; see `SafetyFilter`.
         penalty: Subtracted from the reward per intervention counted, >= 0.
         horizon: Longest plan of mode "lookahead", in steps; see `SafetyFilter`.
+        on_unproved: "ignore", "warn" or "raise"; see `SafetyShield`. Environments that lose the guarantee in the same
+            step for the same reason are told of once.
 
     Raises:
         CertificateError: If the certificate does not verify for the environment's plant.
@@ -73,13 +76,16 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         mode: str = "project",
         penalty: float = 0.0,
         horizon: int | None = None,
+        on_unproved: str = "warn",
     ) -> None:
-        RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty, horizon=horizon)
+        given = {"certificate": certificate, "mode": mode, "penalty": penalty, "horizon": horizon}
+        RecordConstructorArgs.__init__(self, **given, on_unproved=on_unproved)
         inner = self._inner = self._environment_in(env)
         if env.single_action_space != inner.single_action_space:
             raise ValueError(f"a wrapper inside the shield changes the action space to {env.single_action_space}")
         VectorWrapper.__init__(self, env)
         self.penalty = as_number(penalty, "penalty", low=0.0)
+        self._lost = LostGuarantee(on_unproved, self.num_envs)
         if certificate is not None and not isinstance(certificate, Certificate):
             raise ValueError(f"certificate must be a Certificate or None, got {shown(certificate)}")
         self._certificate = (
@@ -113,6 +119,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
 
         Raises:
             ValueError: If what is wrapped is not any more what the shield was made for.
+            GuaranteeLostError: If x in S is not proved and that is to be raised; the episodes have begun then.
         """
         before, self._clock = self._clock or self._interrupted, self._clock and self._interrupted
         try:
@@ -138,7 +145,9 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         self._start(restarted, now.steps == 0)
         self._clock = now
         idle = idle._replace(plan=self._stored)
-        return observation, info | self._info(idle, idle.input, self._state, self._interventions, self._report.age)
+        info = info | self._info(idle, idle.input, self._state, self._interventions, self._report.age)
+        self._lost.tell()
+        return observation, info
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Applies the actions, or what the shield puts in the place of some.
@@ -146,6 +155,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         Raises:
             ValueError: If an action is not finite or the shape is wrong; nothing has moved then.
             gymnasium.error.ResetNeeded: If there was no reset.
+            GuaranteeLostError: If x in S is not proved and that is to be raised; the step has been taken then.
         """
         if self._clock is None:
             raise gym.error.ResetNeeded("call reset before the first step")
@@ -180,6 +190,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             rewards = rewards - self.penalty * charged
         decided = decided._replace(plan=self._stored)
         info = info | added | self._info(decided, proposed, self._state, self._interventions, self._report.age)
+        self._lost.tell()
         return observation, rewards, terminated, truncated, info
 
     @staticmethod
@@ -205,6 +216,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
 
     def _start(self, restarted: np.ndarray, begun: np.ndarray) -> None:
         """Begins anew where episodes began, `begun` where nothing has moved since; shape (N,) each."""
+        self._lost.begin(restarted)
         known, starts = [self._start_known] * self.num_envs, self._inner.starts
         for e in np.flatnonzero(restarted & ~np.isnan(starts[:, 0])).tolist():
             known[e] = starts_known(self._filter, starts[e], self._lead)
@@ -251,7 +263,8 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         decided = Decision(*(array[..., done] for array in decided))
         same_input, on_time = as_decided(known, decided.input, None if due is None else due[:, done])
         state = self._monitor.advance(state, decided, moved_once[done], same_input, report, on_time)
-        for key, value in self._info(decided, proposed[:, done], state, self._interventions[done], report.age).items():
+        own = self._info(decided, proposed[:, done], state, self._interventions[done], report.age, done)
+        for key, value in own.items():
             final[key] = np.full((self.num_envs, *value.shape[1:]), "" if value.dtype == object else 0, value.dtype)
             final[key][done], final[f"_{key}"] = value, is_done.copy()
         return final
@@ -268,11 +281,22 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         return Clock(inner.episodes.copy(), inner.steps.copy(), inner.ticks)
 
     def _info(
-        self, decided: Decision, proposed: np.ndarray, state: MonitorState, interventions: np.ndarray, ages: np.ndarray
+        self,
+        decided: Decision,
+        proposed: np.ndarray,
+        state: MonitorState,
+        interventions: np.ndarray,
+        ages: np.ndarray,
+        chosen: np.ndarray | None = None,
     ) -> dict[str, Any]:
-        """Returns the shield's keys, new arrays, for steps that applied these decisions."""
+        """Returns the shield's keys, new arrays, for steps that applied these decisions, in all or some environments.
+
+        Where the guarantee is lost, that is noted.
+        """
         reasons = self._monitor.reasons(state, ages)
         doubted = np.count_nonzero(reasons) > 0
+        if doubted:
+            self._lost.note(reasons, np.arange(self.num_envs) if chosen is None else chosen)
         ahead = {}
         if len(self._stored):
             ahead["shield_plan_length"] = np.count_nonzero(~np.isnan(decided.plan[:, 0]), axis=0)

@@ -20,6 +20,7 @@ from ncs_gym.validation import as_number, setting, shown
 from shields.certificate import Certificate
 from shields.runtime.decisions import NO_PLAN
 from shields.runtime.guarantee import LoopObservation
+from shields.runtime.lost_guarantee import LostGuarantee
 from shields.runtime.monitored_filter import MonitoredFilter
 from shields.runtime.safety_filter import SafetyFilter
 from shields.runtime.starts import StartKnown, starts_known
@@ -73,6 +74,8 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         mode: "project", "lookahead", "switch", "boundary" or "monitor"; see `SafetyFilter`.
         penalty: Subtracted from the reward per intervention counted, >= 0.
         horizon: Longest plan of mode "lookahead", in steps; see `SafetyFilter`.
+        on_unproved: What reset and step do, once per episode and reason, where x in S is not proved: "warn" with a
+            `GuaranteeLostWarning`, "raise" a `GuaranteeLostError` after the step, "ignore" for who reads the infos.
 
     Raises:
         CertificateError: If the certificate does not verify for the environment's plant.
@@ -91,13 +94,16 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         mode: str = "project",
         penalty: float = 0.0,
         horizon: int | None = None,
+        on_unproved: str = "warn",
     ) -> None:
-        RecordConstructorArgs.__init__(self, certificate=certificate, mode=mode, penalty=penalty, horizon=horizon)
+        given = {"certificate": certificate, "mode": mode, "penalty": penalty, "horizon": horizon}
+        RecordConstructorArgs.__init__(self, **given, on_unproved=on_unproved)
         inner = self._inner = self._environment_in(env)
         if env.action_space != inner.action_space:
             raise ValueError(f"a wrapper inside the shield changes the action space to {env.action_space}")
         gym.Wrapper.__init__(self, env)
         self.penalty = as_number(penalty, "penalty", low=0.0)
+        self._lost = LostGuarantee(on_unproved)
         if certificate is not None and not isinstance(certificate, Certificate):
             raise ValueError(f"certificate must be a Certificate or None, got {shown(certificate)}")
         self._certificate = (
@@ -117,6 +123,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
 
         Raises:
             ValueError: If what is wrapped is not any more what the shield was made for.
+            GuaranteeLostError: If x in S is not proved and that is to be raised; the episode has begun then.
         """
         before, self._clock = self._clock, self._clock and INTERRUPTED
         if self._is_drawn:
@@ -138,7 +145,10 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         u = np.zeros(self._filter.plant.m)
         margin = self._filter.margin(report.estimate, inner.known.error_shape, u)
         self._clock = clock
-        return observation, info | self._info(u, u, margin, intervened=False)
+        info = info | self._info(u, u, margin, intervened=False)
+        self._lost.begin()
+        self._lost.tell_of(info["shield_reason"])
+        return observation, info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Applies the action, or what the shield puts in its place.
@@ -146,6 +156,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         Raises:
             ValueError: If the action is not finite or wrongly shaped; nothing has moved then.
             gymnasium.error.ResetNeeded: If there was no reset.
+            GuaranteeLostError: If x in S is not proved and that is to be raised; the step has been taken then.
         """
         if self._clock is None:
             raise gym.error.ResetNeeded("call reset before the first step")
@@ -164,6 +175,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         self._interventions += decision.intervened
         self._clock = clock
         info = info | self._info(proposed, decision.input, decision.margin, intervened=decision.intervened)
+        self._lost.tell_of(info["shield_reason"])
         return observation, float(reward) - self.penalty * decision.intervened, terminated, truncated, info
 
     @staticmethod

@@ -151,6 +151,7 @@ def test_rates_reach_tensorboard(algorithm, settings, shielded, tmp_path):
     tags = events.Tags()["scalars"]
     assert {"safety/violation_rate", "safety/intervention_rate", "safety/violation_steps", "time/fps"} <= set(tags)
     assert max(event.value for event in events.Scalars("safety/mean_correction")) > 0.0
+    assert {event.value for event in events.Scalars("safety/guaranteed_rate")} == {1.0}
     assert {event.value for event in events.Scalars("eval/success_rate")} == {1.0}
     evaluated = [event.step for event in events.Scalars("eval/mean_reward")]
     assert evaluated[0] == 0

@@ -1,0 +1,162 @@
+"""A guarantee that is lost is said: once per episode and reason, where the caller stands, after everything else."""
+
+import warnings
+
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, VectorWrapper
+
+from agents import LoopConfig, ShieldSettings
+from ncs_gym import Channel, NCSEnv, NCSVectorEnv, truck_trailer
+from shields import GuaranteeLostError, GuaranteeLostWarning, SafeLoop, SafetyShield, VectorSafetyShield
+from shields.runtime.guarantee import NOT_KNOWN_INSIDE, OTHER_INPUT, OTHER_STEPS
+from tests.certificates import certificate_of
+
+PLANT = truck_trailer(mass=4000.0)
+OUTSIDE = 0.99 / np.abs(PLANT.box_rows).max(axis=0)
+
+
+def scalar(**settings):
+    return SafetyShield(NCSEnv(PLANT), certificate_of(PLANT), **settings)
+
+
+def vector(**settings):
+    return VectorSafetyShield(NCSVectorEnv(3, plant=PLANT), certificate_of(PLANT), **settings)
+
+
+def loop(**settings):
+    return SafeLoop(certificate_of(PLANT), PLANT, Channel(), **settings)
+
+
+def still(shield):
+    return np.zeros(shield.action_space.shape, np.float32)
+
+
+def lose(shield, seed=0):
+    """Begins an episode in which the environment moves behind the shield's back: nothing is proved till the next."""
+    shield.reset(seed=seed)
+    shield.unwrapped.step(still(shield))
+
+
+def said(call):
+    """The warnings of a call: what they say and where."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        call()
+    assert {each.category for each in caught} <= {GuaranteeLostWarning}
+    return [(str(each.message), each.filename) for each in caught]
+
+
+@pytest.mark.parametrize("shielded", [scalar, vector])
+def test_shield_warns_once_in_each_episode_of_each_reason(shielded):
+    shield = shielded()
+
+    def episode():
+        lose(shield)
+        for _ in range(3):
+            *_, info = shield.step(still(shield))
+            assert np.all(info["shield_reason"] == OTHER_STEPS)
+
+    text = f"the state is not proved safe now: {OTHER_STEPS} (docs/shield.md says what the reasons mean)"
+    assert said(episode) == [(text, __file__)]
+    assert said(episode) == [(text, __file__)]
+    starts = said(lambda: shield.reset(options={"state": OUTSIDE}))
+    assert [NOT_KNOWN_INSIDE in text for text, _ in starts] == [True]
+    assert said(lambda: shield.reset(seed=0)) == []
+
+
+@pytest.mark.parametrize("shielded", [scalar, vector])
+def test_shield_raises_when_the_step_has_been_taken_and_goes_on(shielded):
+    shield = shielded(on_unproved="raise")
+    lose(shield)
+    with pytest.raises(GuaranteeLostError, match=OTHER_STEPS):
+        shield.step(still(shield))
+    assert np.all(shield.unwrapped.steps == 2)
+    *_, info = shield.step(still(shield))
+    assert np.all(info["shield_reason"] == OTHER_STEPS)
+    with pytest.raises(GuaranteeLostError, match=NOT_KNOWN_INSIDE):
+        shield.reset(options={"state": OUTSIDE})
+    shield.step(still(shield))
+
+
+@pytest.mark.parametrize("shielded", [scalar, vector])
+def test_shield_that_is_told_so_says_nothing(shielded):
+    shield = shielded(on_unproved="ignore")
+    assert said(lambda: (lose(shield), shield.step(still(shield)))) == []
+
+
+@pytest.mark.parametrize("make", [scalar, vector, loop])
+def test_what_to_do_about_a_lost_guarantee_is_one_of_three(make):
+    for wrong in ("log", None, ["warn"]):
+        with pytest.raises(ValueError, match=r"on_unproved must be one of \['ignore', 'warn', 'raise'\]"):
+            make(on_unproved=wrong)
+
+
+def test_one_environment_of_many_is_enough_and_says_it_in_its_own_episode():
+    shield = vector()
+    states = np.zeros((3, PLANT.n))
+    states[1] = OUTSIDE
+    assert len(said(lambda: shield.reset(seed=0, options={"state": states}))) == 1
+    mask = np.array([True, False, True])
+    assert said(lambda: shield.reset(options={"reset_mask": mask})) == []
+    assert len(said(lambda: shield.reset(options={"reset_mask": ~mask, "state": states}))) == 1
+
+
+def test_guarantee_lost_in_the_last_step_of_an_episode_is_said_though_the_next_has_begun():
+    class Halves(VectorWrapper):
+        def step(self, actions):
+            return self.env.step(0.5 * actions)
+
+    env = NCSVectorEnv(2, plant=PLANT, max_episode_steps=1, autoreset_mode=AutoresetMode.SAME_STEP)
+    shield = VectorSafetyShield(Halves(env), certificate_of(PLANT))
+    shield.reset(seed=0)
+    (text, _), *others = said(lambda: shield.step(np.full(shield.action_space.shape, 0.01, np.float32)))
+    assert OTHER_INPUT in text
+    assert others == []
+    assert len(said(lambda: shield.step(np.full(shield.action_space.shape, 0.01, np.float32)))) == 1
+
+
+def test_loop_warns_its_caller_once_in_each_episode_of_each_reason():
+    real = loop()
+
+    def episode():
+        real.start(np.zeros(PLANT.n))
+        real.step(np.zeros(PLANT.m))
+        for _ in range(3):
+            real.step(np.zeros(PLANT.m), applied=PLANT.u_max)
+
+    for _ in range(2):
+        (text, place), *others = said(episode)
+        assert OTHER_INPUT in text
+        assert place == __file__
+        assert others == []
+    with pytest.warns(GuaranteeLostWarning, match=NOT_KNOWN_INSIDE):
+        real.start(OUTSIDE)
+
+
+@pytest.mark.parametrize("kind", [GuaranteeLostError, GuaranteeLostWarning])
+def test_loop_takes_nothing_back_when_a_lost_guarantee_is_raised(kind):
+    real = loop(on_unproved="raise" if kind is GuaranteeLostError else "warn")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(kind, match=NOT_KNOWN_INSIDE):
+            real.start(OUTSIDE)
+        real.start(np.zeros(PLANT.n))
+        real.step(np.zeros(PLANT.m))
+        with pytest.raises(kind, match=OTHER_INPUT):
+            real.receive(applied=PLANT.u_max)
+        assert (real.steps, real.reason) == (1, OTHER_INPUT)
+        assert real.estimate @ real.estimate > 0.0  # it has followed what was applied
+        real.decide(np.zeros(PLANT.m))
+        real.step(np.zeros(PLANT.m))
+
+
+def test_loop_of_an_agent_hands_the_choice_to_its_shield():
+    settings = ShieldSettings(certificate_of(PLANT), on_unproved="raise")
+    config = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0", shield=settings)
+    with pytest.raises(GuaranteeLostError):
+        config.single().reset(options={"state": OUTSIDE})
+    with pytest.raises(GuaranteeLostError):
+        config.vector(2).reset(options={"state": OUTSIDE})
+    with pytest.raises(ValueError, match="on_unproved must be one of"):
+        ShieldSettings(certificate_of(PLANT), on_unproved="maybe")
