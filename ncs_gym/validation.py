@@ -46,14 +46,18 @@ class ReadOnlyArrays:
 def setting(name: str, kept_as: str | None = None) -> Any:
     """Returns a property for what an object is made with, and other parts of it rest on: it is read, and never set.
 
+    Who tries is told how to make another object; a class may say so by its attribute `made_by`.
+
     Args:
         name: Of the property.
-        kept_as: Attribute that holds the value; the name after an underscore by default.
+        kept_as: Attribute that holds the value, also of a part ("part.attribute"); the name after an underscore by
+            default.
     """
 
     def refuse(owner: Any, value: Any) -> None:
         kind = type(owner).__name__
-        raise AttributeError(f"{name} is a setting of {kind} and cannot be changed: make another {kind} with it")
+        way = f", as in {owner.made_by}" if hasattr(owner, "made_by") else ""
+        raise AttributeError(f"{name} is a setting of {kind} and cannot be changed: make another {kind} with it{way}")
 
     return property(attrgetter(kept_as or f"_{name}"), refuse)
 

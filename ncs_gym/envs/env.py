@@ -127,6 +127,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES, "render_fps": RENDER_FPS}
+    made_by: ClassVar[str] = "gym.make(id, channel=...)"
     observation_space: Box
     action_space: Box
     plant: LinearPlant = setting("plant")
@@ -144,6 +145,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     noise: str = setting("noise")
     process: Process = setting("process", "_process_given")
     downlink: Channel | None = setting("downlink")
+    downlink_contract: ChannelContract | None = setting("downlink_contract")
     downlink_protocol: DownlinkProtocol | None = setting("downlink_protocol", "_protocol")
 
     def __init__(
@@ -178,6 +180,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         contracts = loop_contracts(plant, self._channel, contract, downlink, downlink_contract)
         self._contract, self._protocol, self._certificate_contract = contracts
         self._downlink = downlink
+        self._downlink_contract = None if self._protocol is None else self._protocol.contract
         patterns = arrival_patterns(plant, self._channel, self._certificate_contract)
         self._error_set = patterns.recursion.error_set
         self._estimator = Estimator(plant, self._channel, patterns=patterns)

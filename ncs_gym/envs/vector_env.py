@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -22,8 +22,11 @@ from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.downlink import DownlinkProtocol, Inputs, VectorDownlinkState, no_inputs
 from ncs_gym.network.packet_transmission import VectorChannelState
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.processes.process import Process
 from ncs_gym.processes.simulation import PlantSimulation
 from ncs_gym.tasks.task import Task
+from ncs_gym.uncertainty.disturbance import Disturbance
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_count, setting, shown
 
 
@@ -52,14 +55,23 @@ class NCSVectorEnv(VectorEnv):
         ValueError: If a setting is wrong; see `NCSEnv`.
     """
 
+    made_by: ClassVar[str] = "gym.make_vec(id, num_envs, channel=...)"
     single: NCSEnv = setting("single")
     plant: LinearPlant = setting("plant")
     channel: Channel = setting("channel")
     task: Task = setting("task")
+    disturbance: Disturbance = setting("disturbance", "_single.disturbance")
+    initial_set: Ellipsoid = setting("initial_set", "_single.initial_set")
+    terminate_on_violation: bool = setting("terminate_on_violation", "_single.terminate_on_violation")
+    allow_assumption_violation: bool = setting("allow_assumption_violation", "_single.allow_assumption_violation")
+    horizon: int = setting("horizon", "_single.horizon")
+    noise: str = setting("noise", "_single.noise")
+    process: Process = setting("process", "_single.process")
     contract: ChannelContract | None = setting("contract")
     certificate_contract: ChannelContract | None = setting("certificate_contract")
     error_set: ErrorSet = setting("error_set")
     downlink: Channel | None = setting("downlink")
+    downlink_contract: ChannelContract | None = setting("downlink_contract", "_single.downlink_contract")
     downlink_protocol: DownlinkProtocol | None = setting("downlink_protocol", "_protocol")
     max_episode_steps: int | None = setting("max_episode_steps")
     autoreset_mode: AutoresetMode = setting("autoreset_mode")
