@@ -261,7 +261,7 @@ def require_same(before: dict[str, Any], now: dict[str, Any]) -> None:
 
 
 def hint_for(env: Any) -> str:
-    """Returns which shield an environment takes that the other one refuses; empty if neither takes it."""
+    """Returns which shield an environment takes that the other one refuses, or what to read if neither takes it."""
     inner = getattr(env, "unwrapped", None)
     if isinstance(inner, NCSEnv):
         return ": use SafetyShield for a single environment"
@@ -269,7 +269,7 @@ def hint_for(env: Any) -> str:
         return ": use VectorSafetyShield for a vectorized environment"
     if isinstance(inner, VectorEnv):
         return ": for gymnasium's sync and async vector environments give make_vec(..., wrappers=[SafetyShield])"
-    return ""
+    return ", which has no linear model with bounds: docs/own_plant.md says how one is given to it"
 
 
 def environment_behind(env: Any, wrappers: type, refused: tuple[type, ...], wanted: type[T], hint: str = "") -> T:

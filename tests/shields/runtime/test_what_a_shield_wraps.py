@@ -111,3 +111,8 @@ def test_settings_of_a_loop_cannot_be_changed(name):
     loop = SafeLoop(certificate_of(PLANT), PLANT, Channel())
     with pytest.raises(AttributeError, match=f"{name} is a setting of SafeLoop"):
         setattr(loop, name, None)
+
+
+def test_environment_of_somebody_else_is_refused_with_the_page_that_helps():
+    with pytest.raises(ValueError, match=r"needs an NCSEnv inside, got PendulumEnv, .*: docs/own_plant\.md says how"):
+        SafetyShield(gym.make("Pendulum-v1"))
