@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from shields.certificate import Certificate, Multipliers, Proof, Updates
 from shields.errors import CertificateError, Infeasible
+from shields.polytope import Polytope
 from shields.runtime import Decision, SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.verification import Condition, Report, verify
 
@@ -23,6 +24,7 @@ __all__ = [
     "Decision",
     "Infeasible",
     "Multipliers",
+    "Polytope",
     "Proof",
     "Report",
     "SafeLoop",

@@ -32,7 +32,7 @@ LAYERS = {
     ),
     "shields": (
         {"errors", "atomic_write", "certificate_text"},
-        {"json_documents"},
+        {"json_documents", "polytope"},
         {"certificate"},
         {"verification", "paper", "synthesis"},
         {"runtime", "downlink"},
