@@ -27,8 +27,8 @@ CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
 ARMS = {
     "stable-baselines3, scalar": (True, None),
     "the same, rollout 256": (True, {"n_steps": 256}),
-    "ours, scalar, 16 environments": (True, PPOSettings(envs=16, rollout=128, batch_size=1024)),
-    "ours": (False, PPOSettings()),
+    "ours, scalar, 16 environments": (True, dict(n_envs=16, n_steps=128, batch_size=1024)),
+    "ours": (False, {}),
 }
 SB3_ENVS = 8
 
@@ -60,7 +60,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=2)
     options = parser.parse_args()
     print(f"{'settings':32s}{'frames/s':>10s}{'ratio':>8s}{'return':>10s}   by seed", flush=True)
-    trained(False, PPOSettings(), 1, 0)  # What only the first training of a process takes time for is not measured.
+    trained(False, {}, 1, 0)  # What only the first training of a process takes time for is not measured.
     base = None
     for name, (scalar, settings) in ARMS.items():
         rates, returns = [], []

@@ -21,7 +21,6 @@ from pathlib import Path
 import gymnasium as gym
 
 from agents.loop import LoopConfig, ShieldSettings
-from agents.settings import PPOSettings
 from experiments.backends import ray_backend, ray_cluster
 from experiments.backends.job import Job
 from experiments.runs import RunStore, TrainingRun, execute_run, versions
@@ -74,7 +73,7 @@ def per_call(function, items) -> float:
 def example(episodes: int) -> TrainingRun:
     """A small run that trains."""
     certificate = synthesize(ncs_env(gym.make(ENV)).plant)
-    settings = PPOSettings(envs=4)
+    settings = dict(n_envs=4)
     loop = LoopConfig(env=ENV, shield=ShieldSettings(certificate, "project"))
     return TrainingRun(
         arm="shielded",

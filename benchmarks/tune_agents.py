@@ -46,7 +46,7 @@ STREAMS = {
     "ncs_gym/CartPoleNonlinear-v0": 7,
     "ncs_gym/InvertedPendulum-v0": 7,
 }
-GUESS = PPOSettings(envs=128, rollout=32, discount=0.98, gae_lambda=0.95)
+GUESS = dict(n_envs=128, n_steps=32, gamma=0.98, gae_lambda=0.95)
 SPACE: dict[str, tuple[Any, ...]] = {
     "envs": (128,),
     "rollout": (16, 32),
@@ -94,7 +94,7 @@ def trained_return(loop: LoopConfig, settings: PPOSettings, steps: int, experime
 def candidate(env_id: str, number: int) -> PPOSettings:
     """The settings of a number: the defaults, the guess, then random ones."""
     if number < 2:
-        return (PPOSettings(), GUESS)[number]
+        return ({}, GUESS)[number]
     rng = np.random.default_rng([SEARCH_SEED, STREAMS[env_id], number])
     return PPOSettings(**{name: values[rng.integers(len(values))] for name, values in SPACE.items()})
 
@@ -143,7 +143,7 @@ def search(env_id: str, results: Results, candidates: int, finalists: int, seeds
 
 def changes(settings: PPOSettings) -> dict[str, Any]:
     """The settings that differ from the defaults."""
-    return {name: value for name, value in asdict(settings).items() if value != getattr(PPOSettings(), name)}
+    return {name: value for name, value in asdict(settings).items() if value != getattr({}, name)}
 
 
 def main() -> None:

@@ -52,7 +52,7 @@ def policies(loop: LoopConfig, with_defaults: bool) -> dict[str, Callable[[int],
     settings, steps = tuned_settings(loop.env), tuned_steps(loop.env)
     found: dict[str, Callable[[int], Policy]] = {TUNED: lambda seed: trained(loop, settings, steps, seed)}
     if with_defaults:
-        found[DEFAULTS] = lambda seed: trained(loop, PPOSettings(), DEFAULT_STEPS, seed)
+        found[DEFAULTS] = lambda seed: trained(loop, {}, DEFAULT_STEPS, seed)
     found["random"] = lambda seed: random_actions(plant.m, seed)
     return found | {each.name: lambda seed, each=each: each.policy(plant) for each in (certified, linear)}
 

@@ -18,6 +18,7 @@ from experiments.runs import (
     experiment_provenance,
     loop_config,
     prepare_output,
+    require_trainable,
     run_of_arm,
 )
 from experiments.settings import BackendSettings, TrainSettings
@@ -43,6 +44,7 @@ def train(settings: TrainSettings) -> None:
     settings = short_version(settings, **_SMOKE)
     Arm.of(settings.arm, settings.mode)
     loop = loop_config(settings.env, settings.channel)
+    require_trainable(settings, loop)
     certificate = certificate_of(loop, settings.certificate)
     with claim_folder("train", settings.completed):
         _train_in_folder(settings, loop, certificate)

@@ -16,6 +16,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from agents.former_settings import from_former_file
 from experiments.errors import FolderInUseError, OtherResultsError, ResultsError
 from experiments.runs.experiment import INCIDENTAL_SETTINGS
 from experiments.settings import save_settings, settings_json
@@ -162,7 +163,7 @@ def _require_same(folder: Path, command: str, settings: Any) -> None:
     if kept_command != command:
         raise OtherResultsError(f"{folder} holds finished results of ncs {kept_command}: {advice}")
     defaults = settings_json(command, type(settings)())["settings"]
-    before, now = _flat(defaults | kept), _flat(settings_json(command, settings)["settings"])
+    before, now = _flat(defaults | from_former_file(kept)), _flat(settings_json(command, settings)["settings"])
     growing = _GROWING.get(command, ())
     others = [
         f"{name} {_shown(before.get(name))}, now {_shown(now.get(name))}"

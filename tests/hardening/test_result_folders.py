@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.loop import LoopConfig, ShieldSettings
-from agents.settings import PPOSettings
 from agents.sharing.agent_file import AgentError
 from experiments.analysis.arm_table import summary_text
 from experiments.analysis.parquet_tables import write_tables
@@ -60,7 +59,7 @@ def run(certificate):
         certificate=certificate,
         conditions=("gaussian",),
         algorithm="PPO",
-        settings=PPOSettings(envs=2, rollout=64, batch_size=64, epochs=1, width=8),
+        settings=dict(n_envs=2, n_steps=64, batch_size=64, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8])),
     )
 
 

@@ -11,7 +11,6 @@ from types import SimpleNamespace
 import pytest
 
 from agents.loop import LoopConfig
-from agents.settings import PPOSettings
 from experiments.backends import ray_cluster
 from experiments.backends.execution import results_of
 from experiments.backends.ray_cluster import _execute_on_node, execute_submitted, portable_task, require_answer
@@ -34,7 +33,7 @@ def run(certificate):
         episodes=1,
         certificate=certificate,
         algorithm="PPO",
-        settings=PPOSettings(),
+        settings={},
     )
 
 

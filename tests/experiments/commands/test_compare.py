@@ -6,7 +6,6 @@ import pytest
 from agents import tuned_settings
 from agents.loop import LoopConfig
 from agents.results import Episode
-from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
 from experiments.analysis.arm_table import _rows
 from experiments.analysis.summary import covered_fraction, paired_differences, summarize_arm
 from experiments.commands.compare import _findings, _training_runs
@@ -14,7 +13,6 @@ from experiments.runs.arms import Arm, by_arm
 from experiments.runs.run_store import prepare_output
 from experiments.runs.training_run import RunResult
 from experiments.settings import CompareSettings
-from experiments.settings.agent_overrides import A2COverrides, OffPolicyOverrides, PPOOverrides
 
 ALL_ARMS = ("unshielded", "monitor", "penalized", "shielded", "shielded:switch+penalty", "shielded:boundary")
 
@@ -123,7 +121,7 @@ def test_unknown_arms_are_refused(name):
     [("PPO", PPOSettings), ("TRPO", PPOSettings), ("A2C", A2CSettings), ("SAC", OffPolicySettings)],
 )
 def test_settings_reach_every_run(certificate, algo, settings):
-    given = {"ppo": PPOOverrides(envs=3), "a2c": A2COverrides(envs=3), "off_policy": OffPolicyOverrides(envs=3)}
+    given = {"ppo": dict(n_envs=3), "a2c": dict(n_envs=3), "off_policy": dict(n_envs=3)}
     expected = replace(tuned_settings(CRUISE) if algo == "PPO" else settings(), envs=3)
     for run in runs_of(certificate, steps=7, episodes=9, algo=algo, **given):
         assert (run.steps, run.episodes, run.algorithm, run.settings) == (7, 9, algo, expected)

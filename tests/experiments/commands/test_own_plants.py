@@ -13,7 +13,6 @@ from functools import partial
 import gymnasium as gym
 import pytest
 
-from agents.settings import PPOSettings
 from ncs_gym import truck_trailer
 from shields import Certificate
 from tests.command import assert_one_sentence, environment, ncs
@@ -69,7 +68,7 @@ def test_own_plant_is_trained_in_and_evaluated_by_its_id(folder, without_workers
     assert run.returncode == 0, run.stderr
     settings = json.loads((folder / "r" / "settings.json").read_text())
     assert settings["settings"]["env"] == "Plants/Truck-v0"  # a file names no module
-    assert settings["settings"]["ppo"] == vars(PPOSettings(rollout=16, envs=2))
+    assert settings["settings"]["ppo"] == vars(dict(n_steps=16, n_envs=2))
     assert "PPO, default settings, as given envs, rollout:" in run.stdout
     model = next((folder / "r" / "models").iterdir())
     assert json.loads((model / "agent.json").read_text())["agent"]["env"] == "Plants/Truck-v0"

@@ -1,12 +1,12 @@
 from dataclasses import asdict, fields, replace
 
 import pytest
+from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
+from experiments.settings.agent_overrides import A2COverrides, OffPolicyOverrides, PPOOverrides
 
 from agents import tuned_settings, tuned_steps
-from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
 from experiments.__main__ import _parse
 from experiments.settings import CompareSettings, SweepSettings, TrainSettings, save_settings
-from experiments.settings.agent_overrides import A2COverrides, OffPolicyOverrides, PPOOverrides
 
 CART_POLE = "ncs_gym/CartPole-v0"
 

@@ -6,7 +6,6 @@ import pytest
 from experiments.__main__ import _parse
 from experiments.errors import SettingsError
 from experiments.settings import CompareSettings, SweepSettings, config_defaults, save_settings
-from experiments.settings.agent_overrides import PPOOverrides
 
 
 @pytest.mark.parametrize(
@@ -22,7 +21,7 @@ from experiments.settings.agent_overrides import PPOOverrides
                 algo="SAC",
                 smoke=True,
                 channel={"loss": 1e-3, "delay": 4},
-                ppo=PPOOverrides(learning_rate=1e-5, log_std=-1.5),
+                hyperparams=dict(learning_rate="lin_1e-05", policy_kwargs=dict(log_std_init=-1.5)),
             ),
         ),
         ("sweep", SweepSettings(losses=(0.0, 1 / 3), quantization_steps=(0.05,))),
