@@ -69,7 +69,7 @@ class _Rollout:
         # Episodes that end early are stepped on without being counted: the others' random numbers stay the same.
         prototype = ncs_env(loop.single())
         self._terminates = prototype.terminate_on_violation
-        self._envs, self._C, self._level_matrix = loop.vector(count), prototype.plant.C, level_matrix
+        self._envs, self._C, self._level_matrix = loop.vector(count), prototype.plant.box_rows, level_matrix
         if self._terminates and isinstance(self._envs.unwrapped, NCSVectorEnv):
             self._envs = loop.vector(count, terminate_on_violation=False)
         self._running = np.ones(count, np.bool_)

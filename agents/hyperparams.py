@@ -35,6 +35,8 @@ ALGORITHMS = {
     "TQC": "sb3_contrib",
     "CrossQ": "sb3_contrib",
 }
+# Numbers that are counted from 1: of a wrong one the library complains only while it trains, or never.
+_COUNTS = ("n_envs", "n_steps", "n_epochs", "buffer_size")
 # Algorithms that learn from whole rollouts of `n_steps` steps in every environment.
 ON_POLICY = ("PPO", "A2C", "TRPO")
 
@@ -88,8 +90,8 @@ def complete_hyperparams(algorithm: str, given: Mapping[str, Any] | None = None)
         given: Hyperparameters by name; None for none.
 
     Raises:
-        ValueError: If the algorithm is unknown, what is given is no dictionary of JSON values, or one of those that are
-            not the library's is out of range: `n_envs`, `n_steps` of rollouts, `gamma`.
+        ValueError: If the algorithm is unknown, what is given is no dictionary of JSON values, or `gamma` or a count
+            (`n_envs`, `n_steps`, `n_epochs`, `buffer_size`) is out of range.
     """
     if algorithm not in ALGORITHMS:
         raise ValueError(f"unknown algorithm {algorithm!r}; known are {', '.join(ALGORITHMS)}")
@@ -100,8 +102,8 @@ def complete_hyperparams(algorithm: str, given: Mapping[str, Any] | None = None)
     except (TypeError, ValueError) as error:
         raise ValueError(f"hyperparameters must be JSON values: {error}") from error
     hyperparams = with_changes(DEFAULTS[algorithm], copied)
-    for name in ("n_envs", "n_steps") if algorithm in ON_POLICY else ("n_envs",):
-        if type(value := hyperparams[name]) is not int or value < 1:
+    for name in _COUNTS:
+        if name in hyperparams and (type(value := hyperparams[name]) is not int or value < 1):
             raise ValueError(f"{name} must be a whole number >= 1, got {shown(value)}")
     gamma = hyperparams["gamma"]
     if type(gamma) not in (int, float) or not 0.0 <= gamma <= 1.0:

@@ -48,7 +48,7 @@ def linear_controllers(plant: LinearPlant, task: Task) -> list[LinearController]
     if isinstance(task, SetpointTracking):
         return _setpoint_regulators(plant, task)
     assert isinstance(task, Regulation)
-    weights = plant.C.T @ plant.C
+    weights = plant.box_rows.T @ plant.box_rows
     efforts = [effort * np.diag(1.0 / plant.u_max**2) for effort in EFFORTS]
     return [
         LinearController(f"LQR, effort {effort:g}", regulator(plant.A, plant.B, weights, R), np.zeros((plant.m, 0)))
@@ -67,7 +67,7 @@ def setpoint(plant: LinearPlant, output: np.ndarray) -> tuple[np.ndarray, np.nda
     n, m = plant.n, plant.m
     rest = np.hstack([np.eye(n) - plant.A, -plant.B])
     equations, sides = np.vstack([rest, np.append(output, np.zeros(m))]), np.append(np.zeros(n), 1.0)
-    widths = np.append(np.diag(np.linalg.inv(plant.C.T @ plant.C)) ** 0.5, plant.u_max)
+    widths = np.append(np.diag(np.linalg.inv(plant.box_rows.T @ plant.box_rows)) ** 0.5, plant.u_max)
     solution = widths * np.linalg.lstsq(equations * widths, sides)[0]
     return solution[:n], solution[n:]
 
@@ -77,7 +77,7 @@ def _setpoint_regulators(plant: LinearPlant, task: SetpointTracking) -> list[Lin
     found = []
     for effort in EFFORTS:
         for weight in BOX_WEIGHTS:
-            Q = np.outer(task.output, task.output) / task.width**2 + weight * plant.C.T @ plant.C
+            Q = np.outer(task.output, task.output) / task.width**2 + weight * plant.box_rows.T @ plant.box_rows
             gain = regulator(plant.A, plant.B, Q, effort * np.diag(1.0 / plant.u_max**2))
             feed = (held - gain @ state)[:, None]
             found.append(LinearController(f"LQR, effort {effort:g}, box {weight:g}", gain, feed))
@@ -102,7 +102,7 @@ def _speed_regulators(plant: LinearPlant, task: SpeedTracking) -> list[LinearCon
     for effort in EFFORTS:
         for weight in (0.0, *BOX_WEIGHTS):
             Q = np.zeros((n + 1, n + 1))
-            Q[:n, :n], Q[n, n] = weight * plant.C.T @ plant.C, 1.0 / 25.0
+            Q[:n, :n], Q[n, n] = weight * plant.box_rows.T @ plant.box_rows, 1.0 / 25.0
             gain = regulator(A, B, Q, effort * np.diag(1.0 / plant.u_max**2))
             found.append(LinearController(f"LQR, effort {effort:g}, box {weight:g}", gain[:, :n], gain[:, n:]))
     return found

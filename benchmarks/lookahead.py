@@ -63,7 +63,7 @@ class PlainProgram:
         self.plans = shield.lookahead.planner.test
         self.start, self.proposed = cp.Parameter(plant.n), cp.Parameter(plant.m)
         self.room, self.weighting, self.radius = (
-            cp.Parameter((steps, len(plant.C))),
+            cp.Parameter((steps, len(plant.box_rows))),
             cp.Parameter((plant.n, plant.n)),
             cp.Parameter(),
         )
@@ -71,7 +71,7 @@ class PlainProgram:
         self.weighted = cp.Variable(plant.n)
         constraints = [self.c[0] == self.start, cp.abs(self.u) <= np.tile(plant.u_max, (steps, 1))]
         constraints += [self.c[1:] == self.c[:-1] @ plant.A.T + self.u @ plant.B.T]
-        constraints += [cp.abs(self.c[1:-1] @ plant.C.T) <= self.room[:-1]] if steps > 1 else []
+        constraints += [cp.abs(self.c[1:-1] @ plant.box_rows.T) <= self.room[:-1]] if steps > 1 else []
         constraints += [self.weighted == self.weighting @ self.c[-1], cp.norm(self.weighted) <= self.radius]
         self.problem = cp.Problem(cp.Minimize(cp.sum_squares(self.u[0] - self.proposed)), constraints)
 
@@ -91,7 +91,7 @@ class FreePlan:
     def __init__(self, plant: LinearPlant, root: np.ndarray, steps: int) -> None:
         self.start, u, c = cp.Parameter(plant.n), cp.Variable((steps, plant.m)), cp.Variable((steps + 1, plant.n))
         constraints = [c[0] == self.start, cp.abs(u) <= np.tile(plant.u_max, (steps, 1))]
-        constraints += [c[1:] == c[:-1] @ plant.A.T + u @ plant.B.T, cp.abs(c[1:] @ plant.C.T) <= 1.0]
+        constraints += [c[1:] == c[:-1] @ plant.A.T + u @ plant.B.T, cp.abs(c[1:] @ plant.box_rows.T) <= 1.0]
         self.problem = cp.Problem(cp.Minimize(cp.norm(root @ c[-1])), constraints)
 
     def exists(self, state: np.ndarray) -> bool:
@@ -116,7 +116,7 @@ def drawn(env: gym.Env, count: int) -> Beliefs:
     states = np.empty((0, inner.plant.n))
     while len(states) < count:
         more = rng.uniform(-1, 1, (count, inner.plant.n)) * inner.plant.half_widths
-        states = np.concatenate([states, more[(np.abs(more @ inner.plant.C.T) <= 1.0).all(axis=1)]])
+        states = np.concatenate([states, more[(np.abs(more @ inner.plant.box_rows.T) <= 1.0).all(axis=1)]])
     states = states[:count]
     errors = Ellipsoid(shape).sample_boundary(rng, count)
     return Beliefs(states, states + errors, rng.uniform(-1, 1, (count, inner.plant.m)) * inner.plant.u_max, shape)

@@ -48,7 +48,7 @@ for step in range(3000):
     applied = actuator.apply(step)
     as_decided += np.array_equal(applied, decided[step])  # Three steps ago; nobody acknowledged it.
     state = plant.A @ state + plant.B @ applied + plant.nominal_disturbance.sample_boundary(rng)
-    worst = max(worst, float(np.abs(plant.C @ state).max()))
+    worst = max(worst, float(np.abs(plant.box_rows @ state).max()))
 print(f"decided {loop.lead} steps ahead; applied as decided: {as_decided} of 3000")
 print(f"overridden: {overridden} of 3000, closest to the limit: {worst:.3f} (violated above 1)")
 print(f"proved: {proved} of 3000 steps")

@@ -23,7 +23,7 @@ _REMEDIES = {
     errno.ENOSPC: "make room and start the command again, which keeps what is finished",
     errno.EDQUOT: "make room and start the command again, which keeps what is finished",
 }
-_TRAINING = {"train": ("stable_baselines3", "torch", "tensorboard", "pyarrow", "jinja2")}
+_TRAINING = {"train": ("stable_baselines3", "torch", "tensorboard", "pandas", "pyarrow", "jinja2")}
 # The settings and the function of each command, and the packages that it needs of each extra.
 COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
     "compare": ("CompareSettings", "experiments.commands.compare:compare", _TRAINING),
@@ -76,7 +76,7 @@ def _parse(arguments: list[str]) -> object:
     import tyro
 
     from experiments import settings
-    from experiments.settings.assignments import with_assignments
+    from experiments.settings.assignments import beside_those_of_file, with_assignments
     from experiments.settings.help_levels import at_help_level
 
     if arguments:
@@ -88,7 +88,8 @@ def _parse(arguments: list[str]) -> object:
     if hasattr(kinds.get(command), "config"):
         defaults, others = settings.config_defaults(rest, command, kinds[command])
         if defaults is not None:
-            return tyro.cli(kinds[command], prog=f"ncs {command}", args=others, default=defaults)
+            given = tyro.cli(kinds[command], prog=f"ncs {command}", args=others, default=defaults)
+            return beside_those_of_file(given, defaults)
     return tyro.extras.subcommand_cli_from_dict(
         kinds, prog="ncs", description="Safe learning control over imperfect networks.", args=arguments
     )

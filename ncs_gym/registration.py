@@ -160,6 +160,8 @@ def from_json(value: Any, kinds: tuple[type, ...], name: str) -> Any:
     """
     if not isinstance(value, dict):
         return value
+    if Ellipsoid in kinds and set(value) == {"shape"}:  # the former name of its field
+        return Ellipsoid(value["shape"])
     names = {kind: {entry.name for entry in fields(kind)} for kind in kinds}
     fitting = [kind for kind in kinds if set(value) <= names[kind]]
     try:

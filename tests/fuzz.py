@@ -90,9 +90,9 @@ def tasks(draw, plant: LinearPlant) -> Any:
     if kind == "speed":
         return SpeedTracking(fastest=draw(st.sampled_from([1e-3, 25.0, 1e6])), input_index=plant.m - 1)
     if kind == "setpoint":
-        return SetpointTracking(output=plant.C[0], reach=draw(st.sampled_from([1e-6, 0.5, 1e6])), width=0.1)
+        return SetpointTracking(output=plant.box_rows[0], reach=draw(st.sampled_from([1e-6, 0.5, 1e6])), width=0.1)
     if kind == "costs":
-        return Regulation(state_cost=plant.C.T @ plant.C, input_cost=np.zeros((plant.m, plant.m)))
+        return Regulation(state_cost=plant.box_rows.T @ plant.box_rows, input_cost=np.zeros((plant.m, plant.m)))
     return Regulation()
 
 

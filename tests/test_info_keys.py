@@ -42,7 +42,7 @@ def assert_is(value, kind, plant):
     if kind in TYPES:
         assert isinstance(value, TYPES[kind])
     else:
-        sizes = {"n": plant.n, "m": plant.m, "k": len(plant.C)}
+        sizes = {"n": plant.n, "m": plant.m, "k": len(plant.box_rows)}
         assert value.shape == tuple(sizes[size] for size in re.findall("[nmk]", kind))
 
 

@@ -7,9 +7,9 @@ from unittest import mock
 import pytest
 
 from experiments.plots.figure_style import CaptionedFigure
-from experiments.study.quoted_tables import quoted, tables_by_name
-from experiments.study.study_figures import study_figures
-from experiments.study.study_report import results_page
+from experiments.study.figures import study_figures
+from experiments.study.pages import quoted, results_page
+from experiments.study.tables import tables_by_name
 
 ROOT = Path(__file__).resolve().parent.parent
 STORED = ROOT / "docs" / "results.json"

@@ -197,7 +197,7 @@ def _versions(spec: Any) -> str:
 
 def _reach(ellipsoid: Ellipsoid, plant: LinearPlant) -> str:
     """Returns how far an ellipsoid of states reaches, in the units of the states."""
-    radii = np.sqrt(np.diag(ellipsoid.shape))
+    radii = np.sqrt(np.diag(ellipsoid.shape_matrix))
     reach = (_with_unit(radius, plant.state_units, index) for index, radius in enumerate(radii))
     return ", ".join(f"{name} {far}" for name, far in zip(plant.state_names, reach, strict=True))
 

@@ -1,25 +1,38 @@
-"""Summaries of the training runs of an arm."""
+"""Summaries of arms and the differences between them: queries of the table of episodes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
+import pandas as pd
 
-from agents.results import Episode
+from experiments.analysis.episodes import TRAINING
 from experiments.analysis.statistics import bootstrap_interval, clopper_pearson, interquartile_mean, mean_interval
-from experiments.runs.arms import is_shield
-from experiments.runs.training_run import RunResult
+from experiments.runs.arms import Arm, is_shield
+from experiments.runs.evaluation_conditions import AS_TRAINED
+
+# Columns of which a run has a sum, and a mean over its episodes.
+_COUNTED = ["steps", "violation_steps", "estimate_violation_steps", "interventions", "planned", "guaranteed"]
+_COUNTED += ["violating", "outside_set"]
+_AVERAGED = ["episode_return", "violating", "outside_set"]
 
 
-def arm_summary(results: Sequence[RunResult], mode: str | None, *, fixed_policy: bool) -> dict[str, Any]:
-    """Returns the summary of one arm's runs with the mode of its shield; see `summarize_arm`."""
-    return {"mode": mode, "shielded": is_shield(mode)} | summarize_arm(results, fixed_policy=fixed_policy)
+def arm_summaries(episodes: pd.DataFrame, mode: str) -> dict[str, dict[str, Any]]:
+    """Returns what `arm_summary` says of every arm, by its name and in the order of the rows.
+
+    Args:
+        episodes: What `episodes_table` returns.
+        mode: Mode of the shield of arms that name none.
+    """
+    arms = {str(name): (Arm.of(str(name), mode), rows) for name, rows in episodes.groupby("arm", sort=False)}
+    return {
+        name: arm_summary(rows, arm.mode, fixed_policy=arm.policy not in ("trained", "untrained"))
+        for name, (arm, rows) in arms.items()
+    }
 
 
-def summarize_arm(results: Sequence[RunResult], *, fixed_policy: bool) -> dict[str, Any]:
-    """Returns the summary of one arm's runs, JSON values only.
+def arm_summary(episodes: pd.DataFrame, mode: str | None, *, fixed_policy: bool) -> dict[str, Any]:
+    """Returns the summary of an arm, JSON values only.
 
     `eval_violation_rate_ci95` is the Clopper-Pearson interval of the probability that an episode violates, given the
     trained policies. `eval_violation_steps` counts violating steps of the true state and
@@ -30,75 +43,89 @@ def summarize_arm(results: Sequence[RunResult], *, fixed_policy: bool) -> dict[s
     true state left the safe set. `plan_rate` is the share of steps that live from a plan: after whose decision inputs
     of a certified plan are in store (mode "lookahead", 0 in others). `conditions` holds the same numbers of the
     evaluation under each other condition.
+
+    Args:
+        episodes: Rows of the arm in what `episodes_table` returns.
+        mode: Mode of its shield, or name of its other filter; None for neither.
+        fixed_policy: Whether the policy is the same in all runs.
     """
-    train_steps = sum(result.train_steps for result in results)
+    training = episodes.groupby("run")[TRAINING].first()
+    steps, violations, interventions = (int(total) for total in training.sum())
     conditions = {
-        name: _evaluated([result.conditions[name] for result in results], fixed_policy=fixed_policy)
-        for name in results[0].conditions
+        name: _evaluated(played, fixed_policy=fixed_policy)
+        for name, played in episodes.groupby("condition", sort=False)
     }
     return {
-        "runs": len(results),
-        "train_steps": train_steps,
-        "train_violation_steps": sum(result.train_violation_steps for result in results),
-        "train_violation_steps_by_run": [result.train_violation_steps for result in results],
-        "train_intervention_rate": _rate(sum(result.train_interventions for result in results), train_steps),
-        **_evaluated([result.episodes for result in results], fixed_policy=fixed_policy),
+        "mode": mode,
+        "shielded": is_shield(mode),
+        "runs": len(training),
+        "train_steps": steps,
+        "train_violation_steps": violations,
+        "train_violation_steps_by_run": training["train_violation_steps"].tolist(),
+        "train_intervention_rate": interventions / steps if steps else 0.0,
+        **conditions.pop(AS_TRAINED),
         "conditions": conditions,
     }
 
 
-def _evaluated(runs: Sequence[Sequence[Episode]], *, fixed_policy: bool) -> dict[str, Any]:
-    """Returns what the summary says of the evaluation episodes of each run under one condition."""
-    episodes = [episode for run in runs for episode in run]
-    violating = sum(episode.violation_steps > 0 for episode in episodes)
-    eval_steps = sum(episode.steps for episode in episodes)
-    means = [_mean_return(run) for run in runs]
-    values = [episode.episode_return for episode in episodes] if fixed_policy else means
+def _evaluated(episodes: pd.DataFrame, *, fixed_policy: bool) -> dict[str, Any]:
+    """Returns what a summary says of the evaluation episodes of an arm under one condition."""
+    runs, count = episodes.groupby("run"), len(episodes)
+    means, sums = runs[_AVERAGED].mean(), runs[_COUNTED].sum()
+    total = {name: int(number) for name, number in sums.sum().items()}
+    values = (episodes if fixed_policy else means)["episode_return"].to_numpy()
     return {
-        "eval_episodes": len(episodes),
-        "eval_steps": eval_steps,
-        "eval_violation_steps": sum(episode.violation_steps for episode in episodes),
-        "eval_estimate_violation_steps": sum(episode.estimate_violation_steps for episode in episodes),
-        "eval_violating_episodes": violating,
-        "eval_violation_rate": violating / len(episodes),
-        "eval_violation_rate_ci95": list(clopper_pearson(violating, len(episodes))),
-        "eval_episodes_outside_set": sum(episode.largest_level > 1.0 for episode in episodes),
-        "eval_return_mean": float(np.mean(means)),
-        "eval_return_ci95": _listed(mean_interval(values)),
-        "eval_return_bootstrap_ci95": _listed(bootstrap_interval(values)),
+        "eval_episodes": count,
+        "eval_steps": total["steps"],
+        "eval_violation_steps": total["violation_steps"],
+        "eval_estimate_violation_steps": total["estimate_violation_steps"],
+        "eval_violating_episodes": total["violating"],
+        "eval_violation_rate": total["violating"] / count,
+        "eval_violation_rate_ci95": clopper_pearson(total["violating"], count),
+        "eval_episodes_outside_set": total["outside_set"],
+        "eval_return_mean": float(means["episode_return"].mean()),
+        "eval_return_ci95": mean_interval(values),
+        "eval_return_bootstrap_ci95": bootstrap_interval(values),
         "eval_return_iqm": float(interquartile_mean(values)),
-        "eval_return_iqm_bootstrap_ci95": _listed(bootstrap_interval(values, interquartile_mean)),
+        "eval_return_iqm_bootstrap_ci95": bootstrap_interval(values, statistic=interquartile_mean),
         "eval_return_ci95_over": "episodes" if fixed_policy else "runs",
-        "eval_return_by_run": means,
-        "eval_violation_rate_by_run": [_share(run, lambda episode: episode.violation_steps > 0) for run in runs],
-        "eval_outside_set_rate_by_run": [_share(run, lambda episode: episode.largest_level > 1.0) for run in runs],
-        "intervention_rate_by_run": [_intervention_rate(run) for run in runs],
-        "intervention_rate": _intervention_rate(episodes),
-        "plan_rate": sum(episode.planned for episode in episodes) / eval_steps,
-        "guaranteed_episodes": sum(episode.guaranteed for episode in episodes),
-        "largest_level": max(episode.largest_level for episode in episodes),
+        "eval_return_by_run": means["episode_return"].tolist(),
+        "eval_violation_rate_by_run": means["violating"].tolist(),
+        "eval_outside_set_rate_by_run": means["outside_set"].tolist(),
+        "intervention_rate_by_run": (sums["interventions"] / sums["steps"]).tolist(),
+        "intervention_rate": total["interventions"] / total["steps"],
+        "plan_rate": total["planned"] / total["steps"],
+        "guaranteed_episodes": total["guaranteed"],
+        "largest_level": float(episodes["largest_level"].max()),
     }
 
 
-def paired_differences(arms: dict[str, Sequence[RunResult]], baseline: str) -> dict[str, Any]:
+def paired_differences(episodes: pd.DataFrame, baseline: str) -> dict[str, Any]:
     """Returns the differences between each other arm and the baseline in the runs with equal index, JSON values.
 
     They are the differences of the mean returns, with Student's and the bootstrap's interval over the runs, and of the
     numbers of violating episodes.
+
+    Args:
+        episodes: Rows of the arms in what `episodes_table` returns.
+        baseline: Name of the arm that is subtracted.
     """
-    differences = {}
-    for name in arms.keys() - {baseline}:
-        pairs = list(zip(arms[name], arms[baseline], strict=True))
-        returns = [_mean_return(one.episodes) - _mean_return(other.episodes) for one, other in pairs]
-        violating = [_violating(one) - _violating(other) for one, other in pairs]
-        differences[name] = {
-            "return_mean": float(np.mean(returns)),
-            "return_ci95": _listed(mean_interval(returns)),
-            "return_bootstrap_ci95": _listed(bootstrap_interval(returns)),
-            "violating_episodes": sum(violating),
-            "violating_episodes_by_run": violating,
+    as_trained = episodes[episodes["condition"] == AS_TRAINED]
+    runs = as_trained.groupby(["run", "arm"]).agg(mean=("episode_return", "mean"), violating=("violating", "sum"))
+    returns, violating = (
+        runs[name].unstack().pipe(lambda wide: wide.sub(wide[baseline], axis=0)) for name in ("mean", "violating")
+    )
+    return {
+        name: {
+            "return_mean": float(returns[name].mean()),
+            "return_ci95": mean_interval(returns[name].to_numpy()),
+            "return_bootstrap_ci95": bootstrap_interval(returns[name].to_numpy()),
+            "violating_episodes": int(violating[name].sum()),
+            "violating_episodes_by_run": violating[name].astype(int).tolist(),
         }
-    return {name: differences[name] for name in arms if name in differences}
+        for name in episodes["arm"].unique()
+        if name != baseline
+    }
 
 
 def covered_fraction(summary: dict[str, Any]) -> float | None:
@@ -115,27 +142,3 @@ def covered_fraction(summary: dict[str, Any]) -> float | None:
         return None
     start, goal, here = (arm["eval_return_mean"] for arm in (start, goal, here))
     return (here - start) / (goal - start) if goal > start else None
-
-
-def _mean_return(episodes: Sequence[Episode]) -> float:
-    return float(np.mean([episode.episode_return for episode in episodes]))
-
-
-def _intervention_rate(episodes: Sequence[Episode]) -> float:
-    return sum(episode.interventions for episode in episodes) / sum(episode.steps for episode in episodes)
-
-
-def _share(episodes: Sequence[Episode], holds: Callable[[Episode], bool]) -> float:
-    return sum(map(holds, episodes)) / len(episodes)
-
-
-def _violating(result: RunResult) -> int:
-    return sum(episode.violation_steps > 0 for episode in result.episodes)
-
-
-def _listed(interval: tuple[float, float] | None) -> list[float] | None:
-    return None if interval is None else list(interval)
-
-
-def _rate(events: int, trials: int) -> float:
-    return events / trials if trials else 0.0

@@ -6,9 +6,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from experiments.attack.attack_cases import AttackCase, attack_cases, plant_cases
-from experiments.runs.provenance import json_digest, versions
+from experiments.runs.provenance import versions
 from ncs_gym import ChannelContract
 from ncs_gym.registration import EPISODE_STEPS
+from shields.json_documents import digest
 
 # Modes of the shield, one per batch in turn, where none is chosen.
 SHIELD_MODES = ("project", "switch", "boundary")
@@ -60,7 +61,7 @@ class Campaign:
     def key(self) -> str:
         """SHA-256 of everything that the counts depend on except the certificates and the channels."""
         given = {name: value for name, value in asdict(self).items() if value is not None}
-        return json_digest(given | {"versions": versions()})
+        return digest(given | {"versions": versions()})
 
     @property
     def batch_steps(self) -> int:

@@ -10,10 +10,10 @@ from typing import Any
 from experiments.attack.monte_carlo_batch import MonteCarloBatch
 from experiments.attack.safety_counts import SafetyCounts
 from experiments.errors import ResultsError
-from experiments.runs.provenance import json_digest
 from experiments.runs.run_store import count_of
 from ncs_gym.registration import EPISODE_STEPS
 from shields.atomic_write import write_atomically
+from shields.json_documents import digest
 
 
 class CountsStore:
@@ -51,13 +51,13 @@ class CountsStore:
         """
         content = {"key": self._keys[batch.case], "case": batch.case, "index": batch.index, "tally": asdict(counts)}
         with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps({"sha256": json_digest(content), **content}) + "\n")
+            file.write(json.dumps({"sha256": digest(content), **content}) + "\n")
         self.counts[batch] = counts
 
     def _read(self, number: int, line: bytes) -> None:
         try:
             document = json.loads(line)
-            if document.pop("sha256") != json_digest(document):
+            if document.pop("sha256") != digest(document):
                 raise ValueError("checksum")
             index = count_of(document["index"], "index")
             if document["case"] in self._keys and document["key"] == self._keys[document["case"]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from experiments.analysis.escapes import rounded_up
+from experiments.analysis.gaussian_bound import rounded_up
 from experiments.analysis.terminal_text import text_table
 from experiments.attack.monte_carlo_batch import SETTLING_STEPS
 from experiments.attack.safety_counts import SafetyCounts

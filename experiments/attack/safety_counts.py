@@ -63,7 +63,7 @@ class SafetyCounts:
         return self.interval[1]
 
     @property
-    def interval(self) -> tuple[float, float]:
+    def interval(self) -> list[float]:
         """Exact 95 % interval of the probability that an episode is broken."""
         return clopper_pearson(self.broken_episodes, self.episodes)
 

@@ -68,7 +68,7 @@ class BoundedPush(Disturbance):
     def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
         d = np.zeros(nominal_next.shape)
         for bound in (Ellipsoid(plant.gamma * np.eye(plant.n)), plant.disturbance_bound):
-            if bound is not None and np.any(bound.shape):
+            if bound is not None and np.any(bound.shape_matrix):
                 d = d + INWARD * bound.farthest_point((nominal_next + d).T, self.M).T
         return d
 
@@ -101,7 +101,7 @@ def starts_in_box(rng: np.random.Generator, plant: LinearPlant, certificate: Cer
     chosen, missing = np.arange(count) % 2 == 1, np.arange(count) % 2 == 1
     while missing.any():
         states[missing] = rng.uniform(-1.0, 1.0, (int(missing.sum()), plant.n)) * plant.half_widths
-        missing = chosen & (np.abs(states @ plant.C.T).max(axis=1) > 1.0)
+        missing = chosen & (np.abs(states @ plant.box_rows.T).max(axis=1) > 1.0)
     return states
 
 

@@ -68,7 +68,7 @@ def _regulator(env: NCSEnv, K: np.ndarray, seed: int) -> _Inputs:
     speed error of `SpeedTracking`, e+ = e - dt u, is a state of its own.
     """
     plant, task = env.plant, env.task
-    states, effort = BOX_WEIGHT * plant.C.T @ plant.C, np.diag(INPUT_WEIGHT / plant.u_max**2)
+    states, effort = BOX_WEIGHT * plant.box_rows.T @ plant.box_rows, np.diag(INPUT_WEIGHT / plant.u_max**2)
     if isinstance(task, SpeedTracking):
         A = np.pad(plant.A, (0, 1))
         A[-1, -1] = 1.0

@@ -46,7 +46,7 @@ class PredictiveFilter:
         self._plans = np.empty((0, horizon - 1, plant.m))
         self._prediction = Prediction(OneStepTest(certificate.L, plant), horizon)
         self._program = PlanProgram(self._prediction)
-        self._room = np.ones((horizon - 1, len(plant.C)))
+        self._room = np.ones((horizon - 1, len(plant.box_rows)))
 
     def __call__(self, estimates: np.ndarray, proposed: np.ndarray, begun: np.ndarray) -> np.ndarray:
         """Returns the inputs to apply, shape (N, m).
@@ -76,7 +76,7 @@ class PredictiveFilter:
         states = estimates @ plant.A.T + proposed @ plant.B.T
         fine = np.ones(len(states), np.bool_)
         for _ in range(self._horizon - 1):
-            fine &= (np.abs(states @ plant.C.T) <= 1.0).all(axis=1)
+            fine &= (np.abs(states @ plant.box_rows.T) <= 1.0).all(axis=1)
             plans.append(self._gained(states))
             states = states @ plant.A.T + plans[-1] @ plant.B.T
         return fine & (np.square(states @ self._root.T).sum(axis=1) <= 1.0), np.stack(plans, axis=1)
@@ -84,7 +84,7 @@ class PredictiveFilter:
     def _solved(self, estimate: np.ndarray, proposed: np.ndarray) -> np.ndarray | None:
         """Returns the inputs of the best plan, shape (horizon, m); None if the solver finds none."""
         plant = self._plant
-        missed = np.abs(plant.C @ plant.A @ estimate) - np.abs(plant.C @ plant.B) @ plant.u_max
+        missed = np.abs(plant.box_rows @ plant.A @ estimate) - np.abs(plant.box_rows @ plant.B) @ plant.u_max
         if not missed.max() <= 1.0:  # no input brings the next state into the box
             return None
         plan = self._program.solve(estimate, self._room, self._root, 1.0, proposed)
@@ -92,7 +92,7 @@ class PredictiveFilter:
             return None
         plan = np.clip(plan, -plant.u_max, plant.u_max)
         centers = self._prediction.centers(estimate[None], plan[None, None])[..., 0, 0]
-        missed = max(np.abs(centers[:-1] @ plant.C.T).max(), np.linalg.norm(self._root @ centers[-1]))
+        missed = max(np.abs(centers[:-1] @ plant.box_rows.T).max(), np.linalg.norm(self._root @ centers[-1]))
         return plan if missed <= 1.0 + TOLERANCE else None
 
     def _gained(self, states: np.ndarray) -> np.ndarray:

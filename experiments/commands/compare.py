@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import pandas as pd
 
 from agents.loop import LoopConfig
-from experiments.analysis.arm_table import condition_text, decimals_of, summary_text
-from experiments.analysis.escapes import escape_sentences, escape_summary
-from experiments.analysis.parquet_tables import write_tables
-from experiments.analysis.summary import arm_summary, covered_fraction, paired_differences
+from experiments.analysis.episodes import episodes_table, parquet, training_table
+from experiments.analysis.gaussian_bound import gaussian_sentences, gaussian_summary
+from experiments.analysis.summary import arm_summaries, covered_fraction, paired_differences
+from experiments.analysis.tables import condition_text, decimals_of, summary_text
 from experiments.analysis.terminal_text import wrapped
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
@@ -22,7 +21,6 @@ from experiments.plots.comparison_figures import comparison_figures
 from experiments.report import comparison_report
 from experiments.runs import (
     Arm,
-    RunResult,
     TrainingRun,
     by_arm,
     certificate_of,
@@ -32,14 +30,13 @@ from experiments.runs import (
     prepare_output,
     require_trainable,
     run_of_arm,
+    write_results,
 )
-from experiments.runs.arms import is_shield
 from experiments.runs.experiment import certificate_line
 from experiments.settings import CompareSettings
 from ncs_gym import escape_probability
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, SafetyFilter, verify
-from shields.atomic_write import write_atomically
 from shields.runtime.starts import starts_known
 
 # Budget of `--smoke`: enough to pass through every part.
@@ -76,14 +73,19 @@ def _compare_in_folder(settings: CompareSettings, loop: LoopConfig, certificate:
     settings = settings.completed
     runs = _training_runs(settings, loop, certificate)
     results = results_of(runs, settings.out, settings)
-    summary = _summary(settings, loop, certificate, runs, results)
+    episodes = episodes_table(results)
+    summary = _summary(settings, loop, certificate, runs, episodes)
     findings = _findings(summary)
     if "gaussian_noise" in summary:
-        findings += escape_sentences(summary["gaussian_noise"])
+        findings += gaussian_sentences(summary["gaussian_noise"])
     figures = comparison_figures(plant, certificate, summary, by_arm(results))
     certificate.save(settings.out / "certificate.json")
-    page = comparison_report(summary, verification, dict(figures.values()), findings)
-    _write(settings.out, summary, results, figures, page)
+    files = {
+        "episodes.parquet": parquet(episodes, summary),
+        "training.parquet": parquet(training_table(results), summary),
+        "report.html": comparison_report(summary, verification, dict(figures.values()), findings),
+    }
+    write_results(settings.out, summary, files, figures)
     count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
     trained = max(arm["train_steps"] for arm in summary["arms"].values())
     print(f"\n{settings.env}: {count} and {trained:,} training steps per arm, {settings.episodes} episodes per run\n")
@@ -126,38 +128,23 @@ def _summary(
     loop: LoopConfig,
     certificate: Certificate,
     runs: Sequence[TrainingRun],
-    results: Sequence[RunResult],
+    episodes: pd.DataFrame,
 ) -> dict[str, Any]:
     """Returns the content of summary.json."""
-    results_by_arm = by_arm(results)
-    modes = {name: Arm.of(name, settings.mode).mode for name in results_by_arm}
-
-    def arm(name: str) -> dict[str, Any]:
-        fixed = Arm.of(name).policy not in ("trained", "untrained")
-        return arm_summary(results_by_arm[name], modes[name], fixed_policy=fixed)
-
+    arms = arm_summaries(episodes, settings.mode)
     gaussian = {}
     if settings.noise == "gaussian":
-        gaussian["gaussian_noise"] = _escapes(loop, certificate, modes, results_by_arm)
+        gaussian["gaussian_noise"] = _gaussian_noise(loop, certificate, arms)
     baseline = "unshielded" if "unshielded" in settings.arms else settings.arms[0]
+    compared = episodes[episodes["arm"].isin(settings.arms)]
     return {
-        "arms": {name: arm(name) for name in settings.arms},
-        "references": {name: arm(name) for name in settings.references},
-        "paired_differences": {
-            "baseline": baseline,
-            "arms": paired_differences({name: results_by_arm[name] for name in settings.arms}, baseline),
-        },
-        "units": {run.name: run.key for run in runs},
-        "seeds": {run.index: {"training": run.training_seed, "evaluation": run.evaluation_seed} for run in runs},
-    } | (gaussian | experiment_provenance("compare", settings, loop, certificate))
+        "arms": {name: arms[name] for name in settings.arms},
+        "references": {name: arms[name] for name in settings.references},
+        "paired_differences": {"baseline": baseline, "arms": paired_differences(compared, baseline)},
+    } | (gaussian | experiment_provenance("compare", settings, loop, certificate, runs))
 
 
-def _escapes(
-    loop: LoopConfig,
-    certificate: Certificate,
-    modes: dict[str, str | None],
-    results_by_arm: Mapping[str, Sequence[RunResult]],
-) -> dict[str, Any]:
+def _gaussian_noise(loop: LoopConfig, certificate: Certificate, arms: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
     """Returns the bound on the probability that an episode leaves the safe set, and how often shielded arms did.
 
     The bound is about episodes that begin in the safe set, and behind a downlink stay there until the first decision
@@ -171,9 +158,8 @@ def _escapes(
     known = starts_known(SafetyFilter(certificate, env.plant), env.initial_set, lead)
     begins_inside = is_promised and all(each.in_safe_set for each in known)
     bound = escape_probability(env.plant, env.channel, steps) if begins_inside else 1.0
-    shielded = [name for name, mode in modes.items() if is_shield(mode) and mode != "lookahead"]
-    episodes = {name: [each for result in results_by_arm[name] for each in result.episodes] for name in shielded}
-    return escape_summary(bound, steps, episodes)
+    claimed = {name: arm for name, arm in arms.items() if arm["shielded"] and arm["mode"] != "lookahead"}
+    return gaussian_summary(bound, steps, claimed)
 
 
 def _findings(summary: dict[str, Any]) -> list[str]:
@@ -215,15 +201,3 @@ def _findings(summary: dict[str, Any]) -> list[str]:
     if "monitor" in summary["arms"]:
         findings.append("In brackets: what the shield would have overridden.")
     return findings
-
-
-def _write(
-    out: Path, summary: dict[str, Any], results: Sequence[RunResult], figures: dict[str, tuple[str, bytes]], page: str
-) -> None:
-    """Writes tables, figures and report; summary.json comes last, so that it stands for a complete experiment."""
-    for name, (_, png) in figures.items():
-        write_atomically(out / "figures" / f"{name}.png", png)
-    names = ("settings", "seeds", "plant", "certificate", "certificate_file", "versions")
-    write_tables(out, results, {name: summary[name] for name in names})
-    write_atomically(out / "report.html", page)
-    write_atomically(out / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 
 from agents import evaluation
 from agents.loop import LoopConfig, ShieldSettings
-from experiments.analysis.arm_table import summary_text
+from experiments.analysis.episodes import episodes_table
 from experiments.analysis.summary import arm_summary
+from experiments.analysis.tables import summary_text
 from experiments.commands import short_version
 from experiments.runs import RunResult, certificate_of, require_place, versions
 from experiments.runs.environments import module_and_id, registered_env
@@ -57,7 +58,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     )
     shield_name = mode or "none"
     result = RunResult(shield_name, 0, 0, 0, 0, [], evaluated.episodes, evaluated.trajectory, {})
-    arms = {f"shield: {shield_name}": arm_summary([result], mode, fixed_policy=True)}
+    arms = {f"shield: {shield_name}": arm_summary(episodes_table([result]), mode, fixed_policy=True)}
     print(f"{agent.algorithm} of {folder} in {agent.env}, {settings.episodes:,} episodes", end="\n\n")
     print(summary_text(arms, {}))
     if settings.out is not None:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
-from pathlib import Path
-from typing import Any
+
+import pandas as pd
 
 from agents.loop import LoopConfig
-from experiments.analysis.parquet_tables import parquet
-from experiments.analysis.summary import summarize_arm
-from experiments.analysis.sweep_table import sweep_table
+from experiments.analysis.episodes import episodes_table, parquet
+from experiments.analysis.summary import arm_summaries
+from experiments.analysis.tables import sweep_table
 from experiments.analysis.terminal_text import wrapped
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
@@ -20,8 +19,6 @@ from experiments.plots.heatmaps import sweep_figures
 from experiments.report import sweep_report
 from experiments.runs import (
     Arm,
-    RunResult,
-    by_arm,
     certificate_of,
     claim_folder,
     experiment_provenance,
@@ -29,11 +26,11 @@ from experiments.runs import (
     prepare_output,
     require_trainable,
     run_of_arm,
+    write_results,
 )
 from experiments.settings import Assignments, SweepSettings
 from ncs_gym.envs.env import ncs_env
-from shields import Certificate, Report, verify
-from shields.atomic_write import write_atomically
+from shields import Certificate, verify
 
 # Budget of `--smoke`, and the sides of the grid of which it takes the first and the last value.
 _SMOKE = {"steps": 1_024, "episodes": 4, "seeds": 1}
@@ -67,6 +64,11 @@ class _GridPoint:
         mass = "" if self.mass_factor is None else f"-mass{self.mass_factor}"
         downlink = "" if self.downlink_loss is None else f"-down{self.downlink_loss}"
         return f"loss{self.loss}-delay{self.delay}{quantization}-burst{self.burst_length}{mass}{downlink}"
+
+    @property
+    def columns(self) -> dict[str, float]:
+        """What all rows of the table of episodes at this point have in common; NaN for the environment's own."""
+        return {name: float("nan" if value is None else value) for name, value in asdict(self).items()}
 
     def channel(self, base: Assignments) -> Assignments:
         """Returns the changes of the environment's channel that make this point's channel."""
@@ -129,17 +131,21 @@ def _sweep_in_folder(
     ]
     results = results_of(runs, settings.out, settings)
     per_point = len(runs) // len(points)
-    parts = [results[i * per_point : (i + 1) * per_point] for i in range(len(points))]
+    parts = [
+        episodes_table(results[i * per_point : (i + 1) * per_point], **point.columns) for i, point in enumerate(points)
+    ]
+    arms = [arm_summaries(part, settings.mode) for part in parts]
     summary = {
-        "cells": [asdict(point) | {"arms": _arms(part)} for point, part in zip(points, parts, strict=True)],
-        "units": {run.name: run.key for run in runs},
-        "seeds": {run.index: {"training": run.training_seed, "evaluation": run.evaluation_seed} for run in runs},
-    }
-    origin = experiment_provenance("sweep", settings, loops[0], certificates[0])
-    rows = [row for point, part in zip(points, parts, strict=True) for row in _rows(point, part)]
+        "cells": [asdict(point) | {"arms": each} for point, each in zip(points, arms, strict=True)]
+    } | experiment_provenance("sweep", settings, loops[0], certificates[0], runs)
+    figures = sweep_figures(summary, settings.arms)
     certificates[0].save(settings.out / "certificate.json")
-    write_atomically(settings.out / "sweep.parquet", parquet(rows, origin))
-    _write(settings, summary | origin, verify(certificates[0], ncs_env(loops[0].single()).plant))
+    verification = verify(certificates[0], ncs_env(loops[0].single()).plant)
+    files = {
+        "episodes.parquet": parquet(pd.concat(parts), summary),
+        "report.html": sweep_report(summary, verification, dict(figures.values())),
+    }
+    write_results(settings.out, summary, files, figures)
     count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
     print(f"{settings.env}: {count} per arm and channel\n", sweep_table(summary["cells"]), sep="\n")
     print(f"files: {settings.out}")
@@ -165,27 +171,3 @@ def _grid_points(settings: SweepSettings) -> list[_GridPoint]:
             raise ValueError(f"--{name.replace('_', '-')} must be different values, at least one")
     del sides["arms"]
     return [_GridPoint(*point) for point in product(*sides.values())]
-
-
-def _write(settings: SweepSettings, summary: dict[str, Any], verification: Report) -> None:
-    """Writes figures and report; summary.json comes last, so that it stands for a complete experiment."""
-    out: Path = settings.out
-    figures = sweep_figures(summary, settings.arms)
-    for name, (_, png) in figures.items():
-        write_atomically(out / "figures" / f"{name}.png", png)
-    write_atomically(out / "report.html", sweep_report(summary, verification, dict(figures.values())))
-    write_atomically(out / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
-
-
-def _arms(results: Sequence[RunResult]) -> dict[str, Any]:
-    return {name: summarize_arm(runs, fixed_policy=False) for name, runs in by_arm(results).items()}
-
-
-def _rows(point: _GridPoint, results: Sequence[RunResult]) -> list[dict[str, Any]]:
-    """Returns one row per training run."""
-    rows = []
-    for result in results:
-        summary = summarize_arm([result], fixed_policy=False)
-        numbers = {name: value for name, value in summary.items() if isinstance(value, (int, float))}
-        rows.append(asdict(point) | {"arm": result.arm, "run": result.index} | numbers)
-    return rows

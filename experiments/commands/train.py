@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
-
 from agents.loop import LoopConfig
-from experiments.analysis.arm_table import summary_text
+from experiments.analysis.episodes import episodes_table
 from experiments.analysis.summary import arm_summary
+from experiments.analysis.tables import summary_text
 from experiments.analysis.terminal_text import wrapped
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
@@ -20,10 +19,10 @@ from experiments.runs import (
     prepare_output,
     require_trainable,
     run_of_arm,
+    write_results,
 )
 from experiments.settings import BackendSettings, TrainSettings
 from shields import Certificate
-from shields.atomic_write import write_atomically
 
 # Budget of `--smoke`.
 _SMOKE = {"steps": 4_096, "episodes": 10}
@@ -57,10 +56,11 @@ def _train_in_folder(settings: TrainSettings, loop: LoopConfig, certificate: Cer
     settings = settings.completed
     run = run_of_arm(settings, loop, certificate, settings.arm, 0)
     results = results_of([run], settings.out, BackendSettings(jobs=1))
-    arms = {settings.arm: arm_summary(results, Arm.of(settings.arm, settings.mode).mode, fixed_policy=True)}
+    mode = Arm.of(settings.arm, settings.mode).mode
+    arms = {settings.arm: arm_summary(episodes_table(results), mode, fixed_policy=True)}
     certificate.save(settings.out / "certificate.json")
-    content = {"arms": arms} | experiment_provenance("train", settings, loop, certificate)
-    write_atomically(settings.out / "summary.json", json.dumps(content, indent=1) + "\n")
+    summary = {"arms": arms} | experiment_provenance("train", settings, loop, certificate, [run])
+    write_results(settings.out, summary)
     print(f"{results[0].train_steps:,} training steps, {settings.episodes:,} episodes\n")
     print(summary_text(arms, {}), *_hints(results[0], is_smoke=settings.smoke), sep="\n")
     print(f"agent: {settings.out / 'models' / run.name}")

@@ -165,8 +165,8 @@ def _misread_alpha(example: PaperExample) -> float:
 def safe_box(example: PaperExample) -> Claim:
     """Returns the row about (C3)."""
     plant, L = example.plant, example.L
-    largest = max(float(row @ L @ row) for row in plant.C)
-    rounded = max(float(row @ np.linalg.inv(example.M - _PRINTED_DIGITS * np.eye(2)) @ row) for row in plant.C)
+    largest = max(float(row @ L @ row) for row in plant.box_rows)
+    rounded = max(float(row @ np.linalg.inv(example.M - _PRINTED_DIGITS * np.eye(2)) @ row) for row in plant.box_rows)
     is_rounding = 1.0 < largest <= rounded
     return Claim(
         "(C3) the set lies in the safe box",
@@ -501,13 +501,13 @@ def farthest_without_input(example: PaperExample) -> np.ndarray:
     the truncated process noise together.
     """
     plant = example.plant
-    return np.abs(example.A) @ _half_widths(example) + np.sqrt(np.diag(plant.disturbance.shape))
+    return np.abs(example.A) @ _half_widths(example) + np.sqrt(np.diag(plant.disturbance.shape_matrix))
 
 
 def box_is_invariant(example: PaperExample) -> bool:
     """Returns whether exact arithmetic shows that with u = 0 no state leaves the safe box |x_i| <= w_i."""
     widths = [Fraction(float(width)) for width in _half_widths(example)]
-    for row, variance, own in zip(example.A, np.diag(example.plant.disturbance.shape), widths, strict=True):
+    for row, variance, own in zip(example.A, np.diag(example.plant.disturbance.shape_matrix), widths, strict=True):
         left = own - sum(abs(Fraction(float(entry))) * width for entry, width in zip(row, widths, strict=True))
         if left < 0 or left**2 < Fraction(float(variance)):
             return False
@@ -516,7 +516,7 @@ def box_is_invariant(example: PaperExample) -> bool:
 
 def _half_widths(example: PaperExample) -> np.ndarray:
     """Returns the half-widths w_i of the safe box, whose rows are c_i = e_i / w_i with powers of two, shape (2,)."""
-    return 1.0 / np.diag(example.plant.C)
+    return 1.0 / np.diag(example.plant.box_rows)
 
 
 CLAIMS: tuple[Callable[[PaperExample], Claim], ...] = (

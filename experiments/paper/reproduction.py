@@ -90,7 +90,7 @@ class Simulation:
         """Counts and largest values of the simulation."""
         design = self.design
         levels = np.einsum("ski,ij,skj->sk", self.states, np.linalg.inv(design.L), self.states)
-        boxes = np.abs(self.states @ design.plant.C.T).max(axis=2)
+        boxes = np.abs(self.states @ design.plant.box_rows.T).max(axis=2)
         gain = design.plant.B @ design.K
         return Outcome(
             steps=self.inputs.size,

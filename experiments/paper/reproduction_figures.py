@@ -50,7 +50,7 @@ def _draw_states(axis: Axes, simulation: Simulation) -> None:
         label = None if i else "true state"
         axis.plot(path[:, 0], path[:, 1], color=_COLOR, lw=0.6, alpha=0.5, label=label)
     axis.plot(*(np.linalg.cholesky(design.L) @ circle), color="black", lw=1.4, label="safe set")
-    corners = np.linalg.solve(design.plant.C, np.array([[1, 1, -1, -1, 1], [1, -1, -1, 1, 1]], dtype=float))
+    corners = np.linalg.solve(design.plant.box_rows, np.array([[1, 1, -1, -1, 1], [1, -1, -1, 1, 1]], dtype=float))
     axis.plot(*corners, color="black", lw=1.0, ls="--", label="safe box")
     axis.set_xlabel("coupling stretch [m]")
     axis.set_ylabel("stretch rate [m/s]")

@@ -94,7 +94,7 @@ def _draw_sets(axis: Axes, plant: LinearPlant, certificate: Certificate, plane: 
     prefix = "" if plant.n == 2 else "projection of the "
     (outline,) = axis.plot(*projected_ellipsoid(certificate.L, plane).T, color=_INK, lw=1.3)
     handles: dict[str, Artist] = {f"{prefix}safe set S": outline}
-    box = projected_box(plant.C, plane)
+    box = projected_box(plant.box_rows, plane)
     if box is not None:
         (outline,) = axis.plot(*box.T, color=_INK, lw=1.0, ls="--")
         handles[f"{prefix}safe box"] = outline
@@ -103,7 +103,7 @@ def _draw_sets(axis: Axes, plant: LinearPlant, certificate: Certificate, plane: 
 
 def _reach(plant: LinearPlant, certificate: Certificate, plane: tuple[int, int]) -> np.ndarray:
     """Returns the largest half-widths of the view, shape (2,) [units of the states]."""
-    outlines = [projected_ellipsoid(certificate.L, plane), projected_box(plant.C, plane)]
+    outlines = [projected_ellipsoid(certificate.L, plane), projected_box(plant.box_rows, plane)]
     return _VIEW * np.max([np.abs(outline).max(axis=0) for outline in outlines if outline is not None], axis=0)
 
 

@@ -78,7 +78,7 @@ def _draw_states(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant) -
     for (name, path), width in zip(paths.items(), _WIDTHS, strict=False):
         color = ArmStyle.of(name).color
         time = plant.dt * np.arange(len(path.states))
-        true, estimated = (np.abs(x @ plant.C.T).max(axis=1) for x in (path.states, path.estimates))
+        true, estimated = (np.abs(x @ plant.box_rows.T).max(axis=1) for x in (path.states, path.estimates))
         (handles[name],) = axis.plot(time, true, color=color, lw=width)
         (handles[f"{name}, estimate"],) = axis.plot(time, estimated, color=_dark(color), lw=1.1, ls=":", zorder=3)
         if (true > 1.0).any():

@@ -8,9 +8,9 @@ from experiments.runs.experiment import (
     require_trainable,
     run_of_arm,
 )
-from experiments.runs.output_folder import claim_folder, require_place
+from experiments.runs.output_folder import claim_folder, prepare_output, require_place, write_results
 from experiments.runs.provenance import versions
-from experiments.runs.run_store import RunStore, prepare_output
+from experiments.runs.run_store import RunStore
 from experiments.runs.training_run import RunResult, TrainingRun, execute_run
 
 __all__ = [
@@ -29,4 +29,5 @@ __all__ = [
     "require_trainable",
     "run_of_arm",
     "versions",
+    "write_results",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -144,7 +145,7 @@ def certificate_line(certificate: Certificate, verification: Report) -> str:
 
 
 def experiment_provenance(
-    command: str, settings: LearningSettings, loop: LoopConfig, certificate: Certificate
+    command: str, settings: LearningSettings, loop: LoopConfig, certificate: Certificate, runs: Sequence[TrainingRun]
 ) -> dict[str, Any]:
     """Returns what a reader needs to know where the results of a command come from, JSON values."""
     content, env = settings_json(command, settings)["settings"], ncs_env(loop.single())
@@ -152,6 +153,8 @@ def experiment_provenance(
     if env.downlink is not None:
         channel += f" Commands: {env.downlink.description}"
     return {
+        "units": {run.name: run.key for run in runs},
+        "seeds": {run.index: {"training": run.training_seed, "evaluation": run.evaluation_seed} for run in runs},
         "settings": {name: value for name, value in content.items() if name not in INCIDENTAL_SETTINGS},
         "plant": {"fingerprint": env.plant.fingerprint, "spectral_radius": env.plant.spectral_radius},
         "described": {"plant": str(env.plant), "channel": channel},

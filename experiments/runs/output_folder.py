@@ -9,9 +9,10 @@ import errno
 import json
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from filelock import FileLock, Timeout
@@ -21,6 +22,7 @@ from experiments.errors import FolderInUseError, OtherResultsError, ResultsError
 from experiments.runs.experiment import INCIDENTAL_SETTINGS
 from experiments.settings import save_settings, settings_json
 from experiments.settings.settings_file import FORMAT as SETTINGS_FORMAT
+from shields.atomic_write import write_atomically
 
 # Files by which a folder is known to hold something finished.
 _FINISHED = ("summary.json", "certify.json", "units/*.json")
@@ -38,6 +40,15 @@ _GROWING = {
 _LOCK = ".lock"
 # What the operating system says where there are no locks.
 _NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
+# What stands for a finished experiment, and what is drawn and listed of it: patterns where names depend on settings.
+_TABLES = ("episodes.parquet", "training.parquet", "sweep.parquet", "study.parquet")
+_FIGURES = ("scatter", "training", "episode", "phase", "violations", "return", "interventions", "states", "inputs")
+_MADE_OF_RESULTS = (
+    "summary.json",
+    "report.html",
+    *_TABLES,
+    *(f"figures/{name}.png" for name in (*_FIGURES, "trusting-*")),
+)
 # Differences that a message lists, and characters of each value.
 _MOST_LISTED, _MOST_CHARACTERS = 3, 40
 
@@ -72,6 +83,45 @@ def claim_folder(command: str, settings: Any) -> Iterator[None]:
             _require_own_settings(folder / "settings.json")
         save_settings(folder / "settings.json", command, settings)
         yield
+
+
+def prepare_output(folder: Path) -> None:
+    """Creates an output folder and removes an earlier summary, tables, figures and report, which belong together.
+
+    Files of other names are left where they are.
+
+    Raises:
+        OSError: If the folder cannot be written.
+    """
+    (folder / "figures").mkdir(parents=True, exist_ok=True)
+    write_atomically(folder / ".writable", "")
+    (folder / ".writable").unlink()
+    for file in [file for pattern in _MADE_OF_RESULTS for file in folder.glob(pattern)]:
+        file.unlink(missing_ok=True)
+
+
+def write_results(
+    folder: Path,
+    summary: dict[str, Any],
+    files: Mapping[str, str | bytes] = MappingProxyType({}),
+    figures: Mapping[str, tuple[str, bytes]] = MappingProxyType({}),
+) -> None:
+    """Writes what a command leaves; summary.json comes last, so that it stands for complete results.
+
+    Args:
+        folder: The output folder.
+        summary: Content of summary.json, JSON values.
+        files: Contents of other files by name.
+        figures: Caption and PNG file of every figure by name.
+
+    Raises:
+        OSError: If a file cannot be written.
+    """
+    for name, (_, png) in figures.items():
+        write_atomically(folder / "figures" / f"{name}.png", png)
+    for name, content in files.items():
+        write_atomically(folder / name, content)
+    write_atomically(folder / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
 
 
 @contextmanager

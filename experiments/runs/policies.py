@@ -94,7 +94,7 @@ def _greedy_action(env: NCSEnv, observation: np.ndarray, estimate: np.ndarray) -
     elif isinstance(task, SetpointTracking):
         effect, missing = task.output @ plant.B, float(observation[-1] - task.output @ plant.A @ estimate)
     else:
-        u = np.linalg.lstsq(plant.C @ plant.B, -plant.C @ plant.A @ estimate)[0]
+        u = np.linalg.lstsq(plant.box_rows @ plant.B, -plant.box_rows @ plant.A @ estimate)[0]
         return np.clip(u / plant.u_max, -1.0, 1.0).astype(np.float32)
     largest = float(np.abs(effect) @ plant.u_max)
     fraction = min(1.0, abs(missing) / largest) if largest > 0.0 else 0.0

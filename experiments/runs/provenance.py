@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import platform
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
 _DEPENDENCIES = ("ncs-gym", "gymnasium", "stable-baselines3", "sb3-contrib", "torch", "cvxpy", "clarabel")
 _DEPENDENCIES += ("numpy", "scipy", "filterpy")
@@ -19,11 +17,6 @@ _SOURCE_PACKAGES = ("ncs_gym", "shields", "agents", "experiments")
 def versions() -> dict[str, str]:
     """Returns the versions of the installed packages that results depend on, and a digest of this project's source."""
     return {"python": platform.python_version()} | _installed() | {"source": _source_digest()}
-
-
-def json_digest(content: Any) -> str:
-    """Returns the SHA-256 of JSON values; the order of keys does not matter."""
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 @cache

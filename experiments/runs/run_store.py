@@ -18,40 +18,16 @@ import numpy as np
 from agents.results import Episode, TrainingPoint, Trajectory
 from agents.sharing.agent_file import AGENT_FILES, require_names, write_files
 from experiments.errors import ResultsError
-from experiments.runs.provenance import json_digest
 from experiments.runs.training_run import RunResult, TrainingRun
 from ncs_gym.validation import LARGEST_NUMBER, MAX_QUOTED_LENGTH, as_numbers, shown
 from shields.atomic_write import write_atomically
+from shields.json_documents import digest
 
 _FORMAT = "ncs-gym unit 2"
-# What stands for a finished experiment, and what is drawn and listed of it: patterns where names depend on settings.
-_TABLES = ("episodes.parquet", "training.parquet", "sweep.parquet", "study.parquet")
-_FIGURES = ("scatter", "training", "episode", "phase", "violations", "return", "interventions", "states", "inputs")
-_MADE_OF_RESULTS = (
-    "summary.json",
-    "report.html",
-    *_TABLES,
-    *(f"figures/{name}.png" for name in (*_FIGURES, "trusting-*")),
-)
 # Counts are numbers that floats and tables hold exactly.
 LARGEST_COUNT = 2**53
 _FLAGS = ("intervened", "arrivals")
 _Entry = TypeVar("_Entry", TrainingPoint, Episode)
-
-
-def prepare_output(folder: Path) -> None:
-    """Creates an output folder and removes an earlier summary, tables, figures and report, which belong together.
-
-    Files of other names are left where they are.
-
-    Raises:
-        OSError: If the folder cannot be written.
-    """
-    (folder / "figures").mkdir(parents=True, exist_ok=True)
-    write_atomically(folder / ".writable", "")
-    (folder / ".writable").unlink()
-    for file in [file for pattern in _MADE_OF_RESULTS for file in folder.glob(pattern)]:
-        file.unlink(missing_ok=True)
 
 
 class RunStore:
@@ -83,7 +59,7 @@ class RunStore:
             models.mkdir(exist_ok=True)
         write_files(models, result.files)
         content = _content_of(result)
-        document = {"format": _FORMAT, "key": run.key, "sha256": json_digest(content), "result": content}
+        document = {"format": _FORMAT, "key": run.key, "sha256": digest(content), "result": content}
         write_atomically(self._path(run), json.dumps(document) + "\n")
 
     def load(self, run: TrainingRun) -> RunResult | None:
@@ -98,7 +74,7 @@ class RunStore:
             if document["format"] != _FORMAT:
                 return None
             content = document["result"]
-            if document["sha256"] != json_digest(content):
+            if document["sha256"] != digest(content):
                 raise ResultsError(f"{path} was altered: its checksum does not match; delete it to repeat the run")
             if document["key"] != run.key:
                 return None
@@ -117,10 +93,10 @@ class RunStore:
     def _files(self, run: TrainingRun, digests: dict[str, str]) -> dict[str, bytes]:
         """Returns the contents of the agent's files; ResultsError if one is missing or is not the one stored."""
         files = {}
-        for name, digest in digests.items():
+        for name, checksum in digests.items():
             path = self._folder / "models" / run.name / name
             content = path.read_bytes() if path.is_file() else b""
-            if hashlib.sha256(content).hexdigest() != digest:
+            if hashlib.sha256(content).hexdigest() != checksum:
                 raise ResultsError(f"{path} is missing or was altered; delete {self._path(run)} to repeat the run")
             files[name] = content
         return files
@@ -174,8 +150,8 @@ def _result_of(content: Any, run: TrainingRun) -> tuple[RunResult, dict[str, str
     )
     digests = content["files"]
     _require_entries(digests, set(AGENT_FILES) if run.trains else set(), "files")
-    for digest in digests.values():
-        _require(isinstance(digest, str), "files", digest)
+    for checksum in digests.values():
+        _require(isinstance(checksum, str), "files", checksum)
     return result, digests
 
 

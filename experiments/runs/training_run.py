@@ -21,9 +21,10 @@ from agents.sharing.agent_file import write_files
 from experiments.baselines import controller
 from experiments.runs.environments import import_module, module_digest
 from experiments.runs.evaluation_conditions import AS_TRAINED, under
-from experiments.runs.provenance import json_digest, versions
+from experiments.runs.provenance import versions
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate
+from shields.json_documents import digest
 
 if TYPE_CHECKING:
     from agents.agent import Agent
@@ -106,7 +107,7 @@ class TrainingRun:
             "loop": _described(self.loop, certificate),
             "agent_files": {name: hashlib.sha256(file).hexdigest() for name, file in self.agent_files.items()},
         }
-        return json_digest(content | {"versions": versions()})
+        return digest(content | {"versions": versions()})
 
     @property
     def total_steps(self) -> int:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import pairwise
 from typing import Annotated, Any
 
 from tyro.constructors import PrimitiveConstructorSpec
 
 from agents.former_settings import FORMER_FLAGS, from_former
-from agents.hyperparams import literal
+from agents.hyperparams import literal, with_changes
 from ncs_gym.validation import shown
 
 
@@ -53,12 +54,32 @@ def with_assignments(arguments: list[str]) -> list[str]:
     """
     arguments, found = _without_group(arguments, "--channel")
     arguments = _with_values(arguments, "--channel", found)
-    algorithm = next((value for flag, value in pairwise(arguments) if flag == "--algo"), None)
+    split = [part for each in arguments for part in (each.split("=", 1) if each.startswith("--algo=") else [each])]
+    algorithm = next((value for flag, value in pairwise(split) if flag == "--algo"), None)
     for flag, usual in FORMER_FLAGS.items():
         arguments, found = _without_group(arguments, flag)
         former = {name: literal(value) for name, value in found.items()}
         arguments = _with_values(arguments, "--hyperparams", from_former(algorithm or usual, former))
     return arguments
+
+
+def beside_those_of_file(settings: Any, of_file: Any) -> Any:
+    """Returns a command's settings in which the assignments of a settings file hold where none are given.
+
+    Hyperparameters of the file are for its algorithm alone, and give way to a file of hyperparameters.
+
+    Args:
+        settings: Settings of the command line; those of the file are their defaults.
+        of_file: Settings of the file.
+    """
+    merged = {
+        name: with_changes(getattr(of_file, name), getattr(settings, name))
+        for name in ("channel", "hyperparams")
+        if hasattr(settings, name)
+    }
+    if "hyperparams" in merged and (settings.algo != of_file.algo or settings.conf_file is not None):
+        merged["hyperparams"] = {} if settings.hyperparams == of_file.hyperparams else settings.hyperparams
+    return replace(settings, **merged)
 
 
 def _without_group(arguments: list[str], flag: str) -> tuple[list[str], dict[str, str]]:

@@ -14,7 +14,7 @@ from experiments.settings.steps import StepCount
 class SweepSettings(BackendSettings, LearningSettings):
     """Compares arms over a grid of channels: how safety, return and interventions depend on the channel.
 
-    Every point of the grid is a comparison of its own with the same seeds. Leaves sweep.parquet, summary.json,
+    Every point of the grid is a comparison of its own with the same seeds. Leaves episodes.parquet, summary.json,
     settings.json, report.html with heatmaps, and the models. Started again with the same folder, finished runs are
     kept.
 
@@ -60,8 +60,8 @@ class StudySettings(BackendSettings):
     Every environment is a comparison of its own (`ncs compare`) in a folder below the output folder, with the settings
     of that command; then linear controllers and trained agents meet worse and better channels, behind filters with and
     without the error set. Leaves report.html, the same as a page of Markdown (docs/results.md is one), figures,
-    summary.json and study.parquet. Started again with the same folder, finished runs are kept: a long study can be run
-    in parts.
+    summary.json and episodes.parquet. Started again with the same folder, finished runs are kept: a long study can be
+    run in parts.
 
     Attributes:
         config: Settings file (settings.json) of an earlier study; its settings hold where none are given here.

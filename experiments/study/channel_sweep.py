@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from experiments.analysis.episodes import episodes_table
 from experiments.analysis.statistics import clopper_pearson
 from experiments.backends.execution import results_of
 from experiments.errors import ResultsError
@@ -14,7 +15,6 @@ from experiments.runs import (
     RunResult,
     RunStore,
     TrainingRun,
-    by_arm,
     certificate_of,
     loop_config,
     run_of_arm,
@@ -150,25 +150,21 @@ def _runs(point: _Point, settings: CompareSettings, agents: Mapping[str, AgentFi
 def _rows(point: _Point, results: Sequence[RunResult]) -> list[dict[str, Any]]:
     """Returns what happened at a point, a row per arm and disturbance."""
     rows = []
-    for arm, runs in by_arm(results).items():
-        for condition in (AS_TRAINED, *runs[0].conditions):
-            parts = [({AS_TRAINED: run.episodes} | run.conditions)[condition] for run in runs]
-            episodes = [episode for part in parts for episode in part]
-            outside = sum(episode.largest_level > 1.0 for episode in episodes)
-            violating = sum(episode.violation_steps > 0 for episode in episodes)
-            rows.append(
-                {
-                    "side": point.side,
-                    "value": point.value,
-                    "arm": arm,
-                    "condition": condition,
-                    "policies": len(runs),
-                    "episodes": len(episodes),
-                    "outside_set": outside,
-                    "outside_set_ci95": list(clopper_pearson(outside, len(episodes))),
-                    "violating": violating,
-                    "violating_ci95": list(clopper_pearson(violating, len(episodes))),
-                    "intervention_rate": sum(e.interventions for e in episodes) / sum(e.steps for e in episodes),
-                }
-            )
+    for (arm, condition), played in episodes_table(results).groupby(["arm", "condition"], sort=False):
+        count, outside, violating = len(played), int(played["outside_set"].sum()), int(played["violating"].sum())
+        rows.append(
+            {
+                "side": point.side,
+                "value": point.value,
+                "arm": arm,
+                "condition": condition,
+                "policies": played["run"].nunique(),
+                "episodes": count,
+                "outside_set": outside,
+                "outside_set_ci95": clopper_pearson(outside, count),
+                "violating": violating,
+                "violating_ci95": clopper_pearson(violating, count),
+                "intervention_rate": float(played["interventions"].sum() / played["steps"].sum()),
+            }
+        )
     return rows

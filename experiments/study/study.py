@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from experiments.analysis.parquet_tables import parquet
+import pandas as pd
+
+from experiments.analysis.episodes import parquet
 from experiments.commands import short_version
 from experiments.commands.compare import compare
-from experiments.runs import claim_folder, prepare_output, versions
+from experiments.runs import claim_folder, prepare_output, versions, write_results
 from experiments.runs.experiment import INCIDENTAL_SETTINGS
 from experiments.settings import BackendSettings, CompareSettings, StudySettings, settings_json
 from experiments.settings.study import short_name
 from experiments.study.channel_sweep import channel_sweep, trained_agents
-from experiments.study.quoted_tables import quoted, require_marks, tables_by_name
-from experiments.study.study_figures import study_figures
-from experiments.study.study_report import results_page, study_report
-from experiments.study.study_summary import page_summary, study_summary
+from experiments.study.figures import study_figures
+from experiments.study.pages import quoted, require_marks, results_page, study_report
+from experiments.study.summary import page_summary, study_summary
+from experiments.study.tables import tables_by_name
 from shields.atomic_write import write_atomically
 
 # Budget of `--smoke`: enough to pass through every part.
@@ -66,9 +67,8 @@ def _study_in_folder(settings: StudySettings) -> None:
         "versions": versions(),
     }
     summary = study_summary(comparisons) | {"channels": channels} | provenance
-    _write(settings, summary, comparisons)
-    for path in settings.quote:
-        write_atomically(path, quoted(path.read_text("utf-8"), tables_by_name(page_summary(summary))))
+    episodes = {name: pd.read_parquet(part.out / "episodes.parquet") for name, part in parts.items()}
+    _write(settings, summary, pd.concat(episodes, names=["environment"]).reset_index("environment"))
     print(f"files: {settings.out}")
 
 
@@ -91,19 +91,20 @@ def _comparison_settings(settings: StudySettings, env_id: str) -> CompareSetting
     return replace(part, steps=math.ceil(settings.budget * part.training_steps))
 
 
-def _write(settings: StudySettings, summary: dict[str, Any], comparisons: Mapping[str, dict[str, Any]]) -> None:
-    """Writes every file; summary.json comes last, so that it stands for a complete study."""
-    out, shown = settings.out, page_summary(summary)
+def _write(settings: StudySettings, summary: dict[str, Any], episodes: pd.DataFrame) -> None:
+    """Writes every file."""
+    shown = page_summary(summary)
     figures = study_figures(shown)
-    for name, (_, png) in figures.items():
-        write_atomically(out / "figures" / f"{name}.png", png)
-    provenance = {name: summary[name] for name in ("settings", "versions")}
-    write_atomically(out / "study.parquet", parquet(_rows(comparisons), provenance))
-    write_atomically(out / "report.html", study_report(shown, figures))
-    write_atomically(out / "results.md", results_page(shown, figures, "figures/"))
     if settings.page is not None:
         _write_page(settings.page, shown, figures)
-    write_atomically(out / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
+    files = {
+        "episodes.parquet": parquet(episodes, summary),
+        "report.html": study_report(shown, figures),
+        "results.md": results_page(shown, figures, "figures/"),
+    }
+    write_results(settings.out, summary, files, figures)
+    for path in settings.quote:
+        write_atomically(path, quoted(path.read_text("utf-8"), tables_by_name(shown)))
 
 
 def _write_page(page: Path, shown: dict[str, Any], figures: dict[str, tuple[str, bytes]]) -> None:
@@ -114,26 +115,3 @@ def _write_page(page: Path, shown: dict[str, Any], figures: dict[str, tuple[str,
         write_atomically(images / f"{page.stem}-{name}.png", png)
     write_atomically(page.with_suffix(".json"), json.dumps(shown, allow_nan=False) + "\n")
     write_atomically(page, results_page(shown, figures, f"images/{page.stem}-"))
-
-
-def _rows(comparisons: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    """Returns one row per environment, arm, condition and run."""
-    rows = []
-    for name, comparison in comparisons.items():
-        for arm_name, arm in (comparison["arms"] | comparison["references"]).items():
-            for condition, played in {"as trained": arm, **arm["conditions"]}.items():
-                for run in range(arm["runs"]):
-                    rows.append(
-                        {
-                            "environment": name,
-                            "arm": arm_name,
-                            "condition": condition,
-                            "run": run,
-                            "return": played["eval_return_by_run"][run],
-                            "violating_episodes_rate": played["eval_violation_rate_by_run"][run],
-                            "outside_set_rate": played["eval_outside_set_rate_by_run"][run],
-                            "intervention_rate": played["intervention_rate_by_run"][run],
-                            "train_violation_steps": arm["train_violation_steps_by_run"][run],
-                        }
-                    )
-    return rows

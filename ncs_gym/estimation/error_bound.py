@@ -146,8 +146,10 @@ def require_error_set(error_set: ErrorSet, plant: LinearPlant) -> None:
     Sigma, rate, ages = error_set.Sigma, error_set.rate, error_set.ages
     if ages is None:
         identity = np.eye(plant.n)
-        first = congruence_sum((identity, plant.initial_error.shape, 1.0))
-        grown = congruence_sum((plant.A, Sigma, 1.0 / rate), (identity, plant.disturbance.shape, 1.0 / (1.0 - rate)))
+        first = congruence_sum((identity, plant.initial_error.shape_matrix, 1.0))
+        grown = congruence_sum(
+            (plant.A, Sigma, 1.0 / rate), (identity, plant.disturbance.shape_matrix, 1.0 / (1.0 - rate))
+        )
         needs = {"(E0)": [(Sigma, *first)], "(E1)": [(Sigma, *grown)]}
     else:
         needs = ages.needs(plant)
@@ -200,9 +202,9 @@ def _unconditional_set(plant: LinearPlant) -> ErrorSet:
     inverse, identity = np.linalg.cholesky(plant.weight).T, np.eye(plant.n)
     T = np.linalg.inv(inverse)
     A = inverse @ plant.A @ T
-    D = inverse @ plant.disturbance.shape @ inverse.T
+    D = inverse @ plant.disturbance.shape_matrix @ inverse.T
     D = D + THICKENING * float(np.trace(D)) / plant.n * identity
-    first = inverse @ plant.initial_error.shape @ inverse.T + THINNEST**2 * identity
+    first = inverse @ plant.initial_error.shape_matrix @ inverse.T + THINNEST**2 * identity
 
     def size(rate: float) -> float:
         return float(np.trace(_smallest_solution(A, D, first, rate)))

@@ -81,8 +81,8 @@ class ErrorSetsByAge(ReadOnlyArrays):
 
         In (C2) the inner one includes the rounding of the estimate that is updated with T_j.
         """
-        D, identity = plant.disturbance.shape, np.eye(plant.n)
-        first = congruence_sum((identity, plant.initial_error.shape, 1.0))
+        D, identity = plant.disturbance.shape_matrix, np.eye(plant.n)
+        first = congruence_sum((identity, plant.initial_error.shape_matrix, 1.0))
         grown = [
             congruence_sum((plant.A, self.shapes[j], 1.0 / rate), (identity, D, 1.0 / (1.0 - rate)))
             for j, rate in enumerate(self.rates)
@@ -147,11 +147,11 @@ def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsBy
     inverse = np.linalg.cholesky(_cost(plant)).T
     T = np.linalg.inv(inverse)
     A, H = inverse @ plant.A @ T, plant.H @ T
-    D = inverse @ plant.disturbance.shape @ inverse.T
+    D = inverse @ plant.disturbance.shape_matrix @ inverse.T
     D = D + 1e-9 * float(np.trace(D)) / plant.n * np.eye(plant.n)
-    first = inverse @ plant.initial_error.shape @ inverse.T + THINNEST**2 * np.eye(plant.n)
+    first = inverse @ plant.initial_error.shape_matrix @ inverse.T + THINNEST**2 * np.eye(plant.n)
     rounding = inverse @ plant.estimate_rounding @ inverse.T
-    allowed = plant.sensor_error_with(contract.quantization_step).shape
+    allowed = plant.sensor_error_with(contract.quantization_step).shape_matrix
     noise = NOISE_MARGIN * allowed + 1e-12 * np.diag(np.diag(H @ H.T)) * float(np.trace(D)) / plant.n
     start, steps = first, contract.max_age + 1
     for turn in range(ITERATIONS):

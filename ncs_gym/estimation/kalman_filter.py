@@ -71,7 +71,7 @@ class ErrorRecursion:
     @property
     def first(self) -> ErrorStatistics:
         """The statistics of the first estimate, whose error lies in E(r0^2 I)."""
-        return ErrorStatistics(self.plant.kalman_covariances[2].copy(), self.plant.initial_error.shape.copy(), 0)
+        return ErrorStatistics(self.plant.kalman_covariances[2].copy(), self.plant.initial_error.shape_matrix.copy(), 0)
 
     def predicted(self, statistics: ErrorStatistics) -> ErrorStatistics:
         """Returns the statistics one step later, without a sample."""

@@ -41,7 +41,7 @@ class SetMembership:
         self._abs_ball, self._abs_to_ball = np.abs(self._ball), np.abs(self._to_ball)
         # Entries of |ball to_ball - I| are at most these.
         self._ball_error = 4.0 * plant.n * np.finfo(float).eps * (self._abs_ball @ self._abs_to_ball)
-        noise = plant.sensor_error_with(quantization_step).shape
+        noise = plant.sensor_error_with(quantization_step).shape_matrix
         # Perfect sensors get a little noise, relative to what they measure: a larger bound is a bound.
         self.noise = noise + FLAT_INFLATION * np.diag(np.diag(plant.H @ Sigma @ plant.H.T))
         self._noise_extent = np.sqrt(np.diag(self.noise))
@@ -62,7 +62,7 @@ class SetMembership:
             shape: Sigma_k, shape (n, n).
             age: Steps since the newest sample used was taken.
         """
-        A, D, certified = self.plant.A, self.plant.disturbance.shape, self.error_set.shape_at(age + 1)
+        A, D, certified = self.plant.A, self.plant.disturbance.shape_matrix, self.error_set.shape_at(age + 1)
         extent = self._abs_A @ np.sqrt(shape.diagonal())
         moved = enlarged_by_rounding(A @ shape @ A.T, extent)
         predicted = self.rounded_up(outer_sum(moved, D, self.plant.weight))

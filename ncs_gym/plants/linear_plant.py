@@ -353,9 +353,9 @@ class LinearPlant(ReadOnlyArrays):
         A = np.zeros((n + stored, n + stored))
         A[:n, :n], A[:n, n : n + m] = self.A, self.B
         A[n:-m, n + m :] = np.eye(stored - m)
-        box = np.zeros((len(self.C) + stored, n + stored))
-        box[: len(self.C), :n] = self.C
-        box[len(self.C) :, n:] = np.diag(np.tile(1.0 / (STORED_INPUT_REACH * self.u_max), delay))
+        box = np.zeros((len(self.box_rows) + stored, n + stored))
+        box[: len(self.box_rows), :n] = self.box_rows
+        box[len(self.box_rows) :, n:] = np.diag(np.tile(1.0 / (STORED_INPUT_REACH * self.u_max), delay))
         ages = [f"{age} step{'s' * (age > 1)} ago" for age in range(delay, 0, -1)]
         disturbance = self.disturbance_bound
         if self.gamma > 0.0:  # one bound for both: the ball of gamma would reach the inputs under way
@@ -364,7 +364,7 @@ class LinearPlant(ReadOnlyArrays):
         # The further states of a model move as they should: inputs under way keep their limits.
         remainder = self.remainder
         if remainder is not None:
-            remainder = replace(remainder, bound=Ellipsoid(np.pad(remainder.bound.shape, (0, stored))))
+            remainder = replace(remainder, bound=Ellipsoid(np.pad(remainder.bound.shape_matrix, (0, stored))))
         return replace(
             self,
             A=A,
@@ -426,10 +426,10 @@ class LinearPlant(ReadOnlyArrays):
     @property
     def assumptions(self) -> tuple[str, ...]:
         """What a certificate takes for granted beyond the numbers of the bounds, in sentences."""
-        first = [self.initial_cov, *([] if self.initial_bound is None else [self.initial_bound.shape])]
+        first = [self.initial_cov, *([] if self.initial_bound is None else [self.initial_bound.shape_matrix])]
         zero = (
-            not np.any(self.nominal_disturbance.shape),
-            not np.any(self.nominal_sensor_error.shape),
+            not np.any(self.nominal_disturbance.shape_matrix),
+            not np.any(self.nominal_sensor_error.shape_matrix),
             not any(np.any(part) for part in first),
         )
         assumed = [
@@ -465,9 +465,14 @@ class LinearPlant(ReadOnlyArrays):
         return self if self.remainder is None else replace(self, remainder=None)
 
     @cached_property
-    def C(self) -> np.ndarray:
+    def box_rows(self) -> np.ndarray:
         """Rows c_j of the safe box |c_j x| <= 1, shape (k, n)."""
         return self.box
+
+    @property
+    def C(self) -> np.ndarray:
+        """The former name of `box_rows`, which stays."""
+        return self.box_rows
 
     @cached_property
     def spectral_radius(self) -> float:
@@ -486,20 +491,21 @@ class LinearPlant(ReadOnlyArrays):
         It is the same on every machine: these numbers are given, or rounded once (`ncs_gym.exact`).
         """
         digest = hashlib.sha256()
-        for name in ("A", "B", "C", "H", "u_max", "process_noise_cov", "measurement_noise_cov", "initial_cov"):
-            array = getattr(self, name)
+        matrices = {"A": self.A, "B": self.B, "C": self.box_rows, "H": self.H, "u_max": self.u_max}
+        names = ("process_noise_cov", "measurement_noise_cov", "initial_cov")
+        for name, array in (matrices | {name: getattr(self, name) for name in names}).items():
             digest.update(f"{name}{array.shape}".encode() + array.astype("<f8").tobytes())
         digest.update(np.array([self.dt, self.gamma, self.delta], dtype="<f8").tobytes())
         if self.error_gain is not None:
             digest.update(self.error_gain.astype("<f8").tobytes())
         for name in ("disturbance_bound", "sensor_bound", "initial_bound", "operating_state", "operating_input"):
             value = getattr(self, name)
-            array = value.shape if isinstance(value, Ellipsoid) else value
+            array = value.shape_matrix if isinstance(value, Ellipsoid) else value
             if array is not None and np.any(array):  # a plant without them keeps the fingerprint it always had
                 digest.update(name.encode() + array.astype("<f8").tobytes())
         if self.remainder is not None:
             digest.update(
-                f"remainder{self.remainder.proved}".encode() + self.remainder.bound.shape.astype("<f8").tobytes()
+                f"remainder{self.remainder.proved}".encode() + self.remainder.bound.shape_matrix.astype("<f8").tobytes()
             )
         return digest.hexdigest()
 
@@ -509,7 +515,7 @@ class LinearPlant(ReadOnlyArrays):
 
     def constraint_values(self, state: np.ndarray) -> np.ndarray:
         """Returns |c_j x| - 1 for each row of the safe box, shape (k,) or (k, N); positive is violated."""
-        return abs(self.C.dot(state)) - 1.0
+        return abs(self.box_rows.dot(state)) - 1.0
 
     def to_deviation(self, value: ArrayLike, of: str = "state") -> np.ndarray:
         """Returns a physical state, input or output as its deviation from the operating point.
@@ -543,7 +549,7 @@ class LinearPlant(ReadOnlyArrays):
     @cached_property
     def weight(self) -> np.ndarray:
         """Positive definite W, shape (n, n), that measures ellipsoids in units of the safe box: C'C, regularized."""
-        gram = exact.product(self.C.T, self.C)
+        gram = exact.product(self.box_rows.T, self.box_rows)
         squares = np.diag(gram)
         return read_only(gram + 1e-6 * np.diag(squares + exact.total(squares) / self.n * (squares == 0.0)))
 
@@ -584,12 +590,12 @@ class LinearPlant(ReadOnlyArrays):
         It is larger than `allowed_disturbance` by what holds that plus E(F), F = n diag(r^2), with r the rounding of
         A x + B u + d for x up to SIMULATED_REACH half-widths out: (1+s/4) allowed + (1+4/s) F, s the inflation.
         """
-        return Ellipsoid(inflated(self.nominal_disturbance.shape) + self._rounding_room)
+        return Ellipsoid(inflated(self.nominal_disturbance.shape_matrix) + self._rounding_room)
 
     @cached_property
     def allowed_disturbance(self) -> Ellipsoid:
         """What a disturbance may use of D: the rest is for the rounding of a simulation, shape (n, n)."""
-        nominal = self.nominal_disturbance.shape
+        nominal = self.nominal_disturbance.shape_matrix
         return Ellipsoid(0.5 * (nominal + inflated(nominal)) + 0.5 * self._rounding_room)
 
     @cached_property
@@ -616,17 +622,17 @@ class LinearPlant(ReadOnlyArrays):
     @cached_property
     def sensor_error(self) -> Ellipsoid:
         """Holds the sensor noise v, shape (p, p), without the channel's quantizer (see `sensor_error_with`)."""
-        return Ellipsoid(inflated(self.nominal_sensor_error.shape))
+        return Ellipsoid(inflated(self.nominal_sensor_error.shape_matrix))
 
     def sensor_error_with(self, quantization_step: float) -> Ellipsoid:
         """Returns N, shape (p, p): sensor noise plus the ball of squared radius p q^2/4 around a quantizer's box."""
         ball = Ellipsoid(self.p * quantization_step**2 / 4.0 * np.eye(self.p))
-        return Ellipsoid(inflated(_ellipsoid_around_sum(ball, self.nominal_sensor_error, np.eye(self.p)).shape))
+        return Ellipsoid(inflated(_ellipsoid_around_sum(ball, self.nominal_sensor_error, np.eye(self.p)).shape_matrix))
 
     @cached_property
     def initial_radius_squared(self) -> float:
         """r0^2 = lambda_max(P0) chi2_{n,1-delta}: the truncated first error is no longer than r0."""
-        return max(exact.largest_eigenvalue(self.initial_noise.bound.shape), 0.0)
+        return max(exact.largest_eigenvalue(self.initial_noise.bound.shape_matrix), 0.0)
 
     @cached_property
     def nominal_initial_error(self) -> Ellipsoid:
@@ -637,7 +643,7 @@ class LinearPlant(ReadOnlyArrays):
     @cached_property
     def initial_error(self) -> Ellipsoid:
         """Holds the error of the first estimate, shape (n, n), with slack for rounding."""
-        return Ellipsoid(inflated(self.nominal_initial_error.shape) + self.estimate_rounding)
+        return Ellipsoid(inflated(self.nominal_initial_error.shape_matrix) + self.estimate_rounding)
 
     @cached_property
     def estimate_rounding(self) -> np.ndarray:
@@ -655,13 +661,13 @@ class LinearPlant(ReadOnlyArrays):
         Q = self.process_noise_cov + self.gamma * np.eye(self.n)
         R, P0 = self.measurement_noise_cov, self.initial_cov
         if self.disturbance_bound is not None:
-            Q = Q + self.disturbance_bound.shape
+            Q = Q + self.disturbance_bound.shape_matrix
         if self.remainder is not None:
-            Q = Q + self.remainder.bound.shape
+            Q = Q + self.remainder.bound.shape_matrix
         if self.sensor_bound is not None:
-            R = R + self.sensor_bound.shape / (self.p + 2)
+            R = R + self.sensor_bound.shape_matrix / (self.p + 2)
         if self.initial_bound is not None:
-            P0 = P0 + self.initial_bound.shape / (self.n + 2)
+            P0 = P0 + self.initial_bound.shape_matrix / (self.n + 2)
         return read_only(Q), read_only(R), read_only(P0)
 
     def sample_sensor_noise(
@@ -681,7 +687,7 @@ def _plus_uniform(
     samples: np.ndarray, bound: Ellipsoid | None, rng: np.random.Generator, count: int | None
 ) -> np.ndarray:
     """Returns samples, shape (n,) or (count, n), plus uniform points of a bound; none are drawn of a point."""
-    return samples if bound is None or not np.any(bound.shape) else samples + bound.sample(rng, count)
+    return samples if bound is None or not np.any(bound.shape_matrix) else samples + bound.sample(rng, count)
 
 
 def inflated(shape: np.ndarray) -> np.ndarray:
@@ -691,14 +697,16 @@ def inflated(shape: np.ndarray) -> np.ndarray:
 
 def _ellipsoid_around_sum(first: Ellipsoid, second: Ellipsoid | None, weight: np.ndarray) -> Ellipsoid:
     """Returns an ellipsoid around the sum, of the smallest tr(W P); where one of them is a point or None, the other."""
-    if second is None or not np.any(second.shape):
+    if second is None or not np.any(second.shape_matrix):
         return first
-    return Ellipsoid(outer_sum(first.shape, second.shape, weight)) if np.any(first.shape) else second
+    return (
+        Ellipsoid(outer_sum(first.shape_matrix, second.shape_matrix, weight)) if np.any(first.shape_matrix) else second
+    )
 
 
 def _padded(bound: Ellipsoid | None, zeros: int) -> Ellipsoid | None:
     """Returns a bound of the same entries and of some more that are zero."""
-    return None if bound is None else Ellipsoid(np.pad(bound.shape, (0, zeros)))
+    return None if bound is None else Ellipsoid(np.pad(bound.shape_matrix, (0, zeros)))
 
 
 def inputs_under_way(plant: LinearPlant) -> int:
@@ -736,14 +744,14 @@ def _describe(plant: LinearPlant) -> str:
     stable = f"stable ({radius})"
     unstable = f"not stable ({radius}): a certificate needs a contract of the channel"
     extents = {
-        "disturbance": (np.sqrt(np.diag(plant.disturbance.shape)), plant.state_names, plant.state_units),
-        "sensor noise": (np.sqrt(np.diag(plant.sensor_error.shape)), *_outputs(plant)),
-        "first error": (np.sqrt(np.diag(plant.initial_error.shape)), plant.state_names, plant.state_units),
+        "disturbance": (np.sqrt(np.diag(plant.disturbance.shape_matrix)), plant.state_names, plant.state_units),
+        "sensor noise": (np.sqrt(np.diag(plant.sensor_error.shape_matrix)), *_outputs(plant)),
+        "first error": (np.sqrt(np.diag(plant.initial_error.shape_matrix)), plant.state_names, plant.state_units),
     }
     lines = {
         "linear plant": [f"{sizes}, a step every {plant.dt:g} s"],
         "dynamics": [stable if plant.spectral_radius < 1.0 else unstable],
-        "safe box": [row_limit(plant, row) for row in plant.C],
+        "safe box": [row_limit(plant, row) for row in plant.box_rows],
         "input limits": [
             _between(name, limit, center, unit)
             for name, limit, center, unit in zip(
@@ -766,7 +774,7 @@ def _describe(plant: LinearPlant) -> str:
 def _as_json(value: Any) -> Any:
     """Returns a field of a plant as a JSON value."""
     if isinstance(value, Ellipsoid):
-        return {"shape": value.shape.tolist()}
+        return {"shape": value.shape_matrix.tolist()}
     if isinstance(value, Remainder):
         return {entry.name: _as_json(getattr(value, entry.name)) for entry in fields(value)}
     return value.tolist() if isinstance(value, np.ndarray) else value

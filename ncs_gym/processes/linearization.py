@@ -216,7 +216,7 @@ def _confirmed(bound: Ellipsoid, remainders: np.ndarray, widths: np.ndarray) -> 
     Raises:
         ValueError: If one lies outside it.
     """
-    padded = Ellipsoid(bound.shape + np.diag((ROUNDING * widths) ** 2))
+    padded = Ellipsoid(bound.shape_matrix + np.diag((ROUNDING * widths) ** 2))
     largest = float(padded.gauge(remainders).max())
     if largest > 1.0:
         raise ValueError(
@@ -232,7 +232,7 @@ def _bearable(remainder: Remainder, widths: np.ndarray) -> Remainder:
     Raises:
         ValueError: If it does not.
     """
-    reached = np.sqrt(np.diag(remainder.bound.shape)) / widths
+    reached = np.sqrt(np.diag(remainder.bound.shape_matrix)) / widths
     worst = int(reached.argmax())
     if reached[worst] >= 1.0:
         raise ValueError(

@@ -89,7 +89,7 @@ class PlantSimulation:
         self._trusted = stays_inside(disturbance)
         if not self._trusted and not self.process.is_written:
             raise ValueError("a disturbance of your own can act only on a process with write_state: give it one")
-        acts = not self._trusted or bool(np.any(self.plant.nominal_disturbance.shape))
+        acts = not self._trusted or bool(np.any(self.plant.nominal_disturbance.shape_matrix))
         self._is_disturbed = self.process.is_written and acts
         self.sensor_noise = BlockSampler(self._draw_sensor_noise, size)
         self.process_noise = BlockSampler(self._draw_process_noise, size)

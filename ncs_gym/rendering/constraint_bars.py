@@ -51,12 +51,12 @@ class ConstraintBarsDrawing:
     """
 
     def __init__(self, plant: LinearPlant) -> None:
-        self._constraints = [_constraint(plant, j) for j in range(min(len(plant.C), _MAX_BARS))]
-        limited = [int(np.flatnonzero(row)[0]) for row in plant.C if np.count_nonzero(row) == 1]
+        self._constraints = [_constraint(plant, j) for j in range(min(len(plant.box_rows), _MAX_BARS))]
+        limited = [int(np.flatnonzero(row)[0]) for row in plant.box_rows if np.count_nonzero(row) == 1]
         order = list(dict.fromkeys([*limited, *range(plant.n)]))
         self.pair = (min(order[:2]), max(order[:2]))
         self._text_width = _TEXT_WIDTH if len(self._constraints) <= _COLUMN else _NARROW_TEXT_WIDTH
-        self._hidden = len(plant.C) - len(self._constraints)
+        self._hidden = len(plant.box_rows) - len(self._constraints)
 
     def draw_background(self, canvas: Canvas) -> None:
         """Draws the names, the empty bars and the limits."""
@@ -100,7 +100,7 @@ class ConstraintBarsDrawing:
 
 
 def _constraint(plant: LinearPlant, index: int) -> _Constraint:
-    row = plant.C[index]
+    row = plant.box_rows[index]
     if np.count_nonzero(row) != 1:
         return _Constraint(f"limit {index + 1}", "", 1.0, lambda state: float(row @ state))
     i = int(np.flatnonzero(row)[0])

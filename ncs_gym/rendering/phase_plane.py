@@ -22,7 +22,7 @@ _FAR = 10.0
 
 def limit_of(plant: LinearPlant, index: int) -> float:
     """Returns the limit of |x_i|; where the safe box has none, how far x_i reaches in the ellipsoid inside the box."""
-    alone = [row[index] for row in plant.C if row[index] != 0.0 and np.count_nonzero(row) == 1]
+    alone = [row[index] for row in plant.box_rows if row[index] != 0.0 and np.count_nonzero(row) == 1]
     return 1.0 / max(abs(entry) for entry in alone) if alone else float(plant.half_widths[index])
 
 
@@ -208,7 +208,7 @@ def _box_corners(plant: LinearPlant, pair: tuple[int, int]) -> np.ndarray:
     corners = _FAR * limits * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
     others = np.ones(plant.n, dtype=bool)
     others[list(pair)] = False
-    for row in plant.C:
+    for row in plant.box_rows:
         if not row[others].any():
             for sign in (-1.0, 1.0):
                 corners = _cut(corners, sign * row[list(pair)])

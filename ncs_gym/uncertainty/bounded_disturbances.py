@@ -128,4 +128,4 @@ class SinusoidDisturbance(Disturbance):
 def _declared(plant: LinearPlant) -> Ellipsoid | None:
     """Returns the plant's declared bound of disturbances; None if there is none or it is a point."""
     bound = plant.disturbance_bound
-    return bound if bound is not None and np.any(bound.shape) else None
+    return bound if bound is not None and np.any(bound.shape_matrix) else None

@@ -77,12 +77,12 @@ def diagonal_inside(bound: Ellipsoid) -> np.ndarray:
 
     It is j diag(P), j the smallest eigenvalue of P in units in which its diagonal is 1.
     """
-    variances = np.diag(bound.shape)
+    variances = np.diag(bound.shape_matrix)
     kept = variances > 0.0
-    if not kept.any() or np.array_equal(bound.shape, np.diag(variances)):
-        return bound.shape
+    if not kept.any() or np.array_equal(bound.shape_matrix, np.diag(variances)):
+        return bound.shape_matrix
     scale = np.sqrt(variances[kept])
-    smallest = np.linalg.eigvalsh(bound.shape[np.ix_(kept, kept)] / np.outer(scale, scale))[0]
+    smallest = np.linalg.eigvalsh(bound.shape_matrix[np.ix_(kept, kept)] / np.outer(scale, scale))[0]
     return max(float(smallest), 0.0) * np.diag(variances)
 
 

@@ -34,22 +34,27 @@ class Ellipsoid(ReadOnlyArrays):
     (zero: the origin alone).
 
     Attributes:
-        shape: P, shape (n, n), symmetric positive semidefinite [square of the unit of z].
+        shape_matrix: P, shape (n, n), symmetric positive semidefinite [square of the unit of z].
 
     Raises:
         ValueError: If the shape is not a finite, symmetric, positive semidefinite square matrix.
     """
 
-    shape: np.ndarray
+    shape_matrix: np.ndarray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "shape", as_covariance(self.shape, None, "shape"))
+        object.__setattr__(self, "shape_matrix", as_covariance(self.shape_matrix, None, "shape"))
         self._make_arrays_read_only()
+
+    @property
+    def shape(self) -> np.ndarray:
+        """The former name of `shape_matrix`, which stays."""
+        return self.shape_matrix
 
     @property
     def dim(self) -> int:
         """The dimension n."""
-        return self.shape.shape[0]
+        return self.shape_matrix.shape[0]
 
     @cached_property
     def factor(self) -> np.ndarray:
@@ -60,9 +65,9 @@ class Ellipsoid(ReadOnlyArrays):
     @cached_property
     def _principal_axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Coordinate scales s, and eigenvalues and eigenvectors of P_ij / (s_i s_j)."""
-        scale = np.sqrt(np.maximum(np.diag(self.shape), 0.0))
+        scale = np.sqrt(np.maximum(np.diag(self.shape_matrix), 0.0))
         divisor = np.where(scale > 0.0, scale, 1.0)
-        values, vectors = np.linalg.eigh(self.shape / np.outer(divisor, divisor))
+        values, vectors = np.linalg.eigh(self.shape_matrix / np.outer(divisor, divisor))
         values = np.where(values > FLAT * max(values[-1], 0.0), values, 0.0)
         return scale, values, vectors
 
@@ -75,12 +80,12 @@ class Ellipsoid(ReadOnlyArrays):
     def support(self, direction: np.ndarray) -> np.ndarray | float:
         """Returns max of a'z over the ellipsoid for a direction a (n,), or for each of shape (..., n)."""
         direction = np.asarray(direction, dtype=np.float64)
-        value = np.sqrt(np.maximum(((direction @ self.shape) * direction).sum(axis=-1), 0.0))
+        value = np.sqrt(np.maximum(((direction @ self.shape_matrix) * direction).sum(axis=-1), 0.0))
         return float(value) if value.ndim == 0 else value
 
     def extreme_point(self, direction: np.ndarray) -> np.ndarray:
         """Returns a point of the ellipsoid, shape (n,), that attains the support in `direction`."""
-        image = self.shape @ direction
+        image = self.shape_matrix @ direction
         height = np.sqrt(max(float(direction @ image), 0.0))
         return image / height if height > 0.0 else np.zeros(self.dim)
 
@@ -118,11 +123,11 @@ class Ellipsoid(ReadOnlyArrays):
 
     def outer_sum(self, other: Ellipsoid) -> Ellipsoid:
         """Returns the trace-smallest ellipsoid of the family P1/nu + P2/(1-nu) around the Minkowski sum."""
-        return Ellipsoid(outer_sum(self.shape, other.shape, np.eye(self.dim)))
+        return Ellipsoid(outer_sum(self.shape_matrix, other.shape_matrix, np.eye(self.dim)))
 
     def sum_contains(self, other: Ellipsoid, point: np.ndarray) -> bool:
         """Returns whether a point lies in the Minkowski sum of both ellipsoids (see `sum_gauge`)."""
-        return sum_gauge(point, self.shape, other.shape) <= 1.0
+        return sum_gauge(point, self.shape_matrix, other.shape_matrix) <= 1.0
 
     def farthest_point(self, centers: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """Returns z of the ellipsoid that maximizes (center + z)' W (center + z).

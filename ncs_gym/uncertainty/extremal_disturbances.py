@@ -48,11 +48,11 @@ class AdversarialDisturbance(Disturbance):
         bound = plant.nominal_disturbance
         if self.M is not None:
             return (1.0 - ROUNDING) * bound.farthest_point(nominal_next.T, self.M).T
-        values = plant.C @ nominal_next
-        reach = np.asarray(bound.support(plant.C))
+        values = plant.box_rows @ nominal_next
+        reach = np.asarray(bound.support(plant.box_rows))
         movable = reach > 0.0 if np.any(reach > 0.0) else np.ones(len(reach), np.bool_)
         worst = np.argmax(np.where(movable, np.abs(values).T + reach, -1.0).T, axis=0)
-        extremes = np.stack([bound.extreme_point(row) for row in plant.C], axis=1)
+        extremes = np.stack([bound.extreme_point(row) for row in plant.box_rows], axis=1)
         signs = np.where(np.take_along_axis(values, worst[None], axis=0)[0] >= 0.0, 1.0, -1.0)
         return (1.0 - ROUNDING) * signs * extremes[:, worst]
 

@@ -124,7 +124,7 @@ def unknown_bounds(plant: LinearPlant) -> list[str]:
     """Returns the declared bounds of a plant of which the paper's theorems know nothing."""
     names = ("disturbance_bound", "remainder_bound", "sensor_bound", "initial_bound")
     declared = {name: getattr(plant, name) for name in names}
-    return [name for name, bound in declared.items() if bound is not None and np.any(bound.shape)]
+    return [name for name, bound in declared.items() if bound is not None and np.any(bound.shape_matrix)]
 
 
 class PaperModel:

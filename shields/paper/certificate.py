@@ -36,7 +36,7 @@ def paper_certificate(plant: LinearPlant, *, dkappa: float, drho: float, search:
         raise ValueError(
             f"method 'paper' knows gamma and covariances alone, not {' and '.join(unknown)}: use method 'certified'"
         )
-    free = plant.n - int(np.linalg.matrix_rank(plant.C))
+    free = plant.n - int(np.linalg.matrix_rank(plant.box_rows))
     if free:
         raise Infeasible(f"the safe box leaves {free} of {plant.n} directions unbounded: add rows to box", "S", free)
     provenance = {"search": search, "dkappa": dkappa, "drho": drho}

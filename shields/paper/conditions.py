@@ -44,7 +44,7 @@ def paper_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[C
     yield matrix_condition("(C1) [kappa L, *; (A+BK) L, L] >= 0", _blocks(scale(kappa, L), closed_loop, L))
     alpha = Fraction(bounds.alpha)
     yield matrix_condition("(C2) L >= alpha I", subtract(L, scale(alpha * (1 + _ROUNDING), identity)))
-    for j, row in enumerate(plant.C):
+    for j, row in enumerate(plant.box_rows):
         yield scalar_condition(f"(C3) c_{j + 1} L c_{j + 1}' <= 1", 1 - quadratic(rational(row), L))
     for i, limit in enumerate(plant.u_max):
         F = multiply([K[i]], L)

@@ -56,7 +56,7 @@ class FeasibilityScan:
     """
 
     def __init__(self, plant: LinearPlant) -> None:
-        key = tuple((array.shape, array.tobytes()) for array in (plant.A, plant.B, plant.C, plant.u_max))
+        key = tuple((array.shape, array.tobytes()) for array in (plant.A, plant.B, plant.box_rows, plant.u_max))
         if key not in _known_scans:
             if len(_known_scans) == _MAX_KNOWN_SCANS:
                 del _known_scans[next(iter(_known_scans))]

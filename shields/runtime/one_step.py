@@ -71,7 +71,7 @@ class OneStepTest:
         self.columns = read_only(np.linalg.norm(size @ np.abs(plant.A), axis=0))
         self.own_columns = read_only(np.linalg.norm(size, axis=0))
         self.pushed = float(np.linalg.norm(size @ np.abs(plant.B), axis=0) @ plant.u_max)
-        bound = plant.disturbance.shape
+        bound = plant.disturbance.shape_matrix
         extent = float(self.own_columns @ np.sqrt(np.diag(bound)))
         D = self.root @ bound @ self.root.T + self.rounding * extent**2 * np.eye(plant.n)
         self.D = read_only(0.5 * (D + D.T))

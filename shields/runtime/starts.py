@@ -52,7 +52,7 @@ def starts_inside(certificate: Certificate, initial: Ellipsoid | np.ndarray) -> 
     """
     L = rational(certificate.L)
     if isinstance(initial, Ellipsoid):
-        return is_positive_semidefinite(subtract(L, rational(initial.shape)))
+        return is_positive_semidefinite(subtract(L, rational(initial.shape_matrix)))
     state = rational(initial)[0]
     one = rational(np.ones(1))[0]
     return is_positive_semidefinite([one + state] + [[x, *row] for x, row in zip(state, L, strict=True)])
@@ -65,9 +65,9 @@ def starts_in_box(plant: LinearPlant, initial: Ellipsoid | np.ndarray) -> bool:
         plant: Gives the rows c_i.
         initial: An ellipsoid E(P), in the box exactly if c_i P c_i' <= 1 for all rows; or a single state, shape (n,).
     """
-    rows = rational(plant.C)
+    rows = rational(plant.box_rows)
     if isinstance(initial, Ellipsoid):
-        shape = rational(initial.shape)
+        shape = rational(initial.shape_matrix)
         return all(quadratic([row], shape) <= 1 for row in rows)
     return all(abs(product) <= 1 for (product,) in multiply(rows, transpose(rational(initial))))
 
@@ -99,7 +99,7 @@ def starts_known(
         return tuple(known * (lead + 1))
     plant = safety_filter.plant
     if isinstance(initial, Ellipsoid):
-        center, shape = np.zeros(plant.n), initial.shape
+        center, shape = np.zeros(plant.n), initial.shape_matrix
     else:
         center, shape = np.asarray(initial, dtype=np.float64), np.zeros((plant.n, plant.n))
     for _ in range(lead):
@@ -182,6 +182,6 @@ def _moved(plant: LinearPlant, center: np.ndarray, shape: np.ndarray) -> tuple[n
     size = np.abs(plant.A)
     carried = enlarged_by_rounding(plant.A @ shape @ plant.A.T, size @ np.sqrt(np.maximum(shape.diagonal(), 0.0)))
     rounding = CENTER_ROUNDING * plant.n * (size @ np.abs(center))
-    spread = outer_sum(plant.disturbance.shape, plant.n * np.diag(rounding**2), plant.weight)
+    spread = outer_sum(plant.disturbance.shape_matrix, plant.n * np.diag(rounding**2), plant.weight)
     moved = outer_sum(carried, spread, plant.weight)
     return plant.A @ center, 0.5 * (moved + moved.T)

@@ -76,7 +76,7 @@ def synthesize(
 
         certificate = paper_certificate(plant, dkappa=dkappa, drho=drho, search=search)
         holds = _is_certifiable(plant, certificate.L, certificate.K)
-        volume = np.linalg.det(np.linalg.solve(largest_box_ellipsoid(plant.C), certificate.L)) ** 0.5
+        volume = np.linalg.det(np.linalg.solve(largest_box_ellipsoid(plant.box_rows), certificate.L)) ** 0.5
         description = _description(plant, certificate.L, float(volume)) | {"exact_conditions_hold": holds}
         return replace(certificate, provenance=certificate.provenance | description)
     if contract is not None and not isinstance(contract, ChannelContract):
@@ -218,7 +218,7 @@ def _certificate(
     return Certificate(
         L=L,
         K=K,
-        D=inflated(plant.disturbance.shape),
+        D=inflated(plant.disturbance.shape_matrix),
         rounding=problem.rounding,
         proofs=_proofs(problem, design, errors),
         updates=_updates(errors),

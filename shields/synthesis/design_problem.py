@@ -119,7 +119,7 @@ def design_problem(plant: LinearPlant, contract: ChannelContract | None = None) 
     Raises:
         Infeasible: If the plant has no error set or its safe box is unbounded.
     """
-    free = plant.n - int(np.linalg.matrix_rank(plant.C))
+    free = plant.n - int(np.linalg.matrix_rank(plant.box_rows))
     if free:
         raise Infeasible(
             f"the safe box leaves {free} of {plant.n} directions unbounded: add rows to box with generous limits",
@@ -140,7 +140,7 @@ def design_problem(plant: LinearPlant, contract: ChannelContract | None = None) 
     except ErrorSetError as error:
         raise Infeasible(str(error), "E1", 0.0) from error
     shapes = errors.Sigma[None] if errors.ages is None else errors.ages.shapes[:-1]
-    return _scaled(plant, shapes, largest_box_ellipsoid(plant.C)), errors
+    return _scaled(plant, shapes, largest_box_ellipsoid(plant.box_rows)), errors
 
 
 def _inflated(errors: ErrorSet) -> ErrorSet:
@@ -152,7 +152,7 @@ def _inflated(errors: ErrorSet) -> ErrorSet:
 def _scaled(plant: LinearPlant, error_shapes: np.ndarray, box: np.ndarray) -> DesignProblem:
     """Returns the design problem for error sets (k, n, n) and the largest ellipsoid in the safe box (n, n)."""
     T = np.linalg.cholesky(box)
-    D = plant.disturbance.shape
+    D = plant.disturbance.shape_matrix
     step = plant.B * (float(ACTION_ROUNDING) * plant.u_max)
     rounding = plant.m * step @ step.T
     weight = np.linalg.inv(box)
@@ -163,7 +163,7 @@ def _scaled(plant: LinearPlant, error_shapes: np.ndarray, box: np.ndarray) -> De
     return DesignProblem(
         A=inverse @ plant.A @ T,
         B=inverse @ plant.B @ np.diag(plant.u_max),
-        C=plant.C @ T,
+        C=plant.box_rows @ T,
         D_u=inverse @ D_u @ inverse.T,
         error_shapes=inverse @ error_shapes @ inverse.T,
         transform=T,

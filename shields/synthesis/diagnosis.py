@@ -93,10 +93,10 @@ def with_feasible_bounds(
 
 def _limits_exceeded(plant: LinearPlant) -> str:
     """Returns which limits of the safe box the disturbance of a single step exceeds, as the rest of a sentence."""
-    reached = np.sqrt(np.einsum("ji,ik,jk->j", plant.C, plant.nominal_disturbance.shape, plant.C))
+    reached = np.sqrt(np.einsum("ji,ik,jk->j", plant.box_rows, plant.nominal_disturbance.shape_matrix, plant.box_rows))
     return "".join(
         f"; the disturbance of one step alone reaches {size:.3g} times the limit {row_limit(plant, row)}"
-        for row, size in zip(plant.C, reached, strict=True)
+        for row, size in zip(plant.box_rows, reached, strict=True)
         if size >= 1.0
     )
 
@@ -105,7 +105,7 @@ def _is_declared(plant: LinearPlant, name: str) -> bool:
     """Returns whether the plant declares an uncertainty by this name that is not zero."""
     value = getattr(plant, name)
     value = value.bound if isinstance(value, Remainder) else value
-    return value is not None and bool(np.any(value.shape if isinstance(value, Ellipsoid) else value))
+    return value is not None and bool(np.any(value.shape_matrix if isinstance(value, Ellipsoid) else value))
 
 
 def _hint(plant: LinearPlant, name: str, factor: float) -> str:
@@ -126,9 +126,9 @@ def _with_scaled(plant: LinearPlant, name: str, factor: float) -> LinearPlant:
     """Returns the plant with one of its bounds multiplied: lengths of an ellipsoid, entries of anything else."""
     value = getattr(plant, name)
     if isinstance(value, Remainder):
-        scaled = replace(value, bound=Ellipsoid(factor**2 * value.bound.shape))
+        scaled = replace(value, bound=Ellipsoid(factor**2 * value.bound.shape_matrix))
     else:
-        scaled = Ellipsoid(factor**2 * value.shape) if isinstance(value, Ellipsoid) else factor * value
+        scaled = Ellipsoid(factor**2 * value.shape_matrix) if isinstance(value, Ellipsoid) else factor * value
     return replace(plant, **{name: scaled})
 
 

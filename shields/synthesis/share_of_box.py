@@ -33,10 +33,10 @@ def share_of_box(plant: LinearPlant, L: np.ndarray) -> dict[str, Any]:
         return {"share_of_box_unknown": "the set is flat in float64"}
     stored = inputs_under_way(plant)
     if not stored:
-        share = _share(plant.C, L)
-        return {"share_of_box_unknown": _reason(plant.C)} if share is None else {"share_of_box": share}
+        share = _share(plant.box_rows, L)
+        return {"share_of_box_unknown": _reason(plant.box_rows)} if share is None else {"share_of_box": share}
     kept = plant.n - stored
-    rows = plant.C[plant.C[:, :kept].any(axis=1)]
+    rows = plant.box_rows[plant.box_rows[:, :kept].any(axis=1)]
     if rows[:, kept:].any() or np.linalg.matrix_rank(rows[:, :kept]) < kept:
         return {"share_of_box_unknown": "the box of the states depends on inputs under way, or is unbounded"}
     share = _share(rows[:, :kept], np.linalg.inv(np.linalg.inv(L)[:kept, :kept]))

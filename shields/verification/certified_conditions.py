@@ -73,14 +73,14 @@ def _bound_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[
     weight = rational(plant.relative_weight)
     required = _with_declared(_sum_bound(ball, noise, weight), plant.disturbance_bound, weight)
     required = _with_declared(required, plant.remainder_bound, weight)
-    bound, (D, _) = rational(plant.disturbance.shape), certificate.disturbances()
+    bound, (D, _) = rational(plant.disturbance.shape_matrix), certificate.disturbances()
     yield matrix_condition("D: the plant's holds the disturbance and the process noise", subtract(bound, required))
     yield matrix_condition("D: the certificate's holds the plant's", subtract(rational(D), bound))
     identity = rational(np.eye(plant.p))
     sensor = scale(Fraction(plant.sensor_noise.energy), rational(plant.measurement_noise_cov))
     sensor = _with_declared(sensor, plant.sensor_bound, identity)
     if certificate.updates is None:
-        yield matrix_condition("N: holds the sensor noise", subtract(rational(plant.sensor_error.shape), sensor))
+        yield matrix_condition("N: holds the sensor noise", subtract(rational(plant.sensor_error.shape_matrix), sensor))
     else:
         step = Fraction(certificate.updates.contract.quantization_step)
         required = _sum_bound(scale(plant.p * step * step / 4, identity), sensor, identity)
@@ -88,7 +88,7 @@ def _bound_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[
         yield matrix_condition("N: holds the sensor noise and the quantization error", difference)
     first = _first_error(plant, weight)
     yield matrix_condition(
-        "r0: holds the error of the first estimate", subtract(rational(plant.initial_error.shape), first)
+        "r0: holds the error of the first estimate", subtract(rational(plant.initial_error.shape_matrix), first)
     )
 
 
@@ -101,7 +101,7 @@ def _first_error(plant: LinearPlant, weight: Matrix) -> Matrix:
     noise = scale(Fraction(plant.initial_noise.energy), rational(plant.initial_cov))
     if plant.initial_bound is None:
         return noise
-    declared = rational(plant.initial_bound.shape)
+    declared = rational(plant.initial_bound.shape_matrix)
     ball = scale(Fraction(plant.initial_radius_squared), rational(np.eye(plant.n)))
     if not (any(map(any, noise)) and any(map(any, declared))):
         return add(noise, declared)
@@ -116,7 +116,7 @@ def _error_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[
     next_shapes = [rational(shape) for shape in certificate.next_error_shapes]
     is_by_age = certificate.updates is not None
     name = "(C0) Sigma_0 - r0^2 I >= 0" if is_by_age else "(E0) Sigma - r0^2 I >= 0"
-    yield matrix_condition(name, subtract(shapes[0], rational(plant.initial_error.shape)))
+    yield matrix_condition(name, subtract(shapes[0], rational(plant.initial_error.shape_matrix)))
     for j, (proof, Sigma, following) in enumerate(zip(certificate.proofs, shapes, next_shapes, strict=True)):
         lam = Fraction(proof.rate)
         predicted = add(scale(1 / lam, congruence(A, Sigma)), scale(1 / (1 - lam), D))
@@ -147,7 +147,7 @@ def _safe_set_conditions(certificate: Certificate, plant: LinearPlant) -> Iterat
     BK, (D, s) = multiply(B, K), certificate.disturbances()
     D_u = _with_action_rounding(rational(D), B, plant.u_max, Fraction(s))
     closed_loop = congruence(add(rational(plant.A), BK), L)
-    for j, row in enumerate(plant.C):
+    for j, row in enumerate(plant.box_rows):
         yield scalar_condition(f"(S) c_{j + 1} L c_{j + 1}' <= 1", 1 - quadratic(rational(row), L))
     for age, proof in enumerate(certificate.proofs):
         label = "" if certificate.updates is None else f" at age {age}"
@@ -172,7 +172,7 @@ def _with_action_rounding(D: Matrix, B: Matrix, u_max: np.ndarray, s: Fraction) 
 
 def _with_declared(first: Matrix, declared: Ellipsoid | None, weight: Matrix) -> Matrix:
     """Returns a shape around E(first) plus a declared bound, if there is one."""
-    return first if declared is None else _sum_bound(first, rational(declared.shape), weight)
+    return first if declared is None else _sum_bound(first, rational(declared.shape_matrix), weight)
 
 
 def _sum_bound(first: Matrix, second: Matrix, weight: Matrix) -> Matrix:

@@ -48,8 +48,8 @@ def test_it_counts_what_a_plain_loop_counts(certificate):
     for e, record in enumerate(played.episodes):
         assert (record.index, record.steps) == (e, 200)
         assert record.episode_return == pytest.approx(total[e])
-        assert record.violation_steps == (np.abs(states[1:, e] @ plant.C.T).max(axis=1) > 1.0).sum() > 0
-        assert record.estimate_violation_steps == (np.abs(estimates[1:, e] @ plant.C.T).max(axis=1) > 1.0).sum()
+        assert record.violation_steps == (np.abs(states[1:, e] @ plant.box_rows.T).max(axis=1) > 1.0).sum() > 0
+        assert record.estimate_violation_steps == (np.abs(estimates[1:, e] @ plant.box_rows.T).max(axis=1) > 1.0).sum()
         assert record.largest_level == pytest.approx(max(x @ certificate.M @ x for x in states[:, e]))
         assert not record.guaranteed
     np.testing.assert_array_equal(played.trajectory.states, states[:, 0])

@@ -39,7 +39,7 @@ def test_training_counts_every_violating_step(monkeypatch):
     class Counter(VectorWrapper):
         def step(self, actions):
             result = self.env.step(actions)
-            states = result[4]["state"] @ self.env.unwrapped.plant.C.T
+            states = result[4]["state"] @ self.env.unwrapped.plant.box_rows.T
             counted.extend((np.abs(states).max(axis=1) > 1.0).tolist())
             return result
 
@@ -279,8 +279,10 @@ def test_untrained_agent_is_reproducible():
         ("SAC", {"gae_lambda": 0.9}, "SAC: unknown hyperparameter 'gae_lambda'; .* noise_std.* buffer_size"),
         ("PPO", {"noise_std": 0.1}, "unknown hyperparameter 'noise_std'"),
         ("PPO", {"device": "cuda"}, "unknown hyperparameter 'device'"),
-        ("PPO", {"n_epochs": 1.5}, "n_epochs cannot be 1.5"),
-        ("PPO", {"n_epochs": True}, "n_epochs cannot be True"),
+        ("PPO", {"vf_coef": "high"}, "vf_coef cannot be 'high'"),
+        ("PPO", {"vf_coef": True}, "vf_coef cannot be True"),
+        ("PPO", {"n_epochs": 1.5}, "n_epochs must be a whole number >= 1, got 1.5"),
+        ("PPO", {"n_epochs": 0}, "n_epochs must be a whole number >= 1, got 0"),
         ("PPO", {"clip_range": [0.2]}, "clip_range cannot be"),
         ("PPO", {"learning_rate": -1.0}, "PPO: Invalid learning rate: -1.0; its hyperparameters are"),
         ("PPO", {"learning_rate": "lin_fast"}, "PPO: could not convert"),
@@ -298,7 +300,7 @@ def test_untrained_agent_is_reproducible():
         ("TD3", {"gamma": "high"}, r"gamma must be in \[0, 1\], got 'high'"),
         ("TD3", {"noise_std": -0.1}, "TD3: noise_std must be >= 0"),
         ("TD3", {"noise_type": "pink"}, "TD3: noise_type cannot be 'pink'"),
-        ("SAC", {"buffer_size": -1}, "SAC: .*; its hyperparameters are"),
+        ("SAC", {"buffer_size": -1}, "buffer_size must be a whole number >= 1, got -1"),
         ("PPO", {"policy_kwargs": {"activation_fn": print}}, "hyperparameters must be JSON values"),
         ("PPO", {"learning_rate": np.nan}, "hyperparameters must be JSON values"),
     ],

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from agents.results import Episode, TrainingPoint, Trajectory
-from experiments.analysis.summary import paired_differences, summarize_arm
+from experiments.analysis.episodes import episodes_table
+from experiments.analysis.summary import arm_summary, paired_differences
 from experiments.runs.arms import Arm
 from experiments.runs.training_run import RunResult
 
@@ -60,15 +61,15 @@ def summary_of(results: dict[str, list[RunResult]], **settings: Any) -> dict[str
 
     def arm(name: str) -> dict[str, Any]:
         mode = Arm.of(name, "project").mode
-        return {"mode": mode, "shielded": mode not in (None, "monitor")} | summarize_arm(
-            results[name], fixed_policy=False
-        )
+        summary = arm_summary(episodes_table(results[name]), mode, fixed_policy=False)
+        return summary | {"shielded": mode not in (None, "monitor")}
 
     baseline = next(iter(results))
+    episodes = episodes_table(run for runs in results.values() for run in runs)
     return {
         "arms": {name: arm(name) for name in results},
         "references": {},
-        "paired_differences": {"baseline": baseline, "arms": paired_differences(results, baseline)},
+        "paired_differences": {"baseline": baseline, "arms": paired_differences(episodes, baseline)},
     } | provenance(arms=list(results), **settings)
 
 
@@ -76,7 +77,7 @@ def provenance(**settings: Any) -> dict[str, Any]:
     """Settings, plant, certificate and versions as in a summary."""
     own = {"env": "ncs_gym/TruckTrailer-v0", "algo": "PPO", "mode": "project", "seed": 5, "seeds": 2, "steps": 100}
     own |= {"episodes": 2, "intervention_penalty": 0.25, "violation_penalty": 3.0}
-    own |= {"ppo": {"envs": 64}, "a2c": {"envs": 32}, "off_policy": {"buffer_size": 77}, "certificate": None}
+    own |= {"hyperparams": {"n_envs": 64, "policy_kwargs": {"net_arch": [8, 8]}}, "certificate": None}
     return {
         "settings": own | settings,
         "plant": {"fingerprint": "f" * 64, "spectral_radius": 0.9},

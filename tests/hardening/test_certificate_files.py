@@ -125,16 +125,16 @@ def assert_true(certificate, plant):
     angles = np.linspace(0.0, np.pi, 361)
     a = np.column_stack([np.cos(angles), np.sin(angles)])
     L, K, room = certificate.L, certificate.K, 1.0 + 1e-9
-    D = support(plant.disturbance.shape, a)
+    D = support(plant.disturbance.shape_matrix, a)
     closed, gain = plant.A + plant.B @ K, plant.B @ K
-    assert (support(L, plant.C) <= room).all()
+    assert (support(L, plant.box_rows) <= room).all()
     assert (np.linalg.eigvalsh(L) > 0.0).all()
     for Sigma in certificate.error_shapes:
         moved = support(closed @ L @ closed.T, a) + support(gain @ Sigma @ gain.T, a) + D
         assert (moved <= room * support(L, a)).all()
         assert (support(L, K) + support(Sigma, K) <= room * plant.u_max).all()
     shapes = [certificate.error_shapes[0], *certificate.next_error_shapes]
-    assert (support(plant.initial_error.shape, a) <= room * support(shapes[0], a)).all()
+    assert (support(plant.initial_error.shape_matrix, a) <= room * support(shapes[0], a)).all()
     for older, newer in zip(shapes[1:], shapes[:-1], strict=True):
         assert (support(plant.A @ newer @ plant.A.T, a) + D <= room * support(older, a)).all()
     if certificate.updates is not None:

@@ -33,8 +33,8 @@ def test_the_disturbance_bound_does_not_depend_on_units():
     for seed in range(5):
         plant = badly_scaled_plant(seed, 4, 1, 6.0, 0.99)
         widths = plant.half_widths
-        parts = np.sqrt(plant.gamma) + np.sqrt(np.diag(plant.process_noise.bound.shape))
-        assert (np.sqrt(np.diag(plant.disturbance.shape)) <= 2.0 * np.maximum(parts, 1e-5 * widths)).all()
+        parts = np.sqrt(plant.gamma) + np.sqrt(np.diag(plant.process_noise.bound.shape_matrix))
+        assert (np.sqrt(np.diag(plant.disturbance.shape_matrix)) <= 2.0 * np.maximum(parts, 1e-5 * widths)).all()
 
 
 def judged(plant, contract=None):

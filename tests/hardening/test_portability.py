@@ -61,7 +61,7 @@ def all_plants():
 def derived(plant):
     """Every number that a proof takes from a plant, as text."""
     bounds = (plant.disturbance, plant.sensor_error_with(0.01), plant.initial_error)
-    numbers = [plant.fingerprint, *(bound.shape.tolist() for bound in bounds)]
+    numbers = [plant.fingerprint, *(bound.shape_matrix.tolist() for bound in bounds)]
     return json.dumps([*numbers, plant.relative_weight.tolist(), plant.initial_radius_squared, plant.u_max.tolist()])
 
 
@@ -167,7 +167,7 @@ def test_agent_and_finished_runs_of_one_processor_are_taken_by_another(tmp_path)
         "--references",
         "lqr",
     )
-    compare = (*compare, "--ppo.envs", "4", "--ppo.rollout", "16", "--ppo.batch-size", "64")
+    compare = (*compare, "--hyperparams", "n_envs=4", "n_steps=16", "batch_size=64")
     under("Haswell", *compare)
     files = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("units/*.json")}
     assert files
@@ -210,7 +210,7 @@ def reordered(certificate, plant, order):
     """Certificate and plant with the states in another order; the proof of the certificate does not change."""
     square = np.ix_(order, order)
     bounds = {
-        name: bound and ncs_gym.Ellipsoid(bound.shape[np.ix_(*2 * [order[: bound.dim]])])
+        name: bound and ncs_gym.Ellipsoid(bound.shape_matrix[np.ix_(*2 * [order[: bound.dim]])])
         for name, bound in (("disturbance_bound", plant.disturbance_bound), ("initial_bound", plant.initial_bound))
     }
     names = {name: [getattr(plant, name)[i] for i in order] for name in ("state_names", "state_units")}
@@ -218,7 +218,7 @@ def reordered(certificate, plant, order):
         plant,
         A=plant.A[square],
         B=plant.B[order],
-        box=plant.C[:, order],
+        box=plant.box_rows[:, order],
         H=plant.H[:, order],
         process_noise_cov=plant.process_noise_cov[square],
         initial_cov=plant.initial_cov[square],
@@ -251,10 +251,13 @@ def is_inside_exactly(certificate, plant, x_hat, shape, u):
     center = [sum(a * b[0] for a, b in zip(row, column, strict=True)) for row in both]
     moved, D, L = (
         congruence(rational(plant.A), rational(shape)),
-        rational(plant.disturbance.shape),
+        rational(plant.disturbance.shape_matrix),
         rational(certificate.L),
     )
-    sizes = [np.sqrt(np.trace(certificate.M @ part)) for part in (plant.A @ shape @ plant.A.T, plant.disturbance.shape)]
+    sizes = [
+        np.sqrt(np.trace(certificate.M @ part))
+        for part in (plant.A @ shape @ plant.A.T, plant.disturbance.shape_matrix)
+    ]
     nus = np.clip(sizes[0] / sum(sizes) + np.linspace(-0.02, 0.02, 9), 1e-9, 1.0 - 1e-9)
     M, c = certificate.M, np.array([float(x) for x in center])
     for nu in map(Fraction, nus.tolist()):

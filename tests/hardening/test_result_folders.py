@@ -11,19 +11,19 @@ from hypothesis import strategies as st
 
 from agents.loop import LoopConfig, ShieldSettings
 from agents.sharing.agent_file import AgentError
-from experiments.analysis.arm_table import summary_text
-from experiments.analysis.parquet_tables import write_tables
+from experiments.analysis.episodes import episodes_table, parquet, training_table
 from experiments.analysis.summary import arm_summary
+from experiments.analysis.tables import summary_text
 from experiments.attack.counts_store import CountsStore
 from experiments.attack.counts_table import counts_table
 from experiments.attack.monte_carlo_batch import MonteCarloBatch
 from experiments.attack.safety_counts import SafetyCounts
 from experiments.errors import ResultsError
 from experiments.runs import claim_folder, prepare_output
-from experiments.runs.provenance import json_digest
 from experiments.runs.run_store import RunStore
 from experiments.runs.training_run import TrainingRun, _agent_of, execute_run
 from experiments.settings import CertifySettings, CompareSettings
+from shields.json_documents import digest
 from tests.command import assert_one_sentence, ncs
 from tests.fuzz import JSON_VALUES, examples
 
@@ -85,7 +85,7 @@ def forged(folder, run, change):
     path = file_of(folder, run)
     document = json.loads(path.read_bytes())
     change(document["result"])
-    path.write_text(json.dumps(document | {"sha256": json_digest(document["result"])}))
+    path.write_text(json.dumps(document | {"sha256": digest(document["result"])}))
 
 
 def everything_in(folder):
@@ -261,7 +261,7 @@ def assert_refused_or_usable(data, folder, run):
     content = json.loads(before)["result"]
     at = data.draw(st.sampled_from(list(places_in(content))), label="at")
     other = replaced(content, at, data.draw(JSON_VALUES, label="by"))
-    document = json.loads(before) | {"result": other, "sha256": json_digest(other)}
+    document = json.loads(before) | {"result": other, "sha256": digest(other)}
     try:
         file_of(folder, run).write_text(json.dumps(document))
         result = RunStore(folder).load(run)
@@ -269,10 +269,12 @@ def assert_refused_or_usable(data, folder, run):
         return
     finally:
         file_of(folder, run).write_bytes(before)
-    arms = {run.arm: arm_summary([result], "project", fixed_policy=False)}
+    episodes = episodes_table([result])
+    arms = {run.arm: arm_summary(episodes, "project", fixed_policy=False)}
     json.dumps(arms, allow_nan=False)
     summary_text(arms, {})
-    write_tables(folder, [result], {})
+    parquet(episodes, {})
+    parquet(training_table([result]), {})
 
 
 @given(data=st.data())
@@ -295,7 +297,7 @@ COUNTS = SafetyCounts(steps=800, episodes=4, interventions=10, level=0.5)
 def tally_line(**change):
     """A line of tallies.jsonl with a right checksum."""
     content = {"key": "key", "case": "case", "index": 0, "tally": asdict(COUNTS)} | change
-    return json.dumps({"sha256": json_digest(content), **content}) + "\n"
+    return json.dumps({"sha256": digest(content), **content}) + "\n"
 
 
 @pytest.mark.parametrize(

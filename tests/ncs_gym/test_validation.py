@@ -27,13 +27,13 @@ def test_settings_do_not_share_memory_with_what_they_were_made_from():
     shape = np.eye(2)
     ellipsoid = Ellipsoid(shape)
     shape[0, 0] = 5.0
-    assert ellipsoid.shape[0, 0] == 1.0
+    assert ellipsoid.shape_matrix[0, 0] == 1.0
 
 
 def test_derived_bounds_survive_pickling_read_only():
     plant = truck_trailer()
-    bound = plant.disturbance.shape.copy()
+    bound = plant.disturbance.shape_matrix.copy()
     twin = pickle.loads(pickle.dumps(plant))
-    np.testing.assert_array_equal(twin.disturbance.shape, bound)
-    assert not twin.disturbance.shape.flags.writeable
+    np.testing.assert_array_equal(twin.disturbance.shape_matrix, bound)
+    assert not twin.disturbance.shape_matrix.flags.writeable
     assert twin.fingerprint == plant.fingerprint

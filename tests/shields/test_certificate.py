@@ -26,7 +26,7 @@ def test_saving_and_loading_is_exact(certificate, path):
 def test_matrix_and_sets_are_derived_from_L(certificate):
     np.testing.assert_allclose(certificate.M @ certificate.L, np.eye(2), atol=1e-12)
     assert isinstance(certificate.safe_set, Ellipsoid)
-    np.testing.assert_array_equal(certificate.error_set.shape, certificate.Sigma)
+    np.testing.assert_array_equal(certificate.error_set.shape_matrix, certificate.Sigma)
 
 
 def test_arrays_are_read_only_even_after_pickling(certificate):

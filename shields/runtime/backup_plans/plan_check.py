@@ -36,8 +36,8 @@ class PlanTest:
     def __init__(self, prediction: Prediction, margin: float) -> None:
         self.prediction, self._margin = prediction, margin
         plant, ends = prediction.plant, prediction.ends
-        self._rows = plant.C
-        sizes = np.abs(plant.C) @ prediction.size_free
+        self._rows = plant.box_rows
+        sizes = np.abs(plant.box_rows) @ prediction.size_free
         self._row_rounding = (prediction.rounding[:, None, None] * sizes).reshape(-1, plant.n).T
         self._end_rounding = np.array([end.rounding * end.columns for end in ends]).T
         # Where in the table the tightenings of a shape are.
@@ -108,7 +108,7 @@ class PlanTest:
     @np.errstate(all="ignore")
     def knows_in_box(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
         """Returns whether |c_i x_hat| + sqrt(c_i Sigma_k c_i') <= 1 for all rows, which proves that x is in the box."""
-        rows, extents = self.prediction.plant.C, np.sqrt(np.diag(error_shape))
+        rows, extents = self.prediction.plant.box_rows, np.sqrt(np.diag(error_shape))
         rounding = float(self.prediction.rounding[0])
         size = np.abs(rows) @ extents
         reach = np.sqrt(np.maximum(((rows @ error_shape) * rows).sum(axis=1), 0.0) + rounding * size**2)
@@ -208,13 +208,13 @@ class EndTest(OneStepTest):
         self.effect = read_only(self.root @ prediction.forced[index])
         self.columns = read_only(np.linalg.norm(size @ prediction.size_free[index], axis=0))
         self.pushed = float(np.linalg.norm(size @ prediction.size_forced[index]))
-        extents = np.sqrt(np.diag(plant.disturbance.shape))
+        extents = np.sqrt(np.diag(plant.disturbance.shape_matrix))
         parts = []
         for i in range(steps):
             root = self.root @ prediction.free[i - 1] if i else self.root
             reach = size @ prediction.size_free[i - 1] if i else size
             room = self.rounding * float(np.linalg.norm(reach, axis=0) @ extents) ** 2
-            parts.append(root @ plant.disturbance.shape @ root.T + room * np.eye(n))
+            parts.append(root @ plant.disturbance.shape_matrix @ root.T + room * np.eye(n))
         widths = np.sqrt([np.trace(part) for part in parts])
         widths = np.maximum(widths, SMALLEST_MULTIPLIER * widths.max())
         D = sum(part * (widths.sum() / width) for part, width in zip(parts, widths, strict=True))
@@ -250,13 +250,13 @@ def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
         shapes: Sigma_k, shape (E, n, n).
     """
     plant, rounding = prediction.plant, prediction.rounding[:, None]
-    rows, sizes = plant.C @ prediction.free, np.abs(plant.C) @ prediction.size_free
-    earlier = np.concatenate([plant.C[None], rows[:-1]])
-    earlier_sizes = np.concatenate([np.abs(plant.C)[None], sizes[:-1]])
-    disturbed = np.cumsum(_supports(earlier, earlier_sizes, plant.disturbance.shape[None], rounding)[0], axis=0)
+    rows, sizes = plant.box_rows @ prediction.free, np.abs(plant.box_rows) @ prediction.size_free
+    earlier = np.concatenate([plant.box_rows[None], rows[:-1]])
+    earlier_sizes = np.concatenate([np.abs(plant.box_rows)[None], sizes[:-1]])
+    disturbed = np.cumsum(_supports(earlier, earlier_sizes, plant.disturbance.shape_matrix[None], rounding)[0], axis=0)
     symmetric = 0.5 * (shapes + shapes.swapaxes(1, 2))
     reach = (_supports(rows, sizes, symmetric, rounding) + disturbed) * (1.0 + rounding)
-    pushed = rounding * (prediction.size_forced @ np.abs(plant.C).T)
+    pushed = rounding * (prediction.size_forced @ np.abs(plant.box_rows).T)
     nothing = np.empty((0, *shapes.shape[1:]))
     errors = [predicted_errors(end, shapes, nothing) for end in prediction.ends]
     radius = np.stack([each.radius for each in errors], axis=1)

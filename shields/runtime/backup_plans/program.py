@@ -37,14 +37,14 @@ class PlanProgram:
         self._free = prediction.free
         self._end = read_only(prediction.forced[-1] * scale)
         forced = prediction.forced[:-1] * scale
-        rows = (plant.C @ forced).reshape(-1, len(scale))
+        rows = (plant.box_rows @ forced).reshape(-1, len(scale))
         self._rows = read_only(np.concatenate([rows, -rows]))
         self._reserve = SOLVER_RESERVE + float(ACTION_ROUNDING) * np.abs(rows).sum(axis=1)
         root = prediction.ends[-1].root
         self._end_reserve = SOLVER_RESERVE + float(ACTION_ROUNDING) * float(
             np.linalg.norm(root @ self._end, axis=0).sum()
         )
-        self._C = plant.C
+        self._C = plant.box_rows
         self._arrange(root)
         self._solver: Any = None
 

@@ -42,7 +42,7 @@ def bound_conditions(D: Any, updates: Updates | None, plant: LinearPlant) -> Ite
         plant: The plant.
     """
     weight, quantizer = plant.relative_weight, np.eye(plant.p)
-    own = matrix(plant.disturbance.shape)
+    own = matrix(plant.disturbance.shape_matrix)
     ball = _part(number(plant.gamma) * identity(plant.n), weight)
     declared = [_declared(bound, weight) for bound in (plant.disturbance_bound, plant.remainder_bound)]
     disturbed = [ball, _noise(plant.process_noise, weight), *declared]
@@ -50,7 +50,7 @@ def bound_conditions(D: Any, updates: Updates | None, plant: LinearPlant) -> Ite
     yield definite("D: the certificate's holds the plant's", D - own)
     sensed = [_noise(plant.sensor_noise, quantizer), _declared(plant.sensor_bound, quantizer)]
     if updates is None:
-        yield _holds_sum("N: holds the sensor noise", matrix(plant.sensor_error.shape), sensed)
+        yield _holds_sum("N: holds the sensor noise", matrix(plant.sensor_error.shape_matrix), sensed)
     else:
         step = number(updates.contract.quantization_step)
         box = plant.p * step * step / 4 * identity(plant.p)  # in the ball around the box of |v_i| <= step/2
@@ -58,7 +58,7 @@ def bound_conditions(D: Any, updates: Updates | None, plant: LinearPlant) -> Ite
         yield _holds_sum("N: holds the sensor noise and the quantization error", matrix(updates.noise), sensed)
     radius = _part(number(plant.initial_radius_squared) * identity(plant.n), weight).size
     first = [_noise(plant.initial_noise, weight)._replace(size=radius), _declared(plant.initial_bound, weight)]
-    yield _holds_sum("r0: holds the error of the first estimate", matrix(plant.initial_error.shape), first)
+    yield _holds_sum("r0: holds the error of the first estimate", matrix(plant.initial_error.shape_matrix), first)
     yield from _truncations(plant)
 
 
@@ -91,7 +91,7 @@ def _noise(noise: TruncatedGaussian, weight: np.ndarray) -> Part:
 
 def _declared(bound: Ellipsoid | None, weight: np.ndarray) -> Part:
     """Returns a declared bound; zero if there is none."""
-    return _part(matrix(np.zeros_like(weight) if bound is None else bound.shape), weight)
+    return _part(matrix(np.zeros_like(weight) if bound is None else bound.shape_matrix), weight)
 
 
 def _part(shape: Any, weight: np.ndarray) -> Part:

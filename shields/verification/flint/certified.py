@@ -75,7 +75,7 @@ def _error_conditions(certificate: Certificate, D: Any, plant: LinearPlant) -> I
     """Checks (E0) and (E1) of one error set, or (C0), (C1) and (C2) of one for every age."""
     A, updates = matrix(plant.A), certificate.updates
     sets, rates = [matrix(proof.Sigma) for proof in certificate.proofs], [proof.rate for proof in certificate.proofs]
-    start = sets[0] - matrix(plant.initial_error.shape)
+    start = sets[0] - matrix(plant.initial_error.shape_matrix)
     if updates is None:
         yield definite("(E0) Sigma - r0^2 I >= 0", start)
         name = "(E1) Sigma - A Sigma A'/lam_e - D/(1-lam_e) >= 0"
@@ -98,7 +98,7 @@ def _safe_set_conditions(certificate: Certificate, D: Any, plant: LinearPlant) -
     L, B = matrix(certificate.L), matrix(plant.B)
     K_rows = [matrix(row) for row in certificate.K]
     yield definite("L > 0", L, strictly=True)
-    for j, row in enumerate(plant.C):
+    for j, row in enumerate(plant.box_rows):
         yield at_least_zero(f"(S) c_{j + 1} L c_{j + 1}' <= 1", 1 - form(matrix(row), L))
     BK, s = B * matrix(certificate.K), number(certificate.disturbances()[1])
     moved = mapped(matrix(plant.A) + BK, L)

@@ -35,7 +35,7 @@ def paper_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[C
     if not fits:
         return
     for bound in (plant.disturbance_bound, plant.remainder_bound, plant.sensor_bound, plant.initial_bound):
-        if bound is not None and np.any(bound.shape):
+        if bound is not None and np.any(bound.shape_matrix):
             yield is_so("bounds: the paper's theorems know gamma and covariances alone", False)
             return
     stated = certificate.constants()
@@ -65,7 +65,7 @@ def _set_conditions(
     with ctx.workprec(PRECISION):
         alpha = constants.alpha.upper().fmpq()
     yield definite("(C2) L >= alpha I", L - alpha * identity(n))
-    for j, row in enumerate(plant.C):
+    for j, row in enumerate(plant.box_rows):
         yield at_least_zero(f"(C3) c_{j + 1} L c_{j + 1}' <= 1", 1 - form(matrix(row), L))
     for i, limit in enumerate(plant.u_max):
         row = matrix(certificate.K[i])

@@ -4,13 +4,12 @@ import re
 
 import pytest
 
-from experiments.analysis.arm_table import condition_text, summary_text
-from experiments.analysis.sweep_table import sweep_table
+from experiments.analysis.tables import condition_text, summary_text, sweep_table
 from experiments.backends.execution import _described
 from experiments.commands.compare import _findings
 from experiments.report.html import _decimal, _interval
-from experiments.study.study_summary import page_summary, study_summary
-from experiments.study.study_tables import evaluation_table, pairs_table, price_table, scores_table, simpler_table
+from experiments.study.summary import page_summary, study_summary
+from experiments.study.tables import evaluation_table, pairs_table, price_table, scores_table, simpler_table
 from tests.experiments.results import run, summary_of
 
 # Returns whose mean lies just below zero, and so do both ends of its interval.

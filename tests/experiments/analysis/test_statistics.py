@@ -1,13 +1,15 @@
 import numpy as np
 import pytest
-from scipy.stats import binom, norm
+from scipy.stats import binom, norm, ttest_1samp
 
 from experiments.analysis.statistics import (
+    all_pairs,
     bootstrap_interval,
     clopper_pearson,
+    holm,
     interquartile_mean,
     mean_interval,
-    stratified_interval,
+    paired_difference,
 )
 
 
@@ -62,20 +64,69 @@ def test_interquartile_mean_is_that_of_the_middle_half():
     np.testing.assert_array_equal(interquartile_mean([[0.0, 1.0, 3.0, 9.0], [1.0] * 4], axis=1), [2.0, 1.0])
 
 
-def test_stratified_interval_of_one_stratum_is_that_of_the_bootstrap():
-    values = np.random.default_rng(3).exponential(size=30)
-    stratified, plain = stratified_interval([values]), bootstrap_interval(values, interquartile_mean)
-    assert stratified == pytest.approx(plain, abs=0.03)
-
-
 def test_stratified_interval_keeps_the_share_of_every_stratum():
     # Resampled together, the mean would vary with how often each stratum is drawn.
     strata = [[0.0, 0.0, 0.0], [100.0, 100.0, 100.0]]
-    assert stratified_interval(strata, np.mean) == (50.0, 50.0)
+    assert bootstrap_interval(*strata) == [50.0, 50.0]
     low, high = bootstrap_interval(np.concatenate(strata))
     assert high - low > 50.0
 
 
 def test_stratified_interval_needs_two_runs_in_every_stratum():
-    assert stratified_interval([[1.0, 2.0], [1.0]]) is None
-    assert stratified_interval([]) is None
+    assert bootstrap_interval([1.0, 2.0], [1.0]) is None
+    assert bootstrap_interval() is None
+
+
+def test_paired_difference_is_the_one_sample_test_of_the_differences():
+    rng = np.random.default_rng(1)
+    first, second = rng.normal(1.0, 1.0, 8), rng.normal(0.0, 2.0, 8)
+    found, test = paired_difference(first, second), ttest_1samp(first - second, 0.0)
+    assert found["p"] == pytest.approx(test.pvalue)
+    assert found["ci95"] == pytest.approx(list(test.confidence_interval(0.95)))
+    assert found["mean"] == pytest.approx((first - second).mean())
+
+
+def test_pairing_finds_what_independent_samples_would_hide():
+    noise = np.random.default_rng(0).normal(0.0, 100.0, 10)
+    shift = 1.0 + 0.01 * np.arange(10)
+    assert paired_difference(noise + shift, noise)["p"] < 1e-6
+    assert paired_difference(noise + shift, noise[::-1])["p"] > 0.5
+
+
+@pytest.mark.parametrize(("difference", "runs", "p"), [(0.0, 5, 1.0), (0.25, 5, 1 / 16), (-1.0, 3, 1 / 4)])
+def test_equal_differences_are_no_proof_beyond_the_sign_flip_test(difference, runs, p):
+    assert paired_difference([difference] * runs, [0.0] * runs)["p"] == p
+
+
+def test_a_single_run_has_neither_interval_nor_p_value():
+    assert paired_difference([2.0], [1.0]) == {"mean": 1.0, "ci95": None, "p": None}
+    assert all_pairs({"one": [2.0], "other": [1.0]})[0]["p_holm"] is None
+
+
+@pytest.mark.parametrize("second", [[], [1.0, 2.0]])
+def test_runs_that_are_not_paired_are_refused(second):
+    with pytest.raises(ValueError, match="equally many"):
+        paired_difference([1.0] if second else [], second)
+
+
+def test_holm_adjusts_as_in_the_textbook():
+    # alpha 0.05, p = 0.01, 0.04, 0.03, 0.005: the two smallest are rejected (Wikipedia, "Holm-Bonferroni method").
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([]) == []
+    assert holm([0.7, 0.9]) == [1.0, 1.0]
+
+
+def test_holm_keeps_the_family_wise_error_where_single_tests_do_not():
+    p_values = np.random.default_rng(0).uniform(size=(2000, 20))
+    assert np.mean(p_values.min(axis=1) < 0.05) > 0.5
+    assert np.mean([min(holm(row.tolist())) < 0.05 for row in p_values]) == pytest.approx(0.05, abs=0.015)
+
+
+def test_all_pairs_are_there_once_and_adjusted_together():
+    rng = np.random.default_rng(0)
+    values = {name: rng.normal(mean, 0.1, 6).tolist() for name, mean in (("a", 0.0), ("b", 0.0), ("c", 9.0))}
+    pairs = all_pairs(values)
+    assert [(pair["first"], pair["second"]) for pair in pairs] == [("a", "b"), ("a", "c"), ("b", "c")]
+    assert [pair["p_holm"] for pair in pairs] == holm([pair["p"] for pair in pairs])
+    assert pairs[1]["mean"] == pytest.approx(-9.0, abs=0.3)
+    assert pairs[0]["p_holm"] > 0.05 > pairs[1]["p_holm"]

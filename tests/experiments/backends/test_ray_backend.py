@@ -25,7 +25,7 @@ from tests.command import ROOT  # noqa: E402
 pytestmark = pytest.mark.slow
 
 GRID = ["--losses", "0.5", "--delays", "1", "--burst-lengths", "0", "3", "--seeds", "2", "--episodes", "3"]
-GRID += ["--steps", "2048", "--ppo.envs", "4"]
+GRID += ["--steps", "2048", "--hyperparams", "n_envs=4"]
 RUNS = 8
 TIMEOUT = 300.0
 ONE_CORE, HALF_A_CORE = (BackendSettings(engine="ray", cpus_per_run=cpus) for cpus in (1.0, 0.5))
@@ -116,7 +116,7 @@ def lines_of_runs(text):
 
 def assert_same(out, other):
     """Rows, summary and the trained networks are the same, bit for bit."""
-    for name in ("summary.json", "sweep.parquet"):
+    for name in ("summary.json", "episodes.parquet"):
         assert (out / name).read_bytes() == (other / name).read_bytes()
     models = sorted(path.relative_to(out) for path in out.glob("models/*/model.zip"))
     assert len(models) == RUNS
@@ -209,7 +209,7 @@ def test_interrupted_driver_stops_everything_and_keeps_what_is_finished(tmp_path
 
 def test_sweep_begun_locally_is_finished_on_ray(local, tmp_path):
     shutil.copytree(local, tmp_path / "out")
-    for name in ("summary.json", "sweep.parquet"):
+    for name in ("summary.json", "episodes.parquet"):
         (tmp_path / "out" / name).unlink()
     for path in sorted((tmp_path / "out" / "units").glob("*.json"))[:3]:
         path.unlink()

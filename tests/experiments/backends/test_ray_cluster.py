@@ -182,7 +182,9 @@ def test_impossible_address_is_one_sentence(address):
 def test_run_that_fails_locally_is_named_and_the_finished_are_kept(run, tmp_path):
     # Whichever comes first, the good one is finished by then or ends before the workers do.
     bad = replace(run, policy_kind="trained", index=1, algorithm="SAC")  # with settings of PPO
-    with pytest.raises(RunError, match=r"run unshielded-1: SAC takes OffPolicySettings, got PPOSettings") as error:
+    with pytest.raises(
+        RunError, match=r"run unshielded-1: SAC: unknown hyperparameter 'n_epochs'; its hyperparameters are"
+    ) as error:
         results_of([run, bad], tmp_path, BackendSettings(jobs=1))
     assert isinstance(error.value.__cause__, ValueError)
     assert [path.stem for path in (tmp_path / "units").glob("*.json")] == ["unshielded-0"]

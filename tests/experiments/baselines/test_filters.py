@@ -97,7 +97,7 @@ def test_trusting_lookahead_keeps_its_plans_and_leaves_the_safe_set_on_purpose(c
         stored, state = decision.plan, loaded.A @ state + loaded.B @ decision.input
         reasons.add(decision.reason)
         farthest = max(farthest, state @ certificate.M @ state)
-        assert np.abs(loaded.C @ state).max() <= 1.0
+        assert np.abs(loaded.box_rows @ state).max() <= 1.0
     assert {"safe", "planned"} <= reasons
     assert farthest > 0.9
 
@@ -122,7 +122,7 @@ def test_predictive_filter_finds_the_closest_input_with_a_nominal_plan(certifica
         proposed = rng.uniform(-1.0, 1.0, 1) * loaded.u_max
         one = loaded.A @ estimate + first @ loaded.B.T
         two = one @ loaded.A.T + second @ loaded.B.T
-        fine = (np.abs(one @ loaded.C.T) <= 1.0).all(axis=1)
+        fine = (np.abs(one @ loaded.box_rows.T) <= 1.0).all(axis=1)
         fine &= np.einsum("ei,ij,ej->e", two, certificate.M, two) <= 1.0
         if fine.any():
             best = np.abs(first[fine] - proposed).min()
@@ -142,8 +142,8 @@ def test_predictive_filter_keeps_the_box_where_the_model_is_the_truth(certificat
         changed += (u != proposed).any()
         state = loaded.A @ state + loaded.B @ u
         raw = loaded.A @ raw + loaded.B @ proposed
-        assert np.abs(loaded.C @ state).max() <= 1.0 + 1e-5
-        widest = max(widest, np.abs(loaded.C @ raw).max())
+        assert np.abs(loaded.box_rows @ state).max() <= 1.0 + 1e-5
+        widest = max(widest, np.abs(loaded.box_rows @ raw).max())
     assert widest > 1.0
     assert 0 < changed < len(proposals)
 

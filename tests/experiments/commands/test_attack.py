@@ -140,7 +140,7 @@ def test_nature_attains_every_bound(files):
     shield = _shields(CAMPAIGN, CRUISE, files[CRUISE])["project"]
     _, info = shield.reset(seed=1)
     np.testing.assert_allclose([certificate.safe_set.gauge(x) for x in info["state"]], 1.0, atol=1e-8)
-    errors, initial = info["estimation_error"], Ellipsoid(case.plant.initial_noise.bound.shape)
+    errors, initial = info["estimation_error"], Ellipsoid(case.plant.initial_noise.bound.shape_matrix)
     np.testing.assert_allclose([initial.gauge(error) for error in errors], 1.0, atol=1e-8)
     before = info["state"]
     _, _, _, _, info = shield.step(np.zeros((32, 1), np.float32))

@@ -3,14 +3,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents import tuned_settings
+from agents import tuned_hyperparams
+from agents.hyperparams import complete_hyperparams
 from agents.loop import LoopConfig
 from agents.results import Episode
-from experiments.analysis.arm_table import _rows
-from experiments.analysis.summary import covered_fraction, paired_differences, summarize_arm
+from experiments.analysis.episodes import episodes_table
+from experiments.analysis.summary import arm_summary, covered_fraction, paired_differences
+from experiments.analysis.tables import _rows
 from experiments.commands.compare import _findings, _training_runs
 from experiments.runs.arms import Arm, by_arm
-from experiments.runs.run_store import prepare_output
+from experiments.runs.output_folder import prepare_output
 from experiments.runs.training_run import RunResult
 from experiments.settings import CompareSettings
 
@@ -103,9 +105,9 @@ def test_horizon_is_refused_where_it_is_of_no_use(change, words):
 def test_steps_that_live_from_a_plan_have_a_column_where_an_arm_looks_ahead():
     one = result([1.0] * 10, [0] * 10)
     one = replace(one, episodes=[replace(each, planned=i % 2) for i, each in enumerate(one.episodes)])
-    summary = summarize_arm([one], fixed_policy=True)
+    summary = arm_summary(episodes_table([one]), "lookahead", fixed_policy=True)
     assert summary["plan_rate"] == 0.05
-    arms = {"shielded": summary | {"mode": "project"}, "lookahead": summary | {"mode": "lookahead"}}
+    arms = {"shielded": summary | {"mode": "project"}, "lookahead": summary}
     assert [row[-2] for row in _rows(arms)] == ["", "from a", "plan", "-", "5.0 %"]
     assert "from a" not in _rows({"shielded": arms["shielded"]})[1]
 
@@ -116,14 +118,10 @@ def test_unknown_arms_are_refused(name):
         Arm.of(name, "project")
 
 
-@pytest.mark.parametrize(
-    ("algo", "settings"),
-    [("PPO", PPOSettings), ("TRPO", PPOSettings), ("A2C", A2CSettings), ("SAC", OffPolicySettings)],
-)
-def test_settings_reach_every_run(certificate, algo, settings):
-    given = {"ppo": dict(n_envs=3), "a2c": dict(n_envs=3), "off_policy": dict(n_envs=3)}
-    expected = replace(tuned_settings(CRUISE) if algo == "PPO" else settings(), envs=3)
-    for run in runs_of(certificate, steps=7, episodes=9, algo=algo, **given):
+@pytest.mark.parametrize("algo", ["PPO", "TRPO", "A2C", "SAC"])
+def test_settings_reach_every_run(certificate, algo):
+    expected = complete_hyperparams(algo, tuned_hyperparams(CRUISE, algo)) | {"n_envs": 3}
+    for run in runs_of(certificate, steps=7, episodes=9, algo=algo, hyperparams={"n_envs": 3}):
         assert (run.steps, run.episodes, run.algorithm, run.settings) == (7, 9, algo, expected)
 
 
@@ -135,8 +133,12 @@ def result(returns, violations, interventions=0, index=0):
     return RunResult("arm", index, 100, 4, 20, [], episodes, None, {})
 
 
+def summary_of_runs(runs, fixed_policy=False):
+    return arm_summary(episodes_table(runs), None, fixed_policy=fixed_policy)
+
+
 def test_summary_of_an_arm_adds_up():
-    summary = summarize_arm([result([1.0, 3.0], [0, 2], 5), result([5.0, 7.0], [0, 0], 5)], fixed_policy=False)
+    summary = summary_of_runs([result([1.0, 3.0], [0, 2], 5), result([5.0, 7.0], [0, 0], 5, index=1)])
     assert summary["train_steps"] == 200
     assert summary["train_violation_steps"] == 8
     assert summary["train_intervention_rate"] == 0.2
@@ -150,8 +152,8 @@ def test_summary_of_an_arm_adds_up():
 
 
 def test_interval_of_a_fixed_policy_is_over_episodes():
-    runs = [result([1.0, 3.0], [0, 0]), result([5.0, 7.0], [0, 0])]
-    fixed = summarize_arm(runs, fixed_policy=True)["eval_return_ci95"]
+    runs = [result([1.0, 3.0], [0, 0]), result([5.0, 7.0], [0, 0], index=1)]
+    fixed = summary_of_runs(runs, fixed_policy=True)["eval_return_ci95"]
     assert fixed[1] - 4.0 == pytest.approx(3.182 * 2.582 / 2, rel=1e-3)
 
 
@@ -192,19 +194,18 @@ def test_a_shield_that_overrode_nothing_is_not_said_to_have_shown_anything(train
 
 
 def test_interquartile_mean_leaves_the_extreme_runs_out():
-    runs = [result([value, value], [0, 0]) for value in (-1000.0, 1.0, 3.0, 50.0)]
-    summary = summarize_arm(runs, fixed_policy=False)
+    runs = [result([value, value], [0, 0], index=i) for i, value in enumerate((-1000.0, 1.0, 3.0, 50.0))]
+    summary = summary_of_runs(runs)
     assert summary["eval_return_iqm"] == 2.0
     low, high = summary["eval_return_iqm_bootstrap_ci95"]
     assert -1000.0 <= low <= 2.0 <= high <= 50.0
 
 
 def test_paired_differences_are_those_of_runs_with_equal_index():
-    arms = {
-        "unshielded": [result([0.0, 2.0], [1, 1]), result([10.0, 12.0], [1, 0], index=1)],
-        "shielded": [result([-1.0, 1.0], [0, 0]), result([7.0, 9.0], [0, 0], index=1)],
-    }
-    difference = paired_differences(arms, "unshielded")["shielded"]
+    unshielded = [result([0.0, 2.0], [1, 1]), result([10.0, 12.0], [1, 0], index=1)]
+    shielded = [result([7.0, 9.0], [0, 0], index=1), result([-1.0, 1.0], [0, 0])]
+    runs = [replace(run, arm="unshielded") for run in unshielded] + [replace(run, arm="shielded") for run in shielded]
+    difference = paired_differences(episodes_table(runs), "unshielded")["shielded"]
     assert difference["return_mean"] == -2.0  # of -1 and -3
     assert difference["return_ci95"][1] + 2.0 == pytest.approx(12.706, rel=1e-3)
     assert difference["return_bootstrap_ci95"] == [-3.0, -1.0]
@@ -213,7 +214,7 @@ def test_paired_differences_are_those_of_runs_with_equal_index():
 
 
 def test_no_violation_is_printed_with_its_upper_bound():
-    summary = summarize_arm([result([1.0] * 10, [0] * 10)], fixed_policy=True) | {"mode": "monitor"}
+    summary = arm_summary(episodes_table([result([1.0] * 10, [0] * 10)]), "monitor", fixed_policy=True)
     row = _rows({"monitor": summary})[-1]
     assert row[3] == "0 [0.0, 30.8 %]"
     assert row[2] == "(20.0 %)"

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from agents.loop import LoopConfig
-from experiments.analysis.arm_table import condition_text, summary_text
+from experiments.analysis.episodes import episodes_table
 from experiments.analysis.summary import arm_summary
+from experiments.analysis.tables import condition_text, summary_text
 from experiments.runs import RunStore, execute_run, run_of_arm
 from experiments.runs.evaluation_conditions import condition_named, other_conditions, under, worse_channel
 from experiments.settings import CompareSettings
@@ -123,7 +124,7 @@ def test_random_policy_acts_alike_under_every_condition(certificate):
 )
 def test_small_returns_are_printed_with_two_significant_digits(results, mean, half, text):
     interval = None if half is None else [mean - half, mean + half]
-    summary = arm_summary([results["proportional"]], None, fixed_policy=True)
+    summary = arm_summary(episodes_table([results["proportional"]]), None, fixed_policy=True)
     summary |= {"eval_return_mean": mean, "eval_return_ci95": interval}
     printed = summary_text({"proportional": summary}, {})
     assert printed.endswith(f" {text}")
@@ -132,7 +133,7 @@ def test_small_returns_are_printed_with_two_significant_digits(results, mean, ha
 
 def test_summary_and_table_have_a_block_per_condition(results):
     modes = {"proportional": None, "proportional+trusting": "trusting", "proportional+shielded": "project"}
-    arms = {name: arm_summary([results[name]], mode, fixed_policy=True) for name, mode in modes.items()}
+    arms = {name: arm_summary(episodes_table([results[name]]), mode, fixed_policy=True) for name, mode in modes.items()}
     json.dumps(arms, allow_nan=False)
     assert {name: arm["shielded"] for name, arm in arms.items()} == dict.fromkeys(modes, False) | {
         "proportional+shielded": True

@@ -11,8 +11,8 @@ from experiments.runs import certificate_of, execute_run, loop_config, run_of_ar
 from experiments.settings import CompareSettings, changed_channel
 from experiments.study.channel_sweep import SWEPT_CONDITIONS, SWEPT_FILTERS, channel_sweep, trained_agents
 from experiments.study.channel_sweep import _points as points_of
-from experiments.study.study_figures import sweep_figure
-from experiments.study.study_tables import channels_table
+from experiments.study.figures import sweep_figure
+from experiments.study.tables import channels_table
 from ncs_gym.envs.env import ncs_env
 from tests.workers import no_worker_processes
 

@@ -3,16 +3,17 @@ import json
 import numpy as np
 import pytest
 
-from experiments.analysis.paired_tests import paired_difference
-from experiments.study.quoted_tables import quoted, tables_by_name
-from experiments.study.study_figures import study_figures
-from experiments.study.study_summary import page_summary, sound_counterpart, study_summary
-from experiments.study.study_tables import (
+from experiments.analysis.statistics import paired_difference
+from experiments.study.figures import study_figures
+from experiments.study.pages import quoted
+from experiments.study.summary import page_summary, sound_counterpart, study_summary
+from experiments.study.tables import (
     evaluation_table,
     overview_table,
     pairs_table,
     price_table,
     simpler_table,
+    tables_by_name,
     training_table,
 )
 from tests.experiments.results import run, summary_of

@@ -393,7 +393,7 @@ def test_a_plant_of_another_size_gets_defaults_that_fit():
 def test_a_variant_of_the_truck_keeps_the_case_studys_disturbance_and_starts():
     env = make(IDS[0], plant=ncs_gym.truck_trailer(mass=1500.0)).unwrapped
     assert env.disturbance is ncs_gym.registration.CASE_STUDY_BOX
-    assert env.initial_set.shape[0, 0] == pytest.approx(1.9**2)
+    assert env.initial_set.shape_matrix[0, 0] == pytest.approx(1.9**2)
 
 
 def test_linear_ncs_without_a_plant_says_what_it_needs():

@@ -102,7 +102,7 @@ def test_next_step_autoreset_ignores_the_action_and_starts_anew():
             assert not info["input"].any()
             assert not info["measurement_age"].any()
             assert (info["episode_violations"] == info["cost"]).all()
-            np.testing.assert_allclose(info["error_shape"][0], env.unwrapped.plant.initial_error.shape)
+            np.testing.assert_allclose(info["error_shape"][0], env.unwrapped.plant.initial_error.shape_matrix)
         assert (env.unwrapped.steps == step % 6).all()
     np.testing.assert_array_equal(env.unwrapped.episodes, 4)
 

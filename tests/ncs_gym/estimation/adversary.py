@@ -82,9 +82,9 @@ class Attack:
         self.error_set = certified_error_set(plant, contract)
         self.many = VectorEstimator(plant, patterns_of(plant, channel, self.error_set), count)
         self.traffic = Traffic(channel, None if contract is None else contract.max_age, count)
-        self.noise = plant.sensor_error_with(channel.quantization_step).shape
+        self.noise = plant.sensor_error_with(channel.quantization_step).shape_matrix
         self.axes = self._axes()
-        self.error = extreme_points(plant.initial_error.shape, self.axes)
+        self.error = extreme_points(plant.initial_error.shape_matrix, self.axes)
         self.many.begin(np.ones(count, np.bool_), self.error)
         self.state = np.zeros((plant.n, count))
         self.gain = plant.u_max[:, None] * holding_gain(plant)
@@ -107,7 +107,7 @@ class Attack:
         aims = np.arange(self.count) % 3 == 0
         ahead = np.linalg.matrix_power(plant.A.T, AIM - 1 - self.step % AIM) @ self.axes
         outwards = np.linalg.solve(shapes, (plant.A @ self.error).T[:, :, None])[:, :, 0].T
-        d = -extreme_points(plant.disturbance.shape, np.where(aims, ahead, outwards))
+        d = -extreme_points(plant.disturbance.shape_matrix, np.where(aims, ahead, outwards))
         self.state = plant.A @ self.state + plant.B @ u + d
         e = plant.A @ self.error - d
         turn = np.where(np.arange(self.count) % 5 == 1, -1.0, 1.0)

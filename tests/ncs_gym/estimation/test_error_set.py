@@ -49,8 +49,8 @@ def test_error_never_leaves_the_set_without_any_packet(seed):
 def test_set_covers_a_bad_first_estimate():
     plant = truck_trailer(initial_cov=0.2 * np.eye(2))
     errors = certified_error_set(plant)
-    slack = np.linalg.eigvalsh(errors.Sigma - plant.initial_error.shape)[0]
-    grown = plant.A @ errors.Sigma @ plant.A.T / errors.rate + plant.disturbance.shape / (1.0 - errors.rate)
+    slack = np.linalg.eigvalsh(errors.Sigma - plant.initial_error.shape_matrix)[0]
+    grown = plant.A @ errors.Sigma @ plant.A.T / errors.rate + plant.disturbance.shape_matrix / (1.0 - errors.rate)
     assert slack > 0.0
     assert np.linalg.eigvalsh(errors.Sigma - grown)[0] > 0.0
 
@@ -58,7 +58,7 @@ def test_set_covers_a_bad_first_estimate():
 def test_covering_a_bad_first_estimate_costs_less_than_scaling_would():
     plant = truck_trailer(mass=4000.0, initial_cov=np.diag([0.0, 0.05]))
     errors, plain = certified_error_set(plant), certified_error_set(truck_trailer(mass=4000.0))
-    factor = plant.initial_error.shape[0, 0] / np.linalg.eigvalsh(plain.Sigma / 1.1)[0]
+    factor = plant.initial_error.shape_matrix[0, 0] / np.linalg.eigvalsh(plain.Sigma / 1.1)[0]
     assert factor > 1.0
     assert np.trace(errors.Sigma) < factor * np.trace(plain.Sigma)
 
@@ -74,7 +74,7 @@ def test_perfectly_known_plant_has_a_thin_but_full_set():
 def test_flat_disturbance_leaves_slack_in_every_direction():
     plant = truck_trailer(gamma=0.0, process_noise_cov=np.diag([0.0, 1e-4]))
     errors = certified_error_set(plant)
-    grown = plant.A @ errors.Sigma @ plant.A.T / errors.rate + plant.disturbance.shape / (1.0 - errors.rate)
+    grown = plant.A @ errors.Sigma @ plant.A.T / errors.rate + plant.disturbance.shape_matrix / (1.0 - errors.rate)
     assert np.linalg.eigvalsh(errors.Sigma - grown)[0] > 0.0
 
 
@@ -83,7 +83,7 @@ def test_units_do_not_change_the_set():
     base = truck_trailer()
     inverse = np.linalg.inv(units)
     scaled = LinearPlant(
-        A=units @ base.A @ inverse, B=units @ base.B, box=base.C @ inverse, u_max=4.0, dt=0.5, gamma=0.0,
+        A=units @ base.A @ inverse, B=units @ base.B, box=base.box_rows @ inverse, u_max=4.0, dt=0.5, gamma=0.0,
         process_noise_cov=units @ (1e-4 * np.eye(2)) @ units, measurement_noise_cov=np.eye(2),
     )  # fmt: skip
     same = truck_trailer(gamma=0.0, initial_cov=np.zeros((2, 2)))
@@ -110,7 +110,7 @@ def test_strongly_coupled_plants_get_a_true_set_or_an_error(seed, radius, n):
         return
     rate, Sigma = Fraction(errors.rate), rational(errors.Sigma)
     moved = congruence(rational(plant.A), Sigma)
-    grown = add(scale(1 / rate, moved), scale(1 / (1 - rate), rational(plant.disturbance.shape)))
+    grown = add(scale(1 / rate, moved), scale(1 / (1 - rate), rational(plant.disturbance.shape_matrix)))
     assert is_positive_semidefinite(subtract(Sigma, grown))
 
 
@@ -125,9 +125,9 @@ def test_set_that_holds_by_no_more_than_rounding_is_an_error(growth):
     # As below; without a first error (E1) alone decides.
     settings = {"disturbance_bound": 0.1, "sensor_bound": 0.1, "initial_bound": 0.0}
     plant = LinearPlant(A=[[0.5]], B=[[1.0]], box=[1.0], u_max=1.0, dt=0.1, **settings)
-    Sigma = growth * 4.0 * plant.disturbance.shape
+    Sigma = growth * 4.0 * plant.disturbance.shape_matrix
     checks = [
-        lambda: _check(Sigma, plant.A, plant.disturbance.shape, plant.initial_error.shape, 0.5),
+        lambda: _check(Sigma, plant.A, plant.disturbance.shape_matrix, plant.initial_error.shape_matrix, 0.5),
         lambda: require_error_set(ErrorSet(Sigma=Sigma, rate=0.5), plant),
     ]
     for check in checks:

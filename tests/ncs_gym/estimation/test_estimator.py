@@ -288,7 +288,7 @@ def test_innovation_at_the_edge_of_both_bounds_is_no_alarm():
     direction = np.array([1.0, 0.3])
     noise = Ellipsoid(sets_of(plant).noise)
     edge = spread.extreme_point(direction) + noise.extreme_point(direction)
-    naive = Ellipsoid(spread.shape + noise.shape)
+    naive = Ellipsoid(spread.shape_matrix + noise.shape_matrix)
     assert not naive.contains(edge)
     for residual, alarm in ((edge, False), (1.001 * edge, True)):
         estimator = Estimator(plant, Channel())
@@ -426,7 +426,7 @@ def test_perfect_sensors_get_a_little_noise_in_their_own_units(perfect):
 def test_quick_test_passes_no_impossible_residual_however_ill_conditioned_the_bound_is(condition):
     rng = np.random.default_rng(0)
     plant = replace(truck_trailer(), measurement_noise_cov=np.eye(2))
-    test, noise = InnovationTest(plant.H, sets_of(plant).noise), plant.sensor_noise.bound.shape
+    test, noise = InnovationTest(plant.H, sets_of(plant).noise), plant.sensor_noise.bound.shape_matrix
     passed = np.zeros(2, dtype=int)
     for _ in range(200):
         along = np.linalg.qr(rng.standard_normal((2, 2)))[0].T

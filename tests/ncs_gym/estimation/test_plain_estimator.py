@@ -45,7 +45,7 @@ def attacked(rng, packets, sent, step, plant):
     elif kind == 4:
         packets.append(Packet(int(step - rng.integers(3)), np.full(plant.p, rng.choice([np.nan, np.inf]))))
     elif kind == 5 and packets:  # noise beyond its bound
-        size = np.sqrt(np.diag(plant.sensor_error.shape)) + np.abs(packets[0].measurement)
+        size = np.sqrt(np.diag(plant.sensor_error.shape_matrix)) + np.abs(packets[0].measurement)
         packets[0] = packets[0]._replace(measurement=packets[0].measurement + 3.0 * size)
     return [packets[index] for index in rng.permutation(len(packets))]
 
@@ -215,7 +215,7 @@ def test_a_copy_goes_on_like_the_original(name):
 def samples_of(plains, rng, plant, step, channel):
     """Random arrivals for many estimators: which samples of each age arrive, and the newest samples, (p, N)."""
     samples = np.stack([plant.H @ plain.mean for plain in plains], axis=1)
-    samples += 0.5 * np.sqrt(np.diag(plant.sensor_error.shape))[:, None] * rng.uniform(-1.0, 1.0, samples.shape)
+    samples += 0.5 * np.sqrt(np.diag(plant.sensor_error.shape_matrix))[:, None] * rng.uniform(-1.0, 1.0, samples.shape)
     ages = range(channel.longest_delay, channel.delay - 1, -1)
     chance = rng.choice([0.05, 0.3, 0.8])
     return samples, [(age, rng.random(len(plains)) < chance) for age in ages if step > age]

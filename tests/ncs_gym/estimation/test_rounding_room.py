@@ -37,12 +37,12 @@ def sets_that_just_hold(room):
     """A plant and error sets for age 0 for which (C0), (C1) and (C2) hold, (C2) with the room or with none."""
     carried = RATE * RADIUS
     rounding = plant_with(1e-9)
-    newest, disturbance = RADIUS**2, rounding.disturbance.shape[0, 0]
+    newest, disturbance = RADIUS**2, rounding.disturbance.shape_matrix[0, 0]
     older = (1.0 + SLACK) * (carried + disturbance**0.5) ** 2
     allowed = (newest - rounding.estimate_rounding[0, 0]) / INFLATION if room else newest
     kept = (1.0 - GAIN) * older**0.5
     noise = (1.0 - SLACK) * (allowed**0.5 - kept) / GAIN  # radius of N: kept + GAIN noise is the radius of the result
-    inflation = plant_with(1e-9).sensor_error.shape[0, 0] / 1e-18
+    inflation = plant_with(1e-9).sensor_error.shape_matrix[0, 0] / 1e-18
     plant = plant_with(noise / inflation**0.5)
     sets = ErrorSetsByAge(
         contract=ChannelContract(0),
@@ -50,7 +50,7 @@ def sets_that_just_hold(room):
         rates=np.array([carried / (carried + disturbance**0.5)]),
         gains=np.array([[[GAIN]]]),
         multipliers=np.array([kept / allowed**0.5]),
-        noise=plant.sensor_error_with(0.0).shape,
+        noise=plant.sensor_error_with(0.0).shape_matrix,
     )
     return plant, ErrorSet(Sigma=sets.shapes[0], rate=float(sets.rates[0]), ages=sets)
 
@@ -164,9 +164,9 @@ def sets_of_two_sensors_whose_noise_is_nearly_common():
         return LinearPlant(A=[[rate]], B=[[1.0]], H=matched, sensor_bound=noise, initial_bound=initial, **settings)
 
     plain = plant_of(0.0)
-    push, room = plain.disturbance.shape[0, 0] ** 0.5, plain.estimate_rounding[0, 0]
+    push, room = plain.disturbance.shape_matrix[0, 0] ** 0.5, plain.estimate_rounding[0, 0]
     plant = plant_of(((radius**2 * (1.0 - 1e-8) - room) / INFLATION) ** 0.5)
-    older, noise = (1.0 + 1e-9) * (rate * radius + push) ** 2, plant.sensor_error_with(0.0).shape
+    older, noise = (1.0 + 1e-9) * (rate * radius + push) ** 2, plant.sensor_error_with(0.0).shape_matrix
     found = []
     for mu in np.linspace(0.001, 0.999, 999):
         spread = older * matched / mu
@@ -225,7 +225,7 @@ def test_room_holds_what_the_residual_of_a_large_error_or_of_large_noise_rounds(
         rates=np.array([0.5]),
         gains=np.array([gain]),
         multipliers=np.array([0.5]),
-        noise=plant.sensor_error_with(0.0).shape,
+        noise=plant.sensor_error_with(0.0).shape_matrix,
     )
     rng, moved = np.random.default_rng(0), 0.0
     for _ in range(300):

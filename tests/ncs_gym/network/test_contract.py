@@ -105,10 +105,10 @@ def test_bad_contracts_are_refused(bad):
 def test_error_sets_meet_their_conditions_exactly(name):
     plant, contract = PLANTS[name]
     sets = certified_error_set(plant, contract).ages
-    A, H, D, N = (rational(matrix) for matrix in (plant.A, plant.H, plant.disturbance.shape, sets.noise))
+    A, H, D, N = (rational(matrix) for matrix in (plant.A, plant.H, plant.disturbance.shape_matrix, sets.noise))
     shapes = [rational(shape) for shape in sets.shapes]
     assert len(shapes) == contract.max_age + 2
-    assert is_positive_semidefinite(subtract(shapes[0], rational(plant.initial_error.shape)))
+    assert is_positive_semidefinite(subtract(shapes[0], rational(plant.initial_error.shape_matrix)))
     for j, rate in enumerate(map(Fraction, sets.rates)):
         grown = add(scale(1 / rate, congruence(A, shapes[j])), scale(1 / (1 - rate), D))
         assert is_positive_semidefinite(subtract(shapes[j + 1], grown))

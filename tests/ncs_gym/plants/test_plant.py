@@ -42,14 +42,14 @@ def test_disturbance_bound_holds_ball_plus_truncated_noise():
 
 def test_case_study_bounds_have_the_measured_radii():
     plant = truck_trailer()
-    assert np.sqrt(plant.disturbance.shape[0, 0]) == pytest.approx(0.0468, abs=5e-5)
-    assert plant.initial_error.shape[0, 0] == pytest.approx(1e-4 * 5.9915, rel=1e-4)
+    assert np.sqrt(plant.disturbance.shape_matrix[0, 0]) == pytest.approx(0.0468, abs=5e-5)
+    assert plant.initial_error.shape_matrix[0, 0] == pytest.approx(1e-4 * 5.9915, rel=1e-4)
 
 
 def test_sensor_bound_with_quantizer_holds_corners_of_the_rounding_box():
     plant = truck_trailer()
     step = 0.05
-    noise, bound = plant.sensor_error.shape, plant.sensor_error_with(step)
+    noise, bound = plant.sensor_error.shape_matrix, plant.sensor_error_with(step)
     corner = np.array([step / 2, -step / 2])
     extreme = corner + np.sqrt(noise[0, 0]) * corner / np.linalg.norm(corner) * (1 - 1e-9)
     assert bound.contains(extreme)
@@ -170,9 +170,9 @@ def test_bad_numbers_are_refused_in_one_sentence(change, words):
 def test_rows_of_two_states_are_taken_from_lists_and_arrays():
     rows = [[0.5, 1.0], [2.0, -2.0]]
     for box in (rows, np.array([(0.5, 1.0), (2.0, -2.0)])):
-        np.testing.assert_array_equal(LinearPlant(**(good() | QUIET | {"box": box})).C, rows)
+        np.testing.assert_array_equal(LinearPlant(**(good() | QUIET | {"box": box})).box_rows, rows)
     three = [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0)]  # more rows than states
-    np.testing.assert_array_equal(LinearPlant(**(good() | QUIET | {"box": three})).C, three)
+    np.testing.assert_array_equal(LinearPlant(**(good() | QUIET | {"box": three})).box_rows, three)
 
 
 def test_arguments_that_a_plant_does_not_have_or_lacks_are_named():

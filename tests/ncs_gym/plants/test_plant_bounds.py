@@ -98,7 +98,7 @@ def test_bounds_survive_replace_copies_and_pickles():
     plant = plain(disturbance_bound=([[1.0], [0.5]], 0.1))
     twins = [replace(plant), copy.deepcopy(plant), pickle.loads(pickle.dumps(plant)), replace(plant, A=plant.A)]
     assert {twin.fingerprint for twin in twins} == {plant.fingerprint}
-    assert not pickle.loads(pickle.dumps(plant)).disturbance_bound.shape.flags.writeable
+    assert not pickle.loads(pickle.dumps(plant)).disturbance_bound.shape_matrix.flags.writeable
     assert replace(plant, A=0.6 * np.eye(2)).fingerprint != plant.fingerprint
 
 
@@ -246,4 +246,6 @@ def test_first_error_along_an_oblique_line_is_held_in_rational_arithmetic():
     for ratio in np.random.default_rng(0).uniform(-2.0, 2.0, 200):
         bound = plain(initial_bound=([[1.0], [ratio]], 1.0)).initial_error
         line = rational(np.array([[1.0], [ratio]]))
-        assert is_positive_semidefinite(subtract(rational(bound.shape), congruence(line, rational(np.ones((1, 1))))))
+        assert is_positive_semidefinite(
+            subtract(rational(bound.shape_matrix), congruence(line, rational(np.ones((1, 1)))))
+        )

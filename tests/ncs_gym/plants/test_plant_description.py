@@ -46,7 +46,8 @@ def test_file_written_by_hand_takes_plain_terms(tmp_path):
     (tmp_path / "plant.json").write_text(json.dumps({"format": "ncs-gym plant 1", "plant": content}))
     plant = LinearPlant.load(tmp_path / "plant.json")
     assert [
-        round(b.shape[0, 0] ** 0.5, 12) for b in (plant.disturbance_bound, plant.sensor_bound, plant.initial_bound)
+        round(b.shape_matrix[0, 0] ** 0.5, 12)
+        for b in (plant.disturbance_bound, plant.sensor_bound, plant.initial_bound)
     ] == [
         0.01,
         0.02,

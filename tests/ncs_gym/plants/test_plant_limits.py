@@ -15,14 +15,14 @@ ROOM = {"A": [[0.9]], "B": [[0.2]], "operating_state": [20.0], "operating_input"
 def test_half_widths_and_rows_say_the_same():
     widths = LinearPlant(**MODEL, box=[2.0, 0.5])
     rows = LinearPlant(**MODEL, box=[[0.5, 0.0], [0.0, 2.0]])
-    np.testing.assert_array_equal(widths.C, [[0.5, 0.0], [0.0, 2.0]])
+    np.testing.assert_array_equal(widths.box_rows, [[0.5, 0.0], [0.0, 2.0]])
     assert widths.fingerprint == rows.fingerprint
     np.testing.assert_allclose(widths.constraint_values(np.array([2.0, -0.25])), [0.0, -0.5])
 
 
 def test_number_limits_every_state_alike_and_infinity_none():
-    np.testing.assert_array_equal(LinearPlant(**MODEL, box=4.0).C, 0.25 * np.eye(2))
-    np.testing.assert_array_equal(LinearPlant(**MODEL, box=[np.inf, 4.0]).C, [[0.0, 0.25]])
+    np.testing.assert_array_equal(LinearPlant(**MODEL, box=4.0).box_rows, 0.25 * np.eye(2))
+    np.testing.assert_array_equal(LinearPlant(**MODEL, box=[np.inf, 4.0]).box_rows, [[0.0, 0.25]])
 
 
 @pytest.mark.parametrize(
@@ -43,13 +43,13 @@ def test_output_matrix_in_the_place_of_the_box_is_refused_with_both_remedies(mak
 
 def test_rows_stay_what_they_are_when_a_plant_is_replaced():
     plant = LinearPlant(**MODEL, box=[2.0, 0.5])
-    np.testing.assert_array_equal(replace(plant, A=0.5 * np.eye(2)).C, plant.C)
-    np.testing.assert_array_equal(plant.box, plant.C)
+    np.testing.assert_array_equal(replace(plant, A=0.5 * np.eye(2)).box_rows, plant.box_rows)
+    np.testing.assert_array_equal(plant.box, plant.box_rows)
 
 
 def test_limits_around_an_operating_point_become_the_largest_symmetric_ones():
     plant = LinearPlant.around(**ROOM, state_limits=(18.0, 25.0), input_limits=(0.0, 12.0), input_names=["heating"])
-    np.testing.assert_allclose(1.0 / plant.C, [[2.0]])
+    np.testing.assert_allclose(1.0 / plant.box_rows, [[2.0]])
     np.testing.assert_allclose(plant.u_max, [2.0])
     np.testing.assert_allclose(plant.to_deviation([21.5]), [1.5])
     np.testing.assert_allclose(plant.from_deviation([-2.0]), [18.0])
@@ -60,7 +60,7 @@ def test_limits_around_an_operating_point_become_the_largest_symmetric_ones():
 def test_rows_that_are_computed_may_have_any_signs(tmp_path):
     rows = np.array([[-1.0, -2.0], [1.0, 3.0]])
     LinearPlant(**MODEL, box=rows).save(tmp_path / "plant.json")
-    np.testing.assert_array_equal(LinearPlant.load(tmp_path / "plant.json").C, rows)
+    np.testing.assert_array_equal(LinearPlant.load(tmp_path / "plant.json").box_rows, rows)
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,7 @@ def test_box_of_three_states_given_as_limits_is_refused(sides):
     ],
 )
 def test_rows_of_two_states_that_cannot_be_limits_or_are_an_array_are_taken(rows):
-    np.testing.assert_array_equal(LinearPlant(**MODEL, box=rows).C, np.asarray(rows, dtype=np.float64))
+    np.testing.assert_array_equal(LinearPlant(**MODEL, box=rows).box_rows, np.asarray(rows, dtype=np.float64))
 
 
 def test_a_number_stands_for_a_vector_of_one_entry():
@@ -169,7 +169,7 @@ def test_one_sided_limits_leave_the_other_side_free():
     settings = {"state_limits": ([0.0, -np.inf], [np.inf, 3.0]), "input_limits": (-1.0, 1.0)}
     point = {"operating_state": [1.0, 1.0], "operating_input": [0.4]}
     plant = LinearPlant.around(A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.5]], dt=0.1, **point, **settings, **QUIET)
-    np.testing.assert_allclose(plant.C, [[1.0, 0.0], [0.0, 0.5]])
+    np.testing.assert_allclose(plant.box_rows, [[1.0, 0.0], [0.0, 0.5]])
     np.testing.assert_allclose(plant.u_max, [0.6])
 
 

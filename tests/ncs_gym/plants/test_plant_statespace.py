@@ -45,7 +45,7 @@ def test_continuous_model_is_sampled_exactly(name):
     end = solve_ivp(lambda _, x: model.A @ x + model.B[:, 0] * 1.7, (0.0, 0.1), [0.4, -0.9], rtol=1e-11, atol=1e-12)
     np.testing.assert_allclose(plant.A @ [0.4, -0.9] + plant.B @ [1.7], end.y[:, -1], atol=1e-9)
     np.testing.assert_array_equal(plant.H, model.C)
-    np.testing.assert_array_equal(plant.C, [[1.0, 0.0], [0.0, 0.5]])
+    np.testing.assert_array_equal(plant.box_rows, [[1.0, 0.0], [0.0, 0.5]])
 
 
 @pytest.mark.parametrize("name", DISCRETE)
@@ -87,7 +87,7 @@ def test_model_takes_limits_around_an_operating_point():
     point = {"operating_state": [1.0, 0.0], "operating_input": [2.0]}
     limits = {"state_limits": ([0.0, -1.0], [3.0, 1.0]), "input_limits": (0.0, 3.0)}
     plant = LinearPlant.from_statespace((A, B, C, D), dt=0.1, input_delay=1, **point, **limits, **settings)
-    np.testing.assert_allclose(plant.C[:2], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    np.testing.assert_allclose(plant.box_rows[:2], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     np.testing.assert_allclose(plant.u_max, [1.0])
     np.testing.assert_allclose(plant.operating_state, [1.0, 0.0, 2.0])
     np.testing.assert_allclose(plant.A @ plant.operating_state + plant.B @ [2.0], plant.operating_state)
@@ -132,7 +132,7 @@ def test_delayed_input_acts_that_many_steps_later(delay):
 
 def test_delayed_inputs_are_limited_but_never_count_as_violated():
     plant = LinearPlant.from_statespace((A, B, C, D), dt=0.1, input_delay=2, **(REST | {"u_max": 0.7}))
-    assert np.linalg.matrix_rank(plant.C) == plant.n
+    assert np.linalg.matrix_rank(plant.box_rows) == plant.n
     assert (plant.constraint_values(np.array([0.0, 0.0, 0.7, -0.7])) < -0.5).all()
 
 
@@ -148,8 +148,8 @@ def test_disturbances_of_a_delayed_plant_leave_its_stored_inputs_alone(name):
         np.testing.assert_array_equal(d[2:], 0.0)
     np.testing.assert_array_equal(plant.process_noise.sample(rng)[2:], 0.0)
     np.testing.assert_array_equal(plant.sample_initial_error(rng)[2:], 0.0)
-    assert (np.diag(plant.disturbance.shape)[2:] < 1e-12).all()
-    assert (np.diag(plant.initial_error.shape)[2:] < 1e-12).all()
+    assert (np.diag(plant.disturbance.shape_matrix)[2:] < 1e-12).all()
+    assert (np.diag(plant.initial_error.shape_matrix)[2:] < 1e-12).all()
 
 
 def test_disturbance_of_a_delayed_plant_holds_that_of_the_plant_itself():

@@ -52,24 +52,24 @@ def test_remainder_lies_in_its_bound_and_says_how_that_is_known(jacobian_bounds)
 
 def test_sampled_bound_is_tight_and_grows_with_the_safety_factor():
     once, twice = model(safety_factor=1.02), model(safety_factor=2.04)
-    np.testing.assert_allclose(twice.remainder.bound.shape, 4.0 * once.remainder.bound.shape)
+    np.testing.assert_allclose(twice.remainder.bound.shape_matrix, 4.0 * once.remainder.bound.shape_matrix)
     assert gauges(once, swing, 2_000).max() > 0.9
     # One direction alone, (dt, 1): the other one is as thin as rounding.
-    assert np.linalg.eigvalsh(once.remainder.bound.shape)[0] < 1e-7 * np.trace(once.remainder.bound.shape)
+    assert np.linalg.eigvalsh(once.remainder.bound.shape_matrix)[0] < 1e-7 * np.trace(once.remainder.bound.shape_matrix)
 
 
 def test_fitted_slope_leaves_less_out_than_the_slope_at_rest():
     """The best slope of a sine leaves out a third of what the tangent does, or less."""
     best = model(safety_factor=1.0 + 1e-3)
     tangent = model(safety_factor=1.0 + 1e-3, A=[[1.0 + STEP * PULL, STEP], [PULL, 1.0]], B=[[0.0075], [0.15]])
-    assert np.trace(best.remainder.bound.shape) < np.trace(tangent.remainder.bound.shape) / 9.0
+    assert np.trace(best.remainder.bound.shape_matrix) < np.trace(tangent.remainder.bound.shape_matrix) / 9.0
 
 
 def test_linear_process_leaves_nothing_out():
     plant = linear_model(lambda x, u: np.array([[0.5, 0.1], [0.0, 0.7]]) @ x + u, [1.0, 2.0], [1.0, 3.0], 0.1, **QUIET)
     np.testing.assert_allclose(plant.A, [[0.5, 0.1], [0.0, 0.7]], atol=1e-9)
     np.testing.assert_allclose(plant.B, np.eye(2), atol=1e-9)
-    assert np.sqrt(plant.remainder.bound.shape.max()) < 1e-9
+    assert np.sqrt(plant.remainder.bound.shape_matrix.max()) < 1e-9
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.02, -0.02])
@@ -82,13 +82,15 @@ def test_proved_bound_holds_what_a_step_from_rest_leaves_out(offset):
     bounds = [[0.4, 0.3]], [[0.6, 0.3]]
     plant = linear_model(kinked, [0.5], [1.0], 0.1, jacobian_bounds=bounds, samples=200, **QUIET)
     assert plant.remainder.proved
-    np.testing.assert_allclose(np.sqrt(plant.remainder.bound.shape), [[0.05 + abs(offset)]], rtol=1e-6)
+    np.testing.assert_allclose(np.sqrt(plant.remainder.bound.shape_matrix), [[0.05 + abs(offset)]], rtol=1e-6)
 
 
 def test_inner_environment_is_modeled_like_its_equations():
     inner, own = model(PendulumProcess()), model()
     np.testing.assert_allclose(inner.A, own.A, atol=1e-8)
-    np.testing.assert_allclose(inner.remainder.bound.shape, own.remainder.bound.shape, rtol=1e-3, atol=1e-12)
+    np.testing.assert_allclose(
+        inner.remainder.bound.shape_matrix, own.remainder.bound.shape_matrix, rtol=1e-3, atol=1e-12
+    )
 
 
 def test_pendulum_is_proved_by_another_route():

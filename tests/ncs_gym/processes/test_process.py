@@ -196,7 +196,7 @@ def test_remainder_is_left_to_the_process():
     """The linear plant may be disturbed by all of E(D); beside a process only what is declared beside the remainder."""
     left_out = Remainder(Ellipsoid(0.01 * np.eye(2)), True, "an example")
     whole = plant(disturbance_bound=0.0, remainder=left_out)
-    np.testing.assert_allclose(whole.disturbance.shape, 0.01 * np.eye(2), rtol=1e-6)
+    np.testing.assert_allclose(whole.disturbance.shape_matrix, 0.01 * np.eye(2), rtol=1e-6)
     for process, moves in ((LinearProcess(), True), (FunctionProcess(linear), False)):
         env = NCSEnv(whole, process=process, disturbance="sphere")
         _, info = env.reset(seed=0)

@@ -61,7 +61,7 @@ def test_vectors_move_like_single_environments(env_id):
     for e in range(3):
         env.reset(seed=0, options={"state": info["state"][e]})
         *_, single = env.step(action[e])
-        room = np.sqrt(np.diag(plant.without_remainder.disturbance.shape))  # of two disturbances
+        room = np.sqrt(np.diag(plant.without_remainder.disturbance.shape_matrix))  # of two disturbances
         assert (np.abs(single["state"] - after["state"][e]) <= 2.0 * room).all()
     many.close()
 
@@ -86,8 +86,10 @@ def test_declared_model_is_the_one_that_sampling_finds(declared, sampled, needs)
     widths = plant.half_widths
     np.testing.assert_allclose(plant.A * widths / widths[:, None], again.A * widths / widths[:, None], atol=1e-6)
     np.testing.assert_allclose(plant.B / widths[:, None], again.B / widths[:, None], atol=1e-6)
-    units = np.sqrt(np.outer(*2 * [np.diag(again.remainder.bound.shape)]))
-    np.testing.assert_allclose(plant.remainder.bound.shape / units, again.remainder.bound.shape / units, atol=1e-3)
+    units = np.sqrt(np.outer(*2 * [np.diag(again.remainder.bound.shape_matrix)]))
+    np.testing.assert_allclose(
+        plant.remainder.bound.shape_matrix / units, again.remainder.bound.shape_matrix / units, atol=1e-3
+    )
     for name in ("sensor_bound", "initial_bound", "disturbance_bound"):
         np.testing.assert_array_equal(getattr(plant, name).shape, getattr(again, name).shape)
 

@@ -10,7 +10,7 @@ from ncs_gym.uncertainty.declared_bound import as_bound, diagonal_inside, sample
 
 
 def test_number_is_the_radius_of_a_ball():
-    np.testing.assert_array_equal(as_bound(0.5, 3, "d").shape, 0.25 * np.eye(3))
+    np.testing.assert_array_equal(as_bound(0.5, 3, "d").shape_matrix, 0.25 * np.eye(3))
 
 
 def test_half_widths_give_the_smallest_ellipsoid_around_their_box():
@@ -21,7 +21,7 @@ def test_half_widths_give_the_smallest_ellipsoid_around_their_box():
 
 
 def test_state_without_disturbance_costs_the_others_nothing():
-    np.testing.assert_allclose(as_bound([0.1, 0.0, 0.3], 3, "d").shape, 2.0 * np.diag([0.01, 0.0, 0.09]))
+    np.testing.assert_allclose(as_bound([0.1, 0.0, 0.3], 3, "d").shape_matrix, 2.0 * np.diag([0.01, 0.0, 0.09]))
 
 
 @pytest.mark.parametrize(("w", "widths"), [(0.2, [0.2, 0.2]), ([0.2, 0.5], [0.2, 0.5])])
@@ -40,7 +40,7 @@ def test_ellipsoid_is_taken_as_it_is():
 
 @pytest.mark.parametrize("zero", [0.0, [0.0, 0.0], ([[1.0], [1.0]], 0.0), Ellipsoid(np.zeros((2, 2)))])
 def test_zero_is_a_bound(zero):
-    np.testing.assert_array_equal(as_bound(zero, 2, "d").shape, np.zeros((2, 2)))
+    np.testing.assert_array_equal(as_bound(zero, 2, "d").shape_matrix, np.zeros((2, 2)))
 
 
 @pytest.mark.parametrize(
@@ -89,4 +89,4 @@ def test_diagonal_shape_lies_inside(shape):
     bound = Ellipsoid(shape)
     inside = diagonal_inside(bound)
     assert np.array_equal(inside, np.diag(np.diag(inside)))
-    assert np.linalg.eigvalsh(bound.shape - inside)[0] >= -1e-12
+    assert np.linalg.eigvalsh(bound.shape_matrix - inside)[0] >= -1e-12

@@ -131,7 +131,7 @@ def test_outer_sum_holds_the_minkowski_sum(seed, n):
 
 def test_plain_sum_of_shapes_would_not_hold_the_minkowski_sum():
     one = Ellipsoid(np.eye(2))
-    assert Ellipsoid(one.shape + one.shape).support([1.0, 0.0]) < 2.0 * one.support([1.0, 0.0])
+    assert Ellipsoid(one.shape_matrix + one.shape_matrix).support([1.0, 0.0]) < 2.0 * one.support([1.0, 0.0])
 
 
 def distance_to_sum(point: np.ndarray, first: Ellipsoid, second: Ellipsoid) -> float:
@@ -164,7 +164,7 @@ def test_membership_in_a_sum_is_exact_at_its_boundary():
         first, second = Ellipsoid(random_shape(rng, 3)), Ellipsoid(random_shape(rng, 3))
         direction = rng.standard_normal(3)
         boundary = first.extreme_point(direction) + second.extreme_point(direction)
-        assert sum_gauge(boundary, first.shape, second.shape) == pytest.approx(1.0, abs=1e-7)
+        assert sum_gauge(boundary, first.shape_matrix, second.shape_matrix) == pytest.approx(1.0, abs=1e-7)
 
 
 def test_flat_ellipsoids_lie_in_one_another_where_they_have_the_same_plane():

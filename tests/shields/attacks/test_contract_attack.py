@@ -171,7 +171,7 @@ def test_margins_by_age_agree_with_floating_point(promised):
     s, growth = certificate.updates, certificate.multipliers.rounding
     shapes = [*certificate.error_shapes, s.last]
     smallest = lambda matrix: np.linalg.eigvalsh(matrix)[0]  # noqa: E731
-    assert margins["(C0)0"] == [pytest.approx(smallest(shapes[0] - plant.initial_error.shape), rel=1e-6)]
+    assert margins["(C0)0"] == [pytest.approx(smallest(shapes[0] - plant.initial_error.shape_matrix), rel=1e-6)]
     for j, found in enumerate(margins["(C1)0"]):
         grown = plant.A @ shapes[j] @ plant.A.T / certificate.proofs[j].rate + certificate.D / (
             1 - certificate.proofs[j].rate

@@ -195,7 +195,7 @@ def test_a_given_start_is_followed_under_zero_input():
     plant, certificate, lead, rng = UNSTABLE.plant, UNSTABLE.certificate, 3, np.random.default_rng(0)
     shield, safe, root = SafetyFilter(certificate, plant), certificate.safe_set, np.linalg.cholesky(certificate.M).T
     powers = [np.linalg.matrix_power(plant.A, k) for k in range(lead + 1)]
-    spread = [np.linalg.norm(root @ power @ np.linalg.cholesky(plant.disturbance.shape), 2) for power in powers]
+    spread = [np.linalg.norm(root @ power @ np.linalg.cholesky(plant.disturbance.shape_matrix), 2) for power in powers]
     entered = left = 0
     for _ in range(200):
         start = safe.sample_boundary(rng) * rng.uniform(0.7, 1.3)

@@ -61,14 +61,14 @@ class WeakestPoint:
     def __call__(self, rng, plant, nominal_next):
         stored = self.shield._monitored._stored if self.shield is not None else []
         bound, center, power, spread = plant.nominal_disturbance, nominal_next, np.eye(plant.n), 0.0
-        values, pulled = [plant.C @ center], [plant.C]
-        rooms = [1.0 - np.abs(plant.C @ center)]
+        values, pulled = [plant.box_rows @ center], [plant.box_rows]
+        rooms = [1.0 - np.abs(plant.box_rows @ center)]
         for u in stored:
             center, power = plant.A @ center + plant.B @ u, plant.A @ power
-            spread = spread + bound.support(plant.C @ power)
-            values.append(plant.C @ center)
-            pulled.append(plant.C @ power)
-            rooms.append(1.0 - np.abs(plant.C @ center) - spread)
+            spread = spread + bound.support(plant.box_rows @ power)
+            values.append(plant.box_rows @ center)
+            pulled.append(plant.box_rows @ power)
+            rooms.append(1.0 - np.abs(plant.box_rows @ center) - spread)
         if self.shield is not None and rng.random() < 0.5:
             return bound.extreme_point(power.T @ self.shield.certificate.M @ center)
         step, row = np.unravel_index(np.argmin(rooms), np.shape(rooms))

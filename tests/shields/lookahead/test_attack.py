@@ -64,7 +64,7 @@ def without_tightening(prediction, shapes):
 def without_a_step_of_disturbance(prediction, shapes):
     """The last step's disturbance is left out of every row."""
     known, plant = tightenings(prediction, shapes), prediction.plant
-    return known._replace(room=known.room + plant.disturbance.support(plant.C))
+    return known._replace(room=known.room + plant.disturbance.support(plant.box_rows))
 
 
 @pytest.mark.parametrize("mutation", [without_tightening, without_a_step_of_disturbance])
@@ -120,7 +120,7 @@ def test_start_outside_the_safe_set_is_guaranteed_exactly_if_a_first_plan_is_cer
         start = rng.uniform(-1.0, 1.0, plant.n) * plant.half_widths * rng.choice([0.3, 0.9, 1.05])
         _, info = inner.reset(seed=seed, options={"state": start})
         outside = not safe.contains(start)
-        if (np.abs(plant.C @ start) > 1.0).any():
+        if (np.abs(plant.box_rows @ start) > 1.0).any():
             assert not info["shield_guaranteed"]
             assert info["shield_reason"] == NOT_KNOWN_INSIDE
         elif outside:

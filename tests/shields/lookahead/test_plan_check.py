@@ -75,7 +75,7 @@ def test_tightenings_are_what_extreme_errors_and_disturbances_attain(case):
     for x_hat, shape, (plan,), room in zip(estimates, shapes, plans, rooms, strict=True):
         nominal = states(plant, x_hat, plan, np.zeros((STEPS, plant.n)))
         for step in range(STEPS):
-            for row, left in zip(plant.C, room[step], strict=True):
+            for row, left in zip(plant.box_rows, room[step], strict=True):
                 pushed = extreme_run(plant, x_hat, shape, plan, row, step)[step]
                 assert row @ (pushed - nominal[step]) == pytest.approx(1.0 - left, rel=1e-6, abs=1e-9)
 
@@ -102,8 +102,10 @@ def test_certified_plans_keep_every_possible_state_in_the_box_and_end_in_the_saf
         for step in np.flatnonzero(passed).tolist():
             lengths += step > 0
             for j in range(step + 1):
-                reached = [extreme_run(plant, x_hat, shape, plan, row, j)[j] for row in (*plant.C, *-plant.C)]
-                assert np.abs(np.array(reached) @ plant.C.T).max() <= 1.0
+                reached = [
+                    extreme_run(plant, x_hat, shape, plan, row, j)[j] for row in (*plant.box_rows, *-plant.box_rows)
+                ]
+                assert np.abs(np.array(reached) @ plant.box_rows.T).max() <= 1.0
             levels.append(farthest(plant, certificate, x_hat, shape, plan, step, rng))
             assert levels[-1] <= 1.0
     assert lengths > 10
@@ -128,8 +130,10 @@ def test_what_is_not_certified_fails_for_a_reason(case):
             if ends:
                 assert not outside
                 kept += 1
-            rows = [extreme_run(plant, x_hat, shape, plan, row, step)[step] for row in (*plant.C, *-plant.C)]
-            outside |= bool(np.abs(np.array(rows) @ plant.C.T).max() > 1.0 + 1e-8)
+            rows = [
+                extreme_run(plant, x_hat, shape, plan, row, step)[step] for row in (*plant.box_rows, *-plant.box_rows)
+            ]
+            outside |= bool(np.abs(np.array(rows) @ plant.box_rows.T).max() > 1.0 + 1e-8)
     assert left > 5
     assert kept > 10
 
@@ -144,7 +148,7 @@ def test_sampled_errors_and_disturbances_stay_inside(case):
             x = x_hat + Ellipsoid(shape).sample_boundary(rng, 300)
             for u in plan[: step + 1]:
                 x = x @ plant.A.T + plant.B @ u + plant.disturbance.sample_boundary(rng, 300)
-                assert (np.abs(x @ plant.C.T) <= 1.0).all()
+                assert (np.abs(x @ plant.box_rows.T) <= 1.0).all()
             assert (certificate.safe_set.gauge(x) <= 1.0).all()
 
 
@@ -252,7 +256,7 @@ def root_of(number):
 
 def exact_reach(plant, row, x_hat, shape, plan):
     """The farthest that an error and disturbances take c x_j from zero after all inputs of a plan, to fifty digits."""
-    A, B, D = (rational(matrix) for matrix in (plant.A, plant.B, plant.disturbance.shape))
+    A, B, D = (rational(matrix) for matrix in (plant.A, plant.B, plant.disturbance.shape_matrix))
     pulls = [rational(row[None])]
     for _ in plan:
         pulls.append(multiply(pulls[-1], A))
@@ -293,7 +297,7 @@ def test_plans_are_certified_in_rational_arithmetic_where_large_inputs_cancel(wh
             return test.certified(start[None], known, plan[None, None])[0, 0, -1]
 
         passes(edge_of(passes, 1e-5))
-        levels.append(exact_reach(plant, plant.C[0], start, nothing, plan[:step]))
+        levels.append(exact_reach(plant, plant.box_rows[0], start, nothing, plan[:step]))
     assert 1.0 - margin - 1e-6 < min(levels) <= max(levels) <= 1.0 - margin
 
 

@@ -49,15 +49,15 @@ def best_distance(shield, x_hat, shape, proposed, length):
     )
     sums = None
     for j in range(length):
-        D = power @ plant.disturbance.shape @ power.T
-        disturbed = disturbed + np.sqrt(np.einsum("ij,jk,ik->i", plant.C, D, plant.C))
+        D = power @ plant.disturbance.shape_matrix @ power.T
+        disturbed = disturbed + np.sqrt(np.einsum("ij,jk,ik->i", plant.box_rows, D, plant.box_rows))
         sums = D if sums is None else outer_sum(sums, D, M)
         center, power = plant.A @ center + plant.B @ u[j], plant.A @ power
-        reach = Ellipsoid(power @ shape @ power.T).support(plant.C) + disturbed
+        reach = Ellipsoid(power @ shape @ power.T).support(plant.box_rows) + disturbed
         if (reach >= 1.0).any():
             return np.inf
         if j < length - 1:
-            constraints.append(cp.abs(plant.C @ center) <= 1.0 - reach)
+            constraints.append(cp.abs(plant.box_rows @ center) <= 1.0 - reach)
     values, axes = np.linalg.eigh(root @ outer_sum(power @ shape @ power.T, sums, M) @ root.T)
     h = np.sqrt(values[-1])
     if h >= 1.0:

@@ -59,13 +59,13 @@ def test_a_step_behind_the_shield_drops_every_plan(many, goes_on):
 
 def test_a_start_in_the_box_is_decided_to_the_last_digit():
     plant = case("batch reactor", "overtaking")[0]
-    row = plant.C[2] / np.linalg.norm(plant.C[2])
+    row = plant.box_rows[2] / np.linalg.norm(plant.box_rows[2])
     inward, outward = 1.0 - 1e-9, 1.0 + 1e-9
     for scale, inside in ((inward, True), (outward, False)):
-        reached = scale / abs(plant.C[2] @ row)
+        reached = scale / abs(plant.box_rows[2] @ row)
         assert starts_in_box(plant, reached * row) is inside
         shape = np.diag(np.full(plant.n, 1e-4)) + (reached**2 - 1e-4) * np.outer(row, row)
-        assert Ellipsoid(shape).support(plant.C[2]) == pytest.approx(scale, abs=1e-12)
+        assert Ellipsoid(shape).support(plant.box_rows[2]) == pytest.approx(scale, abs=1e-12)
         assert starts_in_box(plant, Ellipsoid(shape)) is inside
 
 
@@ -74,8 +74,8 @@ def test_an_estimate_proves_the_box_only_with_room_for_its_error():
     shield = SafetyFilter(certificate_of(plant, contract), plant, "lookahead", horizon=horizon)
     shape = 0.01 * np.eye(plant.n)
     errors = shield.errors_of(shape)
-    row = plant.C[0] / (plant.C[0] @ plant.C[0])  # |c_0 x| = 1 on it
-    room = 1.0 - Ellipsoid(shape).support(plant.C[0])
+    row = plant.box_rows[0] / (plant.box_rows[0] @ plant.box_rows[0])  # |c_0 x| = 1 on it
+    room = 1.0 - Ellipsoid(shape).support(plant.box_rows[0])
     assert shield.lookahead.knows_in_box((room - 1e-6) * row, errors)
     assert not shield.lookahead.knows_in_box((room + 1e-6) * row, errors)
     indefinite = shield.errors_of(shape + 0.02 * np.eye(plant.n)[::-1])

@@ -147,7 +147,7 @@ def test_units_of_the_state_change_nothing(unit, paper):
     scaled = replace(
         SMALL,
         B=SMALL.B * unit,
-        box=SMALL.C / unit,
+        box=SMALL.box_rows / unit,
         gamma=SMALL.gamma * unit**2,
         process_noise_cov=SMALL.process_noise_cov * unit**2,
         measurement_noise_cov=SMALL.measurement_noise_cov * unit**2,

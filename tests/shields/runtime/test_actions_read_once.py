@@ -20,13 +20,13 @@ COUNT = 3
 
 def scalar(wrapper=lambda env: env, mode="project"):
     S = certificate_of(PLANT).safe_set
-    env = NCSEnv(PLANT, CHANNELS["perfect"], initial_set=Ellipsoid(0.9 * S.shape), disturbance="adversarial")
+    env = NCSEnv(PLANT, CHANNELS["perfect"], initial_set=Ellipsoid(0.9 * S.shape_matrix), disturbance="adversarial")
     return SafetyShield(wrapper(env), certificate_of(PLANT), mode)
 
 
 def vector(wrapper=lambda env: env, mode="project"):
     S = certificate_of(PLANT).safe_set
-    settings = {"initial_set": Ellipsoid(0.9 * S.shape), "disturbance": "adversarial"}
+    settings = {"initial_set": Ellipsoid(0.9 * S.shape_matrix), "disturbance": "adversarial"}
     env = NCSVectorEnv(COUNT, plant=PLANT, channel=CHANNELS["perfect"], **settings)
     return VectorSafetyShield(wrapper(env), certificate_of(PLANT), mode)
 

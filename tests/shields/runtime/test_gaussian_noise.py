@@ -78,7 +78,7 @@ def tight_plant(delta):
     """A plant whose safe box is 2 % wider than the bound that a level delta gives to its noise."""
     declared = {"u_max": 1.0, "dt": 0.1, "process_noise_cov": [[0.1]], "sensor_bound": 1e-3, "initial_bound": 1e-3}
     declared |= {"A": [[0.01]], "B": [[1e-3]], "delta": delta}
-    radius = np.sqrt(LinearPlant(box=[1.0], **declared).disturbance.shape[0, 0])
+    radius = np.sqrt(LinearPlant(box=[1.0], **declared).disturbance.shape_matrix[0, 0])
     return LinearPlant(box=[1.02 * radius], **declared)
 
 

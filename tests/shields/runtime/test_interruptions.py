@@ -29,7 +29,7 @@ KEYS = ("state", "estimate", "error_shape", "input", "input_committed", "shield_
 def setting(mode):
     """Where episodes start, and how far plans reach, in a mode: plans are needed outside S alone."""
     S = certificate_of(PLANT).safe_set
-    start = box_ellipsoid(PLANT, 0.95) if mode == "lookahead" else Ellipsoid(0.8 * S.shape)
+    start = box_ellipsoid(PLANT, 0.95) if mode == "lookahead" else Ellipsoid(0.8 * S.shape_matrix)
     return start, 4 if mode == "lookahead" else None
 
 
@@ -88,7 +88,7 @@ def all_same(some, others):
 def assert_inside(shield, info):
     """What is guaranteed is true."""
     guaranteed, states = np.atleast_1d(info["shield_guaranteed"]), np.atleast_2d(info["state"])
-    inside = np.abs(states @ shield.filter.plant.C.T).max(axis=1) <= 1.0
+    inside = np.abs(states @ shield.filter.plant.box_rows.T).max(axis=1) <= 1.0
     if shield.filter.mode != "lookahead":
         inside &= shield.certificate.safe_set.gauge(states) <= 1.0
     assert inside[guaranteed].all()
@@ -312,7 +312,7 @@ def test_solver_that_panics_is_a_solver_without_an_answer(monkeypatch, panic):
             raise panic
 
     monkeypatch.setattr(program, "_solver", Panicking())
-    data = np.zeros(2), np.ones((3, len(PLANT.C))), np.eye(2), 1.0, np.zeros(1)
+    data = np.zeros(2), np.ones((3, len(PLANT.box_rows))), np.eye(2), 1.0, np.zeros(1)
     assert program.solve(*data) is None
     assert program._solver is None
     assert program.solve(*data) is not None
@@ -327,7 +327,7 @@ def test_interrupted_solver_is_not_asked_again(monkeypatch):
 
     monkeypatch.setattr(program, "_solver", Interrupted())
     with pytest.raises(KeyboardInterrupt):
-        program.solve(np.zeros(2), np.ones((3, len(PLANT.C))), np.eye(2), 1.0, np.zeros(1))
+        program.solve(np.zeros(2), np.ones((3, len(PLANT.box_rows))), np.eye(2), 1.0, np.zeros(1))
     assert program._solver is None
 
 

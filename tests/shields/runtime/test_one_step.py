@@ -25,7 +25,7 @@ def case(request):
 def predicted(certificate, plant, shape):
     """The ellipsoid of next states around their center, in coordinates where M = I, and h."""
     root = np.linalg.cholesky(certificate.M).T
-    first, second = root @ plant.A @ shape @ plant.A.T @ root.T, root @ plant.disturbance.shape @ root.T
+    first, second = root @ plant.A @ shape @ plant.A.T @ root.T, root @ plant.disturbance.shape_matrix @ root.T
     share = np.sqrt(np.trace(first)) / (np.sqrt(np.trace(first)) + np.sqrt(np.trace(second)))
     P = first / share + second / (1 - share)
     return root, P, np.sqrt(np.linalg.eigvalsh(P)[-1])
@@ -266,7 +266,7 @@ def test_bounds_on_rounding_hold_column_by_column():
     plant = replace(random_plant(3, 3, 2), A=A)
     L = np.diag([4.0, 9.0, 1.0]) + 0.5
     test = OneStepTest(L, plant)
-    G, D = np.abs(test.root), plant.disturbance.shape
+    G, D = np.abs(test.root), plant.disturbance.shape_matrix
     columns = G @ np.abs(A)
     for i in range(3):
         assert test.columns[i] == pytest.approx(np.linalg.norm(columns[:, i]))

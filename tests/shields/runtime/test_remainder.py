@@ -31,7 +31,7 @@ def reasons(plant, start, mode="monitor", many=False, **settings):
 
 
 def test_both_plants_have_the_same_bounds_but_not_the_same_name():
-    np.testing.assert_array_equal(EXACT.disturbance.shape, LOCAL.disturbance.shape)
+    np.testing.assert_array_equal(EXACT.disturbance.shape_matrix, LOCAL.disturbance.shape_matrix)
     assert EXACT.fingerprint != LOCAL.fingerprint
 
 
@@ -106,8 +106,8 @@ def test_remainder_acts_on_the_state_alone_where_inputs_are_under_way():
     settings = {"box": [1.0, 1.0], "u_max": 1.0, "disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
     model = (COMMON["A"], COMMON["B"], np.eye(2), np.zeros((2, 1)), 0.1)
     plant = LinearPlant.from_statespace(model, input_delay=2, remainder=LEFT_OUT, **settings)
-    np.testing.assert_array_equal(plant.remainder_bound.shape, np.pad(BOUND.shape, (0, 2)))
-    np.testing.assert_allclose(plant.disturbance.shape[:2, :2], BOUND.shape, rtol=1e-6)
+    np.testing.assert_array_equal(plant.remainder_bound.shape_matrix, np.pad(BOUND.shape_matrix, (0, 2)))
+    np.testing.assert_allclose(plant.disturbance.shape_matrix[:2, :2], BOUND.shape_matrix, rtol=1e-6)
     assert plant.remainder.sentence == LEFT_OUT.sentence
 
 

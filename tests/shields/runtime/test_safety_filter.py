@@ -24,7 +24,7 @@ def many(shield, estimates, shapes, inputs):
 
 def worst_next_level(certificate, plant, estimate, shape, u, rng, tries=20):
     """Largest x+' M x+ over the states the estimate allows and all disturbances, by ascent from many starts."""
-    M, D = certificate.M, plant.disturbance.shape
+    M, D = certificate.M, plant.disturbance.shape_matrix
     center = plant.A @ estimate + plant.B @ u
     e, d = Ellipsoid(shape).sample_boundary(rng, tries), plant.disturbance.sample_boundary(rng, tries)
     for _ in range(40):
@@ -361,7 +361,9 @@ def test_margin_is_that_of_the_contract(certificate, loaded):
     estimate, u = np.array([0.4, -0.3]), np.array([1.0])
     root = np.linalg.cholesky(certificate.M).T
     spread = outer_sum(
-        root @ loaded.A @ certificate.Sigma @ loaded.A.T @ root.T, root @ loaded.disturbance.shape @ root.T, np.eye(2)
+        root @ loaded.A @ certificate.Sigma @ loaded.A.T @ root.T,
+        root @ loaded.disturbance.shape_matrix @ root.T,
+        np.eye(2),
     )
     center = loaded.A @ estimate + loaded.B @ u
     expected = 1.0 - np.sqrt(np.linalg.eigvalsh(spread)[-1]) - np.sqrt(center @ certificate.M @ center)

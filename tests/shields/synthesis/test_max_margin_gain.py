@@ -135,7 +135,9 @@ def test_message_names_what_was_declared_and_the_largest_factor_that_works(name,
 
     def scaled(by):
         size = value if name == "process_noise_cov" else getattr(plant, name)
-        return replace(plant, **{name: Ellipsoid(by**2 * size.shape) if isinstance(size, Ellipsoid) else by * size})
+        return replace(
+            plant, **{name: Ellipsoid(by**2 * size.shape_matrix) if isinstance(size, Ellipsoid) else by * size}
+        )
 
     assert synthesize(scaled(0.98 * factor), contract=ChannelContract(0)) is not None
     with feasible_bounds_not_sought(), pytest.raises(Infeasible):

@@ -50,7 +50,7 @@ def test_share_of_a_box_with_more_rows_than_states_agrees_with_counts(n, rows):
 
 def test_rows_that_say_nothing_new_change_nothing():
     plant = truck_trailer()
-    again = replace(plant, box=np.concatenate([plant.C, 0.9 * plant.C]))
+    again = replace(plant, box=np.concatenate([plant.box_rows, 0.9 * plant.box_rows]))
     L = np.diag([3.0, 1.0])
     assert share_of_box(again, L)["share_of_box"] == pytest.approx(share_of_box(plant, L)["share_of_box"], rel=1e-9)
 

@@ -17,7 +17,7 @@ from tests.verdicts import verified
 
 
 def area_fraction(certificate, plant):
-    return np.sqrt(np.linalg.det(certificate.L) / np.linalg.det(largest_box_ellipsoid(plant.C)))
+    return np.sqrt(np.linalg.det(certificate.L) / np.linalg.det(largest_box_ellipsoid(plant.box_rows)))
 
 
 def test_without_process_noise_the_paper_plant_reaches_the_largest_ellipsoid_in_the_box():
@@ -105,7 +105,7 @@ def test_box_with_more_rows_than_states_is_respected():
     plant = truck_trailer(box=np.stack([np.cos(angle), np.sin(angle)], axis=1) / 2.0)
     certificate = synthesize(plant)
     assert verified(certificate, plant).valid
-    assert max(row @ certificate.L @ row for row in plant.C) <= 1.0
+    assert max(row @ certificate.L @ row for row in plant.box_rows) <= 1.0
     assert area_fraction(certificate, plant) > 0.99
 
 
@@ -116,7 +116,7 @@ def test_units_do_not_change_what_is_found():
     plant = LinearPlant(
         A=units @ base.A @ inverse,
         B=units @ base.B,
-        box=base.C @ inverse,
+        box=base.box_rows @ inverse,
         u_max=4.0,
         dt=0.5,
         gamma=0.0,

@@ -52,7 +52,7 @@ def test_sets_that_miss_a_declared_bound_make_a_certificate_invalid(designed, na
 def test_disturbance_set_of_the_certificate_that_misses_the_bound_is_noticed(designed):
     plant, certificate = designed
     without = replace(plant, disturbance_bound=None)
-    found = broken(replace(certificate, D=without.disturbance.shape), plant)
+    found = broken(replace(certificate, D=without.disturbance.shape_matrix), plant)
     assert any(name.startswith("D: the certificate's") for name in found)
 
 
@@ -67,7 +67,7 @@ def test_noise_set_under_a_contract_holds_the_declared_noise():
     plant = truck_trailer(4000.0, **BOUNDS)
     certificate = certificate_of(plant, ChannelContract(1, 0.02))
     assert verified(certificate, plant).valid
-    larger = replaced(plant, sensor_bound=Ellipsoid(1.001 * plant.sensor_bound.shape))
+    larger = replaced(plant, sensor_bound=Ellipsoid(1.001 * plant.sensor_bound.shape_matrix))
     found = broken(certificate, larger)
     assert len(found) == 1
     assert found[0].startswith("N:")
@@ -92,7 +92,7 @@ def test_plant_with_delayed_inputs_goes_through_synthesis_and_verification(input
     plant = LinearPlant.from_statespace((rate, B, C, None), input_delay=input_delay, **settings, **bounds)
     certificate = synthesize(plant)
     assert verified(certificate, plant).valid
-    rows = plant.C[:2]
+    rows = plant.box_rows[:2]
     assert (np.einsum("ij,jk,ik->i", rows, certificate.L, rows) <= 1.0).all()
     assert certificate.safe_set.support(np.eye(plant.n)[0]) > 0.5
     full = np.array([0.0, 0.0, *[0.8] * input_delay])

@@ -200,15 +200,18 @@ ALONE = {
     "0 < lam_e < 1": lambda c, p: (with_multipliers(c, error=1.5), p),
     "lx, le, ld, s > 0": lambda c, p: (with_multipliers(c, estimate=-1e-9), p),
     "lx + le + ld": lambda c, p: (with_multipliers(c, estimate=c.multipliers.estimate + 1e-9), p),
-    "D: the plant's": lambda c, p: (c, replaced(p, disturbance=Ellipsoid((1 - 1e-6) * p.nominal_disturbance.shape))),
+    "D: the plant's": lambda c, p: (
+        c,
+        replaced(p, disturbance=Ellipsoid((1 - 1e-6) * p.nominal_disturbance.shape_matrix)),
+    ),
     "D: the certificate's": lambda c, p: (c, replaced(p, disturbance=Ellipsoid((1 + 2e-9) * c.D))),
-    "N:": lambda c, p: (c, replaced(p, sensor_error=Ellipsoid(0.99 * p.sensor_noise.bound.shape))),
-    "r0:": lambda c, p: (c, replaced(p, initial_error=Ellipsoid(0.99 * p.initial_noise.bound.shape))),
+    "N:": lambda c, p: (c, replaced(p, sensor_error=Ellipsoid(0.99 * p.sensor_noise.bound.shape_matrix))),
+    "r0:": lambda c, p: (c, replaced(p, initial_error=Ellipsoid(0.99 * p.initial_noise.bound.shape_matrix))),
     "(E0)": lambda c, p: (c, replaced(p, initial_error=Ellipsoid(1.01 * np.diag(c.Sigma).max() * np.eye(p.n)))),
     "(E1)": lambda c, p: (with_multipliers(c, error=min(1.0 - 1e-3, c.multipliers.error * 1.2)), p),
     "(I)": lambda c, p: (with_multipliers(c, disturbance=1e-6), p),
-    "(S) c_1": lambda c, p: (c, replaced(p, C=p.C * [[1.0 + 1e-5], [1.0]])),
-    "(S) c_2": lambda c, p: (c, replaced(p, C=p.C * [[1.0], [1.0 + 1e-5]])),
+    "(S) c_1": lambda c, p: (c, replaced(p, box_rows=p.box_rows * [[1.0 + 1e-5], [1.0]])),
+    "(S) c_2": lambda c, p: (c, replaced(p, box_rows=p.box_rows * [[1.0], [1.0 + 1e-5]])),
     "(U) input 1": lambda c, p: (with_multipliers(c, inputs=(1e-9,)), p),
 }
 

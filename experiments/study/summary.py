@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from experiments.analysis.paired_tests import all_pairs, paired_difference
-from experiments.analysis.statistics import interquartile_mean, stratified_interval
+from experiments.analysis.statistics import all_pairs, bootstrap_interval, interquartile_mean, paired_difference
 
 # Arms with a proof, which a page compares all others with.
 SOUND_ARMS = ("shielded", "lookahead")
@@ -105,10 +104,9 @@ def _scores(environments: Sequence[Mapping[str, dict[str, Any]]]) -> dict[str, A
             [(value - zero) / (one - zero) for value in arms[name][MEASURES["return"]]]
             for arms, (zero, one) in zip(environments, ends, strict=True)
         ]
-        interval = stratified_interval(strata)
         scores[name] = {
             "iqm": float(interquartile_mean([score for stratum in strata for score in stratum])),
-            "ci95": None if interval is None else list(interval),
+            "ci95": bootstrap_interval(*strata, statistic=interquartile_mean),
         }
     return scores
 

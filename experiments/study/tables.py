@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from experiments.analysis.terminal_text import text_table
 from experiments.study.channel_sweep import FILTERS_BY_COUNT
-from experiments.study.study_summary import MEASURES, SOUND_ARMS
+from experiments.study.summary import MEASURES, SOUND_ARMS
 
 # Narrow headers of the conditions.
 _CONDITIONS = {
@@ -19,6 +19,9 @@ _CONDITIONS = {
 _SIMPLER = ("zero input", "K x_hat", "random+", "proportional", "lqr", "shield at test")
 # Arms of the overview, of which a study has some: what people would use, and the arms with a proof.
 _OVERVIEW = ("unshielded", "penalized:10", "psf", "shielded", "lookahead", "lqr+shielded")
+# Arms that the short table of the first environment leaves out: they are beside the point or have a twin there.
+_NOT_IN_LEAD = ("penalized:1", "shield at test", "psf at test", "K x_hat", "lqr+psf", "lqr+trusting:lookahead")
+_NOT_IN_LEAD += ("proportional", "proportional+trusting", "proportional+shielded")
 # Headers of the table about channels, by the key of a count and by the side of the sweep.
 _SWEPT_COUNTS = {"outside_set": "left S [%]", "violating": "left the box [%]"}
 _SWEPT_SIDES = {"loss": "loss", "delay": "delay", "quantization_step": "step"}
@@ -166,6 +169,41 @@ def scores_table(summary: dict[str, Any]) -> str:
         cell = f"[{interval[0]:z.2f}, {interval[1]:z.2f}]" if interval else "one run"
         rows.append([name, f"{score['iqm']:z.2f}", cell])
     return text_table(rows)
+
+
+def budget_text(summary: dict[str, Any]) -> str:
+    """Returns what was spent in each environment, one line each."""
+    return "\n".join(
+        f"{name}: {env['seeds']} {'run' if env['seeds'] == 1 else 'runs'} per arm, {env['steps']:,} training steps "
+        f"each, {env['episodes']} episodes per run and condition"
+        for name, env in summary["environments"].items()
+    )
+
+
+def _lead(summary: dict[str, Any]) -> dict[str, Any]:
+    """Returns the first environment with the arms that a short table has."""
+    env = next(iter(summary["environments"].values()))
+    arms = {name: arm for name, arm in env["arms"].items() if name not in _NOT_IN_LEAD}
+    return env | {"arms": arms, "trained": [name for name in env["trained"] if name in arms]}
+
+
+# What other pages can quote, by name.
+QUOTABLE: dict[str, Callable[[dict[str, Any]], str]] = {
+    "lead": lambda summary: evaluation_table(_lead(summary)),
+    "budget": budget_text,
+    "price": price_table,
+    "simpler": simpler_table,
+    "scores": scores_table,
+}
+
+
+def tables_by_name(summary: dict[str, Any]) -> dict[str, str]:
+    """Returns the tables that pages quote: lead (of the first environment), budget, price, simpler and scores.
+
+    Args:
+        summary: What `page_summary` returns, with the sweep of channels.
+    """
+    return {name: table(summary) for name, table in QUOTABLE.items()}
 
 
 def _titled(title: str, table: str) -> str:

@@ -1,12 +1,15 @@
-"""The pages of `ncs study`: one in HTML with its figures inside, one in Markdown for the documentation."""
+"""The pages of `ncs study`: one in HTML with its figures inside, one in Markdown, and others that quote its tables."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from typing import Any
 
 from experiments.report.html import render_page
-from experiments.study.quoted_tables import budget_text
-from experiments.study.study_tables import (
+from experiments.study.tables import (
+    QUOTABLE,
+    budget_text,
     channels_table,
     evaluation_table,
     overview_table,
@@ -16,6 +19,9 @@ from experiments.study.study_tables import (
     simpler_table,
     training_table,
 )
+
+# A mark names a table; what stands between it and the end is replaced.
+_MARKED = re.compile(r"(<!-- ncs study: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def study_report(summary: dict[str, Any], figures: dict[str, tuple[str, bytes]]) -> str:
@@ -55,3 +61,32 @@ def _context(summary: dict[str, Any]) -> dict[str, Any]:
         "simpler": simpler_table(summary),
         "scores": scores_table(summary),
     }
+
+
+def quoted(page: str, tables: Mapping[str, str]) -> str:
+    """Returns a page with the tables between its marks replaced.
+
+    A mark is `<!-- ncs study: NAME -->` on a line of its own, and `<!-- end -->` after the table.
+
+    Args:
+        page: Text of the page.
+        tables: What `tables_by_name` returns.
+
+    Raises:
+        ValueError: If the page has no mark, or one of a table that there is not.
+    """
+    require_marks(page)
+    return _MARKED.sub(lambda found: f"{found[1]}```\n{tables[found[2]]}\n```\n{found[3]}", page)
+
+
+def require_marks(page: str) -> None:
+    """Returns if a page quotes tables of a study, and none that there is not.
+
+    Raises:
+        ValueError: If it does not.
+    """
+    names = [name for _, name, _ in _MARKED.findall(page)]
+    if not names:
+        raise ValueError("the page quotes no table of a study: it has no mark <!-- ncs study: NAME -->")
+    if unknown := set(names) - set(QUOTABLE):
+        raise ValueError(f"unknown table {min(unknown)!r} of a study; known are {', '.join(QUOTABLE)}")

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from agents.results import Episode
-from experiments.analysis.escapes import escape_sentences, escape_summary, rounded_up
+from experiments.analysis.episodes import episodes_table
+from experiments.analysis.gaussian_bound import gaussian_sentences, gaussian_summary, rounded_up
 from experiments.analysis.statistics import clopper_pearson
-from experiments.commands.compare import _escapes, _findings
+from experiments.analysis.summary import arm_summaries, arm_summary
+from experiments.commands.compare import _findings, _gaussian_noise
 from experiments.runs.experiment import certificate_of, loop_config, run_of_arm
-from experiments.runs.training_run import execute_run
+from experiments.runs.training_run import RunResult, execute_run
 from experiments.settings import CompareSettings
 from ncs_gym import Channel, LinearPlant, escape_probability, register_plant
 
@@ -19,7 +21,7 @@ DECLARED = {
     **{"A": 0.01 * np.eye(2), "B": [[1e-3], [0.0]], "u_max": 1.0, "dt": 0.1, "delta": 2e-3},
     **{"process_noise_cov": 0.1 * np.eye(2), "sensor_bound": 1e-3, "initial_bound": 1e-3},
 }
-RADIUS = np.sqrt(LinearPlant(box=[1.0, 1.0], **DECLARED).disturbance.shape[0, 0])
+RADIUS = np.sqrt(LinearPlant(box=[1.0, 1.0], **DECLARED).disturbance.shape_matrix[0, 0])
 PLANT, CHANNEL, STEPS = LinearPlant(box=2 * [1.02 * RADIUS], **DECLARED), Channel(loss=0.3), 60
 register_plant("Tests/Tight-v0", PLANT, channel=CHANNEL, max_episode_steps=STEPS)
 
@@ -28,18 +30,23 @@ def episode(level):
     return Episode(0, 200, 0.0, 0, 0, 0, True, level)
 
 
+def summary_of_episodes(episodes):
+    run = RunResult("shielded", 0, 0, 0, 0, [], episodes, None, {})
+    return arm_summary(episodes_table([run]), "project", fixed_policy=False)
+
+
 def test_episodes_outside_the_safe_set_are_counted_with_their_exact_interval():
     episodes = [episode(level) for level in (0.2, 1.0, 1.0 + 1e-9, 7.0, float("nan"))]
-    summary = escape_summary(0.25, 200, {"shielded": episodes})
+    summary = gaussian_summary(0.25, 200, {"shielded": summary_of_episodes(episodes)})
     assert summary["arms"]["shielded"] == {
         "episodes": 5,
         "episodes_outside_set": 3,
-        "rate_ci95": list(clopper_pearson(3, 5)),
+        "rate_ci95": clopper_pearson(3, 5),
     }
-    (sentence,) = escape_sentences(summary)
+    (sentence,) = gaussian_sentences(summary)
     assert "3 of 5 evaluation episodes [14.66, 94.73 %]" in sentence
     assert "at most 0.25 for an episode of 200 steps" in sentence
-    assert "says nothing" in escape_sentences(summary | {"escape_probability": 1.0})[-1]
+    assert "says nothing" in gaussian_sentences(summary | {"escape_probability": 1.0})[-1]
 
 
 @pytest.mark.parametrize(
@@ -63,7 +70,8 @@ def test_comparison_under_gaussian_noise_plays_it_and_states_the_bound(setup):
     bounded = replace(run, loop=run.loop.with_kwargs(noise=None))
     assert run.key != bounded.key
     result = execute_run(run, lambda steps: None)
-    summary = _escapes(*setup, {"shielded": "project", "monitor": "monitor"}, {"shielded": [result]})
+    arms = arm_summaries(episodes_table([result, replace(result, arm="monitor")]), "project")
+    summary = _gaussian_noise(*setup, arms)
     assert summary["escape_probability"] == escape_probability(PLANT, CHANNEL, STEPS) == pytest.approx(STEPS * 2e-3)
     arm = summary["arms"]["shielded"]
     assert 0.5 < arm["episodes_outside_set"] / arm["episodes"] / summary["escape_probability"] <= 1.0
