@@ -50,10 +50,11 @@ def from_former_file(settings: dict[str, Any]) -> dict[str, Any]:
     algorithm = str(settings.get("algo", "PPO"))
     own = {"PPO": "ppo", "TRPO": "ppo", "A2C": "a2c"}.get(algorithm, "off_policy")
     kept = {name: value for name, value in settings.items() if name not in _GROUPS}
-    group = settings.get(own) or {}
-    if not isinstance(group, dict):
-        raise TypeError(f"{own} = {group!r}")
-    return kept | {"hyperparams": from_former(algorithm, group) | settings.get("hyperparams", {})}
+    group, given = settings.get(own) or {}, settings.get("hyperparams") or {}
+    for name, value in ((own, group), ("hyperparams", given)):
+        if not isinstance(value, dict):
+            raise TypeError(f"{name} = {value!r}")
+    return kept | {"hyperparams": with_changes(from_former(algorithm, group), given)}
 
 
 class FormerSettings:

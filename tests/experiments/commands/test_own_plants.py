@@ -63,20 +63,8 @@ def test_own_plant_is_attacked_behind_every_kind_of_channel(folder, without_work
 
 
 def test_own_plant_is_trained_in_and_evaluated_by_its_id(folder, without_workers):
-    run = ncs(
-        "train",
-        *ENV,
-        "--steps",
-        64,
-        "--episodes",
-        2,
-        "--hyperparams",
-        "n_steps=16",
-        "n_envs=2",
-        "--out",
-        "r",
-        cwd=folder,
-    )
+    short = ("--steps", 64, "--episodes", 2, "--hyperparams", "n_steps=16", "n_envs=2")
+    run = ncs("train", *ENV, *short, "--out", "r", cwd=folder)
     assert run.returncode == 0, run.stderr
     settings = json.loads((folder / "r" / "settings.json").read_text())
     assert settings["settings"]["env"] == "Plants/Truck-v0"  # a file names no module

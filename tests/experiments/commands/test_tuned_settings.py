@@ -15,7 +15,7 @@ def test_command_trains_with_tuned_hyperparameters_and_records_all_of_them(tmp_p
     run = ncs("train", "--env", ENV, *SMALL, networks, "--out", tmp_path / "r")
     assert run.returncode == 0, run.stderr
     prose = " ".join(run.stdout.split())
-    assert f"PPO, hyperparameters tuned for {ENV}, as given n_envs, n_steps, policy_kwargs: n_envs=2, " in prose
+    assert f"PPO, hyperparameters tuned for {ENV}, as given n_envs, policy_kwargs, n_steps: n_envs=2, " in prose
     settings = json.loads((tmp_path / "r" / "settings.json").read_text())["settings"]
     agent = Agent.load(tmp_path / "r" / "models" / "shielded-0")
     tuned = tuned_hyperparams(ENV)

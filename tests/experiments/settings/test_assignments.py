@@ -65,11 +65,7 @@ def test_dotted_flags_mean_the_same():
         ([], ["--ppo.discount", "0.8", "--ppo.envs=4"], ["gamma=0.8", "n_envs=4"]),
         ([], ["--ppo.width=8", "--ppo.log-std=-1"], ["policy_kwargs=dict(net_arch=[8, 8], log_std_init=-1)"]),
         (["--algo", "TRPO"], ["--ppo.epochs", "3"], ["n_critic_updates=3"]),
-        (
-            ["--algo=A2C"],
-            ["--a2c.rollout", "4", "--a2c.learning-rate", "0.01"],
-            ["n_steps=4", "learning_rate=lin_0.01"],
-        ),
+        (["--algo=A2C"], ["--a2c.rollout", "4", "--a2c.discount", "0.5"], ["n_steps=4", "gamma=0.5"]),
         (["--algo=TD3"], ["--off-policy.noise", "0.3", "--hyperparams", "gamma=0.8"], ["noise_std=0.3", "gamma=0.8"]),
         (["--algo", "SAC"], ["--off-policy.noise", "0.3", "--off-policy.envs", "4"], ["n_envs=4"]),
     ],

@@ -71,7 +71,7 @@ def test_what_is_given_wins_over_the_file_and_the_file_over_the_tuned_values(tmp
     expected = tuned | {"gamma": 0.7, "n_steps": 8, "policy_kwargs": networks}
     assert settings.all_hyperparams == expected
     assert settings.training_steps == 5000
-    assert "as given n_steps, gamma, policy_kwargs: " in settings.agent_line
+    assert "as given gamma, policy_kwargs, n_steps: " in settings.agent_line
     assert settings.completed == replace(settings, steps=5000, hyperparams=expected, conf_file=None)
 
 
