@@ -141,7 +141,7 @@ def main() -> None:
     print(f"settings of a run: {len(pickle.dumps(run)) / 1e3:.1f} kB pickled, {memory(run, 1000):.1f} kB in memory")
     start = time.perf_counter()
     defaults = SweepSettings()
-    execute_run(replace(run, steps=defaults.training_steps, settings=defaults.agent), lambda steps: None)
+    execute_run(replace(run, steps=defaults.training_steps, settings=defaults.all_hyperparams), lambda steps: None)
     print(f"a run of ncs sweep with its default budget: {time.perf_counter() - start:.1f} s on one core")
 
 
