@@ -325,13 +325,13 @@ def test_constant_rate_is_constant_and_a_linear_one_falls():
     assert rates[0].checksum != rates[1].checksum
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize(
-    ("algorithm", "former", "hyperparams"),
+    ("algorithm", "kind", "former", "hyperparams"),
     [
         (
             "PPO",
-            PPOSettings(envs=4, rollout=64, batch_size=128, epochs=2, width=16, log_std=-1.5, normalize_rewards=False),
+            PPOSettings,
+            dict(envs=4, rollout=64, batch_size=128, epochs=2, width=16, log_std=-1.5, normalize_rewards=False),
             dict(
                 n_envs=4,
                 n_steps=64,
@@ -343,17 +343,21 @@ def test_constant_rate_is_constant_and_a_linear_one_falls():
         ),
         (
             "TRPO",
-            PPOSettings(envs=4, rollout=64, epochs=3, discount=0.8, learning_rate=1e-3, entropy=0.1),
+            PPOSettings,
+            dict(envs=4, rollout=64, epochs=3, discount=0.8, learning_rate=1e-3, entropy=0.1),
             dict(n_envs=4, n_steps=64, n_critic_updates=3, gamma=0.8, learning_rate="lin_1e-3"),
         ),
         (
             "SAC",
-            OffPolicySettings(envs=4, gradient_steps=1, batch_size=32, learning_starts=64, noise=0.5),
+            OffPolicySettings,
+            dict(envs=4, gradient_steps=1, batch_size=32, learning_starts=64, noise=0.5),
             dict(n_envs=4, gradient_steps=1, batch_size=32, learning_starts=64),
         ),
     ],
 )
-def test_former_settings_train_the_same_agent(algorithm, former, hyperparams):
+def test_former_settings_train_the_same_agent(algorithm, kind, former, hyperparams):
+    with pytest.warns(DeprecationWarning, match="in the words of stable-baselines3"):
+        settings = kind(**former)
     with pytest.warns(DeprecationWarning, match="hyperparams="):
-        old = train(CRUISE, 512, 3, algorithm, settings=former)
+        old = train(CRUISE, 512, 3, algorithm, settings=settings)
     assert old.agent.checksum == train(CRUISE, 512, 3, algorithm, hyperparams).agent.checksum
