@@ -206,6 +206,7 @@ def _require_same(folder: Path, command: str, settings: Any) -> None:
         kept_command, kept = document["command"], document["settings"]
         if not isinstance(kept, dict):
             raise TypeError("settings")
+        kept = from_former_file(kept)
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise OtherResultsError(
             f"{folder} holds finished results, and no settings.json that says of what: {advice}"
@@ -213,7 +214,7 @@ def _require_same(folder: Path, command: str, settings: Any) -> None:
     if kept_command != command:
         raise OtherResultsError(f"{folder} holds finished results of ncs {kept_command}: {advice}")
     defaults = settings_json(command, type(settings)())["settings"]
-    before, now = _flat(defaults | from_former_file(kept)), _flat(settings_json(command, settings)["settings"])
+    before, now = _flat(defaults | kept), _flat(settings_json(command, settings)["settings"])
     growing = _GROWING.get(command, ())
     others = [
         f"{name} {_shown(before.get(name))}, now {_shown(now.get(name))}"

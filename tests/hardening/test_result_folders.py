@@ -339,7 +339,7 @@ def test_changed_counts_are_refused_or_usable(tmp_path_factory, change):
 
 
 @pytest.mark.parametrize(
-    "settings", [[[1, 2]], [["seed", 1]], {"": 1}, {"seed": {"a": {}}}, {"ppo": 3}, {"arms": [[]]}]
+    "settings", [[[1, 2]], [["seed", 1]], {"": 1}, {"seed": {"a": {}}}, {"ppo": 3}, {"hyperparams": 3}, {"arms": [[]]}]
 )
 def test_forged_settings_of_finished_results_are_one_sentence(settings, tmp_path):
     (tmp_path / "summary.json").write_text("{}")
