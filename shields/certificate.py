@@ -17,6 +17,7 @@ from shields.certificate_text import (
     contract_text,
     counted,
     interruption_of,
+    missing_polytope_of,
     numbers_text,
     size_of,
     table,
@@ -24,6 +25,7 @@ from shields.certificate_text import (
 )
 from shields.errors import CertificateError
 from shields.json_documents import document_of, read_content, write_document
+from shields.polytope import Polytope, polytope_content, polytope_of
 
 _FORMAT = "ncs-gym certificate 2"
 # The fields that a certificate of each method has besides L and K, and that one of the other method must not have.
@@ -133,6 +135,8 @@ class PaperConstants(NamedTuple):
 class Certificate(ReadOnlyArrays):
     """A robust control invariant set S = {x : x'Mx <= 1} inside the safe box, its gain, and the numbers that prove it.
 
+    It may also have a polytope around S that the same gain keeps invariant; shields keep the state in that then.
+
     A certificate is not trusted until `shields.verify` has checked it in exact arithmetic. Two certificates are equal
     if their files are, every digit of them. `print(certificate)` says what it is for.
 
@@ -144,6 +148,7 @@ class Certificate(ReadOnlyArrays):
         D: Shape of the disturbance set that the proofs assume, (n, n); None for "paper".
         rounding: Multiplier s of D_u, which is D enlarged by the rounding of actions to float32; None for "paper".
         updates: What a channel contract adds to the proofs; None without a contract.
+        polytope: The polytope that a shield keeps in place of S; None without one, and for "paper".
         method: Method of the synthesis, "certified" or "paper".
         fingerprint: Fingerprint of the plant that the certificate belongs to.
         kappa: Contraction factor of OP; this and the next three are None unless the method is "paper".
@@ -159,6 +164,7 @@ class Certificate(ReadOnlyArrays):
     D: np.ndarray | None = None
     rounding: float | None = None
     updates: Updates | None = None
+    polytope: Polytope | None = None
     method: str
     fingerprint: str
     kappa: float | None = None
@@ -201,6 +207,8 @@ class Certificate(ReadOnlyArrays):
             raise ValueError(f"one of method {self.method!r} has other entries: {', '.join(wrong)}")
         if self.updates is not None and self.method == "paper":
             raise ValueError("one of method 'paper' has no channel contract")
+        if self.polytope is not None and (self.method == "paper" or not isinstance(self.polytope, Polytope)):
+            raise ValueError("its polytope must be a Polytope, and one of method 'paper' has none")
 
     def _check_error_sets(self, n: int) -> None:
         """Raises ValueError unless there is a proof for every age, and all error sets have n dimensions."""
@@ -238,9 +246,14 @@ class Certificate(ReadOnlyArrays):
         return read_only(0.5 * (inverse + inverse.T))
 
     @cached_property
-    def safe_set(self) -> Ellipsoid:
-        """The robust control invariant set S = E(L)."""
+    def ellipsoid(self) -> Ellipsoid:
+        """The robust control invariant ellipsoid S = E(L)."""
         return Ellipsoid(self.L)
+
+    @property
+    def safe_set(self) -> Ellipsoid | Polytope:
+        """The set that a shield keeps: the polytope if there is one, else the ellipsoid S = E(L)."""
+        return self.ellipsoid if self.polytope is None else self.polytope
 
     @property
     def contract(self) -> ChannelContract | None:
@@ -305,8 +318,9 @@ class Certificate(ReadOnlyArrays):
         rows = [
             ("method", METHODS[self.method]),
             ("plant", f"{counted(n, 'state')}, {counted(m, 'input')}, fingerprint {self.fingerprint[:16]}"),
-            ("safe set", f"x'Mx <= 1, that reaches |x_i| <= {numbers_text(np.sqrt(np.diag(self.L)))}"),
+            ("safe set", self._safe_set_text()),
             ("size", size_of(recorded)),
+            ("polytope", missing_polytope_of(recorded)),
             ("fallback", "u = K x_hat"),
             ("contract", contract_text(self.method, self.contract)),
             ("tolerance", tolerance_of(recorded)),
@@ -316,6 +330,12 @@ class Certificate(ReadOnlyArrays):
         return table(
             "Certificate of a robust control invariant set; shields.verify(certificate, plant) checks it", rows
         )
+
+    def _safe_set_text(self) -> str:
+        ellipsoid = f"x'Mx <= 1, that reaches |x_i| <= {numbers_text(np.sqrt(np.diag(self.L)))}"
+        if self.polytope is None:
+            return ellipsoid
+        return f"the polytope |g x| <= 1 of {len(self.polytope.rows)} rows g; inside it the ellipsoid {ellipsoid}"
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a JSON file in which every float is exact; a reader never sees a partial file.
@@ -350,7 +370,8 @@ def _content_of(certificate: Certificate) -> dict[str, Any]:
     Under a contract the arrays of all ages stand in `ages`, and those of the largest age are repeated before.
     """
     c, last = certificate, certificate.multipliers
-    return {
+    polytope = {} if c.polytope is None else {"polytope": polytope_content(c.polytope)}
+    return polytope | {
         "L": c.L.tolist(),
         "K": c.K.tolist(),
         "Sigma": None if c.Sigma is None else c.Sigma.tolist(),
@@ -397,6 +418,8 @@ def _fields_of(content: dict[str, Any]) -> dict[str, Any]:
         return fields
     stated = Multipliers(**content["multipliers"])
     fields["rounding"] = stated.rounding
+    if content.get("polytope") is not None:
+        fields["polytope"] = polytope_of(content["polytope"])
     own = Sigma, stated.error, [stated.state, stated.estimate, stated.disturbance], stated.inputs
     if ages is None:
         return fields | {"proofs": _proofs([own])}

@@ -25,7 +25,8 @@ def size_of(recorded: dict[str, Any]) -> str:
     """
     unknown = recorded.get("share_of_box_unknown")
     shares = (
-        _text(recorded.get("share_of_box"), "{:.4g} % of the safe box's volume", 100.0),
+        _text(recorded.get("polytope_share_of_box"), "{:.3g} % of the safe box's volume; the ellipsoid ", 100.0)
+        + _text(recorded.get("share_of_box"), "{:.4g} % of the safe box's volume", 100.0),
         _text(
             recorded.get("share_of_box_at_rest"),
             "{:.4g} % of the volume of the safe box of the states, with no input under way",
@@ -80,6 +81,12 @@ def assumptions_of(recorded: dict[str, Any]) -> str:
     """Returns the plant's assumptions, if they are recorded."""
     given = recorded.get("assumptions")
     return " ".join(each for each in given if isinstance(each, str)) if isinstance(given, list) else ""
+
+
+def missing_polytope_of(recorded: dict[str, Any]) -> str:
+    """Returns why there is no polytope, if one was asked for."""
+    reason = recorded.get("no_polytope")
+    return f"none: {reason}; shields keep the state in the ellipsoid" if isinstance(reason, str) else ""
 
 
 def interruption_of(recorded: dict[str, Any]) -> str:

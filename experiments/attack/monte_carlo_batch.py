@@ -55,7 +55,7 @@ def run_batch(
     shields = list(_shields(campaign, batch.case, certificate).values())
     shield = shields[batch.index % len(shields)]
     plant = shield.filter.plant
-    root = np.linalg.inv(np.linalg.cholesky(shield.certificate.L))
+    safe_set = shield.filter.kept_set
     seeds = np.random.SeedSequence([campaign.seed, zlib.crc32(batch.case.encode()), batch.index])
     seed, policy_seed = seeds.generate_state(2, np.uint64).tolist()
     rng = np.random.default_rng(policy_seed)
@@ -65,7 +65,7 @@ def run_batch(
         steps=campaign.batch_steps,
         episodes=campaign.envs,
         unproved=int(np.count_nonzero(~info["shield_guaranteed"])),
-        outside_starts=int(np.count_nonzero(_squares(root, info) > 1.0)),
+        outside_starts=int(np.count_nonzero(_levels(safe_set, info) > 1.0)),
     )
     kept, broken = np.ones(campaign.envs, np.bool_), np.zeros(campaign.envs, np.bool_)
     for step in range(EPISODE_STEPS):
@@ -73,7 +73,7 @@ def run_batch(
         claimed, kept = _claimed_and_kept(info, kept)
         if not campaign.shielded:  # nothing is claimed, and everything counted
             claimed[:] = True
-        outside, reached = _outside_and_reached(campaign, info, _squares(root, info))
+        outside, reached = _outside_and_reached(campaign, info, _levels(safe_set, info))
         counts += _step_counts(info, outside, claimed, kept)
         broken |= claimed & (outside.box | (outside.safe_set & (not campaign.looks_ahead)))
         if step >= SETTLING_STEPS:
@@ -104,10 +104,10 @@ def _claimed_and_kept(info: dict[str, Any], kept: np.ndarray) -> tuple[np.ndarra
     return kept | info["shield_guaranteed"], kept & ~info["contract_broken"]
 
 
-def _outside_and_reached(campaign: Campaign, info: dict[str, Any], squares: np.ndarray) -> tuple[_Outside, np.ndarray]:
-    """Returns what lies outside, and the levels that the claim limits to one, shape (N,): sqrt(x'Mx) or max |c_j x|."""
-    outside = _Outside(~(squares <= 1.0), info["cost"] != 0.0)
-    return outside, info["constraint_values"].max(axis=1) + 1.0 if campaign.looks_ahead else np.sqrt(squares)
+def _outside_and_reached(campaign: Campaign, info: dict[str, Any], levels: np.ndarray) -> tuple[_Outside, np.ndarray]:
+    """Returns what lies outside, and the levels that the claim limits to one, (N,): in the safe set or max |c_j x|."""
+    outside = _Outside(~(levels <= 1.0), info["cost"] != 0.0)
+    return outside, info["constraint_values"].max(axis=1) + 1.0 if campaign.looks_ahead else levels
 
 
 def _step_counts(info: dict[str, Any], outside: _Outside, claimed: np.ndarray, kept: np.ndarray) -> SafetyCounts:
@@ -141,9 +141,9 @@ def _begin(campaign: Campaign, shield: VectorSafetyShield, seed: int, rng: np.ra
     return info
 
 
-def _squares(root: np.ndarray, info: dict[str, Any]) -> np.ndarray:
-    """Returns x'Mx of the true states, shape (N,)."""
-    return np.square(root @ info["state"].T).sum(axis=0)
+def _levels(safe_set: Any, info: dict[str, Any]) -> np.ndarray:
+    """Returns how far out the true states are in the set that a shield keeps: 1 on its boundary, shape (N,)."""
+    return safe_set.gauge(info["state"])
 
 
 @lru_cache(maxsize=1)  # a shield's tables may take a hundred megabytes

@@ -19,7 +19,14 @@ START_BEHIND_DOWNLINK = 0.3
 
 def start_set(certificate: Certificate, downlink: Any) -> Ellipsoid:
     """Returns the set on whose boundary episodes start: S, behind a downlink a part of it."""
-    return certificate.safe_set if downlink is None else Ellipsoid(START_BEHIND_DOWNLINK**2 * certificate.L)
+    return certificate.ellipsoid if downlink is None else Ellipsoid(START_BEHIND_DOWNLINK**2 * certificate.L)
+
+
+def _push_out_of(certificate: Certificate) -> AdversarialDisturbance:
+    """Returns the disturbance that takes the next state farthest out of the set that a shield keeps."""
+    if certificate.polytope is None:
+        return AdversarialDisturbance(certificate.M)
+    return AdversarialDisturbance(rows=certificate.polytope.rows)
 
 
 class WorstCaseVectorEnv(NCSVectorEnv):
@@ -35,7 +42,7 @@ class WorstCaseVectorEnv(NCSVectorEnv):
     def __init__(
         self, num_envs: int, certificate: Certificate, *, pushes_to_box: bool = False, **settings: Any
     ) -> None:
-        push = AdversarialDisturbance(None if pushes_to_box else certificate.M)
+        push = AdversarialDisturbance() if pushes_to_box else _push_out_of(certificate)
         initial_set = start_set(certificate, settings.get("downlink"))
         super().__init__(num_envs, disturbance=push, initial_set=initial_set, **settings)
         self._process.sensor_noise = BlockSampler(self._extreme_noise, num_envs)
@@ -97,7 +104,7 @@ def starts_in_box(rng: np.random.Generator, plant: LinearPlant, certificate: Cer
 
     In directions that no row of the box limits, `half_widths` limit them.
     """
-    states = (1.0 - 1e-9) * certificate.safe_set.sample_boundary(rng, count)
+    states = (1.0 - 1e-9) * certificate.ellipsoid.sample_boundary(rng, count)
     chosen, missing = np.arange(count) % 2 == 1, np.arange(count) % 2 == 1
     while missing.any():
         states[missing] = rng.uniform(-1.0, 1.0, (int(missing.sum()), plant.n)) * plant.half_widths

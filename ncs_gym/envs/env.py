@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
-from ncs_gym.envs.info import loop_info
+from ncs_gym.envs.info import Known, loop_info
 from ncs_gym.envs.reset_options import start_option
 from ncs_gym.envs.settings import expect, loop_contracts, require_suitable, starting_set
 from ncs_gym.envs.spaces import observation_space, read_action
@@ -280,6 +280,11 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         if self.renderer is not None:
             self.renderer.annotate(annotation)
 
+    @property
+    def known(self) -> Known:
+        """What a shield decides on, as copies: no wrapper stands between."""
+        return Known(*(each.copy() if isinstance(each, np.ndarray) else each for each in self._known))
+
     def beliefs(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Returns estimate and error shape of now and of every step until the next decision takes effect."""
         return [self._estimator.predicted(self._pending[:ahead]) for ahead in range(len(self._pending) + 1)]
@@ -316,6 +321,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         constraints = values, cost, self._violations
         self._belief = self._predicted_estimate()
         known, alarm = self._estimator, bool(self._estimator.alarm or self._process.alarm)
+        self._known = Known(*self._belief, known.age, alarm, inputs.applied.copy(), inputs.committed.copy())
         return loop_info(known, self._belief, self._contract, self._state, inputs, arrived, constraints, alarm)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -10,6 +10,28 @@ from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.downlink import Inputs
+
+
+class Known(NamedTuple):
+    """What is known where decisions are made, of now; of N environments, arrays whose last axis is the environment.
+
+    A shield takes what it decides on from here, never from an `info`, into which wrappers may have written.
+
+    Attributes:
+        estimate: x_hat of the time at which the next decision takes effect, shape (n,) or (n, N).
+        error_shape: Sigma_k of the same time, shape (n, n) or (N, n, n).
+        age: Steps since the newest sample used was taken, an int or shape (N,).
+        alarm: Whether an assumption was seen to be violated, a bool or shape (N,).
+        applied: The input applied in the last step, shape (m,) or (m, N) [physical units]; zeros at a reset.
+        committed: The input decided in the last step, of the same shape.
+    """
+
+    estimate: np.ndarray
+    error_shape: np.ndarray
+    age: Any
+    alarm: Any
+    applied: np.ndarray
+    committed: np.ndarray
 
 
 def loop_info(

@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from ncs_gym.envs.env import SAMPLE_ROUNDING, NCSEnv, RenderModeError
-from ncs_gym.envs.info import loop_info
+from ncs_gym.envs.info import Known, loop_info
 from ncs_gym.envs.reset_options import vector_reset_options
 from ncs_gym.envs.spaces import read_actions
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
@@ -103,6 +103,8 @@ class NCSVectorEnv(VectorEnv):
         self.steps, self.episodes = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, np.int64)
         self.starts = np.full((self.num_envs, self._plant.n), np.nan)
         self.ticks, self._consistent = 0, False
+        self._known: Known
+        self._ended: tuple[np.ndarray, Known] | None = None
 
     @property
     def error_shapes(self) -> tuple[StatisticsTable, np.ndarray]:
@@ -111,6 +113,19 @@ class NCSVectorEnv(VectorEnv):
         The table grows; it is another object after shapes were forgotten.
         """
         return self._estimator.patterns.table, self._belief[1]
+
+    @property
+    def known(self) -> Known:
+        """What a shield decides on, as copies: no wrapper stands between."""
+        return Known(*(each.copy() for each in self._known))
+
+    @property
+    def ended(self) -> tuple[np.ndarray, Known] | None:
+        """With SAME_STEP, where an episode ended in the last step, shape (N,), and what was known at its end."""
+        if self._ended is None:
+            return None
+        done, known = self._ended
+        return done.copy(), Known(*(each.copy() for each in known))
 
     def beliefs(self, chosen: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Returns what `NCSEnv.beliefs` does for some environments, by index: estimates (n, k), `error_shapes`."""
@@ -138,7 +153,7 @@ class NCSVectorEnv(VectorEnv):
             self._process.forget()
         if not (self._consistent or mask.all()):
             raise gym.error.ResetNeeded("reset all environments first")
-        self._consistent = False
+        self._consistent, self._ended = False, None
         self._begin(mask, starts)
         info = self._info(no_inputs(self._plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), mask)
         self._consistent = True
@@ -157,7 +172,7 @@ class NCSVectorEnv(VectorEnv):
         some_done = bool(self._done.any())
         if some_done and self._autoreset_mode is AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded("some episodes are over: reset them with options={'reset_mask': ...}")
-        self._consistent = False
+        self._consistent, self._ended = False, None
         inputs = self._downlink_state.exchange(self.np_random, self.steps, u)
         applied, committed, missing = inputs
         arrived = self._advance(applied)
@@ -275,16 +290,21 @@ class NCSVectorEnv(VectorEnv):
         belief = self._belief[0], table.shapes.take(numbers, axis=0)
         constraints = values, cost, self._violations.copy()
         alarm = self._estimator.alarm | self._process.alarm
+        self._known = Known(*belief, self._estimator.age.copy(), alarm.copy(), *(each.copy() for each in inputs[:2]))
         return loop_info(self._estimator, belief, self._contract, self._state, inputs, arrived, constraints, alarm)
 
     def _restarted(self, observation: np.ndarray, info: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
         """Returns the first of new episodes where old ones ended, whose last go to final_obs and final_info."""
         done = self._done.copy()
+        ended = self._known
+        self._ended = done, ended
         final = {key: _where(done, value, np.zeros_like(value)) for key, value in info.items()}
         final |= {f"_{key}": done.copy() for key in info}
         final_observation = _where(done, observation, np.zeros_like(observation))
         self._begin(done, None)
         fresh = self._info(no_inputs(self._plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), done)
+        inputs = (np.where(done, 0.0, each) for each in (ended.applied, ended.committed))
+        self._known = Known(*self._known[:4], *inputs)
         merged = {key: _where(done, fresh[key], value) for key, value in info.items()}
         return _where(done, self._observation(), observation), merged | {
             "final_obs": final_observation,

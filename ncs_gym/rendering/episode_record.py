@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -15,10 +15,15 @@ from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.tasks.setpoint_tracking import SetpointTracking
 from ncs_gym.tasks.speed_tracking import SpeedTracking
 from ncs_gym.tasks.task import Task
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 
 # Number of steps of the path and of the packets that a frame shows.
 RECENT_STEPS = 40
+
+
+class ConvexSet(Protocol):
+    """What is drawn of a convex set: its support function, max of a'x over it for directions a, shape (count, n)."""
+
+    def support(self, directions: Any, /) -> Any: ...  # noqa: D102
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -26,7 +31,7 @@ class Annotation:
     """What a shield knows about the step it is about to take, to be shown in the picture of that step.
 
     Attributes:
-        safe_set: The safe set S = {x : x'Mx <= 1} of the shield's certificate.
+        safe_set: The set that the shield keeps the state in.
         label: The shield's mode, written in the header.
         proposed: The input the agent proposed, shape (m,) [physical units]; None at reset.
         intervened: Whether the shield replaces the proposed input.
@@ -36,7 +41,7 @@ class Annotation:
             a shield that stores none.
     """
 
-    safe_set: Ellipsoid
+    safe_set: ConvexSet
     label: str
     proposed: np.ndarray | None = None
     intervened: bool = False

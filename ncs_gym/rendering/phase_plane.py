@@ -7,8 +7,9 @@ import numpy as np
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
-from ncs_gym.rendering.episode_record import RECENT_STEPS, FrameRecord
+from ncs_gym.rendering.episode_record import RECENT_STEPS, ConvexSet, FrameRecord
 from ncs_gym.rendering.panel import draw_plan
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 
 # The axes reach this far, in units of the limits.
 _AXIS_REACH = 1.5
@@ -18,6 +19,8 @@ _BORDER = 7.0
 _MAX_COORDINATE = 2000.0
 # Corners of a polygon that lies outside all axes, in units of the limits.
 _FAR = 10.0
+# Tangents around the projection of a set that is no ellipsoid.
+_TANGENTS = 90
 
 
 def limit_of(plant: LinearPlant, index: int) -> float:
@@ -46,23 +49,23 @@ class PhasePlane:
         """Returns where points in the two coordinates, shape (k, 2), are in the frame, shape (k, 2) [pixels]."""
         return self._center + self._scale * points
 
-    def draw_background(self, canvas: Canvas, safe_set: np.ndarray | None) -> None:
-        """Draws what does not move: the box, the safe set with shape L (n, n), ticks and titles."""
+    def draw_background(self, canvas: Canvas, safe_set: ConvexSet | None) -> None:
+        """Draws what does not move: the box, the safe set, ticks and titles."""
         rect = self._rect
         canvas.rect(rect, theme.DANGER_FILL)
         canvas.clip(rect)
         box = self.pixels_of(_box_corners(self._plant, self._pair))
         canvas.polygon(box, theme.PAPER)
         if safe_set is not None:
-            ellipse = self.pixels_of(self._projection(safe_set))
-            canvas.polygon(ellipse, theme.SAFE_FILL)
+            outline = self.pixels_of(self._outline(safe_set))
+            canvas.polygon(outline, theme.SAFE_FILL)
         for fraction in (-1.0, -0.5, 0.0, 0.5, 1.0):
             x, y = self.pixels_of(fraction * self._limits)
             color = theme.FAINT if fraction == 0.0 else theme.GRID
             canvas.line([(x, rect.y), (x, rect.bottom)], color, 0.5)
             canvas.line([(rect.x, y), (rect.right, y)], color, 0.5)
         if safe_set is not None:
-            canvas.line([*ellipse, ellipse[0]], theme.SAFE, 2.0)
+            canvas.line([*outline, outline[0]], theme.SAFE, 2.0)
         canvas.dashed([*box, box[0]], theme.DANGER, 1.5)
         canvas.clip(None)
         canvas.rect(rect, theme.FAINT, width=0.5)
@@ -95,6 +98,20 @@ class PhasePlane:
             color = theme.blend(theme.FAINT, theme.INK, i / count)
             canvas.line(points[i - 1 : i + 1], color, 1.5)
         _draw_interventions(canvas, points, frame)
+
+    def _outline(self, safe_set: ConvexSet) -> np.ndarray:
+        """Returns points around the projection of a convex set onto the two coordinates, shape (k, 2)."""
+        if isinstance(safe_set, Ellipsoid):
+            return self._projection(safe_set.shape_matrix)
+        angles = np.linspace(0.0, 2.0 * np.pi, _TANGENTS, endpoint=False)
+        normals = np.column_stack([np.cos(angles), np.sin(angles)]) / self._limits
+        directions = np.zeros((_TANGENTS, self._plant.n))
+        directions[:, list(self._pair)] = normals
+        heights = safe_set.support(directions)
+        # Where every tangent meets the next one.
+        pairs = np.stack([normals, np.roll(normals, -1, axis=0)], axis=1)
+        sides = np.stack([heights, np.roll(heights, -1)], axis=1)
+        return np.linalg.solve(pairs, sides[..., None])[..., 0]
 
     def _projection(self, shape: np.ndarray) -> np.ndarray:
         """Returns points around an ellipsoid's projection onto the two coordinates, shape (k, 2)."""
@@ -132,13 +149,13 @@ class TimePlot:
     def __init__(self, plant: LinearPlant, rect: theme.Rect) -> None:
         self._plant, self._rect, self._limit = plant, rect, limit_of(plant, 0)
 
-    def draw_background(self, canvas: Canvas, safe_set: np.ndarray | None) -> None:
-        """Draws what does not move: limits, the safe set with shape L (1, 1), ticks and titles."""
+    def draw_background(self, canvas: Canvas, safe_set: ConvexSet | None) -> None:
+        """Draws what does not move: limits, the safe set, ticks and titles."""
         rect = self._rect
         canvas.rect(rect, theme.DANGER_FILL)
         self._fill_band(canvas, self._limit, theme.PAPER)
         if safe_set is not None:
-            high = float(np.sqrt(safe_set[0, 0]))
+            high = float(safe_set.support(np.ones((1, 1)))[0])
             self._fill_band(canvas, high, theme.SAFE_FILL)
             for y in (self._y(high), self._y(-high)):
                 canvas.line([(rect.x, y), (rect.right, y)], theme.SAFE, 2.0)

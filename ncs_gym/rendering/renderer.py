@@ -167,7 +167,7 @@ class _Picture:
             canvas.clear()
             canvas.rect(theme.PLANT_VIEW, color)
             self._drawing.draw_background(canvas)
-            self._plane.draw_background(canvas, None if safe_set is None else safe_set.shape_matrix)
+            self._plane.draw_background(canvas, safe_set)
             draw_legend(canvas, shielded=safe_set is not None, plans=stores_plans)
             self._backgrounds[key] = safe_set, canvas.snapshot()  # keeps the set alive, so that its id stays its own
         return self._backgrounds[key][1]

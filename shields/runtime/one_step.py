@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -53,6 +53,7 @@ class OneStepTest:
         rounding: Bound on the rounding of a product with G, relative to the product of absolute values.
         columns, own_columns: Norms of the columns of |G| |A| and of |G|, shape (n,).
         pushed: Largest norm of |G| |B| |u| within the limits.
+        shift: Largest norm of G B u within the limits, to which the rounding of an action is relative.
         single: Shapes of a single estimate and input, (n,) and (m,).
         limits: Entries of u_max.
 
@@ -71,10 +72,15 @@ class OneStepTest:
         self.columns = read_only(np.linalg.norm(size @ np.abs(plant.A), axis=0))
         self.own_columns = read_only(np.linalg.norm(size, axis=0))
         self.pushed = float(np.linalg.norm(size @ np.abs(plant.B), axis=0) @ plant.u_max)
+        self.shift = float(np.linalg.norm(self.effect, axis=0) @ plant.u_max)
         bound = plant.disturbance.shape_matrix
         extent = float(self.own_columns @ np.sqrt(np.diag(bound)))
         D = self.root @ bound @ self.root.T + self.rounding * extent**2 * np.eye(plant.n)
         self.D = read_only(0.5 * (D + D.T))
+
+    def predicted(self, shapes: np.ndarray, certified_shapes: np.ndarray) -> PredictedErrors:
+        """Returns what `predicted_errors` does."""
+        return predicted_errors(self, shapes, certified_shapes)
 
     def reachable(self, estimates: np.ndarray, errors: PredictedErrors) -> ReachableSets:
         """Returns the sets of next states that N estimates allow.
@@ -212,25 +218,21 @@ class PredictedErrors(NamedTuple):
     certified: Any
     shape: np.ndarray
 
-    def of(self, numbers: np.ndarray) -> PredictedErrors:
+    def of(self, numbers: np.ndarray) -> Self:
         """Returns those of environments that have the shapes with these numbers, shape (N,)."""
-        return PredictedErrors(*(array.take(numbers, axis=-1) for array in self))
+        return self._make(array.take(numbers, axis=-1) for array in self)
 
-    def single(self) -> PredictedErrors:
+    def single(self) -> Self:
         """Returns the first without a last axis."""
-        weighting, half_widths, shape = (
-            array[..., 0].copy() for array in (self.weighting, self.half_widths, self.shape)
-        )
-        radius, largest, certified = (array.item(0) for array in (self.radius, self.largest, self.certified))
-        return PredictedErrors(weighting, radius, half_widths, largest, certified, shape)
+        return self._make(array.item(0) if array.ndim == 1 else array[..., 0].copy() for array in self)
 
-    def batch(self) -> PredictedErrors:
+    def batch(self) -> Self:
         """Returns a single one as a batch of one."""
-        return PredictedErrors(*(np.asarray(each)[..., None] for each in self))
+        return self._make(np.asarray(each)[..., None] for each in self)
 
-    def followed_by(self, other: PredictedErrors) -> PredictedErrors:
+    def followed_by(self, other: Self) -> Self:
         """Returns these shapes and then the others."""
-        return PredictedErrors(*(np.concatenate(pair, axis=-1) for pair in zip(self, other, strict=True)))
+        return self._make(np.concatenate(pair, axis=-1) for pair in zip(self, other, strict=True))
 
 
 @np.errstate(all="ignore")  # what overflows is found below, what underflows does not count
@@ -244,13 +246,7 @@ def predicted_errors(test: OneStepTest, shapes: np.ndarray, certified_shapes: np
         shapes: Sigma_k, shape (k, n, n).
         certified_shapes: Shapes of the certified error sets, shape (l, n, n).
     """
-    symmetric = 0.5 * (shapes + shapes.swapaxes(1, 2))
-    usable = _are_shapes(symmetric)
-    inside = [
-        bool(fine) and any(is_inside(S, Sigma) for Sigma in certified_shapes)
-        for S, fine in zip(shapes, usable, strict=True)
-    ]
-    symmetric = np.where(usable[:, None, None], symmetric, np.eye(test.plant.n))
+    symmetric, usable, inside = judged_shapes(shapes, certified_shapes)
     half_widths = np.sqrt(np.diagonal(symmetric, axis1=1, axis2=2))
     identity = test.rounding * np.eye(test.plant.n)
     spread = half_widths @ test.columns
@@ -271,9 +267,23 @@ def predicted_errors(test: OneStepTest, shapes: np.ndarray, certified_shapes: np
         radius=radius + unusable,
         half_widths=np.ascontiguousarray((half_widths + unusable[:, None]).T),
         largest=np.sqrt(np.maximum(own, 0.0)) + unusable,
-        certified=np.array(inside, np.bool_) & usable,
+        certified=inside & usable,
         shape=np.ascontiguousarray(shapes.transpose(1, 2, 0)),
     )
+
+
+def judged_shapes(shapes: np.ndarray, certified_shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the symmetric parts of error shapes, (k, n, n), the identity where one is unusable; and which are usable.
+
+    The third result is which lie inside a certified error set; both have shape (k,).
+    """
+    symmetric = 0.5 * (shapes + shapes.swapaxes(1, 2))
+    usable = _are_shapes(symmetric)
+    inside = [
+        bool(fine) and any(is_inside(S, Sigma) for Sigma in certified_shapes)
+        for S, fine in zip(shapes, usable, strict=True)
+    ]
+    return np.where(usable[:, None, None], symmetric, np.eye(shapes.shape[-1])), usable, np.array(inside, np.bool_)
 
 
 def _are_shapes(matrices: np.ndarray) -> np.ndarray:

@@ -170,3 +170,59 @@ def _orthogonal_images(effect: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     sine = tangent * cosine
     images = np.stack([cosine * first - sine * second, sine * first + cosine * second], axis=1)
     return images, np.array([[cosine, sine], [-sine, cosine]])
+
+
+@np.errstate(all="ignore")  # what is not finite is not admissible
+def closest_between(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, room: np.ndarray) -> np.ndarray:
+    """Returns argmin |u - wanted| over |offset + effect u| <= room, row by row; NaN where there is none.
+
+    One input is an interval. Otherwise the closest point of a polytope lies on a face that the wanted one is beyond:
+    on the plane of each of these the problem is the same with one input less.
+
+    Args:
+        wanted: Shape (m, N).
+        offset: Shape (r, N).
+        effect: Shape (r, m, N); every direction has some row.
+        room: Shape (r, N); nothing is admissible where one is negative or NaN.
+
+    Returns:
+        Shape (m, N).
+    """
+    if len(wanted) == 1:
+        slope = effect[:, 0]
+        flat, middle, half = slope == 0.0, -offset / slope, room / np.abs(slope)
+        unmet = flat & ~(np.abs(offset) <= room)
+        low = np.where(flat, np.where(unmet, np.inf, -np.inf), middle - half).max(axis=0)
+        high = np.where(flat, np.inf, middle + half).min(axis=0)
+        return np.where(low <= high, np.minimum(np.maximum(wanted, low), high), np.nan)
+    values = offset + (effect * wanted).sum(axis=1)
+    beyond = ~(np.abs(values) <= room)
+    closest = np.where(beyond.any(axis=0), np.nan, wanted)
+    row, problem = np.nonzero(beyond & (room >= 0.0))
+    if not row.size:
+        return closest
+    normals, start = effect[row, :, problem].T, wanted[:, problem]
+    face = np.sign(values[row, problem]) * room[row, problem]
+    foot = start + normals * ((face - values[row, problem]) / (normals * normals).sum(axis=0))
+    usable = np.isfinite(foot).all(axis=0)
+    row, problem, foot, start, normals = (
+        row[usable],
+        problem[usable],
+        foot[:, usable],
+        start[:, usable],
+        normals[:, usable],
+    )
+    # Directions in the plane of the face, shape (m, m - 1, F).
+    plane = np.linalg.svd(normals.T[:, None])[2][:, 1:].transpose(2, 1, 0)
+    left = room[:, problem]
+    left[row, np.arange(len(row))] = np.inf  # the face itself
+    here = effect[:, :, problem]
+    within = (here[:, :, None] * plane).sum(axis=1)
+    moves = closest_between(np.zeros(plane.shape[1:]), offset[:, problem] + (here * foot).sum(axis=1), within, left)
+    found = foot + (plane * moves).sum(axis=1)
+    distance = np.sqrt(((found - start) ** 2).sum(axis=0))
+    least = np.full(wanted.shape[1], np.inf)
+    np.fmin.at(least, problem, distance)
+    best = distance == least[problem]
+    closest[:, problem[best]] = found[:, best]
+    return closest

@@ -8,18 +8,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ncs_gym import LinearPlant
+from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.validation import ReadOnlyArrays, as_count, as_numbers, read_only, shown
 from shields.certificate import Certificate
+from shields.polytope import Polytope
 from shields.runtime.decisions import FALLBACK, INVALID, PROJECTED, REASONS, SAFE, UNSAFE, Decision
 from shields.runtime.one_step import (
     MOST_INPUTS_WITH_VERTICES,
     OneStepTest,
     PredictedErrors,
     ReachableSets,
-    predicted_errors,
     require_computable,
 )
+from shields.runtime.polytope_step import PolytopeTest
 from shields.verification import ACTION_ROUNDING, require_valid
 
 if TYPE_CHECKING:
@@ -40,8 +41,9 @@ class SafetyFilter(ReadOnlyArrays):
     """A certificate made ready to judge inputs (docs/shield.md).
 
     An input passes if everything that one step can reach with it, for every error in E(Sigma_k) and disturbance in
-    E(D), lies in S (`OneStepTest`). K x_hat needs no test: its safety follows from x in S by (I) and (U) of
-    docs/theory.md section 3.
+    E(D), lies in S (`OneStepTest`), or in the certificate's polytope if it has one (`PolytopeTest`). K x_hat needs no
+    test: its safety follows from x in S by (I) and (U) of docs/theory.md section 3, or from x in the polytope by (P)
+    and (PU) of section 11.
 
     Args:
         certificate: Verified exactly here.
@@ -55,7 +57,7 @@ class SafetyFilter(ReadOnlyArrays):
         horizon: Longest plan of mode "lookahead", in steps; None is 6. Other modes take none.
 
     Attributes:
-        test: The one-step test.
+        test: The one-step test, for the polytope if there is one, except in mode "lookahead".
         lookahead: What finds and certifies the plans of mode "lookahead"; None in others.
 
     Raises:
@@ -68,7 +70,7 @@ class SafetyFilter(ReadOnlyArrays):
     plant: LinearPlant
     mode: str = "project"
     horizon: int | None = None
-    test: OneStepTest = field(init=False, repr=False)
+    test: OneStepTest | PolytopeTest = field(init=False, repr=False)
     lookahead: Lookahead | None = field(init=False, repr=False)
     _no_plan: np.ndarray = field(init=False, repr=False)
     _remembered: dict[bytes, PredictedErrors] = field(init=False, repr=False)
@@ -83,7 +85,10 @@ class SafetyFilter(ReadOnlyArrays):
             raise ValueError(f'mode "boundary" takes at most {MOST_INPUTS_WITH_VERTICES} inputs, got {self.plant.m}')
         require_valid(self.certificate, self.plant)
         require_computable(self.certificate, self.plant)
-        object.__setattr__(self, "test", OneStepTest(self.certificate.L, self.plant))
+        # Plans of mode "lookahead" end in the ellipsoid.
+        polytope = None if self.mode == "lookahead" else self.certificate.polytope
+        test = OneStepTest(self.certificate.L, self.plant) if polytope is None else PolytopeTest(polytope, self.plant)
+        object.__setattr__(self, "test", test)
         object.__setattr__(self, "_no_plan", read_only(np.empty((0, self.plant.m))))
         object.__setattr__(self, "lookahead", self._lookahead())
         object.__setattr__(self, "_remembered", {})
@@ -103,13 +108,23 @@ class SafetyFilter(ReadOnlyArrays):
         given = DEFAULT_HORIZON if self.horizon is None else self.horizon
         horizon = as_count(given, "horizon", low=1, high=LONGEST_HORIZON)
         object.__setattr__(self, "horizon", horizon)
+        assert isinstance(self.test, OneStepTest)
         return Lookahead(self.test, self.certificate.K, horizon, MARGIN)
+
+    @property
+    def polytope(self) -> Polytope | None:
+        """The polytope that is kept in place of S; None in mode "lookahead", whose plans end in S."""
+        return self.certificate.polytope if self.lookahead is None else None
+
+    @property
+    def kept_set(self) -> Ellipsoid | Polytope:
+        """The set that the one-step test keeps the state in."""
+        return self.certificate.ellipsoid if self.polytope is None else self.polytope
 
     @cached_property
     def projection_margin(self) -> float:
         """The slack a projected input needs: the margin, and what rounding the action to float32 can move x+."""
-        effect = float(np.linalg.norm(self.test.effect, axis=0) @ self.plant.u_max)
-        return 2.0 * MARGIN + float(ACTION_ROUNDING) * effect
+        return 2.0 * MARGIN + float(ACTION_ROUNDING) * self.test.shift
 
     def decide(
         self, estimate: np.ndarray, error_shape: np.ndarray, input_proposed: np.ndarray, stored: Any = ()
@@ -218,7 +233,7 @@ class SafetyFilter(ReadOnlyArrays):
 
     def errors_of_many(self, error_shapes: np.ndarray) -> PredictedErrors:
         """Returns what is known of error shapes, (k, n, n); only mode "lookahead" needs the shapes themselves."""
-        known = predicted_errors(self.test, error_shapes, self.certificate.error_shapes)
+        known = self.test.predicted(error_shapes, self.certificate.error_shapes)
         return known if self.lookahead is not None else known._replace(shape=known.shape[:0])
 
     @np.errstate(all="ignore")

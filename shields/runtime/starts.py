@@ -14,6 +14,7 @@ from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.estimation.set_membership import enlarged_by_rounding
 from ncs_gym.uncertainty.shape_matrices import outer_sum
 from shields.certificate import Certificate
+from shields.polytope import Polytope
 from shields.runtime.guarantee import LoopObservation
 from shields.runtime.one_step import PredictedErrors
 from shields.runtime.safety_filter import MARGIN, SafetyFilter
@@ -42,14 +43,17 @@ class StartKnown(NamedTuple):
     in_box: bool
 
 
-def starts_inside(certificate: Certificate, initial: Ellipsoid | np.ndarray) -> bool:
-    """Returns whether all possible starts lie in S, decided in exact arithmetic.
+def starts_inside(certificate: Certificate, initial: Ellipsoid | np.ndarray, polytope: Polytope | None = None) -> bool:
+    """Returns whether all possible starts lie in S, or in a polytope, decided in exact arithmetic.
 
     Args:
         certificate: Gives S = E(L).
         initial: An ellipsoid E(P), inside S exactly if L - P >= 0; or a single state, shape (n,), inside S exactly if
             [1, x'; x, L] >= 0.
+        polytope: What a shield keeps in place of S; None for S.
     """
+    if polytope is not None:
+        return _between(polytope.rows, initial)
     L = rational(certificate.L)
     if isinstance(initial, Ellipsoid):
         return is_positive_semidefinite(subtract(L, rational(initial.shape_matrix)))
@@ -65,7 +69,12 @@ def starts_in_box(plant: LinearPlant, initial: Ellipsoid | np.ndarray) -> bool:
         plant: Gives the rows c_i.
         initial: An ellipsoid E(P), in the box exactly if c_i P c_i' <= 1 for all rows; or a single state, shape (n,).
     """
-    rows = rational(plant.box_rows)
+    return _between(plant.box_rows, initial)
+
+
+def _between(bounds: np.ndarray, initial: Ellipsoid | np.ndarray) -> bool:
+    """Returns whether |g x| <= 1 for all rows g, shape (r, n), and all possible starts."""
+    rows = rational(bounds)
     if isinstance(initial, Ellipsoid):
         shape = rational(initial.shape_matrix)
         return all(quadratic([row], shape) <= 1 for row in rows)
@@ -76,7 +85,7 @@ def start_known(safety_filter: SafetyFilter, initial: Ellipsoid | np.ndarray | N
     """Returns what is known of starts in an ellipsoid E(P), of one state, shape (n,), or of any (None)."""
     if initial is None:
         return StartKnown(False, False)
-    inside = starts_inside(safety_filter.certificate, initial)
+    inside = starts_inside(safety_filter.certificate, initial, safety_filter.polytope)
     return StartKnown(inside, inside or starts_in_box(safety_filter.plant, initial))
 
 

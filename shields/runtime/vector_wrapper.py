@@ -9,13 +9,14 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 
+from ncs_gym.envs.info import Known
 from ncs_gym.envs.spaces import read_actions
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network import CommittedInputs
 from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.validation import as_number, setting, shown
 from shields.certificate import Certificate
-from shields.downlink.schedule import as_decided, columns
+from shields.downlink.schedule import as_decided
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import (
     CODES,
@@ -126,7 +127,8 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         now = self._read_clock()
         restarted = now.episodes != before.episodes
         unmoved = (now.steps == before.steps) & (now.ticks == before.ticks)
-        self._report = self._observed(info)
+        known = inner.known
+        self._report = self._observed(known)
         nothing, none = np.zeros((self._filter.plant.m, self.num_envs)), np.zeros(self.num_envs, np.bool_)
         idle = Decision(nothing, none, none, none, self._idle_margins(np.arange(self.num_envs)), none)
         kept = idle._replace(passed=self._state.inside)  # environments left alone keep what is proved of them
@@ -155,9 +157,10 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         observation, rewards, terminated, truncated, info = self.env.step(actions)
         now, state = self._read_clock(), self._state
         restarted, moved_once = _moved(before, now)
-        self._report = self._observed(info)
+        known = self._inner.known
+        self._report = self._observed(known)
         due = None if self._schedule is None else self._schedule.due(decided.input)
-        same_input, on_time = as_decided(info, decided.input, due)
+        same_input, on_time = as_decided(known, decided.input, due)
         self._state = self._monitor.advance(state, decided, moved_once, same_input, self._report, on_time)
         self._interventions = self._interventions + decided.intervened
         added, charged, self._stored = {}, decided.intervened, decided.plan.copy()
@@ -165,8 +168,9 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             self._stored[..., ~(moved_once & same_input & on_time)] = np.nan
         if np.count_nonzero(restarted):
             charged = charged & ~restarted
-            if "final_info" in info:  # SAME_STEP: the step ended an episode before it began the next
-                added["final_info"] = self._final_info(info, state, decided, proposed, moved_once, due)
+            if (ended := self._inner.ended) is not None:  # SAME_STEP: the step ended episodes before it began the next
+                final = info.get("final_info", {})
+                added["final_info"] = self._final_info(final, ended, state, decided, proposed, moved_once, due)
                 charged = decided.intervened.copy()
             self._start(restarted, moved_once)
             decided.input[:, restarted], proposed[:, restarted], decided.intervened[restarted] = 0.0, 0.0, False
@@ -184,16 +188,10 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         refused = VectorActionWrapper, VectorSafetyShield
         return environment_behind(env, VectorWrapper, refused, NCSVectorEnv, hint_for(env))
 
-    def _observed(self, info: dict[str, Any]) -> LoopObservation:
-        """Returns what decisions and the guarantee need of an info, as copies: callers may write into theirs."""
-        estimates = columns(info.get("estimate"), (self.num_envs, self._filter.plant.n))
+    def _observed(self, known: Known) -> LoopObservation:
+        """Returns what decisions and the guarantee need of what the innermost environment knows."""
         errors = self._errors_of(self._inner.error_shapes[1])
-        alarms = _alarms(info.get("assumption_violated"), self.num_envs)
-        return LoopObservation(np.array(estimates, order="C"), errors, alarms, self._ages(info))
-
-    def _ages(self, info: dict[str, Any]) -> np.ndarray:
-        """Returns the ages of the newest samples used, shape (N,); NaN for what are none."""
-        return columns(info.get("measurement_age"), (self.num_envs,))
+        return LoopObservation(np.array(known.estimate, order="C"), errors, known.alarm, known.age)
 
     def _errors_of(self, numbers: np.ndarray) -> PredictedErrors:
         """Returns what is known of the error shapes with these numbers in the environment's table."""
@@ -236,6 +234,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
     def _final_info(
         self,
         info: dict[str, Any],
+        ended: tuple[np.ndarray, Known],
         state: MonitorState,
         decided: Decision,
         proposed: np.ndarray,
@@ -243,20 +242,18 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         due: np.ndarray | None,
     ) -> dict[str, Any]:
         """Returns final_info with the shield's keys of the last steps of episodes that ended (SAME_STEP)."""
-        final, done = dict(info["final_info"]), np.flatnonzero(info["_final_info"])
-        keys = "estimate", "input", "input_committed", "assumption_violated"
-        ended = {key: np.asarray(final[key])[done] for key in keys}
-        errors = self._filter.errors_of_many(np.asarray(final["error_shape"])[done])
-        estimates = columns(ended["estimate"], (len(done), self._filter.plant.n))
-        alarms = _alarms(ended["assumption_violated"], len(done))
-        report = LoopObservation(estimates, errors, alarms, self._ages(final)[done])
+        final, (is_done, known) = dict(info), ended
+        done = np.flatnonzero(is_done)
+        errors = self._filter.errors_of_many(known.error_shape[done])
+        known = known._replace(applied=known.applied[:, done], committed=known.committed[:, done])
+        report = LoopObservation(known.estimate[:, done], errors, known.alarm[done], known.age[done])
         state = MonitorState(*(array[done] for array in state))
         decided = Decision(*(array[..., done] for array in decided))
-        same_input, on_time = as_decided(ended, decided.input, None if due is None else due[:, done])
+        same_input, on_time = as_decided(known, decided.input, None if due is None else due[:, done])
         state = self._monitor.advance(state, decided, moved_once[done], same_input, report, on_time)
         for key, value in self._info(decided, proposed[:, done], state, self._interventions[done], report.age).items():
             final[key] = np.full((self.num_envs, *value.shape[1:]), "" if value.dtype == object else 0, value.dtype)
-            final[key][done], final[f"_{key}"] = value, info["_final_info"].copy()
+            final[key][done], final[f"_{key}"] = value, is_done.copy()
         return final
 
     def _idle_margins(self, chosen: np.ndarray) -> np.ndarray:
@@ -306,10 +303,3 @@ def overridden(actions: Any, decided: Decision, limits: np.ndarray) -> np.ndarra
     chosen = np.flatnonzero(decided.intervened)
     numbers[chosen] = (decided.input[:, chosen].T / limits).astype(np.float32)
     return numbers
-
-
-def _alarms(value: Any, count: int) -> np.ndarray:
-    """Returns which alarms are reported, shape (N,); all of them if the shape or kind is wrong."""
-    if type(value) is np.ndarray and value.dtype == np.bool_ and value.shape == (count,):
-        return value
-    return ~(columns(value, (count,)) == 0.0)

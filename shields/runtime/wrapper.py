@@ -13,9 +13,10 @@ from gymnasium.vector import VectorEnv
 from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, StickyAction
 
 from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv, NCSVectorEnv
+from ncs_gym.envs.info import Known
 from ncs_gym.envs.spaces import read_action
 from ncs_gym.network.contract import warn_of_broken_contract
-from ncs_gym.validation import as_number, as_numbers, setting, shown
+from ncs_gym.validation import as_number, setting, shown
 from shields.certificate import Certificate
 from shields.runtime.decisions import NO_PLAN
 from shields.runtime.guarantee import LoopObservation
@@ -128,14 +129,14 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             raise
         inner = self._environment_in(self.env)
         require_same(self._made_for, premises_of(inner, inner))
-        clock, report = self._read_clock(), self._observed(info)
+        clock, report = self._read_clock(), self._observed(inner.known)
         start = self._inner.start
         if start is not self._start:  # decided exactly, which takes longer than a step; starts are read-only
             self._start, self._known = start, starts_known(self._filter, start, self._monitored.lead)
         self._monitored.begin(report, self._known, clock[1] == 0, self._inner.beliefs()[:-1])
         self._interventions = 0
         u = np.zeros(self._filter.plant.m)
-        margin = self._filter.margin(report.estimate, info["error_shape"], u)
+        margin = self._filter.margin(report.estimate, inner.known.error_shape, u)
         self._clock = clock
         return observation, info | self._info(u, u, margin, intervened=False)
 
@@ -157,10 +158,9 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             count = self._interventions + decision.intervened
             self._annotate(proposed, count, decision.plan, intervened=decision.intervened)
         observation, reward, terminated, truncated, info = self.env.step(action)
-        clock = self._read_clock()
-        committed = None if self._inner.downlink_protocol is None else as_numbers(info["input_committed"])
+        clock, known = self._read_clock(), self._inner.known
         moved_once = clock == (episode, step + 1)
-        self._monitored.advance(as_numbers(info["input"]), moved_once, self._observed(info), committed)
+        self._monitored.advance(known.applied, moved_once, self._observed(known), known.committed)
         self._interventions += decision.intervened
         self._clock = clock
         info = info | self._info(proposed, decision.input, decision.margin, intervened=decision.intervened)
@@ -171,12 +171,9 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         """Returns the environment behind all wrappers, none of which may stand between it and a shield."""
         return environment_behind(env, gym.Wrapper, (*REFUSED, SafetyShield), NCSEnv, hint_for(env))
 
-    def _observed(self, info: dict[str, Any]) -> LoopObservation:
-        """Returns what the decision and the guarantee need of an info, as copies: callers may write into theirs."""
-        estimate, shape = as_numbers(info["estimate"]), self._filter.test.single[0]
-        estimate = np.full(shape, np.nan) if estimate is None or estimate.shape != shape else estimate.copy()
-        alarm = info["assumption_violated"] not in (False,)
-        return self._monitored.reported(estimate, info["error_shape"], alarm, self._inner.estimator.age)
+    def _observed(self, known: Known) -> LoopObservation:
+        """Returns what the decision and the guarantee need of what the innermost environment knows."""
+        return self._monitored.reported(known.estimate, known.error_shape, known.alarm, known.age)
 
     def _read_clock(self) -> tuple[int, int]:
         """Returns the number of episodes begun and of steps taken in this one."""
@@ -185,7 +182,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
     def _annotate(self, proposed: np.ndarray | None, interventions: int, plan: np.ndarray, *, intervened: bool) -> None:
         """Tells the picture of the step that follows what the shield does in it."""
         note = Annotation(
-            safe_set=self._certificate.safe_set,
+            safe_set=self._filter.kept_set,
             label=self._filter.mode,
             proposed=proposed,
             intervened=intervened,

@@ -20,6 +20,7 @@ from shields.errors import Infeasible, SynthesisInterrupted
 from shields.synthesis.alternating_optimization import largest_set, with_best_gain
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem, design_problem
 from shields.synthesis.diagnosis import infeasibility, with_feasible_bounds
+from shields.synthesis.invariant_polytope import NoPolytope, invariant_polytope, share_in_polytope
 from shields.synthesis.max_margin_gain import max_margin_gain
 from shields.synthesis.multipliers import best_input_multipliers, best_multipliers, with_best_multipliers
 from shields.synthesis.round_numbers import in_round_numbers
@@ -43,6 +44,7 @@ def synthesize(
     method: str = "certified",
     *,
     contract: ChannelContract | None = None,
+    safe_set: str = "ellipsoid",
     progress: Progress | None = None,
     dkappa: float = 0.02,
     drho: float = 0.05,
@@ -57,6 +59,9 @@ def synthesize(
         plant: The plant with its bounds, Schur stable for "certified" without a contract.
         method: "certified" or "paper".
         contract: Channel contract; with one, the error sets depend on the age of the newest sample ("certified").
+        safe_set: What a shield keeps: "ellipsoid", or "polytope", the largest one that the same gain keeps in the box
+            (docs/theory.md section 11). Where there is none within limits of rows and time the ellipsoid stays, and the
+            printed certificate says why ("certified").
         progress: Called with a line of text per stage: what is sought, and the volume reached so far ("certified").
         dkappa: Grid step of kappa ("paper").
         drho: Grid step of rho ("paper").
@@ -71,6 +76,10 @@ def synthesize(
         raise ValueError(f"plant must be a LinearPlant, got {type(plant).__name__}")
     if not (isinstance(method, str) and method in ("certified", "paper")):
         raise ValueError(f"method must be 'certified' or 'paper', got {shown(method)}")
+    if not (isinstance(safe_set, str) and safe_set in ("ellipsoid", "polytope")):
+        raise ValueError(f"safe_set must be 'ellipsoid' or 'polytope', got {shown(safe_set)}")
+    if method == "paper" and safe_set != "ellipsoid":
+        raise ValueError("method 'paper' has an ellipsoid: safe_set='polytope' is for method 'certified'")
     if method == "paper":
         from shields.paper.certificate import paper_certificate  # nothing else here uses the paper's method
 
@@ -84,7 +93,41 @@ def synthesize(
             "contract must be ChannelContract(max_age=...), or contract_of(channel) for a Channel that keeps one, or "
             f"None, got {shown(contract)}"
         )
-    return _largest_certificate(plant, contract, progress or (lambda line: None))
+    report = progress or (lambda line: None)
+    certificate = _largest_certificate(plant, contract, report)
+    return certificate if safe_set == "ellipsoid" else with_polytope(certificate, plant, report)
+
+
+def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progress = lambda line: None) -> Certificate:
+    """Returns a verified certificate with the largest polytope that its gain keeps in the box.
+
+    Without one if none is found; its provenance, and so the printed certificate, says why.
+
+    Args:
+        certificate: A verified one of method "certified".
+        plant: Its plant.
+        progress: Called with a line of text now and then.
+
+    Raises:
+        SynthesisInterrupted: A KeyboardInterrupt with the certificate as it was.
+    """
+    try:
+        polytope = invariant_polytope(certificate, plant, progress)
+        found = replace(certificate, polytope=polytope)
+        progress(f"exact verification: a polytope of {len(polytope.rows)} rows")
+        report = verify(found, plant)
+        if report.valid:
+            share = share_in_polytope(polytope, plant)
+            size = {} if share is None else {"polytope_share_of_box": float(exact.rounded(share, 3))}
+            return replace(found, provenance=certificate.provenance | size)
+        failed = next(condition for condition in report.conditions if not condition.holds)
+        reason = f"in exact arithmetic {failed.name} fails by {-failed.margin:.3g}"
+    except NoPolytope as none:
+        reason = str(none)
+    except KeyboardInterrupt as interrupt:
+        message = "interrupted while a polytope was sought; the certificate has the ellipsoid"
+        raise SynthesisInterrupted(message, certificate) from interrupt
+    return replace(certificate, provenance=certificate.provenance | {"no_polytope": reason})
 
 
 def certify(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> Certificate | None:

@@ -12,6 +12,7 @@ from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
 from shields.certificate import Certificate, Updates
 from shields.verification.conditions import Condition, flag, matrix_condition, scalar_condition
+from shields.verification.polytope_conditions import polytope_conditions
 from shields.verification.rational_matrix import (
     Matrix,
     add,
@@ -37,6 +38,8 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> list[C
         conditions += _bound_conditions(certificate, plant)
         conditions += _error_conditions(certificate, plant)
         conditions += _safe_set_conditions(certificate, plant)
+        if certificate.polytope is not None:
+            conditions += polytope_conditions(certificate.polytope, certificate, plant)
     return conditions
 
 

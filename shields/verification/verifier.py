@@ -16,15 +16,15 @@ from shields.verification.certified_conditions import certified_conditions, mult
 from shields.verification.conditions import Condition, flag
 from shields.verification.flint import flint_conditions
 
-# Where the name of a condition says which age it is about.
-_AGE = re.compile(r"(?<=Sigma_)\d+| at age \d+")
+# Where the name of a condition says which age, or row of the polytope, it is about.
+_AGE = re.compile(r"(?<=Sigma_)\d+| at age \d+| of row \d+")
 
 
 @dataclass(frozen=True)
 class Report:
     """The outcome of a verification.
 
-    Printed it begins with the verdict; of conditions that hold and differ in the age alone, the one with the least
+    Printed it begins with the verdict; of conditions that hold and differ in age or row alone, the one with the least
     margin is printed.
 
     Attributes:
@@ -46,7 +46,7 @@ class Report:
 
 
 def _alike(conditions: Iterable[Condition]) -> list[list[Condition]]:
-    """Returns the conditions in groups: those that differ in the age alone and hold, and each other one by itself."""
+    """Returns the conditions in groups: those that hold and differ in age or row alone, each other by itself."""
     groups: dict[str, list[Condition]] = {}
     for condition in conditions:
         name = _AGE.sub("", condition.name) if condition.holds else condition.name
@@ -67,7 +67,8 @@ def verify(
     """Returns whether a certificate proves what it claims for a plant, in exact rational arithmetic.
 
     The conditions are (E0), (E1), (I), (S), (U) of theory.md section 3, and that D, N and r0^2 I contain what
-    section 1 says they contain; for a certificate of method "paper" they are the constraints of OP (docs/paper.md).
+    section 1 says they contain; where there is a polytope (P) and (PU) of section 11, too. For a certificate of method
+    "paper" they are the constraints of OP (docs/paper.md).
     Neither a tolerance nor a solver nor a float decides; the margins are for people.
 
     Args:

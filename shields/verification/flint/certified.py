@@ -14,6 +14,7 @@ from shields.certificate import Certificate
 from shields.verification.conditions import Condition
 from shields.verification.flint.bounds import bound_conditions
 from shields.verification.flint.exact import at_least_zero, definite, form, identity, is_so, mapped, matrix, number
+from shields.verification.flint.polytope import polytope_conditions
 
 # An action in [-1, 1] that becomes a float32 moves by at most half a unit in the last of 24 binary digits.
 _FLOAT32 = fmpq(1, 2**24)
@@ -33,6 +34,8 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> Iterat
     yield from bound_conditions(D, certificate.updates, plant)
     yield from _error_conditions(certificate, D, plant)
     yield from _safe_set_conditions(certificate, D, plant)
+    if certificate.polytope is not None:
+        yield from polytope_conditions(certificate.polytope, certificate, plant)
 
 
 def _fits(certificate: Certificate, plant: LinearPlant) -> bool:

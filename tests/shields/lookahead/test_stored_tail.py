@@ -111,7 +111,10 @@ class Doubt(gym.Wrapper):
 
     def step(self, action):
         *rest, info = self.env.step(action)
-        return *rest, info | ({"error_shape": FORGED * info["error_shape"]} if self.active else {})
+        if self.active:
+            known = self.unwrapped._known
+            self.unwrapped._known = known._replace(error_shape=FORGED * known.error_shape)
+        return *rest, info
 
 
 class DoubtfulVectorEnv(NCSVectorEnv):

@@ -28,6 +28,7 @@ MAY_IMPORT = {
     "ncs_gym",
     "ncs_gym.uncertainty.truncated_gaussian",
     "shields.certificate",
+    "shields.polytope",
     "shields.verification.conditions",
 }
 

@@ -1,0 +1,103 @@
+"""A polytope of states that the fallback input keeps in the safe box, with the multipliers that prove it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linprog
+
+from ncs_gym.validation import ReadOnlyArrays, as_matrix, read_only, shown
+from shields.errors import CertificateError
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Polytope(ReadOnlyArrays):
+    """The polytope P = {x : |g x| <= 1 for every row g} (docs/theory.md section 11).
+
+    For every row g, and for every row of the gain K, there are numbers lambda_i that write what the closed loop makes
+    of it as a sum of rows, g (A+BK) = sum_i lambda_i g_i + r; what is left, r, is mere rounding. P is symmetric, so
+    that one row stands for two faces and a lambda_i may have either sign.
+
+    Attributes:
+        rows: G, shape (r, n) [1 per unit of the state]; the first are the rows of the safe box.
+        multipliers: Lambda, shape (r + m, r): of the rows of P without unit, then of the gain's in the inputs' units.
+    """
+
+    rows: np.ndarray
+    multipliers: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Raises CertificateError if the shapes do not fit or a number is not finite."""
+        try:
+            rows = as_matrix(self.rows, (None, None), "the rows of the polytope")
+            multipliers = as_matrix(self.multipliers, (None, len(rows)), "the multipliers of the polytope")
+        except (TypeError, ValueError) as error:
+            raise CertificateError(f"not a certificate: {error}") from error
+        object.__setattr__(self, "rows", rows)
+        object.__setattr__(self, "multipliers", multipliers)
+        self._make_arrays_read_only()
+
+    @cached_property
+    def F(self) -> np.ndarray:
+        """All faces: P = {x : F x <= 1}, shape (2 r, n); the rows, and then the negative ones."""
+        return read_only(np.concatenate([self.rows, -self.rows]))
+
+    @property
+    def dim(self) -> int:
+        """The dimension n."""
+        return self.rows.shape[1]
+
+    def gauge(self, points: Any) -> Any:
+        """Returns max |g x| over the rows: 0 at the center, 1 on the boundary.
+
+        Args:
+            points: x, shape (n,), which gives a float, or (count, n), which gives shape (count,).
+        """
+        gauges = np.abs(np.asarray(points, dtype=np.float64) @ self.rows.T).max(axis=-1)
+        return float(gauges) if gauges.ndim == 0 else gauges
+
+    def support(self, directions: Any) -> Any:
+        """Returns max of a'x over the polytope for a direction a (n,), or for each of shape (count, n), by a solver.
+
+        For pictures and tests: no proof takes it.
+        """
+        rows, ones = self.F, np.ones(2 * len(self.rows))
+        found = [
+            -linprog(-a, A_ub=rows, b_ub=ones, bounds=(None, None)).fun for a in np.atleast_2d(np.asarray(directions))
+        ]
+        return float(found[0]) if np.ndim(directions) == 1 else np.array(found)
+
+    def contains(self, point: np.ndarray) -> bool:
+        """Returns whether a point, shape (n,), lies inside or on the boundary (in float64, no tolerance)."""
+        return self.gauge(point) <= 1.0
+
+    def sample_boundary(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        """Returns points of the boundary in random directions, shape (count, n)."""
+        scale = 1.0 / np.maximum(np.abs(self.rows).max(axis=0), np.finfo(float).tiny)
+        directions = rng.standard_normal((count, self.dim)) * scale
+        return directions / self.gauge(directions)[:, None]
+
+
+def polytope_content(polytope: Polytope) -> dict[str, Any]:
+    """Returns the JSON values of a polytope; of the multipliers the pairs [number of the row, value] that count."""
+    multipliers = [[[int(i), float(row[i])] for i in np.flatnonzero(row)] for row in polytope.multipliers]
+    return {"rows": polytope.rows.tolist(), "multipliers": multipliers}
+
+
+def polytope_of(content: Any) -> Polytope:
+    """Returns the polytope that JSON values hold.
+
+    Raises:
+        KeyError, TypeError, ValueError: If an entry is missing or of a wrong kind.
+    """
+    rows, pairs = content["rows"], content["multipliers"]
+    multipliers = np.zeros((len(pairs), len(rows)))
+    for row, entries in zip(multipliers, pairs, strict=True):
+        for index, value in entries:
+            if type(index) is not int or not 0 <= index < len(row) or not isinstance(value, (int, float)):
+                raise ValueError(f"a multiplier of the polytope must be [number of a row, value], got {shown(entries)}")
+            row[index] = value
+    return Polytope(rows=rows, multipliers=multipliers)

@@ -1,0 +1,226 @@
+"""The one-step test of a polytope: which inputs keep every possible next state in it.
+
+The supports of errors and disturbances add up, so the test is exact for what is known, row by row.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ncs_gym import LinearPlant
+from ncs_gym.validation import read_only
+from shields.polytope import Polytope
+from shields.runtime.one_step import FARTHEST, SMALLEST_RADIUS, PredictedErrors, judged_shapes
+from shields.runtime.projection import closest_between
+
+
+class PolytopeTest:
+    """Whether everything one step can reach lies in P = {x : |G x| <= 1} (docs/shield_proof.md, "Polytopes").
+
+    x+ = A x_hat + B u - A e + d with e in E(Sigma_k) and d in E(D), so the test is, for all rows g,
+
+        |g (A x_hat + B u)| + sqrt(g A Sigma_k A' g') + sqrt(g D g') + rounding <= 1.
+
+    It has what `OneStepTest` has, for P in place of S: the filter calls either, and hands on what they return.
+
+    Args:
+        polytope: P.
+        plant: Gives A, B, D and the limits.
+
+    Attributes:
+        root: G, shape (r, n).
+        moved, effect: G A and G B, shapes (r, n) and (r, m).
+        disturbed: sqrt(g D g') with the rounding of computing it, shape (r,).
+        rounding: Bound on the rounding of a product with G, relative to the product of absolute values.
+        columns, own_columns: Largest entries of the columns of |G| |A| and of |G|, shape (n,).
+        pushed: Largest |G| |B| |u| within the limits.
+        shift: Largest |G B u| within the limits, to which the rounding of an action is relative.
+        single: Shapes of a single estimate and input, (n,) and (m,).
+        limits: Entries of u_max.
+    """
+
+    def __init__(self, polytope: Polytope, plant: LinearPlant) -> None:
+        self.plant = plant
+        self.single, self.limits = ((plant.n,), (plant.m,)), plant.u_max.tolist()
+        self.root = polytope.rows
+        self.moved = read_only(self.root @ plant.A)
+        self.effect = read_only(self.root @ plant.B)
+        self.rounding = 8.0 * (plant.n + plant.m) * float(np.finfo(float).eps)
+        size = np.abs(self.root)
+        self.columns = read_only((size @ np.abs(plant.A)).max(axis=0))
+        self.own_columns = read_only(size.max(axis=0))
+        self.pushed = float((size @ np.abs(plant.B) @ plant.u_max).max())
+        self.shift = float((np.abs(self.effect) @ plant.u_max).max())
+        D = plant.disturbance.shape_matrix
+        extent = float(self.own_columns @ np.sqrt(np.diag(D)))
+        self.disturbed = read_only(_supports(self.root, D[None], self.rounding * extent**2)[:, 0])
+
+    @np.errstate(all="ignore")  # what overflows leaves no room, what underflows does not count
+    def predicted(self, shapes: np.ndarray, certified_shapes: np.ndarray) -> Any:
+        """Returns the `PolytopeErrors` of error shapes Sigma_k: what the test and the guarantee need of them.
+
+        Args:
+            shapes: Sigma_k, shape (k, n, n).
+            certified_shapes: Shapes of the certified error sets, shape (l, n, n).
+        """
+        symmetric, usable, inside = judged_shapes(shapes, certified_shapes)
+        half_widths = np.sqrt(np.diagonal(symmetric, axis1=1, axis2=2))
+        spread, own_spread = half_widths @ self.columns, half_widths @ self.own_columns
+        reach = _supports(self.moved, symmetric, self.rounding * spread**2) + self.disturbed[:, None]
+        room = 1.0 - reach * (1.0 + self.rounding) - self.rounding * (spread + self.pushed)
+        own = _supports(self.root, symmetric, self.rounding * own_spread**2)
+        usable &= np.isfinite(room).all(axis=0) & np.isfinite(own).all(axis=0)
+        unusable = np.where(usable, 0.0, np.nan)
+        return PolytopeErrors(
+            room=np.ascontiguousarray(room + unusable),
+            radius=room.min(axis=0) + unusable,
+            half_widths=np.ascontiguousarray((half_widths + unusable[:, None]).T),
+            own=np.ascontiguousarray(own + unusable),
+            certified=inside & usable,
+            shape=np.ascontiguousarray(shapes.transpose(1, 2, 0)),
+        )
+
+    def reachable(self, estimates: np.ndarray, errors: Any) -> Any:
+        """Returns the `PolytopeSets` of next states that N estimates allow.
+
+        Args:
+            estimates: x_hat, shape (n, N).
+            errors: What is known of the Sigma_k of each.
+        """
+        reach = self.columns @ np.abs(estimates)
+        room = errors.room - self.rounding * reach
+        radius = errors.radius - self.rounding * reach
+        far = ~(reach < FARTHEST)
+        if np.count_nonzero(far):  # what is too far out or not finite is unknown
+            radius[far], room[:, far] = np.nan, np.nan
+        return PolytopeSets(self, self.moved @ estimates, room, radius)
+
+    def reachable_alone(self, estimate: np.ndarray, errors: Any) -> Any:
+        """Returns the `PolytopeSet` of one estimate, shape (n,), and one error shape; None if nothing passes."""
+        rounding = self.rounding * float(self.columns.dot(np.abs(estimate)))
+        if not errors.radius - rounding >= SMALLEST_RADIUS:  # neither NaN
+            return None
+        return PolytopeSet(self, self.moved.dot(estimate), errors.room - rounding)
+
+    @np.errstate(all="ignore")
+    def knows_inside(self, estimates: np.ndarray, errors: Any, margin: float) -> np.ndarray:
+        """Returns whether |g x_hat| + sqrt(g Sigma_k g') <= 1 - margin for all rows, which proves that x is in P.
+
+        Args:
+            estimates: x_hat, shape (n, N) or (n,).
+            errors: What is known of the Sigma_k of each.
+            margin: In units of P.
+        """
+        level = (np.abs(self.root.dot(estimates)) + errors.own).max(axis=0)
+        return level <= 1.0 - margin - self.rounding * self.own_columns.dot(np.abs(estimates))
+
+
+class PolytopeErrors(NamedTuple):
+    """What follows from error shapes alone; the last axis counts them (no such axis: a single one).
+
+    Attributes:
+        room: 1 - sqrt(g A Sigma_k A' g') - sqrt(g D g') less the rounding that does not depend on the estimate, shape
+            (r, k); NaN for an unusable shape.
+        radius: The least of these, shape (k,).
+        half_widths: Largest error of each state, shape (n, k); NaN for an unusable shape.
+        own: sqrt(g Sigma_k g'), shape (r, k); NaN for an unusable shape.
+        certified: Whether E(Sigma_k) lies inside a certified error set, shape (k,).
+        shape: Sigma_k itself, shape (n, n, k), or (0, n, k) where nobody asks for it.
+    """
+
+    room: np.ndarray
+    radius: Any
+    half_widths: np.ndarray
+    own: np.ndarray
+    certified: Any
+    shape: np.ndarray
+
+    of, single, batch = PredictedErrors.of, PredictedErrors.single, PredictedErrors.batch
+    followed_by = PredictedErrors.followed_by
+
+
+class PolytopeSets(NamedTuple):
+    """Where next states lie, row by row, for each of N environments.
+
+    Attributes:
+        test: What holds for all of them.
+        offset: G A x_hat, shape (r, N).
+        room: Largest |g (A x_hat + B u)| that passes, shape (r, N); NaN if nothing is known.
+        radius: The least of these, shape (N,).
+    """
+
+    test: PolytopeTest
+    offset: np.ndarray
+    room: np.ndarray
+    radius: np.ndarray
+
+    def some(self, chosen: np.ndarray) -> PolytopeSets:
+        """Returns those of some environments, given by their indices."""
+        offset, room, radius = (array.take(chosen, axis=-1) for array in self[1:])
+        return PolytopeSets(self.test, offset, room, radius)
+
+    def slack(self, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns slack and margin of inputs u, shape (m, N); each has shape (N,), NaN where nothing is known.
+
+        Both are the least room - |g (A x_hat + B u)| over the rows: x+ is in P unless it is negative.
+        """
+        effect = self.test.effect  # with a single input, products without the sums are the same and faster
+        center = self.offset + (effect * inputs if len(inputs) == 1 else effect @ inputs)
+        np.abs(center, out=center)
+        np.subtract(self.room, center, out=center)
+        slack = center.min(axis=0)
+        return slack, slack.copy()
+
+    def smallest_slack(self) -> np.ndarray:
+        """Returns the slack of the worst input within the limits, shape (N,)."""
+        worst = np.abs(self.test.effect) @ self.test.plant.u_max
+        return (self.room - np.abs(self.offset) - worst[:, None]).min(axis=0)
+
+    def closest(self, inputs: np.ndarray, margin: float) -> np.ndarray:
+        """Returns the inputs within the limits, shape (m, N), closest to given ones with a slack of `margin`.
+
+        NaN where there is none.
+        """
+        limits, count = self.test.plant.u_max, inputs.shape[1]
+        rows = np.concatenate([self.test.effect, np.eye(len(limits))])
+        offset = np.concatenate([self.offset, np.zeros(inputs.shape)])
+        room = np.concatenate([self.room - margin, np.repeat(limits[:, None], count, axis=1)])
+        return closest_between(inputs, offset, np.repeat(rows[..., None], count, axis=-1), room)
+
+
+class PolytopeSet(NamedTuple):
+    """`PolytopeSets` of a single environment: the same formulas without its axis.
+
+    Attributes:
+        test: What holds for all environments.
+        offset: G A x_hat, shape (r,).
+        room: Largest |g (A x_hat + B u)| that passes, shape (r,).
+    """
+
+    test: PolytopeTest
+    offset: np.ndarray
+    room: np.ndarray
+
+    def slack(self, u: np.ndarray) -> tuple[float, float]:
+        """Returns slack and margin of an input u, shape (m,)."""
+        slack = float((self.room - np.abs(self.offset + self.test.effect.dot(u))).min())
+        return slack, slack
+
+    def closest(self, u: float, margin: float) -> float:
+        """Returns what `PolytopeSets.closest` does for plants with a single input."""
+        sets = PolytopeSets(self.test, self.offset[:, None], self.room[:, None], self.room[:1])
+        return float(sets.closest(np.array([[u]]), margin)[0, 0])
+
+
+def _supports(rows: np.ndarray, shapes: np.ndarray, rounding: Any) -> np.ndarray:
+    """Returns upper bounds of sqrt(g S g') for rows g, (r, n), and shapes S, (k, n, n): shape (r, k).
+
+    Args:
+        rows: g, shape (r, n).
+        shapes: S, shape (k, n, n).
+        rounding: What computing g S g' is off by at most, for all rows, shape (k,) or a number.
+    """
+    squares = ((rows @ shapes) * rows).sum(axis=-1).T
+    return np.sqrt(np.maximum(squares, 0.0) + rounding)

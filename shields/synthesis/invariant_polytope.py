@@ -1,0 +1,167 @@
+"""The largest polytope that the certified gain keeps in the safe box (docs/theory.md section 11).
+
+It begins with the rows of the box and of the input limits. For every row g with |g x| <= 1, the states after one step
+fulfil it if |g (A+BK) x| <= 1 - s - d, where s and d are the supports of the estimation error and of the disturbance:
+that is a row again. What a linear program shows to hold already is not added. A+BK is stable, so this comes to an end.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+from scipy.optimize import linprog
+from scipy.stats import qmc
+
+from ncs_gym import LinearPlant, exact
+from ncs_gym.plants.linear_plant import inputs_under_way
+from shields.certificate import Certificate
+from shields.polytope import Polytope
+from shields.verification import ACTION_ROUNDING
+
+# What there is at most, so that a decision and a verification stay fast; of the rows each stands for two faces.
+MOST_ROWS, LONGEST_SEARCH = 400, 60.0
+# What the next states keep from every face, relative to the polytope: room for the rounding of rows and multipliers.
+_RESERVE = 1e-6
+# A row counts as implied by others up to this: a thousandth of the reserve.
+_IMPLIED = 1e-9
+# Significant digits of rows and multipliers; what a row lacks by that is far below the reserve.
+_DIGITS = 10
+# The solver's own tolerances, next to units of 1.
+_SOLVER = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+# Points at which the share of the box is counted: the third digit is right.
+_POINTS_LOG2 = 16
+
+
+class NoPolytope(Exception):
+    """There is no polytope, or none within the limits of rows and time; the message says which."""
+
+
+def invariant_polytope(certificate: Certificate, plant: LinearPlant, progress: Callable[[str], object]) -> Polytope:
+    """Returns the largest polytope that the gain of a certificate keeps invariant, not yet verified.
+
+    Args:
+        certificate: Of method "certified"; gives the gain, the error sets and D.
+        plant: Its plant.
+        progress: Called with a line of text now and then.
+
+    Raises:
+        NoPolytope: If there is none within `MOST_ROWS` rows and `LONGEST_SEARCH` seconds.
+    """
+    step = _ClosedLoop(certificate, plant)
+    rows = step.first_rows()
+    deadline, following = time.monotonic() + LONGEST_SEARCH, 0
+    while following < len(rows):
+        if len(rows) > MOST_ROWS:
+            raise NoPolytope(f"it would need more than {MOST_ROWS} rows")
+        if time.monotonic() > deadline:
+            raise NoPolytope(f"its search took longer than {LONGEST_SEARCH:g} s")
+        if following % 50 == 0:
+            progress(f"polytope: {len(rows)} rows")
+        row = step.predecessor(rows[following])
+        if _largest(rows, row)[0] > 1.0 + _IMPLIED:
+            rows = np.concatenate([rows, row[None]])
+        following += 1
+    progress(f"polytope: which of {len(rows)} rows count")
+    return _rounded(step, _without_implied(rows, len(plant.box_rows)))
+
+
+def share_in_polytope(polytope: Polytope, plant: LinearPlant) -> float | None:
+    """Returns the share of the safe box's volume that a polytope fills, to about three digits.
+
+    None where states are inputs under way, or the box is no product of intervals.
+    """
+    rows = plant.box_rows
+    is_product = rows.shape == (plant.n, plant.n) and np.count_nonzero(rows) == plant.n
+    if inputs_under_way(plant) or not is_product:
+        return None
+    points = 2.0 * qmc.Sobol(plant.n, scramble=False).random_base2(_POINTS_LOG2) - 1.0
+    return float((polytope.gauge(points / np.abs(rows).sum(axis=0)) <= 1.0).mean())
+
+
+class _ClosedLoop:
+    """What one step makes of rows, in units of the safe box."""
+
+    def __init__(self, certificate: Certificate, plant: LinearPlant) -> None:
+        self._plant, self._K = plant, certificate.K
+        self.widths = plant.half_widths
+        self.next = plant.A + plant.B @ certificate.K
+        self._D = certificate.disturbances()[0]
+        self._errors = certificate.error_shapes
+
+    def first_rows(self) -> np.ndarray:
+        """Returns the rows of the box and of the input limits, in units of the box.
+
+        Raises:
+            NoPolytope: If errors of the estimate alone take an input beyond its limit.
+        """
+        allowed = self._plant.u_max * (1.0 - float(ACTION_ROUNDING) - _RESERVE) - self._reach(self._K)
+        if (allowed <= 0.0).any():
+            raise NoPolytope("the error of the estimate alone takes an input beyond its limit")
+        return np.concatenate([self._plant.box_rows, self._K / allowed[:, None]]) * self.widths
+
+    def predecessor(self, row: np.ndarray) -> np.ndarray:
+        """Returns the row that states have to fulfil so that the next ones fulfil a row, both in units of the box.
+
+        Raises:
+            NoPolytope: If errors and disturbances alone leave the row.
+        """
+        physical = row / self.widths
+        pushed = physical @ self._plant.B
+        left = 1.0 - _RESERVE - float(self._reach(pushed @ self._K)) - math.sqrt(physical @ self._D @ physical)
+        left -= float(ACTION_ROUNDING) * float(np.abs(pushed) @ self._plant.u_max)
+        if left <= 0.0:
+            raise NoPolytope("errors and disturbances alone leave one of its faces")
+        return (physical @ self.next) * self.widths / left
+
+    def _reach(self, rows: np.ndarray) -> np.ndarray:
+        """Returns the largest support over the error sets of rows, shape (..., n) in physical units."""
+        squares = np.einsum("...i,kij,...j->k...", rows, self._errors, rows)
+        return np.sqrt(np.maximum(squares, 0.0)).max(axis=0)
+
+    def in_physical_units(self, rows: np.ndarray) -> np.ndarray:
+        """Returns rows in physical units, rounded; the rows of the box are those of the plant to the last bit."""
+        rounded = exact.rounded(rows, _DIGITS, axis=1) / self.widths
+        box = self._plant.box_rows
+        return np.concatenate([box, rounded[len(box) :]])
+
+    def multipliers(self, rows: np.ndarray) -> np.ndarray:
+        """Returns what writes every row after one step, and every row of the gain, as a sum of rows, (r + m, r)."""
+        scaled, limits = rows * self.widths, self._plant.u_max
+        images = np.concatenate([rows @ self.next, self._K / limits[:, None]]) * self.widths
+        found = np.array([_largest(scaled, image)[1] for image in images])
+        found[np.abs(found) < 1e-13] = 0.0
+        found[len(rows) :] *= limits[:, None]
+        return exact.rounded(found, _DIGITS + 2, axis=1)
+
+
+def _largest(rows: np.ndarray, row: np.ndarray) -> tuple[float, np.ndarray]:
+    """Returns max row z over |rows z| <= 1, and the multipliers, shape (r,), that prove it; infinite if unbounded."""
+    found = linprog(
+        -row,
+        A_ub=np.concatenate([rows, -rows]),
+        b_ub=np.ones(2 * len(rows)),
+        bounds=(None, None),
+        method="highs",
+        options=_SOLVER,
+    )
+    if found.status != 0:
+        return math.inf, np.zeros(len(rows))
+    prices = -found.ineqlin.marginals
+    return -found.fun, prices[: len(rows)] - prices[len(rows) :]
+
+
+def _without_implied(rows: np.ndarray, kept: int) -> np.ndarray:
+    """Returns rows without those that the others imply; the first `kept` stay."""
+    for i in range(len(rows) - 1, kept - 1, -1):
+        others = np.delete(rows, i, axis=0)
+        if _largest(others, rows[i])[0] <= 1.0 + _IMPLIED:
+            rows = others
+    return rows
+
+
+def _rounded(step: _ClosedLoop, rows: np.ndarray) -> Polytope:
+    physical = step.in_physical_units(rows)
+    return Polytope(rows=physical, multipliers=step.multipliers(physical))
