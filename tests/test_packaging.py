@@ -38,9 +38,9 @@ LAYERS = {
         {"runtime", "downlink"},
     ),
     "agents": (
-        {"settings", "results", "sb3_vec_env"},
-        {"loop"},
-        {"algorithms", "callbacks", "evaluation", "sharing", "tuned"},
+        {"hyperparams", "results", "sb3_vec_env"},
+        {"former_settings", "loop"},
+        {"algorithms", "callbacks", "evaluation", "sharing"},
         {"agent"},
         {"training"},
     ),
