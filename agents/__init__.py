@@ -13,13 +13,13 @@ if TYPE_CHECKING:
     from agents.agent import Agent
     from agents.callbacks import DualAscentCallback, EvaluationCallback, SafetyCallback
     from agents.evaluation import evaluate
-    from agents.loop import ControlLoop, LoopConfig, ShieldSettings
+    from agents.former_settings import A2CSettings, OffPolicySettings, PPOSettings, tuned_settings
+    from agents.hyperparams import read_hyperparams, tuned_hyperparams, tuned_steps
+    from agents.loop import ControlLoop, LagrangianSettings, LoopConfig, ShieldSettings
     from agents.results import Episode, Evaluation, TrainingPoint, Trajectory
     from agents.sb3_vec_env import SB3VecEnv
-    from agents.settings import A2CSettings, LagrangianSettings, OffPolicySettings, PPOSettings
     from agents.sharing.agent_file import AgentError
     from agents.training import TrainingResult, train
-    from agents.tuned import tuned_settings, tuned_steps
 
 __all__ = [
     "A2CSettings",
@@ -41,7 +41,9 @@ __all__ = [
     "TrainingResult",
     "Trajectory",
     "evaluate",
+    "read_hyperparams",
     "train",
+    "tuned_hyperparams",
     "tuned_settings",
     "tuned_steps",
 ]
@@ -49,14 +51,14 @@ __all__ = [
 _MODULES = {
     "agent": ("Agent",),
     "callbacks": ("DualAscentCallback", "EvaluationCallback", "SafetyCallback"),
-    "loop": ("ControlLoop", "LoopConfig", "ShieldSettings"),
+    "loop": ("ControlLoop", "LagrangianSettings", "LoopConfig", "ShieldSettings"),
     "evaluation": ("evaluate",),
+    "former_settings": ("A2CSettings", "OffPolicySettings", "PPOSettings", "tuned_settings"),
+    "hyperparams": ("read_hyperparams", "tuned_hyperparams", "tuned_steps"),
     "results": ("Episode", "Evaluation", "TrainingPoint", "Trajectory"),
     "sb3_vec_env": ("SB3VecEnv",),
     "sharing.agent_file": ("AgentError",),
-    "settings": ("A2CSettings", "LagrangianSettings", "OffPolicySettings", "PPOSettings"),
     "training": ("TrainingResult", "train"),
-    "tuned": ("tuned_settings", "tuned_steps"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

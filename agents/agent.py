@@ -15,11 +15,12 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.algorithms import ALGORITHMS, build_model
+from agents.algorithms import build_model
+from agents.former_settings import from_former
+from agents.hyperparams import ALGORITHMS, complete_hyperparams
 from agents.loop import LoopConfig, ShieldSettings, with_gain
 from agents.results import Evaluation
 from agents.sb3_vec_env import SB3VecEnv
-from agents.settings import AgentSettings
 from agents.sharing.agent_file import AgentError, document_of, read_files, shield_from_json
 from agents.sharing.model_card import card_text
 from ncs_gym import Channel, LinearPlant
@@ -65,8 +66,8 @@ class Agent:
     """A policy with everything needed to act, to be saved and to be loaded.
 
     Attributes:
-        algorithm: Name of the algorithm in `agents.algorithms.ALGORITHMS`.
-        settings: Settings the agent was trained with.
+        algorithm: Name of the algorithm in `agents.hyperparams.ALGORITHMS`.
+        hyperparams: Hyperparameters the agent was trained with, JSON values by name.
         env: Id of the environment the agent was trained in.
         channel: Channel the agent was trained with; None for that of the id.
         model: The stable-baselines3 model.
@@ -77,7 +78,7 @@ class Agent:
     """
 
     algorithm: str
-    settings: AgentSettings
+    hyperparams: dict[str, Any]
     env: str
     channel: Channel | None
     model: BaseAlgorithm
@@ -124,7 +125,7 @@ class Agent:
         self.model.save(buffer)
         content = {
             "algorithm": self.algorithm,
-            "settings": asdict(self.settings),
+            "hyperparams": self.hyperparams,
             "env": self.env,
             "channel": None if self.channel is None else asdict(self.channel),
             "shield": None if self.shield_mode is None else {"mode": self.shield_mode, "horizon": self.horizon},
@@ -158,7 +159,7 @@ class Agent:
         folder = Path(folder)
         if shield is not None and not _is_for_plant_of(self.env, shield.certificate.fingerprint):
             raise ValueError(f"the certificate is for another plant than that of {self.env}: their fingerprints differ")
-        of_agent = {name: getattr(self, name) for name in ("algorithm", "settings", "env", "channel", "checksum")}
+        of_agent = {name: getattr(self, name) for name in ("algorithm", "hyperparams", "env", "channel", "checksum")}
         files = self.files() | {"README.md": card_text(**of_agent, shield=shield, evaluation=evaluation).encode()}
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
@@ -209,10 +210,11 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         raise AgentError(f"the agent was trained on another plant than that of {env_id}: their fingerprints differ")
     if algorithm not in ALGORITHMS:
         raise AgentError(f"the agent is of an unknown algorithm, {algorithm!r}")
-    settings = ALGORITHMS[algorithm][1](**content["settings"])
+    given = content["hyperparams"] if "hyperparams" in content else from_former(algorithm, content["settings"])
+    hyperparams = complete_hyperparams(algorithm, given)
     loop = LoopConfig(env=env_id, kwargs={"channel": content["channel"]})
     shield_mode, horizon = shield_from_json(content.get("shield"))
-    model = build_model(algorithm, SB3VecEnv(loop.vector(1)), settings, seed=0)
+    model = build_model(algorithm, SB3VecEnv(loop.vector(2)), hyperparams, seed=0)  # as in `untrained`
     _, parameters, _ = load_from_zip_file(io.BytesIO(weights), load_data=False, device="cpu")
     model.set_parameters(parameters, exact_match=True, device="cpu")
     numbers = content["normalization"]
@@ -228,7 +230,7 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
             raise AgentError("the agent is damaged: its residual gain has a wrong shape or value")
     return Agent(
         algorithm=algorithm,
-        settings=settings,
+        hyperparams=hyperparams,
         env=env_id,
         channel=loop.channel,
         model=model,

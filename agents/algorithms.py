@@ -1,10 +1,14 @@
-"""The learning algorithms of stable-baselines3 and sb3-contrib, by name."""
+"""Makes the models of stable-baselines3 and sb3-contrib from hyperparameters, which their constructors judge."""
 
 from __future__ import annotations
 
+import copy
 import importlib
 import importlib.util
-from typing import Any
+import inspect
+from collections.abc import Mapping
+from types import UnionType
+from typing import Any, Union, get_args, get_origin
 
 import numpy as np
 import torch
@@ -12,95 +16,130 @@ from gymnasium.spaces import flatdim
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from agents.settings import A2CSettings, AgentSettings, OffPolicySettings, PPOSettings
+from agents.hyperparams import ALGORITHMS, ON_POLICY, rollout_steps
+from ncs_gym.validation import shown
 
-# The package of each algorithm and the class of its settings.
-ALGORITHMS: dict[str, tuple[str, type[AgentSettings]]] = {
-    "PPO": ("stable_baselines3", PPOSettings),
-    "A2C": ("stable_baselines3", A2CSettings),
-    "SAC": ("stable_baselines3", OffPolicySettings),
-    "TD3": ("stable_baselines3", OffPolicySettings),
-    "TRPO": ("sb3_contrib", PPOSettings),
-    "TQC": ("sb3_contrib", OffPolicySettings),
-    "CrossQ": ("sb3_contrib", OffPolicySettings),
-}
+# Arguments of the library that are no hyperparameters: they are given here.
+_NO_HYPERPARAMS = ("env", "venv", "action_noise", "tensorboard_log", "verbose", "seed", "device", "_init_setup_model")
+_LINEAR = "lin_"
 
 
-def checked_settings(name: str, settings: AgentSettings | None) -> AgentSettings:
-    """Returns the settings of an algorithm: the given ones, or its defaults for None.
+def algorithm_class(name: str) -> type[BaseAlgorithm]:
+    """Returns the class of an algorithm.
 
     Raises:
-        ValueError: If the name is unknown, or the settings are those of another algorithm.
-        ModuleNotFoundError: If the algorithm's package is not installed.
+        ModuleNotFoundError: If its package is not installed.
     """
-    if name not in ALGORITHMS:
-        raise ValueError(f"unknown algorithm {name!r}; known are {', '.join(ALGORITHMS)}")
-    package, kind = ALGORITHMS[name]
+    package = ALGORITHMS[name]
     if importlib.util.find_spec(package) is None:
         extra = "contrib" if package == "sb3_contrib" else "train"
         distribution = package.replace("_", "-")
         raise ModuleNotFoundError(f"{name} needs {distribution}: in a clone of ncs-gym, pip install -e '.[{extra}]'")
-    if settings is not None and not isinstance(settings, kind):
-        raise ValueError(f"{name} takes {kind.__name__}, got {type(settings).__name__}")
-    return settings or kind()
+    return getattr(importlib.import_module(package), name)
 
 
-def build_model(name: str, env: VecEnv, settings: AgentSettings, seed: int, steps: int = 0) -> BaseAlgorithm:
+def normalized_env(name: str, env: VecEnv, hyperparams: Mapping[str, Any]) -> VecNormalize:
+    """Returns an environment as an agent learns in it; agents keep the statistics of the observations.
+
+    Raises:
+        ValueError: If the hyperparameter `normalize` is neither true nor arguments of `VecNormalize`, or leaves
+            observations as they are.
+    """
+    normalize = hyperparams["normalize"]
+    arguments = {} if normalize is True else normalize
+    if not isinstance(arguments, dict) or not arguments.get("norm_obs", True):
+        raise ValueError(f"{name}: normalize must be true or have arguments of VecNormalize, got {shown(normalize)}")
+    _require_fitting(VecNormalize, arguments, f"{name}: normalize: ")
+    return VecNormalize(env, **{"gamma": hyperparams["gamma"], **arguments})
+
+
+def build_model(name: str, env: VecEnv, hyperparams: Mapping[str, Any], seed: int, steps: int = 0) -> BaseAlgorithm:
     """Returns an untrained model.
 
     Args:
         name: A name in `ALGORITHMS`.
         env: The environment it will be trained in.
-        settings: Settings of the algorithm.
+        hyperparams: What `agents.hyperparams.complete_hyperparams` returns.
         seed: Seed of the network's weights and of sampling.
-        steps: Number of steps it will be trained for, over which the learning rate falls to zero.
+        steps: Number of steps it will be trained for, over which linear rates fall.
 
     Raises:
-        ValueError: If the name is unknown, or the settings are those of another algorithm.
+        ValueError: If there is no such hyperparameter, or stable-baselines3 does not take its value; the message names
+            those that the algorithm has.
         ModuleNotFoundError: If the algorithm's package is not installed.
     """
-    settings = checked_settings(name, settings)
-    cls = getattr(importlib.import_module(ALGORITHMS[name][0]), name)
+    cls = algorithm_class(name)
     torch.set_num_threads(1)  # more threads only pay off at batches of 16384 and make results depend on their number
-    common: dict[str, Any] = {
-        "learning_rate": _learning_rate(env, settings, steps),
-        "gamma": settings.discount,
-        "seed": seed,
-        "device": "cpu",
-        "policy_kwargs": {"net_arch": [settings.width] * 2},
+    try:
+        return cls(env=env, seed=seed, device="cpu", **_arguments(name, cls, env, hyperparams, steps))
+    except Exception as error:  # the library checks by many kinds of errors
+        reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+        known = [*_not_the_librarys(name), *(each for each in _parameters(cls) if each not in _NO_HYPERPARAMS)]
+        raise ValueError(f"{name}: {reason}; its hyperparameters are {', '.join(known)}") from error
+
+
+def _not_the_librarys(name: str) -> tuple[str, ...]:
+    """Returns the hyperparameters of an algorithm that its constructor does not take."""
+    return ("n_envs", "n_timesteps", "normalize") + (() if name in ON_POLICY else ("noise_type", "noise_std"))
+
+
+def _arguments(
+    name: str, cls: type[BaseAlgorithm], env: VecEnv, hyperparams: Mapping[str, Any], steps: int
+) -> dict[str, Any]:
+    """Returns the arguments of the constructor; raises ValueError if a hyperparameter is unknown or of a wrong type."""
+    own = {"policy": "MlpPolicy"} | {
+        key: copy.deepcopy(value) for key, value in hyperparams.items() if key not in _not_the_librarys(name)
     }
-    if isinstance(settings, OffPolicySettings):
-        return cls("MlpPolicy", env, **common, **_replay(name, settings, flatdim(env.action_space)))
-    common["policy_kwargs"]["log_std_init"] = settings.log_std
-    common |= {"n_steps": settings.rollout, "gae_lambda": settings.gae_lambda}
-    if isinstance(settings, PPOSettings):
-        common["batch_size"] = min(settings.batch_size, settings.rollout * env.num_envs)
-        common["n_epochs" if name == "PPO" else "n_critic_updates"] = settings.epochs
-        common |= {"ent_coef": settings.entropy} if name == "PPO" else {}
-    return cls("MlpPolicy", env, **common)
+    for key, value in own.items():
+        if isinstance(value, str) and value.startswith(_LINEAR):
+            own[key] = _falling(float(value.removeprefix(_LINEAR)), name, env, hyperparams, steps)
+    _require_fitting(cls, own)
+    if name in ON_POLICY and "batch_size" in own:
+        own["batch_size"] = min(own["batch_size"], hyperparams["n_steps"] * env.num_envs)
+    if (noise_type := hyperparams.get("noise_type")) not in (None, "normal"):
+        raise ValueError(f"noise_type cannot be {shown(noise_type)}")
+    if (deviation := hyperparams.get("noise_std")) is not None:
+        if not _fits(deviation, float) or not 0.0 <= deviation < float("inf"):
+            raise ValueError(f"noise_std must be >= 0, got {shown(deviation)}")
+        size = flatdim(env.action_space)
+        own["action_noise"] = NormalActionNoise(np.zeros(size), deviation * np.ones(size))
+    return own
 
 
-def _learning_rate(env: VecEnv, settings: AgentSettings, steps: int) -> LinearSchedule:
-    """Returns a learning rate that falls linearly; the last update still has the rate at the start of its rollout.
+def _falling(rate: float, name: str, env: VecEnv, hyperparams: Mapping[str, Any], steps: int) -> LinearSchedule:
+    """Returns a rate that falls linearly; the last update still has the rate at the start of its rollout.
 
     The library evaluates the schedule at the end of each rollout, where that of the last one would be zero.
     """
-    rollout = env.num_envs * (1 if isinstance(settings, OffPolicySettings) else settings.rollout)
+    rollout = rollout_steps(name, {**hyperparams, "n_envs": env.num_envs})
     fraction = min(rollout / steps, 1.0) if steps else 0.0
-    rate = settings.learning_rate
     return LinearSchedule(rate * (1.0 + fraction), rate * fraction, 1.0)
 
 
-def _replay(name: str, settings: OffPolicySettings, inputs: int) -> dict[str, Any]:
-    """Returns the further arguments of algorithms with a replay buffer."""
-    noise = NormalActionNoise(np.zeros(inputs), settings.noise * np.ones(inputs)) if name == "TD3" else None
-    return {
-        "batch_size": settings.batch_size,
-        "buffer_size": settings.buffer_size,
-        "learning_starts": settings.learning_starts,
-        "train_freq": 1,
-        "gradient_steps": settings.gradient_steps,
-        "action_noise": noise,
-    }
+def _parameters(cls: type) -> Mapping[str, inspect.Parameter]:
+    return inspect.signature(cls).parameters
+
+
+def _require_fitting(cls: type, arguments: Mapping[str, Any], prefix: str = "") -> None:
+    """Raises ValueError if a class of the library has no such argument, or says that it is of another type.
+
+    Its constructors rarely look: a text for a number would come to light only when the first rollout is over.
+    """
+    for name, value in arguments.items():
+        if name not in _parameters(cls) or name in _NO_HYPERPARAMS:
+            raise ValueError(f"{prefix}unknown hyperparameter {shown(name)}")
+        if not _fits(value, _parameters(cls)[name].annotation):
+            raise ValueError(f"{prefix}{name} cannot be {shown(value)}")
+
+
+def _fits(value: Any, annotation: Any) -> bool:
+    """Returns whether a value has a type that an annotation names; True if it names none."""
+    is_union = get_origin(annotation) in (Union, UnionType)
+    kinds = [get_origin(each) or each for each in (get_args(annotation) if is_union else (annotation,))]
+    if not all(isinstance(each, type) for each in kinds):
+        return True
+    if isinstance(value, bool):
+        return bool in kinds
+    return isinstance(value, (*kinds, int) if float in kinds else tuple(kinds))

@@ -10,10 +10,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
 from agents.evaluation import evaluate
-from agents.loop import CostPenalty, LoopConfig, with_gain
+from agents.loop import CostPenalty, LagrangianSettings, LoopConfig, with_gain
 from agents.results import TrainingPoint
 from agents.sb3_vec_env import SB3VecEnv
-from agents.settings import LagrangianSettings
 from ncs_gym.registration import EPISODE_STEPS
 
 # The history has about this many points where every step of all environments is a rollout.

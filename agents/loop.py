@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -11,7 +12,6 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import SyncVectorEnv, VectorEnv, VectorWrapper
 
-from agents.settings import LagrangianSettings
 from ncs_gym import Channel
 from ncs_gym.registration import from_json
 from ncs_gym.validation import shown
@@ -54,6 +54,27 @@ class ShieldSettings:
     def arguments(self) -> dict[str, Any]:
         """Arguments of `SafetyShield` and `VectorSafetyShield` after the environment."""
         return {name: getattr(self, name) for name in [each.name for each in fields(self)]}
+
+
+@dataclass(frozen=True, kw_only=True)
+class LagrangianSettings:
+    """Settings of PPO-Lagrangian: how the price of a violating step is adapted (Ray et al. 2019).
+
+    Attributes:
+        cost_limit: Largest cost of an episode of full length (violating steps) that the agent is trained for.
+        learning_rate: Added to the multiplier per rollout and violating step of such an episode above the limit.
+        multiplier: Price of a violating step at the start of the training.
+    """
+
+    cost_limit: float = 0.0
+    learning_rate: float = 0.05
+    multiplier: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        for entry in fields(self):
+            if not 0.0 <= (value := getattr(self, entry.name)) < math.inf:
+                raise ValueError(f"{entry.name} must be >= 0, got {value!r}")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from gymnasium.vector import VectorEnv
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.agent import Agent, Normalization
-from agents.algorithms import build_model, checked_settings
+from agents.algorithms import build_model, normalized_env
 from agents.callbacks import DualAscentCallback, EvaluationCallback, SafetyCallback
+from agents.former_settings import FormerSettings, from_former
+from agents.hyperparams import ON_POLICY, complete_hyperparams
 from agents.loop import CostPenalty, LoopConfig
 from agents.results import TrainingPoint
 from agents.sb3_vec_env import SB3VecEnv
-from agents.settings import AgentSettings, OffPolicySettings
 
 
 @dataclass(frozen=True)
@@ -44,8 +48,9 @@ def train(
     steps: int,
     seed: int,
     algorithm: str = "PPO",
-    settings: AgentSettings | None = None,
+    hyperparams: Mapping[str, Any] | None = None,
     *,
+    settings: Any = None,
     log_folder: Path | None = None,
     on_progress: Callable[[int], None] | None = None,
 ) -> TrainingResult:
@@ -56,24 +61,20 @@ def train(
         steps: Environment steps to train for, rounded up to whole rollouts.
         seed: Seed of environments, network weights and sampling. Loops with the same seed use common random numbers
             (starts, disturbances, noise, packet losses) as long as their episodes last equally long.
-        algorithm: A name in `agents.algorithms.ALGORITHMS`.
-        settings: Settings of the algorithm; None for its defaults.
+        algorithm: A name in `agents.hyperparams.ALGORITHMS`.
+        hyperparams: Keyword arguments of the algorithm in stable-baselines3, and `n_envs` and `normalize`, JSON values;
+            what is not given has the values of `agents.hyperparams.DEFAULTS`.
+        settings: Former name of `hyperparams`.
         log_folder: Folder for TensorBoard's events, with evaluations on the way; None for neither.
         on_progress: Called with the number of steps taken since its last call.
 
     Raises:
-        ValueError: If the algorithm is unknown, the settings are those of another one, or no step is left to learn in.
+        ValueError: If the algorithm or a hyperparameter is unknown, stable-baselines3 does not take a value, or no step
+            is left to learn in.
         ModuleNotFoundError: If the algorithm's package is not installed.
     """
-    settings = checked_settings(algorithm, settings)
-    if steps < 1:
-        raise ValueError(f"steps must be at least 1, got {steps}")
-    if isinstance(settings, OffPolicySettings) and steps <= settings.learning_starts:
-        raise ValueError(f"{steps} steps train nothing: learning starts after {settings.learning_starts}")
-    envs = loop.vector(settings.envs)
-    normalized = getattr(settings, "normalize_rewards", True)
-    env = VecNormalize(SB3VecEnv(envs), gamma=settings.discount, norm_reward=normalized)
-    model = build_model(algorithm, env, settings, seed, steps)
+    hyperparams = _complete(algorithm, hyperparams, settings)
+    envs, env, model = _trainable(loop, steps, seed, algorithm, hyperparams)
     model.set_logger(configure(str(log_folder), ["tensorboard"]) if log_folder else Logger(None, []))
     callback = SafetyCallback(on_progress)
     beside: list[BaseCallback] = [callback]
@@ -82,23 +83,61 @@ def train(
     if log_folder:
         beside.append(EvaluationCallback(loop, seed))
     model.learn(steps, callback=beside)
-    agent = _agent(loop, algorithm, settings, model, env)
+    agent = _agent(loop, algorithm, hyperparams, model, env)
     return TrainingResult(
         agent, callback.history, model.num_timesteps, callback.violation_steps, callback.interventions
     )
 
 
-def untrained(loop: LoopConfig, seed: int, algorithm: str = "PPO", settings: AgentSettings | None = None) -> Agent:
+def untrained(
+    loop: LoopConfig,
+    seed: int,
+    algorithm: str = "PPO",
+    hyperparams: Mapping[str, Any] | None = None,
+    *,
+    settings: Any = None,
+) -> Agent:
     """Returns an agent with the random weights that training starts from; arguments and errors as for `train`."""
-    settings = checked_settings(algorithm, settings)
-    env = VecNormalize(SB3VecEnv(loop.vector(1)), training=False)
-    return _agent(loop, algorithm, settings, build_model(algorithm, env, settings, seed), env)
+    hyperparams = _complete(algorithm, hyperparams, settings)
+    env = VecNormalize(SB3VecEnv(loop.vector(2)), training=False)  # PPO refuses rollouts of a single step
+    return _agent(loop, algorithm, hyperparams, build_model(algorithm, env, hyperparams, seed), env)
 
 
-def _agent(loop: LoopConfig, algorithm: str, settings: AgentSettings, model: BaseAlgorithm, env: VecNormalize) -> Agent:
+def require_trainable(loop: LoopConfig, steps: int, algorithm: str, hyperparams: Mapping[str, Any]) -> None:
+    """Returns if `train` can begin with these arguments; it raises what `train` does, before anything is computed."""
+    _trainable(loop, steps, 0, algorithm, _complete(algorithm, hyperparams, None))[0].close()
+
+
+def _complete(algorithm: str, hyperparams: Any, settings: Any) -> dict[str, Any]:
+    """Returns all hyperparameters; `settings` and objects of the former classes are taken in their place."""
+    if settings is not None:
+        warnings.warn("settings= is now hyperparams=", DeprecationWarning, stacklevel=3)
+        hyperparams = settings
+    if isinstance(hyperparams, FormerSettings):
+        hyperparams = from_former(algorithm, hyperparams.settings)
+    return complete_hyperparams(algorithm, hyperparams)
+
+
+def _trainable(
+    loop: LoopConfig, steps: int, seed: int, algorithm: str, hyperparams: dict[str, Any]
+) -> tuple[VectorEnv, VecNormalize, BaseAlgorithm]:
+    """Returns what a training begins with: the environments, the same as stable-baselines3 sees them, and the model."""
+    if steps < 1:
+        raise ValueError(f"steps must be at least 1, got {steps}")
+    envs = loop.vector(hyperparams["n_envs"])
+    env = normalized_env(algorithm, SB3VecEnv(envs), hyperparams)
+    model = build_model(algorithm, env, hyperparams, seed, steps)
+    if algorithm not in ON_POLICY and steps <= hyperparams["learning_starts"]:
+        raise ValueError(f"{steps} steps train nothing: learning starts after {hyperparams['learning_starts']}")
+    return envs, env, model
+
+
+def _agent(
+    loop: LoopConfig, algorithm: str, hyperparams: dict[str, Any], model: BaseAlgorithm, env: VecNormalize
+) -> Agent:
     return Agent(
         algorithm=algorithm,
-        settings=settings,
+        hyperparams=hyperparams,
         env=loop.env,
         channel=loop.channel,
         model=model,

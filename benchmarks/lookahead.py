@@ -27,7 +27,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents import PPOSettings, SB3VecEnv
+from agents import SB3VecEnv
 from agents.algorithms import build_model
 from ncs_gym import Ellipsoid, LinearPlant
 from shields import SafetyFilter, VectorSafetyShield
@@ -213,7 +213,7 @@ def loop() -> None:
 
 def training(steps: int) -> None:
     name, horizon = CASES[-1]
-    settings, agents, rates = PPOSettings(envs=ENVS), {}, {}
+    settings, agents, rates = dict(n_envs=ENVS), {}, {}
     for count in (1, steps):  # what only the first training of a process takes time for is not measured
         for mode in MODES:
             env = SB3VecEnv(shielded(name, mode, horizon, autoreset_mode="SameStep"))

@@ -21,7 +21,6 @@ from pathlib import Path
 import gymnasium as gym
 
 from agents.loop import LoopConfig, ShieldSettings
-from agents.settings import PPOSettings
 from experiments.backends import ray_backend, ray_cluster
 from experiments.backends.job import Job
 from experiments.runs import RunStore, TrainingRun, execute_run, versions
@@ -74,7 +73,7 @@ def per_call(function, items) -> float:
 def example(episodes: int) -> TrainingRun:
     """A small run that trains."""
     certificate = synthesize(ncs_env(gym.make(ENV)).plant)
-    settings = PPOSettings(envs=4)
+    settings = dict(n_envs=4)
     loop = LoopConfig(env=ENV, shield=ShieldSettings(certificate, "project"))
     return TrainingRun(
         arm="shielded",
@@ -142,7 +141,7 @@ def main() -> None:
     print(f"settings of a run: {len(pickle.dumps(run)) / 1e3:.1f} kB pickled, {memory(run, 1000):.1f} kB in memory")
     start = time.perf_counter()
     defaults = SweepSettings()
-    execute_run(replace(run, steps=defaults.training_steps, settings=defaults.agent), lambda steps: None)
+    execute_run(replace(run, steps=defaults.training_steps, settings=defaults.all_hyperparams), lambda steps: None)
     print(f"a run of ncs sweep with its default budget: {time.perf_counter() - start:.1f} s on one core")
 
 

@@ -1,14 +1,14 @@
-"""Searches PPO's settings for each registered environment, behind its shield (mode project).
+"""Searches PPO's hyperparameters for each registered environment, behind its shield (mode project).
 
     python benchmarks/tune_agents.py [--env ncs_gym/CartPole-v0 ...] [--candidates 6] [--finalists 2] [--seeds 1]
     python benchmarks/tune_agents.py --write
 
 A random search in two rounds: every candidate is trained once with 150,000 steps, the best ones `--seeds` times more,
-on other seeds, with the steps that belong to the environment; the settings with the highest mean return of these last
-trainings are chosen. The first candidate is the default settings, the second a guess by hand, the others are drawn
+on other seeds, with the steps that belong to the environment; those with the highest mean return of these last
+trainings are chosen. The first candidate is the defaults, the second a guess by hand, the others are drawn
 from `SPACE`. Seeds are those of `ncs compare --seed 1000000`, so that neither the seeds of a study (`--seed 0`) nor
 those of the table (benchmarks/tuned_agents.py) were searched on. Every result is a line of OUT/results.jsonl: started
-again, the search continues where it stopped. `--write` also writes the chosen settings to agents/tuned/ppo.json.
+again, the search continues where it stopped. `--write` also writes what was chosen to agents/tuned/ppo.json.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from agents import LoopConfig, PPOSettings, ShieldSettings, evaluate, train
+from agents import LoopConfig, ShieldSettings, evaluate, train
+from agents.hyperparams import DEFAULTS, complete_hyperparams
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.registration import registered_ids
 from shields.runtime.wrapper import certificate_for
@@ -46,20 +46,22 @@ STREAMS = {
     "ncs_gym/CartPoleNonlinear-v0": 7,
     "ncs_gym/InvertedPendulum-v0": 7,
 }
-GUESS = PPOSettings(envs=128, rollout=32, discount=0.98, gae_lambda=0.95)
+GUESS = dict(n_envs=128, n_steps=32, gamma=0.98, gae_lambda=0.95)
+# In the order in which they are drawn; `_NETWORKS` are in `policy_kwargs`.
 SPACE: dict[str, tuple[Any, ...]] = {
-    "envs": (128,),
-    "rollout": (16, 32),
+    "n_envs": (128,),
+    "n_steps": (16, 32),
     "batch_size": (512, 1024, 2048),
-    "epochs": (5, 10, 20),
-    "learning_rate": (1e-3, 2e-3, 3e-3, 5e-3),
-    "discount": (0.9, 0.95, 0.98, 0.99),
+    "n_epochs": (5, 10, 20),
+    "learning_rate": ("lin_0.001", "lin_0.002", "lin_0.003", "lin_0.005"),
+    "gamma": (0.9, 0.95, 0.98, 0.99),
     "gae_lambda": (0.9, 0.95, 0.98),
-    "log_std": (-1.5, -0.7, -0.3),
-    "width": (64, 128),
-    "entropy": (0.0, 1e-3),
-    "normalize_rewards": (True, True, False),
+    "log_std_init": (-1.5, -0.7, -0.3),
+    "net_arch": ([64, 64], [128, 128]),
+    "ent_coef": (0.0, 1e-3),
+    "normalize": (True, True, {"norm_reward": False}),
 }
+_NETWORKS = ("log_std_init", "net_arch")
 
 
 def shielded_loop(env_id: str) -> LoopConfig:
@@ -84,23 +86,26 @@ def mean_return(loop: LoopConfig, policy: Callable[..., np.ndarray], seed: int, 
     return float(np.mean([each.episode_return for each in evaluate(loop, policy, episodes, seed).episodes]))
 
 
-def trained_return(loop: LoopConfig, settings: PPOSettings, steps: int, experiment_seed: int, index: int) -> float:
+def trained_return(
+    loop: LoopConfig, hyperparams: dict[str, Any], steps: int, experiment_seed: int, index: int
+) -> float:
     """Mean return of an agent after its training."""
     training_seed, evaluation_seed = seeds_of(experiment_seed, index)
-    agent = train(loop, steps, training_seed, settings=settings).agent
+    agent = train(loop, steps, training_seed, hyperparams=hyperparams).agent
     return mean_return(loop, lambda observations, infos: agent.act(observations), evaluation_seed)
 
 
-def candidate(env_id: str, number: int) -> PPOSettings:
-    """The settings of a number: the defaults, the guess, then random ones."""
+def candidate(env_id: str, number: int) -> dict[str, Any]:
+    """All hyperparameters of a number: the defaults, the guess, then random ones."""
     if number < 2:
-        return (PPOSettings(), GUESS)[number]
+        return complete_hyperparams("PPO", ({}, GUESS)[number])
     rng = np.random.default_rng([SEARCH_SEED, STREAMS[env_id], number])
-    return PPOSettings(**{name: values[rng.integers(len(values))] for name, values in SPACE.items()})
+    drawn = {name: values[rng.integers(len(values))] for name, values in SPACE.items()}
+    return complete_hyperparams("PPO", drawn | {"policy_kwargs": {name: drawn.pop(name) for name in _NETWORKS}})
 
 
 class Results:
-    """Returns by environment, settings, steps and run, kept in a file as they come."""
+    """Returns by environment, hyperparameters, steps and run, kept in a file as they come."""
 
     def __init__(self, file: Path) -> None:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -110,20 +115,20 @@ class Results:
 
     @staticmethod
     def _key(entry: dict[str, Any]) -> str:
-        return json.dumps({name: entry[name] for name in ("env", "settings", "steps", "run")}, sort_keys=True)
+        return json.dumps({name: entry[name] for name in ("env", "hyperparams", "steps", "run")}, sort_keys=True)
 
-    def of(self, loop: LoopConfig, settings: PPOSettings, steps: int, run: int) -> float:
+    def of(self, loop: LoopConfig, hyperparams: dict[str, Any], steps: int, run: int) -> float:
         """The return of a training, which is run unless it was before."""
-        entry = {"env": loop.env, "settings": asdict(settings), "steps": steps, "run": run}
+        entry = {"env": loop.env, "hyperparams": hyperparams, "steps": steps, "run": run}
         if (key := self._key(entry)) not in self._known:
-            self._known[key] = trained_return(loop, settings, steps, SEARCH_SEED, run)
+            self._known[key] = trained_return(loop, hyperparams, steps, SEARCH_SEED, run)
             with self._file.open("a") as file:
                 file.write(json.dumps(entry | {"return": self._known[key]}) + "\n")
         return self._known[key]
 
 
-def search(env_id: str, results: Results, candidates: int, finalists: int, seeds: int) -> PPOSettings:
-    """Prints both rounds and returns the chosen settings."""
+def search(env_id: str, results: Results, candidates: int, finalists: int, seeds: int) -> dict[str, Any]:
+    """Prints both rounds and returns the chosen hyperparameters."""
     loop, steps = shielded_loop(env_id), steps_of(env_id)
     chosen = [candidate(env_id, number) for number in range(candidates)]
     first = [results.of(loop, each, STEPS, 0) for each in chosen]
@@ -141,9 +146,9 @@ def search(env_id: str, results: Results, candidates: int, finalists: int, seeds
     return chosen[best]
 
 
-def changes(settings: PPOSettings) -> dict[str, Any]:
-    """The settings that differ from the defaults."""
-    return {name: value for name, value in asdict(settings).items() if value != getattr(PPOSettings(), name)}
+def changes(hyperparams: dict[str, Any]) -> dict[str, Any]:
+    """The hyperparameters that differ from the defaults."""
+    return {name: value for name, value in hyperparams.items() if value != DEFAULTS["PPO"][name]}
 
 
 def main() -> None:
@@ -160,7 +165,7 @@ def main() -> None:
     found = {each: search(each, results, *size) for each in options.env}
     if options.write:
         known = json.loads(TUNED.read_text()) if TUNED.exists() else {}
-        known |= {env_id: {"steps": steps_of(env_id)} | asdict(settings) for env_id, settings in found.items()}
+        known |= {env_id: {"n_timesteps": steps_of(env_id)} | chosen for env_id, chosen in found.items()}
         TUNED.write_text(json.dumps(known, indent=1) + "\n")
 
 

@@ -2,7 +2,7 @@
 
     python benchmarks/tuned_agents.py [--env ncs_gym/CartPole-v0 ...] [--seeds 5] [--out runs/tuned_agents]
 
-The tuned agent has the settings and steps of agents/tuned; with `--defaults` there is one with the default settings and
+The tuned agent has the hyperparameters and steps of agents/tuned; with `--defaults` there is one with the defaults and
 150,000 steps, too. The best linear controller is the one of benchmarks/linear_controllers.py with the highest return on
 a seed of the search (benchmarks/tune_agents.py). Every policy plays 200 episodes per seed, the same for all policies,
 of the seeds of `ncs compare --seed 2000000`; intervals are Student's over seeds. The last line of an environment pairs
@@ -15,13 +15,14 @@ import argparse
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from linear_controllers import LinearController, linear_controllers
 from tune_agents import EPISODES, SEARCH_SEED, mean_return, seeds_of, shielded_loop
 
-from agents import LoopConfig, PPOSettings, train, tuned_settings, tuned_steps
+from agents import LoopConfig, train, tuned_hyperparams, tuned_steps
 from experiments.analysis.statistics import mean_interval
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.registration import registered_ids
@@ -49,17 +50,17 @@ def policies(loop: LoopConfig, with_defaults: bool) -> dict[str, Callable[[int],
     env, linear = ncs_env(gym.make(loop.env)), best_linear(loop)
     plant, entries = env.plant, env.observation_space.shape[0] - env.plant.n
     certified = LinearController("K x_hat", loop.shield.certificate.K, np.zeros((plant.m, entries)))
-    settings, steps = tuned_settings(loop.env), tuned_steps(loop.env)
-    found: dict[str, Callable[[int], Policy]] = {TUNED: lambda seed: trained(loop, settings, steps, seed)}
+    tuned, steps = tuned_hyperparams(loop.env), tuned_steps(loop.env)
+    found: dict[str, Callable[[int], Policy]] = {TUNED: lambda seed: trained(loop, tuned, steps, seed)}
     if with_defaults:
-        found[DEFAULTS] = lambda seed: trained(loop, PPOSettings(), DEFAULT_STEPS, seed)
+        found[DEFAULTS] = lambda seed: trained(loop, {}, DEFAULT_STEPS, seed)
     found["random"] = lambda seed: random_actions(plant.m, seed)
     return found | {each.name: lambda seed, each=each: each.policy(plant) for each in (certified, linear)}
 
 
-def trained(loop: LoopConfig, settings: PPOSettings, steps: int, seed: int) -> Policy:
+def trained(loop: LoopConfig, hyperparams: dict[str, Any], steps: int, seed: int) -> Policy:
     """An agent after its training."""
-    agent = train(loop, steps, seed, settings=settings).agent
+    agent = train(loop, steps, seed, hyperparams=hyperparams).agent
     return lambda observations, infos: agent.act(observations)
 
 

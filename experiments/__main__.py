@@ -76,19 +76,20 @@ def _parse(arguments: list[str]) -> object:
     import tyro
 
     from experiments import settings
-    from experiments.settings.assignments import dotted_as_assignments
+    from experiments.settings.assignments import beside_those_of_file, with_assignments
     from experiments.settings.help_levels import at_help_level
 
     if arguments:
         arguments = [_ALIASES.get(arguments[0], arguments[0]), *arguments[1:]]
     kinds = {name: getattr(settings, kind) for name, (kind, _, _) in COMMANDS.items()}
     arguments, kinds = at_help_level(arguments, kinds)
-    arguments = dotted_as_assignments(arguments, "--channel")
+    arguments = with_assignments(arguments)
     command, rest = "".join(arguments[:1]), arguments[1:]
     if hasattr(kinds.get(command), "config"):
         defaults, others = settings.config_defaults(rest, command, kinds[command])
         if defaults is not None:
-            return tyro.cli(kinds[command], prog=f"ncs {command}", args=others, default=defaults)
+            given = tyro.cli(kinds[command], prog=f"ncs {command}", args=others, default=defaults)
+            return beside_those_of_file(given, defaults)
     return tyro.extras.subcommand_cli_from_dict(
         kinds, prog="ncs", description="Safe learning control over imperfect networks.", args=arguments
     )

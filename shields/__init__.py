@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from shields.certificate import Certificate, Multipliers, Proof, Updates
 from shields.errors import CertificateError, GuaranteeLostError, GuaranteeLostWarning, Infeasible
+from shields.polytope import Polytope
 from shields.runtime import Decision, SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.verification import Condition, Report, verify
 
@@ -25,6 +26,7 @@ __all__ = [
     "GuaranteeLostWarning",
     "Infeasible",
     "Multipliers",
+    "Polytope",
     "Proof",
     "Report",
     "SafeLoop",

@@ -11,7 +11,6 @@ import gymnasium as gym
 import numpy as np
 
 from agents.loop import LoopConfig
-from agents.settings import PPOSettings
 from agents.training import train
 from ncs_gym import Channel, ChannelContract, GilbertElliott, LinearPlant
 from shields import SafetyShield, VectorSafetyShield, synthesize
@@ -80,8 +79,8 @@ def synthesized() -> dict[str, str]:
 
 def trained(seed: int, steps: int) -> dict[str, str]:
     """Every weight of an agent."""
-    settings = PPOSettings(envs=4, rollout=32, batch_size=64, epochs=2)
-    model = train(LoopConfig(env=f"ncs_gym/{IDS[1]}"), steps, seed, settings=settings).agent.model
+    hyperparams = dict(n_envs=4, n_steps=32, batch_size=64, n_epochs=2)
+    model = train(LoopConfig(env=f"ncs_gym/{IDS[1]}"), steps, seed, hyperparams=hyperparams).agent.model
     weights = {name: value.detach().numpy() for name, value in model.policy.state_dict().items()}
     return {"PPO": digest_of(weights)}
 

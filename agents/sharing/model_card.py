@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -10,7 +10,6 @@ import numpy as np
 
 from agents.loop import ShieldSettings
 from agents.results import Evaluation
-from agents.settings import AgentSettings
 from ncs_gym import Channel
 
 _USE = """## Use
@@ -30,7 +29,7 @@ loop = LoopConfig(env=agent.env, kwargs={{"channel": agent.channel}}{shield})
 def card_text(
     *,
     algorithm: str,
-    settings: AgentSettings,
+    hyperparams: Mapping[str, Any],
     env: str,
     channel: Channel | None,
     checksum: str,
@@ -41,7 +40,7 @@ def card_text(
 
     Args:
         algorithm: Name of the algorithm.
-        settings: Settings the agent was trained with.
+        hyperparams: Hyperparameters the agent was trained with.
         env: Id of the environment the agent was trained in.
         channel: Channel the agent was trained with; None for that of the id.
         checksum: SHA-256 of the weights.
@@ -54,7 +53,7 @@ def card_text(
         "plant": "none" if plant is None else f"fingerprint `{plant.fingerprint}`",
         "channel": _channel(env, channel),
         "shield": _shield_text(shield),
-        "settings": ", ".join(f"{each.name}={getattr(settings, each.name)!r}" for each in fields(settings)),
+        "hyperparameters": ", ".join(f"{name}={value!r}" for name, value in hyperparams.items()),
         "SHA-256 of the weights": f"`{checksum}`",
     }
     table = [f"| {name} | {value} |" for name, value in rows.items()]

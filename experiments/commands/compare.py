@@ -28,6 +28,7 @@ from experiments.runs import (
     experiment_provenance,
     loop_config,
     prepare_output,
+    require_trainable,
     run_of_arm,
     write_results,
 )
@@ -57,6 +58,7 @@ def compare(settings: CompareSettings) -> None:
     """
     settings = _with_full_names(short_version(settings, **_SMOKE))
     loop = loop_config(settings.env, settings.channel, noise=settings.noise)
+    require_trainable(settings, loop)
     certificate = certificate_of(loop, settings.certificate)
     with claim_folder("compare", settings.completed):
         _compare_in_folder(settings, loop, certificate)

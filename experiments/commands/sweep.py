@@ -24,6 +24,7 @@ from experiments.runs import (
     experiment_provenance,
     loop_config,
     prepare_output,
+    require_trainable,
     run_of_arm,
     write_results,
 )
@@ -106,6 +107,7 @@ def sweep(settings: SweepSettings) -> None:
     for name in settings.arms:
         Arm.of(name, settings.mode)
     loops = [point.loop(settings) for point in points]
+    require_trainable(settings, loops[0])
     certificates = [certificate_of(loop, settings.certificate) for loop in loops]
     with claim_folder("sweep", settings.completed):
         _sweep_in_folder(settings, points, loops, certificates)

@@ -28,7 +28,9 @@ def synthesize(settings: SynthesizeSettings) -> None:
     plant, contract = _plant_and_contract(settings)
     try:
         with synthesis_status() as show:
-            certificate = shields.synthesize(plant, settings.method, contract=contract, progress=show)
+            certificate = shields.synthesize(
+                plant, settings.method, contract=contract, safe_set=settings.safe_set, progress=show
+            )
     except SynthesisInterrupted as interrupt:
         if interrupt.certificate is None:
             raise

@@ -17,6 +17,7 @@ from experiments.runs import (
     experiment_provenance,
     loop_config,
     prepare_output,
+    require_trainable,
     run_of_arm,
     write_results,
 )
@@ -42,6 +43,7 @@ def train(settings: TrainSettings) -> None:
     settings = short_version(settings, **_SMOKE)
     Arm.of(settings.arm, settings.mode)
     loop = loop_config(settings.env, settings.channel)
+    require_trainable(settings, loop)
     certificate = certificate_of(loop, settings.certificate)
     with claim_folder("train", settings.completed):
         _train_in_folder(settings, loop, certificate)

@@ -17,8 +17,6 @@ from shields import Report
 _PIXEL_RATIO = 2.1
 # Bytes of a PNG file that hold the width of the image.
 _PNG_WIDTH = slice(16, 20)
-# Group of settings that an algorithm takes; all others take "off_policy".
-_ALGORITHM_SETTINGS = {"PPO": "ppo", "TRPO": "ppo", "A2C": "a2c"}
 
 
 def comparison_report(
@@ -77,8 +75,6 @@ def _rendered(
         **context: Further variables of the template.
     """
     settings = summary["settings"]
-    used = _ALGORITHM_SETTINGS.get(settings["algo"], "off_policy")
-    unused = {"ppo", "a2c", "off_policy"} - {used}
     return (
         _environment()
         .get_template(template)
@@ -87,7 +83,7 @@ def _rendered(
             command=command,
             summary=summary,
             settings=settings,
-            shown_settings=_flat({name: value for name, value in settings.items() if name not in unused}),
+            shown_settings=_flat(settings),
             verification=verification,
             images=[_image(caption, png) for caption, png in figures.items()],
             percent=f"{100 * CONFIDENCE:.0f}\N{NO-BREAK SPACE}%",

@@ -1,7 +1,13 @@
 """The unit of work: a training run, the control loop it takes place in, and the store of finished results."""
 
 from experiments.runs.arms import Arm, by_arm
-from experiments.runs.experiment import certificate_of, experiment_provenance, loop_config, run_of_arm
+from experiments.runs.experiment import (
+    certificate_of,
+    experiment_provenance,
+    loop_config,
+    require_trainable,
+    run_of_arm,
+)
 from experiments.runs.output_folder import claim_folder, prepare_output, require_place, write_results
 from experiments.runs.provenance import versions
 from experiments.runs.run_store import RunStore
@@ -20,6 +26,7 @@ __all__ = [
     "loop_config",
     "prepare_output",
     "require_place",
+    "require_trainable",
     "run_of_arm",
     "versions",
     "write_results",

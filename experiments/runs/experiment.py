@@ -59,6 +59,20 @@ def loop_config(
     return LoopConfig(env=module_and_id(env_id)[1], kwargs=kwargs)
 
 
+def require_trainable(settings: LearningSettings, loop: LoopConfig) -> None:
+    """Returns if agents can be trained with the hyperparameters given; those that are not given can.
+
+    Raises:
+        ValueError: If there is no such hyperparameter, or the learning library does not take its value.
+        ModuleNotFoundError: If the algorithm's package is not installed.
+        OSError: If the file of hyperparameters cannot be read.
+    """
+    if settings.hyperparams or settings.conf_file is not None:
+        from agents import training  # imports torch
+
+        training.require_trainable(loop, settings.training_steps, settings.algo, settings.all_hyperparams)
+
+
 def certificate_of(loop: LoopConfig, file: Path | None = None) -> Certificate:
     """Returns a certificate for the plant of a control loop, under the contract of its channels.
 
@@ -118,7 +132,7 @@ def run_of_arm(
         certificate_basis=origin if settings.certificate is None else "",
         conditions=other_conditions(settings.evaluated_under),
         algorithm=settings.algo,
-        settings=settings.agent,
+        settings=settings.all_hyperparams,
         grid_point=grid_point,
     )
 

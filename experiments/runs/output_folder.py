@@ -17,6 +17,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from agents.former_settings import from_former_file
 from experiments.errors import FolderInUseError, OtherResultsError, ResultsError
 from experiments.runs.experiment import INCIDENTAL_SETTINGS
 from experiments.settings import save_settings, settings_json
@@ -205,6 +206,7 @@ def _require_same(folder: Path, command: str, settings: Any) -> None:
         kept_command, kept = document["command"], document["settings"]
         if not isinstance(kept, dict):
             raise TypeError("settings")
+        kept = from_former_file(kept)
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise OtherResultsError(
             f"{folder} holds finished results, and no settings.json that says of what: {advice}"

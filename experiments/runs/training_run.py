@@ -14,9 +14,9 @@ import gymnasium as gym
 import numpy as np
 
 from agents.evaluation import Policy, evaluate
+from agents.hyperparams import rollout_steps
 from agents.loop import LoopConfig
 from agents.results import Episode, TrainingPoint, Trajectory
-from agents.settings import AgentSettings, OffPolicySettings
 from agents.sharing.agent_file import write_files
 from experiments.baselines import controller
 from experiments.runs.environments import import_module, module_digest
@@ -51,8 +51,8 @@ class TrainingRun:
         certificate_basis: What the certificate was synthesized from, in words; empty for one that was given. Its last
             digits may depend on the machine, and a run that another machine finished is still the same run.
         conditions: Conditions that the policy is evaluated under besides that of its training.
-        algorithm: Name of the learning algorithm, a key of `agents.algorithms`.
-        settings: Settings of the learning algorithm.
+        algorithm: Name of the learning algorithm, one of `agents.hyperparams.ALGORITHMS`.
+        settings: Hyperparameters of the learning algorithm.
         grid_point: Name of the point of a sweep's grid; part of the run's name only.
         agent_files: Files of an agent that was trained before: it is evaluated, and nothing is trained. Empty for none.
     """
@@ -70,7 +70,7 @@ class TrainingRun:
     certificate_basis: str = ""
     conditions: tuple[str, ...] = ()
     algorithm: str
-    settings: AgentSettings
+    settings: dict[str, Any]
     grid_point: str = ""
     agent_files: dict[str, bytes] = field(default_factory=dict)
 
@@ -107,7 +107,7 @@ class TrainingRun:
             "loop": _described(self.loop, certificate),
             "agent_files": {name: hashlib.sha256(file).hexdigest() for name, file in self.agent_files.items()},
         }
-        return digest(content | {"settings": asdict(self.settings), "versions": versions()})
+        return digest(content | {"versions": versions()})
 
     @property
     def total_steps(self) -> int:
@@ -115,8 +115,7 @@ class TrainingRun:
         evaluation = self.episodes * (gym.spec(self.loop.env).max_episode_steps or 1) * (1 + len(self.conditions))
         if not self.trains:
             return evaluation
-        steps_per_env = 1 if isinstance(self.settings, OffPolicySettings) else self.settings.rollout
-        rollout = self.settings.envs * steps_per_env
+        rollout = rollout_steps(self.algorithm, self.settings)
         return -(-self.steps // rollout) * rollout + evaluation
 
     def _seeds(self) -> list[int]:

@@ -10,9 +10,9 @@ import tyro
 
 # Flag that lists every setting.
 HELP_ALL = "--help-all"
-# Settings that the first level leaves out: of clusters, and of the learning algorithms.
-_LATER = {"ray_address", "ray_wait", "cpus_per_run", "gpus_per_run", "ppo", "a2c", "off_policy", "lagrangian"}
-_POINTER = f"Settings of Ray and of the learning algorithms are listed by {HELP_ALL}."
+# Settings that the first level leaves out: of clusters, and of PPO-Lagrangian.
+_LATER = {"ray_address", "ray_wait", "cpus_per_run", "gpus_per_run", "lagrangian"}
+_POINTER = f"Settings of Ray and of PPO-Lagrangian are listed by {HELP_ALL}."
 
 
 def at_help_level(arguments: list[str], kinds: dict[str, Any]) -> tuple[list[str], dict[str, Any]]:

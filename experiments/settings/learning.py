@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import tyro
 
-from agents.settings import AgentSettings, LagrangianSettings
-from experiments.settings.agent_overrides import (
-    A2COverrides,
-    AgentOverrides,
-    OffPolicyOverrides,
-    PPOOverrides,
-    complete_settings,
-    default_steps,
-    described_settings,
-)
+from agents.hyperparams import DEFAULTS, read_hyperparams, tuned_hyperparams, tuned_steps, with_changes
+from agents.loop import LagrangianSettings
 from experiments.settings.assignments import Assignments
 from experiments.settings.backend import BackendSettings
 from experiments.settings.steps import OptionalStepCount, require_horizon
+from ncs_gym.validation import shown
 
+# Training steps where none belong to tuned hyperparameters.
+_DEFAULT_STEPS = 150_000
 Algorithm = Literal["PPO", "A2C", "SAC", "TD3", "TRPO", "TQC", "CrossQ"]
 Mode = Literal["project", "lookahead", "switch", "boundary"]
 
@@ -35,8 +30,8 @@ class LearningSettings:
         env: Id of an environment with a plant of its own; module:id first imports the module, which registers one of
             your own (`ncs_gym.register_plant`).
         seed: Seed of the experiment, >= 0; all runs derive their seeds from it.
-        steps: Training steps per run, rounded up to whole rollouts; if not given, those of the settings tuned for the
-            environment, or 150,000.
+        steps: Training steps per run, rounded up to whole rollouts; if not given, n_timesteps of the hyperparameters,
+            or 150,000.
         episodes: Evaluation episodes per run.
         algo: Learning algorithm; TRPO, TQC and CrossQ need sb3-contrib.
         mode: What the shield applies in place of an unsafe action: the closest safe input ("project"), the closest one
@@ -48,9 +43,10 @@ class LearningSettings:
         certificate: Certificate file to use instead of synthesizing one.
         channel: Changes of the environment's channel: loss, burst_length (mean number of packets lost in a row), delay,
             jitter and send_period [steps], quantization_step, max_consecutive_losses.
-        ppo: Settings of PPO and TRPO; what is not given is tuned for the environment (agents/tuned), or the default.
-        a2c: Settings of A2C.
-        off_policy: Settings of SAC, TD3, TQC and CrossQ.
+        hyperparams: Hyperparameters of the learning algorithm, by their names in stable-baselines3: gamma=0.99
+            n_steps=64 "policy_kwargs=dict(net_arch=[64, 64])". What is not given is tuned for the environment
+            (agents/tuned), or the default.
+        conf_file: File of hyperparameters by environment, YAML or JSON, like those of rl-zoo3.
         lagrangian: How the arm "lagrangian" adapts its penalty per violating step.
         smoke: Run a short version, whatever else is asked for, to see that everything works; if `--out` is not given,
             in a folder of its own, with -smoke at the end of its name.
@@ -69,9 +65,8 @@ class LearningSettings:
     violation_penalty: float = 1.0
     certificate: Path | None = None
     channel: Assignments = field(default_factory=dict)
-    ppo: PPOOverrides = field(default_factory=PPOOverrides)
-    a2c: A2COverrides = field(default_factory=A2COverrides)
-    off_policy: OffPolicyOverrides = field(default_factory=OffPolicyOverrides)
+    hyperparams: Assignments = field(default_factory=dict)
+    conf_file: Path | None = None
     lagrangian: LagrangianSettings = field(default_factory=LagrangianSettings)
     smoke: bool = False
     force: bool = False
@@ -82,30 +77,59 @@ class LearningSettings:
         return ()
 
     @property
-    def agent(self) -> AgentSettings:
-        """All settings of the chosen learning algorithm: those given, those tuned for the environment, the defaults."""
-        return complete_settings(self.env, self.algo, getattr(self, self._kind))
+    def all_hyperparams(self) -> dict[str, Any]:
+        """All hyperparameters of the algorithm: those given, those of the file, those tuned, the defaults.
+
+        Raises:
+            ValueError: If the file is damaged, or has none for the environment.
+            OSError: If the file cannot be read.
+        """
+        given, env_id = self._given_hyperparams, self._env_id
+        tuned = None if given.keys() >= DEFAULTS[self.algo].keys() else tuned_hyperparams(env_id, self.algo)
+        found = with_changes(with_changes(DEFAULTS[self.algo], tuned or {}), given)
+        return {name: value for name, value in found.items() if name != "n_timesteps"}
 
     @property
     def training_steps(self) -> int:
-        """Training steps per run: those given, or those that belong to the environment."""
-        return self.steps or default_steps(self.env, self.algo)
+        """Training steps per run: those given, or those that belong to the hyperparameters.
+
+        Raises:
+            ValueError: If the hyperparameter `n_timesteps` is no number of steps.
+        """
+        if self.steps is not None:
+            return self.steps
+        steps = self._given_hyperparams.get("n_timesteps", tuned_steps(self._env_id, self.algo) or _DEFAULT_STEPS)
+        if type(steps) not in (int, float) or not 1 <= steps < 1e15 or steps != int(steps):
+            raise ValueError(f"n_timesteps must be a whole number >= 1, got {shown(steps)}")
+        return int(steps)
 
     @property
     def agent_line(self) -> str:
-        """One line with all settings of the chosen learning algorithm and where they come from."""
-        return described_settings(self.env, self.algo, getattr(self, self._kind))
+        """One line with all hyperparameters of the algorithm and where they come from."""
+        found, given = self.all_hyperparams, self._given_hyperparams.keys() - {"n_timesteps"}
+        is_tuned = tuned_hyperparams(self._env_id, self.algo) is not None
+        source = f"hyperparameters tuned for {self._env_id}" if is_tuned else "default hyperparameters"
+        if given == found.keys():
+            source = "hyperparameters as given"
+        elif given:
+            source += f", as given {', '.join(name for name in found if name in given)}"
+        return f"{self.algo}, {source}: " + ", ".join(f"{name}={value}" for name, value in found.items())
 
     @property
     def completed(self) -> Self:
-        """The same settings with the steps and all settings of the chosen algorithm given, for settings.json."""
-        given: AgentOverrides = getattr(self, self._kind)
-        return replace(self, steps=self.training_steps, **{self._kind: type(given)(**asdict(self.agent))})
+        """The same settings with the steps and all hyperparameters given, for settings.json."""
+        return replace(self, steps=self.training_steps, hyperparams=self.all_hyperparams, conf_file=None)
 
     @property
-    def _kind(self) -> str:
-        """Name of the field with the changes of the chosen learning algorithm's settings."""
-        return {"PPO": "ppo", "TRPO": "ppo", "A2C": "a2c"}.get(self.algo, "off_policy")
+    def _env_id(self) -> str:
+        """The id of "module:id", by which the environment is registered."""
+        return self.env.rpartition(":")[2]
+
+    @property
+    def _given_hyperparams(self) -> dict[str, Any]:
+        """Hyperparameters of the command line, and those of the file."""
+        of_file = {} if self.conf_file is None else read_hyperparams(self.conf_file, self._env_id)
+        return with_changes(of_file, self.hyperparams)
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""

@@ -9,13 +9,14 @@ from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from agents.former_settings import from_former_file
 from experiments.errors import SettingsError
 from ncs_gym.validation import MAX_QUOTED_LENGTH, shown
 from shields.atomic_write import write_atomically
 
 FORMAT = "ncs-gym settings 1"
 # Settings of one call, which a file neither keeps nor gives: files outside the output folder are the user's to name.
-_OF_THE_CALL = ("config", "force", "page", "quote")
+_OF_THE_CALL = ("config", "conf_file", "force", "page", "quote")
 # Where runs are executed is kept in a file and not taken from it: a file of others must not connect to a cluster.
 _OF_THE_MACHINE = ("engine", "ray_address", "ray_wait", "cpus_per_run", "gpus_per_run")
 
@@ -98,7 +99,7 @@ def _load(path: Path, command: str, kind: type, names_folder: bool) -> Any:
                 "alone, and give --env module:id if you trust the module"
             )
     try:
-        settings = _from_json(values, kind)
+        settings = _from_json(from_former_file(values), kind)
         if not names_folder and not _is_near(settings.out, path):
             raise ValueError(f"out = {shown(str(settings.out))} lies neither here nor beside the file: give --out")
         return settings

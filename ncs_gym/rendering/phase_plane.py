@@ -19,8 +19,8 @@ _BORDER = 7.0
 _MAX_COORDINATE = 2000.0
 # Corners of a polygon that lies outside all axes, in units of the limits.
 _FAR = 10.0
-# Tangents around the projection of a set that is no ellipsoid.
-_TANGENTS = 90
+# Tangents around the projection of a set that is no ellipsoid: every 3 degrees, the axes among them.
+_TANGENTS = 120
 
 
 def limit_of(plant: LinearPlant, index: int) -> float:

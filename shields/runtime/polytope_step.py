@@ -15,6 +15,9 @@ from shields.polytope import Polytope
 from shields.runtime.one_step import FARTHEST, SMALLEST_RADIUS, PredictedErrors, judged_shapes
 from shields.runtime.projection import closest_between
 
+# Entries of an array that are worked on together: as many as a processor keeps near.
+BLOCK = 32_768
+
 
 class PolytopeTest:
     """Whether everything one step can reach lies in P = {x : |G x| <= 1} (docs/shield_proof.md, "Polytopes").
@@ -31,7 +34,7 @@ class PolytopeTest:
 
     Attributes:
         root: G, shape (r, n).
-        moved, effect: G A and G B, shapes (r, n) and (r, m).
+        moved, effect: G A and G B, shapes (r, n) and (r, m); joint: both beside each other.
         disturbed: sqrt(g D g') with the rounding of computing it, shape (r,).
         rounding: Bound on the rounding of a product with G, relative to the product of absolute values.
         columns, own_columns: Largest entries of the columns of |G| |A| and of |G|, shape (n,).
@@ -47,6 +50,7 @@ class PolytopeTest:
         self.root = polytope.rows
         self.moved = read_only(self.root @ plant.A)
         self.effect = read_only(self.root @ plant.B)
+        self.joint = read_only(np.hstack([self.moved, self.effect]))
         self.rounding = 8.0 * (plant.n + plant.m) * float(np.finfo(float).eps)
         size = np.abs(self.root)
         self.columns = read_only((size @ np.abs(plant.A)).max(axis=0))
@@ -90,19 +94,15 @@ class PolytopeTest:
             errors: What is known of the Sigma_k of each.
         """
         reach = self.columns @ np.abs(estimates)
-        room = errors.room - self.rounding * reach
-        radius = errors.radius - self.rounding * reach
-        far = ~(reach < FARTHEST)
-        if np.count_nonzero(far):  # what is too far out or not finite is unknown
-            radius[far], room[:, far] = np.nan, np.nan
-        return PolytopeSets(self, self.moved @ estimates, room, radius)
+        rounding = np.where(reach < FARTHEST, self.rounding * reach, np.nan)  # what is too far out is unknown
+        return PolytopeSets(self, estimates, errors.room, rounding, errors.radius - rounding)
 
     def reachable_alone(self, estimate: np.ndarray, errors: Any) -> Any:
         """Returns the `PolytopeSet` of one estimate, shape (n,), and one error shape; None if nothing passes."""
         rounding = self.rounding * float(self.columns.dot(np.abs(estimate)))
         if not errors.radius - rounding >= SMALLEST_RADIUS:  # neither NaN
             return None
-        return PolytopeSet(self, self.moved.dot(estimate), errors.room - rounding)
+        return PolytopeSet(self, estimate, self.moved.dot(estimate), errors.room - rounding)
 
     @np.errstate(all="ignore")
     def knows_inside(self, estimates: np.ndarray, errors: Any, margin: float) -> np.ndarray:
@@ -146,37 +146,43 @@ class PolytopeSets(NamedTuple):
 
     Attributes:
         test: What holds for all of them.
-        offset: G A x_hat, shape (r, N).
-        room: Largest |g (A x_hat + B u)| that passes, shape (r, N); NaN if nothing is known.
-        radius: The least of these, shape (N,).
+        estimates: x_hat, shape (n, N).
+        room: Largest |g (A x_hat + B u)| that passes, shape (r, N), before
+        rounding: what it loses by rounding, shape (N,); NaN if nothing is known.
+        radius: The least room left, shape (N,).
     """
 
     test: PolytopeTest
-    offset: np.ndarray
+    estimates: np.ndarray
     room: np.ndarray
+    rounding: np.ndarray
     radius: np.ndarray
 
     def some(self, chosen: np.ndarray) -> PolytopeSets:
         """Returns those of some environments, given by their indices."""
-        offset, room, radius = (array.take(chosen, axis=-1) for array in self[1:])
-        return PolytopeSets(self.test, offset, room, radius)
+        return PolytopeSets(self.test, *(array.take(chosen, axis=-1) for array in self[1:]))
 
     def slack(self, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns slack and margin of inputs u, shape (m, N); each has shape (N,), NaN where nothing is known.
 
         Both are the least room - |g (A x_hat + B u)| over the rows: x+ is in P unless it is negative.
         """
-        effect = self.test.effect  # with a single input, products without the sums are the same and faster
-        center = self.offset + (effect * inputs if len(inputs) == 1 else effect @ inputs)
-        np.abs(center, out=center)
-        np.subtract(self.room, center, out=center)
-        slack = center.min(axis=0)
+        joint, least = np.concatenate([self.estimates, inputs]), np.empty(inputs.shape[1])
+        block = max(1, BLOCK // len(self.test.root))
+        for start in range(0, len(least), block):
+            part = slice(start, start + block)
+            center = self.test.joint @ joint[:, part]
+            np.abs(center, out=center)
+            np.subtract(self.room[:, part], center, out=center)
+            least[part] = center.min(axis=0)
+        slack = least - self.rounding
         return slack, slack.copy()
 
     def smallest_slack(self) -> np.ndarray:
         """Returns the slack of the worst input within the limits, shape (N,)."""
         worst = np.abs(self.test.effect) @ self.test.plant.u_max
-        return (self.room - np.abs(self.offset) - worst[:, None]).min(axis=0)
+        center = np.abs(self.test.moved @ self.estimates)
+        return (self.room - center - worst[:, None]).min(axis=0) - self.rounding
 
     def closest(self, inputs: np.ndarray, margin: float) -> np.ndarray:
         """Returns the inputs within the limits, shape (m, N), closest to given ones with a slack of `margin`.
@@ -185,8 +191,10 @@ class PolytopeSets(NamedTuple):
         """
         limits, count = self.test.plant.u_max, inputs.shape[1]
         rows = np.concatenate([self.test.effect, np.eye(len(limits))])
-        offset = np.concatenate([self.offset, np.zeros(inputs.shape)])
-        room = np.concatenate([self.room - margin, np.repeat(limits[:, None], count, axis=1)])
+        offset = np.concatenate([self.test.moved @ self.estimates, np.zeros(inputs.shape)])
+        room = np.concatenate([self.room - self.rounding - margin, np.repeat(limits[:, None], count, axis=1)])
+        if len(limits) == 1:
+            return closest_between(inputs, offset, rows[..., None], room)
         return closest_between(inputs, offset, np.repeat(rows[..., None], count, axis=-1), room)
 
 
@@ -195,11 +203,13 @@ class PolytopeSet(NamedTuple):
 
     Attributes:
         test: What holds for all environments.
+        estimate: x_hat, shape (n,).
         offset: G A x_hat, shape (r,).
         room: Largest |g (A x_hat + B u)| that passes, shape (r,).
     """
 
     test: PolytopeTest
+    estimate: np.ndarray
     offset: np.ndarray
     room: np.ndarray
 
@@ -210,7 +220,7 @@ class PolytopeSet(NamedTuple):
 
     def closest(self, u: float, margin: float) -> float:
         """Returns what `PolytopeSets.closest` does for plants with a single input."""
-        sets = PolytopeSets(self.test, self.offset[:, None], self.room[:, None], self.room[:1])
+        sets = PolytopeSets(self.test, self.estimate[:, None], self.room[:, None], np.zeros(1), self.room[:1])
         return float(sets.closest(np.array([[u]]), margin)[0, 0])
 
 

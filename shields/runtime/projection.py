@@ -182,18 +182,21 @@ def closest_between(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, 
     Args:
         wanted: Shape (m, N).
         offset: Shape (r, N).
-        effect: Shape (r, m, N); every direction has some row.
+        effect: Shape (r, m, N), with a single input also (r, 1, 1); every direction has some row.
         room: Shape (r, N); nothing is admissible where one is negative or NaN.
 
     Returns:
         Shape (m, N).
     """
     if len(wanted) == 1:
-        slope = effect[:, 0]
-        flat, middle, half = slope == 0.0, -offset / slope, room / np.abs(slope)
-        unmet = flat & ~(np.abs(offset) <= room)
-        low = np.where(flat, np.where(unmet, np.inf, -np.inf), middle - half).max(axis=0)
-        high = np.where(flat, np.inf, middle + half).min(axis=0)
+        inverse = 1.0 / effect[:, 0]
+        flat = np.isinf(inverse)
+        middle, half = offset * -inverse, room * np.abs(inverse)
+        low, high = middle - half, middle + half
+        if np.count_nonzero(flat):  # rows that no input moves
+            low = np.where(flat, np.where(np.abs(offset) <= room, -np.inf, np.inf), low)
+            high = np.where(flat, np.inf, high)
+        low, high = low.max(axis=0), high.min(axis=0)
         return np.where(low <= high, np.minimum(np.maximum(wanted, low), high), np.nan)
     values = offset + (effect * wanted).sum(axis=1)
     beyond = ~(np.abs(values) <= room)

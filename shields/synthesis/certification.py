@@ -20,7 +20,7 @@ from shields.errors import Infeasible, SynthesisInterrupted
 from shields.synthesis.alternating_optimization import largest_set, with_best_gain
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem, design_problem
 from shields.synthesis.diagnosis import infeasibility, with_feasible_bounds
-from shields.synthesis.invariant_polytope import NoPolytope, invariant_polytope, share_in_polytope
+from shields.synthesis.invariant_polytope import invariant_polytope, share_in_polytope
 from shields.synthesis.max_margin_gain import max_margin_gain
 from shields.synthesis.multipliers import best_input_multipliers, best_multipliers, with_best_multipliers
 from shields.synthesis.round_numbers import in_round_numbers
@@ -122,7 +122,7 @@ def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progre
             return replace(found, provenance=certificate.provenance | size)
         failed = next(condition for condition in report.conditions if not condition.holds)
         reason = f"in exact arithmetic {failed.name} fails by {-failed.margin:.3g}"
-    except NoPolytope as none:
+    except Infeasible as none:
         reason = str(none)
     except KeyboardInterrupt as interrupt:
         message = "interrupted while a polytope was sought; the certificate has the ellipsoid"

@@ -18,6 +18,7 @@ from scipy.stats import qmc
 from ncs_gym import LinearPlant, exact
 from ncs_gym.plants.linear_plant import inputs_under_way
 from shields.certificate import Certificate
+from shields.errors import Infeasible
 from shields.polytope import Polytope
 from shields.verification import ACTION_ROUNDING
 
@@ -35,10 +36,6 @@ _SOLVER = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 
 _POINTS_LOG2 = 16
 
 
-class NoPolytope(Exception):
-    """There is no polytope, or none within the limits of rows and time; the message says which."""
-
-
 def invariant_polytope(certificate: Certificate, plant: LinearPlant, progress: Callable[[str], object]) -> Polytope:
     """Returns the largest polytope that the gain of a certificate keeps invariant, not yet verified.
 
@@ -48,16 +45,16 @@ def invariant_polytope(certificate: Certificate, plant: LinearPlant, progress: C
         progress: Called with a line of text now and then.
 
     Raises:
-        NoPolytope: If there is none within `MOST_ROWS` rows and `LONGEST_SEARCH` seconds.
+        Infeasible: If there is none within `MOST_ROWS` rows and `LONGEST_SEARCH` seconds; the message says why.
     """
     step = _ClosedLoop(certificate, plant)
     rows = step.first_rows()
     deadline, following = time.monotonic() + LONGEST_SEARCH, 0
     while following < len(rows):
         if len(rows) > MOST_ROWS:
-            raise NoPolytope(f"it would need more than {MOST_ROWS} rows")
+            raise _none(f"it would need more than {MOST_ROWS} rows")
         if time.monotonic() > deadline:
-            raise NoPolytope(f"its search took longer than {LONGEST_SEARCH:g} s")
+            raise _none(f"its search took longer than {LONGEST_SEARCH:g} s")
         if following % 50 == 0:
             progress(f"polytope: {len(rows)} rows")
         row = step.predecessor(rows[following])
@@ -95,25 +92,25 @@ class _ClosedLoop:
         """Returns the rows of the box and of the input limits, in units of the box.
 
         Raises:
-            NoPolytope: If errors of the estimate alone take an input beyond its limit.
+            Infeasible: If errors of the estimate alone take an input beyond its limit.
         """
         allowed = self._plant.u_max * (1.0 - float(ACTION_ROUNDING) - _RESERVE) - self._reach(self._K)
         if (allowed <= 0.0).any():
-            raise NoPolytope("the error of the estimate alone takes an input beyond its limit")
+            raise _none("the error of the estimate alone takes an input beyond its limit")
         return np.concatenate([self._plant.box_rows, self._K / allowed[:, None]]) * self.widths
 
     def predecessor(self, row: np.ndarray) -> np.ndarray:
         """Returns the row that states have to fulfil so that the next ones fulfil a row, both in units of the box.
 
         Raises:
-            NoPolytope: If errors and disturbances alone leave the row.
+            Infeasible: If errors and disturbances alone leave the row.
         """
         physical = row / self.widths
         pushed = physical @ self._plant.B
         left = 1.0 - _RESERVE - float(self._reach(pushed @ self._K)) - math.sqrt(physical @ self._D @ physical)
         left -= float(ACTION_ROUNDING) * float(np.abs(pushed) @ self._plant.u_max)
         if left <= 0.0:
-            raise NoPolytope("errors and disturbances alone leave one of its faces")
+            raise _none("errors and disturbances alone leave one of its faces")
         return (physical @ self.next) * self.widths / left
 
     def _reach(self, rows: np.ndarray) -> np.ndarray:
@@ -135,6 +132,10 @@ class _ClosedLoop:
         found[np.abs(found) < 1e-13] = 0.0
         found[len(rows) :] *= limits[:, None]
         return exact.rounded(found, _DIGITS + 2, axis=1)
+
+
+def _none(reason: str) -> Infeasible:
+    return Infeasible(reason, "P", 0.0)
 
 
 def _largest(rows: np.ndarray, row: np.ndarray) -> tuple[float, np.ndarray]:

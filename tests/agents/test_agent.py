@@ -9,8 +9,8 @@ import pytest
 
 from agents.agent import Agent, Normalization
 from agents.evaluation import evaluate
+from agents.hyperparams import with_changes
 from agents.loop import LoopConfig, ShieldSettings
-from agents.settings import OffPolicySettings, PPOSettings
 from agents.sharing.agent_file import AgentError, digest
 from agents.training import train
 from ncs_gym import Channel, GilbertElliott, truck_trailer
@@ -20,8 +20,15 @@ from tests.certificates import certificate_of
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 OBSERVATIONS = np.random.default_rng(0).standard_normal((50, 3))
 SETTINGS = {
-    "PPO": PPOSettings(envs=4, rollout=64, batch_size=128, epochs=2, width=16),
-    "TD3": OffPolicySettings(envs=4, gradient_steps=1, batch_size=32, buffer_size=1000, learning_starts=64, width=16),
+    "PPO": dict(n_envs=4, n_steps=64, batch_size=128, n_epochs=2, policy_kwargs=dict(net_arch=[16, 16])),
+    "TD3": dict(
+        n_envs=4,
+        gradient_steps=1,
+        batch_size=32,
+        buffer_size=1000,
+        learning_starts=64,
+        policy_kwargs=dict(net_arch=[16, 16]),
+    ),
 }
 
 
@@ -48,7 +55,8 @@ def test_loaded_agent_acts_like_the_saved_one(algorithm, tmp_path):
     for place in (tmp_path, tmp_path / "model.zip"):
         again = Agent.load(place)
         np.testing.assert_array_equal(again.act(OBSERVATIONS), agent.act(OBSERVATIONS))
-        assert (again.algorithm, again.settings, again.env) == (algorithm, SETTINGS[algorithm], CRUISE)
+        assert (again.algorithm, again.hyperparams, again.env) == (algorithm, agent.hyperparams, CRUISE)
+        assert with_changes(again.hyperparams, SETTINGS[algorithm]) == again.hyperparams
         assert again.channel == bursts
 
 
@@ -90,7 +98,7 @@ def test_shared_folder_has_the_agent_its_shield_and_a_card(agent, certificate, t
         agent.checksum,
         "loss=0.3",
         'mode "switch"',
-        "width=16",
+        "n_steps=64",
     ):
         assert words in card
     interventions = sum(episode.interventions for episode in evaluation.episodes)
@@ -224,7 +232,7 @@ SHORT = {"mean": [0.0], "variance": [1.0], "epsilon": 1, "clip": 1}
         (lambda folder: change(folder, env="Nowhere-v0"), "Nowhere-v0, which is not registered"),
         (lambda folder: change(folder, env="ncs_gym/TruckTrailer-v0"), "another plant"),
         (lambda folder: change(folder, algorithm="DQN"), "unknown algorithm"),
-        (lambda folder: change(folder, settings={}), "damaged"),
+        (lambda folder: change(folder, hyperparams={"tensorboard_log": "/"}), "damaged: PPO: unknown hyperparameter"),
         (lambda folder: change(folder, channel={"loss": 7}), "damaged"),
         (lambda folder: change(folder, normalization={"mean": [0.0] * 3}), "damaged"),
         (

@@ -7,13 +7,12 @@ import pytest
 
 from agents.agent import Agent
 from agents.callbacks import DualAscentCallback
-from agents.loop import CostPenalty, LoopConfig, ResidualActions
-from agents.settings import LagrangianSettings, PPOSettings
+from agents.loop import CostPenalty, LagrangianSettings, LoopConfig, ResidualActions
 from agents.sharing.agent_file import AgentError
 from agents.training import train
 
 CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
-TINY = PPOSettings(envs=4, rollout=50, batch_size=200, epochs=1, width=8)
+TINY = dict(n_envs=4, n_steps=50, batch_size=200, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8]))
 GAIN = np.array([[0.4, -0.3]])
 
 
@@ -62,7 +61,7 @@ def test_multiplier_moves_at_every_rollout_although_all_episodes_end_in_the_same
         DualAscentCallback, "_on_rollout_end", lambda self: (original(self), prices.append(self._priced.penalty))
     )
     loop = LoopConfig(env=CRUISE.env, lagrangian=LagrangianSettings())
-    train(loop, 32 * 20 * 6, 0, settings=replace(TINY, envs=32, rollout=20, batch_size=640))
+    train(loop, 32 * 20 * 6, 0, hyperparams=TINY | {"n_envs": 32, "n_steps": 20, "batch_size": 640})
     assert len(prices) == 6  # 120 of an episode's 200 steps
     assert len(set(prices)) > 3
 
@@ -85,12 +84,12 @@ def test_training_raises_the_price_of_what_the_agent_violates(monkeypatch):
 
     monkeypatch.setattr(DualAscentCallback, "_on_rollout_end", noted)
     loop = LoopConfig(env=CRUISE.env, lagrangian=LagrangianSettings(learning_rate=0.5))
-    result = train(loop, 1600, 0, settings=TINY)
+    result = train(loop, 1600, 0, hyperparams=TINY)
     assert result.violation_steps > 0
     # Rollouts are as long as an episode, 200 steps in all.
     violating = np.array([point.violation_steps for point in result.history])
     np.testing.assert_allclose(prices, 0.5 * violating, rtol=1e-12)
-    plain = train(CRUISE, 1600, 0, settings=TINY)
+    plain = train(CRUISE, 1600, 0, hyperparams=TINY)
     observations = np.random.default_rng(0).standard_normal((20, 3))
     assert (plain.agent.act(observations) != result.agent.act(observations)).any()
 
@@ -107,7 +106,7 @@ def test_residual_action_is_added_to_the_gain_and_clipped():
 
 def test_residual_agent_is_trained_saved_and_loaded_with_its_gain(tmp_path):
     loop = LoopConfig(env=CRUISE.env, residual_gain=GAIN)
-    agent = train(loop, 400, 0, settings=TINY).agent
+    agent = train(loop, 400, 0, hyperparams=TINY).agent
     observations = np.random.default_rng(0).uniform(-0.1, 0.1, (20, 3)).astype(np.float32)
     part = agent.model.predict(agent.normalization(observations), deterministic=True)[0]
     np.testing.assert_allclose(agent.act(observations), np.clip(part + observations[:, :2] @ GAIN.T, -1, 1), rtol=1e-6)

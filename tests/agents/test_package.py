@@ -24,7 +24,8 @@ def test_unknown_name_is_an_attribute_error():
 def test_results_and_settings_need_neither_stable_baselines3_nor_torch():
     code = """if True:
         import sys
-        from agents import LoopConfig, Episode, Evaluation, PPOSettings, ShieldSettings, TrainingPoint, evaluate
+        from agents import LoopConfig, Episode, Evaluation, ShieldSettings, TrainingPoint, evaluate
+        from agents import PPOSettings, tuned_hyperparams
         assert not {"stable_baselines3", "torch"} & sys.modules.keys()
     """
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)

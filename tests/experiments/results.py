@@ -77,7 +77,7 @@ def provenance(**settings: Any) -> dict[str, Any]:
     """Settings, plant, certificate and versions as in a summary."""
     own = {"env": "ncs_gym/TruckTrailer-v0", "algo": "PPO", "mode": "project", "seed": 5, "seeds": 2, "steps": 100}
     own |= {"episodes": 2, "intervention_penalty": 0.25, "violation_penalty": 3.0}
-    own |= {"ppo": {"envs": 64}, "a2c": {"envs": 32}, "off_policy": {"buffer_size": 77}, "certificate": None}
+    own |= {"hyperparams": {"n_envs": 64, "policy_kwargs": {"net_arch": [8, 8]}}, "certificate": None}
     return {
         "settings": own | settings,
         "plant": {"fingerprint": "f" * 64, "spectral_radius": 0.9},

@@ -15,13 +15,13 @@ from tests.fuzz import examples
 
 GOOD = {"compare": CompareSettings(), "sweep": SweepSettings()}
 NAMES = sorted(
-    {*settings_json("compare", CompareSettings())["settings"], "no-smoke", "smoke=", "x", "ppo.gamma", "--seed"}
+    {*settings_json("compare", CompareSettings())["settings"], "no-smoke", "smoke=", "x", "hyperparams.gamma", "--seed"}
 )
 SETTINGS = st.dictionaries(st.sampled_from(NAMES) | st.text(max_size=6), JSON, min_size=1, max_size=2)
 NESTED = st.dictionaries(
-    st.sampled_from(["channel", "ppo"]),
+    st.sampled_from(["channel", "hyperparams"]),
     st.dictionaries(
-        st.sampled_from(["loss", "delay", "gamma", "learning_rate", "hidden", "n_epochs"]), JSON, max_size=2
+        st.sampled_from(["loss", "delay", "gamma", "learning_rate", "policy_kwargs", "n_epochs"]), JSON, max_size=2
     ),
     min_size=1,
 )

@@ -167,7 +167,7 @@ def test_agent_and_finished_runs_of_one_processor_are_taken_by_another(tmp_path)
         "--references",
         "lqr",
     )
-    compare = (*compare, "--ppo.envs", "4", "--ppo.rollout", "16", "--ppo.batch-size", "64")
+    compare = (*compare, "--hyperparams", "n_envs=4", "n_steps=16", "batch_size=64")
     under("Haswell", *compare)
     files = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("units/*.json")}
     assert files

@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.loop import LoopConfig, ShieldSettings
-from agents.settings import PPOSettings
 from agents.sharing.agent_file import AgentError
 from experiments.analysis.episodes import episodes_table, parquet, training_table
 from experiments.analysis.summary import arm_summary
@@ -60,7 +59,7 @@ def run(certificate):
         certificate=certificate,
         conditions=("gaussian",),
         algorithm="PPO",
-        settings=PPOSettings(envs=2, rollout=64, batch_size=64, epochs=1, width=8),
+        settings=dict(n_envs=2, n_steps=64, batch_size=64, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8])),
     )
 
 
@@ -340,7 +339,7 @@ def test_changed_counts_are_refused_or_usable(tmp_path_factory, change):
 
 
 @pytest.mark.parametrize(
-    "settings", [[[1, 2]], [["seed", 1]], {"": 1}, {"seed": {"a": {}}}, {"ppo": 3}, {"arms": [[]]}]
+    "settings", [[[1, 2]], [["seed", 1]], {"": 1}, {"seed": {"a": {}}}, {"ppo": 3}, {"hyperparams": 3}, {"arms": [[]]}]
 )
 def test_forged_settings_of_finished_results_are_one_sentence(settings, tmp_path):
     (tmp_path / "summary.json").write_text("{}")

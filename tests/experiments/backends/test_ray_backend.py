@@ -25,7 +25,7 @@ from tests.command import ROOT  # noqa: E402
 pytestmark = pytest.mark.slow
 
 GRID = ["--losses", "0.5", "--delays", "1", "--burst-lengths", "0", "3", "--seeds", "2", "--episodes", "3"]
-GRID += ["--steps", "2048", "--ppo.envs", "4"]
+GRID += ["--steps", "2048", "--hyperparams", "n_envs=4"]
 RUNS = 8
 TIMEOUT = 300.0
 ONE_CORE, HALF_A_CORE = (BackendSettings(engine="ray", cpus_per_run=cpus) for cpus in (1.0, 0.5))

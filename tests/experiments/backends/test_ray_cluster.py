@@ -11,7 +11,6 @@ from types import SimpleNamespace
 import pytest
 
 from agents.loop import LoopConfig
-from agents.settings import PPOSettings
 from experiments.backends import ray_cluster
 from experiments.backends.execution import results_of
 from experiments.backends.ray_cluster import _execute_on_node, execute_submitted, portable_task, require_answer
@@ -34,7 +33,7 @@ def run(certificate):
         episodes=1,
         certificate=certificate,
         algorithm="PPO",
-        settings=PPOSettings(),
+        settings={},
     )
 
 
@@ -182,8 +181,8 @@ def test_impossible_address_is_one_sentence(address):
 
 def test_run_that_fails_locally_is_named_and_the_finished_are_kept(run, tmp_path):
     # Whichever comes first, the good one is finished by then or ends before the workers do.
-    bad = replace(run, policy_kind="trained", index=1, algorithm="SAC")  # with settings of PPO
-    with pytest.raises(RunError, match=r"run unshielded-1: SAC takes OffPolicySettings, got PPOSettings") as error:
+    bad = replace(run, policy_kind="trained", index=1, algorithm="SAC", settings={"n_steps": 0})
+    with pytest.raises(RunError, match=r"run unshielded-1: n_steps must be a whole number >= 1, got 0") as error:
         results_of([run, bad], tmp_path, BackendSettings(jobs=1))
     assert isinstance(error.value.__cause__, ValueError)
     assert [path.stem for path in (tmp_path / "units").glob("*.json")] == ["unshielded-0"]

@@ -9,7 +9,6 @@ from queue import Queue
 import pytest
 
 from agents.loop import LoopConfig
-from agents.settings import PPOSettings
 from experiments.backends.execution import results_of
 from experiments.backends.job import Job
 from experiments.backends.worker_processes import _execute, execute_all
@@ -33,7 +32,7 @@ def endless(certificate):
         episodes=10_000_000,
         certificate=certificate,
         algorithm="PPO",
-        settings=PPOSettings(),
+        settings={},
     )
 
 
@@ -62,7 +61,7 @@ def test_the_first_failure_stops_the_others_and_is_the_one_reported(endless):
 def test_progress_bar_names_what_its_steps_are(endless, tmp_path, capsys, without_workers):
     results_of([replace(endless, episodes=1)], tmp_path / "fixed", BackendSettings(jobs=1))
     assert "\revaluation: 100%" in capsys.readouterr().err
-    small = PPOSettings(envs=1, rollout=8, batch_size=8, epochs=1, width=8)
+    small = dict(n_envs=1, n_steps=8, batch_size=8, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8]))
     run = replace(endless, policy_kind="trained", episodes=1, steps=8, settings=small)
     results_of([run], tmp_path / "trained", BackendSettings(jobs=1))
     shown = capsys.readouterr().err

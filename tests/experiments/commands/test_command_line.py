@@ -23,7 +23,7 @@ from tests.verdicts import verified
 from tests.workers import no_worker_processes
 
 # A short comparison whose unshielded agents explore enough to violate in training.
-SMOKE = ("compare", "--smoke", "--ppo.log-std", "0.0", "--ppo.epochs", "2")
+SMOKE = ("compare", "--smoke", "--hyperparams", "policy_kwargs=dict(log_std_init=0.0)", "n_epochs=2")
 ARM_KEYS = {
     "train_steps",
     "train_violation_steps",
@@ -217,8 +217,8 @@ def test_finished_study_is_not_overwritten(command, smoke):
 
 
 def test_finished_study_is_overwritten_by_force(tmp_path, without_workers):
-    small = ["compare", "--arms", "unshielded", "--references", "--steps", 64, "--ppo.envs", 2, "--ppo.rollout", 16]
-    small += ["--episodes", 2, "--seeds", 1, "--out", tmp_path]
+    small = ["compare", "--arms", "unshielded", "--references", "--steps", 64, "--episodes", 2, "--seeds", 1]
+    small += ["--hyperparams", "n_envs=2", "n_steps=16", "--out", tmp_path]
     assert ncs(*small).returncode == 0
     kept = (tmp_path / "units" / "unshielded-0.json").read_bytes()
     assert_one_sentence(ncs(*small, "--seed", 1), "(seed 0, now 1)")
@@ -299,7 +299,7 @@ def test_one_agent_is_trained(tmp_path, without_workers):
 
 def test_agent_behind_lookahead_is_trained_and_evaluated_with_its_horizon(tmp_path, without_workers):
     out = tmp_path / "one"
-    given = ["--arm", "lookahead", "--horizon", "3", "--ppo.envs", "8", "--ppo.rollout", "64", "--steps", "512"]
+    given = ["--arm", "lookahead", "--horizon", "3", "--hyperparams", "n_envs=8", "n_steps=64", "--steps", "512"]
     given += ["--episodes", "3"]
     run = ncs("train", "--env", "ncs_gym/BatchReactor-v0", *given, "--out", out)
     assert run.returncode == 0, run.stderr
@@ -329,7 +329,7 @@ def test_agent_behind_lookahead_is_trained_and_evaluated_with_its_horizon(tmp_pa
 def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path, without_workers):
     out = tmp_path / "sweep"
     grid = ["--losses", "0.5", "--delays", "1", "--burst-lengths", "0", "3", "--episodes", "3", "--steps", "256"]
-    run = ncs("sweep", *grid, "--ppo.envs", "4", "--ppo.rollout", "64", "--out", out)
+    run = ncs("sweep", *grid, "--hyperparams", "n_envs=4", "n_steps=64", "--out", out)
     assert run.returncode == 0, run.stderr
     summary = json.loads((out / "summary.json").read_text())
     assert [(cell["loss"], cell["burst_length"]) for cell in summary["cells"]] == [(0.5, 0), (0.5, 3)]
@@ -430,12 +430,13 @@ def test_every_command_has_help_seed_and_out(command):
 def test_help_has_two_levels(command):
     first, everything = ncs(command, "--help"), ncs(command, "--help-all")
     assert (first.returncode, everything.returncode) == (0, 0)
-    later = {"--ppo.width", "--a2c.rollout", "--off-policy.noise", "--lagrangian.cost-limit"}
+    later = {"--lagrangian.cost-limit"}
     later |= set() if command == "train" else {"--ray-address", "--ray-wait", "--cpus-per-run", "--gpus-per-run"}
     for flag in later:
         assert flag not in first.stdout
         assert flag in everything.stdout
-    for flag in ("--env", "--steps", "--mode", "--channel", "--smoke", "--force", "--help"):
+    both = ("--env", "--steps", "--mode", "--channel", "--hyperparams", "--conf-file", "--smoke", "--force", "--help")
+    for flag in both:
         assert flag in first.stdout
         assert flag in everything.stdout
     assert "--help-all" in first.stdout
@@ -445,7 +446,7 @@ def test_first_level_of_help_shows_what_a_settings_file_gives(smoke):
     run = ncs("compare", "--config", smoke[0] / "settings.json", "--help")
     assert run.returncode == 0
     assert "(default: 4096)" in run.stdout
-    assert "--ppo.width" not in run.stdout
+    assert "--lagrangian.cost-limit" not in run.stdout
 
 
 @pytest.mark.parametrize(
@@ -460,7 +461,7 @@ def test_first_level_of_help_shows_what_a_settings_file_gives(smoke):
         (["compare", "--jobs", "-1"], "--jobs must be at least 1"),
         (["compare", "--seed", "-1"], "--seed must be >= 0"),
         (["compare", "--violation-penalty", "nan"], "--violation-penalty must be"),
-        (["compare", "--ppo.discount", "2"], "discount must be in"),
+        (["compare", "--hyperparams", "gamma"], "expected NAME=VALUE"),
         (["compare", "--engine", "hope"], "hope"),
         (["compare", "--ray-address", "auto"], "--ray-address is a setting of --engine ray"),
         (["sweep", "--engine", "ray", "--ray-address", "head"], "--ray-address must be local, auto or HOST:PORT"),
@@ -492,6 +493,13 @@ def test_usage_errors_are_the_parsers(arguments, words):
         (["compare", "--arms", "shielded", "shielded"], ["--arms must be different"]),
         (["compare", "--config", "nowhere.json"], ["cannot read settings nowhere.json"]),
         (["compare", "--channel.loss", "1.5"], ["loss"]),
+        (["compare", "--hyperparams", "gamma=2"], ["gamma must be in [0, 1], got 2"]),
+        (
+            ["train", "--hyperparams", "gama=0.9"],
+            ["PPO: unknown hyperparameter 'gama'; its hyperparameters are"],
+        ),
+        (["sweep", "--ppo.discount", "2"], ["gamma must be in [0, 1], got 2"]),
+        (["train", "--conf-file", "nowhere.yml"], ["nowhere.yml"]),
         (["train", "--arm", "hope"], ["unknown arm 'hope'"]),
         (["compare", "--arms", "unshielded,shielded"], ["'unshielded,shielded' (several are separated by spaces)"]),
         (["evaluate", "nowhere"], ["no agent in nowhere"]),

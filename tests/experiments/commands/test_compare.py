@@ -3,10 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents import tuned_settings
+from agents import tuned_hyperparams
+from agents.hyperparams import complete_hyperparams
 from agents.loop import LoopConfig
 from agents.results import Episode
-from agents.settings import A2CSettings, OffPolicySettings, PPOSettings
 from experiments.analysis.episodes import episodes_table
 from experiments.analysis.summary import arm_summary, covered_fraction, paired_differences
 from experiments.analysis.tables import _rows
@@ -15,7 +15,6 @@ from experiments.runs.arms import Arm, by_arm
 from experiments.runs.output_folder import prepare_output
 from experiments.runs.training_run import RunResult
 from experiments.settings import CompareSettings
-from experiments.settings.agent_overrides import A2COverrides, OffPolicyOverrides, PPOOverrides
 
 ALL_ARMS = ("unshielded", "monitor", "penalized", "shielded", "shielded:switch+penalty", "shielded:boundary")
 
@@ -119,14 +118,10 @@ def test_unknown_arms_are_refused(name):
         Arm.of(name, "project")
 
 
-@pytest.mark.parametrize(
-    ("algo", "settings"),
-    [("PPO", PPOSettings), ("TRPO", PPOSettings), ("A2C", A2CSettings), ("SAC", OffPolicySettings)],
-)
-def test_settings_reach_every_run(certificate, algo, settings):
-    given = {"ppo": PPOOverrides(envs=3), "a2c": A2COverrides(envs=3), "off_policy": OffPolicyOverrides(envs=3)}
-    expected = replace(tuned_settings(CRUISE) if algo == "PPO" else settings(), envs=3)
-    for run in runs_of(certificate, steps=7, episodes=9, algo=algo, **given):
+@pytest.mark.parametrize("algo", ["PPO", "TRPO", "A2C", "SAC"])
+def test_settings_reach_every_run(certificate, algo):
+    expected = complete_hyperparams(algo, tuned_hyperparams(CRUISE, algo)) | {"n_envs": 3}
+    for run in runs_of(certificate, steps=7, episodes=9, algo=algo, hyperparams={"n_envs": 3}):
         assert (run.steps, run.episodes, run.algorithm, run.settings) == (7, 9, algo, expected)
 
 

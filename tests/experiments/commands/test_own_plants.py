@@ -13,7 +13,7 @@ from functools import partial
 import gymnasium as gym
 import pytest
 
-from agents.settings import PPOSettings
+from agents.hyperparams import complete_hyperparams
 from ncs_gym import truck_trailer
 from shields import Certificate
 from tests.command import assert_one_sentence, environment, ncs
@@ -63,14 +63,13 @@ def test_own_plant_is_attacked_behind_every_kind_of_channel(folder, without_work
 
 
 def test_own_plant_is_trained_in_and_evaluated_by_its_id(folder, without_workers):
-    run = ncs(
-        "train", *ENV, "--steps", 64, "--episodes", 2, "--ppo.rollout", 16, "--ppo.envs", 2, "--out", "r", cwd=folder
-    )
+    short = ("--steps", 64, "--episodes", 2, "--hyperparams", "n_steps=16", "n_envs=2")
+    run = ncs("train", *ENV, *short, "--out", "r", cwd=folder)
     assert run.returncode == 0, run.stderr
     settings = json.loads((folder / "r" / "settings.json").read_text())
     assert settings["settings"]["env"] == "Plants/Truck-v0"  # a file names no module
-    assert settings["settings"]["ppo"] == vars(PPOSettings(rollout=16, envs=2))
-    assert "PPO, default settings, as given envs, rollout:" in run.stdout
+    assert settings["settings"]["hyperparams"] == complete_hyperparams("PPO", dict(n_steps=16, n_envs=2))
+    assert "PPO, default hyperparameters, as given n_envs, n_steps:" in run.stdout
     model = next((folder / "r" / "models").iterdir())
     assert json.loads((model / "agent.json").read_text())["agent"]["env"] == "Plants/Truck-v0"
     evaluated = ncs("evaluate", model, *ENV, "--episodes", 2, cwd=folder)

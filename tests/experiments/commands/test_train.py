@@ -6,7 +6,7 @@ import pytest
 
 from tests.command import ncs
 
-SMALL = ("--episodes", 1, "--ppo.envs", 8, "--ppo.rollout", 64, "--ppo.batch-size", 64, "--ppo.width", 8)
+SMALL = ("n_envs=8", "n_steps=64", "batch_size=64")
 HINT = "This training had no violation and no override"
 
 
@@ -20,7 +20,9 @@ HINT = "This training had no violation and no override"
     ],
 )
 def test_hint_follows_exactly_the_trainings_in_which_nothing_happened(tmp_path, without_workers, arm, log_std, happens):
-    run = ncs("train", "--arm", arm, "--steps", 512, "--ppo.log-std", log_std, *SMALL, "--out", tmp_path / "r")
+    networks = f"policy_kwargs=dict(net_arch=[8, 8], log_std_init={log_std})"
+    short = ("--steps", 512, "--episodes", 1, "--hyperparams", *SMALL, networks)
+    run = ncs("train", "--arm", arm, *short, "--out", tmp_path / "r")
     assert run.returncode == 0, run.stderr
     summary = json.loads((tmp_path / "r" / "summary.json").read_text())["arms"][arm]
     assert {name for name in ("train_violation_steps", "train_intervention_rate") if summary[name]} == happens
@@ -30,7 +32,8 @@ def test_hint_follows_exactly_the_trainings_in_which_nothing_happened(tmp_path, 
 
 
 def test_hint_of_a_smoke_run_names_the_flag_that_keeps_it_short(tmp_path, without_workers):
-    run = ncs("train", "--smoke", "--ppo.log-std", -4, *SMALL[2:], "--out", tmp_path / "r")
+    networks = "policy_kwargs=dict(net_arch=[8, 8], log_std_init=-4.0)"
+    run = ncs("train", "--smoke", "--hyperparams", *SMALL, networks, "--out", tmp_path / "r")
     assert run.returncode == 0, run.stderr
     assert f"{HINT}, so it does not show what the shield is for: leave out --smoke" in " ".join(run.stdout.split())
     assert run.stdout.splitlines()[-1].startswith("agent: ")

@@ -1,25 +1,46 @@
-"""What a command that trains uses, prints and records of the settings tuned for its environment."""
+"""What a command that trains uses, prints and records of the hyperparameters tuned for its environment."""
 
 import json
 
-from agents import tuned_settings
+from agents import tuned_hyperparams
 from agents.agent import Agent
 from tests.command import ncs
 
 ENV = "ncs_gym/TruckTrailer-v0"
-SMALL = ("--steps", 64, "--episodes", 2, "--ppo.envs", 2, "--ppo.rollout", 16)
+SMALL = ("--steps", 64, "--episodes", 2, "--hyperparams", "n_envs=2", "n_steps=16")
 
 
-def test_command_trains_with_tuned_settings_and_records_all_of_them(tmp_path, without_workers):
-    run = ncs("train", "--env", ENV, *SMALL, "--ppo.width", 8, "--out", tmp_path / "r")
+def test_command_trains_with_tuned_hyperparameters_and_records_all_of_them(tmp_path, without_workers):
+    networks = "policy_kwargs=dict(net_arch=[8, 8])"
+    run = ncs("train", "--env", ENV, *SMALL, networks, "--out", tmp_path / "r")
     assert run.returncode == 0, run.stderr
-    assert f"PPO, settings tuned for {ENV}, as given envs, rollout, width:" in run.stdout
+    prose = " ".join(run.stdout.split())
+    assert f"PPO, hyperparameters tuned for {ENV}, as given n_envs, policy_kwargs, n_steps: n_envs=2, " in prose
     settings = json.loads((tmp_path / "r" / "settings.json").read_text())["settings"]
     agent = Agent.load(tmp_path / "r" / "models" / "shielded-0")
-    tuned = vars(tuned_settings(ENV))
-    assert settings["ppo"] == vars(agent.settings) == tuned | {"envs": 2, "rollout": 16, "width": 8}
+    tuned = tuned_hyperparams(ENV)
+    expected = tuned | {"n_envs": 2, "n_steps": 16, "policy_kwargs": tuned["policy_kwargs"] | {"net_arch": [8, 8]}}
+    assert settings["hyperparams"] == agent.hyperparams == expected
     assert settings["steps"] == 64
     again = ncs("train", "--config", tmp_path / "r" / "settings.json", "--out", tmp_path / "again")
     assert again.returncode == 0, again.stderr
-    assert "PPO, settings as given:" in again.stdout
+    assert "PPO, hyperparameters as given: " in again.stdout
     assert Agent.load(tmp_path / "again" / "models" / "shielded-0").checksum == agent.checksum
+
+
+def test_file_of_former_settings_and_former_flags_train_the_same_agent(tmp_path, without_workers):
+    former = {"format": "ncs-gym settings 1", "command": "train"}
+    former["settings"] = {"env": ENV, "steps": 64, "episodes": 2, "ppo": {"envs": 2, "rollout": 16, "width": 8}}
+    (tmp_path / "settings.json").write_text(json.dumps(former))
+    flags = ("--ppo.envs", 2, "--ppo.rollout", 16, "--ppo.width", 8)
+    now = ("--hyperparams", "n_envs=2", "n_steps=16", "policy_kwargs=dict(net_arch=[8, 8])")
+    checksums = set()
+    for name, given in (
+        ("file", ("--config", tmp_path / "settings.json")),
+        ("flags", ("--env", ENV, *SMALL[:4], *flags)),
+        ("now", ("--env", ENV, *SMALL[:4], *now)),
+    ):
+        run = ncs("train", *given, "--out", tmp_path / name)
+        assert run.returncode == 0, run.stderr
+        checksums.add(Agent.load(tmp_path / name / "models" / "shielded-0").checksum)
+    assert len(checksums) == 1

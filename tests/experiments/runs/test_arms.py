@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
-from agents.loop import CostPenalty, LoopConfig, ResidualActions
-from agents.settings import LagrangianSettings
+from agents.loop import CostPenalty, LagrangianSettings, LoopConfig, ResidualActions
 from experiments.baselines import EstimateFilter
 from experiments.runs import Arm, certificate_of, loop_config, run_of_arm
 from experiments.settings import CompareSettings
-from experiments.settings.agent_overrides import PPOOverrides
 from shields import VectorSafetyShield
 
 
@@ -107,8 +105,8 @@ def test_residual_agents_add_to_the_certified_gain_outside_of_the_filter(run_of,
 def test_every_arm_plays(run_of, name):
     from experiments.runs import execute_run
 
-    tiny = PPOOverrides(envs=2, rollout=64, batch_size=64, epochs=1, width=8)
-    result = execute_run(run_of(name, steps=256, episodes=2, ppo=tiny), lambda steps: None)
+    tiny = dict(n_envs=2, n_steps=64, batch_size=64, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8]))
+    result = execute_run(run_of(name, steps=256, episodes=2, hyperparams=tiny), lambda steps: None)
     assert (result.arm, len(result.episodes)) == (name, 2)
     assert result.train_steps == (0 if name.startswith("lqr") else 256)
     assert (result.episodes[0].guaranteed, result.episodes[1].guaranteed) == (2 * (name[:6] == "shield",))
@@ -117,8 +115,8 @@ def test_every_arm_plays(run_of, name):
 def test_predictive_filter_acts_on_trained_agents_in_training_or_at_test_alone():
     from experiments.runs import execute_run
 
-    tiny = PPOOverrides(envs=2, rollout=64, batch_size=64, epochs=1, width=8)
-    settings, loop = CompareSettings(steps=512, episodes=2, ppo=tiny), loop_config("ncs_gym/BatchReactor-v0")
+    tiny = dict(n_envs=2, n_steps=64, batch_size=64, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8]))
+    settings, loop = CompareSettings(steps=512, episodes=2, hyperparams=tiny), loop_config("ncs_gym/BatchReactor-v0")
     certificate = certificate_of(loop)
     unshielded, filtered, at_test = (
         execute_run(run_of_arm(settings, loop, certificate, name, 0), lambda steps: None)

@@ -21,7 +21,6 @@ from experiments.settings import (
     SweepSettings,
     TrainSettings,
 )
-from experiments.settings.agent_overrides import PPOOverrides
 from tests.command import assert_one_sentence, ncs
 
 
@@ -47,7 +46,7 @@ def finished(command, settings, file="summary.json"):
         ("compare", CompareSettings, {"arms": ("shielded",)}, "arms"),
         ("compare", CompareSettings, {"noise": "gaussian"}, "noise"),
         ("compare", CompareSettings, {"channel": {"loss": 0.5}}, r"\(channel.loss null, now 0.5\)"),
-        ("compare", CompareSettings, {"ppo": PPOOverrides(width=8)}, "ppo.width"),
+        ("compare", CompareSettings, {"hyperparams": {"gamma": 0.9}}, r"\(hyperparams.gamma null, now 0.9\)"),
         ("compare", CompareSettings, {"seed": 1, "seeds": 1, "steps": 1, "episodes": 1}, r"; \.\.\.\)"),
         ("train", TrainSettings, {"arm": "unshielded"}, "arm"),
         ("sweep", SweepSettings, {"losses": (0.0, 0.3)}, "losses"),

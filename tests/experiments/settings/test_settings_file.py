@@ -6,7 +6,6 @@ import pytest
 from experiments.__main__ import _parse
 from experiments.errors import SettingsError
 from experiments.settings import CompareSettings, SweepSettings, config_defaults, save_settings
-from experiments.settings.agent_overrides import PPOOverrides
 
 
 @pytest.mark.parametrize(
@@ -22,7 +21,7 @@ from experiments.settings.agent_overrides import PPOOverrides
                 algo="SAC",
                 smoke=True,
                 channel={"loss": 1e-3, "delay": 4},
-                ppo=PPOOverrides(learning_rate=1e-5, log_std=-1.5),
+                hyperparams=dict(learning_rate="lin_1e-05", policy_kwargs=dict(log_std_init=-1.5)),
             ),
         ),
         ("sweep", SweepSettings(losses=(0.0, 1 / 3), quantization_steps=(0.05,))),
@@ -40,6 +39,23 @@ def test_flags_of_the_user_win(tmp_path):
     own = ["compare", "--steps", "9", f"--config={tmp_path / 's.json'}", "--arms", "shielded", "--no-smoke"]
     read = _parse(own)
     assert (read.steps, read.arms, read.smoke) == (9, ("shielded",), False)
+
+
+def test_assignments_of_the_user_stand_beside_those_of_the_file(tmp_path):
+    kept = CompareSettings(hyperparams={"gamma": 0.9, "policy_kwargs": {"net_arch": [8]}}, channel={"delay": 2})
+    save_settings(tmp_path / "s.json", "compare", kept)
+    given = ["--hyperparams", "policy_kwargs=dict(log_std_init=-1.0)", "--channel", "loss=0.5"]
+    read = _parse(["compare", "--config", str(tmp_path / "s.json"), *given])
+    networks = {"net_arch": [8], "log_std_init": -1.0}
+    assert read == replace(kept, hyperparams={"gamma": 0.9, "policy_kwargs": networks}, channel=dict(delay=2, loss=0.5))
+
+
+@pytest.mark.parametrize("given", [["--algo", "SAC"], ["--conf-file", "mine.yml"]])
+def test_hyperparameters_of_the_file_give_way_to_another_algorithm_and_to_their_own_file(given, tmp_path):
+    save_settings(tmp_path / "s.json", "compare", CompareSettings(hyperparams={"n_epochs": 3}))
+    config = ["compare", "--config", str(tmp_path / "s.json"), *given]
+    assert _parse(config).hyperparams == {}
+    assert _parse([*config, "--hyperparams", "gamma=0.8"]).hyperparams == {"gamma": 0.8}
 
 
 def test_without_config_nothing_changes():
@@ -89,9 +105,10 @@ def test_values_in_a_file_are_no_flags(values, tmp_path):
         ({"config": "other.json"}, "config = "),
         ({"seed": True}, "seed = true"),
         ({"steps": 10**400, "violation_penalty": 10**400}, "too large"),
-        ({"ppo": {"envs": 4.0}}, "ppo.envs = 4.0"),
+        ({"ppo": 3}, "ppo = 3"),
+        ({"ppo": {}, "hyperparams": 3}, "hyperparams = 3"),
         ({"channel": {"loss": float("nan")}}, "channel.loss = NaN"),
-        ({"ppo": {"discount": 2.0}}, "discount must be in"),
+        ({"hyperparams": {"gamma": float("inf")}}, "hyperparams.gamma = Infinity"),
         ({"steps": 0}, "--steps must be at least 1"),
     ],
 )

@@ -9,7 +9,6 @@ from experiments.backends.execution import results_of
 from experiments.errors import ResultsError
 from experiments.runs import certificate_of, execute_run, loop_config, run_of_arm
 from experiments.settings import CompareSettings, changed_channel
-from experiments.settings.agent_overrides import PPOOverrides
 from experiments.study.channel_sweep import SWEPT_CONDITIONS, SWEPT_FILTERS, channel_sweep, trained_agents
 from experiments.study.channel_sweep import _points as points_of
 from experiments.study.figures import sweep_figure
@@ -37,7 +36,7 @@ def trained(tmp_path_factory):
         arms=("unshielded", *SWEPT_FILTERS),
         seeds=2,
         steps=256,
-        ppo=PPOOverrides(envs=8, rollout=32, batch_size=64),
+        hyperparams=dict(n_envs=8, n_steps=32, batch_size=64),
         episodes=2,
         jobs=1,
         out=out,

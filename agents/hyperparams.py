@@ -1,0 +1,190 @@
+"""Hyperparameters of the learning algorithms: stable-baselines3's keywords, in the form of rl-zoo3's files.
+
+Hyperparameters are a dictionary of JSON values by name. Most are keyword arguments of the algorithm's constructor in
+stable-baselines3, which judges them when a model is made (`agents.algorithms.build_model`). As in rl-zoo3,
+`"lin_0.003"` stands for a rate that falls linearly from 0.003 during the training, and these names are no arguments of
+the constructor:
+
+- `n_envs`: number of environments stepped side by side;
+- `n_timesteps`: training steps, where the caller asks for no number of them;
+- `normalize`: true, or arguments of `VecNormalize` such as `{"norm_reward": false}`;
+- `noise_std`, and `noise_type`, which is "normal": exploration noise of off-policy algorithms, in units of the limits.
+
+`agents/tuned/ppo.json` has those found by a search for each registered environment (docs/agents.md).
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+from collections.abc import Mapping
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from ncs_gym.validation import shown
+
+# The package of each algorithm, which has a class of the same name.
+ALGORITHMS = {
+    "PPO": "stable_baselines3",
+    "A2C": "stable_baselines3",
+    "SAC": "stable_baselines3",
+    "TD3": "stable_baselines3",
+    "TRPO": "sb3_contrib",
+    "TQC": "sb3_contrib",
+    "CrossQ": "sb3_contrib",
+}
+# Numbers that are counted from 1: of a wrong one the library complains only while it trains, or never.
+_COUNTS = ("n_envs", "n_steps", "n_epochs", "buffer_size")
+# Algorithms that learn from whole rollouts of `n_steps` steps in every environment.
+ON_POLICY = ("PPO", "A2C", "TRPO")
+
+# Many environments, batches of 2048 and a higher learning rate than stable-baselines3's defaults train about eight
+# times as fast at no loss of return on these small tasks (`python benchmarks/ppo_settings.py`).
+_ROLLOUTS = {
+    "n_envs": 64,
+    "gamma": 0.9,
+    "gae_lambda": 0.9,
+    "policy_kwargs": {"net_arch": [64, 64], "log_std_init": -0.7},
+    "normalize": True,
+}
+_MINIBATCHES = {**_ROLLOUTS, "n_steps": 64, "batch_size": 2048, "learning_rate": "lin_0.003"}
+_REPLAY = {
+    "n_envs": 64,
+    "gradient_steps": 16,
+    "batch_size": 256,
+    "buffer_size": 200_000,
+    "learning_starts": 2_000,
+    "learning_rate": "lin_0.003",
+    "gamma": 0.9,
+    "policy_kwargs": {"net_arch": [64, 64]},
+    "normalize": True,
+}
+# What an algorithm learns with where nothing else is said; of everything else stable-baselines3 has the defaults.
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "PPO": {**_MINIBATCHES, "n_epochs": 10, "ent_coef": 0.0},
+    "TRPO": {**_MINIBATCHES, "n_critic_updates": 10},
+    "A2C": {**_ROLLOUTS, "n_steps": 8, "learning_rate": "lin_0.002"},
+    "SAC": _REPLAY,
+    "TD3": {**_REPLAY, "noise_std": 0.2},
+    "TQC": _REPLAY,
+    "CrossQ": _REPLAY,
+}
+
+
+def with_changes(hyperparams: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns hyperparameters with changes, of `policy_kwargs` entry by entry."""
+    changed = {**hyperparams, **changes}
+    own, given = hyperparams.get("policy_kwargs"), changes.get("policy_kwargs")
+    if isinstance(own, Mapping) and isinstance(given, Mapping):
+        changed["policy_kwargs"] = {**own, **given}
+    return changed
+
+
+def complete_hyperparams(algorithm: str, given: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Returns the hyperparameters that an algorithm is trained with: those given, and the defaults.
+
+    Args:
+        algorithm: A name in `ALGORITHMS`.
+        given: Hyperparameters by name; None for none.
+
+    Raises:
+        ValueError: If the algorithm is unknown, what is given is no dictionary of JSON values, or `gamma` or a count
+            (`n_envs`, `n_steps`, `n_epochs`, `buffer_size`) is out of range.
+    """
+    if algorithm not in ALGORITHMS:
+        raise ValueError(f"unknown algorithm {algorithm!r}; known are {', '.join(ALGORITHMS)}")
+    if not isinstance(given, Mapping | None):
+        raise ValueError(f"hyperparameters must be a dictionary, got {type(given).__name__}")
+    try:
+        copied = json.loads(json.dumps(dict(given or {}), allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"hyperparameters must be JSON values: {error}") from error
+    hyperparams = with_changes(DEFAULTS[algorithm], copied)
+    for name in _COUNTS:
+        if name in hyperparams and (type(value := hyperparams[name]) is not int or value < 1):
+            raise ValueError(f"{name} must be a whole number >= 1, got {shown(value)}")
+    gamma = hyperparams["gamma"]
+    if type(gamma) not in (int, float) or not 0.0 <= gamma <= 1.0:
+        raise ValueError(f"gamma must be in [0, 1], got {shown(gamma)}")
+    return hyperparams
+
+
+def rollout_steps(algorithm: str, hyperparams: Mapping[str, Any]) -> int:
+    """Returns how many steps of all environments together lie between two updates; trainings end with whole ones."""
+    known = {**DEFAULTS[algorithm], **hyperparams}
+    return known["n_envs"] * (known["n_steps"] if algorithm in ON_POLICY else 1)
+
+
+def tuned_hyperparams(env_id: str, algorithm: str = "PPO") -> dict[str, Any] | None:
+    """Returns the hyperparameters tuned for an environment; None where there are none, as for plants of one's own.
+
+    Args:
+        env_id: Id by which the environment is registered.
+        algorithm: Name of the learning algorithm; none but PPO is tuned.
+    """
+    entry = _tuned().get(env_id) if algorithm == "PPO" else None
+    return None if entry is None else {name: value for name, value in entry.items() if name != "n_timesteps"}
+
+
+def tuned_steps(env_id: str, algorithm: str = "PPO") -> int | None:
+    """Returns the number of training steps that belongs to the tuned hyperparameters; None where there are none."""
+    return _tuned()[env_id]["n_timesteps"] if tuned_hyperparams(env_id, algorithm) is not None else None
+
+
+@cache
+def _tuned() -> dict[str, dict[str, Any]]:
+    """Returns the file of PPO: hyperparameters by environment id."""
+    return json.loads(resources.files("agents").joinpath("tuned", "ppo.json").read_text("utf-8"))
+
+
+def read_hyperparams(file: str | Path, env_id: str) -> dict[str, Any]:
+    """Returns the hyperparameters of an environment in a file like those of rl-zoo3.
+
+    Args:
+        file: YAML (.yml, .yaml) or JSON: hyperparameters by environment id, or under "default" for all others. Texts
+            such as `dict(net_arch=[64, 64])` are read as Python's literals.
+        env_id: Id by which the environment is registered.
+
+    Raises:
+        ValueError: If the file has no entry for the environment, or is damaged.
+        OSError: If it cannot be read.
+    """
+    path = Path(file)
+    text = path.read_text("utf-8")
+    try:
+        document = json.loads(text) if path.suffix == ".json" else _yaml(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"hyperparameters {path} are damaged: {' '.join(str(error).split())}") from error
+    entries = document if isinstance(document, dict) else {}
+    entry = entries.get(env_id, entries.get("default"))
+    if not isinstance(entry, dict):
+        raise ValueError(f"{path} has no hyperparameters for {env_id}, nor for default")
+    return {name: literal(value) if isinstance(value, str) else value for name, value in entry.items()}
+
+
+def _yaml(text: str) -> Any:
+    import yaml  # of the extra "train", as everything that is trained needs
+
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ValueError(str(error)) from error
+
+
+def literal(text: str) -> Any:
+    """Returns what a text stands for in Python: a number, a list, a dictionary (also `dict(a=1)`), True, False or None.
+
+    Returns:
+        JSON values; the text itself if it stands for nothing that JSON can keep.
+    """
+    try:
+        node = ast.parse(text.strip(), mode="eval").body
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "dict" and not node.args:
+            value: Any = {str(each.arg): ast.literal_eval(each.value) for each in node.keywords}
+        else:
+            value = ast.literal_eval(node)
+        return json.loads(json.dumps(value, allow_nan=False))
+    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError):
+        return text

@@ -1,0 +1,112 @@
+"""Hyperparameters: those tuned for each environment, those of a file, and those of former settings."""
+
+import json
+
+import pytest
+
+from agents import read_hyperparams, tuned_hyperparams, tuned_steps
+from agents.former_settings import from_former, from_former_file
+from agents.hyperparams import DEFAULTS, _tuned, complete_hyperparams, literal, with_changes
+from ncs_gym.registration import ENVIRONMENTS, needing_extras, registered_ids
+
+OWN = [env_id for env_id in ENVIRONMENTS if env_id in {*registered_ids(), *needing_extras()}]
+
+
+@pytest.mark.parametrize("env_id", OWN)
+def test_registered_environment_has_tuned_hyperparameters(env_id):
+    tuned = tuned_hyperparams(env_id)
+    assert tuned is not None
+    assert tuned.keys() == DEFAULTS["PPO"].keys()
+    assert tuned_steps(env_id) >= 100_000
+
+
+def test_file_names_registered_environments_only():
+    assert set(_tuned()) == set(OWN)
+    assert len(OWN) == 9
+
+
+@pytest.mark.parametrize("env_id", ["ncs_gym/LinearNCS-v0", "Plants/Tanks-v0", "ncs_gym:ncs_gym/CartPole-v0"])
+def test_plant_of_ones_own_has_none(env_id):
+    assert tuned_hyperparams(env_id) is None
+    assert tuned_steps(env_id) is None
+
+
+@pytest.mark.parametrize("algorithm", ["TRPO", "A2C", "SAC", "TD3", "../ppo"])
+def test_algorithm_that_was_not_tuned_has_none(algorithm):
+    assert tuned_hyperparams("ncs_gym/CartPole-v0", algorithm) is None
+    assert tuned_steps("ncs_gym/CartPole-v0", algorithm) is None
+
+
+def test_budget_of_the_main_job_has_not_grown():
+    assert tuned_steps("ncs_gym/TruckTrailerCruise-v0") == 150_000
+
+
+def test_discount_of_the_cart_pole_sees_farther_than_a_fifth_of_a_second():
+    assert 0.02 / (1.0 - tuned_hyperparams("ncs_gym/CartPole-v0")["gamma"]) > 0.5
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("mine.yml", "A-v0:\n  n_envs: 8\n  n_timesteps: !!float 1e5\n  policy_kwargs: dict(net_arch=[64, 64])\n"),
+        ("mine.json", '{"A-v0": {"n_envs": 8, "n_timesteps": 1e5, "policy_kwargs": {"net_arch": [64, 64]}}}'),
+    ],
+)
+def test_file_like_those_of_rl_zoo3_is_read(name, text, tmp_path):
+    (tmp_path / name).write_text(text)
+    found = read_hyperparams(tmp_path / name, "A-v0")
+    assert found == {"n_envs": 8, "n_timesteps": 100_000, "policy_kwargs": {"net_arch": [64, 64]}}
+    with pytest.raises(ValueError, match="has no hyperparameters for B-v0, nor for default"):
+        read_hyperparams(tmp_path / name, "B-v0")
+
+
+@pytest.mark.parametrize(("name", "text"), [("m.json", "{"), ("m.yml", "{"), ("m.yml", "!!python/name:os.system")])
+def test_damaged_file_is_one_sentence_and_runs_nothing(name, text, tmp_path):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match="are damaged: ") as caught:
+        read_hyperparams(tmp_path / name, "A-v0")
+    assert "\n" not in str(caught.value)
+
+
+def test_text_that_calls_something_stays_a_text():
+    for text in ("dict(a=print(1))", "exec('1')", "dict([1])", "lin_0.1", "{1, 2}", "1e999"):
+        assert literal(text) == text
+
+
+def test_part_of_the_networks_arguments_may_be_changed():
+    changed = with_changes(DEFAULTS["PPO"], {"gamma": 0.99, "policy_kwargs": {"net_arch": [8]}})
+    expected = {"gamma": 0.99, "policy_kwargs": {"net_arch": [8], "log_std_init": -0.7}}
+    assert changed == DEFAULTS["PPO"] | expected
+    assert complete_hyperparams("PPO", expected) == changed
+    assert DEFAULTS["PPO"]["policy_kwargs"]["net_arch"] == [64, 64]
+
+
+FORMER = {"envs": 128, "rollout": 32, "batch_size": 512, "epochs": 5, "learning_rate": 1e-3, "discount": 0.98}
+FORMER |= {"gae_lambda": 0.95, "log_std": -1.5, "width": 32, "entropy": 0.0, "normalize_rewards": False}
+
+
+def test_former_settings_have_the_names_of_the_library():
+    assert from_former("PPO", FORMER) == {
+        "n_envs": 128,
+        "n_steps": 32,
+        "batch_size": 512,
+        "n_epochs": 5,
+        "learning_rate": "lin_0.001",
+        "gamma": 0.98,
+        "gae_lambda": 0.95,
+        "policy_kwargs": {"log_std_init": -1.5, "net_arch": [32, 32]},
+        "ent_coef": 0.0,
+        "normalize": {"norm_reward": False},
+    }
+
+
+def test_former_file_is_that_of_its_algorithm():
+    groups = {"ppo": FORMER, "a2c": dict.fromkeys(FORMER), "off_policy": {"envs": 4, "noise": 0.3}}
+    for algorithm, expected in (
+        ("PPO", from_former("PPO", FORMER)),
+        ("A2C", {}),
+        ("TD3", {"n_envs": 4, "noise_std": 0.3}),
+        ("SAC", {"n_envs": 4}),
+    ):
+        settings = json.loads(json.dumps({"algo": algorithm, "seed": 3} | groups))
+        assert from_former_file(settings) == {"algo": algorithm, "seed": 3, "hyperparams": expected}

@@ -1,0 +1,103 @@
+"""Which hyperparameters a command trains with: those given, those of a file, those tuned, the defaults."""
+
+from dataclasses import replace
+
+import pytest
+
+from agents import tuned_hyperparams, tuned_steps
+from agents.hyperparams import DEFAULTS, complete_hyperparams
+from experiments.__main__ import _parse
+from experiments.runs import loop_config, require_trainable
+from experiments.settings import CompareSettings, SweepSettings, TrainSettings, save_settings
+
+CART_POLE = "ncs_gym/CartPole-v0"
+
+
+@pytest.mark.parametrize("kind", [CompareSettings, TrainSettings, SweepSettings])
+@pytest.mark.parametrize("env_id", [CART_POLE, "ncs_gym/TruckTrailerCruise-v0", "ncs_gym:ncs_gym/BatchReactor-v0"])
+def test_hyperparameters_tuned_for_the_environment_are_used(kind, env_id):
+    settings, own_id = kind(env=env_id), env_id.rpartition(":")[2]
+    assert settings.all_hyperparams == tuned_hyperparams(own_id)
+    assert f"PPO, hyperparameters tuned for {own_id}: n_envs=" in settings.agent_line
+
+
+@pytest.mark.parametrize("algo", DEFAULTS)
+def test_plant_of_ones_own_gets_the_defaults(algo):
+    settings = CompareSettings(env="plants:Plants/Tanks-v0", algo=algo)
+    assert settings.all_hyperparams == DEFAULTS[algo]
+    assert f"{algo}, default hyperparameters: n_envs=" in settings.agent_line
+
+
+@pytest.mark.parametrize("algo", ["TRPO", "A2C", "TD3"])
+def test_algorithm_that_was_not_tuned_gets_the_defaults(algo):
+    settings = CompareSettings(env=CART_POLE, algo=algo)
+    assert settings.all_hyperparams == DEFAULTS[algo]
+    assert f"{algo}, default hyperparameters: " in settings.agent_line
+
+
+def test_steps_are_those_given_or_tuned_or_the_default():
+    assert tuned_steps(CART_POLE) == CompareSettings(env=CART_POLE).training_steps == 600_000
+    assert CompareSettings(env=CART_POLE, steps=150_000).training_steps == 150_000
+    assert CompareSettings(env="plants:Plants/Tanks-v0").training_steps == 150_000
+    assert CompareSettings(env=CART_POLE, algo="A2C").training_steps == 150_000
+    assert SweepSettings(env=CART_POLE).training_steps == 50_000
+    assert CompareSettings(env=CART_POLE).completed.steps == 600_000
+
+
+def test_steps_are_a_hyperparameter_of_a_file_too():
+    assert CompareSettings(hyperparams={"n_timesteps": 3e4}).training_steps == 30_000
+    assert CompareSettings(hyperparams={"n_timesteps": 3e4}, steps=7).training_steps == 7
+    assert "n_timesteps" not in CompareSettings(hyperparams={"n_timesteps": 3e4}).all_hyperparams
+    for steps in (0, 1.5, True, "many", 1e16):
+        with pytest.raises(ValueError, match="n_timesteps must be a whole number >= 1, got"):
+            CompareSettings(hyperparams={"n_timesteps": steps}).training_steps  # noqa: B018
+
+
+def test_what_is_given_wins_over_the_tuned_value_also_if_it_equals_the_default():
+    default, tuned = DEFAULTS["PPO"]["gamma"], tuned_hyperparams(CART_POLE)
+    assert tuned["gamma"] != default
+    settings = _parse(["compare", "--env", CART_POLE, "--hyperparams", f"gamma={default}"])
+    assert settings.all_hyperparams == tuned | {"gamma": default}
+    assert f"tuned for {CART_POLE}, as given gamma: " in settings.agent_line
+
+
+def test_what_is_given_wins_over_the_file_and_the_file_over_the_tuned_values(tmp_path):
+    (tmp_path / "mine.yml").write_text(
+        f"{CART_POLE}:\n  n_timesteps: 5000\n  gamma: 0.5\n  n_steps: 8\n  policy_kwargs: dict(net_arch=[8])\n"
+    )
+    given = ["--conf-file", str(tmp_path / "mine.yml"), "--hyperparams", "gamma=0.7"]
+    settings, tuned = _parse(["train", "--env", CART_POLE, *given]), tuned_hyperparams(CART_POLE)
+    networks = tuned["policy_kwargs"] | {"net_arch": [8]}
+    expected = tuned | {"gamma": 0.7, "n_steps": 8, "policy_kwargs": networks}
+    assert settings.all_hyperparams == expected
+    assert settings.training_steps == 5000
+    assert "as given gamma, policy_kwargs, n_steps: " in settings.agent_line
+    assert settings.completed == replace(settings, steps=5000, hyperparams=expected, conf_file=None)
+
+
+def test_completed_settings_come_back_whatever_is_tuned_later(tmp_path, monkeypatch):
+    completed = CompareSettings(env=CART_POLE, hyperparams={"policy_kwargs": {"net_arch": [16]}}).completed
+    found = completed.all_hyperparams
+    assert completed.hyperparams == found
+    save_settings(tmp_path / "s.json", "compare", completed)
+    later = complete_hyperparams("PPO", {"n_epochs": 1, "vf_coef": 0.1, "policy_kwargs": {"log_std_init": 1.0}})
+    monkeypatch.setattr("experiments.settings.learning.tuned_hyperparams", lambda *_: later)
+    read = _parse(["compare", "--config", str(tmp_path / "s.json")])
+    assert read == completed
+    assert read.all_hyperparams == found
+    assert "hyperparameters as given: " in read.agent_line
+
+
+def test_file_that_gives_an_environment_alone_gets_its_tuned_hyperparameters(tmp_path):
+    save_settings(tmp_path / "s.json", "compare", CompareSettings(env=CART_POLE))
+    read = _parse(["compare", "--config", str(tmp_path / "s.json")])
+    assert read.all_hyperparams == tuned_hyperparams(CART_POLE)
+
+
+@pytest.mark.parametrize("algo", DEFAULTS)
+def test_what_cannot_be_trained_with_is_refused_before_anything_is_computed(algo):
+    loop = loop_config("ncs_gym/TruckTrailer-v0")
+    require_trainable(TrainSettings(algo=algo, hyperparams={"gamma": 0.8}), loop)
+    for change, words in (({"gamma": 2.0}, "gamma must be in"), ({"discount": 0.8}, "unknown hyperparameter")):
+        with pytest.raises(ValueError, match=words):
+            require_trainable(TrainSettings(algo=algo, hyperparams=change), loop)

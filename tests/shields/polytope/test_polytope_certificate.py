@@ -1,0 +1,248 @@
+"""Polytopes that the certified gain keeps in the box: found, proved by both engines, and refused when changed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from fractions import Fraction
+from functools import cache
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from ncs_gym import LinearPlant, cart_pole
+from ncs_gym.network.contract import contract_of
+from ncs_gym.registration import CART_POLE_CHANNEL
+from shields import Certificate, CertificateError, SafetyFilter, synthesize, verify
+from shields.errors import Infeasible, SynthesisInterrupted
+from shields.json_documents import document_of
+from shields.polytope import Polytope
+from shields.synthesis import invariant_polytope as search
+from shields.synthesis.certification import with_polytope
+from shields.verification.polytope_conditions import _half_widths, _root_above
+from tests.certificates import certificate_of
+from tests.plants import random_plant
+
+IDS = {"TruckTrailerCruise": 0.93, "CartPole": 0.43, "BatchReactor": 0.75, "Pendulum": 0.71}
+
+
+def both(certificate, plant):
+    """Verdict of either engine; they have to agree."""
+    verdicts = {verify(certificate, plant, engine=engine).valid for engine in ("rational", "flint")}
+    assert len(verdicts) == 1
+    return verdicts.pop()
+
+
+@cache
+def found(name):
+    """Certificate with a polytope, the one that it was made of, and the plant of a registered environment."""
+    env = gym.make(f"ncs_gym/{name}-v0").unwrapped
+    certificate = certificate_of(env.plant, env.certificate_contract)
+    return with_polytope(certificate, env.plant), certificate, env.plant
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_polytopes_fill_much_more_of_the_box_and_both_engines_prove_them(name):
+    wide, certificate, plant = found(name)
+    assert wide.provenance["polytope_share_of_box"] >= IDS[name] > certificate.provenance["share_of_box"]
+    assert both(wide, plant)
+    assert wide.safe_set is wide.polytope
+    assert replace(wide, polytope=None, provenance=certificate.provenance) == certificate
+    # The ellipsoid lies inside: it is invariant under the same gain, and the polytope is the largest such set.
+    points = certificate.safe_set.sample_boundary(np.random.default_rng(0), 2000)
+    assert wide.polytope.gauge(points).max() <= 1.0 + 1e-5
+
+
+def test_file_holds_the_polytope_and_one_without_is_as_before(tmp_path):
+    wide, certificate, plant = found("BatchReactor")
+    wide.save(tmp_path / "wide.json")
+    again = Certificate.load(tmp_path / "wide.json")
+    assert again == wide != certificate
+    np.testing.assert_array_equal(again.polytope.multipliers, wide.polytope.multipliers)
+    assert again.polytope.F.shape == (2 * len(wide.polytope.rows), plant.n)
+    assert "polytope" not in certificate.document["certificate"]
+    assert "the polytope" in str(again)
+    assert "the polytope" not in str(certificate)
+
+
+def test_default_is_the_ellipsoid_bit_for_bit():
+    plant = random_plant(3, 2, 1)
+    plain = synthesize(plant)
+    wide = synthesize(plant, safe_set="polytope")
+    assert plain == synthesize(plant, safe_set="ellipsoid")
+    assert plain.polytope is None
+    assert wide.polytope is not None
+    np.testing.assert_array_equal(wide.L, plain.L)
+
+
+def changed(polytope, rows=None, multipliers=None):
+    return Polytope(
+        rows=polytope.rows if rows is None else rows,
+        multipliers=polytope.multipliers if multipliers is None else multipliers,
+    )
+
+
+def without_a_row(polytope, k):
+    rows = np.delete(polytope.rows, k, axis=0)
+    return changed(polytope, rows, np.delete(np.delete(polytope.multipliers, k, axis=0), k, axis=1))
+
+
+def scaled_multipliers(polytope, factor):
+    return changed(polytope, multipliers=factor * polytope.multipliers)
+
+
+def swapped(polytope):
+    order = np.arange(len(polytope.rows))
+    order[[-1, -2]] = order[[-2, -1]]
+    return changed(polytope, rows=polytope.rows[order])
+
+
+MUTANTS = {
+    "a row of the box left out": lambda p, k: without_a_row(p, 0),
+    "a row of the box moved out": lambda p, k: changed(p, rows=np.vstack([p.rows[:1] * (1 - 1e-9), p.rows[1:]])),
+    "a needed row left out": lambda p, k: without_a_row(p, k),
+    "a row moved out": lambda p, k: changed(
+        p, rows=np.vstack([p.rows[:k], 0.999 * p.rows[k : k + 1], p.rows[k + 1 :]])
+    ),
+    "multipliers too small": lambda p, k: scaled_multipliers(p, 1.0 - 1e-4),
+    "multipliers too large": lambda p, k: scaled_multipliers(p, 1.0 + 1e-4),
+    "multipliers of the opposite sign": lambda p, k: scaled_multipliers(p, -1.0),
+    "rows in another order": lambda p, k: swapped(p),
+    "no multipliers": lambda p, k: scaled_multipliers(p, 0.0),
+}
+
+
+@pytest.mark.parametrize("mutant", MUTANTS)
+@pytest.mark.parametrize("name", ["CartPole", "BatchReactor"])
+def test_changed_polytopes_are_refused_by_both_engines(name, mutant):
+    wide, _, plant = found(name)
+    broken = replace(wide, polytope=MUTANTS[mutant](wide.polytope, len(plant.box_rows)))
+    assert not both(broken, plant)
+    with pytest.raises(CertificateError, match="does not verify"):
+        SafetyFilter(broken, plant)
+
+
+@pytest.mark.parametrize("name", ["CartPole", "BatchReactor"])
+def test_polytope_of_other_numbers_is_refused(name):
+    wide, _, plant = found(name)
+    assert not both(replace(wide, K=1.01 * wide.K), plant)
+    larger = replace(wide, D=1.2 * wide.D)
+    broken = [c.name for c in verify(larger, plant).conditions if not c.holds]
+    assert any(name.startswith("(P)") for name in broken)
+    grown = replace(wide, proofs=tuple(replace(proof, Sigma=1.5 * proof.Sigma) for proof in wide.proofs))
+    broken = [c.name for c in verify(grown, plant).conditions if not c.holds]
+    assert any(name.startswith("(P)") for name in broken)
+    tighter = replace(wide, polytope=scaled_multipliers(wide.polytope, 1.0))
+    tighter.polytope.multipliers.setflags(write=True)
+    tighter.polytope.multipliers[len(wide.polytope.rows)] *= 0.5
+    broken = [c.name for c in verify(tighter, plant).conditions if not c.holds]
+    assert broken == ["(PU) input 1 stays within u_max (1 - 2^-24) on the polytope"]
+
+
+@pytest.mark.parametrize("entry", [[[0, "1"]], [[0.5, 1.0]], [[-1, 1.0]], [[10**6, 1.0]], [[0]], "x", None])
+def test_file_with_other_multipliers_is_refused(entry, tmp_path):
+    wide, _, _ = found("Pendulum")
+    content = wide.document["certificate"]
+    content["polytope"]["multipliers"][0] = entry
+
+    (tmp_path / "c.json").write_text(json.dumps(document_of("certificate", "ncs-gym certificate 2", content)))
+    with pytest.raises(CertificateError):
+        Certificate.load(tmp_path / "c.json")
+
+
+def test_without_a_polytope_within_the_limits_the_certificate_says_why(monkeypatch):
+    plant = cart_pole()
+    certificate = certificate_of(plant, contract_of(CART_POLE_CHANNEL))
+    monkeypatch.setattr(search, "MOST_ROWS", 50)
+    narrow = with_polytope(certificate, plant)
+    assert narrow.polytope is None
+    assert "more than 50 rows; shields keep the state in the ellipsoid" in " ".join(str(narrow).split())
+    monkeypatch.setattr(search, "MOST_ROWS", 400)
+    monkeypatch.setattr(search, "LONGEST_SEARCH", -1.0)
+    assert "longer than" in with_polytope(certificate, plant).provenance["no_polytope"]
+
+
+def test_errors_that_leave_a_face_alone_leave_no_polytope():
+    plant = random_plant(3, 2, 1)
+    certificate = synthesize(plant)
+    wide = replace(certificate, proofs=(replace(certificate.proofs[0], Sigma=1e4 * certificate.Sigma),))
+    with pytest.raises(Infeasible):
+        search.invariant_polytope(wide, plant, lambda line: None)
+
+
+def test_interrupted_search_keeps_the_ellipsoid():
+    plant = random_plant(3, 2, 1)
+    certificate = synthesize(plant)
+
+    def interrupt(line):
+        raise KeyboardInterrupt
+
+    with pytest.raises(SynthesisInterrupted, match="has the ellipsoid") as caught:
+        with_polytope(certificate, plant, interrupt)
+    assert caught.value.certificate == certificate
+
+
+@pytest.mark.parametrize("wrong", ["Polytope", None, 3, ["polytope"]])
+def test_unknown_kinds_of_sets_are_refused(wrong):
+    with pytest.raises(ValueError, match="safe_set must be"):
+        synthesize(random_plant(3, 2, 1), safe_set=wrong)
+    with pytest.raises(ValueError, match="safe_set='polytope' is for method 'certified'"):
+        synthesize(random_plant(3, 2, 1), "paper", safe_set="polytope")
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10_000), st.integers(1, 3), st.integers(1, 2))
+def test_random_plants_have_polytopes_that_verify_and_hold_under_extreme_points(seed, n, m):
+    plant = random_plant(seed, n, m, gamma=1e-4)
+    try:
+        wide = synthesize(plant, safe_set="polytope")
+    except Infeasible:
+        assume(False)
+    assert (wide.polytope is None) == ("no_polytope" in wide.provenance)
+    assume(wide.polytope is not None)
+    assert both(wide, plant)
+    rng = np.random.default_rng(seed)
+    x = wide.polytope.sample_boundary(rng, 300)
+    error, push = wide.error_set.sample_boundary(rng, 300), plant.disturbance.sample_boundary(rng, 300)
+    u = (x + error) @ wide.K.T
+    assert (np.abs(u) <= plant.u_max).all()
+    assert wide.polytope.gauge(x @ plant.A.T + u @ plant.B.T + push).max() <= 1.0
+    # By another route: for every row the farthest state, error and disturbance.
+    for row in wide.polytope.rows:
+        image = wide.polytope.support(row @ (plant.A + plant.B @ wide.K))
+        assert image + wide.error_set.support(row @ plant.B @ wide.K) + plant.disturbance.support(row) <= 1.0
+
+
+def test_half_widths_and_roots_are_upper_bounds():
+    rng = np.random.default_rng(0)
+    for n in (1, 2, 4):
+        rows = rng.standard_normal((n + 2, n)).round(3)
+        exact_rows = [[Fraction(float(x)) for x in row] for row in rows]
+        widths = np.array([float(width) for width in _half_widths(exact_rows)])
+        points = rng.standard_normal((5000, n))
+        points /= np.abs(points @ rows.T).max(axis=1)[:, None]
+        assert (np.abs(points).max(axis=0) <= widths * (1 + 1e-12)).all()
+    assert _half_widths([[Fraction(1), Fraction(1)], [Fraction(2), Fraction(2)]]) is None
+    for square in (Fraction(2), Fraction(1, 3), Fraction(0), Fraction(10) ** -40, Fraction(10) ** 30):
+        root = _root_above(square)
+        assert root * root >= square
+        assert root - Fraction(1, 2**127) <= 0 or (root - Fraction(1, 2**127)) ** 2 <= square
+
+
+def test_plant_with_an_oblique_box_has_a_polytope():
+    plant = LinearPlant(
+        A=[[0.9, 0.2], [0.0, 0.8]],
+        B=[[0.0], [0.3]],
+        box=np.array([[1.0, 0.5], [-0.5, 1.0], [0.4, 0.4]]),
+        u_max=1.0,
+        dt=0.1,
+        gamma=1e-4,
+        measurement_noise_cov=1e-5 * np.eye(2),
+        initial_cov=1e-5 * np.eye(2),
+    )
+    wide = synthesize(plant, safe_set="polytope")
+    assert wide.polytope is not None
+    assert both(wide, plant)

@@ -1,0 +1,288 @@
+"""The one-step test of a polytope: decisions judged by extreme points and by a conic solver, and attacked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import cvxpy as cp
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from ncs_gym import AdversarialDisturbance, Ellipsoid, LinearPlant
+from ncs_gym.processes.simulation import BlockSampler
+from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, synthesize
+from shields.runtime.projection import closest_between
+from shields.runtime.safety_filter import MARGIN
+from shields.runtime.starts import starts_inside
+from shields.synthesis.certification import with_polytope
+from tests.certificates import certificate_of
+from tests.plants import random_plant
+
+ALL = ("TruckTrailerCruise", "CartPole", "BatchReactor", "Pendulum", "CartPoleTwoWay")
+
+
+@cache
+def wide_certificate(name):
+    env = gym.make(f"ncs_gym/{name}-v0").unwrapped
+    return with_polytope(certificate_of(env.plant, env.certificate_contract), env.plant), env.plant
+
+
+@cache
+def random_filter(seed, n, m, mode="project", u_max=2.0):
+    plant = replace(random_plant(seed, n, m, gamma=1e-4), u_max=u_max)
+    return SafetyFilter(synthesize(plant, safe_set="polytope"), plant, mode)
+
+
+def situations(shield, count, seed=0):
+    """Estimates in and a little out of the polytope, error shapes, and proposals: (count, n), (n, n), (count, m)."""
+    rng = np.random.default_rng(seed)
+    polytope, plant = shield.certificate.polytope, shield.plant
+    estimates = polytope.sample_boundary(rng, count) * rng.uniform(0.3, 1.15, (count, 1))
+    return estimates, 0.5 * shield.certificate.Sigma, rng.uniform(-1.0, 1.0, (count, plant.m)) * plant.u_max
+
+
+def largest_row(shield, estimate, shape, u):
+    """Largest |g x+| over all errors and disturbances, by their extreme points."""
+    plant, worst = shield.plant, 0.0
+    errors, pushes = Ellipsoid(shape), plant.disturbance
+    for row in shield.certificate.polytope.rows:
+        for sign in (1.0, -1.0):
+            x = estimate + errors.extreme_point(sign * row @ plant.A)
+            worst = max(worst, sign * row @ (plant.A @ x + plant.B @ u + pushes.extreme_point(sign * row)))
+    return worst
+
+
+@pytest.mark.parametrize(("seed", "n", "m"), [(1, 2, 1), (2, 3, 2), (3, 2, 3)])
+def test_input_passes_exactly_if_every_extreme_point_stays_inside(seed, n, m):
+    shield = random_filter(seed, n, m)
+    estimates, shape, proposals = situations(shield, 300, seed)
+    passed = 0
+    for estimate, proposed in zip(estimates, proposals, strict=True):
+        decision = shield.decide(estimate, shape, proposed)
+        reached = largest_row(shield, estimate, shape, proposed)
+        if abs(reached - 1.0) > 1e-8:
+            assert (decision.reason == "safe") == (reached < 1.0)
+        passed += decision.reason == "safe"
+        if decision.reason == "projected":
+            assert largest_row(shield, estimate, shape, decision.input) <= 1.0
+    assert 20 < passed < 280
+
+
+@pytest.mark.parametrize(("seed", "n", "m"), [(1, 2, 1), (2, 3, 2), (3, 2, 3)])
+def test_projected_input_is_the_closest_one_of_a_conic_solver(seed, n, m):
+    shield = random_filter(seed, n, m)
+    plant, polytope = shield.plant, shield.certificate.polytope
+    estimates, shape, proposals = situations(shield, 60, seed)
+    projected = 0
+    for estimate, proposed in zip(estimates, proposals, strict=True):
+        decision = shield.decide(estimate, shape, proposed)
+        if decision.reason == "safe":
+            continue
+        u = cp.Variable(m)
+        room = 1.0 - Ellipsoid(shape).support(polytope.rows @ plant.A) - plant.disturbance.support(polytope.rows)
+        limits = [cp.abs(polytope.rows @ (plant.A @ estimate + plant.B @ u)) <= room, cp.abs(u) <= plant.u_max]
+        problem = cp.Problem(cp.Minimize(cp.sum_squares(u - proposed)), limits)
+        problem.solve(solver=cp.CLARABEL)
+        if problem.status == cp.OPTIMAL and decision.reason == "projected":
+            projected += 1
+            np.testing.assert_allclose(decision.input, u.value, atol=2e-6)
+        elif problem.status == cp.INFEASIBLE:
+            assert decision.reason == "fallback"
+    assert projected >= 10
+
+
+def test_closest_points_are_those_of_a_conic_solver_in_three_dimensions():
+    rng = np.random.default_rng(0)
+    effect, room = rng.standard_normal((12, 3)), rng.uniform(0.2, 1.0, (12, 40))
+    offset, wanted = 0.3 * rng.standard_normal((12, 40)), rng.uniform(-3.0, 3.0, (3, 40))
+    found = closest_between(wanted, offset, np.repeat(effect[..., None], 40, axis=-1), room)
+    infeasible = 0
+    for k in range(40):
+        u = cp.Variable(3)
+        problem = cp.Problem(
+            cp.Minimize(cp.sum_squares(u - wanted[:, k])), [cp.abs(offset[:, k] + effect @ u) <= room[:, k]]
+        )
+        problem.solve(solver=cp.CLARABEL)
+        if problem.status == cp.OPTIMAL:
+            np.testing.assert_allclose(found[:, k], u.value, atol=1e-6)
+        else:
+            infeasible += 1
+            assert np.isnan(found[:, k]).all()
+    assert infeasible < 30
+
+
+@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("mode", ["project", "switch", "boundary", "monitor"])
+def test_batches_decide_as_single_loops(name, mode):
+    certificate, plant = wide_certificate(name)
+    shield = SafetyFilter(certificate, plant, mode)
+    estimates, shape, proposals = situations(shield, 64)
+    errors = shield.errors_of(shape).batch().of(np.zeros(64, np.int64))
+    many = shield.decide_many(np.ascontiguousarray(estimates.T), errors, np.ascontiguousarray(proposals.T))
+    reasons = set()
+    for k in range(64):
+        one = shield.decide(estimates[k], shape, proposals[k])
+        np.testing.assert_allclose(many.input[:, k], one.input, rtol=1e-6, atol=1e-9)
+        assert (bool(many.intervened[k]), bool(many.passed[k])) == (one.intervened, one.passed)
+        reasons.add(one.reason)
+    assert len(reasons) > 1
+
+
+def test_boundary_mode_lets_pass_what_every_vertex_passes():
+    shield = random_filter(2, 3, 2, "boundary", 0.3)
+    estimates, shape, _ = situations(shield, 200)
+    switched = random_filter(2, 3, 2, "switch", 0.3)
+    kept = 0
+    for estimate in estimates:
+        vertices = [shield.plant.u_max * signs for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
+        all_pass = all(switched.decide(estimate, shape, u).reason == "safe" for u in vertices)
+        kept += all_pass
+        assert (shield.decide(estimate, shape, 0.1 * vertices[0]).reason == "safe") == all_pass
+    assert 0 < kept < 200
+
+
+def test_sums_in_another_order_stay_within_the_room_for_rounding():
+    certificate, plant = wide_certificate("CartPole")
+    shield = SafetyFilter(certificate, plant)
+    estimates, shape, proposals = situations(shield, 200)
+    order = np.random.default_rng(1).permutation(plant.n)
+    test = shield.test
+    errors = shield.errors_of(shape)
+    for estimate, u in zip(estimates, proposals, strict=True):
+        alone = test.reachable_alone(estimate, errors)
+        again = (test.moved[:, order] * estimate[order]).cumsum(axis=1)[:, -1] + test.effect @ u
+        moved = np.abs(again - (alone.offset + test.effect.dot(u))).max()
+        assert moved <= test.rounding * (test.columns @ np.abs(estimate) + test.pushed)
+        assert moved < MARGIN
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
+def test_what_is_not_usable_ends_in_the_fallback(value):
+    certificate, plant = wide_certificate("CartPole")
+    shield = SafetyFilter(certificate, plant)
+    shape = certificate.Sigma
+    estimate = np.zeros(plant.n)
+    decision = shield.decide(np.full(plant.n, value), shape, np.zeros(1))
+    assert not decision.passed
+    assert shield.decide(estimate, np.full_like(shape, value), np.zeros(1)).reason != "safe"
+    assert shield.decide(estimate, shape, np.full(1, value)).reason == "invalid"
+    assert shield.decide(estimate, -shape, np.zeros(1)).reason != "safe"
+    assert not shield.knows_inside(np.full(plant.n, value), shape)
+    assert shield.knows_inside(estimate, shape)
+
+
+def test_starts_are_decided_exactly():
+    certificate, _ = wide_certificate("BatchReactor")
+    polytope = certificate.polytope
+    corner = polytope.sample_boundary(np.random.default_rng(0), 1)[0]
+    assert starts_inside(certificate, (1.0 - 1e-12) * corner, polytope)
+    assert not starts_inside(certificate, (1.0 + 1e-12) * corner, polytope)
+    assert not starts_inside(certificate, (1.0 - 1e-12) * corner)
+    assert starts_inside(certificate, certificate.ellipsoid, polytope)
+    assert not starts_inside(certificate, Ellipsoid(2.0 * certificate.L), polytope)
+
+
+def test_lookahead_keeps_to_the_ellipsoid():
+    certificate, plant = wide_certificate("CartPole")
+    ahead = SafetyFilter(certificate, plant, "lookahead")
+    assert ahead.polytope is None
+    plain = SafetyFilter(replace(certificate, polytope=None), plant, "lookahead")
+    estimates, shape, proposals = situations(SafetyFilter(certificate, plant), 50)
+    for estimate, u in zip(estimates, proposals, strict=True):
+        np.testing.assert_array_equal(ahead.decide(estimate, shape, u).input, plain.decide(estimate, shape, u).input)
+
+
+def hostile(name, count, seed):
+    """A vector shield whose disturbances and sensor noise attain their bounds, with what is kept in the polytope."""
+    certificate, plant = wide_certificate(name)
+    env = gym.make_vec(
+        f"ncs_gym/{name}-v0", num_envs=count, disturbance=AdversarialDisturbance(rows=certificate.polytope.rows)
+    )
+    inner = env.unwrapped
+
+    def extreme_noise(rng, size):
+        return (1.0 - 1e-12) * plant.nominal_sensor_error.sample_boundary(rng, size).T
+
+    inner._process.sensor_noise = BlockSampler(extreme_noise, count)
+    shield = VectorSafetyShield(env, certificate, "project")
+    starts = (1.0 - 1e-9) * certificate.polytope.sample_boundary(np.random.default_rng(seed), count)
+    if name.endswith("TwoWay"):  # the first inputs are zero there
+        starts = 0.2 * starts
+    return shield, starts, certificate, plant
+
+
+@pytest.mark.parametrize("name", ["TruckTrailerCruise", "CartPole", "BatchReactor", "CartPoleTwoWay"])
+@pytest.mark.parametrize("policy", ["outwards", "turned", "random"])
+def test_no_policy_and_no_disturbance_leaves_the_polytope(name, policy):
+    count, steps = 60, 60
+    shield, starts, certificate, plant = hostile(name, count, 0)
+    _, info = shield.reset(seed=1, options={"state": starts})
+    rng = np.random.default_rng(2)
+    rows, level, overridden = certificate.polytope.rows, 0.0, 0
+    for _ in range(steps):
+        estimates = info["estimate"]
+        nearest = np.abs(estimates @ plant.A.T @ rows.T).argmax(axis=1)
+        signs = np.sign(np.einsum("ij,ij->i", estimates @ plant.A.T, rows[nearest]))
+        actions = {
+            "outwards": np.sign(signs[:, None] * (rows[nearest] @ plant.B)),
+            "turned": np.clip(-1e3 * estimates @ certificate.K.T, -1.0, 1.0),
+            "random": rng.uniform(-1.0, 1.0, (count, plant.m)),
+        }[policy].astype(np.float32)
+        *_, info = shield.step(actions)
+        assert info["shield_guaranteed"].all()
+        level = max(level, float(certificate.polytope.gauge(info["state"]).max()))
+        assert not info["cost"].any()
+        overridden += int(info["shield_intervened"].sum())
+    assert level <= 1.0
+    assert overridden > 0
+    if not name.endswith("TwoWay"):
+        assert level > 0.9
+
+
+def test_scalar_shield_and_safe_loop_keep_the_polytope():
+    certificate, plant = wide_certificate("CartPole")
+    env = SafetyShield(gym.make("ncs_gym/CartPole-v0"), certificate)
+    start = 0.99 * certificate.polytope.sample_boundary(np.random.default_rng(3), 1)[0]
+    _, info = env.reset(seed=0, options={"state": start})
+    assert info["shield_guaranteed"]
+    for _ in range(150):
+        *_, info = env.step(np.sign(info["estimate"][:1]).astype(np.float32))
+        assert info["shield_guaranteed"]
+        assert certificate.polytope.contains(info["state"])
+    loop = SafeLoop(certificate, plant, env.unwrapped.channel)
+    loop.start(start, start)
+    assert loop.guaranteed
+
+
+def test_a_wrong_row_lets_the_attack_through():
+    """The attack is strong enough to notice a test that looks at half of what errors can do."""
+    certificate, plant = wide_certificate("BatchReactor")
+    shield, starts, *_ = hostile("BatchReactor", 100, 0)
+    test = shield.filter.test
+    loose = np.zeros_like(test.disturbed)
+    test.disturbed = loose
+    test.moved = (1.0 - 1e-3) * test.moved
+    test.joint = np.hstack([test.moved, test.effect])
+    _, info = shield.reset(seed=1, options={"state": starts})
+    level = 0.0
+    for _ in range(60):
+        rows = certificate.polytope.rows
+        nearest = np.abs(info["estimate"] @ plant.A.T @ rows.T).argmax(axis=1)
+        signs = np.sign(np.einsum("ij,ij->i", info["estimate"] @ plant.A.T, rows[nearest]))
+        *_, info = shield.step(np.sign(signs[:, None] * (rows[nearest] @ plant.B)).astype(np.float32))
+        level = max(level, float(certificate.polytope.gauge(info["state"]).max()))
+    assert level > 1.0
+
+
+def test_polytope_of_a_plant_with_one_state_is_an_interval():
+    plant = LinearPlant(
+        A=[[1.05]], B=[[0.5]], box=[1.0], u_max=1.0, dt=0.1, gamma=1e-4,
+        measurement_noise_cov=[[1e-6]], initial_cov=[[1e-6]],
+    )  # fmt: skip
+    from ncs_gym import ChannelContract
+
+    certificate = synthesize(plant, contract=ChannelContract(2), safe_set="polytope")
+    np.testing.assert_array_equal(certificate.polytope.rows[0], plant.box_rows[0])
+    assert SafetyFilter(certificate, plant).decide(np.zeros(1), certificate.Sigma, np.zeros(1)).reason == "safe"
