@@ -12,6 +12,9 @@ from scipy.optimize import linprog
 from ncs_gym.validation import ReadOnlyArrays, as_matrix, read_only, shown
 from shields.errors import CertificateError
 
+# A polytope has at most so many rows, so that a decision and a verification stay fast; each stands for two faces.
+MOST_ROWS = 400
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Polytope(ReadOnlyArrays):
@@ -63,11 +66,19 @@ class Polytope(ReadOnlyArrays):
         """Returns max of a'x over the polytope for a direction a (n,), or for each of shape (count, n), by a solver.
 
         For pictures and tests: no proof takes it.
+
+        Raises:
+            ValueError: If the polytope is unbounded in a direction.
         """
-        rows, ones = self.F, np.ones(2 * len(self.rows))
-        found = [
-            -linprog(-a, A_ub=rows, b_ub=ones, bounds=(None, None)).fun for a in np.atleast_2d(np.asarray(directions))
-        ]
+        units = 1.0 / np.abs(self.rows).max(axis=0)  # the solver drops small coefficients
+        rows, ones = self.F * units, np.ones(2 * len(self.rows))
+        found = []
+        for direction in np.atleast_2d(np.asarray(directions, dtype=np.float64)) * units:
+            size = float(np.abs(direction).max()) or 1.0
+            solution = linprog(-direction / size, A_ub=rows, b_ub=ones, bounds=(None, None))
+            if solution.status != 0:
+                raise ValueError(f"the polytope has no support in a direction: {solution.message}")
+            found.append(-solution.fun * size)
         return float(found[0]) if np.ndim(directions) == 1 else np.array(found)
 
     def contains(self, point: np.ndarray) -> bool:
@@ -93,11 +104,15 @@ def polytope_of(content: Any) -> Polytope:
     Raises:
         KeyError, TypeError, ValueError: If an entry is missing or of a wrong kind.
     """
-    rows, pairs = content["rows"], content["multipliers"]
+    rows, pairs = as_matrix(content["rows"], (None, None), "the rows of the polytope"), content["multipliers"]
+    if len(rows) > MOST_ROWS or not len(rows) < len(pairs) <= 2 * MOST_ROWS:
+        raise ValueError(f"a polytope has at most {MOST_ROWS} rows, and multipliers for each and for every input")
     multipliers = np.zeros((len(pairs), len(rows)))
     for row, entries in zip(multipliers, pairs, strict=True):
+        if len({index for index, _ in entries}) < len(entries):
+            raise ValueError("a multiplier of the polytope is given twice")
         for index, value in entries:
-            if type(index) is not int or not 0 <= index < len(row) or not isinstance(value, (int, float)):
+            if type(index) is not int or not 0 <= index < len(row) or type(value) is not float or value == 0.0:
                 raise ValueError(f"a multiplier of the polytope must be [number of a row, value], got {shown(entries)}")
             row[index] = value
     return Polytope(rows=rows, multipliers=multipliers)

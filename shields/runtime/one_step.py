@@ -335,7 +335,7 @@ def certified_root(L: np.ndarray) -> np.ndarray:
 
 
 def require_computable(certificate: Certificate, plant: LinearPlant) -> None:
-    """Raises unless float64 computes K x_hat on S more accurately than (I) and (U) make room for.
+    """Raises unless float64 computes K x_hat on S, or the polytope, more accurately than the conditions make room for.
 
     D_u allows a shift by 2^-24 u_max, twice what rounding an action to float32 does; the other half is for this.
 
@@ -343,6 +343,8 @@ def require_computable(certificate: Certificate, plant: LinearPlant) -> None:
         CertificateError: If it does not.
     """
     extent = np.sqrt(np.diag(certificate.L))
+    if certificate.polytope is not None:  # anywhere in the box: x'C'Cx is at most the number of its rows there
+        extent = np.maximum(extent, len(plant.box_rows) ** 0.5 * plant.half_widths)
     if len(certificate.error_shapes):
         extent = extent + np.sqrt(np.diagonal(certificate.error_shapes, axis1=1, axis2=2)).max(axis=0)
     error = (plant.n + 2) * np.finfo(float).eps * (np.abs(certificate.K) @ extent)

@@ -44,6 +44,7 @@ class PolytopeTest:
         limits: Entries of u_max.
     """
 
+    @np.errstate(all="ignore")  # what is not finite leaves no room
     def __init__(self, polytope: Polytope, plant: LinearPlant) -> None:
         self.plant = plant
         self.single, self.limits = ((plant.n,), (plant.m,)), plant.u_max.tolist()
@@ -190,6 +191,10 @@ class PolytopeSets(NamedTuple):
         NaN where there is none.
         """
         limits, count = self.test.plant.u_max, inputs.shape[1]
+        block = max(1, BLOCK // (len(self.test.root) * len(limits)))
+        if len(limits) > 1 and count > block:
+            parts = [np.arange(start, min(start + block, count)) for start in range(0, count, block)]
+            return np.hstack([self.some(part).closest(inputs[:, part], margin) for part in parts])
         rows = np.concatenate([self.test.effect, np.eye(len(limits))])
         offset = np.concatenate([self.test.moved @ self.estimates, np.zeros(inputs.shape)])
         room = np.concatenate([self.room - self.rounding - margin, np.repeat(limits[:, None], count, axis=1)])

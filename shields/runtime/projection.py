@@ -9,6 +9,8 @@ import numpy as np
 
 # A gain below this fraction of the largest counts as a direction that does not move the state.
 FLAT = 1e-13
+# Rows whose directions differ by less than this are parallel; what is found is tested again, with a larger margin.
+PARALLEL = 1e-12
 # Newton steps on the multiplier; from the left on a concave function they rise monotonically and converge fast.
 NEWTON_STEPS = 60
 RELATIVE_TOLERANCE = 1e-12
@@ -221,6 +223,10 @@ def closest_between(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, 
     left[row, np.arange(len(row))] = np.inf  # the face itself
     here = effect[:, :, problem]
     within = (here[:, :, None] * plane).sum(axis=1)
+    # A row that is parallel to the face does not change in its plane: rounding must not decide whether it holds there.
+    parallel = (within * within).sum(axis=1) <= PARALLEL**2 * (here * here).sum(axis=1)
+    within = np.where(parallel[:, None], 0.0, within)
+    left = np.where(parallel, left * (1.0 + PARALLEL) + PARALLEL * np.abs(offset[:, problem]), left)
     moves = closest_between(np.zeros(plane.shape[1:]), offset[:, problem] + (here * foot).sum(axis=1), within, left)
     found = foot + (plane * moves).sum(axis=1)
     distance = np.sqrt(((found - start) ** 2).sum(axis=0))

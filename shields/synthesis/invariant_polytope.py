@@ -19,11 +19,11 @@ from ncs_gym import LinearPlant, exact
 from ncs_gym.plants.linear_plant import inputs_under_way
 from shields.certificate import Certificate
 from shields.errors import Infeasible
-from shields.polytope import Polytope
+from shields.polytope import MOST_ROWS, Polytope
 from shields.verification import ACTION_ROUNDING
 
-# What there is at most, so that a decision and a verification stay fast; of the rows each stands for two faces.
-MOST_ROWS, LONGEST_SEARCH = 400, 60.0
+# The search takes at most so long [s].
+LONGEST_SEARCH = 60.0
 # What the next states keep from every face, relative to the polytope: room for the rounding of rows and multipliers.
 _RESERVE = 1e-6
 # A row counts as implied by others up to this: a thousandth of the reserve.

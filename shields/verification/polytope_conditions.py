@@ -50,7 +50,7 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
         left = 1 - _reach(image, multipliers[i], G, widths) - s - d
         yield scalar_condition(f"(P) sum |lambda| + |r| w + s + d <= 1 of row {i + 1}", left)
     for i, (gain, limit) in enumerate(zip(K, limits, strict=True)):
-        rho = _root_above(max(error[i][i] for error in errors))
+        rho = limit * _root_above(max(error[i][i] for error in errors) / limit**2)
         allowed = limit * (1 - _ACTION_ROUNDING)
         left = allowed - _reach(gain, multipliers[len(rows) + i], G, widths) - rho
         yield scalar_condition(f"(PU) input {i + 1} stays within u_max (1 - 2^-24) on the polytope", left)

@@ -142,7 +142,22 @@ def test_polytope_of_other_numbers_is_refused(name):
     assert broken == ["(PU) input 1 stays within u_max (1 - 2^-24) on the polytope"]
 
 
-@pytest.mark.parametrize("entry", [[[0, "1"]], [[0.5, 1.0]], [[-1, 1.0]], [[10**6, 1.0]], [[0]], "x", None])
+@pytest.mark.parametrize(
+    "entry",
+    [
+        [[0, "1"]],
+        [[0.5, 1.0]],
+        [[-1, 1.0]],
+        [[10**6, 1.0]],
+        [[0]],
+        "x",
+        None,
+        [[0, 10**400]],
+        [[0, True]],
+        [[0, 1.0], [0, 0.5]],
+        [[0, 0.0]],
+    ],
+)
 def test_file_with_other_multipliers_is_refused(entry, tmp_path):
     wide, _, _ = found("Pendulum")
     content = wide.document["certificate"]
@@ -151,6 +166,36 @@ def test_file_with_other_multipliers_is_refused(entry, tmp_path):
     (tmp_path / "c.json").write_text(json.dumps(document_of("certificate", "ncs-gym certificate 2", content)))
     with pytest.raises(CertificateError):
         Certificate.load(tmp_path / "c.json")
+
+
+@pytest.mark.parametrize(("rows", "multipliers"), [([[]] * 200_000, [[]] * 200_000), ([[1.0]] * 500, [[]] * 501)])
+def test_file_with_too_many_rows_is_refused_before_they_take_memory(rows, multipliers, tmp_path):
+    wide, _, _ = found("Pendulum")
+    content = wide.document["certificate"] | {"polytope": {"rows": rows, "multipliers": multipliers}}
+    (tmp_path / "c.json").write_text(json.dumps(document_of("certificate", "ncs-gym certificate 2", content)))
+    with pytest.raises(CertificateError):
+        Certificate.load(tmp_path / "c.json")
+
+
+def test_units_of_inputs_do_not_matter():
+    plant = random_plant(3, 2, 1)
+    certificate = synthesize(plant)
+    tiny = replace(plant, B=plant.B * 1e39, u_max=plant.u_max * 1e-39)
+    K = certificate.K * 1e-39
+    found_there = search.invariant_polytope(replace(certificate, K=K), tiny, lambda line: None)
+    broken = [
+        [c.name for c in verify(replace(certificate, K=K, polytope=found_there), tiny, engine=engine).conditions
+         if not c.holds and c.name.startswith("(P")]
+        for engine in ("rational", "flint")
+    ]  # fmt: skip
+    assert broken == [[], []]
+
+
+def test_support_does_not_depend_on_units():
+    tall = Polytope(rows=np.diag([1.0, 1e-10]), multipliers=np.zeros((3, 2)))
+    np.testing.assert_allclose(tall.support(np.eye(2)), [1.0, 1e10])
+    flat = Polytope(rows=np.array([[1.0, 0.0], [1.0, 1e-9]]), multipliers=np.zeros((3, 2)))
+    np.testing.assert_allclose(flat.support([0.0, 1.0]), 2e9)
 
 
 def test_without_a_polytope_within_the_limits_the_certificate_says_why(monkeypatch):

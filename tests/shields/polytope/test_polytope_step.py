@@ -113,6 +113,32 @@ def test_closest_points_are_those_of_a_conic_solver_in_three_dimensions():
     assert infeasible < 30
 
 
+def test_rows_given_twice_or_with_both_signs_change_no_projection():
+    plant = replace(random_plant(2, 2, 2, gamma=1e-4), u_max=2.0)
+    results = []
+    for box in (plant.box_rows, np.concatenate([plant.box_rows, -plant.box_rows, plant.box_rows])):
+        twice = replace(plant, box=box)
+        shield = SafetyFilter(synthesize(twice, safe_set="polytope"), twice)
+        estimates, shape, proposals = situations(random_filter(2, 2, 2), 200)
+        decisions = [shield.decide(x, shape, u) for x, u in zip(estimates, proposals, strict=True)]
+        results.append((np.array([each.input for each in decisions]), [each.reason for each in decisions]))
+    assert results[0][1] == results[1][1]
+    assert results[0][1].count("projected") > 50
+    np.testing.assert_allclose(results[0][0], results[1][0], atol=1e-5)
+
+
+def test_parallel_rows_do_not_hide_the_closest_point():
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        row = rng.standard_normal(2)
+        effect = np.stack([row, rng.uniform(0.1, 3.0) * row, [1.0, 0.0], [0.0, 1.0]])
+        room = np.array([1.0, np.linalg.norm(effect[1]) / np.linalg.norm(row), 5.0, 5.0])
+        wanted = 3.0 * rng.standard_normal((2, 1))
+        found = closest_between(wanted, np.zeros((4, 1)), effect[..., None], room[:, None])[:, 0]
+        once = closest_between(wanted, np.zeros((3, 1)), effect[[0, 2, 3], :, None], room[[0, 2, 3], None])[:, 0]
+        np.testing.assert_allclose(found, once, atol=1e-9)
+
+
 @pytest.mark.parametrize("name", ALL)
 @pytest.mark.parametrize("mode", ["project", "switch", "boundary", "monitor"])
 def test_batches_decide_as_single_loops(name, mode):
