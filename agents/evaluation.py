@@ -11,6 +11,7 @@ from agents.loop import LoopConfig
 from agents.results import Episode, Evaluation, Trajectory
 from ncs_gym import NCSVectorEnv
 from ncs_gym.envs.env import ncs_env
+from shields.polytope import Polytope
 
 # The largest number of episodes that are played side by side.
 _MAX_PARALLEL_EPISODES = 1000
@@ -27,7 +28,7 @@ def evaluate(
     policy: Policy,
     episodes: int,
     seed: int,
-    level_matrix: np.ndarray | None = None,
+    level_matrix: np.ndarray | Polytope | None = None,
     on_progress: Callable[[int], None] | None = None,
 ) -> Evaluation:
     """Returns what a policy does in a number of episodes, played side by side.
@@ -37,7 +38,7 @@ def evaluate(
         policy: Maps observations and infos to actions.
         episodes: Number of episodes, at least 1.
         seed: Seed of all random numbers (see `Episode.index`).
-        level_matrix: M, shape (n, n), for `Episode.largest_level`.
+        level_matrix: M, shape (n, n), for `Episode.largest_level`; or a polytope, of which the gauge is squared.
         on_progress: Called with the number of steps taken since its last call.
 
     Raises:
@@ -62,10 +63,10 @@ class _Rollout:
     Args:
         loop: The control loop, without penalties.
         count: Number of episodes.
-        level_matrix: M, shape (n, n), or None.
+        level_matrix: M, shape (n, n), a polytope, or None.
     """
 
-    def __init__(self, loop: LoopConfig, count: int, level_matrix: np.ndarray | None) -> None:
+    def __init__(self, loop: LoopConfig, count: int, level_matrix: np.ndarray | Polytope | None) -> None:
         # Episodes that end early are stepped on without being counted: the others' random numbers stay the same.
         prototype = ncs_env(loop.single())
         self._terminates = prototype.terminate_on_violation
@@ -135,8 +136,13 @@ class _Rollout:
         guaranteed = info.get("shield_guaranteed", np.zeros(len(self._running), np.bool_)).astype(np.bool_)
         self._guaranteed &= guaranteed | ~self._running
         if self._level_matrix is not None:
-            levels = np.einsum("ei,ij,ej->e", info["state"], self._level_matrix, info["state"])
+            levels = _levels(info["state"], self._level_matrix)
             self._level = np.maximum(self._level, np.where(self._running, levels, 0.0))
+
+
+def _levels(states: np.ndarray, of: np.ndarray | Polytope) -> np.ndarray:
+    """Returns x'Mx of states, shape (N, n), or the squares of their gauges in a polytope: 1 on the boundary."""
+    return of.gauge(states) ** 2 if isinstance(of, Polytope) else np.einsum("ei,ij,ej->e", states, of, states)
 
 
 def _first_trajectory(infos: list[dict[str, np.ndarray]]) -> Trajectory:

@@ -18,7 +18,7 @@ MOST_ROWS = 400
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Polytope(ReadOnlyArrays):
-    """The polytope P = {x : |g x| <= 1 for every row g} (docs/theory.md section 11).
+    """The polytope P = {x : |g x| <= 1 for every row g} (docs/shield_proof.md, "Polytopes").
 
     For every row g, and for every row of the gain K, there are numbers lambda_i that write what the closed loop makes
     of it as a sum of rows, g (A+BK) = sum_i lambda_i g_i + r; what is left, r, is mere rounding. P is symmetric, so
@@ -80,6 +80,21 @@ class Polytope(ReadOnlyArrays):
                 raise ValueError(f"the polytope has no support in a direction: {solution.message}")
             found.append(-solution.fun * size)
         return float(found[0]) if np.ndim(directions) == 1 else np.array(found)
+
+    def outline(self, pair: tuple[int, int]) -> np.ndarray:
+        """Returns corners of a polygon around the projection onto two coordinates, shape (k, 2); for pictures.
+
+        It is bounded by tangents every 3 degrees, the axes among them.
+        """
+        angles = np.linspace(0.0, 2.0 * np.pi, 120, endpoint=False)
+        normals = np.column_stack([np.cos(angles), np.sin(angles)]) * np.abs(self.rows[:, pair]).max(axis=0)
+        directions = np.zeros((len(angles), self.dim))
+        directions[:, pair] = normals
+        heights = self.support(directions)
+        # Where every tangent meets the next one.
+        normals = np.stack([normals, np.roll(normals, -1, axis=0)], axis=1)
+        heights = np.stack([heights, np.roll(heights, -1)], axis=1)
+        return np.linalg.solve(normals, heights[..., None])[..., 0]
 
     def contains(self, point: np.ndarray) -> bool:
         """Returns whether a point, shape (n,), lies inside or on the boundary (in float64, no tolerance)."""

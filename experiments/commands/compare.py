@@ -183,7 +183,7 @@ def _findings(summary: dict[str, Any]) -> list[str]:
         proof = "no broken assumption was seen" if "gaussian_noise" in summary else "the proof held"
         findings += [
             f"{name}: {proof} in {arm['guaranteed_episodes']:,} of {arm['eval_episodes']:,} evaluation "
-            f"episodes; the largest x'Mx was {arm['largest_level']:.3f} (the safe set {limit}).",
+            f"episodes; the largest level was {arm['largest_level']:.3f} (the safe set {limit}).",
             f"{name}: {arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,} episodes violating; from these "
             f"episodes alone at most {upper:.2f} % with 95 % confidence.",
         ]

@@ -54,7 +54,7 @@ def evaluate(settings: EvaluateSettings) -> None:
         lambda observations, infos: agent.act(observations),
         settings.episodes,
         settings.seed,
-        certificate.M,
+        certificate.polytope or certificate.M,
     )
     shield_name = mode or "none"
     result = RunResult(shield_name, 0, 0, 0, 0, [], evaluated.episodes, evaluated.trajectory, {})

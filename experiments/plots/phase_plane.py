@@ -92,8 +92,8 @@ def _draw_path(
 def _draw_sets(axis: Axes, plant: LinearPlant, certificate: Certificate, plane: tuple[int, int]) -> dict[str, Artist]:
     """Draws safe set and safe box, or their projections."""
     prefix = "" if plant.n == 2 else "projection of the "
-    (outline,) = axis.plot(*projected_ellipsoid(certificate.L, plane).T, color=_INK, lw=1.3)
-    handles: dict[str, Artist] = {f"{prefix}safe set S": outline}
+    (outline,) = axis.plot(*_projected(certificate, plane).T, color=_INK, lw=1.3)
+    handles: dict[str, Artist] = {f"{prefix}safe set": outline}
     box = projected_box(plant.box_rows, plane)
     if box is not None:
         (outline,) = axis.plot(*box.T, color=_INK, lw=1.0, ls="--")
@@ -103,7 +103,7 @@ def _draw_sets(axis: Axes, plant: LinearPlant, certificate: Certificate, plane: 
 
 def _reach(plant: LinearPlant, certificate: Certificate, plane: tuple[int, int]) -> np.ndarray:
     """Returns the largest half-widths of the view, shape (2,) [units of the states]."""
-    outlines = [projected_ellipsoid(certificate.L, plane), projected_box(plant.box_rows, plane)]
+    outlines = [_projected(certificate, plane), projected_box(plant.box_rows, plane)]
     return _VIEW * np.max([np.abs(outline).max(axis=0) for outline in outlines if outline is not None], axis=0)
 
 
@@ -124,6 +124,14 @@ def _name_axes(panels: Any, plant: LinearPlant, plane: tuple[int, int], count: i
         lowest = at + columns >= count
         label(panel, x if lowest else "", y if at % columns == 0 else "", panel.get_title())
         panel.tick_params(labelbottom=lowest)
+
+
+def _projected(certificate: Certificate, plane: tuple[int, int]) -> np.ndarray:
+    """Returns points around the projection of the safe set onto two states, shape (k, 2); the first one is the last."""
+    if certificate.polytope is None:
+        return projected_ellipsoid(certificate.L, plane)
+    corners = certificate.polytope.outline(plane)
+    return np.concatenate([corners, corners[:1]])
 
 
 def projected_ellipsoid(shape: np.ndarray, plane: tuple[int, int], points: int = 361) -> np.ndarray:

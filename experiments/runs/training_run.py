@@ -191,7 +191,7 @@ def execute_run(run: TrainingRun, on_progress: Callable[[int], None], log_folder
     for condition in (AS_TRAINED, *run.conditions):
         loop, policy = under(condition, run.loop), _policy(run, agent)  # a random policy begins anew each time
         evaluations[condition] = evaluate(
-            loop, policy, run.episodes, run.evaluation_seed, run.certificate.M, on_progress
+            loop, policy, run.episodes, run.evaluation_seed, run.certificate.polytope or run.certificate.M, on_progress
         )
     evaluation = evaluations.pop(AS_TRAINED)
     return RunResult(

@@ -15,15 +15,21 @@ from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.tasks.setpoint_tracking import SetpointTracking
 from ncs_gym.tasks.speed_tracking import SpeedTracking
 from ncs_gym.tasks.task import Task
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 
 # Number of steps of the path and of the packets that a frame shows.
 RECENT_STEPS = 40
 
 
-class ConvexSet(Protocol):
-    """What is drawn of a convex set: its support function, max of a'x over it for directions a, shape (count, n)."""
+class OutlinedSet(Protocol):
+    """What is drawn of a convex set that is no ellipsoid."""
 
-    def support(self, directions: Any, /) -> Any: ...  # noqa: D102
+    def support(self, directions: Any, /) -> Any:
+        """Returns max of a'x over the set for directions a, shape (count, n)."""
+
+    def outline(self, pair: tuple[int, int], /) -> np.ndarray:
+        """Returns corners around its projection onto two coordinates, shape (k, 2)."""
+        ...
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,7 +47,7 @@ class Annotation:
             a shield that stores none.
     """
 
-    safe_set: ConvexSet
+    safe_set: Ellipsoid | OutlinedSet
     label: str
     proposed: np.ndarray | None = None
     intervened: bool = False

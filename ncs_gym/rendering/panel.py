@@ -69,7 +69,7 @@ def draw_legend(canvas: Canvas, *, shielded: bool, plans: bool) -> None:
         _draw_disc(canvas, (second, rows[1]), theme.SAFE_FILL, theme.SAFE)
         canvas.circle((second, rows[2]), 3.5, theme.SHIELD)
         _draw_correction(canvas, second + 4.0, second - 12.0, rows[3])
-        marks += ["safe set S", "shield acted", "overridden"]
+        marks += ["safe set", "shield acted", "overridden"]
     canvas.circle((third, rows[0]), 3.5, theme.ESTIMATE)
     canvas.circle((third, rows[1]), 3.5, theme.LATE)
     canvas.circle((third, rows[2]), 3.5, theme.LATE, width=1.5)

@@ -7,7 +7,7 @@ import numpy as np
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
-from ncs_gym.rendering.episode_record import RECENT_STEPS, ConvexSet, FrameRecord
+from ncs_gym.rendering.episode_record import RECENT_STEPS, FrameRecord, OutlinedSet
 from ncs_gym.rendering.panel import draw_plan
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 
@@ -19,8 +19,6 @@ _BORDER = 7.0
 _MAX_COORDINATE = 2000.0
 # Corners of a polygon that lies outside all axes, in units of the limits.
 _FAR = 10.0
-# Tangents around the projection of a set that is no ellipsoid: every 3 degrees, the axes among them.
-_TANGENTS = 120
 
 
 def limit_of(plant: LinearPlant, index: int) -> float:
@@ -49,7 +47,7 @@ class PhasePlane:
         """Returns where points in the two coordinates, shape (k, 2), are in the frame, shape (k, 2) [pixels]."""
         return self._center + self._scale * points
 
-    def draw_background(self, canvas: Canvas, safe_set: ConvexSet | None) -> None:
+    def draw_background(self, canvas: Canvas, safe_set: Ellipsoid | OutlinedSet | None) -> None:
         """Draws what does not move: the box, the safe set, ticks and titles."""
         rect = self._rect
         canvas.rect(rect, theme.DANGER_FILL)
@@ -99,19 +97,11 @@ class PhasePlane:
             canvas.line(points[i - 1 : i + 1], color, 1.5)
         _draw_interventions(canvas, points, frame)
 
-    def _outline(self, safe_set: ConvexSet) -> np.ndarray:
-        """Returns points around the projection of a convex set onto the two coordinates, shape (k, 2)."""
+    def _outline(self, safe_set: Ellipsoid | OutlinedSet) -> np.ndarray:
+        """Returns points around the projection of the safe set onto the two coordinates, shape (k, 2)."""
         if isinstance(safe_set, Ellipsoid):
             return self._projection(safe_set.shape_matrix)
-        angles = np.linspace(0.0, 2.0 * np.pi, _TANGENTS, endpoint=False)
-        normals = np.column_stack([np.cos(angles), np.sin(angles)]) / self._limits
-        directions = np.zeros((_TANGENTS, self._plant.n))
-        directions[:, list(self._pair)] = normals
-        heights = safe_set.support(directions)
-        # Where every tangent meets the next one.
-        pairs = np.stack([normals, np.roll(normals, -1, axis=0)], axis=1)
-        sides = np.stack([heights, np.roll(heights, -1)], axis=1)
-        return np.linalg.solve(pairs, sides[..., None])[..., 0]
+        return safe_set.outline(self._pair)
 
     def _projection(self, shape: np.ndarray) -> np.ndarray:
         """Returns points around an ellipsoid's projection onto the two coordinates, shape (k, 2)."""
@@ -149,13 +139,13 @@ class TimePlot:
     def __init__(self, plant: LinearPlant, rect: theme.Rect) -> None:
         self._plant, self._rect, self._limit = plant, rect, limit_of(plant, 0)
 
-    def draw_background(self, canvas: Canvas, safe_set: ConvexSet | None) -> None:
+    def draw_background(self, canvas: Canvas, safe_set: Ellipsoid | OutlinedSet | None) -> None:
         """Draws what does not move: limits, the safe set, ticks and titles."""
         rect = self._rect
         canvas.rect(rect, theme.DANGER_FILL)
         self._fill_band(canvas, self._limit, theme.PAPER)
         if safe_set is not None:
-            high = float(safe_set.support(np.ones((1, 1)))[0])
+            high = float(np.atleast_1d(safe_set.support(np.ones((1, 1))))[0])
             self._fill_band(canvas, high, theme.SAFE_FILL)
             for y in (self._y(high), self._y(-high)):
                 canvas.line([(rect.x, y), (rect.right, y)], theme.SAFE, 2.0)

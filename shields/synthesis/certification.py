@@ -60,8 +60,8 @@ def synthesize(
         method: "certified" or "paper".
         contract: Channel contract; with one, the error sets depend on the age of the newest sample ("certified").
         safe_set: What a shield keeps: "ellipsoid", or "polytope", the largest one that the same gain keeps in the box
-            (docs/theory.md section 11). Where there is none within limits of rows and time the ellipsoid stays, and the
-            printed certificate says why ("certified").
+            (docs/theory.md, "Polytopes"). Where there is none within limits of rows and time the ellipsoid stays, and
+            the printed certificate says why ("certified").
         progress: Called with a line of text per stage: what is sought, and the volume reached so far ("certified").
         dkappa: Grid step of kappa ("paper").
         drho: Grid step of rho ("paper").

@@ -1,4 +1,4 @@
-"""The conditions of a polytope (docs/theory.md section 11), evaluated in rational arithmetic."""
+"""The conditions of a polytope (docs/shield_proof.md, "Polytopes"), evaluated in rational arithmetic."""
 
 from __future__ import annotations
 

@@ -6,6 +6,7 @@ import pytest
 
 from agents.evaluation import _SEED_STREAM, evaluate
 from agents.loop import LoopConfig, ShieldSettings
+from shields.synthesis.certification import with_polytope
 from tests.certificates import certificate_of
 
 CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
@@ -81,6 +82,16 @@ def test_it_is_guaranteed_behind_a_shield_and_leaves_penalties_out(shield):
         assert one.episode_return == other.episode_return
     assert free.trajectory.intervened.sum() == free.episodes[0].interventions
     assert (free.trajectory.inputs != free.trajectory.proposed).any()
+
+
+def test_levels_are_those_of_the_set_that_the_shield_keeps(certificate, loaded):
+    """The polytope is larger: states of it are outside the ellipsoid, and never count as outside of what is kept."""
+    wide = with_polytope(certificate, loaded)
+    loop = LoopConfig(env=CRUISE.env, shield=ShieldSettings(wide))
+    kept = evaluate(loop, throttle, 5, 0, wide.polytope).episodes
+    measured_by_the_ellipsoid = evaluate(loop, throttle, 5, 0, wide.M).episodes
+    assert all(record.guaranteed and record.largest_level <= 1.0 for record in kept)
+    assert max(record.largest_level for record in measured_by_the_ellipsoid) > 1.0
 
 
 def test_arms_have_common_random_numbers(shield):

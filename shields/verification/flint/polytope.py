@@ -1,4 +1,4 @@
-"""The conditions of a polytope (docs/theory.md section 11) by the second engine: rational matrices, roots as balls."""
+"""(P) and (PU) of docs/shield_proof.md by the second engine: rational matrices, roots as balls."""
 
 from __future__ import annotations
 

@@ -126,7 +126,7 @@ def test_smoke_run_prints_the_table_and_the_files(smoke):
     assert max(len(line) for line in lines if not line.startswith("files: ")) <= 100
     prose = " ".join(run.stdout.split())
     assert "% of the volume of the largest ellipsoid in the box)" in prose
-    assert "evaluation episodes; the largest x'Mx was" in prose
+    assert "evaluation episodes; the largest level was" in prose
     assert str(out) in run.stdout
     assert "A smoke run shows that everything runs" in run.stdout
     assert "step/s" in run.stderr

@@ -80,7 +80,7 @@ def test_arms_have_the_same_color_in_every_figure(plant):
     shown = arms("unshielded", "shielded:boundary")
     training = training_figure(shown).axes[0]
     scatter = scatter_figure(summary_of(shown)["arms"], shown).axes[0]
-    phase = phase_figure(plant, SimpleNamespace(L=np.eye(2)), shown)
+    phase = phase_figure(plant, SimpleNamespace(L=np.eye(2), polytope=None), shown)
     wanted = {ArmStyle.of(name).color.lower() for name in shown}
     assert set(by_color(training)) == wanted
     assert {to_hex(line.get_markeredgecolor()).lower() for line in scatter.get_lines()} >= wanted
@@ -180,7 +180,7 @@ def test_caption_names_the_arms_whose_return_contains_penalties_and_what_a_monit
 def test_phase_plane_has_a_panel_per_arm_a_path_per_run_and_marks_violations(plant):
     states = np.linspace(0.0, 2.5, 6)[:, None] * [1.0, 0.0]  # the box ends at 2: one state violates
     shown = arms("unshielded", "shielded", runs=3, trajectory=trajectory(states))
-    figure = phase_figure(plant, SimpleNamespace(L=np.eye(2)), shown)
+    figure = phase_figure(plant, SimpleNamespace(L=np.eye(2), polytope=None), shown)
     assert len(figure.axes) == 2
     for axis, name in zip(figure.axes, shown, strict=True):
         own = [line for line in lines(axis) if to_hex(line.get_color()).lower() == ArmStyle.of(name).color.lower()]
@@ -193,7 +193,7 @@ def test_phase_plane_has_a_panel_per_arm_a_path_per_run_and_marks_violations(pla
 
 def test_view_holds_the_sets_and_leaves_out_what_is_far_away(plant):
     far = trajectory(np.array([[0.0, 0.0], [1e3, 0.0]]))
-    figure = phase_figure(plant, SimpleNamespace(L=np.eye(2)), arms("unshielded", trajectory=far))
+    figure = phase_figure(plant, SimpleNamespace(L=np.eye(2), polytope=None), arms("unshielded", trajectory=far))
     low, high = figure.axes[0].get_xlim()
     assert 2.0 < high < 10.0
     assert low == -high
@@ -203,7 +203,10 @@ def test_view_holds_the_sets_and_leaves_out_what_is_far_away(plant):
 def test_of_many_states_the_largest_are_shown_and_the_caption_speaks_of_projections():
     plant = random_plant(0, 4, 1)
     states = np.array([[0.0, 0.1, 0.0, 0.1], [0.1, 0.9, 0.2, 0.3]])
-    shown, certificate = arms("shielded", trajectory=trajectory(states)), SimpleNamespace(L=np.diag([1.0, 1, 1, 0.1]))
+    shown, certificate = (
+        arms("shielded", trajectory=trajectory(states)),
+        SimpleNamespace(L=np.diag([1.0, 1, 1, 0.1]), polytope=None),
+    )
     assert _plane(certificate, shown) == (1, 3)
     caption = phase_figure(plant, certificate, shown).caption
     assert "x2 and x4" in caption
@@ -353,7 +356,7 @@ def test_scatter_caption_warns_of_episodes_that_end_early():
 
 def test_every_figure_is_a_png_with_a_caption_of_its_own(plant):
     shown = arms(*ALL_ARMS[:5])
-    figures = comparison_figures(plant, SimpleNamespace(L=np.eye(2)), summary_of(shown), shown)
+    figures = comparison_figures(plant, SimpleNamespace(L=np.eye(2), polytope=None), summary_of(shown), shown)
     assert set(figures) == {"training", "scatter", "phase", "episode"}
     assert all(png.startswith(b"\x89PNG") for _, png in figures.values())
     assert len({caption for caption, _ in figures.values()}) == 4
@@ -362,7 +365,7 @@ def test_every_figure_is_a_png_with_a_caption_of_its_own(plant):
 def test_a_single_state_has_no_phase_plane():
     single = LinearPlant(A=[[0.9]], B=[[1.0]], box=[1.0], u_max=1.0, dt=0.1, disturbance_bound=0.01, initial_bound=0.0)
     shown = arms("unshielded", "shielded", trajectory=trajectory(np.zeros((11, 1))))
-    figures = comparison_figures(single, SimpleNamespace(L=np.eye(1)), summary_of(shown), shown)
+    figures = comparison_figures(single, SimpleNamespace(L=np.eye(1), polytope=None), summary_of(shown), shown)
     assert set(figures) == {"training", "scatter", "episode"}
 
 

@@ -36,6 +36,19 @@ def test_process_noise_is_part_of_what_extremal_kinds_use(plant):
     assert radius > 1.5 * np.sqrt(plant.gamma)
 
 
+def test_adversary_pushes_out_of_the_rows_that_it_is_given(plant):
+    rng = np.random.default_rng(1)
+    rows = np.array([[1.0, 2.0], [-3.0, 1.0], [0.0, 1.0]])
+    source = AdversarialDisturbance(rows=rows)
+    for _ in range(100):
+        nominal = rng.standard_normal(2)
+        d = source.draw(rng, plant, nominal, 0, None)
+        others = plant.disturbance.sample_boundary(rng, 50)
+        assert np.abs(rows @ (nominal + d)).max() >= np.abs(rows @ (nominal + others).T).max() - 1e-9
+    with pytest.raises(ValueError, match="rows must have 2 columns, got 3"):
+        as_disturbance(AdversarialDisturbance(rows=np.ones((1, 3))), plant, False)
+
+
 def test_adversary_maximizes_the_largest_constraint(plant):
     rng = np.random.default_rng(1)
     for _ in range(50):
