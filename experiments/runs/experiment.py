@@ -153,7 +153,7 @@ def experiment_provenance(
     if env.downlink is not None:
         channel += f" Commands: {env.downlink.description}"
     return {
-        "units": {run.name: run.key for run in runs},
+        "runs": {run.name: run.key for run in runs},
         "seeds": {run.index: {"training": run.training_seed, "evaluation": run.evaluation_seed} for run in runs},
         "settings": {name: value for name, value in content.items() if name not in INCIDENTAL_SETTINGS},
         "plant": {"fingerprint": env.plant.fingerprint, "spectral_radius": env.plant.spectral_radius},

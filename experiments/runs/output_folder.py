@@ -25,7 +25,7 @@ from experiments.settings.settings_file import FORMAT as SETTINGS_FORMAT
 from shields.atomic_write import write_atomically
 
 # Files by which a folder is known to hold something finished.
-_FINISHED = ("summary.json", "certify.json", "units/*.json")
+_FINISHED = ("summary.json", "certify.json", "runs/*.json", "units/*.json")  # the last of earlier versions
 _FINISHED_PARTS = {"study": ("*/summary.json",)}
 # Settings that results do not depend on; what "smoke" changes is compared by itself.
 _IGNORED = {*INCIDENTAL_SETTINGS, "smoke", "page", "quote"}

@@ -5,7 +5,6 @@ import re
 import pytest
 
 from experiments.analysis.tables import condition_text, summary_text, sweep_table
-from experiments.backends.execution import _described
 from experiments.commands.compare import _findings
 from experiments.report.html import _decimal, _interval
 from experiments.study.summary import page_summary, study_summary
@@ -40,7 +39,7 @@ def test_no_table_prints_a_negative_zero(runs):
         summary_text(summary["arms"], {}),
         condition_text("worst-case disturbance", summary["arms"], {}),
         *_findings(summary),
-        _described(run("shielded", violations=(0, 0), returns=TINY)),
+        run("shielded", violations=(0, 0), returns=TINY).outcome,
         sweep_table([cell()]),
         *(evaluation_table(env), pairs_table(env)),
         *(price_table(study), simpler_table(study), scores_table(study)),

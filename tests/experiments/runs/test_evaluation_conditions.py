@@ -11,7 +11,7 @@ from agents.loop import LoopConfig
 from experiments.analysis.episodes import episodes_table
 from experiments.analysis.summary import arm_summary
 from experiments.analysis.tables import condition_text, summary_text
-from experiments.runs import RunStore, execute_run, run_of_arm
+from experiments.runs import RunStore, run_of_arm
 from experiments.runs.evaluation_conditions import condition_named, other_conditions, under, worse_channel
 from experiments.settings import CompareSettings
 from ncs_gym import AdversarialDisturbance, Channel, ChannelContract, GilbertElliott
@@ -70,19 +70,16 @@ def test_worse_channel_uses_what_the_contract_leaves_and_bursts_get_denser():
 @pytest.fixture(scope="module")
 def results(certificate):
     names = ("proportional", "proportional+trusting", "proportional+shielded", "random")
-    return {name: execute_run(run_of(certificate, name), lambda steps: None) for name in names}
+    return {name: run_of(certificate, name).execute(lambda steps: None) for name in names}
 
 
 def test_conditions_are_stored_beside_the_evaluation_as_trained(certificate, results, tmp_path):
     run, result = run_of(certificate, "proportional+shielded"), results["proportional+shielded"]
     assert tuple(result.conditions) == ALL
-    alone = execute_run(run_of(certificate, "proportional+shielded", ()), lambda steps: None)
+    alone = run_of(certificate, "proportional+shielded", ()).execute(lambda steps: None)
     assert (alone.episodes, alone.conditions) == (result.episodes, {})
     for condition, episodes in result.conditions.items():
-        assert (
-            episodes
-            == execute_run(run_of(certificate, run.arm, (condition,)), lambda steps: None).conditions[condition]
-        )
+        assert episodes == run_of(certificate, run.arm, (condition,)).execute(lambda steps: None).conditions[condition]
         assert episodes != result.episodes
     store = RunStore(tmp_path)
     store.save(run, result)
@@ -105,7 +102,7 @@ def test_shield_holds_where_the_filter_that_trusts_the_estimate_breaks(results):
 
 def test_random_policy_acts_alike_under_every_condition(certificate):
     run = run_of(certificate, "random", ("as trained",))
-    first, again = (execute_run(run, lambda steps: None).trajectory.inputs for _ in range(2))
+    first, again = (run.execute(lambda steps: None).trajectory.inputs for _ in range(2))
     np.testing.assert_array_equal(first, again)
 
 

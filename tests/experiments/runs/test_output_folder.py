@@ -91,8 +91,8 @@ def test_single_finished_runs_are_kept_and_a_folder_without_any_is_taken(tmp_pat
     settings = CompareSettings(out=tmp_path)
     claim_folder("compare", settings)
     claim_folder("compare", replace(settings, seed=1))
-    (tmp_path / "units").mkdir()
-    (tmp_path / "units" / "shielded-0.json").write_text("{}")
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "shielded-0.json").write_text("{}")
     with pytest.raises(OtherResultsError, match="seed 1, now 2"):
         claim_folder("compare", replace(settings, seed=2))
 
