@@ -15,7 +15,7 @@ from experiments.attack.campaign import Campaign
 from experiments.attack.counts_table import GAUSSIAN_LEGEND, counts_table, gaussian_table, require_safe, require_within
 from experiments.backends.execution import results_of
 from experiments.runs import claim_folder, versions
-from experiments.settings import CertifySettings
+from experiments.settings import AttackSettings
 from experiments.settings.certificates import changed_contract
 from ncs_gym.network import downlink_protocol
 from shields import Certificate
@@ -23,7 +23,7 @@ from shields.atomic_write import write_atomically
 from shields.runtime.safety_filter import DEFAULT_HORIZON
 
 
-def attack(settings: CertifySettings) -> None:
+def attack(settings: AttackSettings) -> None:
     """Runs `ncs attack`.
 
     Raises:
@@ -49,7 +49,7 @@ def attack(settings: CertifySettings) -> None:
         _attack_in_folder(settings, campaign, cases)
 
 
-def _attack_in_folder(settings: CertifySettings, campaign: Campaign, cases: dict[str, AttackCase]) -> None:
+def _attack_in_folder(settings: AttackSettings, campaign: Campaign, cases: dict[str, AttackCase]) -> None:
     """Executes the batches that are missing, prints the table and writes the counts; raises as `attack` says."""
     certificates = _certificates(cases, settings.out / "certificates")
     numbers = _numbers_of_batches(len(cases), settings.steps / campaign.batch_steps, campaign.kinds_of_batches)
@@ -77,7 +77,7 @@ def _attack_in_folder(settings: CertifySettings, campaign: Campaign, cases: dict
         require_safe(total, looks_ahead=campaign.looks_ahead)
 
 
-def _campaign(settings: CertifySettings) -> Campaign:
+def _campaign(settings: AttackSettings) -> Campaign:
     return Campaign(
         seed=settings.seed,
         random_plants=settings.random_plants,

@@ -31,8 +31,8 @@ _FINISHED_PARTS = {"study": ("*/summary.json",)}
 _IGNORED = {*INCIDENTAL_SETTINGS, "smoke", "page", "quote"}
 # Settings that may grow in the same folder, because the results that are there become part of the larger ones.
 _GROWING = {
-    "compare": ("seeds", "arms", "references"),
-    "study": ("seeds", "arms", "references", "envs"),
+    "compare": ("seeds", "arms", "baselines"),
+    "study": ("seeds", "arms", "baselines", "envs"),
     "sweep": ("seeds", "arms", "losses", "delays", "quantization_steps", "burst_lengths", "downlink_losses"),
     "certify": ("steps",),
 }

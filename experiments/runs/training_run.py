@@ -21,8 +21,8 @@ from agents.results import Episode, TrainingPoint, Trajectory
 from agents.sharing.agent_file import AGENT_FILES, write_files
 from experiments.baselines import controller
 from experiments.runs.environments import import_module, module_digest
-from experiments.runs.evaluation_conditions import AS_TRAINED, under
 from experiments.runs.provenance import versions
+from experiments.runs.scenarios import AS_TRAINED, under
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import LARGEST_NUMBER, shown
 from shields import Certificate
@@ -54,7 +54,7 @@ class TrainingRun:
         certificate: Certificate of shield or filter, which also defines x'Mx and the gain of controllers.
         certificate_basis: What the certificate was synthesized from, in words; empty for one that was given. Its last
             digits may depend on the machine, and a run that another machine finished is still the same run.
-        conditions: Conditions that the policy is evaluated under besides that of its training.
+        scenarios: Scenarios that the policy is evaluated under besides that of its training.
         algorithm: Name of the learning algorithm, one of `agents.hyperparams.ALGORITHMS`.
         settings: Hyperparameters of the learning algorithm.
         grid_point: Name of the point of a sweep's grid; part of the run's name only.
@@ -72,7 +72,7 @@ class TrainingRun:
     episodes: int
     certificate: Certificate
     certificate_basis: str = ""
-    conditions: tuple[str, ...] = ()
+    scenarios: tuple[str, ...] = ()
     algorithm: str
     settings: dict[str, Any]
     grid_point: str = ""
@@ -131,7 +131,7 @@ class TrainingRun:
     @property
     def total_steps(self) -> int:
         """Training steps, in whole rollouts, and evaluation steps."""
-        evaluation = self.episodes * (gym.spec(self.loop.env).max_episode_steps or 1) * (1 + len(self.conditions))
+        evaluation = self.episodes * (gym.spec(self.loop.env).max_episode_steps or 1) * (1 + len(self.scenarios))
         if not self.trains:
             return evaluation
         rollout = rollout_steps(self.algorithm, self.settings)
@@ -167,10 +167,10 @@ class TrainingRun:
             )
         agent = trained.agent if trained else _agent_of(self)
         evaluations = {}
-        for condition in (AS_TRAINED, *self.conditions):
-            loop, policy = under(condition, self.loop), _policy(self, agent)  # a random policy begins anew each time
+        for scenario in (AS_TRAINED, *self.scenarios):
+            loop, policy = under(scenario, self.loop), _policy(self, agent)  # a random policy begins anew each time
             level = self.certificate.polytope or self.certificate.M
-            evaluations[condition] = evaluate(loop, policy, self.episodes, self.evaluation_seed, level, on_progress)
+            evaluations[scenario] = evaluate(loop, policy, self.episodes, self.evaluation_seed, level, on_progress)
         evaluation = evaluations.pop(AS_TRAINED)
         return RunResult(
             arm=self.arm,
@@ -182,7 +182,7 @@ class TrainingRun:
             episodes=evaluation.episodes,
             trajectory=evaluation.trajectory,
             files=trained.agent.files() if trained else {},
-            conditions={condition: each.episodes for condition, each in evaluations.items()},
+            scenarios={scenario: each.episodes for scenario, each in evaluations.items()},
         )
 
     def require(self, result: RunResult) -> None:
@@ -214,7 +214,7 @@ class RunResult:
         episodes: Evaluation episodes.
         trajectory: Trajectory of the first evaluation episode.
         files: Contents of the trained agent's files by name; empty if nothing was trained.
-        conditions: Evaluation episodes under other conditions than that of the training, by the condition's name.
+        scenarios: Evaluation episodes under other scenarios than that of the training, by the scenario's name.
     """
 
     arm: str
@@ -226,7 +226,7 @@ class RunResult:
     episodes: list[Episode]
     trajectory: Trajectory
     files: dict[str, bytes] = field(default_factory=dict)
-    conditions: dict[str, list[Episode]] = field(default_factory=dict)
+    scenarios: dict[str, list[Episode]] = field(default_factory=dict)
 
     @property
     def outcome(self) -> str:
@@ -250,8 +250,8 @@ def _judged(run: TrainingRun, result: RunResult) -> Iterator[tuple[str, object, 
         counted = after.violation_steps, after.interventions
         falls = after.violation_steps < before.violation_steps or after.interventions < before.interventions
         yield "history", after, before.steps < after.steps <= steps and max(counted) <= after.steps and not falls
-    yield "conditions", result.conditions, result.conditions.keys() == set(run.conditions)
-    others = {f"conditions, {name}": episodes for name, episodes in result.conditions.items()}
+    yield "scenarios", result.scenarios, result.scenarios.keys() == set(run.scenarios)
+    others = {f"scenarios, {name}": episodes for name, episodes in result.scenarios.items()}
     for name, episodes in {"episodes": result.episodes, **others}.items():
         indices = [each.index for each in episodes]
         yield name, indices, indices == list(range(run.episodes))

@@ -99,7 +99,7 @@ def _refuse_both(env: str | None, plant: Path | None) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CertifySettings(BackendSettings):
+class AttackSettings(BackendSettings):
     """Attacks shielded control loops within the assumptions, and counts the states that leave the safe set or box.
 
     The plants are those of the registered environments (--env attacks those with other environments inside) and random

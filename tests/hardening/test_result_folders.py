@@ -22,7 +22,7 @@ from experiments.errors import ResultsError
 from experiments.runs import claim_folder, prepare_output
 from experiments.runs.run_store import RunStore
 from experiments.runs.training_run import TrainingRun, _agent_of
-from experiments.settings import CertifySettings, CompareSettings
+from experiments.settings import AttackSettings, CompareSettings
 from shields.json_documents import document_of
 from tests.command import assert_one_sentence, ncs
 from tests.fuzz import JSON_VALUES, examples
@@ -57,7 +57,7 @@ def run(certificate):
         steps=256,
         episodes=2,
         certificate=certificate,
-        conditions=("gaussian",),
+        scenarios=("gaussian",),
         algorithm="PPO",
         settings=dict(n_envs=2, n_steps=64, batch_size=64, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8])),
     )
@@ -151,7 +151,7 @@ def test_pipes_in_an_output_folder_are_refused_and_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "runs")
     with (
         pytest.raises(ResultsError, match=r"runs is neither a file nor a folder"),
-        claim_folder("certify", CertifySettings(out=tmp_path)),
+        claim_folder("certify", AttackSettings(out=tmp_path)),
     ):
         pass
 
@@ -202,10 +202,10 @@ CHANGES = [
     ("episodes", lambda c: c["episodes"][0].update(guaranteed=1)),
     ("episodes", lambda c: c["episodes"][0].update(more=1)),
     ("episodes", lambda c: c["episodes"].__setitem__(0, None)),
-    ("conditions", lambda c: c.update(conditions={})),
-    ("conditions", lambda c: c.update(conditions=["gaussian"])),
-    ("conditions", lambda c: c["conditions"].update(better=c["episodes"])),
-    ("conditions", lambda c: c["conditions"].update(gaussian=[])),
+    ("scenarios", lambda c: c.update(scenarios={})),
+    ("scenarios", lambda c: c.update(scenarios=["gaussian"])),
+    ("scenarios", lambda c: c["scenarios"].update(better=c["episodes"])),
+    ("scenarios", lambda c: c["scenarios"].update(gaussian=[])),
     ("trajectory", lambda c: c["trajectory"].pop("states")),
     ("trajectory", lambda c: c["trajectory"].update(states=[])),
     ("trajectory", lambda c: c["trajectory"]["states"].pop()),

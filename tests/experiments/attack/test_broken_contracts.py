@@ -10,7 +10,7 @@ from experiments.attack.attack_cases import attack_cases
 from experiments.attack.campaign import Campaign
 from experiments.attack.monte_carlo_batch import MonteCarloBatch, _claimed_and_kept
 from experiments.commands.attack import attack
-from experiments.settings.certificates import CertifySettings
+from experiments.settings.certificates import AttackSettings
 from ncs_gym import Channel
 from tests.certificates import certificate_of
 
@@ -108,5 +108,5 @@ def test_a_downlink_without_a_contract_is_refused(monkeypatch, tmp_path):
     case = replace(attack_cases(0, 0)[NAME], downlink=Channel(loss=0.3))
     monkeypatch.setattr(Campaign, "cases", lambda self: {NAME: case})
     with pytest.raises(ValueError, match="BatchReactor-v0, late: nothing is claimed behind a downlink without a contr"):
-        attack(CertifySettings(out=tmp_path / "out"))
+        attack(AttackSettings(out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()

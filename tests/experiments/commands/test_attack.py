@@ -16,7 +16,7 @@ from experiments.commands import attack as command
 from experiments.commands.attack import attack
 from experiments.errors import OtherResultsError, ResultsError, RunError, SafetyBroken
 from experiments.runs import RunStore
-from experiments.settings.certificates import CertifySettings
+from experiments.settings.certificates import AttackSettings
 from ncs_gym import truck_trailer
 from ncs_gym.network.contract import contract_of
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
@@ -216,7 +216,7 @@ def small(monkeypatch):
 
 
 def settings(out, **changes):
-    return CertifySettings(**{"steps": 1, "out": out, "random_plants": 1, "envs": 16, **changes})
+    return AttackSettings(**{"steps": 1, "out": out, "random_plants": 1, "envs": 16, **changes})
 
 
 def document(folder):

@@ -217,7 +217,7 @@ def test_finished_study_is_not_overwritten(command, smoke):
 
 
 def test_finished_study_is_overwritten_by_force(tmp_path, without_workers):
-    small = ["compare", "--arms", "unshielded", "--references", "--steps", 64, "--episodes", 2, "--seeds", 1]
+    small = ["compare", "--arms", "unshielded", "--baselines", "--steps", 64, "--episodes", 2, "--seeds", 1]
     small += ["--hyperparams", "n_envs=2", "n_steps=16", "--out", tmp_path]
     assert ncs(*small).returncode == 0
     kept = (tmp_path / "runs" / "unshielded-0.json").read_bytes()
@@ -426,27 +426,13 @@ def test_every_command_has_help_seed_and_out(command):
     assert "--out" in run.stdout
 
 
-@pytest.mark.parametrize("command", ["compare", "sweep", "train"])
-def test_help_has_two_levels(command):
-    first, everything = ncs(command, "--help"), ncs(command, "--help-all")
-    assert (first.returncode, everything.returncode) == (0, 0)
-    later = {"--lagrangian.cost-limit"}
-    later |= set() if command == "train" else {"--ray-address", "--ray-wait", "--cpus-per-run", "--gpus-per-run"}
-    for flag in later:
-        assert flag not in first.stdout
-        assert flag in everything.stdout
-    both = ("--env", "--steps", "--mode", "--channel", "--hyperparams", "--conf-file", "--smoke", "--force", "--help")
-    for flag in both:
-        assert flag in first.stdout
-        assert flag in everything.stdout
-    assert "--help-all" in first.stdout
-
-
-def test_first_level_of_help_shows_what_a_settings_file_gives(smoke):
+def test_help_shows_every_setting_and_what_a_settings_file_gives(smoke):
     run = ncs("compare", "--config", smoke[0] / "settings.json", "--help")
     assert run.returncode == 0
     assert "(default: 4096)" in run.stdout
-    assert "--lagrangian.cost-limit" not in run.stdout
+    for flag in ("--env", "--channel", "--hyperparams", "--lagrangian.cost-limit", "--ray-address", "--gpus-per-run"):
+        assert flag in run.stdout
+    assert ncs("train", "--help-all").stdout == ncs("train", "--help").stdout
 
 
 @pytest.mark.parametrize(

@@ -58,6 +58,14 @@ def test_hyperparameters_of_the_file_give_way_to_another_algorithm_and_to_their_
     assert _parse([*config, "--hyperparams", "gamma=0.8"]).hyperparams == {"gamma": 0.8}
 
 
+def test_former_names_of_settings_and_flags_are_read(tmp_path):
+    now = _parse(["compare", "--baselines", "lqr", "--scenarios", "gaussian"])
+    assert (now.baselines, now.scenarios) == (("lqr",), ("gaussian",))
+    assert _parse(["compare", "--references", "lqr", "--conditions", "gaussian"]) == now
+    file = written(tmp_path, {"references": ["lqr"], "conditions": ["gaussian"]})
+    assert _parse(["compare", "--config", file]) == now
+
+
 def test_without_config_nothing_changes():
     for arguments in ([], ["--help"], ["--steps", "9"]):
         assert config_defaults(arguments, "compare", CompareSettings) == (None, arguments)

@@ -9,7 +9,7 @@ from experiments.backends.execution import results_of
 from experiments.errors import ResultsError
 from experiments.runs import certificate_of, loop_config, run_of_arm
 from experiments.settings import CompareSettings, changed_channel
-from experiments.study.channel_sweep import SWEPT_CONDITIONS, SWEPT_FILTERS, channel_sweep, trained_agents
+from experiments.study.channel_sweep import SWEPT_FILTERS, SWEPT_SCENARIOS, channel_sweep, trained_agents
 from experiments.study.channel_sweep import _points as points_of
 from experiments.study.figures import sweep_figure
 from experiments.study.tables import channels_table
@@ -76,12 +76,12 @@ def test_a_finished_sweep_is_read_again(rows):
     sides = {each["side"] for each in rows[0]}
     assert sides == {"loss", "delay", "quantization_step"}
     assert {(r["arm"], r["condition"]) for r in rows[0]} == {
-        (f"lqr+{name}", condition) for name in SWEPT_FILTERS for condition in SWEPT_CONDITIONS
+        (f"lqr+{name}", condition) for name in SWEPT_FILTERS for condition in SWEPT_SCENARIOS
     }
 
 
 def test_agents_do_on_the_own_channel_what_they_did_in_the_comparison(trained, sweep_of_agents):
-    of_agents = {r["arm"]: r for r in sweep_of_agents[1] if r["condition"] == SWEPT_CONDITIONS[0]}
+    of_agents = {r["arm"]: r for r in sweep_of_agents[1] if r["condition"] == SWEPT_SCENARIOS[0]}
     for name in SWEPT_FILTERS:
         episodes = [episode for result in trained[1] if result.arm == name for episode in result.episodes]
         row = of_agents[name]
