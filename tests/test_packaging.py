@@ -45,7 +45,7 @@ LAYERS = {
         {"training"},
     ),
     "experiments": (
-        {"errors", "warning_sentences"},
+        {"errors", "warning_sentences", "json_values"},
         {"settings", "baselines"},
         {"runs"},
         {"backends", "analysis", "plots"},

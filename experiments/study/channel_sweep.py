@@ -20,8 +20,9 @@ from experiments.runs import (
     run_of_arm,
 )
 from experiments.runs.environments import registered_env
+from experiments.runs.loops import changed_channel
 from experiments.runs.scenarios import AS_TRAINED
-from experiments.settings import Assignments, CompareSettings, changed_channel
+from experiments.settings import Assignments, CompareSettings
 
 # The filters, in pairs without and with the error set, by the count in the rows that tells whether they do what they
 # are for: the first keep S, the others may leave it and keep the box.

@@ -8,7 +8,8 @@ import pytest
 from experiments.backends.execution import results_of
 from experiments.errors import ResultsError
 from experiments.runs import certificate_of, loop_config, run_of_arm
-from experiments.settings import CompareSettings, changed_channel
+from experiments.runs.loops import changed_channel
+from experiments.settings import CompareSettings
 from experiments.study.channel_sweep import SWEPT_FILTERS, SWEPT_SCENARIOS, channel_sweep, trained_agents
 from experiments.study.channel_sweep import _points as points_of
 from experiments.study.figures import sweep_figure
