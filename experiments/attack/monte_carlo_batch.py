@@ -55,7 +55,7 @@ def run_batch(
     shields = list(_shields(campaign, batch.case, certificate).values())
     shield = shields[batch.index % len(shields)]
     plant = shield.filter.plant
-    safe_set = shield.filter.kept_set
+    safe_set = shield.filter.certificate.safe_set
     seeds = np.random.SeedSequence([campaign.seed, zlib.crc32(batch.case.encode()), batch.index])
     seed, policy_seed = seeds.generate_state(2, np.uint64).tolist()
     rng = np.random.default_rng(policy_seed)

@@ -82,10 +82,11 @@ class SafeLoop:
     `start`; a packet carries the number of the step at which its sample was taken, and that of the episode.
 
     The guarantee is that of `SafetyShield`, under the same assumptions (docs/shield.md): `guaranteed` says whether the
-    state is proved to be in S at this step, `reason` why not, `print(loop)` both. What the loop cannot see is that the
-    clock misses a step, that the actuator applies something else (unless it is told), or that packets carry wrong
-    stamps. A certificate under a channel contract brings its error sets along. Not for use by several threads at once.
-    Where `start`, `receive` or `decide` is interrupted, by whatever it may be, nothing has happened: call it again.
+    state is proved to be in the certificate's safe set S at this step, `reason` why not, `print(loop)` both. What the
+    loop cannot see is that the clock misses a step, that the actuator applies something else (unless it is told), or
+    that packets carry wrong stamps. A certificate under a channel contract brings its error sets along. Not for use by
+    several threads at once. Where `start`, `receive` or `decide` is interrupted, by whatever it may be, nothing has
+    happened: call it again.
 
     Behind a downlink that is late or loses commands, send `command` after each `decide` instead, and let an
     `ncs_gym.Actuator` apply what it holds (docs/contracts.md, "Both directions"). What is decided takes effect `lead`

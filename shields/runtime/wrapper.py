@@ -43,10 +43,11 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
     """Overrides an action whenever the safe set could be left (docs/shield.md).
 
     The action passes unchanged if every state the estimate allows stays in S; otherwise "project" applies the closest
-    input that keeps it there, "switch" (and "project" where there is none) the certified u = K x_hat. From a start in S
-    the true state then stays in S for ever, for any policy, disturbance and channel within the assumptions;
-    `info["shield_guaranteed"]` says whether they still hold as far as can be seen. "boundary" trusts the agent only
-    where no input at all could leave S. "monitor" never changes the action and counts what "switch" would have done.
+    input that keeps it there, "switch" (and "project" where there is none) the certified u = K x_hat. S is the
+    certificate's safe set: its polytope, or its ellipsoid if it has none. From a start in S the true state then stays
+    in S for ever, for any policy, disturbance and channel within the assumptions; `info["shield_guaranteed"]` says
+    whether they still hold as far as can be seen. "boundary" trusts the agent only where no input at all could leave S.
+    "monitor" never changes the action and counts what "switch" would have done.
 
     Wrap it directly around what `gym.make` returns; wrappers that change or repeat actions go outside it.
 
@@ -194,7 +195,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
     def _annotate(self, proposed: np.ndarray | None, interventions: int, plan: np.ndarray, *, intervened: bool) -> None:
         """Tells the picture of the step that follows what the shield does in it."""
         note = Annotation(
-            safe_set=self._filter.kept_set,
+            safe_set=self._certificate.safe_set,
             label=self._filter.mode,
             proposed=proposed,
             intervened=intervened,

@@ -15,6 +15,7 @@ from ncs_gym import LinearPlant
 from shields.runtime.backup_plans.plan_check import PlanTest, Prediction, Tightening
 from shields.runtime.backup_plans.program import PlanProgram
 from shields.runtime.one_step import OneStepTest
+from shields.runtime.polytope_step import PolytopeTest
 
 # A first input this close to the proposed one, in units of the limits, is tried as the proposed one itself.
 AS_PROPOSED = 1e-5
@@ -61,7 +62,7 @@ class Planner:
         horizon: N.
     """
 
-    def __init__(self, first: OneStepTest, gain: np.ndarray, horizon: int, margin: float) -> None:
+    def __init__(self, first: OneStepTest | PolytopeTest, gain: np.ndarray, horizon: int, margin: float) -> None:
         self.test, self.horizon = PlanTest(Prediction(first, horizon), margin), horizon
         self._plant = first.plant
         braking, unlimited = regulator(first.plant), regulator(first.plant, UNLIMITED_INPUT_WEIGHT)
@@ -166,7 +167,7 @@ class Planner:
         limits, (box, radius) = self._plant.u_max, self.test.room(estimates, tightening)
         tried = np.full((len(estimates), 2, self.horizon, self._plant.m), np.nan)
         for e, u in enumerate(proposed):
-            data = estimates[e], box[e, :-1], tightening.weighting[e, -1], float(radius[e, -1]), u
+            data = estimates[e], box[e], tightening.weighting[e, -1], float(radius[e, -1]), u
             if (found := self._program.solve(*data)) is not None:
                 tried[e] = expressible(found, limits)
                 if (np.abs(found[0] - u) <= AS_PROPOSED * limits).all():
