@@ -1,6 +1,7 @@
 """Plants behind imperfect networks as Gymnasium environments; importing registers the ids."""
 
 from ncs_gym.envs.env import NCSEnv
+from ncs_gym.envs.episode_channels import RandomChannel, VectorRandomChannel
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlantError, certified_error_set
 from ncs_gym.estimation.estimator import Estimator
@@ -52,6 +53,7 @@ __all__ = [
     "NoNoiseWarning",
     "Packet",
     "Process",
+    "RandomChannel",
     "Regulation",
     "Remainder",
     "SetpointTracking",
@@ -60,6 +62,7 @@ __all__ = [
     "SphereDisturbance",
     "Task",
     "UnstablePlantError",
+    "VectorRandomChannel",
     "batch_reactor",
     "cart_pole",
     "certified_error_set",

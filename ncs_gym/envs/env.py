@@ -8,8 +8,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
+from ncs_gym.envs.episode_channels import EpisodeChannels, covering, downlinks, uplinks
 from ncs_gym.envs.info import Constraints, Known, loop_info
-from ncs_gym.envs.reset_options import start_option
+from ncs_gym.envs.reset_options import CHANNELS, start_option
 from ncs_gym.envs.settings import expect, loop_contracts, require_own_equations, require_suitable, starting_set
 from ncs_gym.envs.spaces import observation_space, read_action
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
@@ -67,7 +68,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
 
     ## Starting state
     Uniform in `initial_set`, or `options={"state": x0}`. The first estimate is off by Gaussian noise
-    (truncated unless `noise` says otherwise) and a uniform draw from the plant's `initial_bound`.
+    (truncated unless `noise` says otherwise) and a uniform draw from the plant's `initial_bound`. Other options of
+    `reset` give the episode another channel.
 
     ## Episode end
     Terminates on a violation of the safe box only with `terminate_on_violation`, or with an environment that is the
@@ -119,6 +121,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         certificate_contract: Contract that a certificate for this environment rests on: `contract` with c steps added.
         steps: Steps taken in this episode.
         episodes: Episodes begun.
+        episode_channel: The channel of this episode, `channel` unless an option of the reset gave another one.
+        episode_downlink: The downlink of this episode, likewise.
         start: What the start of this episode is known to lie in: `initial_set`, or the state given as an option.
 
     Raises:
@@ -187,6 +191,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._error_set = patterns.recursion.error_set
         self._estimator = Estimator(plant, self._channel, patterns=patterns)
         self._downlink_state = DownlinkState(self._protocol, plant.m)
+        self._uplinks, self._downlinks = uplinks([self._channel], self._channel), downlinks([downlink], self._protocol)
         self._noise = as_noise(noise, plant)
         truncated = self._noise == "truncated"
         self._process_given = LinearProcess() if process is None else expect(process, Process, "process")
@@ -210,12 +215,17 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
 
         Args:
             seed: Seeds `np_random`, the only source of randomness.
-            options: {"state": x0} starts at x0, shape (n,).
+            options: {"state": x0} starts at x0, shape (n,). {"channel": c}, {"downlink": c} give this episode another
+                channel, a `Channel` or a function (rng) -> Channel that draws one. Contract, error set and spaces stay
+                those that the environment was made with: a channel that cannot keep the contract may break it, as ever,
+                one that rounds more coarsely than the environment's own, or delays commands by more than its
+                downlink commits ahead, is refused.
 
         Raises:
-            ValueError: If an option is unknown or x0 has a wrong shape or is not finite.
+            ValueError: If an option is unknown or wrong, or the environment cannot have the channel.
         """
         start = start_option(options, self._plant.n)
+        read = [links.read((options or {}).get(name), name) for name, links in self._links()]
         super().reset(seed=seed)
         self._consistent = False
         if seed is not None:
@@ -225,9 +235,15 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._state, self.start = self._process.start(rng, first, initial)
         self._task_state = self._task.begin(rng, self._plant)
         self._disturbance_memory = self._process.begin(rng)
-        self._channel_state = ChannelState(self._channel, rng)
+        for (_, links), sources in zip(self._links(), read, strict=True):
+            links.give(sources)
+            links.begin(rng)
+        channel = self.episode_channel
+        self._channel_state = ChannelState(channel, rng)
+        if (channel.delay, channel.jitter) != (self._estimator.channel.delay, self._estimator.channel.jitter):
+            self._estimator = self._estimator_for(covering([channel], self._channel))
         self._estimator.reset(self._state + self._process.first_error(rng))
-        self._downlink_state.begin(rng, self._estimator.episode)
+        self._downlink_state.begin(rng, self._estimator.episode, self.episode_downlink)
         self.steps = 0
         self.episodes += 1
         self._violations = 0.0
@@ -288,6 +304,16 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             self.renderer.annotate(annotation)
 
     @property
+    def episode_channel(self) -> Channel:
+        """The channel of this episode."""
+        return self._uplinks.now[0]
+
+    @property
+    def episode_downlink(self) -> Channel | None:
+        """The downlink of this episode; None for an ideal one."""
+        return self._downlinks.now[0]
+
+    @property
     def known(self) -> Known:
         """What a shield decides on, as copies: no wrapper stands between."""
         return Known(*(each.copy() if isinstance(each, np.ndarray) else each for each in self._known))
@@ -310,6 +336,14 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     def _predicted_estimate(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimate, (n,), and error shape, (n, n), of the time at which the next decision takes effect."""
         return self._estimator.predicted(self._pending)
+
+    def _links(self) -> list[tuple[str, EpisodeChannels]]:
+        return list(zip(CHANNELS, (self._uplinks, self._downlinks), strict=True))
+
+    def _estimator_for(self, channel: Channel) -> Estimator:
+        """Returns an estimator of the episodes to come, for packets of other delays."""
+        patterns = arrival_patterns(self._plant, channel, self._certificate_contract)
+        return Estimator(self._plant, channel, patterns=patterns, after=self._estimator)
 
     def _drawn_start(self, rng: np.random.Generator) -> np.ndarray:
         return (1.0 - SAMPLE_ROUNDING) * self._initial_set.sample(rng)

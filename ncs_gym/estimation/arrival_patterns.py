@@ -171,8 +171,15 @@ class ArrivalPatterns:
             numbers = successor._adopted(self, np.unique(patterns).tolist())
         return successor, np.array([numbers[each] for each in patterns.tolist()], np.int64)
 
+    def taking_over(self, other: ArrivalPatterns, patterns: np.ndarray) -> np.ndarray:
+        """Returns the numbers here of patterns, shape (k,), of a graph with fewer delays of the same plant."""
+        with self._lock:
+            numbers = self._adopted(other, np.unique(patterns).tolist())
+        return np.array([numbers[each] for each in patterns.tolist()], np.int64)
+
     def _adopted(self, other: ArrivalPatterns, patterns: list[int]) -> dict[int, int]:
         """Returns the numbers of another graph's patterns."""
+        older = self.buffer - other.buffer
 
         def same(number: int) -> int:
             return number if number == UNKNOWN else self.table.number_of(other.table.statistics[number])
@@ -180,7 +187,8 @@ class ArrivalPatterns:
         numbers = {}
         for each in patterns:
             present, priors, held, replay_from = other._patterns[each]
-            adopted = Pattern(same(present), tuple(map(same, priors)), held, replay_from)
+            known = (*map(same, priors), *[UNKNOWN] * older)
+            adopted = Pattern(same(present), known, (*held, *[False] * older), replay_from)
             numbers[each] = self._number_of_pattern(adopted)
         self._adopted_count, self.is_full = max(self._adopted_count, len(patterns)), False
         return numbers

@@ -65,7 +65,7 @@ def contract_of(channel: Channel) -> ChannelContract | None:
 
 
 def warn_of_broken_contract(
-    contract: ChannelContract | None, channel: Channel, lead: int, *, counts_losses: bool = False
+    contract: ChannelContract | None, channel: Channel, lead: int, *, counts_losses: bool = False, stacklevel: int = 3
 ) -> None:
     """Warns the caller of the calling constructor if a channel cannot keep the contract that a certificate assumes.
 
@@ -75,6 +75,7 @@ def warn_of_broken_contract(
         lead: c, the number of steps from a decision to its effect.
         counts_losses: Whether the losses and the jitter that the channel promises not to exceed count. Without them it
             is warned only of what breaks the contract although no packet is lost.
+        stacklevel: As for `warnings.warn`.
     """
     promised = contract_of(channel) if counts_losses else None
     age = channel.send_period - 1 + channel.delay if promised is None else promised.max_age
@@ -86,7 +87,7 @@ def warn_of_broken_contract(
         f"{_steps(contract.max_age)} in all, so that the guarantee is likely to be lost: give a certificate of "
         f"ChannelContract(max_age={age + lead}), or of a larger max_age where packets are lost",
         BrokenContractWarning,
-        stacklevel=3,
+        stacklevel=stacklevel,
     )
 
 

@@ -13,7 +13,6 @@ from ncs_gym.envs.info import Known
 from ncs_gym.envs.spaces import read_actions
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network import CommittedInputs
-from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.validation import as_number, setting, shown
 from shields.certificate import Certificate
 from shields.downlink.schedule import as_decided
@@ -30,7 +29,14 @@ from shields.runtime.lost_guarantee import LostGuarantee
 from shields.runtime.one_step import PredictedErrors, norms
 from shields.runtime.safety_filter import SafetyFilter
 from shields.runtime.starts import StartKnown, first_observations, first_store, starts_known
-from shields.runtime.wrapper import certificate_for, environment_behind, hint_for, premises_of, require_same
+from shields.runtime.wrapper import (
+    certificate_for,
+    environment_behind,
+    hint_for,
+    premises_of,
+    require_same,
+    warned_of,
+)
 
 REASONS = np.array(EXPLANATIONS, dtype=object)
 
@@ -94,7 +100,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         self._filter = SafetyFilter(self._certificate, inner.plant, mode, horizon)
         self._monitor = GuaranteeMonitor(self._filter, inner.downlink_protocol)
         self._lead = 0 if inner.downlink_protocol is None else inner.downlink_protocol.lead
-        warn_of_broken_contract(self._certificate.contract, inner.channel, self._lead)
+        self._channels = warned_of({*inner.episode_channels}, set(), self._certificate, self._lead)
         self._start_known = starts_known(self._filter, inner.single.initial_set, self._lead)
         count, nothing = self.num_envs, np.zeros(self.num_envs, np.bool_)
         self._schedule = (
@@ -131,6 +137,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             raise
         inner = self._environment_in(self.env)
         require_same(self._made_for, premises_of(inner, inner.single))
+        self._channels = warned_of({*inner.episode_channels}, self._channels, self._certificate, self._lead)
         now = self._read_clock()
         restarted = now.episodes != before.episodes
         unmoved = (now.steps == before.steps) & (now.ticks == before.ticks)
@@ -167,6 +174,9 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         observation, rewards, terminated, truncated, info = self.env.step(actions)
         now, state = self._read_clock(), self._state
         restarted, moved_once = _moved(before, now)
+        if np.count_nonzero(restarted):
+            channels = {*self._inner.episode_channels}
+            self._channels = warned_of(channels, self._channels, self._certificate, self._lead)
         known = self._inner.known
         self._report = self._observed(known)
         due = None if self._schedule is None else self._schedule.due(decided.input)

@@ -12,7 +12,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv
 from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, StickyAction
 
-from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv, NCSVectorEnv
+from ncs_gym import Annotation, Channel, ChannelContract, LinearPlant, NCSEnv, NCSVectorEnv
 from ncs_gym.envs.info import Known
 from ncs_gym.envs.spaces import read_action
 from ncs_gym.network.contract import warn_of_broken_contract
@@ -112,7 +112,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         )
         self._filter = SafetyFilter(self._certificate, inner.plant, mode, horizon)
         self._monitored = MonitoredFilter(self._filter, inner.downlink_protocol)
-        warn_of_broken_contract(self._certificate.contract, inner.channel, self._monitored.lead)
+        self._channels = warned_of({inner.channel}, set(), self._certificate, self._monitored.lead)
         self._clock: tuple[int, int] | None = None
         self._start: Any = None
         self._known: tuple[StartKnown, ...] = ()
@@ -137,6 +137,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             raise
         inner = self._environment_in(self.env)
         require_same(self._made_for, premises_of(inner, inner))
+        self._channels = warned_of({inner.episode_channel}, self._channels, self._certificate, self._monitored.lead)
         clock, report = self._read_clock(), self._observed(inner.known)
         start = self._inner.start
         if start is not self._start:  # decided exactly, which takes longer than a step; starts are read-only
@@ -238,6 +239,20 @@ def certificate_for(
 
         _synthesized[key] = synthesize(plant, contract=contract, progress=progress)
     return _synthesized[key]
+
+
+def warned_of(now: set[Channel], before: set[Channel], certificate: Certificate, lead: int) -> set[Channel]:
+    """Returns the channels of the present episodes; warns the caller's caller of new ones that break the contract.
+
+    Args:
+        now: These channels.
+        before: Those that were looked at before.
+        certificate: Rests on a contract.
+        lead: c.
+    """
+    for channel in now - before:
+        warn_of_broken_contract(certificate.contract, channel, lead, stacklevel=4)
+    return now
 
 
 def premises_of(inner: NCSEnv | NCSVectorEnv, single: NCSEnv) -> dict[str, Any]:
