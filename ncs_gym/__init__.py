@@ -7,7 +7,7 @@ from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlan
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet
 from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
-from ncs_gym.network.downlink import Actuator, Command
+from ncs_gym.network.downlink import Actuator, Command, Echo
 from ncs_gym.network.escape_probability import escape_probability
 from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
@@ -39,6 +39,7 @@ __all__ = [
     "ChannelContract",
     "Command",
     "Disturbance",
+    "Echo",
     "Ellipsoid",
     "ErrorSet",
     "ErrorSetError",

@@ -231,13 +231,14 @@ def _interrupted(plant: LinearPlant, stage: str, best: Certificate | None) -> Sy
 
 
 def _with_tolerated_scale(certificate: Certificate, problem: DesignProblem) -> Certificate:
-    """Returns the certificate with a record of how much larger all radii could be for some other set and gain."""
+    """Returns the certificate with a record of how much larger all radii could be for some set and gain.
+
+    It is 1 at least, because this certificate exists: the search for a larger one is local, and covers the error sets
+    of all ages by one.
+    """
     gain = max_margin_gain(problem, problem.covering_error_shape, searches=1)
-    if gain is None or gain.margin < 1.0:  # the search for it is local, and covers the error sets of all ages by one
-        return certificate
-    return replace(
-        certificate, provenance=certificate.provenance | {"tolerated_scale": float(exact.rounded(gain.margin, 3))}
-    )
+    scale = 1.0 if gain is None else max(gain.margin, 1.0)
+    return replace(certificate, provenance=certificate.provenance | {"tolerated_scale": float(exact.rounded(scale, 3))})
 
 
 def _failed_verification(report: Report) -> Infeasible:
