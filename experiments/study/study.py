@@ -85,6 +85,7 @@ def _comparison_settings(settings: StudySettings, env_id: str) -> CompareSetting
         arms=settings.arms,
         references=settings.references,
         conditions=settings.conditions,
+        safe_set=settings.safe_set,
         force=settings.force,
         **backend,
     )
