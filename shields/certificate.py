@@ -320,7 +320,7 @@ class Certificate(ReadOnlyArrays):
             ("plant", f"{counted(n, 'state')}, {counted(m, 'input')}, fingerprint {self.fingerprint[:16]}"),
             ("safe set", self._safe_set_text()),
             ("size", size_of(recorded)),
-            ("polytope", missing_polytope_of(recorded)),
+            ("polytope", missing_polytope_of(recorded) if self.proofs and self.polytope is None else ""),
             ("fallback", "u = K x_hat"),
             ("contract", contract_text(self.method, self.contract)),
             ("tolerance", tolerance_of(recorded)),

@@ -36,7 +36,7 @@ INTERRUPTED = (-1, -1)
 # What of an environment a shield's proof rests on.
 PREMISES = "plant", "channel", "contract", "downlink_protocol", "certificate_contract", "process", "initial_set"
 
-_synthesized: dict[tuple[str, ChannelContract | None], Certificate] = {}
+_synthesized: dict[tuple[str, ChannelContract | None, str | None], Certificate] = {}
 
 
 class SafetyShield(gym.Wrapper, RecordConstructorArgs):
@@ -221,23 +221,27 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
 
 
 def certificate_for(
-    plant: LinearPlant, contract: ChannelContract | None = None, progress: Callable[[str], object] | None = None
+    plant: LinearPlant,
+    contract: ChannelContract | None = None,
+    progress: Callable[[str], object] | None = None,
+    safe_set: str | None = None,
 ) -> Certificate:
-    """Returns a synthesized certificate, made once per process, plant and channel contract.
+    """Returns a synthesized certificate, made once per process, plant, channel contract and kind of safe set.
 
     Args:
         plant: The plant.
         contract: Channel contract; None for none.
         progress: Called with a line of text per stage of the synthesis.
+        safe_set: "polytope", "ellipsoid" or None; see `synthesize`.
 
     Raises:
         Infeasible: If none is found.
     """
-    key = plant.fingerprint, contract
+    key = plant.fingerprint, contract, safe_set
     if key not in _synthesized:
         from shields.synthesis import synthesize  # the solver, which who has a certificate does without
 
-        _synthesized[key] = synthesize(plant, contract=contract, progress=progress)
+        _synthesized[key] = synthesize(plant, contract=contract, safe_set=safe_set, progress=progress)
     return _synthesized[key]
 
 

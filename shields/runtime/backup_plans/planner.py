@@ -121,7 +121,9 @@ class Planner:
     ) -> Plans:
         """Returns certified plans of E environments whose first inputs are close to the proposed ones.
 
-        Candidates are the projected input and then the regulator, what is stored, and either gain from the start.
+        Candidates are the projected input and then the regulator, what is stored, and either gain from the start. The
+        solver is asked where none of them is certified; where plans end in S also if nothing is stored. Plans that end
+        in P hardly come closer by it than the projected input does, for three times the time.
 
         Args:
             estimates: x_hat, shape (E, n).
@@ -136,7 +138,9 @@ class Planner:
         candidates = completed(self._plant, estimates, beginnings, self._gains[[0, 1, 0, 1]])
         plans = self._best(estimates, tightening, candidates, proposed)
         if self.horizon > 1:
-            needed = (plans.lengths == 0) | np.isnan(stored[:, 0, 0])
+            needed = plans.lengths == 0
+            if self.test.prediction.ends:
+                needed |= np.isnan(stored[:, 0, 0])
             left = np.flatnonzero(needed & (plans.distances > 0.0))
             if left.size:
                 known = Tightening(*(part[left] for part in tightening))
