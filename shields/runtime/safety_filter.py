@@ -19,7 +19,7 @@ from shields.runtime.one_step import (
     ReachableSets,
     require_computable,
 )
-from shields.runtime.polytope_step import PolytopeTest
+from shields.runtime.polytope_step import EllipsoidOnGrid, PolytopeTest
 from shields.verification import ACTION_ROUNDING, require_valid
 
 if TYPE_CHECKING:
@@ -85,7 +85,8 @@ class SafetyFilter(ReadOnlyArrays):
         require_valid(self.certificate, self.plant)
         require_computable(self.certificate, self.plant)
         polytope = self.certificate.polytope
-        test = OneStepTest(self.certificate.L, self.plant) if polytope is None else PolytopeTest(polytope, self.plant)
+        kind = OneStepTest if self.plant.grid_rows is None else EllipsoidOnGrid
+        test = kind(self.certificate.L, self.plant) if polytope is None else PolytopeTest(polytope, self.plant)
         object.__setattr__(self, "test", test)
         object.__setattr__(self, "_no_plan", read_only(np.empty((0, self.plant.m))))
         object.__setattr__(self, "lookahead", self._lookahead())
