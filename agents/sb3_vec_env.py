@@ -13,6 +13,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 from ncs_gym import NCSVectorEnv
+from ncs_gym.envs.reset_options import CHANNELS
 
 # Vector environments whose reset takes options={"reset_mask": ...} and resets only the environments in the mask.
 _WITH_RESET_MASK = (NCSVectorEnv, SyncVectorEnv, AsyncVectorEnv)
@@ -21,7 +22,17 @@ _EPISODE_KEYS = ("episode_violations", "is_success")
 # Infos in the dicts of every step, asked for or not: what algorithms for constrained problems read.
 _STEP_KEYS = ("cost",)
 # Attributes that change with the episodes of an `NCSVectorEnv`, but never in its scalar prototype.
-_STATEFUL_ATTRIBUTES = ("steps", "episodes", "np_random", "starts", "spec", "num_envs", "metadata")
+_STATEFUL_ATTRIBUTES = (
+    "steps",
+    "episodes",
+    "episode_channel",
+    "episode_downlink",
+    "np_random",
+    "starts",
+    "spec",
+    "num_envs",
+    "metadata",
+)
 
 
 class SB3VecEnv(VecEnv):
@@ -86,6 +97,7 @@ class SB3VecEnv(VecEnv):
         seeds: Any = None if self._seeds[0] is None else self._seeds
         if seeds is not None and not isinstance(self.vector_env.unwrapped, _WITH_RESET_MASK[1:]):
             seeds = seeds[0]
+        self._kept = {name: option for name, option in options.items() if name in CHANNELS}
         observation, info = self.vector_env.reset(seed=seeds, options=options or None)
         self._require_known_keys(info)
         self._reset_seeds()
@@ -131,7 +143,7 @@ class SB3VecEnv(VecEnv):
         if done.any():
             self._returns[done], self._lengths[done] = 0.0, 0
             if self._masks and self._mode is not AutoresetMode.SAME_STEP:
-                fresh, reset_info = self.vector_env.reset(options={"reset_mask": done.copy()})
+                fresh, reset_info = self.vector_env.reset(options={"reset_mask": done.copy(), **self._kept})
                 observation = np.where(done.reshape(-1, *[1] * (observation.ndim - 1)), fresh, observation)
                 for e in np.flatnonzero(done).tolist():
                     self.reset_infos[e] = {key: value[e] for key, value in _dense(reset_info).items()}

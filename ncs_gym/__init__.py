@@ -2,6 +2,7 @@
 
 from ncs_gym.envs.env import NCSEnv
 from ncs_gym.envs.episode_channels import RandomChannel, VectorRandomChannel
+from ncs_gym.envs.spaces import ClippedObservationWarning
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlantError, certified_error_set
 from ncs_gym.estimation.estimator import Estimator
@@ -37,6 +38,7 @@ __all__ = [
     "BrokenContractWarning",
     "Channel",
     "ChannelContract",
+    "ClippedObservationWarning",
     "Command",
     "Disturbance",
     "Ellipsoid",

@@ -12,7 +12,7 @@ from ncs_gym.envs.episode_channels import EpisodeChannels, covering, downlinks, 
 from ncs_gym.envs.info import Known, loop_info
 from ncs_gym.envs.reset_options import CHANNELS, start_option
 from ncs_gym.envs.settings import expect, loop_contracts, require_suitable, starting_set
-from ncs_gym.envs.spaces import observation_space, read_action
+from ncs_gym.envs.spaces import entries_within, observation_space, read_action
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
@@ -34,7 +34,7 @@ from ncs_gym.validation import as_count, as_flag, setting, shown
 # Keeps the rounding of a sampled start inside the initial set.
 SAMPLE_ROUNDING = 1e-9
 # The steps the observation space is sized for are gone through one by one.
-LONGEST_HORIZON = 100_000
+DEFAULT_HORIZON, LONGEST_HORIZON = 200, 100_000
 RENDER_MODES = ["human", "rgb_array"]
 RENDER_FPS = 30
 
@@ -51,7 +51,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     Finite actions outside the box are clipped.
 
     ## Observation space
-    A finite `Box` of float32, sized by what the plant and the task can reach within `horizon` steps:
+    A finite `Box` of float32, sized by what the plant and the task can reach within `horizon` steps, for an unstable
+    plant by what one step out of the safe box can reach. What is beyond is clipped, in `info` it is not:
 
     | entries | meaning | unit |
     |---|---|---|
@@ -107,7 +108,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             if the plant is unstable, none if it is stable. A channel that may break it is allowed.
         render_mode: "human" shows every step in a window, "rgb_array" makes `render` return an image; both need
             the extra `[render]` (docs/rendering.md).
-        horizon: Steps the observation space is sized for.
+        horizon: Steps the observation space is sized for; give it beside a longer `max_episode_steps`.
         noise: "truncated", or "gaussian" for process noise, sensor noise and first errors without a bound: what is
             proved then holds but for a probability that `escape_probability` bounds (docs/shield.md).
         process: What really moves (docs/beyond_linear.md); the plant's own equations by default.
@@ -163,7 +164,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         allow_assumption_violation: bool = False,
         contract: ChannelContract | None = None,
         render_mode: str | None = None,
-        horizon: int = 200,
+        horizon: int = DEFAULT_HORIZON,
         noise: str = "truncated",
         process: Process | None = None,
         downlink: Channel | None = None,
@@ -200,11 +201,13 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._horizon = as_count(horizon, "horizon", low=1, high=LONGEST_HORIZON)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)
         steps = self._horizon + len(self._pending)
-        self.observation_space = observation_space(plant, self._task, self._error_set, self._initial_set, steps)
+        self.observation_space = observation_space(
+            plant, self._task, self._error_set, self._initial_set, steps, len(self._pending)
+        )
         self._low, self._high = self.observation_space.low, self.observation_space.high
         self.steps = self.episodes = 0
         self.start: Ellipsoid | np.ndarray = self._initial_set
-        self._consistent = False
+        self._consistent = self._warned = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -348,8 +351,9 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         task_state = self._task_state
         for u in self._pending:
             task_state = self._task.predict(self._plant, task_state, u)
-        entries = np.concatenate([self._belief[0], self._task.observe(task_state)])
-        return np.minimum(np.maximum(entries, self._low), self._high).astype(np.float32)
+        own, bounds = self._task.observe(task_state), (self._low, self._high)
+        within, self._warned = entries_within(self._task, self._belief[0], own, *bounds, self._warned, self._horizon)
+        return within.astype(np.float32)
 
     def _info(self, inputs: Inputs, *, arrived: bool) -> dict[str, Any]:
         values = self._plant.constraint_values(self._state)
