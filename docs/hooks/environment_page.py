@@ -112,11 +112,7 @@ def _observations(env: NCSEnv) -> str:
         low, high = (_with_unit(bound[index], units, index) for bound in (space.low, space.high))
         rows.append(f"| {index} | {name} | {low} | {high} |")
     task = " [Rewards](#rewards) says what the task adds." if extra else ""
-    cap = (
-        ""
-        if plant.spectral_radius < 1.0
-        else " without having left the safe box for more than one step; what is beyond is clipped"
-    )
+    cap = "" if plant.spectral_radius < 1.0 else " within a step of leaving the safe box; what is beyond is clipped"
     return "\n".join(rows) + f"\n\nThe limits are what can be reached within an episode{cap}.{task}"
 
 
