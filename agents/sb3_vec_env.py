@@ -18,7 +18,7 @@ from ncs_gym.envs.reset_options import CHANNELS
 # Vector environments whose reset takes options={"reset_mask": ...} and resets only the environments in the mask.
 _WITH_RESET_MASK = (NCSVectorEnv, SyncVectorEnv, AsyncVectorEnv)
 # Infos of an episode's last step that become part of info["episode"], as with `Monitor(info_keywords=...)`.
-_EPISODE_KEYS = ("episode_violations", "is_success")
+_EPISODE_KEYS = ("episode_violations", "is_success", "episode_guaranteed")
 # Infos in the dicts of every step, asked for or not: what algorithms for constrained problems read.
 _STEP_KEYS = ("cost",)
 # Attributes that change with the episodes of an `NCSVectorEnv`, but never in its scalar prototype.
@@ -44,10 +44,11 @@ class SB3VecEnv(VecEnv):
     Other NEXT_STEP environments take a step to reset: with `allow_reset_transitions=True` the learner sees that step,
     once per episode, as a transition of reward 0 from the last observation of an episode to the first of the next.
 
-    Like `Monitor` it adds `info["episode"]` (`r`, `l`, `t`) to the last step of an episode, with `episode_violations`
-    and `is_success` where there are such infos. Filling a dict per environment and step is slow. Therefore the dicts
-    hold by default only what the library needs, and `cost` where there is such an info: `batch_info` has all values of
-    the last step as arrays, and `info_keys` names further values to be copied into the dicts.
+    Like `Monitor` it adds `info["episode"]` (`r`, `l`, `t`) to the last step of an episode, with `episode_violations`,
+    `is_success` and `episode_guaranteed` where there are such infos. Filling a dict per environment and step is slow.
+    Therefore the dicts hold by default only what the library needs, and `cost` where there is such an info:
+    `batch_info` has all values of the last step as arrays, and `info_keys` names further values to be copied into the
+    dicts.
 
     Args:
         vector_env: The vector environment.

@@ -10,6 +10,7 @@ from ncs_gym.network.channel import Channel, GilbertElliott, Packet
 from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
 from ncs_gym.network.downlink import Actuator, Command
 from ncs_gym.network.escape_probability import escape_probability
+from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
 from ncs_gym.plants.linear_plant import LinearPlant, NoNoiseWarning
@@ -64,6 +65,7 @@ __all__ = [
     "SphereDisturbance",
     "Task",
     "UnstablePlantError",
+    "UnusedPacketsWarning",
     "VectorRandomChannel",
     "batch_reactor",
     "cart_pole",

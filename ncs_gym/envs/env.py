@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -19,6 +20,7 @@ from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.downlink import DownlinkProtocol, DownlinkState, Inputs, no_inputs
+from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from ncs_gym.network.packet_transmission import ChannelState
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import LinearProcess, Process
@@ -188,6 +190,13 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._downlink_contract = None if self._protocol is None else self._protocol.contract
         patterns = arrival_patterns(plant, self._channel, self._certificate_contract)
         self._error_set = patterns.recursion.error_set
+        if not patterns.uses_samples:
+            warnings.warn(
+                f"no packet is of use: with a quantization step of {self._channel.quantization_step:g} and this sensor "
+                "noise samples move the estimate by less than 1 % of what they differ by, so that it is a prediction",
+                UnusedPacketsWarning,
+                stacklevel=3,
+            )
         self._estimator = Estimator(plant, self._channel, patterns=patterns)
         self._downlink_state = DownlinkState(self._protocol, plant.m)
         self._uplinks, self._downlinks = uplinks([self._channel], self._channel), downlinks([downlink], self._protocol)
@@ -248,7 +257,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self.steps = 0
         self.episodes += 1
         self._violations = 0.0
-        self._consistent = True
+        self._consistent, self._over = True, False
         info = self._info(no_inputs(self._plant.m), arrived=False)
         if self.renderer is not None:
             self.renderer.begin(info, self._task_state)
@@ -259,11 +268,13 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
 
         Raises:
             ValueError: If the action is not finite or wrongly shaped; nothing has moved then.
-            gymnasium.error.ResetNeeded: If there was no reset, or an earlier step failed half-way.
+            gymnasium.error.ResetNeeded: If there was no reset, an earlier step failed half-way, or ended the episode.
         """
         _, decided = read_action(self._plant, action)
         if not self._consistent:
             raise gym.error.ResetNeeded("call reset: there was none, or an earlier step failed half-way")
+        if self._over:
+            raise gym.error.ResetNeeded("the episode is over, as the step before said: call reset")
         self._consistent = False
         rng = self.np_random
         inputs = self._downlink_state.exchange(rng, self.steps, decided)
@@ -278,7 +289,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         reward = float(self._task.reward(self._plant, self._task_state, self._state, u))
         info = self._info(inputs, arrived=bool(packets))
         terminated = self._process.terminated or (self._terminate_on_violation and info["cost"] > 0.0)
-        self._consistent = True
+        self._consistent, self._over = True, terminated or self._process.truncated
         if self.renderer is not None:
             self.renderer.record(info, self._task_state, self._channel_state, packets)
         return self._observation(), reward, terminated, self._process.truncated, info
