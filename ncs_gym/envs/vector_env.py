@@ -10,11 +10,11 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from ncs_gym.envs.env import SAMPLE_ROUNDING, NCSEnv, RenderModeError
+from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, SAMPLE_ROUNDING, NCSEnv, RenderModeError
 from ncs_gym.envs.episode_channels import covering, downlinks, uplinks
 from ncs_gym.envs.info import Constraints, Known, loop_info
 from ncs_gym.envs.reset_options import CHANNELS, vector_reset_options
-from ncs_gym.envs.spaces import read_actions
+from ncs_gym.envs.spaces import entries_within, read_actions
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.error_statistics_table import StatisticsTable
@@ -40,7 +40,7 @@ class NCSVectorEnv(VectorEnv):
 
     Args:
         num_envs: N.
-        max_episode_steps: Truncation; None never truncates.
+        max_episode_steps: Truncation; None never truncates. A `horizon` that is shorter becomes as long.
         autoreset_mode: `AutoresetMode.NEXT_STEP` or "NextStep" (the step after an episode's last ignores the action
             and returns the new episode's first observation), "SameStep" (`final_obs` and `final_info` hold the last
             ones) or "Disabled" (reset with `options={"reset_mask": ...}`).
@@ -102,6 +102,9 @@ class NCSVectorEnv(VectorEnv):
         if settings.get("render_mode") is not None:
             raise RenderModeError("a vector environment draws nothing: use gym.make(..., render_mode=...)")
         own = [self._one_each(each, name) for name, each in zip(CHANNELS, (channel, downlink), strict=True)]
+        if self._max_episode_steps is not None:
+            own_horizon = settings.get("horizon", DEFAULT_HORIZON)
+            settings["horizon"] = max(own_horizon, min(self._max_episode_steps, LONGEST_HORIZON))
         settings |= {name: each and widest(each) for name, each in zip(CHANNELS, own, strict=True)}
         self._single = single = NCSEnv(**settings)
         self._plant, self._channel, self._task = single.plant, single.channel, single.task
@@ -130,7 +133,7 @@ class NCSVectorEnv(VectorEnv):
         self._violations, self._done = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
         self.steps, self.episodes = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, np.int64)
         self.starts = np.full((self.num_envs, self._plant.n), np.nan)
-        self.ticks, self._consistent = 0, False
+        self.ticks, self._consistent, self._warned = 0, False, False
         self._known: Known
         self._ended: tuple[np.ndarray, Known] | None = None
 
@@ -351,10 +354,11 @@ class NCSVectorEnv(VectorEnv):
         task_state = self._task_state
         for u in self._downlink_state.committed.pending:
             task_state = self._task.predict_many(self._plant, task_state, u)
-        entries = np.concatenate([self._belief[0], self._task.observe_many(task_state)])
-        observation = np.empty(entries.shape, np.float32)
-        np.minimum(np.maximum(entries, self._low), self._high, out=observation, casting="same_kind")
-        return observation.T
+        own, bounds = self._task.observe_many(task_state), (self._low, self._high)
+        within, self._warned = entries_within(
+            self._task, self._belief[0], own, *bounds, self._warned, self._single.horizon
+        )
+        return within.astype(np.float32).T
 
     def _info(self, inputs: Inputs, arrived: np.ndarray, counted: np.ndarray | None) -> dict[str, Any]:
         """Returns the infos; the costs of environments that are not `counted`, shape (N,), do not count once more."""

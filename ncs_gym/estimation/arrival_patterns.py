@@ -26,6 +26,8 @@ from ncs_gym.plants.linear_plant import LinearPlant
 MAX_PATTERNS, MAX_NUMBERS = 1 << 17, 1 << 25
 # A graph takes at least this many times the patterns it began with, or it would be forgotten at every step.
 SMALLEST_GROWTH = 4
+# Some sample of these many steps should move an estimate by this share of its distance from the sample.
+FIRST_STEPS, SMALLEST_SHARE = 50, 0.01
 # Of more plants and channels than this, graphs are kept only as long as an estimator uses them.
 MAX_GRAPHS = 32
 
@@ -152,6 +154,16 @@ class ArrivalPatterns:
                 known[number] = self.predicted(number, steps)
             ahead = known.take(statistics)
         return ahead
+
+    @property
+    def uses_samples(self) -> bool:
+        """Whether a sample of one of the first steps moves the estimate towards it, if it arrives at once."""
+        number, H = self.statistics_of(self.root), self.recursion.plant.H
+        for _ in range(FIRST_STEPS):
+            number = self.predicted(number, 1)
+            if np.diagonal(H @ self.update(number).gain).max() >= SMALLEST_SHARE:
+                return True
+        return False
 
     def statistics_of(self, pattern: int) -> int:
         """Returns the number of the statistics of the present estimate."""

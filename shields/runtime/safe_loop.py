@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from enum import Enum, auto
 from functools import wraps
@@ -9,7 +10,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
-from ncs_gym import Channel, ChannelContract, Ellipsoid, Estimator, LinearPlant, Packet
+from ncs_gym import Channel, ChannelContract, Ellipsoid, Estimator, LinearPlant, Packet, UnusedPacketsWarning
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
 from ncs_gym.estimation.first_estimate import first_estimate
 from ncs_gym.network import AppliedInputs, Command, CommittedInputs, Echo, downlink_protocol
@@ -56,7 +57,7 @@ def _transaction(method: Callable[Concatenate[SafeLoop, P], T]) -> Callable[Conc
         before = [(part, part.saved()) for part in parts]
         try:
             return method(loop, *args, **kwargs)
-        except (GuaranteeLostError, GuaranteeLostWarning):  # the latter where warnings are errors
+        except (GuaranteeLostError, GuaranteeLostWarning, UnusedPacketsWarning):  # warnings where they are errors
             raise
         except BaseException:  # Ctrl-C, the timeout of a signal and panics of native code are no Exceptions
             loop._phase = _Phase.STOPPED
@@ -155,7 +156,7 @@ class SafeLoop:
         self._applied = AppliedInputs(self._echo_age)
         # Samples by stamp and inputs, the newest first, from which the state is to be found; None once it is known.
         self._unknown: tuple[dict[int, np.ndarray], tuple[np.ndarray, ...]] | None = None
-        self._discarded = DiscardedPackets()
+        self._discarded, self._told_of_late = DiscardedPackets(), False
         self._phase = _Phase.STOPPED
 
     def __str__(self) -> str:
@@ -271,6 +272,14 @@ class SafeLoop:
         self._discarded = self._discarded.with_those_of(arrived, self.steps, self.episode, oldest)
         self._phase = _Phase.RECEIVED
         estimate = self.estimate
+        if self._discarded.too_late and not self._told_of_late:
+            self._told_of_late = True
+            warnings.warn(
+                f"a packet was discarded: it came later than the {oldest} steps that the channel of this loop delays "
+                "any; give SafeLoop the channel with its longest delay (`discarded` counts such packets)",
+                UnusedPacketsWarning,
+                stacklevel=3,
+            )
         self._lost.tell_of(self.reason)
         return estimate
 

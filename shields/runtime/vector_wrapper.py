@@ -107,7 +107,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             None if inner.downlink_protocol is None else CommittedInputs(self._lead, (inner.plant.m, count))
         )
         self._state = MonitorState(np.full(count, CODES[OTHER_STEPS]), nothing, nothing, np.zeros(count, np.int64))
-        self._interventions = np.zeros(count, np.int64)
+        self._interventions, self._proved = np.zeros((2, count), np.int64)
         # Plans stored in mode "lookahead", NaN beyond their ends.
         self._stored = np.full((self._filter.horizon or 0, inner.plant.m, count), np.nan)
         self._table: Any = None
@@ -152,7 +152,9 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         self._start(restarted, now.steps == 0)
         self._clock = now
         idle = idle._replace(plan=self._stored)
-        info = info | self._info(idle, idle.input, self._state, self._interventions, self._report.age)
+        own = self._info(idle, idle.input, self._state, self._interventions, self._report.age)
+        self._proved = np.where(restarted, own["shield_guaranteed"], self._proved)
+        info = info | own | {"episode_guaranteed": self._proved / (now.steps + 1)}
         self._lost.tell()
         return observation, info
 
@@ -190,7 +192,9 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             charged = charged & ~restarted
             if (ended := self._inner.ended) is not None:  # SAME_STEP: the step ended episodes before it began the next
                 final = info.get("final_info", {})
-                added["final_info"] = self._final_info(final, ended, state, decided, proposed, moved_once, due)
+                added["final_info"] = self._final_info(
+                    final, ended, state, decided, proposed, moved_once, due, before.steps
+                )
                 charged = decided.intervened.copy()
             self._start(restarted, moved_once)
             decided.input[:, restarted], proposed[:, restarted], decided.intervened[restarted] = 0.0, 0.0, False
@@ -199,7 +203,9 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         if self.penalty:
             rewards = rewards - self.penalty * charged
         decided = decided._replace(plan=self._stored)
-        info = info | added | self._info(decided, proposed, self._state, self._interventions, self._report.age)
+        own = self._info(decided, proposed, self._state, self._interventions, self._report.age)
+        self._proved = np.where(restarted, 0, self._proved) + own["shield_guaranteed"]
+        info = info | added | own | {"episode_guaranteed": self._proved / (now.steps + 1)}
         self._lost.tell()
         return observation, rewards, terminated, truncated, info
 
@@ -262,6 +268,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         proposed: np.ndarray,
         moved_once: np.ndarray,
         due: np.ndarray | None,
+        steps: np.ndarray,
     ) -> dict[str, Any]:
         """Returns final_info with the shield's keys of the last steps of episodes that ended (SAME_STEP)."""
         final, (is_done, known) = dict(info), ended
@@ -274,6 +281,8 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         same_input, on_time = as_decided(known, decided.input, None if due is None else due[:, done])
         state = self._monitor.advance(state, decided, moved_once[done], same_input, report, on_time)
         own = self._info(decided, proposed[:, done], state, self._interventions[done], report.age, done)
+        proved = self._proved[done] + own["shield_guaranteed"]
+        own["episode_guaranteed"] = proved / (steps[done] + 2)
         for key, value in own.items():
             final[key] = np.full((self.num_envs, *value.shape[1:]), "" if value.dtype == object else 0, value.dtype)
             final[key][done], final[f"_{key}"] = value, is_done.copy()

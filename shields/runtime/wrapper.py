@@ -61,6 +61,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
     | `shield_guaranteed` | bool | - | whether x in S is proved now (in mode "lookahead": x in the box, to stay) |
     | `shield_reason` | str | - | why it is not; empty while it is |
     | `episode_interventions` | int | steps | number of steps of this episode with `shield_intervened` |
+    | `episode_guaranteed` | float | - | share of the states of this episode, the first included, proved as now |
     | `shield_plan_length` | int | steps | in mode "lookahead" only: number of inputs stored for later steps |
 
     In mode "lookahead" an input passes too if a certified plan that begins with it keeps the state in the box until it
@@ -143,7 +144,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         if start is not self._start:  # decided exactly, which takes longer than a step; starts are read-only
             self._start, self._known = start, starts_known(self._filter, start, self._monitored.lead)
         self._monitored.begin(report, self._known, clock[1] == 0, self._inner.beliefs()[:-1])
-        self._interventions = 0
+        self._interventions = self._proved = 0
         u = np.zeros(self._filter.plant.m)
         margin = self._filter.margin(report.estimate, inner.known.error_shape, u)
         self._clock = clock
@@ -208,6 +209,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
 
     def _info(self, proposed: np.ndarray, applied: np.ndarray, margin: float, *, intervened: bool) -> dict[str, Any]:
         reason = self._monitored.reason
+        self._proved += not reason
         ahead = {} if self._filter.lookahead is None else {"shield_plan_length": self._monitored.plan_length}
         return ahead | {
             "shield_intervened": intervened,
@@ -217,6 +219,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             "shield_guaranteed": not reason,
             "shield_reason": reason,
             "episode_interventions": self._interventions,
+            "episode_guaranteed": self._proved / (self._inner.steps + 1),
         }
 
 
