@@ -21,6 +21,8 @@ from ncs_gym.validation import as_count, as_numbers, read_only, shown
 
 # Stamp of the newest command where none has arrived.
 NEVER = -(2**31)
+# Digest of the inputs before the first step.
+NO_INPUTS = bytes(16)
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,7 @@ def digest_of_inputs(before: bytes, u: np.ndarray | None) -> bytes:
     """Returns 16 bytes that stand for all inputs of an episode so far, given those for all but the last one, (m,).
 
     Args:
-        before: The digest before this step; empty at the start.
+        before: The digest before this step; `NO_INPUTS` at the start.
         u: What was applied; None for a step at which nothing was.
     """
     return blake2b(before + (b"" if u is None else (u + 0.0).astype("<f8").tobytes()), digest_size=16).digest()
@@ -166,6 +168,7 @@ class Actuator:
         u_max: Largest size of each input, a number or shape (m,) [physical units]; None where the plant limits them.
 
     Attributes:
+        lead, inputs: c and m.
         missing: Whether the input applied last was zero because the committed one had not arrived.
         refused: How many commands of this episode were refused.
         echo: What was applied since the start of the episode, for `SafeLoop.receive(echoes=...)`.
@@ -175,8 +178,9 @@ class Actuator:
     """
 
     def __init__(self, lead: int, inputs: int, u_max: Any = None) -> None:
-        self._lead = as_count(lead, "lead", low=0)
-        self._nothing = np.zeros(as_count(inputs, "inputs", low=1))
+        self.lead = as_count(lead, "lead", low=0)
+        self.inputs = as_count(inputs, "inputs", low=1)
+        self._nothing = np.zeros(self.inputs)
         self._limits = np.full_like(self._nothing, np.inf)
         if u_max is not None:
             limits = as_numbers(u_max)
@@ -191,7 +195,7 @@ class Actuator:
         Raises:
             ValueError: If the number of the episode is no whole number from 0 on.
         """
-        self.echo = Echo(0, 0, b"", as_count(episode, "episode", low=0))
+        self.echo = Echo(0, 0, NO_INPUTS, as_count(episode, "episode", low=0))
         self._committed: dict[int, np.ndarray] = {}
         self.missing, self.refused = False, 0
 
@@ -206,10 +210,10 @@ class Actuator:
                 f"commands must be a list of Command(stamp, inputs), empty if nothing arrived, got {shown(commands)}"
             )
         now = self.echo.steps
-        for command in [_as_command(each, (self._lead + 1, len(self._nothing))) for each in commands]:
+        for command in [_as_command(each, (self.lead + 1, len(self._nothing))) for each in commands]:
             if command.episode != self.echo.episode:
                 continue
-            if command.stamp > now + self._lead + 1 or (np.abs(command.inputs) > self._limits).any():
+            if command.stamp > now + self.lead + 1 or (np.abs(command.inputs) > self._limits).any():
                 self.refused += 1
                 continue
             for ahead, u in enumerate(command.inputs, command.stamp):
@@ -219,19 +223,22 @@ class Actuator:
     def apply(self, step: int) -> np.ndarray:
         """Returns the input to apply at a step, shape (m,) [physical units], as a new array.
 
-        Steps that were left out since the last call count as missing.
+        Steps that were left out since the last call count as missing, but for the first c, which are zero by agreement.
 
         Raises:
             ValueError: If the step is no whole number from 0 on.
         """
         step = as_count(step, "step", low=0)
-        committed = self._committed.get(step) if step >= self._lead else self._nothing
+        committed = self._committed.get(step) if step >= self.lead else self._nothing
         self.missing = committed is None
         u = (self._nothing if committed is None else committed).copy()
         steps, missing, digest, episode = self.echo
         if step >= steps:
-            if step > steps:
-                missing, digest = missing + step - steps, digest_of_inputs(digest, None)
+            for _ in range(steps, min(step, self.lead)):
+                digest = digest_of_inputs(digest, self._nothing)
+            left_out = step - max(steps, min(step, self.lead))
+            if left_out > 0:
+                missing, digest = missing + left_out, digest_of_inputs(digest, None)
             self.echo = Echo(step + 1, missing + self.missing, digest_of_inputs(digest, u), episode)
             self._committed = {ahead: each for ahead, each in self._committed.items() if ahead >= step}
         return u
@@ -339,7 +346,9 @@ class AppliedInputs:
     def start(self) -> None:
         """Starts an episode."""
         self.is_other, self._confirmed = False, 0
-        self._digests: tuple[bytes, ...] = (b"",)  # after the newest number of steps, then one step less, and so on
+        self._digests: tuple[bytes, ...] = (
+            NO_INPUTS,
+        )  # after the newest number of steps, then one step less, and so on
 
     def saved(self) -> dict[str, Any]:
         """Returns all that changes, as attributes to be put back."""

@@ -118,6 +118,7 @@ class SafeLoop:
         contract: Channel contract of the certificate; None without one. Behind a downlink it counts c steps more than
             that of the channel.
         lead: c, the number of steps from a decision to its effect; 0 without a downlink.
+        echo_age: The largest age of an echo [steps]; None without echoes.
 
     Raises:
         CertificateError: If the certificate does not verify for the plant.
@@ -128,6 +129,7 @@ class SafeLoop:
     filter: SafetyFilter = setting("filter")
     contract: ChannelContract | None = setting("contract")
     lead: int = setting("lead")
+    echo_age: int | None = setting("echo_age")
 
     def __init__(
         self,
