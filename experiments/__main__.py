@@ -32,6 +32,7 @@ COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
     "evaluate": ("EvaluateSettings", "experiments.commands.evaluate:evaluate", _TRAINING),
     "sweep": ("SweepSettings", "experiments.commands.sweep:sweep", _TRAINING),
     "render": ("RenderSettings", "experiments.commands.render:render", {"render": ("pygame",)}),
+    "loop": ("LoopSettings", "experiments.commands.loop:loop", {}),
     "synthesize": ("SynthesizeSettings", "experiments.commands.synthesize:synthesize", {}),
     "verify": ("VerifySettings", "experiments.commands.verify:verify", {}),
     "attack": ("AttackSettings", "experiments.commands.attack:attack", {}),

@@ -75,7 +75,7 @@ class MonteCarloBatch:
         campaign = self.campaign
         shields = list(_shields(campaign, self.case, self.certificate).values())
         shield = shields[self.index % len(shields)]
-        plant, safe_set = shield.filter.plant, shield.filter.kept_set
+        plant, safe_set = shield.filter.plant, shield.filter.certificate.safe_set
         seeds = np.random.SeedSequence([campaign.seed, zlib.crc32(self.case.encode()), self.index])
         seed, policy_seed = seeds.generate_state(2, np.uint64).tolist()
         rng = np.random.default_rng(policy_seed)

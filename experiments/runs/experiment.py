@@ -38,12 +38,13 @@ def require_trainable(settings: LearningSettings, loop: LoopConfig) -> None:
         training.require_trainable(loop, settings.training_steps, settings.algo, settings.all_hyperparams)
 
 
-def certificate_of(loop: LoopConfig, file: Path | None = None) -> Certificate:
+def certificate_of(loop: LoopConfig, file: Path | None = None, safe_set: str | None = None) -> Certificate:
     """Returns a certificate for the plant of a control loop, under the contract of its channels.
 
     Args:
         loop: The control loop.
         file: File of the certificate, which is verified; None synthesizes one.
+        safe_set: Of one that is synthesized: "polytope", "ellipsoid" or None; see `shields.synthesize`.
 
     Raises:
         ValueError: If the environment cannot have its keyword arguments.
@@ -53,7 +54,7 @@ def certificate_of(loop: LoopConfig, file: Path | None = None) -> Certificate:
     env = ncs_env(loop.single())
     if file is None:
         with synthesis_status() as show:
-            return certificate_for(env.plant, env.certificate_contract, show)
+            return certificate_for(env.plant, env.certificate_contract, show, safe_set)
     certificate = Certificate.load(file)
     require_valid(certificate, env.plant)
     return certificate
@@ -83,6 +84,7 @@ def run_of_arm(
     arm = Arm.of(arm_name, settings.mode)
     training_loop, loop = arm.loops(loop, certificate, settings)
     origin = f"synthesized for plant {certificate.fingerprint} under {certificate.contract}"
+    origin += "" if certificate.polytope is None else " with a polytope"
     return TrainingRun(
         arm=arm.name,
         policy_kind=arm.policy,

@@ -15,6 +15,7 @@ from experiments.settings.learning import (
     LearningSettings,
     TrainSettings,
 )
+from experiments.settings.network_loop import LoopSettings
 from experiments.settings.rendering import RenderSettings
 from experiments.settings.settings_file import config_defaults, save_settings, settings_json
 from experiments.settings.study import StudySettings, SweepSettings
@@ -27,6 +28,7 @@ __all__ = [
     "CompareSettings",
     "EvaluateSettings",
     "LearningSettings",
+    "LoopSettings",
     "RenderSettings",
     "ReproduceSettings",
     "StudySettings",

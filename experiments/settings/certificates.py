@@ -24,7 +24,8 @@ class SynthesizeSettings:
         plant: File of a plant that `LinearPlant.save` wrote, in place of an environment's.
         method: Synthesis method: ours, whose result is verified exactly, or the published one as printed.
         safe_set: What a shield with this certificate keeps: the ellipsoid, or the largest polytope that the same gain
-            keeps in the safe box, which leaves the policy more room.
+            keeps in the safe box, which leaves the policy more room. By default the polytope; the published method has
+            an ellipsoid.
         out: File for the certificate (JSON).
         max_age: Largest measurement age of the channel contract [steps]; by default the environment's contract, none
             for the plant of a file.
@@ -36,7 +37,7 @@ class SynthesizeSettings:
     env: str | None = None
     plant: Path | None = None
     method: Literal["certified", "paper"] = "certified"
-    safe_set: Literal["ellipsoid", "polytope"] = "ellipsoid"
+    safe_set: Literal["polytope", "ellipsoid"] | None = None
     out: Path = Path("certificate.json")
     max_age: int | None = None
     quantization_step: float | None = None

@@ -44,6 +44,7 @@ class LearningSettings:
         intervention_penalty: Subtracted from the training reward per intervention, in arms with "+penalty".
         violation_penalty: Subtracted from the training reward per violating step, in the arm "penalized".
         certificate: Certificate file to use instead of synthesizing one.
+        safe_set: What the shield keeps if its certificate is synthesized: the polytope, or the ellipsoid inside it.
         channel: Changes of the environment's channel: loss, burst_length (mean number of packets lost in a row), delay,
             jitter and send_period [steps], quantization_step, max_consecutive_losses.
         hyperparams: Hyperparameters of the learning algorithm, by their names in stable-baselines3: gamma=0.99
@@ -67,6 +68,7 @@ class LearningSettings:
     intervention_penalty: float = 0.1
     violation_penalty: float = 1.0
     certificate: Path | None = None
+    safe_set: Literal["polytope", "ellipsoid"] = "polytope"
     channel: Assignments = field(default_factory=dict)
     hyperparams: Assignments = field(default_factory=dict)
     conf_file: Path | None = None

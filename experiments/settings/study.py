@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from experiments.settings.backend import BackendSettings
 from experiments.settings.learning import Algorithm, Baselines, LearningSettings, Scenarios
@@ -75,6 +76,7 @@ class StudySettings(BackendSettings):
         arms: Trained arms; see `ncs compare`.
         baselines: Arms in which nothing is trained.
         scenarios: What policies are evaluated under besides "as trained".
+        safe_set: What shields keep: the ellipsoid, as in the published study, or the polytope that other commands take.
         channel_episodes: Episodes per point of the figure about channels; 0 leaves it out.
         page: Also write the page of Markdown to this file, its figures into the folder images beside it, and its
             numbers into the file with the ending .json.
@@ -119,6 +121,7 @@ class StudySettings(BackendSettings):
         "lqr+lookahead",
     )
     scenarios: Scenarios = ("worst-case-disturbance", "worse-channel", "gaussian")
+    safe_set: Literal["polytope", "ellipsoid"] = "ellipsoid"
     channel_episodes: int = 100
     page: Path | None = None
     quote: tuple[Path, ...] = ()

@@ -74,7 +74,7 @@ def trained_agents(settings: CompareSettings) -> dict[str, AgentFiles]:
         ResultsError: If the agents are missing or damaged.
     """
     loop, store = loop_config(settings.env, settings.channel), RunStore(settings.out)
-    certificate = certificate_of(loop, settings.certificate)
+    certificate = certificate_of(loop, settings.certificate, settings.safe_set)
     arms = {Arm.of(name, settings.mode).name for name in settings.arms}
     agents: dict[str, AgentFiles] = {}
     count = min(settings.seeds, MOST_AGENTS)
@@ -134,7 +134,7 @@ def _points(env_id: str) -> list[_Point]:
 def _runs(point: _Point, settings: CompareSettings, agents: Mapping[str, AgentFiles]) -> list[TrainingRun]:
     """Returns the runs at a point; nothing is trained in them."""
     loop = loop_config(settings.env, point.change)
-    certificate = certificate_of(loop, settings.certificate)
+    certificate = certificate_of(loop, settings.certificate, settings.safe_set)
 
     def run(settings: CompareSettings, name: str, index: int) -> TrainingRun:
         return run_of_arm(settings, loop, certificate, name, index, grid_point=point.name)

@@ -85,6 +85,7 @@ def _comparison_settings(settings: StudySettings, env_id: str) -> CompareSetting
         arms=settings.arms,
         baselines=settings.baselines,
         scenarios=settings.scenarios,
+        safe_set=settings.safe_set,
         force=settings.force,
         **backend,
     )
