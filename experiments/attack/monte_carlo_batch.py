@@ -85,7 +85,7 @@ class MonteCarloBatch:
             steps=campaign.batch_steps,
             episodes=campaign.envs,
             unproved=int(np.count_nonzero(~info["shield_guaranteed"])),
-            outside_starts=int(np.count_nonzero(_levels(safe_set, info) > 1.0)),
+            outside_starts=int(np.count_nonzero(safe_set.gauge(info["state"]) > 1.0)),
         )
         kept, broken = np.ones(campaign.envs, np.bool_), np.zeros(campaign.envs, np.bool_)
         for step in range(EPISODE_STEPS):
@@ -93,7 +93,7 @@ class MonteCarloBatch:
             claimed, kept = _claimed_and_kept(info, kept)
             if not campaign.shielded:  # nothing is claimed, and everything counted
                 claimed[:] = True
-            outside, reached = _outside_and_reached(campaign, info, _levels(safe_set, info))
+            outside, reached = _outside_and_reached(campaign, info, safe_set.gauge(info["state"]))
             counts += _step_counts(info, outside, claimed, kept)
             broken |= claimed & (outside.box | (outside.safe_set & (not campaign.looks_ahead)))
             if step >= SETTLING_STEPS:
@@ -174,11 +174,6 @@ def _begin(campaign: Campaign, shield: VectorSafetyShield, seed: int, rng: np.ra
         states = (1.0 - 1e-9) * env.single.initial_set.sample_boundary(rng, count)
         _, info = shield.reset(options={"state": states, "reset_mask": ~info["shield_guaranteed"]})
     return info
-
-
-def _levels(safe_set: Any, info: dict[str, Any]) -> np.ndarray:
-    """Returns how far out the true states are in the set that a shield keeps: 1 on its boundary, shape (N,)."""
-    return safe_set.gauge(info["state"])
 
 
 @lru_cache(maxsize=1)  # a shield's tables may take a hundred megabytes

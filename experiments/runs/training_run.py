@@ -5,11 +5,11 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
 # Counts are numbers that floats and tables hold exactly.
 _LARGEST_COUNT = 2**53
-PolicyKind = Literal["trained", "untrained", "zero input", "K x_hat", "random", "proportional", "lqr"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +61,7 @@ class TrainingRun:
     """
 
     arm: str
-    policy_kind: PolicyKind
+    policy_kind: str
     training_loop: LoopConfig
     loop: LoopConfig
     module: str = ""
@@ -269,7 +268,7 @@ def _judged(run: TrainingRun, result: RunResult) -> Iterator[tuple[str, object, 
 
 def _described(loop: LoopConfig, certificate: str) -> dict[str, Any]:
     """Returns a control loop as JSON values, what belongs to the certificate under the name given to that."""
-    values = {each.name: getattr(loop, each.name) for each in fields(loop)}
+    values = dict(vars(loop))
     for name in ("shield", "filter"):
         values[name] = values[name] and vars(values[name]) | {"certificate": certificate}
     residual = loop.residual_gain is not None
