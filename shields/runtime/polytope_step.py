@@ -16,7 +16,7 @@ from shields.runtime.one_step import FARTHEST, SMALLEST_RADIUS, PredictedErrors,
 from shields.runtime.projection import closest_between
 
 # Entries of an array that are worked on together: as many as a processor keeps near.
-BLOCK = 32_768
+BLOCK = 524_288
 
 
 class PolytopeTest:
