@@ -159,14 +159,18 @@ def _step_counts(info: dict[str, Any], outside: _Outside, claimed: np.ndarray, k
 
 
 def _begin(campaign: Campaign, shield: VectorSafetyShield, seed: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Starts the episodes of a batch and returns their infos.
+    """Starts the episodes of a batch, on the boundary of the safe set, and returns their infos.
 
     In mode "lookahead" half of the starts are drawn from the box; those for which no first plan is certified, of which
     nothing is claimed, are replaced by others on the boundary of the set that episodes start in.
     """
-    if not campaign.looks_ahead:
-        return shield.reset(seed=seed)[1]
     plant, certificate, count = shield.filter.plant, shield.certificate, campaign.envs
+    if not campaign.looks_ahead:
+        polytope, env = certificate.polytope, shield.env.unwrapped
+        assert isinstance(env, NCSVectorEnv)
+        if polytope is None or env.single.downlink is not None:  # behind a downlink the first inputs are zero
+            return shield.reset(seed=seed)[1]
+        return shield.reset(seed=seed, options={"state": (1.0 - 1e-9) * polytope.sample_boundary(rng, count)})[1]
     _, info = shield.reset(seed=seed, options={"state": starts_in_box(rng, plant, certificate, count)})
     if not info["shield_guaranteed"].all():
         env = shield.env.unwrapped
