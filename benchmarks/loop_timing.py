@@ -4,8 +4,7 @@
 
 In real time on a machine that does other things, too: median, 99.9 % and worst case in microseconds, and by how much the
 resident memory has grown since a tenth of the steps. "cold" is a loop that meets every arrival history for the first
-time, "rehearsed" the same one after it ran through the same steps once; the garbage collector is frozen and off, as in
-`ncs loop`.
+time, "rehearsed" another one that runs through the same steps again; the garbage collector is frozen and off.
 """
 
 from __future__ import annotations

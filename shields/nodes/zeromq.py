@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
+from contextlib import suppress
 from typing import Any
 
 import zmq
@@ -52,10 +53,8 @@ class ZmqTransport:
 
     def send(self, data: bytes, to: Any = None) -> None:
         """Sends a message."""
-        try:
+        with suppress(zmq.ZMQError):  # nobody is there
             self._sender.send_multipart([to, data] if self._is_router else [data], zmq.NOBLOCK)
-        except zmq.ZMQError:  # nobody is there
-            pass
 
     def received(self) -> list[Datagram]:
         """Returns what arrived since the last call."""
