@@ -2,7 +2,7 @@
 
     python benchmarks/loop_timing.py [--steps 100000]
 
-In real time on a machine that does other things, too: median, 99.9 % and worst case in microseconds, and by how much the
+In real time, whatever else the machine does: median, 99.9 % and worst case in microseconds, and by how much the
 resident memory has grown since a tenth of the steps. "cold" is a loop that meets every arrival history for the first
 time, "rehearsed" another one that runs through the same steps again; the garbage collector is frozen and off.
 """
