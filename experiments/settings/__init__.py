@@ -3,8 +3,8 @@
 from experiments.settings.assignments import Assignments
 from experiments.settings.backend import BackendSettings
 from experiments.settings.certificates import (
+    AttackSettings,
     AuditSettings,
-    CertifySettings,
     ReproduceSettings,
     SynthesizeSettings,
     VerifySettings,
@@ -23,9 +23,9 @@ from experiments.settings.study import StudySettings, SweepSettings
 
 __all__ = [
     "Assignments",
+    "AttackSettings",
     "AuditSettings",
     "BackendSettings",
-    "CertifySettings",
     "CompareSettings",
     "EvaluateSettings",
     "LearningSettings",

@@ -47,6 +47,7 @@ class Estimator:
         channel: Gives the quantizer's error and the longest delay, hence the replay buffer.
         error_set: E(Sigma) with its rate; computed from the plant by default.
         patterns: A graph of the caller's in place of the shared one.
+        after: An estimator whose episodes are counted on.
 
     Attributes:
         step: Steps since the start of the episode.
@@ -70,6 +71,7 @@ class Estimator:
         channel: Channel,
         error_set: ErrorSet | None = None,
         patterns: ArrivalPatterns | None = None,
+        after: Estimator | None = None,
     ) -> None:
         self._plant, self._channel, self._buffer = plant, channel, channel.longest_delay
         if patterns is None:
@@ -84,7 +86,7 @@ class Estimator:
         if ages is not None and not ages.contract.is_fine_enough_for(channel):
             raise ValueError(f"the channel rounds more coarsely than the contract of the error set: {ages.contract}")
         self._limit = plant.state_limit if np.isfinite(plant.state_limit).all() else None
-        self.episode, self._is_new = 0, True
+        self.episode, self._is_new = (0, True) if after is None else (after.episode, after._is_new)
         self._begin(np.zeros(plant.n))
 
     def saved(self) -> dict[str, Any]:

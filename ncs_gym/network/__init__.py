@@ -19,7 +19,7 @@ from ncs_gym.network.downlink import (
     downlink_protocol,
 )
 from ncs_gym.network.escape_probability import escape_probability
-from ncs_gym.network.packet_reception import DiscardedPackets
+from ncs_gym.network.packet_reception import DiscardedPackets, UnusedPacketsWarning
 from ncs_gym.network.packet_transmission import ChannelState
 
 __all__ = [
@@ -36,6 +36,7 @@ __all__ = [
     "Echo",
     "GilbertElliott",
     "Packet",
+    "UnusedPacketsWarning",
     "contract_of",
     "downlink_protocol",
     "escape_probability",

@@ -6,7 +6,7 @@ directions").
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from hashlib import blake2b
 from operator import index
@@ -98,6 +98,20 @@ def downlink_protocol(downlink: Channel | None, contract: ChannelContract | None
         )
     lead = downlink.longest_delay if contract is None else contract.max_age
     return DownlinkProtocol(downlink, lead, contract)
+
+
+def require_fitting_downlink(protocol: DownlinkProtocol | None, downlink: Channel) -> None:
+    """Returns if a downlink may take the place of a protocol's, whose c and contract stay; it may break the contract.
+
+    Raises:
+        ValueError: If there is no downlink to take the place of, or what is given is none, or delays commands by more
+            than c steps.
+    """
+    if protocol is None:
+        raise ValueError(
+            "the environment has an ideal downlink, and commits no inputs ahead: make it with downlink=Channel(...)"
+        )
+    downlink_protocol(downlink, ChannelContract(protocol.lead))
 
 
 class Command(NamedTuple):
@@ -399,8 +413,9 @@ class DownlinkState:
         self._actuator, self.committed = Actuator(lead, inputs), CommittedInputs(lead, inputs)
         self.in_flight: ChannelState
 
-    def begin(self, rng: np.random.Generator, episode: int = 0) -> None:
-        """Starts an episode."""
+    def begin(self, rng: np.random.Generator, episode: int = 0, channel: Channel | None = None) -> None:
+        """Starts an episode, over another channel than that of the protocol if one is given."""
+        self._channel = channel or self._channel
         if self._channel is not None:
             self.in_flight, self._episode = ChannelState(self._channel, rng), episode
             self._actuator.start(episode)
@@ -438,14 +453,20 @@ class VectorDownlinkState:
         self._newest, self._on_time = np.full(size, NEVER, np.int64), np.zeros(size, np.bool_)
         self._channel_state: VectorChannelState
 
-    def begin(self, rng: np.random.Generator, chosen: np.ndarray) -> None:
-        """Starts episodes in some environments, given by a mask of shape (N,)."""
+    def begin(self, rng: np.random.Generator, chosen: np.ndarray, channels: Sequence[Channel] | None = None) -> None:
+        """Starts episodes in some environments, given by a mask of shape (N,).
+
+        Args:
+            rng: Source of randomness.
+            chosen: The mask.
+            channels: Those of all N environments from now on, the others' being as before; None for all as before.
+        """
         if self._channel is None:
             return
         if chosen.all():
-            self._channel_state = VectorChannelState(self._channel, rng, self._size)
+            self._channel_state = VectorChannelState(channels or self._channel, rng, self._size)
         else:
-            self._channel_state.begin(rng, chosen)
+            self._channel_state.begin(rng, chosen, channels)
         self._newest[chosen] = NEVER
         self.committed.start(chosen)
 

@@ -73,6 +73,8 @@ class LoopObservation(NamedTuple):
 class GuaranteeMonitor:
     """Whether x in S is proved now, and why not (docs/shield.md, "How you see that an assumption broke").
 
+    S is the certificate's safe set: its polytope, or its ellipsoid if it has none.
+
     In mode "lookahead" it is whether x is in the box now and stays there: "in S, or in the box with a certified tail
     stored". Whoever hands the store from decision to decision drops it where the input applied is another one.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from enum import Enum, auto
 from functools import wraps
@@ -9,7 +10,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
-from ncs_gym import Channel, ChannelContract, Ellipsoid, Estimator, LinearPlant, Packet
+from ncs_gym import Channel, ChannelContract, Ellipsoid, Estimator, LinearPlant, Packet, UnusedPacketsWarning
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
 from ncs_gym.estimation.first_estimate import first_estimate
 from ncs_gym.network import AppliedInputs, Command, CommittedInputs, Echo, downlink_protocol
@@ -56,7 +57,7 @@ def _transaction(method: Callable[Concatenate[SafeLoop, P], T]) -> Callable[Conc
         before = [(part, part.saved()) for part in parts]
         try:
             return method(loop, *args, **kwargs)
-        except (GuaranteeLostError, GuaranteeLostWarning):  # the latter where warnings are errors
+        except (GuaranteeLostError, GuaranteeLostWarning, UnusedPacketsWarning):  # warnings where they are errors
             raise
         except BaseException:  # Ctrl-C, the timeout of a signal and panics of native code are no Exceptions
             loop._phase = _Phase.STOPPED
@@ -85,11 +86,12 @@ class SafeLoop:
     `start`; a packet carries the number of the step at which its sample was taken, and that of the episode.
 
     The guarantee is that of `SafetyShield`, under the same assumptions (docs/shield.md): `guaranteed` says whether the
-    state is proved to be in S at this step, `reason` why not, `print(loop)` both. What the loop cannot see is that the
-    clock misses a step, that the actuator applies something else (unless it is told, or hears `echoes`), or that
-    packets carry wrong stamps. A certificate under a channel contract brings its error sets along. Not for use by
-    several threads at once. A loop can be pickled between two calls, and goes on from there where it is loaded.
-    Where `start`, `receive` or `decide` is interrupted, by whatever it may be, nothing has happened: call it again.
+    state is proved to be in the certificate's safe set S at this step, `reason` why not, `print(loop)` both. What the
+    loop cannot see is that the clock misses a step, that the actuator applies something else (unless it is told, or
+    hears `echoes`), or that packets carry wrong stamps. A certificate under a channel contract brings its error sets
+    along. Not for use by several threads at once. A loop can be pickled between two calls, and goes on from there
+    where it is loaded. Where `start`, `receive` or `decide` is interrupted, by whatever it may be, nothing has
+    happened: call it again.
 
     Behind a downlink that is late or loses commands, send `command` after each `decide` instead, and let an
     `ncs_gym.Actuator` apply what it holds (docs/contracts.md, "Both directions"). What is decided takes effect `lead`
@@ -156,7 +158,7 @@ class SafeLoop:
         self._applied = AppliedInputs(self._echo_age)
         # Samples by stamp and inputs, the newest first, from which the state is to be found; None once it is known.
         self._unknown: tuple[dict[int, np.ndarray], tuple[np.ndarray, ...]] | None = None
-        self._discarded = DiscardedPackets()
+        self._discarded, self._told_of_late = DiscardedPackets(), False
         self._phase = _Phase.STOPPED
 
     def __str__(self) -> str:
@@ -272,6 +274,14 @@ class SafeLoop:
         self._discarded = self._discarded.with_those_of(arrived, self.steps, self.episode, oldest)
         self._phase = _Phase.RECEIVED
         estimate = self.estimate
+        if self._discarded.too_late and not self._told_of_late:
+            self._told_of_late = True
+            warnings.warn(
+                f"a packet was discarded: it came later than the {oldest} steps that the channel of this loop delays "
+                "any; give SafeLoop the channel with its longest delay (`discarded` counts such packets)",
+                UnusedPacketsWarning,
+                stacklevel=3,
+            )
         self._lost.tell_of(self.reason)
         return estimate
 
