@@ -3,7 +3,15 @@
 None of them comes with a proof under estimation errors, so none reports `shield_guaranteed`.
 """
 
-from experiments.baselines.controllers import CONTROLLERS, controller
+from experiments.baselines.controllers import CONTROLLERS, REGULATORS, RegulatorWeights, controller
 from experiments.baselines.estimate_filter import FILTERS, EstimateFilter, EstimateFilterSettings
 
-__all__ = ["CONTROLLERS", "FILTERS", "EstimateFilter", "EstimateFilterSettings", "controller"]
+__all__ = [
+    "CONTROLLERS",
+    "FILTERS",
+    "REGULATORS",
+    "EstimateFilter",
+    "EstimateFilterSettings",
+    "RegulatorWeights",
+    "controller",
+]
