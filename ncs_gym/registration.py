@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -78,7 +78,7 @@ class Factory:
     plant: Callable[[], LinearPlant] | None
     channel: Channel
     task: Task
-    disturbance: Disturbance = BallDisturbance()
+    disturbance: Disturbance = field(default_factory=BallDisturbance)
     terminates: bool = False
     start: float | None = None
     process: Process | None = None
@@ -199,8 +199,8 @@ BATCH_REACTOR_CHANNEL = Channel(loss=0.2, delay=1, max_consecutive_losses=2, qua
 PENDULUM_CHANNEL = Channel(loss=0.3, max_consecutive_losses=2)
 
 
-# Where the network decides (docs/results.md): a sample per step, one step late, 40 % of which are lost, for the tank never
-# more than five in a row, for the vehicles seven. What disturbs them keeps its sign for half a period.
+# Where the network decides (docs/results.md): a sample per step, one step late, 40 % of which are lost, for the tank
+# never more than five in a row, for the vehicles seven. What disturbs them keeps its sign for half a period.
 CSTR_CHANNEL = Channel(loss=0.4, delay=1, max_consecutive_losses=5, quantization_step=0.1)
 CONVOY_CHANNEL = Channel(loss=0.4, delay=1, max_consecutive_losses=7, quantization_step=0.05)
 LANE_CHANNEL = replace(CONVOY_CHANNEL, quantization_step=0.002)

@@ -25,14 +25,15 @@ class PredictiveFilter:
         min |u_0 - proposed|^2  s.t.  x_{i+1} = A x_i + B u_i,  |u_i| <= u_max,
                                       |c_j x_i| <= 1 - t_ij (0 < i < N),  |x_N|_M <= 1 - t_N.
 
-    The tightenings t are zero, a margin, the same for all, or those of a tube: with u_i + K (x_hat_i - x_i) applied, the
-    true state is off x_i by (A+BK)^i e_0 + sum_j (A+BK)^j (B K e + d), each term as large as the certificate's error
-    sets and the plant's disturbance let it be. Where the proposed input followed by u = K x is such a plan already, nothing is solved. Where the program has no
-    solution, the rest of the last plan is applied, as the authors do, and u = K x_hat when it is used up.
+    The tightenings t are zero, a margin, the same for all, or those of a tube: with u_i + K (x_hat_i - x_i) applied,
+    the true state is off x_i by (A+BK)^i e_0 + sum_j (A+BK)^j (B K e + d), each term as large as the certificate's
+    error sets and the plant's disturbance let it be. Where the proposed input followed by u = K x is such a plan
+    already, nothing is solved. Where the program has no solution, the rest of the last plan is applied, as the authors
+    do, and u = K x_hat when it is used up.
 
     Wabersich and Zeilinger: "Linear model predictive safety certification for learning-based control" (2018) and "A
-    predictive safety filter for learning-based control of constrained nonlinear dynamical systems" (2021), both of which
-    tighten; the tube of an estimate is that of Mayne et al., "Robust output feedback model predictive control of
+    predictive safety filter for learning-based control of constrained nonlinear dynamical systems" (2021), both of
+    which tighten; the tube of an estimate is that of Mayne et al., "Robust output feedback model predictive control of
     constrained linear systems" (2006).
 
     Args:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -18,7 +18,7 @@ from agents.hyperparams import rollout_steps
 from agents.loop import LoopConfig
 from agents.results import Episode, TrainingPoint, Trajectory
 from agents.sharing.agent_file import write_files
-from experiments.baselines import controller
+from experiments.baselines import controller, tuned_weights
 from experiments.runs.environments import import_module, module_digest
 from experiments.runs.evaluation_conditions import AS_TRAINED, under
 from experiments.runs.provenance import versions
@@ -29,7 +29,8 @@ from shields.json_documents import digest
 if TYPE_CHECKING:
     from agents.agent import Agent
 
-PolicyKind = Literal["trained", "untrained", "zero input", "K x_hat", "random", "proportional", "lqr"]
+# "trained", "untrained", or a name in `experiments.baselines.CONTROLLERS` or `REGULATORS`.
+PolicyKind = str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +40,7 @@ class TrainingRun:
     Attributes:
         arm: Name of the arm that the run belongs to.
         policy_kind: "trained" is a trained agent; "untrained" an agent with its initial weights; the others are
-            controllers (`experiments.baselines.CONTROLLERS`).
+            controllers (`experiments.baselines.CONTROLLERS` and `REGULATORS`).
         training_loop: Control loop that the policy is trained in, with its penalties.
         loop: Control loop that the policy is evaluated in.
         module: Module of the user's that registers the environment, imported where the run is executed; empty for none.
@@ -234,4 +235,5 @@ def _policy(run: TrainingRun, agent: Agent | None) -> Policy:
     """Returns what acts in the evaluation of a run: an agent, or for None the run's controller, which begins anew."""
     if agent is not None:
         return lambda observations, infos: agent.act(observations)
-    return controller(run.policy_kind, ncs_env(run.loop.single()), run.certificate.K, run.evaluation_seed)
+    weights = tuned_weights(run.loop.env, run.arm)
+    return controller(run.policy_kind, ncs_env(run.loop.single()), run.certificate.K, run.evaluation_seed, weights)

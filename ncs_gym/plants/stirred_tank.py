@@ -15,8 +15,8 @@ def stirred_tank(dt: float = 3.0, **bounds: Any) -> LinearPlant:
 
     x = (concentration [0.01 mol/L], temperature [K]) and u the temperature of the coolant [K], |u| <= 20, all in
     deviations from the operating point. An exothermic reaction heats what it is sped up by: left alone, deviations grow
-    by a factor of 2.7 in 21 s (a pole at +2.83/min). Safe box 10 and 5 K. What comes in is up to 2 K/min too warm or too
-    cold; both states are measured to within 0.02 of their units.
+    by a factor of 2.7 in 21 s (a pole at +2.83/min). Safe box 10 and 5 K. What comes in is up to 2 K/min too warm or
+    too cold; both states are measured to within 0.02 of their units.
 
     Seborg, Edgar, Mellichamp and Doyle: "Process Dynamics and Control", the reactor of chapter 2.
 

@@ -19,8 +19,8 @@ BY_NAME: dict[str, type[Disturbance]] = {
     "sphere": SphereDisturbance,
     "adversarial": AdversarialDisturbance,
 }
-# How the noise of a plant may be drawn: inside the bounds that its covariances are truncated at, without a bound, or with
-# sensor noise and first errors on their bounds.
+# How the noise of a plant may be drawn: inside the bounds that its covariances are truncated at, without a bound, or
+# with sensor noise and first errors on their bounds.
 NOISES = ("truncated", "gaussian", "extreme")
 
 
@@ -57,8 +57,8 @@ def as_noise(value: Any, plant: LinearPlant) -> str:
 
     "gaussian" draws what a covariance describes, which is process noise, sensor noise and first error, from the
     Gaussian itself. What is bounded by declaration (`gamma`, `disturbance_bound`, `sensor_bound`, `initial_bound`) has
-    no distribution beyond its bound and stays inside. "extreme" draws sensor noise and first errors in random directions
-    on the boundary of what is assumed of them.
+    no distribution beyond its bound and stays inside. "extreme" draws sensor noise and first errors in random
+    directions on the boundary of what is assumed of them.
 
     Raises:
         ValueError: If it is another value, or "gaussian" for a plant without any covariance.

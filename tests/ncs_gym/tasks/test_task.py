@@ -116,16 +116,8 @@ def test_farthest_equilibrium_is_that_of_a_search_over_all_inputs():
     rng = np.random.default_rng(3)
     for _ in range(10):
         A, B = 0.5 * rng.standard_normal((3, 3)), rng.standard_normal((3, 2))
-        plant = LinearPlant(
-            A=A,
-            B=B,
-            box=rng.uniform(0.5, 2.0, 3),
-            u_max=[1.0, 2.0],
-            dt=1.0,
-            gamma=1e-6,
-            sensor_bound=0,
-            initial_bound=0,
-        )
+        known = {"gamma": 1e-6, "sensor_bound": 0, "initial_bound": 0}
+        plant = LinearPlant(A=A, B=B, box=rng.uniform(0.5, 2.0, 3), u_max=[1.0, 2.0], dt=1.0, **known)
         to_state, output = np.linalg.solve(np.eye(3) - A, B), rng.standard_normal(3)
         angles = np.linspace(0.0, 2.0 * np.pi, 20_001)
         inputs = np.stack([np.cos(angles), np.sin(angles)])
