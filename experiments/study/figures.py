@@ -62,8 +62,8 @@ def runs_figure(summary: dict[str, Any]) -> CaptionedFigure:
         summary: What `study_summary` returns.
     """
     caption = (
-        "Violating episodes under attack, by training run. Small dots are runs, markers their mean, bars 95 % intervals "
-        "over runs and episodes."
+        "Violating episodes under attack, by training run. Small dots are runs, markers their mean, bars 95 % "
+        "intervals over runs and episodes."
     )
 
     def draw(axis: Axes, style: ArmStyle, arm: dict[str, Any], height: int) -> None:
@@ -83,8 +83,8 @@ def training_figure(summary: dict[str, Any]) -> CaptionedFigure:
         summary: What `study_summary` returns.
     """
     caption = (
-        "Violating steps while the agents learned, on a scale that is linear up to 1 and logarithmic beyond. Small dots "
-        "are runs, markers their mean. These violations do not appear in the evaluation."
+        "Violating steps while the agents learned, on a scale that is linear up to 1 and logarithmic beyond. Small "
+        "dots are runs, markers their mean. These violations do not appear in the evaluation."
     )
 
     def draw(axis: Axes, style: ArmStyle, arm: dict[str, Any], height: int) -> None:
