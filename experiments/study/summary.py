@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.analysis.statistics import CONFIDENCE, clopper_pearson, hierarchical_interval
+from experiments.baselines import MARGINS
 from experiments.runs.arms import Arm
 from experiments.runs.evaluation_conditions import AS_TRAINED
 
@@ -180,11 +181,5 @@ def margins_needed(env: Mapping[str, Any], family: str, scenario: str) -> str | 
 
 def members(env: Mapping[str, Any], family: str) -> Sequence[str]:
     """Returns the arms of a family that an environment has, the smallest margin first."""
-
-    def margin(name: str) -> str:
-        return name.removeprefix(family).removeprefix(":")
-
-    found = [
-        name for name in env["arms"] if name == family or (name.startswith(f"{family}:") and margin(name).isdigit())
-    ]
-    return sorted(found, key=lambda name: int(margin(name) or 0))
+    names = {0: family} | {margin: f"{family}:{margin}" for margin in MARGINS}
+    return [names[margin] for margin in sorted(names) if names[margin] in env["arms"]]
