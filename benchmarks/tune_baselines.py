@@ -54,7 +54,7 @@ def main() -> None:
     chosen: dict[str, dict[str, dict[str, float]]] = {}
     for env_id in options.env:
         env = ncs_env(LoopConfig(env=env_id).single())
-        certificate = certificate_for(env.plant, env.certificate_contract)
+        certificate = certificate_for(env.plant, env.certificate_contract, safe_set="ellipsoid")
         for arm in REGULATED_ARMS:
             returns = []
             for weights in GRID:

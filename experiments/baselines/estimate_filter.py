@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 
+from experiments.baselines.certainty_equivalent import CertaintyEquivalentFilter
 from experiments.baselines.margins import MARGINS
 from experiments.baselines.predictive import TUBE_HORIZON, PredictiveFilter
-from experiments.baselines.trusting import TrustingFilter
 from ncs_gym import NCSVectorEnv
 from shields import Certificate
 
@@ -21,8 +21,8 @@ Rule = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 # How each filter is made from a certificate and its plant.
 _NOMINAL: dict[str, Callable[..., Rule]] = {
-    "trusting": TrustingFilter,
-    "trusting:lookahead": partial(TrustingFilter, mode="lookahead"),
+    "trusting": CertaintyEquivalentFilter,
+    "trusting:lookahead": partial(CertaintyEquivalentFilter, mode="lookahead"),
     "psf": PredictiveFilter,
 }
 # Also with margins in percent of the safe set, as in "psf:10", and with a tube.

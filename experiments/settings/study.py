@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from experiments.baselines.margins import MARGINS
 from experiments.settings.backend import BackendSettings
-from experiments.settings.learning import Algorithm, LearningSettings
+from experiments.settings.learning import Algorithm, Baselines, LearningSettings, Scenarios
 from experiments.settings.steps import StepCount
 
 # Environments in which the network decides.
@@ -70,7 +71,7 @@ class SweepSettings(BackendSettings, LearningSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class StudySettings(BackendSettings):
-    """Compares arms in several environments and under several conditions, with the statistics to judge them by.
+    """Compares arms in several environments and under several scenarios, with the statistics to judge them by.
 
     Every environment is a comparison of its own (`ncs compare`) in a folder below the output folder, with the settings
     of that command; then linear controllers and trained agents are attacked with every impairment of the channel on and
@@ -85,11 +86,13 @@ class StudySettings(BackendSettings):
         seed: Seed of the study, >= 0.
         seeds: Number of paired training runs per arm and environment.
         budget: Fraction of the training steps of each environment, in (0, 1].
-        episodes: Evaluation episodes per run and condition.
+        episodes: Evaluation episodes per run and scenario.
         algo: Learning algorithm.
         arms: Trained arms; see `ncs compare`.
-        references: Arms in which nothing is trained.
-        conditions: What policies are evaluated under besides "as trained".
+        baselines: Arms in which nothing is trained.
+        scenarios: What policies are evaluated under besides "as trained".
+        safe_set: What shields keep: the ellipsoid, which the filters beside them have too, or the polytope that other
+            commands take.
         channel_episodes: Episodes per arm and combination of impairments; 0 leaves them out.
         page: Also write the page of Markdown to this file, its figures into the folder images beside it, and its
             numbers into the file with the ending .json.
@@ -108,8 +111,9 @@ class StudySettings(BackendSettings):
     episodes: int = 100
     algo: Algorithm = "PPO"
     arms: tuple[str, ...] = ("unshielded", "penalized:10", "lagrangian", "trusting:20", "shielded", "lookahead")
-    references: tuple[str, ...] = REGULATED_ARMS
-    conditions: tuple[str, ...] = ("ideal-channel", "worse-channel", "attacked", "attacked-on-an-ideal-channel")
+    baselines: Baselines = REGULATED_ARMS
+    scenarios: Scenarios = ("ideal-channel", "worse-channel", "attacked", "attacked-on-an-ideal-channel")
+    safe_set: Literal["polytope", "ellipsoid"] = "ellipsoid"
     channel_episodes: int = 100
     page: Path | None = None
     quote: tuple[Path, ...] = ()

@@ -68,7 +68,7 @@ def trained_agents(settings: CompareSettings) -> dict[str, AgentFiles]:
         ResultsError: If the agents are missing or damaged.
     """
     loop, store = loop_config(settings.env, settings.channel), RunStore(settings.out)
-    certificate = certificate_of(loop, settings.certificate)
+    certificate = certificate_of(loop, settings.certificate, settings.safe_set)
     arms = {Arm.of(name, settings.mode).name for name in settings.arms}
     agents: dict[str, AgentFiles] = {}
     count = min(settings.seeds, MOST_AGENTS)
@@ -100,7 +100,7 @@ def channel_switches(settings: CompareSettings, agents: Mapping[str, AgentFiles]
         ClusterError: If a cluster cannot execute the runs.
         OSError: If the folder cannot be written.
     """
-    settings = replace(settings, conditions=(ATTACKED,))
+    settings = replace(settings, scenarios=(ATTACKED,))
     points = [on for count in range(len(SWITCHES) + 1) for on in combinations(SWITCHES, count)]
     runs_at = {on: _runs(on, settings, agents) for on in points}
     results = iter(results_of([run for runs in runs_at.values() for run in runs], settings.out, settings))
@@ -134,7 +134,7 @@ def _runs(on: Sequence[str], settings: CompareSettings, agents: Mapping[str, Age
     """Returns the runs with some impairments on; nothing is trained in them."""
     env = registered_env(settings.env)
     loop = loop_config(settings.env, switched(env.channel, env.contract, on))
-    certificate, point = certificate_of(loop, settings.certificate), "-".join(on) or "ideal"
+    certificate, point = certificate_of(loop, settings.certificate, settings.safe_set), "-".join(on) or "ideal"
 
     def run(settings: CompareSettings, name: str, index: int) -> TrainingRun:
         return run_of_arm(settings, loop, certificate, name, index, grid_point=point)

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from experiments.plots.arm_style import ArmStyle
 from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below, thousands
-from experiments.runs.evaluation_conditions import AS_TRAINED
+from experiments.runs.scenarios import AS_TRAINED
 from experiments.study.summary import ATTACKED
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from experiments.analysis.terminal_text import text_table
-from experiments.runs.evaluation_conditions import AS_TRAINED
+from experiments.runs.scenarios import AS_TRAINED
 from experiments.study.channel_switches import SWITCHES
 from experiments.study.summary import ATTACKED, FAMILIES, IDEAL, margins_needed, members
 
