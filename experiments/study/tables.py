@@ -79,7 +79,8 @@ def margins_table(summary: dict[str, Any]) -> str:
     rows = [["margin without a violation", "as trained", "return", "attacked", "return", "lost, ideal"]]
     for title, env in summary["environments"].items():
         for family, sound in FAMILIES.items():
-            if not members(env, family) or sound not in env["arms"]:
+            known = {name for arm in env["arms"].values() for name in arm["scenarios"]}
+            if not members(env, family) or sound not in env["arms"] or not {IDEAL, ATTACKED} <= known:
                 continue
             cells, lost = [], "-"
             for scenario in (AS_TRAINED, ATTACKED):
