@@ -105,10 +105,10 @@ def _attacked(loop: LoopConfig) -> LoopConfig:
 
 
 _CHANGES: dict[str, Callable[[LoopConfig], LoopConfig]] = {
-    "ideal channel": _on_ideal_channel,
-    "attacked": _attacked,
-    "attacked on an ideal channel": lambda loop: _on_ideal_channel(_attacked(loop)),
     "worst-case disturbance": lambda loop: loop.with_kwargs(disturbance="adversarial"),
     "worse channel": _on_worse_channel,
     "gaussian": lambda loop: loop.with_kwargs(noise="gaussian"),
+    "ideal channel": _on_ideal_channel,
+    "attacked": _attacked,
+    "attacked on an ideal channel": lambda loop: _on_ideal_channel(_attacked(loop)),
 }
