@@ -12,6 +12,7 @@ import numpy as np
 
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
 from ncs_gym.validation import read_only
+from shields.runtime.between_samples import GridTest, grid_test
 from shields.runtime.one_step import SMALLEST_RADIUS, OneStepTest, predicted_errors
 
 # Error shapes whose tightenings are remembered; they recur, since they depend only on what arrived when.
@@ -36,8 +37,8 @@ class PlanTest:
     def __init__(self, prediction: Prediction, margin: float) -> None:
         self.prediction, self._margin = prediction, margin
         plant, ends = prediction.plant, prediction.ends
-        self._rows = plant.box_rows
-        sizes = np.abs(plant.box_rows) @ prediction.size_free
+        self._rows = prediction.box_rows
+        sizes = np.abs(prediction.box_rows) @ prediction.size_free
         self._row_rounding = (prediction.rounding[:, None, None] * sizes).reshape(-1, plant.n).T
         self._end_rounding = np.array([end.rounding * end.columns for end in ends]).T
         # Where in the table the tightenings of a shape are.
@@ -98,6 +99,8 @@ class PlanTest:
         box, radius = self.room(estimates, tightening)
         values, weighted = self.judged(estimates, tightening, plans)
         kept = _kept(values, weighted, box.transpose(1, 2, 0)[..., None], radius.T[..., None])
+        if self.prediction.grid is not None:
+            kept &= self.prediction.grid.keeps(estimates, tightening.between, plans, self._margin)
         return kept.transpose(1, 2, 0) & self._within_limits(plans)
 
     def _within_limits(self, plans: np.ndarray) -> np.ndarray:
@@ -108,7 +111,7 @@ class PlanTest:
     @np.errstate(all="ignore")
     def knows_in_box(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
         """Returns whether |c_i x_hat| + sqrt(c_i Sigma_k c_i') <= 1 for all rows, which proves that x is in the box."""
-        rows, extents = self.prediction.plant.box_rows, np.sqrt(np.diag(error_shape))
+        rows, extents = self.prediction.box_rows, np.sqrt(np.diag(error_shape))
         rounding = float(self.prediction.rounding[0])
         size = np.abs(rows) @ extents
         reach = np.sqrt(np.maximum(((rows @ error_shape) * rows).sum(axis=1), 0.0) + rounding * size**2)
@@ -144,6 +147,8 @@ class Prediction:
     Attributes:
         plant: The plant.
         steps: N.
+        box_rows: Rows of the box, shape (k, n); closer ones where it counts between samples, too (`GridTest`).
+        grid: What is asked between samples then; None where only these count.
         free: A^j, shape (N, n, n).
         forced: Block rows [A^{j-1} B, ..., B, 0, ...], shape (N, n, N m).
         size_free: |A|^j, shape (N, n, n).
@@ -154,7 +159,7 @@ class Prediction:
 
     def __init__(self, first: OneStepTest, steps: int) -> None:
         plant, n, m = first.plant, first.plant.n, first.plant.m
-        self.plant, self.steps = plant, steps
+        self.plant, self.steps, self.box_rows = plant, steps, grid_test(plant).at_samples
         powers, sizes = [np.eye(n)], [np.eye(n)]
         for _ in range(steps):
             powers.append(plant.A @ powers[-1])
@@ -169,6 +174,7 @@ class Prediction:
         self.size_forced = read_only(np.cumsum(pushes, axis=0))
         self.rounding = read_only(8.0 * (n + m) * (np.arange(1, steps + 1) + 2.0) * float(np.finfo(float).eps))
         self.ends = tuple(EndTest(first, self, j) for j in range(steps))
+        self.grid = None if plant.grid_rows is None else PlanGrid(self, grid_test(plant))
         self._free = np.ascontiguousarray(self.free.reshape(steps * n, n))
         self._forced = np.ascontiguousarray(self.forced.reshape(steps * n, steps * m))
 
@@ -183,6 +189,64 @@ class Prediction:
         pushed = (self._forced @ plans.reshape(count * number, -1).T).reshape(-1, count, number)
         moved = (self._free @ estimates.T)[..., None] + pushed
         return moved.reshape(self.steps, self.plant.n, count, number)
+
+
+class PlanGrid:
+    """The rows of the grid in every step of a plan, i = 0..N-1: |row (A_tau c_i + B_tau u_i)| + rho_i <= 1.
+
+    Args:
+        prediction: Of the plant, without its grid.
+        test: Rows of one step.
+
+    Attributes:
+        free: Rows on x_hat, shape (N, g, n).
+        forced: Rows on a plan, shape (N, g, N m).
+    """
+
+    def __init__(self, prediction: Prediction, test: GridTest) -> None:
+        steps, m, n = prediction.steps, prediction.plant.m, prediction.plant.n
+        self._shape, self._rounding = prediction.plant.disturbance.shape_matrix, prediction.rounding
+        begun, size = np.eye(n)[None], np.abs(test.moved)
+        self.free = read_only(test.moved @ np.concatenate([begun, prediction.free[:-1]]))
+        self._size = read_only(size @ np.concatenate([begun, prediction.size_free[:-1]]))
+        forced = test.moved @ np.concatenate([np.zeros((1, n, steps * m)), prediction.forced[:-1]])
+        for i in range(steps):
+            forced[i, :, i * m : (i + 1) * m] += test.effect
+        self.forced = read_only(forced)
+        pushed = np.concatenate([np.zeros((1, n)), prediction.size_forced[:-1]]) @ size.T
+        self._pushed = read_only(pushed + np.abs(test.effect) @ prediction.plant.u_max)
+        own = _supports(self.free, self._size, self._shape[None], self._rounding[:, None])[0]
+        self._disturbed = read_only(np.concatenate([np.zeros_like(own[:1]), np.cumsum(own[:-1], axis=0)]))
+        self._arriving = test.disturbed
+
+    def room(self, shapes: np.ndarray) -> np.ndarray:
+        """Returns 1 - rho_i less the rounding that does not depend on the estimate, shape (E, N, g).
+
+        Args:
+            shapes: Symmetric Sigma_k, shape (E, n, n).
+        """
+        rounding = self._rounding[:, None]
+        reach = _supports(self.free, self._size, shapes, rounding) + self._disturbed + self._arriving
+        return 1.0 - reach * (1.0 + rounding) - rounding * self._pushed
+
+    def keeps(self, estimates: np.ndarray, room: np.ndarray, plans: np.ndarray, margin: float) -> np.ndarray:
+        """Returns whether the box is kept between the samples of the first i+1 steps of plans, shape (N, E, P).
+
+        Args:
+            estimates: x_hat, shape (E, n).
+            room: What `room` returns for the error shape of each.
+            plans: Inputs, shape (E, P, N, m) [physical units].
+            margin: By which it must be kept.
+        """
+        steps, g, n = self.free.shape
+        count, number = plans.shape[:2]
+        left = room - (np.abs(estimates) @ (self._rounding[:, None, None] * self._size).reshape(-1, n).T).reshape(
+            count, steps, g
+        )
+        values = (self.forced.reshape(steps * g, -1) @ plans.reshape(count * number, -1).T).reshape(-1, count, number)
+        values += (self.free.reshape(-1, n) @ estimates.T)[..., None]
+        inside = np.abs(values.reshape(steps, g, count, number)) <= left.transpose(1, 2, 0)[..., None] - margin
+        return np.logical_and.accumulate(inside.all(axis=1), axis=0)
 
 
 class EndTest(OneStepTest):
@@ -231,11 +295,13 @@ class Tightening(NamedTuple):
         weighting: T G, shape (E, N, n, n), with T of `PredictedErrors` after j steps: c_j is far enough inside S if
             |T G c_j| is at most the radius.
         radius: 1 - h less the rounding that does not depend on the estimate, shape (E, N); NaN for an unusable shape.
+        between: `PlanGrid.room`, shape (E, N, g); g is 0 where the box counts at samples alone.
     """
 
     room: np.ndarray
     weighting: np.ndarray
     radius: np.ndarray
+    between: np.ndarray
 
 
 @np.errstate(all="ignore")  # what overflows leaves no room
@@ -250,19 +316,21 @@ def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
         shapes: Sigma_k, shape (E, n, n).
     """
     plant, rounding = prediction.plant, prediction.rounding[:, None]
-    rows, sizes = plant.box_rows @ prediction.free, np.abs(plant.box_rows) @ prediction.size_free
-    earlier = np.concatenate([plant.box_rows[None], rows[:-1]])
-    earlier_sizes = np.concatenate([np.abs(plant.box_rows)[None], sizes[:-1]])
+    box_rows, grid = prediction.box_rows, prediction.grid
+    rows, sizes = box_rows @ prediction.free, np.abs(box_rows) @ prediction.size_free
+    earlier = np.concatenate([box_rows[None], rows[:-1]])
+    earlier_sizes = np.concatenate([np.abs(box_rows)[None], sizes[:-1]])
     disturbed = np.cumsum(_supports(earlier, earlier_sizes, plant.disturbance.shape_matrix[None], rounding)[0], axis=0)
     symmetric = 0.5 * (shapes + shapes.swapaxes(1, 2))
     reach = (_supports(rows, sizes, symmetric, rounding) + disturbed) * (1.0 + rounding)
-    pushed = rounding * (prediction.size_forced @ np.abs(plant.box_rows).T)
+    pushed = rounding * (prediction.size_forced @ np.abs(box_rows).T)
     nothing = np.empty((0, *shapes.shape[1:]))
     errors = [predicted_errors(end, shapes, nothing) for end in prediction.ends]
     radius = np.stack([each.radius for each in errors], axis=1)
     unusable = np.where(np.isnan(radius).any(axis=1), np.nan, 0.0)
     weightings = np.stack([each.weighting.transpose(2, 0, 1) for each in errors], axis=1) @ prediction.ends[0].root
-    return Tightening(1.0 - reach - pushed + unusable[:, None, None], weightings, radius)
+    between = np.empty((len(shapes), prediction.steps, 0)) if grid is None else grid.room(symmetric)
+    return Tightening(1.0 - reach - pushed + unusable[:, None, None], weightings, radius, between)
 
 
 def _supports(rows: np.ndarray, sizes: np.ndarray, shapes: np.ndarray, rounding: np.ndarray) -> np.ndarray:

@@ -37,14 +37,18 @@ class PlanProgram:
         self._free = prediction.free
         self._end = read_only(prediction.forced[-1] * scale)
         forced = prediction.forced[:-1] * scale
-        rows = (plant.box_rows @ forced).reshape(-1, len(scale))
+        rows = (prediction.box_rows @ forced).reshape(-1, len(scale))
+        grid = prediction.grid
+        self._between = np.empty((0, plant.n)) if grid is None else grid.free.reshape(-1, plant.n)
+        if grid is not None:
+            rows = np.concatenate([rows, (grid.forced * scale).reshape(-1, len(scale))])
         self._rows = read_only(np.concatenate([rows, -rows]))
         self._reserve = SOLVER_RESERVE + float(ACTION_ROUNDING) * np.abs(rows).sum(axis=1)
         root = prediction.ends[-1].root
         self._end_reserve = SOLVER_RESERVE + float(ACTION_ROUNDING) * float(
             np.linalg.norm(root @ self._end, axis=0).sum()
         )
-        self._C = plant.box_rows
+        self._C = prediction.box_rows
         self._arrange(root)
         self._solver: Any = None
 
@@ -68,7 +72,13 @@ class PlanProgram:
         self._typical = numbered
 
     def solve(
-        self, estimate: np.ndarray, room: np.ndarray, weighting: np.ndarray, radius: float, proposed: np.ndarray
+        self,
+        estimate: np.ndarray,
+        room: np.ndarray,
+        weighting: np.ndarray,
+        radius: float,
+        between: np.ndarray,
+        proposed: np.ndarray,
     ) -> np.ndarray | None:
         """Returns a plan, shape (N, m) [physical units], of which nothing is known; None if the solver fails.
 
@@ -77,10 +87,11 @@ class PlanProgram:
             room: Largest |c_i c_j| for j = 1..N-1, shape (N-1, k).
             weighting: T G of the last step, shape (n, n).
             radius: Largest |T G c_j| of the last step.
+            between: Largest values of the rows of the grid in every step, shape (N, g).
             proposed: Shape (m,).
         """
         try:
-            A, b, q = self._data(estimate, room, weighting, radius, proposed)
+            A, b, q = self._data(estimate, room, weighting, radius, between, proposed)
             if not (np.isfinite(b).all() and np.isfinite(A).all() and np.isfinite(q).all()):
                 return None
             solver, self._solver = self._set_up() if self._solver is None else self._solver, None
@@ -95,11 +106,18 @@ class PlanProgram:
         return plan.reshape(self._length, self._m) * self._limits if usable else None
 
     def _data(
-        self, estimate: np.ndarray, room: np.ndarray, weighting: np.ndarray, radius: float, proposed: np.ndarray
+        self,
+        estimate: np.ndarray,
+        room: np.ndarray,
+        weighting: np.ndarray,
+        radius: float,
+        between: np.ndarray,
+        proposed: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns entries of the matrix, right-hand side and linear cost."""
         centers = self._free @ estimate
-        drift, allowed = (centers[:-1] @ self._C.T).ravel(), room.ravel() - self._reserve
+        drift = np.concatenate([(centers[:-1] @ self._C.T).ravel(), self._between @ estimate])
+        allowed = np.concatenate([room.ravel(), between.ravel()]) - self._reserve
         ones = np.ones(2 * self._length * self._m)
         cone = np.concatenate([[radius - self._end_reserve], weighting @ centers[-1]])
         b = np.concatenate([allowed - drift, allowed + drift, ones, cone])
