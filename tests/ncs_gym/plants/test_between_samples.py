@@ -35,7 +35,9 @@ def random_model(seed, n, m, k):
     rows = np.concatenate([np.eye(n) * rng.uniform(0.3, 3.0, n), rng.standard_normal((k, n))])
     model = (2.0 * rng.standard_normal((n, n)), rng.standard_normal((n, m)), np.eye(n), np.zeros((n, m)))
     bounds = {"disturbance_bound": 1e-3, "sensor_bound": 1e-3, "initial_bound": 1e-3}
-    return LinearPlant.from_statespace(model, 0.2, box=rows, u_max=rng.uniform(0.2, 5.0, m), between_samples=5, **bounds)
+    return LinearPlant.from_statespace(
+        model, 0.2, box=rows, u_max=rng.uniform(0.2, 5.0, m), between_samples=5, **bounds
+    )
 
 
 @pytest.mark.parametrize("name", PLANTS)
