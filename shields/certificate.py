@@ -327,7 +327,7 @@ class Certificate(ReadOnlyArrays):
             ("safe set", self._safe_set_text()),
             ("claim", claim_text(self.between_samples)),
             ("size", size_of(recorded)),
-            ("polytope", missing_polytope_of(recorded)),
+            ("polytope", missing_polytope_of(recorded) if self.proofs and self.polytope is None else ""),
             ("fallback", "u = K x_hat"),
             ("contract", contract_text(self.method, self.contract)),
             ("tolerance", tolerance_of(recorded)),

@@ -91,9 +91,9 @@ def assumptions_of(recorded: dict[str, Any]) -> str:
 
 
 def missing_polytope_of(recorded: dict[str, Any]) -> str:
-    """Returns why there is no polytope, if one was asked for."""
+    """Returns why there is no polytope."""
     reason = recorded.get("no_polytope")
-    return f"none: {reason}; shields keep the state in the ellipsoid" if isinstance(reason, str) else ""
+    return f"none: {reason}; shields keep the state in the ellipsoid" if isinstance(reason, str) else "none was sought"
 
 
 def interruption_of(recorded: dict[str, Any]) -> str:

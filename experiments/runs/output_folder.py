@@ -25,14 +25,14 @@ from experiments.settings.settings_file import FORMAT as SETTINGS_FORMAT
 from shields.atomic_write import write_atomically
 
 # Files by which a folder is known to hold something finished.
-_FINISHED = ("summary.json", "certify.json", "units/*.json")
+_FINISHED = ("summary.json", "certify.json", "runs/*.json", "units/*.json")  # the last of earlier versions
 _FINISHED_PARTS = {"study": ("*/summary.json",)}
 # Settings that results do not depend on; what "smoke" changes is compared by itself.
 _IGNORED = {*INCIDENTAL_SETTINGS, "smoke", "page", "quote"}
 # Settings that may grow in the same folder, because the results that are there become part of the larger ones.
 _GROWING = {
-    "compare": ("seeds", "arms", "references"),
-    "study": ("seeds", "arms", "references", "envs"),
+    "compare": ("seeds", "arms", "baselines"),
+    "study": ("seeds", "arms", "baselines", "envs"),
     "sweep": ("seeds", "arms", "losses", "delays", "quantization_steps", "burst_lengths", "downlink_losses"),
     "certify": ("steps",),
 }

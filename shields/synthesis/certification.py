@@ -47,7 +47,7 @@ def synthesize(
     method: str = "certified",
     *,
     contract: ChannelContract | None = None,
-    safe_set: str = "ellipsoid",
+    safe_set: str | None = None,
     progress: Progress | None = None,
     dkappa: float = 0.02,
     drho: float = 0.05,
@@ -62,9 +62,10 @@ def synthesize(
         plant: The plant with its bounds, Schur stable for "certified" without a contract.
         method: "certified" or "paper".
         contract: Channel contract; with one, the error sets depend on the age of the newest sample ("certified").
-        safe_set: What a shield keeps: "ellipsoid", or "polytope", the largest one that the same gain keeps in the box
-            (docs/theory.md, "Polytopes"). Where there is none within limits of rows and time the ellipsoid stays, and
-            the printed certificate says why ("certified").
+        safe_set: What a shield keeps: "polytope", the largest one that the gain of the ellipsoid keeps in the box
+            (docs/theory.md, "Polytopes"), or "ellipsoid". Where there is no polytope within limits of rows and time the
+            ellipsoid stays, and the printed certificate says why. None is "polytope" for "certified"; "paper" has an
+            ellipsoid.
         progress: Called with a line of text per stage: what is sought, and the volume reached so far ("certified").
         dkappa: Grid step of kappa ("paper").
         drho: Grid step of rho ("paper").
@@ -79,9 +80,9 @@ def synthesize(
         raise ValueError(f"plant must be a LinearPlant, got {type(plant).__name__}")
     if not (isinstance(method, str) and method in ("certified", "paper")):
         raise ValueError(f"method must be 'certified' or 'paper', got {shown(method)}")
-    if not (isinstance(safe_set, str) and safe_set in ("ellipsoid", "polytope")):
-        raise ValueError(f"safe_set must be 'ellipsoid' or 'polytope', got {shown(safe_set)}")
-    if method == "paper" and safe_set != "ellipsoid":
+    if not (safe_set is None or (isinstance(safe_set, str) and safe_set in ("ellipsoid", "polytope"))):
+        raise ValueError(f"safe_set must be 'polytope', 'ellipsoid' or None, got {shown(safe_set)}")
+    if method == "paper" and safe_set == "polytope":
         raise ValueError("method 'paper' has an ellipsoid: safe_set='polytope' is for method 'certified'")
     if method == "paper":
         from shields.paper.certificate import paper_certificate  # nothing else here uses the paper's method
@@ -278,13 +279,14 @@ def _interrupted(plant: LinearPlant, stage: str, best: Certificate | None) -> Sy
 
 
 def _with_tolerated_scale(certificate: Certificate, problem: DesignProblem) -> Certificate:
-    """Returns the certificate with a record of how much larger all radii could be for some other set and gain."""
+    """Returns the certificate with a record of how much larger all radii could be for some set and gain.
+
+    It is 1 at least, because this certificate exists: the search for a larger one is local, and covers the error sets
+    of all ages by one.
+    """
     gain = max_margin_gain(problem, problem.covering_error_shape, searches=1)
-    if gain is None or gain.margin < 1.0:  # the search for it is local, and covers the error sets of all ages by one
-        return certificate
-    return replace(
-        certificate, provenance=certificate.provenance | {"tolerated_scale": float(exact.rounded(gain.margin, 3))}
-    )
+    scale = 1.0 if gain is None else max(gain.margin, 1.0)
+    return replace(certificate, provenance=certificate.provenance | {"tolerated_scale": float(exact.rounded(scale, 3))})
 
 
 def _failed_verification(report: Report) -> Infeasible:

@@ -127,7 +127,7 @@ def test_shielded_episodes_stay_inside_at_all_times(name, mode):
             for _ in range(100):
                 before = info
                 sign = np.where(rng.random(plant.m) < 0.2, -sign, sign)
-                *_, terminated, truncated, info = env.step(sign.astype(np.float32))
+                *_, info = env.step(sign.astype(np.float32))
                 assert info["shield_guaranteed"], info["shield_reason"]
                 assert info["cost"] == 0.0
                 assert worst_between(name, before["state"][:, None], info["input"][:, None]) <= 1.0
@@ -137,7 +137,6 @@ def test_shielded_episodes_stay_inside_at_all_times(name, mode):
 
 def test_unshielded_cruise_leaves_its_box_between_two_samples_inside_it():
     # The largest value between two samples in the box is about a tenth beyond it.
-    plant = found("TruckTrailerCruise")[0]
     rng = np.random.default_rng(0)
     x = np.concatenate([rng.uniform(-2.0, 2.0, (2, 200_000)), rng.choice([-4.0, 4.0], (1, 200_000))])
     rows = fine_rows("TruckTrailerCruise")
@@ -231,8 +230,8 @@ def test_certificate_of_a_plant_that_counts_otherwise_is_refused():
 
 
 def test_polytope_of_samples_alone_is_refused_at_times_between_them():
-    plant, plain, _ = found("TruckTrailerCruise", 8)
-    _, _, without = found("TruckTrailerCruise")
+    plant = found("TruckTrailerCruise", 8)[0]
+    without = found("TruckTrailerCruise")[2]
     rows, m = without.polytope.rows, plant.m
     multipliers = np.concatenate([without.polytope.multipliers, np.zeros((8 * len(plant.box_rows), len(rows)))])
     closed = plant.grid_rows.state + plant.grid_rows.input @ without.K

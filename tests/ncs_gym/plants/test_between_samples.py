@@ -134,7 +134,7 @@ def test_many_environments_report_what_single_ones_do():
             assert info["cost"][e] == float(expected.max() > 0.0)
     same = gym.make_vec(CRUISE, num_envs=3, plant=plant, max_episode_steps=4, autoreset_mode="SameStep")
     same.reset(seed=0)
-    for k in range(4):
+    for _ in range(4):
         *_, info = same.step(np.ones((3, 1), np.float32))
     np.testing.assert_array_equal(info["worst_constraint_values"], info["constraint_values"])
     assert (info["final_info"]["worst_constraint_values"] >= info["final_info"]["constraint_values"]).all()
