@@ -36,6 +36,7 @@ LAYERS = {
         {"certificate"},
         {"verification", "paper", "synthesis"},
         {"runtime", "downlink"},
+        {"nodes"},
     ),
     "agents": (
         {"hyperparams", "results", "sb3_vec_env"},
@@ -49,7 +50,7 @@ LAYERS = {
         {"settings", "baselines"},
         {"runs"},
         {"backends", "analysis", "plots"},
-        {"report", "attack", "paper"},
+        {"report", "attack", "paper", "network_loop"},
         {"commands"},
         {"study"},
         {"__main__"},
