@@ -12,7 +12,7 @@ from ncs_gym.envs.info import Known, loop_info
 from ncs_gym.envs.reset_options import start_option
 from ncs_gym.envs.settings import expect, loop_contracts, require_suitable, starting_set
 from ncs_gym.envs.spaces import observation_space, read_action
-from ncs_gym.estimation.arrival_patterns import arrival_patterns
+from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel
@@ -181,9 +181,9 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._contract, self._protocol, self._certificate_contract = contracts
         self._downlink = downlink
         self._downlink_contract = None if self._protocol is None else self._protocol.contract
-        patterns = arrival_patterns(plant, self._channel, self._certificate_contract)
-        self._error_set = patterns.recursion.error_set
-        self._estimator = Estimator(plant, self._channel, patterns=patterns)
+        histories = arrival_histories(plant, self._channel, self._certificate_contract)
+        self._error_set = histories.recursion.error_set
+        self._estimator = Estimator(plant, self._channel, histories=histories)
         self._downlink_state = DownlinkState(self._protocol, plant.m)
         self._noise = as_noise(noise, plant)
         truncated = self._noise == "truncated"

@@ -13,9 +13,8 @@ from ncs_gym.envs.env import SAMPLE_ROUNDING, NCSEnv, RenderModeError
 from ncs_gym.envs.info import Known, loop_info
 from ncs_gym.envs.reset_options import vector_reset_options
 from ncs_gym.envs.spaces import read_actions
-from ncs_gym.estimation.arrival_patterns import arrival_patterns
+from ncs_gym.estimation.arrival_histories import ErrorTable, arrival_histories
 from ncs_gym.estimation.error_bound import ErrorSet
-from ncs_gym.estimation.error_statistics_table import StatisticsTable
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
@@ -106,8 +105,8 @@ class NCSVectorEnv(VectorEnv):
         )
         self._downlink, self._protocol = single.downlink, single.downlink_protocol
         self._certificate_contract = single.certificate_contract
-        patterns = arrival_patterns(self._plant, self._channel, self._certificate_contract)
-        self._estimator = VectorEstimator(self._plant, patterns, self.num_envs)
+        histories = arrival_histories(self._plant, self._channel, self._certificate_contract)
+        self._estimator = VectorEstimator(self._plant, histories, self.num_envs)
         self._downlink_state = VectorDownlinkState(self._protocol, self._plant.m, self.num_envs)
         self._belief = self._predicted_estimates()
         self._state = np.zeros((self._plant.n, self.num_envs))
@@ -119,12 +118,12 @@ class NCSVectorEnv(VectorEnv):
         self._ended: tuple[np.ndarray, Known] | None = None
 
     @property
-    def error_shapes(self) -> tuple[StatisticsTable, np.ndarray]:
+    def error_shapes(self) -> tuple[ErrorTable, np.ndarray]:
         """A table whose `shapes` (k, n, n) are the distinct error shapes so far, and the number there of each one now.
 
         The table grows; it is another object after shapes were forgotten.
         """
-        return self._estimator.patterns.table, self._belief[1]
+        return self._estimator.histories.table, self._belief[1]
 
     @property
     def known(self) -> Known:
