@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
 from agents.evaluation import Policy
 from ncs_gym import LinearPlant, NCSEnv, SetpointTracking, SpeedTracking
+from ncs_gym.plants.lqr import lqr_gain
 
 # Weights of the regulator: an input at its limit, and a state at the edge of the box, against an error of one width.
 INPUT_WEIGHT, BOX_WEIGHT = 0.01, 0.01
@@ -113,9 +113,14 @@ def equilibrium(plant: LinearPlant, output: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def _optimal_gain(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """Returns the gain, shape (m, n), of u = gain x that minimizes the sum of x'Qx + u'Ru."""
-    P = solve_discrete_are(A, B, Q, R)
-    return -np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    """Returns the gain of `lqr_gain`.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    if (gain := lqr_gain(A, B, Q, R)) is None:
+        raise ValueError("there is no linear-quadratic regulator: the inputs cannot stabilize the plant")
+    return gain
 
 
 CONTROLLERS: dict[str, Callable[[NCSEnv, np.ndarray, int], _Inputs]] = {

@@ -10,7 +10,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 
 from ncs_gym.envs.info import Known
-from ncs_gym.envs.spaces import read_actions
+from ncs_gym.envs.spaces import nearest_action, read_actions
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network import CommittedInputs
 from ncs_gym.network.contract import warn_of_broken_contract
@@ -325,5 +325,5 @@ def overridden(actions: Any, decided: Decision, limits: np.ndarray) -> np.ndarra
     numbers = np.asarray(actions)
     numbers = numbers.astype(np.float32 if numbers.dtype == np.float32 else np.float64)
     chosen = np.flatnonzero(decided.intervened)
-    numbers[chosen] = (decided.input[:, chosen].T / limits).astype(np.float32)
+    numbers[chosen] = nearest_action(decided.input[:, chosen].T, limits)
     return numbers
