@@ -9,8 +9,7 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from ncs_gym.envs.info import Known, loop_info
-from ncs_gym.envs.reset_options import start_option
-from ncs_gym.envs.settings import expect, loop_contracts, require_suitable, starting_set
+from ncs_gym.envs.settings import expect, loop_contracts, require_suitable, start_option, starting_set
 from ncs_gym.envs.spaces import observation_space, read_action
 from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.error_bound import ErrorSet

@@ -11,7 +11,7 @@ from gymnasium.vector.utils import batch_space
 
 from ncs_gym.envs.env import SAMPLE_ROUNDING, NCSEnv, RenderModeError
 from ncs_gym.envs.info import Known, loop_info
-from ncs_gym.envs.reset_options import vector_reset_options
+from ncs_gym.envs.settings import vector_reset_options
 from ncs_gym.envs.spaces import read_actions
 from ncs_gym.estimation.arrival_histories import ErrorTable, arrival_histories
 from ncs_gym.estimation.error_bound import ErrorSet
