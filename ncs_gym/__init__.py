@@ -7,7 +7,8 @@ from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet
 from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
 from ncs_gym.network.downlink import Actuator, Command
-from ncs_gym.network.escape_probability import escape_probability
+from ncs_gym.network.gaussian_bound import bound_violation_probability
+from ncs_gym.network.gaussian_bound import bound_violation_probability as escape_probability  # noqa: F401  its former name
 from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
 from ncs_gym.plants.linear_plant import LinearPlant, NoNoiseWarning
@@ -61,10 +62,10 @@ __all__ = [
     "Task",
     "UnstablePlantError",
     "batch_reactor",
+    "bound_violation_probability",
     "cart_pole",
     "certified_error_set",
     "contract_of",
-    "escape_probability",
     "linear_model",
     "register_plant",
     "truck_trailer",

@@ -106,7 +106,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             the extra `[render]` (docs/rendering.md).
         horizon: Steps the observation space is sized for.
         noise: "truncated", or "gaussian" for process noise, sensor noise and first errors without a bound: what is
-            proved then holds but for a probability that `escape_probability` bounds (docs/shield.md).
+            proved then holds but for a probability that `bound_violation_probability` bounds (docs/shield.md).
         process: What really moves (docs/beyond_linear.md); the plant's own equations by default.
         downlink: The network between controller and actuator (docs/contracts.md); ideal by default.
         downlink_contract: What is assumed of the downlink, which may then break it; by default what the downlink's

@@ -2,15 +2,15 @@
 
 `channel` has the settings (packet loss, quantization, transmission period, delay and jitter), `packet_transmission`
 what happens to packets during an episode, `contract` what a channel guarantees about the age of samples,
-`packet_reception` which packets a receiver can use, and `escape_probability` says how likely Gaussian noise is to leave
-its bounds, given how many samples a channel takes. `downlink` is the way of the commands, with the inputs that are
+`packet_reception` which packets a receiver can use, and `gaussian_bound` says how likely Gaussian noise is to leave its
+bounds, given how many samples a channel takes. `downlink` is the way of the commands, with the inputs that are
 committed ahead.
 """
 
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet
 from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
 from ncs_gym.network.downlink import Actuator, Command, CommittedInputs, DownlinkProtocol, downlink_protocol
-from ncs_gym.network.escape_probability import escape_probability
+from ncs_gym.network.gaussian_bound import bound_violation_probability
 from ncs_gym.network.packet_reception import DiscardedPackets
 from ncs_gym.network.packet_transmission import ChannelState
 
@@ -26,7 +26,7 @@ __all__ = [
     "DownlinkProtocol",
     "GilbertElliott",
     "Packet",
+    "bound_violation_probability",
     "contract_of",
     "downlink_protocol",
-    "escape_probability",
 ]
