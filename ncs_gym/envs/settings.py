@@ -12,11 +12,15 @@ from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.network.downlink import DownlinkProtocol, downlink_protocol
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.processes.process import LinearProcess, Process
 from ncs_gym.tasks.task import Task
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_numbers, as_vector, shown
 
 T = TypeVar("T")
+
+# Options of `reset` that give channels.
+CHANNELS = "channel", "downlink"
 
 
 def _assumed_contract(plant: LinearPlant, channel: Channel, contract: ChannelContract | None) -> ChannelContract | None:
@@ -72,6 +76,20 @@ def require_suitable(task: Task, plant: LinearPlant) -> None:
     """Raises ValueError unless a task suits the plant."""
     if problem := task.check(plant):
         raise ValueError(f"{type(task).__name__}: {problem}")
+    kind = type(task)
+    if kind.observe is not Task.observe and kind.observation_bound is Task.observation_bound:
+        raise ValueError(
+            f"{kind.__name__}: observe is defined, observation_bound is not: it must return the largest absolute value "
+            "of each of these entries within the horizon"
+        )
+
+
+def require_own_equations(process: Process | None, plant: LinearPlant) -> None:
+    """Raises ValueError if times between samples are to count of a process whose states there nobody knows."""
+    if plant.between_samples is not None and not (process is None or isinstance(process, LinearProcess)):
+        raise ValueError(
+            "between_samples is about the plant's own equations: beside another process= give a plant without it"
+        )
 
 
 def expect(value: Any, kind: type[T], name: str) -> T:
@@ -91,7 +109,7 @@ def start_option(options: dict[str, Any] | None, n: int) -> np.ndarray | None:
     Raises:
         ValueError: If an option is unknown, has a wrong shape or is not finite.
     """
-    options = _known_options(options, {"state"})
+    options = _known_options(options, {"state", *CHANNELS})
     if "state" not in options:
         return None
     return as_vector(options["state"], n, "options['state']")
@@ -103,7 +121,7 @@ def vector_reset_options(options: dict[str, Any] | None, count: int, n: int) -> 
     Raises:
         ValueError: If an option is unknown, has a wrong shape or is not finite.
     """
-    options = _known_options(options, {"state", "reset_mask"})
+    options = _known_options(options, {"state", "reset_mask", *CHANNELS})
     given = options.get("reset_mask", np.ones(count, np.bool_))
     mask = np.zeros(0, np.bool_) if as_numbers(given) is None else np.array(given)
     if mask.shape != (count,) or mask.dtype != np.bool_ or not mask.any():

@@ -34,6 +34,8 @@ NO_SAMPLE = 0
 MAX_HISTORIES, MAX_BYTES = 1 << 17, 16 << 20
 # A graph takes at least this many times the histories it began with, or it would be forgotten at every step.
 SMALLEST_GROWTH = 4
+# Some sample of these many steps should move an estimate by this share of its distance from the sample.
+FIRST_STEPS, SMALLEST_SHARE = 50, 0.01
 # Of more plants and channels than this, graphs are kept only as long as an estimator uses them.
 MAX_GRAPHS = 32
 # Numbers that arrays have room for to begin with; the room doubles when it is used up.
@@ -339,6 +341,18 @@ class ArrivalHistories:
             ahead = known.take(statistics)
         return ahead
 
+    @property
+    def uses_samples(self) -> bool:
+        """Whether a sample of one of the first steps moves the estimate towards it, if it arrives at once."""
+        number, H = self.present.item(self.root), self.recursion.plant.H
+        with self._lock:
+            for _ in range(FIRST_STEPS):
+                number = self.table.after_step(number)
+                self.table.after_update(number)
+                if np.diagonal(H @ self.table.update(number)[0]).max() >= SMALLEST_SHARE:
+                    return True
+        return False
+
     def keeping(self, histories: np.ndarray) -> tuple[ArrivalHistories, np.ndarray]:
         """Returns a graph with some histories, shape (k,), only, and their numbers there.
 
@@ -357,17 +371,23 @@ class ArrivalHistories:
         numbers = successor._adopted(self, np.unique(histories).tolist())
         return successor, np.array([numbers[each] for each in histories.tolist()], np.int64)
 
+    def taking_over(self, other: ArrivalHistories, histories: np.ndarray) -> np.ndarray:
+        """Returns the numbers here of histories, shape (k,), of a graph with fewer delays of the same plant."""
+        numbers = self._adopted(other, np.unique(histories).tolist())
+        return np.array([numbers[each] for each in histories.tolist()], np.int64)
+
     def _adopted(self, other: ArrivalHistories, histories: list[int]) -> dict[int, int]:
         """Returns the numbers of another graph's histories."""
 
         def same(number: int) -> int:
             return number if number == UNKNOWN else self.table.number_of(other.table.statistics(number))
 
-        numbers = {}
+        numbers, older = {}, self.buffer - other.buffer
         with self._lock:
             for each in histories:
                 present, priors, held, replay_from = other._history(each)
-                numbers[each] = self._number_of(same(present), tuple(map(same, priors)), held, replay_from)
+                known = (*map(same, priors), *[UNKNOWN] * older)
+                numbers[each] = self._number_of(same(present), known, (*held, *[False] * older), replay_from)
             self._adopted_count, self.is_full = max(self._adopted_count, len(histories)), False
         return numbers
 

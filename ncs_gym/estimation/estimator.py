@@ -16,7 +16,7 @@ from ncs_gym.estimation.arrival_histories import (
     histories_of,
 )
 from ncs_gym.estimation.error_bound import ErrorSet, require_error_set
-from ncs_gym.estimation.kalman_filter import filterpy_filter
+from ncs_gym.estimation.kalman_filter import ErrorStatistics, filterpy_filter
 from ncs_gym.network.channel import Channel, Packet
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.validation import frozen, setting
@@ -52,6 +52,7 @@ class Estimator:
         channel: Gives the quantizer's error and the longest delay, hence the replay buffer.
         error_set: E(Sigma) with its rate; computed from the plant by default.
         histories: A graph of the caller's in place of the shared one.
+        after: An estimator whose episodes are counted on.
 
     Attributes:
         step: Steps since the start of the episode.
@@ -75,6 +76,7 @@ class Estimator:
         channel: Channel,
         error_set: ErrorSet | None = None,
         histories: ArrivalHistories | None = None,
+        after: Estimator | None = None,
     ) -> None:
         self._plant, self._channel, self._buffer = plant, channel, channel.longest_delay
         if histories is None:
@@ -83,13 +85,13 @@ class Estimator:
             else:
                 require_error_set(error_set, plant)
                 histories = histories_of(plant, channel, error_set)
-        self._histories = histories
+        self._histories = self._usual = histories
         self._error_set = self._histories.recursion.error_set
         ages = self._error_set.ages
         if ages is not None and not ages.contract.is_fine_enough_for(channel):
             raise ValueError(f"the channel rounds more coarsely than the contract of the error set: {ages.contract}")
         self._limit = plant.state_limit if np.isfinite(plant.state_limit).all() else None
-        self.episode, self._is_new = 0, True
+        self.episode, self._is_new = (0, True) if after is None else (after.episode, after._is_new)
         self._begin(np.zeros(plant.n))
 
     def saved(self) -> dict[str, Any]:
@@ -106,11 +108,25 @@ class Estimator:
         """
         self.episode += not self._is_new
         self._is_new = False
+        self._histories = self._usual
         self._begin(mean)
 
-    def _begin(self, mean: np.ndarray) -> None:
-        """Forgets everything but a first estimate, shape (n,)."""
-        self.step = self.age = 0
+    def restart(self, mean: np.ndarray, age: int) -> None:
+        """Begins anew at this step of the episode; samples taken before it are discarded from now on.
+
+        Args:
+            mean: An estimate, shape (n,), whose error lies in the certified set of an age.
+            age: Steps since the newest sample used was taken.
+        """
+        shape = self._error_set.shape_at(age)
+        assert shape is not None
+        first = ErrorStatistics(self._plant.kalman_covariances[2].copy(), shape.copy(), age)
+        self._histories = histories_of(self._plant, self._channel, self._error_set, first=first)
+        self._begin(mean, self.step, age)
+
+    def _begin(self, mean: np.ndarray, step: int = 0, age: int = 0) -> None:
+        """Forgets everything but an estimate, shape (n,), at a step."""
+        self.step, self.age = step, age
         self.alarm = False
         self.mean = frozen(np.array(mean, dtype=np.float64))
         self._history = self._histories.root
@@ -162,8 +178,11 @@ class Estimator:
             history = self._take_in(packet, history)
         self._history = present if history == present else self._replayed(history)
         if self._histories.is_full:
-            self._histories, kept = self._histories.keeping(np.array([self._history]))
+            full = self._histories
+            self._histories, kept = full.keeping(np.array([self._history]))
             self._history = kept.item()
+            if self._usual is full:  # or it would stay in memory, and be full again after every reset
+                self._usual = self._histories
 
     def predicted(self, inputs: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimate, shape (n,), and error shape, (n, n), after the next steps, given their inputs, (m,) each.

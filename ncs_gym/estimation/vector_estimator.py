@@ -47,6 +47,12 @@ class VectorEstimator:
         """Numbers of the error statistics, whose shapes are `histories.table.shapes`, shape (N,)."""
         return self.histories.present.take(self.history)
 
+    def follow(self, histories: ArrivalHistories) -> None:
+        """Goes on with a graph for more delays, that of the same plant."""
+        self.histories, self.history = histories, histories.taking_over(self.histories, self.history)
+        for name in ("_priors", "_inputs", "_samples"):
+            setattr(self, name, deque(getattr(self, name), maxlen=histories.buffer + 1))
+
     def begin(self, chosen: Any, mean: np.ndarray) -> None:
         """Starts episodes in some environments with first estimates, shape (n, count)."""
         self.mean = self.mean.copy()  # the old array is kept as a mean before an update
