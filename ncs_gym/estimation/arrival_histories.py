@@ -31,7 +31,7 @@ UNKNOWN = NO_REPLAY = -1
 # Number of the statistics that stand for "no sample is used here": their gain is zero.
 NO_SAMPLE = 0
 # Histories are forgotten but for those in use when there are this many, or when all takes about this much memory.
-MAX_HISTORIES, MAX_BYTES = 1 << 17, 16 << 20
+MAX_HISTORIES, MAX_BYTES = 1 << 17, 20 << 20
 # A graph takes at least this many times the histories it began with, or it would be forgotten at every step.
 SMALLEST_GROWTH = 4
 # Some sample of these many steps should move an estimate by this share of its distance from the sample.
