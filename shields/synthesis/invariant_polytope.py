@@ -48,7 +48,26 @@ def invariant_polytope(certificate: Certificate, plant: LinearPlant, progress: C
         Infeasible: If there is none within `MOST_ROWS` rows and `LONGEST_SEARCH` seconds; the message says why.
     """
     step = _ClosedLoop(certificate, plant)
-    rows = step.first_rows()
+    return _rounded(step, invariant_rows(step.first_rows(), step.predecessor, len(plant.box_rows), progress))
+
+
+def invariant_rows(
+    rows: np.ndarray,
+    predecessor: Callable[[np.ndarray], np.ndarray],
+    kept: int,
+    progress: Callable[[str], object] = lambda line: None,
+) -> np.ndarray:
+    """Returns the rows of the largest polytope in another one whose states stay in it, shape (r, n).
+
+    Args:
+        rows: Of the other one, |row z| <= 1, shape (k, n), in coordinates of similar size.
+        predecessor: Of a row, shape (n,), what states fulfil exactly if the next ones fulfil the row for sure.
+        kept: So many of the first rows stay even where others imply them.
+        progress: Called with a line of text now and then.
+
+    Raises:
+        Infeasible: If there are none within `MOST_ROWS` rows and `LONGEST_SEARCH` seconds, or `predecessor` raises it.
+    """
     deadline, following = time.monotonic() + LONGEST_SEARCH, 0
     while following < len(rows):
         if len(rows) > MOST_ROWS:
@@ -57,12 +76,12 @@ def invariant_polytope(certificate: Certificate, plant: LinearPlant, progress: C
             raise _none(f"its search took longer than {LONGEST_SEARCH:g} s")
         if following % 50 == 0:
             progress(f"polytope: {len(rows)} rows")
-        row = step.predecessor(rows[following])
+        row = predecessor(rows[following])
         if _largest(rows, row)[0] > 1.0 + _IMPLIED:
             rows = np.concatenate([rows, row[None]])
         following += 1
     progress(f"polytope: which of {len(rows)} rows count")
-    return _rounded(step, _without_implied(rows, len(plant.box_rows)))
+    return _without_implied(rows, kept)
 
 
 def share_in_polytope(polytope: Polytope, plant: LinearPlant) -> float | None:
