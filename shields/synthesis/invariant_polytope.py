@@ -71,9 +71,9 @@ def invariant_rows(
     deadline, following = time.monotonic() + LONGEST_SEARCH, 0
     while following < len(rows):
         if len(rows) > MOST_ROWS:
-            raise _none(f"it would need more than {MOST_ROWS} rows")
+            raise _none(f"it would need more than {MOST_ROWS} rows, fewer with longer steps or less disturbance")
         if time.monotonic() > deadline:
-            raise _none(f"its search took longer than {LONGEST_SEARCH:g} s")
+            raise _none(f"its search took longer than {LONGEST_SEARCH:g} s, less with fewer states or longer steps")
         if following % 50 == 0:
             progress(f"polytope: {len(rows)} rows")
         row = predecessor(rows[following])
@@ -115,7 +115,7 @@ class _ClosedLoop:
         """
         allowed = self._plant.u_max * (1.0 - float(ACTION_ROUNDING) - _RESERVE) - self._reach(self._K)
         if (allowed <= 0.0).any():
-            raise _none("the error of the estimate alone takes an input beyond its limit")
+            raise _none("the error of the estimate alone takes an input beyond its limit; better sensors leave room")
         return np.concatenate([self._plant.box_rows, self._K / allowed[:, None]]) * self.widths
 
     def predecessor(self, row: np.ndarray) -> np.ndarray:
@@ -129,7 +129,9 @@ class _ClosedLoop:
         left = 1.0 - _RESERVE - float(self._reach(pushed @ self._K)) - math.sqrt(physical @ self._D @ physical)
         left -= float(ACTION_ROUNDING) * float(np.abs(pushed) @ self._plant.u_max)
         if left <= 0.0:
-            raise _none("errors and disturbances alone leave one of its faces")
+            raise _none(
+                "errors and disturbances alone leave one of its faces; smaller bounds leave room"
+            )
         return (physical @ self.next) * self.widths / left
 
     def _reach(self, rows: np.ndarray) -> np.ndarray:
