@@ -115,15 +115,15 @@ def row(name: str, tool: str, find: Callable[[Case], np.ndarray], case: Case, lo
     def stop(*_: object) -> None:
         raise TimeoutError
 
-    signal.signal(signal.SIGALRM, stop)
-    signal.alarm(longest)
+    signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, longest)
     begin = time.process_time()
     try:
         faces = find(case)
     except TimeoutError:
         return f"{name:20}{tool:10}stopped after {time.process_time() - begin:.0f} s of CPU time"
     finally:
-        signal.alarm(0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
     seconds = time.process_time() - begin
     points = 2.0 * qmc.Sobol(len(case.W), scramble=False).random_base2(16) - 1.0
     share = ((points @ faces.T).max(axis=1) <= 1.0).mean()
@@ -135,7 +135,7 @@ def row(name: str, tool: str, find: Callable[[Case], np.ndarray], case: Case, lo
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--ids", nargs="*", default=IDS)
-    parser.add_argument("--longest", type=int, default=300, help="longest time of a search [s]")
+    parser.add_argument("--longest", type=int, default=300, help="longest CPU time of a search [s]")
     options = parser.parse_args()
     print(f"{'id':20}{'by':10}{'seconds':>8} {'faces':>6} {'of box':>8}   exact")
     for name in options.ids:
