@@ -10,8 +10,8 @@ from typing import Any
 from agents.loop import LoopConfig
 from experiments.runs.arms import Arm
 from experiments.runs.environments import module_and_id, registered_env
-from experiments.runs.evaluation_conditions import other_conditions
 from experiments.runs.provenance import versions
+from experiments.runs.scenarios import other_scenarios
 from experiments.runs.synthesis_status import synthesis_status
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import Assignments, BackendSettings, LearningSettings, changed_channel, settings_json
@@ -114,7 +114,7 @@ def run_of_arm(
         grid_point: Name of the point of a sweep's grid.
 
     Raises:
-        ValueError: If the arm or a condition is unknown.
+        ValueError: If the arm or a scenario is unknown.
     """
     arm = Arm.of(arm_name, settings.mode)
     training_loop, loop = arm.loops(loop, certificate, settings)
@@ -132,7 +132,7 @@ def run_of_arm(
         episodes=settings.episodes,
         certificate=certificate,
         certificate_basis=origin if settings.certificate is None else "",
-        conditions=other_conditions(settings.evaluated_under),
+        scenarios=other_scenarios(settings.evaluated_under),
         algorithm=settings.algo,
         settings=settings.all_hyperparams,
         grid_point=grid_point,
@@ -155,7 +155,7 @@ def experiment_provenance(
     if env.downlink is not None:
         channel += f" Commands: {env.downlink.description}"
     return {
-        "units": {run.name: run.key for run in runs},
+        "runs": {run.name: run.key for run in runs},
         "seeds": {run.index: {"training": run.training_seed, "evaluation": run.evaluation_seed} for run in runs},
         "settings": {name: value for name, value in content.items() if name not in INCIDENTAL_SETTINGS},
         "plant": {"fingerprint": env.plant.fingerprint, "spectral_radius": env.plant.spectral_radius},

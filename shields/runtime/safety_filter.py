@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ from shields.runtime.one_step import (
     ReachableSets,
     require_computable,
 )
-from shields.runtime.polytope_step import PolytopeTest
+from shields.runtime.polytope_step import EllipsoidOnGrid, PolytopeTest
 from shields.verification import ACTION_ROUNDING, require_valid
 
 if TYPE_CHECKING:
@@ -85,7 +86,8 @@ class SafetyFilter(ReadOnlyArrays):
         require_valid(self.certificate, self.plant)
         require_computable(self.certificate, self.plant)
         polytope = self.certificate.polytope
-        test = OneStepTest(self.certificate.L, self.plant) if polytope is None else PolytopeTest(polytope, self.plant)
+        kind = OneStepTest if self.plant.grid_rows is None else EllipsoidOnGrid
+        test = kind(self.certificate.L, self.plant) if polytope is None else PolytopeTest(polytope, self.plant)
         object.__setattr__(self, "test", test)
         object.__setattr__(self, "_no_plan", read_only(np.empty((0, self.plant.m))))
         object.__setattr__(self, "lookahead", self._lookahead())
@@ -126,6 +128,8 @@ class SafetyFilter(ReadOnlyArrays):
                 step has passed since. What is no plan of at most `horizon` inputs within the limits counts as none.
         """
         x_hat, proposed = _as_array(estimate).copy(), _as_array(input_proposed).copy()  # read once
+        if (x_hat.shape, proposed.shape) != self.test.single:
+            self._tell_of_shapes(estimate, input_proposed)
         return self.decide_knowing(x_hat, self.errors_of(error_shape), proposed, stored)
 
     def decide_knowing(
@@ -196,6 +200,18 @@ class SafetyFilter(ReadOnlyArrays):
         if self.lookahead is not None and stored is not None:
             self.lookahead.complete(decided, sets, estimates, errors, proposed, stored)
         return decided
+
+    def _tell_of_shapes(self, estimate: Any, proposed: Any) -> None:
+        """Warns the caller of `decide` of what is no single estimate or input; what is decided then is K x_hat."""
+        for name, value, (size,) in zip(("estimate", "input"), (estimate, proposed), self.test.single, strict=True):
+            if (array := _as_array(value)).shape != (size,):
+                got = f"shape {array.shape}" if array.size else f"a {type(value).__name__}"
+                warnings.warn(
+                    f"decide takes one {name}, numbers of shape ({size},), got {got}: it falls back to K x_hat "
+                    "(decide_many takes batches, shields.torch.SafeLayer tensors)",
+                    stacklevel=3,
+                )
+                return
 
     def first_plan(self, estimate: np.ndarray, errors: PredictedErrors) -> np.ndarray:
         """Returns a certified plan that may be stored before the first decision, shape (k, m); empty without one."""

@@ -121,7 +121,9 @@ def starts_known(
         center, shape = np.zeros(plant.n), initial.shape_matrix
     else:
         center, shape = np.asarray(initial, dtype=np.float64), np.zeros((plant.n, plant.n))
-    for _ in range(lead):
+    for ahead in range(lead):
+        if not safety_filter.test.keeps_between(center, safety_filter.errors_of(shape), MARGIN):
+            known[ahead] = StartKnown(False, False)
         center, shape = _moved(plant, center, shape)
         errors = safety_filter.errors_of(shape)
         inside = bool(safety_filter.test.knows_inside(center, errors, MARGIN))
@@ -138,9 +140,11 @@ def known_inside(safety_filter: SafetyFilter, known: StartKnown, estimate: np.nd
         estimate: Its estimate, shape (n,).
         errors: What is known of the error shape of that.
     """
-    if known.in_safe_set or bool(safety_filter.test.knows_inside(estimate, errors, MARGIN)):
+    if known.in_safe_set or (known.in_box and safety_filter.lookahead is not None):
         return True
-    return safety_filter.lookahead is not None and (known.in_box or _in_box(safety_filter, estimate, errors))
+    if not safety_filter.test.keeps_between(estimate, errors, MARGIN):
+        return False
+    return bool(safety_filter.test.knows_inside(estimate, errors, MARGIN)) or _in_box(safety_filter, estimate, errors)
 
 
 def first_observations(

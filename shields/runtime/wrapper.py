@@ -12,7 +12,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv
 from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, StickyAction
 
-from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv, NCSVectorEnv
+from ncs_gym import Annotation, Channel, ChannelContract, LinearPlant, NCSEnv, NCSVectorEnv
 from ncs_gym.envs.info import Known
 from ncs_gym.envs.spaces import read_action
 from ncs_gym.network.contract import warn_of_broken_contract
@@ -61,6 +61,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
     | `shield_guaranteed` | bool | - | whether x in S is proved now (in mode "lookahead": x in the box, to stay) |
     | `shield_reason` | str | - | why it is not; empty while it is |
     | `episode_interventions` | int | steps | number of steps of this episode with `shield_intervened` |
+    | `episode_guaranteed` | float | - | share of the states of this episode, the first included, proved as now |
     | `shield_plan_length` | int | steps | in mode "lookahead" only: number of inputs stored for later steps |
 
     In mode "lookahead" an input passes too if a certified plan that begins with it keeps the state in the box until it
@@ -112,7 +113,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         )
         self._filter = SafetyFilter(self._certificate, inner.plant, mode, horizon)
         self._monitored = MonitoredFilter(self._filter, inner.downlink_protocol)
-        warn_of_broken_contract(self._certificate.contract, inner.channel, self._monitored.lead)
+        self._channels = warned_of({inner.channel}, set(), self._certificate, self._monitored.lead)
         self._clock: tuple[int, int] | None = None
         self._start: Any = None
         self._known: tuple[StartKnown, ...] = ()
@@ -137,12 +138,13 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             raise
         inner = self._environment_in(self.env)
         require_same(self._made_for, premises_of(inner, inner))
+        self._channels = warned_of({inner.episode_channel}, self._channels, self._certificate, self._monitored.lead)
         clock, report = self._read_clock(), self._observed(inner.known)
         start = self._inner.start
         if start is not self._start:  # decided exactly, which takes longer than a step; starts are read-only
             self._start, self._known = start, starts_known(self._filter, start, self._monitored.lead)
         self._monitored.begin(report, self._known, clock[1] == 0, self._inner.beliefs()[:-1])
-        self._interventions = 0
+        self._interventions = self._proved = 0
         u = np.zeros(self._filter.plant.m)
         margin = self._filter.margin(report.estimate, inner.known.error_shape, u)
         self._clock = clock
@@ -207,6 +209,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
 
     def _info(self, proposed: np.ndarray, applied: np.ndarray, margin: float, *, intervened: bool) -> dict[str, Any]:
         reason = self._monitored.reason
+        self._proved += not reason
         ahead = {} if self._filter.lookahead is None else {"shield_plan_length": self._monitored.plan_length}
         return ahead | {
             "shield_intervened": intervened,
@@ -216,6 +219,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             "shield_guaranteed": not reason,
             "shield_reason": reason,
             "episode_interventions": self._interventions,
+            "episode_guaranteed": self._proved / (self._inner.steps + 1),
         }
 
 
@@ -242,6 +246,20 @@ def certificate_for(
 
         _synthesized[key] = synthesize(plant, contract=contract, safe_set=safe_set, progress=progress)
     return _synthesized[key]
+
+
+def warned_of(now: set[Channel], before: set[Channel], certificate: Certificate, lead: int) -> set[Channel]:
+    """Returns the channels of the present episodes; warns the caller's caller of new ones that break the contract.
+
+    Args:
+        now: These channels.
+        before: Those that were looked at before.
+        certificate: Rests on a contract.
+        lead: c.
+    """
+    for channel in now - before:
+        warn_of_broken_contract(certificate.contract, channel, lead, stacklevel=4)
+    return now
 
 
 def premises_of(inner: NCSEnv | NCSVectorEnv, single: NCSEnv) -> dict[str, Any]:
