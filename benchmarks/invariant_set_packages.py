@@ -28,7 +28,7 @@ from scipy.optimize import linprog
 from scipy.stats import qmc
 
 import ncs_gym  # noqa: F401  (registers the environments)
-from shields import synthesize
+from shields import Infeasible, synthesize
 from shields.synthesis.invariant_polytope import invariant_rows
 from shields.verification import ACTION_ROUNDING
 
@@ -122,6 +122,8 @@ def row(name: str, tool: str, find: Callable[[Case], np.ndarray], case: Case, lo
         faces = find(case)
     except TimeoutError:
         return f"{name:20}{tool:10}stopped after {time.process_time() - begin:.0f} s of CPU time"
+    except Infeasible as none:
+        return f"{name:20}{tool:10}{none}"
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0)
     seconds = time.process_time() - begin
