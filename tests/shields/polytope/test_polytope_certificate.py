@@ -251,7 +251,7 @@ def test_interrupted_search_keeps_the_ellipsoid():
 def test_numbers_out_of_reach_leave_the_ellipsoid(monkeypatch):
     certificate, plant = found("BatchReactor")[1:]
 
-    def failing(*_):
+    def failing(*_, **__):
         raise ValueError("A_ub must not contain values inf, nan, or None")
 
     monkeypatch.setattr(search, "linprog", failing)
