@@ -28,7 +28,7 @@ from shields import Certificate, SafetyFilter, VectorSafetyShield, synthesize
 from shields.synthesis.certification import with_polytope
 
 IDS = {"TruckTrailer": 8, "TruckTrailerCruise": 8, "CartPole": 4, "BatchReactor": 4}
-BLOCKS, REPEATS = 40, 50
+BLOCKS, REPEATS = 200, 10
 
 
 def behind(name: str, plant: LinearPlant, certificate: Certificate, steps: int) -> tuple[float, float]:
@@ -77,6 +77,8 @@ def stepping(name: str, plant: LinearPlant, number: int) -> Callable[[], object]
     env = gym.make(path, **settings).unwrapped if number == 1 else gym.make_vec(path, num_envs=number, **settings)
     action = 0.0 * env.action_space.sample()
     env.reset(seed=0)
+    for _ in range(300):  # patterns of arrivals are worked out when they occur first
+        env.step(action)
     return lambda: env.step(action)
 
 
