@@ -218,7 +218,7 @@ def summary_of(folder: Path) -> dict[str, Any]:
         counts["outside, proved"] += row["outside"] == "1" and proved.get(key) == "1" and missing == 0
         counts["proved, missed"] += proved.get(key) == "1" and missing > 0
         counts["drift"] = step
-    summary = {
+    summary: dict[str, Any] = {
         "episodes": len({episode for episode, _ in proved}),
         "steps of the controller": counts["steps"],
         "steps of the plant": counts["plant"],
