@@ -4,7 +4,8 @@
 
 Median, 99.9 % and worst case in microseconds, of the thread's own time on the processor and, whatever else the machine
 does, on the clock; and by how much the resident memory has grown since a tenth of the steps. "cold" is a loop that
-meets every arrival history for the first time, "rehearsed" another one that runs through the same steps again; the garbage collector is frozen and off.
+meets every arrival history for the first time, "rehearsed" another one that runs through the same steps again; the
+garbage collector is frozen and off.
 """
 
 from __future__ import annotations
