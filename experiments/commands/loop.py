@@ -211,13 +211,12 @@ def summary_of(folder: Path) -> dict[str, Any]:
         last = row
     last_of: dict[str, int] = {}
     for row in rows_of(folder, "plant"):
-        step, missing, key = int(row["step"]), int(row["missing"]), (row["episode"], row["step"])
+        missing, key = int(row["missing"]), (row["episode"], row["step"])
         last_of[row["episode"]] = missing
         counts["plant"] += 1
         counts["outside"] += row["outside"] == "1"
         counts["outside, proved"] += row["outside"] == "1" and proved.get(key) == "1" and missing == 0
         counts["proved, missed"] += proved.get(key) == "1" and missing > 0
-        counts["drift"] = step
     summary: dict[str, Any] = {
         "episodes": len({episode for episode, _ in proved}),
         "steps of the controller": counts["steps"],

@@ -237,7 +237,9 @@ class ControllerNode:
             self.skipped += 1
         due = [each for each in self._waiting if _stamp(each) <= self.step]
         self._waiting = [each for each in self._waiting if _stamp(each) > self.step]
-        packets = [each for each in due if isinstance(each, Packet)]
+        oldest = self.step - self.loop.channel.longest_delay
+        packets = [each for each in due if isinstance(each, Packet) and each.stamp >= oldest]
+        self.refused["late"] += sum(isinstance(each, Packet) and each.stamp < oldest for each in due)
         echoes = [each for each in due if isinstance(each, Echo)]
         self.arrived = [packet.stamp for packet in packets]
         self.missing = max([self.missing, *(echo.missing for echo in echoes)])

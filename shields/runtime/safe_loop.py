@@ -118,6 +118,7 @@ class SafeLoop:
         contract: Channel contract of the certificate; None without one. Behind a downlink it counts c steps more than
             that of the channel.
         lead: c, the number of steps from a decision to its effect; 0 without a downlink.
+        channel: The channel of the samples.
         echo_age: The largest age of an echo [steps]; None without echoes.
 
     Raises:
@@ -130,6 +131,7 @@ class SafeLoop:
     contract: ChannelContract | None = setting("contract")
     lead: int = setting("lead")
     echo_age: int | None = setting("echo_age")
+    channel: Channel = setting("channel", "_estimator.channel")
 
     def __init__(
         self,

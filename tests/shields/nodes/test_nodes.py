@@ -185,6 +185,19 @@ def test_nothing_leaves_the_box_and_the_proof_holds_while_the_network_keeps_its_
     assert {"tag", "episode"} & set(world.sensor.refused | world.actuator.refused | world.controller.refused)
 
 
+@pytest.mark.slow
+def test_hour_at_50_hz_with_drift_attacks_and_mischief_is_proved_at_every_step():
+    world, reasons, worst = World(seed=5, offset=1234.0, drift=3e-4), set(), 0.0
+    for _ in range(90):
+        reasons |= set(world.run(2000))
+        worst = max(worst, world.worst)
+        world.history.clear()
+        world.air.recorded = world.air.recorded[-1000:]
+    assert reasons == {""}
+    assert 0.9 < worst <= 1.0  # the attack comes close
+    assert (world.actuator.actuator.echo.missing, world.clock.jumps) == (0, 0)
+
+
 def test_the_same_without_the_shield_leaves_the_box():
     world = World()
     loop = SafeLoop(CERTIFICATE, PLANT, CHANNEL, "monitor", downlink=CHANNEL, echo_age=10, on_unproved="ignore")
