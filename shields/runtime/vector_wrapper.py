@@ -169,7 +169,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         if self._clock is None:
             raise gym.error.ResetNeeded("call reset before the first step")
         actions, proposed = read_actions(self._filter.plant, actions, self.num_envs)
-        decided = self._filter.decide_many(self._report.estimate, self._report.errors, proposed, self._stored)
+        decided = self._filter.decide_columns(self._report.estimate, self._report.errors, proposed, self._stored)
         if self._filter.mode != "monitor" and np.count_nonzero(decided.intervened):
             actions = overridden(actions, decided, self._filter.plant.u_max)
         before, self._clock = self._clock, self._interrupted
