@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from agents.callbacks import DualAscentCallback, EvaluationCallback, SafetyCallb
 from agents.former_settings import FormerSettings, from_former
 from agents.hyperparams import ON_POLICY, complete_hyperparams
 from agents.loop import CostPenalty, LoopConfig
+from agents.replay import APPLIED
 from agents.results import TrainingPoint
 from agents.sb3_vec_env import SB3VecEnv
 
@@ -53,6 +54,7 @@ def train(
     settings: Any = None,
     log_folder: Path | None = None,
     on_progress: Callable[[int], None] | None = None,
+    callbacks: Sequence[BaseCallback] = (),
 ) -> TrainingResult:
     """Returns a trained agent and what happened on the way; the same seed gives the same result on one machine.
 
@@ -67,6 +69,7 @@ def train(
         settings: Former name of `hyperparams`.
         log_folder: Folder for TensorBoard's events, with evaluations on the way; None for neither.
         on_progress: Called with the number of steps taken since its last call.
+        callbacks: Callbacks of stable-baselines3 of your own, after those of this package.
 
     Raises:
         ValueError: If the algorithm or a hyperparameter is unknown, stable-baselines3 does not take a value, or no step
@@ -82,7 +85,7 @@ def train(
         beside.append(DualAscentCallback(loop.lagrangian, envs))
     if log_folder:
         beside.append(EvaluationCallback(loop, seed))
-    model.learn(steps, callback=beside)
+    model.learn(steps, callback=[*beside, *callbacks])
     agent = _agent(loop, algorithm, hyperparams, model, env)
     return TrainingResult(
         agent, callback.history, model.num_timesteps, callback.violation_steps, callback.interventions
@@ -125,7 +128,9 @@ def _trainable(
     if steps < 1:
         raise ValueError(f"steps must be at least 1, got {steps}")
     envs = loop.vector(hyperparams["n_envs"])
-    env = normalized_env(algorithm, SB3VecEnv(envs), hyperparams)
+    if (is_applied := hyperparams.get("stored_action") == "applied") and loop.residual_gain is not None:
+        raise ValueError('stored_action="applied" stores whole inputs, a residual policy has only a part of them')
+    env = normalized_env(algorithm, SB3VecEnv(envs, info_keys=(APPLIED,) if is_applied else ()), hyperparams)
     model = build_model(algorithm, env, hyperparams, seed, steps)
     if algorithm not in ON_POLICY and steps <= hyperparams["learning_starts"]:
         raise ValueError(f"{steps} steps train nothing: learning starts after {hyperparams['learning_starts']}")

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -21,8 +20,9 @@ from experiments.backends.execution import execute
 from experiments.backends.job import Job
 from experiments.runs import claim_folder, versions
 from experiments.settings import BackendSettings, CertifySettings
-from experiments.settings.certificates import changed_contract
+from experiments.settings.certificates import FEWEST_ENVS, changed_contract
 from ncs_gym.network import downlink_protocol
+from ncs_gym.registration import EPISODE_STEPS
 from shields import Certificate
 from shields.atomic_write import write_atomically
 from shields.runtime.safety_filter import DEFAULT_HORIZON
@@ -47,6 +47,9 @@ def attack(settings: CertifySettings) -> None:
     """
     campaign = _campaign(settings)
     cases = campaign.cases()
+    # Smaller batches, so that each kind of each case comes in once within the budget.
+    each = int(settings.steps / (len(cases) * campaign.kinds_of_batches * EPISODE_STEPS))
+    campaign = replace(campaign, envs=min(campaign.envs, max(each, FEWEST_ENVS)))
     if campaign.shielded:
         _require_claims(cases)
     with claim_folder("certify", settings):  # the name of the command in files
@@ -60,7 +63,9 @@ def _attack_in_folder(settings: CertifySettings, campaign: Campaign, cases: dict
     if campaign.env is not None:  # what a module registers may change
         keys = {case: f"{key} {cases[case].channel} {cases[case].downlink}" for case, key in keys.items()}
     store = CountsStore(settings.out / "tallies.jsonl", keys, campaign.envs)
-    batches = _batches(list(cases), settings.steps / campaign.batch_steps, campaign.kinds_of_batches)
+    batches = _batches(list(cases), int(settings.steps // campaign.batch_steps), campaign.kinds_of_batches)
+    if left_out := len(cases) - len(batches):
+        print(f"{left_out} of {len(cases)} cases are not attacked within {settings.steps:,.0f} steps", flush=True)
     missing = [each for planned in batches.values() for each in planned if each not in store.counts]
     start, steps = time.perf_counter(), campaign.batch_steps * len(missing)
     execute_batches(campaign, missing, certificates, store, settings.jobs)
@@ -158,15 +163,18 @@ def _certificate_files(cases: dict[str, AttackCase], folder: Path) -> dict[str, 
     return files
 
 
-def _batches(cases: list[str], count: float, least: int) -> dict[str, list[MonteCarloBatch]]:
-    """Returns the batches of each case, as evenly as possible, earlier cases first.
+def _batches(cases: list[str], count: int, least: int) -> dict[str, list[MonteCarloBatch]]:
+    """Returns the batches of each case that has some, as evenly as possible, earlier cases first.
 
     Args:
         cases: Names of the cases.
-        count: Smallest number of batches in all.
-        least: Smallest number of batches of each case.
+        count: Number of batches in all that the budget allows; one at least is run.
+        least: Number of kinds of batches, which take turns: they come in for the same cases where not all can.
     """
-    each, extra = divmod(max(math.ceil(count), least * len(cases)), len(cases))
+    count = max(count, 1)
+    if count < least * len(cases):
+        cases = cases[: -(-count // least)]
+    each, extra = divmod(count, len(cases))
     return {
         name: [MonteCarloBatch(name, index) for index in range(each + (number < extra))]
         for number, name in enumerate(cases)

@@ -22,7 +22,8 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
     """Returns a policy for an environment.
 
     Args:
-        name: "greedy", "zero", "random", or the folder of a trained agent or of the run that left it.
+        name: "greedy", "zero", "random", the folder of a trained agent or of the run that left it, or a zip of
+            stable-baselines3.
         env_id: Id of the environment.
         env: The environment.
         seed: Seed of the random policy.
@@ -40,8 +41,10 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
     if name == "greedy":
         return lambda observation, info: _greedy_action(env, observation, info["estimate"])
     from agents.agent import Agent  # imports torch
+    from agents.sharing.sb3_zip import is_sb3_zip, load_sb3_zip
 
-    agent = Agent.load(agent_folder(Path(name)))
+    path = Path(name)
+    agent = load_sb3_zip(path, env_id) if is_sb3_zip(path) else Agent.load(agent_folder(path))
     if agent.env != env_id:
         raise AgentError(f"the agent in {name} was trained in {agent.env}, not in {env_id}")
     return lambda observation, info: agent.act(observation[None])[0]

@@ -212,8 +212,12 @@ def small(monkeypatch):
     )
 
 
+# Steps in which each kind of both cases comes in once.
+ROUND = 6 * 16 * 200
+
+
 def settings(out, **changes):
-    return CertifySettings(**{"steps": 1, "out": out, "random_plants": 1, "envs": 16, **changes})
+    return CertifySettings(**{"steps": ROUND, "out": out, "random_plants": 1, "envs": 16, **changes})
 
 
 def document(folder):
@@ -230,6 +234,15 @@ def test_results_do_not_depend_on_worker_processes(tmp_path, small, capsys):
     assert document(tmp_path / "none")["total"]["steps"] == 6 * 16 * 200
 
 
+@pytest.mark.parametrize(
+    ("steps", "envs", "batches", "left_out"), [(20_000, 16, 6, 0), (7_000, 5, 6, 0), (2_500, 4, 3, 1)]
+)
+def test_a_budget_of_steps_is_kept(tmp_path, small, capsys, without_workers, steps, envs, batches, left_out):
+    attack(settings(tmp_path, steps=steps, envs=16))
+    assert document(tmp_path)["total"]["steps"] == batches * envs * 200 <= steps
+    assert ("1 of 2 cases are not attacked" in capsys.readouterr().out) is bool(left_out)
+
+
 def test_interrupted_campaign_goes_on(tmp_path, small, capsys, without_workers):
     attack(settings(tmp_path))
     whole = document(tmp_path)
@@ -242,11 +255,11 @@ def test_interrupted_campaign_goes_on(tmp_path, small, capsys, without_workers):
     capsys.readouterr()
     attack(settings(tmp_path))  # all there
     assert "per second" not in capsys.readouterr().out
-    attack(settings(tmp_path, steps=6 * 16 * 200 + 1))
+    attack(settings(tmp_path, steps=7 * 16 * 200))
     assert document(tmp_path)["total"]["steps"] == 7 * 16 * 200
     assert len(log.read_bytes().splitlines()) == 7
     finished = (tmp_path / "certify.json").read_bytes()
-    for changes in ({"steps": 1}, {"mode": "switch"}):
+    for changes in ({"steps": ROUND}, {"mode": "switch"}):
         with pytest.raises(OtherResultsError, match=next(iter(changes))):
             attack(settings(tmp_path, **changes))
         assert (tmp_path / "certify.json").read_bytes() == finished
@@ -397,7 +410,7 @@ def test_the_certificate_of_a_case_fits_its_plant_and_contract():
 
 def test_earlier_name_of_the_command_is_the_same_command(tmp_path, small, without_workers):
     for name in ("attack", "certify"):
-        run = ncs(name, "--steps", 1, "--random-plants", 1, "--envs", 16, "--out", tmp_path / "out")
+        run = ncs(name, "--steps", ROUND, "--random-plants", 1, "--envs", 16, "--out", tmp_path / "out")
         assert run.returncode == 0, run.stderr
     assert "per second" not in run.stdout  # all there, in the folder of the other name
     helps = [ncs(name, "--help").stdout for name in ("attack", "certify")]
