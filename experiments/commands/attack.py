@@ -64,8 +64,6 @@ def _attack_in_folder(settings: CertifySettings, campaign: Campaign, cases: dict
         keys = {case: f"{key} {cases[case].channel} {cases[case].downlink}" for case, key in keys.items()}
     store = CountsStore(settings.out / "tallies.jsonl", keys, campaign.envs)
     batches = _batches(list(cases), int(settings.steps // campaign.batch_steps), campaign.kinds_of_batches)
-    if left_out := len(cases) - len(batches):
-        print(f"{left_out} of {len(cases)} cases are not attacked within {settings.steps:,.0f} steps", flush=True)
     missing = [each for planned in batches.values() for each in planned if each not in store.counts]
     start, steps = time.perf_counter(), campaign.batch_steps * len(missing)
     execute_batches(campaign, missing, certificates, store, settings.jobs)
@@ -73,7 +71,9 @@ def _attack_in_folder(settings: CertifySettings, campaign: Campaign, cases: dict
     counts = {case: sum((store.counts[each] for each in planned), SafetyCounts()) for case, planned in batches.items()}
     total = sum(counts.values(), SafetyCounts())
     print(counts_table(counts, looks_ahead=campaign.looks_ahead))
-    limits = {name: case.escape_probability() for name, case in cases.items()} if campaign.gaussian else {}
+    if left_out := len(cases) - len(batches):
+        print(f"{left_out} of {len(cases)} cases are not attacked within {settings.steps:,.0f} steps")
+    limits = {name: cases[name].escape_probability() for name in batches} if campaign.gaussian else {}
     if limits:
         print("", gaussian_table(counts, limits), GAUSSIAN_LEGEND, sep="\n")
     if steps > 0:

@@ -87,15 +87,15 @@ def _greedy_action(env: NCSEnv, observation: np.ndarray, estimate: np.ndarray) -
 
     Args:
         env: Environment with the plant and the task.
-        observation: Observation, whose last entry belongs to the task.
+        observation: Observation, whose entry after the estimate belongs to the task.
         estimate: Estimate x_hat, shape (n,).
     """
     plant, task = env.plant, env.task
     if isinstance(task, SpeedTracking):
-        effect, missing = np.zeros(plant.m), float(observation[-1])
+        effect, missing = np.zeros(plant.m), float(observation[plant.n])
         effect[task.input_index] = plant.dt
     elif isinstance(task, SetpointTracking):
-        effect, missing = task.output @ plant.B, float(observation[-1] - task.output @ plant.A @ estimate)
+        effect, missing = task.output @ plant.B, float(observation[plant.n] - task.output @ plant.A @ estimate)
     else:
         u = np.linalg.lstsq(plant.box_rows @ plant.B, -plant.box_rows @ plant.A @ estimate)[0]
         return np.clip(u / plant.u_max, -1.0, 1.0).astype(np.float32)

@@ -235,7 +235,7 @@ def test_results_do_not_depend_on_worker_processes(tmp_path, small, capsys):
 
 
 @pytest.mark.parametrize(
-    ("steps", "envs", "batches", "left_out"), [(20_000, 16, 6, 0), (7_000, 5, 6, 0), (2_500, 4, 3, 1)]
+    ("steps", "envs", "batches", "left_out"), [(20_000, 16, 6, 0), (7_000, 5, 7, 0), (2_500, 4, 3, 1)]
 )
 def test_a_budget_of_steps_is_kept(tmp_path, small, capsys, without_workers, steps, envs, batches, left_out):
     attack(settings(tmp_path, steps=steps, envs=16))
