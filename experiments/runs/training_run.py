@@ -185,6 +185,7 @@ def execute_run(run: TrainingRun, on_progress: Callable[[int], None], log_folder
             run.settings,
             log_folder=log_folder,
             on_progress=on_progress,
+            checkpoints=log_folder and log_folder / "checkpoint",
         )
     agent = trained.agent if trained else _agent_of(run)
     evaluations = {}
