@@ -8,7 +8,7 @@ from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlan
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet
 from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
-from ncs_gym.network.downlink import Actuator, Command
+from ncs_gym.network.downlink import Actuator, Command, Echo
 from ncs_gym.network.escape_probability import escape_probability
 from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from ncs_gym.plants.batch_reactor import batch_reactor
@@ -42,6 +42,7 @@ __all__ = [
     "ClippedObservationWarning",
     "Command",
     "Disturbance",
+    "Echo",
     "Ellipsoid",
     "ErrorSet",
     "ErrorSetError",

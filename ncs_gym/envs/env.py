@@ -11,9 +11,9 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from ncs_gym.envs.episode_channels import EpisodeChannels, covering, downlinks, uplinks
-from ncs_gym.envs.info import Known, loop_info
+from ncs_gym.envs.info import Constraints, Known, loop_info
 from ncs_gym.envs.reset_options import CHANNELS, start_option
-from ncs_gym.envs.settings import expect, loop_contracts, require_suitable, starting_set
+from ncs_gym.envs.settings import expect, loop_contracts, require_own_equations, require_suitable, starting_set
 from ncs_gym.envs.spaces import entries_within, observation_space, observed_of, read_action, read_observed
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
 from ncs_gym.estimation.error_bound import ErrorSet
@@ -90,7 +90,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     | `input` | `(m,)` | of the inputs | the input applied in this step; zeros at reset |
     | `input_committed` | `(m,)` | of the inputs | the input decided in this step; without a downlink the one applied |
     | `constraint_values` | `(k,)` | - | abs(c_j x) - 1 for each of the k rows of the safe box; positive is violated |
-    | `cost` | float | - | 1.0 if the true state violates the safe box now, else 0.0 |
+    | `worst_constraint_values` | `(k,)` | - | the largest since the last step, also between samples if they count |
+    | `cost` | float | - | 1.0 if one of them is positive: the true state violated the safe box, else 0.0 |
     | `measurement_age` | int | steps | age of the newest sample used; the first estimate counts as a sample of step 0 |
     | `packet_arrived` | bool | - | whether a packet arrived at this step |
     | `assumption_violated` | bool | - | whether a measurement or the process broke a bound since the last reset |
@@ -186,6 +187,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._disturbance = as_disturbance(disturbance, plant, self._allow_assumption_violation)
         self._initial_set = starting_set(initial_set, plant)
         require_suitable(self._task, plant)
+        require_own_equations(process, plant)
         if render_mode is not None and not (isinstance(render_mode, str) and render_mode in RENDER_MODES):
             raise RenderModeError(f"render_mode must be None or one of {RENDER_MODES}, got {shown(render_mode)}")
         self.render_mode = render_mode
@@ -264,7 +266,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self.episodes += 1
         self._violations = 0.0
         self._consistent, self._over = True, False
-        info = self._info(no_inputs(self._plant.m), arrived=False)
+        values = self._plant.constraint_values(self._state)
+        info = self._info(no_inputs(self._plant.m), values, arrived=False)
         if self.renderer is not None:
             self.renderer.begin(info, self._task_state)
         return self._observation(), info
@@ -284,8 +287,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._consistent = False
         rng = self.np_random
         inputs = self._downlink_state.exchange(rng, self.steps, decided)
-        u = inputs.applied
-        self._state = self._process.advance(rng, self._state, u, self.steps, self._disturbance_memory)
+        u, before = inputs.applied, self._state
+        self._state = self._process.advance(rng, before, u, self.steps, self._disturbance_memory)
         self._task_state = self._task.advance(rng, self._plant, self._task_state, u)
         self.steps += 1
         sends = self._channel_state.sends_at(self.steps)
@@ -293,7 +296,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         packets = self._channel_state.exchange(rng, self.steps, sample, self._estimator.episode)
         self._estimator.advance(u, packets)
         reward = float(self._task.reward(self._plant, self._task_state, self._state, u))
-        info = self._info(inputs, arrived=bool(packets))
+        worst = self._plant.worst_constraint_values(before, u, self._state)
+        info = self._info(inputs, worst, arrived=bool(packets))
         terminated = self._process.terminated or (self._terminate_on_violation and info["cost"] > 0.0)
         self._consistent, self._over = True, terminated or self._process.truncated
         if self.renderer is not None:
@@ -376,11 +380,11 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         )
         return within.astype(np.float32)
 
-    def _info(self, inputs: Inputs, *, arrived: bool) -> dict[str, Any]:
-        values = self._plant.constraint_values(self._state)
-        cost = 1.0 if max(values.tolist()) > 0.0 else 0.0
+    def _info(self, inputs: Inputs, worst: np.ndarray, *, arrived: bool) -> dict[str, Any]:
+        values = worst if self._plant.between_samples is None else self._plant.constraint_values(self._state)
+        cost = 1.0 if max(worst.tolist()) > 0.0 else 0.0
         self._violations += cost
-        constraints = values, cost, self._violations
+        constraints = Constraints(values, worst, cost, self._violations)
         self._belief = self._predicted_estimate()
         known, alarm = self._estimator, bool(self._estimator.alarm or self._process.alarm)
         self._known = Known(*self._belief, known.age, alarm, inputs.applied.copy(), inputs.committed.copy())

@@ -165,7 +165,7 @@ class VectorRandomChannel(VectorWrapper, RecordConstructorArgs):
         return self.env.reset(seed=seed, options=self._drawn | (options or {}))  # pyright: ignore[reportArgumentType]
 
 
-def _drawn(channel: Any, downlink: Any) -> dict[str, Callable[[np.random.Generator], Channel]]:
+def _drawn(channel: Any, downlink: Any) -> dict[str, Callable[[np.random.Generator], Any]]:
     """Returns the options of `reset` that draw channels."""
     given = {name: each for name, each in {"channel": channel, "downlink": downlink}.items() if each is not None}
     if not given:
@@ -173,7 +173,7 @@ def _drawn(channel: Any, downlink: Any) -> dict[str, Callable[[np.random.Generat
     return {name: _draw(each, name) for name, each in given.items()}
 
 
-def _draw(source: Any, name: str) -> Callable[[np.random.Generator], Channel]:
+def _draw(source: Any, name: str) -> Callable[[np.random.Generator], Any]:
     if callable(source):
         return source
     choices = tuple(source) if isinstance(source, (list, tuple)) else ()

@@ -34,6 +34,22 @@ class Known(NamedTuple):
     committed: np.ndarray
 
 
+class Constraints(NamedTuple):
+    """How the safe box is kept; of N environments arrays whose last axis is the environment.
+
+    Attributes:
+        values: |c_j x| - 1 now, shape (k,) or (k, N).
+        worst: The largest since the last step, of the same shape.
+        cost: 1.0 if one of these is positive, else 0.0, a float or shape (N,).
+        violations: The sum of costs in the episode, a float or shape (N,).
+    """
+
+    values: np.ndarray
+    worst: np.ndarray
+    cost: Any
+    violations: Any
+
+
 def loop_info(
     estimator: Estimator | VectorEstimator,
     belief: tuple[np.ndarray, np.ndarray],
@@ -41,7 +57,7 @@ def loop_info(
     state: np.ndarray,
     inputs: Inputs,
     arrived: Any,
-    constraints: tuple[np.ndarray, Any, Any],
+    constraints: Constraints,
     alarm: Any,
 ) -> dict[str, Any]:
     """Returns `info`, every array a fresh copy; the environment is the first axis of what it holds for many.
@@ -54,10 +70,10 @@ def loop_info(
         state: x, shape (n,) or (n, N).
         inputs: What was applied and what was committed in the step.
         arrived: Whether a packet arrived at this step, a bool or a fresh array of shape (N,).
-        constraints: Constraint values, shape (k,) or (k, N), the cost, and the sum of costs in the episode.
+        constraints: How the safe box is kept.
         alarm: Whether an assumption was seen to be violated, a bool or a fresh array of shape (N,).
     """
-    values, cost, violations = constraints
+    values, worst, cost, violations = constraints
     age: Any = estimator.age
     applied, committed, missing = inputs
     estimate, error_shape = belief
@@ -71,6 +87,7 @@ def loop_info(
         "input": applied.copy().T if many else applied.copy(),
         "input_committed": committed.copy().T if many else committed.copy(),
         "constraint_values": values.T if many else values,
+        "worst_constraint_values": worst.copy().T if many else worst.copy(),
         "cost": cost,
         "measurement_age": age.copy() if many else age,
         "packet_arrived": arrived,

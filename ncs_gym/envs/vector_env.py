@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 
 from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, SAMPLE_ROUNDING, NCSEnv
 from ncs_gym.envs.episode_channels import covering, downlinks, uplinks
-from ncs_gym.envs.info import Known, loop_info
+from ncs_gym.envs.info import Constraints, Known, loop_info
 from ncs_gym.envs.reset_options import CHANNELS, vector_reset_options
 from ncs_gym.envs.spaces import entries_within, observed_of, read_actions
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
@@ -132,6 +132,7 @@ class NCSVectorEnv(VectorEnv):
         self._downlink_state = VectorDownlinkState(self._protocol, self._plant.m, self.num_envs)
         self._belief = self._predicted_estimates()
         self._state = np.zeros((self._plant.n, self.num_envs))
+        self._worst = self._plant.constraint_values(self._state)
         self._violations, self._done = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
         self.steps, self.episodes = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, np.int64)
         self.starts = np.full((self.num_envs, self._plant.n), np.nan)
@@ -205,6 +206,7 @@ class NCSVectorEnv(VectorEnv):
         for (_, each), sources in zip(links, read, strict=True):
             each.give(sources, np.flatnonzero(mask).tolist())
         self._begin(mask, starts)
+        self._worst = np.where(mask, self._plant.constraint_values(self._state), self._worst)
         info = self._info(no_inputs(self._plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), mask)
         self._consistent = True
         self._draw(info, begins=mask, moved=False)
@@ -233,6 +235,7 @@ class NCSVectorEnv(VectorEnv):
             self._begin(restarted, None)
             applied, committed = (np.where(restarted, 0.0, each) for each in (applied, committed))
             reward[restarted], arrived[restarted] = 0.0, False
+            self._worst[:, restarted] = self._plant.constraint_values(self._state[:, restarted])
             inputs = Inputs(applied, committed, missing & ~restarted)
         info = self._info(inputs, arrived, None)
         terminated, truncated = self._ends(info["cost"], restarted)
@@ -290,8 +293,9 @@ class NCSVectorEnv(VectorEnv):
 
     def _advance(self, u: np.ndarray) -> np.ndarray:
         """Moves everything one step on with inputs (m, N), and returns where packets arrived, shape (N,)."""
-        rng, estimator = self.np_random, self._estimator
-        self._state = self._process.advance(rng, self._state, u, self.steps, self._disturbance_memory)
+        rng, estimator, before = self.np_random, self._estimator, self._state
+        self._state = self._process.advance(rng, before, u, self.steps, self._disturbance_memory)
+        self._worst = self._plant.worst_constraint_values(before, u, self._state)
         self._task_state = self._task.advance_many(rng, self._plant, self._task_state, u)
         self.steps += 1
         self.ticks += 1
@@ -395,13 +399,13 @@ class NCSVectorEnv(VectorEnv):
 
     def _info(self, inputs: Inputs, arrived: np.ndarray, counted: np.ndarray | None) -> dict[str, Any]:
         """Returns the infos; the costs of environments that are not `counted`, shape (N,), do not count once more."""
-        values = self._plant.constraint_values(self._state)
-        cost = (np.maximum.reduce(values) > 0.0).astype(np.float64)
+        values = self._worst if self._plant.between_samples is None else self._plant.constraint_values(self._state)
+        cost = (np.maximum.reduce(self._worst) > 0.0).astype(np.float64)
         self._violations = self._violations + (cost if counted is None else cost * counted)
         self._belief = self._predicted_estimates()
         table, numbers = self.error_shapes
         belief = self._belief[0], table.shapes.take(numbers, axis=0)
-        constraints = values, cost, self._violations.copy()
+        constraints = Constraints(values, self._worst, cost, self._violations.copy())
         alarm = self._estimator.alarm | self._process.alarm
         self._known = Known(*belief, self._estimator.age.copy(), alarm.copy(), *(each.copy() for each in inputs[:2]))
         return loop_info(self._estimator, belief, self._contract, self._state, inputs, arrived, constraints, alarm)
@@ -415,6 +419,7 @@ class NCSVectorEnv(VectorEnv):
         final |= {f"_{key}": done.copy() for key in info}
         final_observation = _where(done, observation, np.zeros_like(observation))
         self._begin(done, None)
+        self._worst = self._plant.constraint_values(self._state)
         fresh = self._info(no_inputs(self._plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), done)
         inputs = (np.where(done, 0.0, each) for each in (ended.applied, ended.committed))
         self._known = Known(*self._known[:4], *inputs)

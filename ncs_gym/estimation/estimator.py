@@ -11,6 +11,7 @@ import numpy as np
 from ncs_gym.estimation.arrival_patterns import ArrivalPatterns, arrival_patterns, patterns_of
 from ncs_gym.estimation.error_bound import ErrorSet, require_error_set
 from ncs_gym.estimation.error_statistics_table import NO_SAMPLE, UNKNOWN
+from ncs_gym.estimation.kalman_filter import ErrorStatistics
 from ncs_gym.network.channel import Channel, Packet
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.validation import frozen, setting
@@ -79,7 +80,7 @@ class Estimator:
             else:
                 require_error_set(error_set, plant)
                 patterns = patterns_of(plant, channel, error_set)
-        self._patterns = patterns
+        self._patterns = self._usual = patterns
         self._error_set = self._patterns.recursion.error_set
         ages = self._error_set.ages
         if ages is not None and not ages.contract.is_fine_enough_for(channel):
@@ -102,11 +103,25 @@ class Estimator:
         """
         self.episode += not self._is_new
         self._is_new = False
+        self._patterns = self._usual
         self._begin(mean)
 
-    def _begin(self, mean: np.ndarray) -> None:
-        """Forgets everything but a first estimate, shape (n,)."""
-        self.step = self.age = 0
+    def restart(self, mean: np.ndarray, age: int) -> None:
+        """Begins anew at this step of the episode; samples taken before it are discarded from now on.
+
+        Args:
+            mean: An estimate, shape (n,), whose error lies in the certified set of an age.
+            age: Steps since the newest sample used was taken.
+        """
+        shape = self._error_set.shape_at(age)
+        assert shape is not None
+        first = ErrorStatistics(self._plant.kalman_covariances[2].copy(), shape.copy(), age)
+        self._patterns = patterns_of(self._plant, self._channel, self._error_set, first=first)
+        self._begin(mean, self.step, age)
+
+    def _begin(self, mean: np.ndarray, step: int = 0, age: int = 0) -> None:
+        """Forgets everything but an estimate, shape (n,), at a step."""
+        self.step, self.age = step, age
         self.alarm = False
         self.mean = frozen(np.array(mean, dtype=np.float64))
         self._pattern = self._patterns.root

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.plants import limits, statespace
+from ncs_gym.plants import between_samples, limits, statespace
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.remainder import Remainder, as_remainder
@@ -170,6 +170,11 @@ class LinearPlant(ReadOnlyArrays):
         initial_bound: Of a further error of the first estimate; kept as an `Ellipsoid`.
         remainder: What the model leaves out of the process that really moves, part of d (`ncs_gym.linear_model`); None
             if nothing.
+        continuous_model: [Ac, Bc] of the model x' = Ac x + Bc u in continuous time that A and B were sampled from,
+            shape (n, n + m) [1/s]; None if it is unknown.
+        between_samples: Number N of times per step, 2 to 64, at which the box counts; with a bound on what is between
+            them it then counts at all times, for environments and certificates (docs/shield_proof.md). None: at the
+            sampling instants alone. Needs a continuous model without remainder and a box that bounds every state.
         error_gain: The gain, shape (m, n), whose answers to an estimation error make it costly when error sets by age
             are chosen (docs/contracts.md), a certificate's K in round numbers; a regulator's by default.
         operating_state: State that deviations are counted from, shape (n,); for conversion and text.
@@ -198,6 +203,8 @@ class LinearPlant(ReadOnlyArrays):
     sensor_bound: Ellipsoid | None = None
     initial_bound: Ellipsoid | None = None
     remainder: Remainder | None = None
+    continuous_model: np.ndarray | None = None
+    between_samples: int | None = None
     error_gain: np.ndarray | None = None
     operating_state: np.ndarray = FILLED_IN_LATER
     operating_input: np.ndarray = FILLED_IN_LATER
@@ -226,6 +233,8 @@ class LinearPlant(ReadOnlyArrays):
             sensor_bound: Bound | None = None,
             initial_bound: Bound | None = None,
             remainder: Remainder | None = None,
+            continuous_model: ArrayLike | None = None,
+            between_samples: int | None = None,
             error_gain: ArrayLike | None = None,
             operating_state: ArrayLike | None = None,
             operating_input: ArrayLike | None = None,
@@ -249,6 +258,7 @@ class LinearPlant(ReadOnlyArrays):
         is_given = self._check_declared()
         if self.error_gain is not None:
             self._set("error_gain", as_matrix(self.error_gain, (self.m, n), "error_gain"))
+        self._check_between_samples()
         for name, size, letter in (("state", n, "x"), ("input", self.m, "u")):
             center = f"operating_{name}"
             self._set(center, limits.as_operating_point(getattr(self, center), size, center))
@@ -280,6 +290,27 @@ class LinearPlant(ReadOnlyArrays):
             remainder = remainder.of_model({name: getattr(self, name) for name in ("A", "B", "box", "u_max", "dt")})
         self._set("remainder", remainder)
         return is_given[0] or self.gamma > 0.0 or remainder is not None, is_given[1], is_given[2]
+
+    def _check_between_samples(self) -> None:
+        """Raises ValueError unless the model in continuous time is one, and there if times between samples count."""
+        if self.continuous_model is not None:
+            shape = (self.n, self.n + self.m)
+            self._set("continuous_model", as_matrix(self.continuous_model, shape, "continuous_model"))
+        if self.between_samples is None:
+            return
+        points = as_count(self.between_samples, "between_samples", low=2, high=between_samples.MOST_POINTS)
+        self._set("between_samples", points)
+        if self.continuous_model is None:
+            raise ValueError(
+                "between_samples needs a model in continuous time: make the plant by LinearPlant.from_statespace"
+            )
+        if self.remainder is not None:
+            raise ValueError(
+                "between_samples is for a plant without a remainder, which says nothing of the times between samples"
+            )
+        if np.linalg.matrix_rank(self.box) < self.n:
+            raise ValueError("between_samples needs a box that bounds every state: give it rows with generous limits")
+        between_samples.require_model_of(self.continuous_model, self.A, self.B, self.dt)
 
     @classmethod
     def around(
@@ -327,6 +358,8 @@ class LinearPlant(ReadOnlyArrays):
         Raises:
             ValueError: If D is not zero, dt is missing or another than the model's, or an argument is wrong.
         """
+        if input_delay and settings.get("between_samples") is not None:
+            raise ValueError("between_samples is for plants without input_delay")
         arguments = statespace.sampled_arguments(sys, dt, settings)
         given = {"state_limits", "input_limits"} & set(settings)
         if len(given) == 1:
@@ -377,6 +410,7 @@ class LinearPlant(ReadOnlyArrays):
             disturbance_bound=_padded(disturbance, stored),
             initial_bound=_padded(self.initial_bound, stored),
             remainder=remainder,
+            continuous_model=None,
             error_gain=None if self.error_gain is None else np.pad(self.error_gain, ((0, 0), (0, stored))),
             operating_state=np.concatenate([self.operating_state, np.tile(self.operating_input, delay)]),
             state_names=[*self.state_names, *(f"{name} of {age}" for age in ages for name in self.input_names)],
@@ -469,6 +503,15 @@ class LinearPlant(ReadOnlyArrays):
         """Rows c_j of the safe box |c_j x| <= 1, shape (k, n)."""
         return self.box
 
+    @cached_property
+    def grid_rows(self) -> between_samples.GridRows | None:
+        """What the box says of states and inputs between samples; None if only the sampling instants count."""
+        if self.between_samples is None or self.continuous_model is None:
+            return None
+        return between_samples.grid_rows(
+            self.continuous_model, self.box_rows, self.u_max, self.dt, self.between_samples
+        )
+
     @property
     def C(self) -> np.ndarray:
         """The former name of `box_rows`, which stays."""
@@ -507,6 +550,9 @@ class LinearPlant(ReadOnlyArrays):
             digest.update(
                 f"remainder{self.remainder.proved}".encode() + self.remainder.bound.shape_matrix.astype("<f8").tobytes()
             )
+        if self.between_samples is not None and self.continuous_model is not None:
+            digest.update(f"between_samples{self.between_samples}".encode())
+            digest.update(self.continuous_model.astype("<f8").tobytes())
         return digest.hexdigest()
 
     def has_fingerprint(self, fingerprint: str) -> bool:
@@ -516,6 +562,25 @@ class LinearPlant(ReadOnlyArrays):
     def constraint_values(self, state: np.ndarray) -> np.ndarray:
         """Returns |c_j x| - 1 for each row of the safe box, shape (k,) or (k, N); positive is violated."""
         return abs(self.box_rows.dot(state)) - 1.0
+
+    @cached_property
+    def _grid_values(self) -> between_samples.GridValues | None:
+        rows = self.grid_rows
+        return None if rows is None else between_samples.GridValues(rows, self.box_rows, self.A, self.B)
+
+    def worst_constraint_values(self, state: np.ndarray, u: np.ndarray, x_next: np.ndarray) -> np.ndarray:
+        """Returns the largest |c_j x| - 1 of a step after its beginning, shape (k,) or (k, N).
+
+        With `between_samples` at these times of the step, what moved x+ away from A x + B u in proportion to the time;
+        else at its end alone.
+
+        Args:
+            state: x at the beginning, shape (n,) or (n, N).
+            u: Input that was held, shape (m,) or (m, N).
+            x_next: x+, of the shape of x.
+        """
+        values, grid = self.constraint_values(x_next), self._grid_values
+        return values if grid is None else grid.worst(state, u, x_next, values)
 
     def to_deviation(self, value: ArrayLike, of: str = "state") -> np.ndarray:
         """Returns a physical state, input or output as its deviation from the operating point.
@@ -759,6 +824,8 @@ def _describe(plant: LinearPlant) -> str:
             )
         ],
     }
+    if plant.between_samples is not None:
+        lines["safe box"].append(f"at all times: at {plant.between_samples} of each step, and bounded between them")
     for title, (sizes_of, names, units) in extents.items():
         parts = [f"{name} up to {_sized(*each)}" for name, *each in zip(names, sizes_of, units, strict=True)]
         lines[title] = [", ".join(part.replace(" ", _UNBROKEN) for part in parts)]

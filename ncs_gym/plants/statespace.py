@@ -69,7 +69,16 @@ def arguments_with_noise(
         "measurement_noise_cov": np.diag(np.square(sensor * outputs)) / truncation_energy(delta, len(H)),
         "initial_cov": np.diag(np.square(sensor * smallest)) / truncation_energy(delta, n),
     }
-    common = {"A": sampled_A, "B": sampled_B, "box": half_widths, "H": H, "u_max": u_max, "dt": dt}
+    model = np.concatenate([A, B], axis=1)
+    common = {
+        "A": sampled_A,
+        "B": sampled_B,
+        "continuous_model": model,
+        "box": half_widths,
+        "H": H,
+        "u_max": u_max,
+        "dt": dt,
+    }
     return common | defaults | arguments
 
 
@@ -104,11 +113,13 @@ def sampled_arguments(sys: Any, dt: float | None, settings: dict[str, Any]) -> d
             raise ValueError("the model has no sampling time: give dt, the duration of a step in seconds")
         dt = own
     dt = as_number(dt, "dt", low=0.0, low_open=True)
+    model = {}
     if is_continuous:
+        model = {"continuous_model": np.concatenate([A, B], axis=1)}
         A, B = zero_order_hold(A, B, dt)
     elif own is not True and abs(as_number(own, "dt of the model", low=0.0) - dt) > SAME_STEP * dt:
         raise ValueError(f"dt must be that of the model in discrete time, {own}, or be left out, got {dt}")
-    return {"A": A, "B": B, "H": H, "dt": dt} | settings
+    return {"A": A, "B": B, "H": H, "dt": dt} | model | settings
 
 
 def _matrices(sys: Any) -> tuple[Any, Any, Any, Any, Any]:

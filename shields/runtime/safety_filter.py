@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ncs_gym import Ellipsoid, LinearPlant
+from ncs_gym import LinearPlant
 from ncs_gym.validation import ReadOnlyArrays, as_count, as_numbers, read_only, shown
 from shields.certificate import Certificate
-from shields.polytope import Polytope
 from shields.runtime.decisions import FALLBACK, INVALID, PROJECTED, REASONS, SAFE, UNSAFE, Decision
 from shields.runtime.one_step import (
     MOST_INPUTS_WITH_VERTICES,
@@ -21,7 +20,7 @@ from shields.runtime.one_step import (
     ReachableSets,
     require_computable,
 )
-from shields.runtime.polytope_step import PolytopeTest
+from shields.runtime.polytope_step import EllipsoidOnGrid, PolytopeTest
 from shields.verification import ACTION_ROUNDING, require_valid
 
 if TYPE_CHECKING:
@@ -58,7 +57,7 @@ class SafetyFilter(ReadOnlyArrays):
         horizon: Longest plan of mode "lookahead", in steps; None is 6. Other modes take none.
 
     Attributes:
-        test: The one-step test, for the polytope if there is one, except in mode "lookahead".
+        test: The one-step test, for the polytope if there is one.
         lookahead: What finds and certifies the plans of mode "lookahead"; None in others.
 
     Raises:
@@ -86,9 +85,9 @@ class SafetyFilter(ReadOnlyArrays):
             raise ValueError(f'mode "boundary" takes at most {MOST_INPUTS_WITH_VERTICES} inputs, got {self.plant.m}')
         require_valid(self.certificate, self.plant)
         require_computable(self.certificate, self.plant)
-        # Plans of mode "lookahead" end in the ellipsoid.
-        polytope = None if self.mode == "lookahead" else self.certificate.polytope
-        test = OneStepTest(self.certificate.L, self.plant) if polytope is None else PolytopeTest(polytope, self.plant)
+        polytope = self.certificate.polytope
+        kind = OneStepTest if self.plant.grid_rows is None else EllipsoidOnGrid
+        test = kind(self.certificate.L, self.plant) if polytope is None else PolytopeTest(polytope, self.plant)
         object.__setattr__(self, "test", test)
         object.__setattr__(self, "_no_plan", read_only(np.empty((0, self.plant.m))))
         object.__setattr__(self, "lookahead", self._lookahead())
@@ -109,18 +108,7 @@ class SafetyFilter(ReadOnlyArrays):
         given = DEFAULT_HORIZON if self.horizon is None else self.horizon
         horizon = as_count(given, "horizon", low=1, high=LONGEST_HORIZON)
         object.__setattr__(self, "horizon", horizon)
-        assert isinstance(self.test, OneStepTest)
         return Lookahead(self.test, self.certificate.K, horizon, MARGIN)
-
-    @property
-    def polytope(self) -> Polytope | None:
-        """The polytope that is kept in place of S; None in mode "lookahead", whose plans end in S."""
-        return self.certificate.polytope if self.lookahead is None else None
-
-    @property
-    def kept_set(self) -> Ellipsoid | Polytope:
-        """The set that the one-step test keeps the state in."""
-        return self.certificate.ellipsoid if self.polytope is None else self.polytope
 
     @cached_property
     def projection_margin(self) -> float:
@@ -300,7 +288,7 @@ class SafetyFilter(ReadOnlyArrays):
 
     @np.errstate(all="ignore")
     def knows_inside(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
-        """Returns whether |x_hat|_M + sqrt(lambda_max(M Sigma_k)) <= 1, which proves that x is in S."""
+        """Returns whether estimate and error shape prove that x is in the certificate's safe set."""
         x_hat, errors = _as_array(estimate), self.errors_of(error_shape)
         return x_hat.shape == (self.plant.n,) and bool(self.test.knows_inside(x_hat, errors, MARGIN))
 

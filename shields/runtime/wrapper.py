@@ -37,17 +37,18 @@ INTERRUPTED = (-1, -1)
 # What of an environment a shield's proof rests on.
 PREMISES = "plant", "channel", "contract", "downlink_protocol", "certificate_contract", "process", "initial_set"
 
-_synthesized: dict[tuple[str, ChannelContract | None], Certificate] = {}
+_synthesized: dict[tuple[str, ChannelContract | None, str | None], Certificate] = {}
 
 
 class SafetyShield(gym.Wrapper, RecordConstructorArgs):
     """Overrides an action whenever the safe set could be left (docs/shield.md).
 
     The action passes unchanged if every state the estimate allows stays in S; otherwise "project" applies the closest
-    input that keeps it there, "switch" (and "project" where there is none) the certified u = K x_hat. From a start in S
-    the true state then stays in S for ever, for any policy, disturbance and channel within the assumptions;
-    `info["shield_guaranteed"]` says whether they still hold as far as can be seen. "boundary" trusts the agent only
-    where no input at all could leave S. "monitor" never changes the action and counts what "switch" would have done.
+    input that keeps it there, "switch" (and "project" where there is none) the certified u = K x_hat. S is the
+    certificate's safe set: its polytope, or its ellipsoid if it has none. From a start in S the true state then stays
+    in S for ever, for any policy, disturbance and channel within the assumptions; `info["shield_guaranteed"]` says
+    whether they still hold as far as can be seen. "boundary" trusts the agent only where no input at all could leave S.
+    "monitor" never changes the action and counts what "switch" would have done.
 
     Wrap it directly around what `gym.make` returns; wrappers that change or repeat actions go outside it.
 
@@ -220,7 +221,7 @@ def annotation_of(
 ) -> Annotation:
     """Returns what a picture shows of a shield in a step, or at a reset, where nothing is proposed."""
     return Annotation(
-        safe_set=safety_filter.kept_set,
+        safe_set=safety_filter.certificate.safe_set,
         label=safety_filter.mode,
         proposed=proposed,
         intervened=intervened,
@@ -246,23 +247,27 @@ def recorded_certificate(given: Any) -> Any:
 
 
 def certificate_for(
-    plant: LinearPlant, contract: ChannelContract | None = None, progress: Callable[[str], object] | None = None
+    plant: LinearPlant,
+    contract: ChannelContract | None = None,
+    progress: Callable[[str], object] | None = None,
+    safe_set: str | None = None,
 ) -> Certificate:
-    """Returns a synthesized certificate, made once per process, plant and channel contract.
+    """Returns a synthesized certificate, made once per process, plant, channel contract and kind of safe set.
 
     Args:
         plant: The plant.
         contract: Channel contract; None for none.
         progress: Called with a line of text per stage of the synthesis.
+        safe_set: "polytope", "ellipsoid" or None; see `synthesize`.
 
     Raises:
         Infeasible: If none is found.
     """
-    key = plant.fingerprint, contract
+    key = plant.fingerprint, contract, safe_set
     if key not in _synthesized:
         from shields.synthesis import synthesize  # the solver, which who has a certificate does without
 
-        _synthesized[key] = synthesize(plant, contract=contract, progress=progress)
+        _synthesized[key] = synthesize(plant, contract=contract, safe_set=safe_set, progress=progress)
     return _synthesized[key]
 
 

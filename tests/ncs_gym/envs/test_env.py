@@ -25,6 +25,7 @@ KEYS = {
     "input": np.ndarray,
     "input_committed": np.ndarray,
     "constraint_values": np.ndarray,
+    "worst_constraint_values": np.ndarray,
     "cost": float,
     "measurement_age": int,
     "packet_arrived": bool,

@@ -1,0 +1,136 @@
+"""The safe box between two sampling instants, on a grid of times (docs/shield_proof.md, "Between the samples").
+
+With the input held, x(tau) = A_tau x + B_tau u + d_tau, where [A_tau, B_tau] is the upper part of exp(G tau) for
+G = [[Ac, Bc], [0, 0]] of the model x' = Ac x + Bc u + w in continuous time.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ncs_gym import exact
+from ncs_gym.plants.statespace import zero_order_hold
+from ncs_gym.validation import read_only
+
+MOST_POINTS = 64
+# A and B of a plant are those of its model in continuous time up to this, relative to their largest entries.
+SAME_MODEL = 1e-9
+# What the bound between grid points is enlarged by, relative to itself and to what a row reaches: for the rounding of
+# the rows, which the verification of a certificate bounds.
+SLACK, ROUNDING = 0.01, 1e-12
+
+
+class GridRows(NamedTuple):
+    """What the rows c of the safe box say about x and u at the times tau_i = i dt / N of a step, i = 0..N-1.
+
+    Attributes:
+        state: c A_tau, shape (N, k, n); those of i = 0 are the rows themselves.
+        input: c B_tau, shape (N, k, m).
+        remainder: eta, shape (k,): while x is in the box and u within its limits, |c (A_tau x + B_tau u)| is nowhere
+            larger than at the two grid points around tau by more than this, the rounding of the rows included.
+    """
+
+    state: np.ndarray
+    input: np.ndarray
+    remainder: np.ndarray
+
+
+def generator(model: np.ndarray) -> np.ndarray:
+    """Returns G = [[Ac, Bc], [0, 0]], shape (n + m, n + m), of [Ac, Bc], shape (n, n + m)."""
+    n, size = model.shape
+    return np.concatenate([model, np.zeros((size - n, size))])
+
+
+def widest(box_rows: np.ndarray) -> np.ndarray:
+    """Returns bounds of |x_i| in the safe box, shape (n,): x = (C'C)^-1 C' (C x), and no entry of C x exceeds 1.
+
+    Raises:
+        ZeroDivisionError: If the box does not bound every state.
+    """
+    gram = exact.product(box_rows.T, box_rows)
+    return np.abs(exact.product(exact.inverse(gram), box_rows.T)).sum(axis=1)
+
+
+def grid_rows(model: np.ndarray, box_rows: np.ndarray, u_max: np.ndarray, dt: float, points: int) -> GridRows:
+    """Returns the rows on the grid; every number is the same on every machine.
+
+    Between two grid points a function leaves its linear interpolation by at most h^2/8 times its largest second
+    derivative, here [c, 0] G^2 exp(G tau) (x, u). In the norm |q|_W = sum |q_j| W_j, with W the largest |x_j| and
+    |u_j|, that grows from one grid point to the next by at most exp(h m), m the logarithmic norm of G.
+
+    Args:
+        model: [Ac, Bc], shape (n, n + m).
+        box_rows: c, shape (k, n).
+        u_max: Input limits, shape (m,).
+        dt: Duration of a step [s].
+        points: N.
+
+    Raises:
+        ZeroDivisionError: If the box does not bound every state.
+    """
+    G, (k, n), h = generator(model), box_rows.shape, dt / points
+    W = np.concatenate([widest(box_rows), u_max])
+    rows = np.concatenate([box_rows, np.zeros((k, len(u_max)))], axis=1)
+    onward = [rows] + [exact.product(rows, exact.exponential(G, dt * i / points)) for i in range(1, points)]
+    bends = [exact.product(np.abs(exact.product(each, G, G)), W) for each in onward]
+    sizes = [exact.product(np.abs(each), W) for each in onward]
+    growth = float(exact.exponential(np.array([[logarithmic_norm(G, W)]]), h)[0, 0])
+    remainder = (1.0 + SLACK) * (h * h / 8.0) * growth * np.max(bends, axis=0) + ROUNDING * np.max(sizes, axis=0)
+    stacked = np.array(onward)
+    return GridRows(read_only(stacked[..., :n]), read_only(stacked[..., n:]), read_only(remainder))
+
+
+def logarithmic_norm(G: np.ndarray, W: np.ndarray) -> float:
+    """Returns m = max_i (G_ii + sum_{j != i} |G_ij| W_j / W_i), at least 0.
+
+    In the norm max |z_j| / W_j of columns, and so in |q|_W of rows, |exp(G s)| <= exp(s m).
+    """
+    off = np.abs(G) * (1.0 - np.eye(len(G)))
+    return max(float((np.diag(G) + exact.product(off, W) / W).max()), 0.0)
+
+
+def require_model_of(model: np.ndarray, A: np.ndarray, B: np.ndarray, dt: float) -> None:
+    """Raises ValueError unless A and B are those of [Ac, Bc], shape (n, n + m), with the input held over a step."""
+    n = len(A)
+    sampled = np.concatenate(zero_order_hold(model[:, :n], model[:, n:], dt), axis=1)
+    given = np.concatenate([A, B], axis=1)
+    if not (np.abs(sampled - given) <= SAME_MODEL * np.abs(given).max()).all():
+        raise ValueError(
+            "between_samples needs the model in continuous time that A and B were sampled from, and continuous_model "
+            "is another one: make the plant by LinearPlant.from_statespace"
+        )
+
+
+class GridValues:
+    """The constraint values |c x| - 1 at the grid points within a step of a simulation, given its two ends.
+
+    What a disturbance did to the step, d = x+ - A x - B u, has come in proportion to the time: d_tau = (tau / dt) d,
+    which lies in E(D) as d does. So c x(tau_i) is a sum of products with x, u and x+.
+
+    Args:
+        rows: Of the plant.
+        box_rows: c, shape (k, n).
+        A, B: Of the plant.
+    """
+
+    def __init__(self, rows: GridRows, box_rows: np.ndarray, A: np.ndarray, B: np.ndarray) -> None:
+        points, k, _ = rows.state.shape
+        shares = (np.arange(1, points) / points)[:, None, None]
+        moved = rows.state[1:] - shares * (box_rows @ A)
+        pushed = rows.input[1:] - shares * (box_rows @ B)
+        joint = np.concatenate([moved, pushed, shares * box_rows], axis=2)
+        self._shape, self._joint = (points - 1, k), np.ascontiguousarray(joint.reshape((points - 1) * k, -1))
+
+    def worst(self, state: np.ndarray, u: np.ndarray, x_next: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Returns the largest values since the last sample, shape (k,) or (k, N); never below those at the end.
+
+        Args:
+            state: x, shape (n,) or (n, N).
+            u: Applied input, shape (m,) or (m, N).
+            x_next: x+, of the shape of x.
+            values: |c x+| - 1, shape (k,) or (k, N).
+        """
+        sizes = np.abs(self._joint.dot(np.concatenate([state, u, x_next])))
+        return np.maximum(sizes.reshape(*self._shape, *values.shape[1:]).max(axis=0, initial=0.0) - 1.0, values)
