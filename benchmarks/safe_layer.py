@@ -35,6 +35,11 @@ class SafePPOPolicy(ActorCriticPolicy):
         self.seen = obs
         return super().extract_features(obs, features_extractor)
 
+    def get_distribution(self, obs: Any) -> Any:
+        """Returns the distribution of actions."""
+        self.seen = obs
+        return super().get_distribution(obs)
+
     def _get_action_dist_from_latent(self, latent_pi: Any) -> Any:
         (layer,) = self.layer_of
         mean = layer(self.action_net(latent_pi), self.seen[:, : layer.filter.plant.n])

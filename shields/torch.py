@@ -11,6 +11,7 @@ from torch import nn
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
 from shields.runtime.one_step import ReachableSets
+from shields.runtime.polytope_step import PolytopeSets, SetsOnGrid
 from shields.runtime.safety_filter import SafetyFilter
 
 # A constraint counts as attained by the closest input within this much, relative to what it bounds.
@@ -104,6 +105,8 @@ def projection_jacobians(
     For inputs that do not pass and have a closest one that does. With the active linear constraints a u = b the
     projection moves in their null space only, spanned by the columns of V. If it lies on |o + E u| = r with multiplier
     t, and q = E'(o + E u), then V'(I + t E'E) V dz + V'q dt = V'dw and q'V dz = 0, du = V dz, where w is the proposal.
+    Of several inputs on an ellipsoid and a grid the shield alternates projections; this is then what the constraints
+    that hold at the end leave free.
 
     Args:
         shield: In mode "project".
@@ -111,27 +114,29 @@ def projection_jacobians(
         error_shapes: Shape (N, n, n) or (n, n).
         proposals: Shape (N, m) [physical units].
     """
-    test, limits, count = shield.test, shield.plant.u_max, len(estimates)
+    limits, count = shield.plant.u_max, len(estimates)
     found = np.zeros((count, len(limits), len(limits)))
     if len(limits) == 1:  # it is moved to an end of the interval
         return found
     errors = shield.errors_of_many(np.broadcast_to(error_shapes, (count, *error_shapes.shape[-2:])))
-    sets = test.reachable(np.array(estimates.T, order="C"), errors)
+    sets = shield.test.reachable(np.array(estimates.T, order="C"), errors)
     wanted = np.array(proposals.T, order="C")
     closest = sets.closest(wanted, shield.projection_margin)
+    ball_of = sets.first if isinstance(sets, SetsOnGrid) else sets if isinstance(sets, ReachableSets) else None
+    rows_of = sets.grid if isinstance(sets, SetsOnGrid) else sets if isinstance(sets, PolytopeSets) else None
     for e in range(count):
         u, held = closest[:, e], np.abs(closest[:, e]) >= (1.0 - ATTAINED) * limits
         active, ball = np.eye(len(limits))[held], None
-        if isinstance(sets, ReachableSets):
-            weighting = sets.weighting[..., e]
-            effect, center = weighting @ sets.test.effect, weighting @ (sets.offset[:, e] + sets.test.effect @ u)
-            radius = float(sets.radius[e]) - shield.projection_margin
+        if ball_of is not None:
+            test, weighting = ball_of.test, ball_of.weighting[..., e]
+            effect, center = weighting @ test.effect, weighting @ (ball_of.offset[:, e] + test.effect @ u)
+            radius = float(ball_of.radius[e]) - shield.projection_margin
             if np.sqrt(center @ center) >= (1.0 - ATTAINED) * radius:
                 ball = effect, effect.T @ center
-        else:
-            room = sets.room[:, e] - sets.rounding[e] - shield.projection_margin
-            center = np.abs(sets.test.moved @ estimates[e] + sets.test.effect @ u)
-            active = np.vstack([active, sets.test.effect[center >= room - ATTAINED * np.maximum(room, 1e-3)]])
+        if rows_of is not None:
+            test, room = rows_of.test, rows_of.room[:, e] - rows_of.rounding[e] - shield.projection_margin
+            center = np.abs(test.moved @ estimates[e] + test.effect @ u)
+            active = np.vstack([active, test.effect[center >= room - ATTAINED * np.maximum(room, 1e-3)]])
         found[e] = _jacobian(_null_space(active, limits), ball, wanted[:, e] - u)
     return found * limits / limits[:, None]  # d(u / limits) / d(w / limits)
 
