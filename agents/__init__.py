@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from agents.former_settings import A2CSettings, OffPolicySettings, PPOSettings, tuned_settings
     from agents.hyperparams import read_hyperparams, tuned_hyperparams, tuned_steps
     from agents.loop import ControlLoop, LagrangianSettings, LoopConfig, ShieldSettings
+    from agents.replay import AppliedActionBuffer
     from agents.results import Episode, Evaluation, TrainingPoint, Trajectory
     from agents.sb3_vec_env import SB3VecEnv
     from agents.sharing.agent_file import AgentError
@@ -25,6 +26,7 @@ __all__ = [
     "A2CSettings",
     "Agent",
     "AgentError",
+    "AppliedActionBuffer",
     "ControlLoop",
     "DualAscentCallback",
     "Episode",
@@ -55,6 +57,7 @@ _MODULES = {
     "evaluation": ("evaluate",),
     "former_settings": ("A2CSettings", "OffPolicySettings", "PPOSettings", "tuned_settings"),
     "hyperparams": ("read_hyperparams", "tuned_hyperparams", "tuned_steps"),
+    "replay": ("AppliedActionBuffer",),
     "results": ("Episode", "Evaluation", "TrainingPoint", "Trajectory"),
     "sb3_vec_env": ("SB3VecEnv",),
     "sharing.agent_file": ("AgentError",),

@@ -19,6 +19,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from agents.hyperparams import ALGORITHMS, ON_POLICY, rollout_steps
+from agents.replay import AppliedActionBuffer
 from ncs_gym.validation import shown
 
 # Arguments of the library that are no hyperparameters: they are given here.
@@ -82,7 +83,9 @@ def build_model(name: str, env: VecEnv, hyperparams: Mapping[str, Any], seed: in
 
 def _not_the_librarys(name: str) -> tuple[str, ...]:
     """Returns the hyperparameters of an algorithm that its constructor does not take."""
-    return ("n_envs", "n_timesteps", "normalize") + (() if name in ON_POLICY else ("noise_type", "noise_std"))
+    return ("n_envs", "n_timesteps", "normalize") + (
+        () if name in ON_POLICY else ("noise_type", "noise_std", "stored_action")
+    )
 
 
 def _arguments(
@@ -98,6 +101,11 @@ def _arguments(
     _require_fitting(cls, own)
     if name in ON_POLICY and "batch_size" in own:
         own["batch_size"] = min(own["batch_size"], hyperparams["n_steps"] * env.num_envs)
+    if (stored := hyperparams.get("stored_action", "proposed")) not in ("proposed", "applied"):
+        raise ValueError(f'stored_action must be "proposed" or "applied", got {shown(stored)}')
+    if stored == "applied":
+        own["replay_buffer_class"] = AppliedActionBuffer
+        own["replay_buffer_kwargs"] = {"limits": env.get_attr("plant")[0].u_max}
     if (noise_type := hyperparams.get("noise_type")) not in (None, "normal"):
         raise ValueError(f"noise_type cannot be {shown(noise_type)}")
     if (deviation := hyperparams.get("noise_std")) is not None:

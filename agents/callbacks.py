@@ -132,6 +132,30 @@ class DualAscentCallback(BaseCallback):
         self.logger.record("safety/multiplier", self._priced.penalty)
 
 
+class CheckpointCallback(BaseCallback):
+    """Saves what is learned so far about ten times while an agent is trained, between rollouts.
+
+    Args:
+        save: Saves it.
+    """
+
+    def __init__(self, save: Callable[[], None]) -> None:
+        super().__init__()
+        self._save, self._due = save, 0.0
+
+    def _on_training_start(self) -> None:
+        self._interval = self.locals["total_timesteps"] / _EVALUATIONS
+        self._due = self._interval
+
+    def _on_rollout_start(self) -> None:
+        if self.num_timesteps >= self._due:
+            self._save()
+            self._due = self.num_timesteps + self._interval
+
+    def _on_step(self) -> bool:
+        return True
+
+
 class EvaluationCallback(BaseCallback):
     """Evaluates the policy about every tenth part of the training, and once more at its end, and logs the results.
 

@@ -8,7 +8,9 @@ the constructor:
 - `n_envs`: number of environments stepped side by side;
 - `n_timesteps`: training steps, where the caller asks for no number of them;
 - `normalize`: true, or arguments of `VecNormalize` such as `{"norm_reward": false}`;
-- `noise_std`, and `noise_type`, which is "normal": exploration noise of off-policy algorithms, in units of the limits.
+- `noise_std`, and `noise_type`, which is "normal": exploration noise of off-policy algorithms, in units of the limits;
+- `stored_action`: of off-policy algorithms, "applied" to learn from the actions that the shield applied, "proposed"
+  (the default) from the agent's own.
 
 `agents/tuned/ppo.json` has those found by a search for each registered environment (docs/agents.md).
 """

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,16 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.agent import Agent, Normalization
 from agents.algorithms import build_model, normalized_env
-from agents.callbacks import DualAscentCallback, EvaluationCallback, SafetyCallback
+from agents.callbacks import CheckpointCallback, DualAscentCallback, EvaluationCallback, SafetyCallback
 from agents.former_settings import FormerSettings, from_former
 from agents.hyperparams import ON_POLICY, complete_hyperparams
 from agents.loop import CostPenalty, LoopConfig
+from agents.replay import APPLIED
 from agents.results import TrainingPoint
 from agents.sb3_vec_env import SB3VecEnv
+
+# Observations that the normalization of an agent to go on from counts as.
+KNOWN_STEPS = 100_000
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,9 @@ def train(
     settings: Any = None,
     log_folder: Path | None = None,
     on_progress: Callable[[int], None] | None = None,
+    callbacks: Sequence[BaseCallback] = (),
+    start: Agent | None = None,
+    checkpoints: Path | None = None,
 ) -> TrainingResult:
     """Returns a trained agent and what happened on the way; the same seed gives the same result on one machine.
 
@@ -67,10 +75,15 @@ def train(
         settings: Former name of `hyperparams`.
         log_folder: Folder for TensorBoard's events, with evaluations on the way; None for neither.
         on_progress: Called with the number of steps taken since its last call.
+        callbacks: Callbacks of stable-baselines3 of your own, after those of this package.
+        start: An agent to go on from, of the same environment, algorithm and networks: its weights, the state of its
+            optimizers and its normalization; rates that fall, and replay buffers, begin anew.
+        checkpoints: Folder that holds the agent as it is, written ten times on the way and when the training is
+            interrupted (Ctrl-C); None for none.
 
     Raises:
-        ValueError: If the algorithm or a hyperparameter is unknown, stable-baselines3 does not take a value, or no step
-            is left to learn in.
+        ValueError: If the agent to go on from does not fit, the algorithm or a hyperparameter is unknown,
+            stable-baselines3 does not take a value, or no step is left to learn in.
         ModuleNotFoundError: If the algorithm's package is not installed.
     """
     hyperparams = _complete(algorithm, hyperparams, settings)
@@ -82,8 +95,18 @@ def train(
         beside.append(DualAscentCallback(loop.lagrangian, envs))
     if log_folder:
         beside.append(EvaluationCallback(loop, seed))
-    model.learn(steps, callback=beside)
-    agent = _agent(loop, algorithm, hyperparams, model, env)
+    if start is not None:
+        _go_on(start, loop, algorithm, model, env)
+    current = partial(_agent, loop, algorithm, hyperparams, model, env)
+    if checkpoints is not None:
+        beside.append(CheckpointCallback(lambda: current().save(checkpoints, loop.shield)))
+    try:
+        model.learn(steps, callback=[*beside, *callbacks])
+    except KeyboardInterrupt:
+        if checkpoints is not None:
+            current().save(checkpoints, loop.shield)
+        raise
+    agent = current()
     return TrainingResult(
         agent, callback.history, model.num_timesteps, callback.violation_steps, callback.interventions
     )
@@ -125,11 +148,33 @@ def _trainable(
     if steps < 1:
         raise ValueError(f"steps must be at least 1, got {steps}")
     envs = loop.vector(hyperparams["n_envs"])
-    env = normalized_env(algorithm, SB3VecEnv(envs), hyperparams)
+    if (is_applied := hyperparams.get("stored_action") == "applied") and loop.residual_gain is not None:
+        raise ValueError('stored_action="applied" stores whole inputs, a residual policy has only a part of them')
+    env = normalized_env(algorithm, SB3VecEnv(envs, info_keys=(APPLIED,) if is_applied else ()), hyperparams)
     model = build_model(algorithm, env, hyperparams, seed, steps)
     if algorithm not in ON_POLICY and steps <= hyperparams["learning_starts"]:
         raise ValueError(f"{steps} steps train nothing: learning starts after {hyperparams['learning_starts']}")
     return envs, env, model
+
+
+def _go_on(start: Agent, loop: LoopConfig, algorithm: str, model: BaseAlgorithm, env: VecNormalize) -> None:
+    """Puts weights, optimizers and normalization of an agent into a model and its environment.
+
+    Raises:
+        ValueError: If the agent is of another environment or algorithm, or its networks have other sizes.
+    """
+    if (start.env, start.algorithm) != (loop.env, algorithm):
+        raise ValueError(
+            f"the agent to go on from is {start.algorithm} of {start.env}, this is {algorithm} of {loop.env}"
+        )
+    try:
+        model.set_parameters(start.model.get_parameters(), exact_match=True, device="cpu")
+    except (ValueError, RuntimeError) as error:
+        raise ValueError(f"the agent to go on from has other networks: {str(error).splitlines()[0]}") from error
+    statistics = env.obs_rms
+    if not isinstance(statistics, dict):
+        statistics.mean, statistics.var = start.normalization.mean.copy(), start.normalization.variance.copy()
+        statistics.count = float(KNOWN_STEPS)
 
 
 def _agent(

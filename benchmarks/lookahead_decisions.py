@@ -26,9 +26,9 @@ ALONE = 4
 class Recorded(SafetyFilter):
     """A safety filter that keeps what it decides about, and the microseconds per decision."""
 
-    def decide_many(self, estimates, errors, proposed, stored=None):
+    def decide_columns(self, estimates, errors, proposed, stored=None):
         start = time.process_time()
-        decided = super().decide_many(estimates, errors, proposed, stored)
+        decided = super().decide_columns(estimates, errors, proposed, stored)
         spent = 1e6 * (time.process_time() - start) / ENVS
         steps = self.__dict__.setdefault("steps", [])
         steps.append((spent, estimates.copy(), errors, proposed.copy(), stored.copy()))

@@ -45,7 +45,7 @@ def per_decision(shields: list[SafetyFilter], count: int) -> list[float]:
                 batch = errors.batch().of(np.zeros(count, np.int64))
                 begin = time.perf_counter()
                 for _ in range(REPEATS):
-                    shield.decide_many(estimates, batch, proposals)
+                    shield.decide_columns(estimates, batch, proposals)
             least[k] = min(least[k], time.perf_counter() - begin)
     return least
 

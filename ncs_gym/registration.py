@@ -143,8 +143,8 @@ class Factory:
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """What gymnasium asks of an entry point before it is called: a vector environment draws nothing."""
-        return NCSEnv.metadata | ({"render_modes": []} if self.is_vector else {})
+        """What gymnasium asks of an entry point before it is called."""
+        return NCSEnv.metadata
 
     @property
     def is_installed(self) -> bool:

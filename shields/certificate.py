@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -25,7 +27,7 @@ from shields.certificate_text import (
     tolerance_of,
 )
 from shields.errors import CertificateError
-from shields.json_documents import document_of, read_content, write_document
+from shields.json_documents import content_of, document_of, read_content, write_document
 from shields.polytope import Polytope, polytope_content, polytope_of
 
 _FORMAT = "ncs-gym certificate 2"
@@ -353,14 +355,36 @@ class Certificate(ReadOnlyArrays):
         write_document(path, self.document)
 
     @classmethod
+    def read(cls, given: Certificate | Mapping[str, Any] | str | os.PathLike[str]) -> Certificate:
+        """Returns a certificate that is given as such, as its `document`, or as the path of its file.
+
+        Raises:
+            CertificateError: If the document or file is missing, damaged or altered.
+        """
+        if isinstance(given, cls):
+            return given
+        if not isinstance(given, Mapping):
+            return cls.load(given)  # pyright: ignore[reportArgumentType]
+        try:
+            text = json.dumps(given)
+        except (TypeError, ValueError, RecursionError) as error:
+            raise CertificateError("what is given is no document of a certificate") from error
+        return cls._in(lambda: content_of(text, "document", "certificate", _FORMAT), "the document")
+
+    @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Certificate:
         """Returns the certificate in a file; its conditions are not verified by this.
 
         Raises:
             CertificateError: If the file is missing, not a certificate, truncated or altered.
         """
+        return cls._in(lambda: read_content(path, "certificate", _FORMAT), str(path))
+
+    @classmethod
+    def _in(cls, read: Callable[[], Any], name: str) -> Certificate:
+        """Returns the certificate in a content that is read; `name` is what messages call it."""
         try:
-            content = read_content(path, "certificate", _FORMAT)
+            content = read()
         except ValueError as error:
             raise CertificateError(str(error)) from error
         try:
@@ -368,7 +392,7 @@ class Certificate(ReadOnlyArrays):
         except CertificateError:
             raise
         except (KeyError, TypeError, ValueError) as error:
-            raise CertificateError(f"{path} is not a certificate: an entry is missing or of a wrong kind") from error
+            raise CertificateError(f"{name} is not a certificate: an entry is missing or of a wrong kind") from error
 
 
 def _content_of(certificate: Certificate) -> dict[str, Any]:

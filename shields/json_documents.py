@@ -50,10 +50,18 @@ def read_content(path: str | os.PathLike[str], kind: str, format_name: str) -> A
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
-        document, literal = json.loads(text), with_literal_numbers(text)
-    except (OSError, TypeError, ValueError, RecursionError) as error:
+    except (OSError, TypeError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "it is not valid JSON"
         raise ValueError(f"cannot read {kind} {path}: {reason}") from error
+    return content_of(text, path, kind, format_name)
+
+
+def content_of(text: str, path: Any, kind: str, format_name: str) -> Any:
+    """Returns what `read_content` does, of the text of a document, which messages call `path`."""
+    try:
+        document, literal = json.loads(text), with_literal_numbers(text)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"cannot read {kind} {path}: it is not valid JSON") from error
     if not isinstance(document, dict) or document.get("format") != format_name or kind not in document:
         raise ValueError(f"{path} is not a file of format {format_name!r}")
     if document.get("sha256") != digest(literal[kind]):

@@ -54,6 +54,6 @@ class CertaintyEquivalentFilter:
         errors, plans = self._assumed.of(np.zeros(len(estimates), np.intp)), None
         if self._plans.shape[-1] == len(estimates):
             plans = np.where(begun, np.nan, self._plans)
-        decided = self._filter.decide_many(estimates.T, errors, proposed.T, plans)
+        decided = self._filter.decide_columns(estimates.T, errors, proposed.T, plans)
         self._plans = decided.plan
         return decided.input.T

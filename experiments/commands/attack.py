@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from tqdm import tqdm
@@ -16,8 +15,9 @@ from experiments.attack.counts_table import GAUSSIAN_LEGEND, counts_table, gauss
 from experiments.backends.execution import results_of
 from experiments.runs import claim_folder, versions
 from experiments.settings import AttackSettings
-from experiments.settings.certificates import changed_contract
+from experiments.settings.certificates import FEWEST_ENVS, changed_contract
 from ncs_gym.network import downlink_protocol
+from ncs_gym.registration import EPISODE_STEPS
 from shields import Certificate
 from shields.atomic_write import write_atomically
 from shields.runtime.safety_filter import DEFAULT_HORIZON
@@ -43,6 +43,9 @@ def attack(settings: AttackSettings) -> None:
     """
     campaign = _campaign(settings)
     cases = campaign.cases()
+    # Smaller batches, so that each kind of each case comes in once within the budget.
+    each = int(settings.steps / (len(cases) * campaign.kinds_of_batches * EPISODE_STEPS))
+    campaign = replace(campaign, envs=min(campaign.envs, max(each, FEWEST_ENVS)))
     if campaign.shielded:
         _require_claims(cases)
     with claim_folder("certify", settings):  # the name of the command in files
@@ -52,18 +55,20 @@ def attack(settings: AttackSettings) -> None:
 def _attack_in_folder(settings: AttackSettings, campaign: Campaign, cases: dict[str, AttackCase]) -> None:
     """Executes the batches that are missing, prints the table and writes the counts; raises as `attack` says."""
     certificates = _certificates(cases, settings.out / "certificates")
-    numbers = _numbers_of_batches(len(cases), settings.steps / campaign.batch_steps, campaign.kinds_of_batches)
+    numbers = _numbers_of_batches(len(cases), int(settings.steps // campaign.batch_steps), campaign.kinds_of_batches)
     batches = [
         MonteCarloBatch(campaign, case, index, certificate)
         for (case, certificate), number in zip(certificates.items(), numbers, strict=True)
         for index in range(number)
     ]
-    counts = dict.fromkeys(cases, SafetyCounts())
+    counts = {case: SafetyCounts() for case, number in zip(cases, numbers, strict=True) if number}
     for batch, counted in zip(batches, results_of(batches, settings.out, settings), strict=True):
         counts[batch.case] += counted
     total = sum(counts.values(), SafetyCounts())
     print(counts_table(counts, looks_ahead=campaign.looks_ahead))
-    limits = {name: case.escape_probability() for name, case in cases.items()} if campaign.gaussian else {}
+    if left_out := len(cases) - len(counts):
+        print(f"{left_out} of {len(cases)} cases are not attacked within {settings.steps:,.0f} steps")
+    limits = {name: cases[name].escape_probability() for name in counts} if campaign.gaussian else {}
     if limits:
         print("", gaussian_table(counts, limits), GAUSSIAN_LEGEND, sep="\n")
     document = {"settings": asdict(campaign), "versions": versions(), "total": total.document()}
@@ -122,13 +127,15 @@ def _certificates(cases: dict[str, AttackCase], folder: Path) -> dict[str, Certi
     return found
 
 
-def _numbers_of_batches(cases: int, count: float, least: int) -> list[int]:
+def _numbers_of_batches(cases: int, count: int, least: int) -> list[int]:
     """Returns the number of batches of each case, as even as possible, more for earlier cases.
 
     Args:
         cases: Number of cases.
-        count: Smallest number of batches in all.
-        least: Smallest number of batches of each case.
+        count: Number of batches in all that the budget allows; one at least is run.
+        least: Number of kinds of batches, which take turns: they come in for the same cases where not all can.
     """
-    each, extra = divmod(max(math.ceil(count), least * cases), cases)
-    return [each + (number < extra) for number in range(cases)]
+    count = max(count, 1)
+    attacked = min(cases, -(-count // least))
+    each, extra = divmod(count, attacked)
+    return [each + (number < extra) if number < attacked else 0 for number in range(cases)]

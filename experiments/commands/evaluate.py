@@ -80,7 +80,7 @@ def _agent(folder: Path, env_id: str | None) -> Agent:
     """Returns the agent in a folder.
 
     Args:
-        folder: The agent's folder.
+        folder: The agent's folder, or a zip of stable-baselines3.
         env_id: Id that the user gave, which may name a module to import; None for the agent's own.
 
     Raises:
@@ -88,9 +88,14 @@ def _agent(folder: Path, env_id: str | None) -> Agent:
         ValueError: If the environment is unknown, or not the one that the agent was trained in.
     """
     from agents.agent import Agent  # imports torch
+    from agents.sharing.sb3_zip import is_sb3_zip, load_sb3_zip
 
     if env_id is not None:
         registered_env(env_id)
+    if is_sb3_zip(folder):
+        if env_id is None:
+            raise ValueError(f"{folder} does not say of which environment it is: give --env")
+        return load_sb3_zip(folder, module_and_id(env_id)[1])
     agent = Agent.load(folder)
     if env_id is None:
         registered_env(agent.env)

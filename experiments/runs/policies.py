@@ -22,7 +22,8 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
     """Returns a policy for an environment.
 
     Args:
-        name: "greedy", "zero", "random", or the folder of a trained agent or of the run that left it.
+        name: "greedy", "zero", "random", the folder of a trained agent or of the run that left it, or a zip of
+            stable-baselines3.
         env_id: Id of the environment.
         env: The environment.
         seed: Seed of the random policy.
@@ -40,8 +41,10 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
     if name == "greedy":
         return lambda observation, info: _greedy_action(env, observation, info["estimate"])
     from agents.agent import Agent  # imports torch
+    from agents.sharing.sb3_zip import is_sb3_zip, load_sb3_zip
 
-    agent = Agent.load(agent_folder(Path(name)))
+    path = Path(name)
+    agent = load_sb3_zip(path, env_id) if is_sb3_zip(path) else Agent.load(agent_folder(path))
     if agent.env != env_id:
         raise AgentError(f"the agent in {name} was trained in {agent.env}, not in {env_id}")
     return lambda observation, info: agent.act(observation[None])[0]
@@ -84,15 +87,15 @@ def _greedy_action(env: NCSEnv, observation: np.ndarray, estimate: np.ndarray) -
 
     Args:
         env: Environment with the plant and the task.
-        observation: Observation, whose last entry belongs to the task.
+        observation: Observation, whose entry after the estimate belongs to the task.
         estimate: Estimate x_hat, shape (n,).
     """
     plant, task = env.plant, env.task
     if isinstance(task, SpeedTracking):
-        effect, missing = np.zeros(plant.m), float(observation[-1])
+        effect, missing = np.zeros(plant.m), float(observation[plant.n])
         effect[task.input_index] = plant.dt
     elif isinstance(task, SetpointTracking):
-        effect, missing = task.output @ plant.B, float(observation[-1] - task.output @ plant.A @ estimate)
+        effect, missing = task.output @ plant.B, float(observation[plant.n] - task.output @ plant.A @ estimate)
     else:
         u = np.linalg.lstsq(plant.box_rows @ plant.B, -plant.box_rows @ plant.A @ estimate)[0]
         return np.clip(u / plant.u_max, -1.0, 1.0).astype(np.float32)

@@ -162,6 +162,7 @@ class TrainingRun:
                 self.algorithm,
                 self.settings,
                 log_folder=logs,
+                checkpoints=logs and logs / "checkpoint",
                 on_progress=on_progress,
             )
         agent = trained.agent if trained else _agent_of(self)

@@ -99,6 +99,10 @@ def _refuse_both(env: str | None, plant: Path | None) -> None:
         raise ValueError("give either --env or --plant, not both")
 
 
+# Episodes of a batch, at least.
+FEWEST_ENVS = 4
+
+
 @dataclass(frozen=True, kw_only=True)
 class AttackSettings(BackendSettings):
     """Attacks shielded control loops within the assumptions, and counts the states that leave the safe set or box.
@@ -109,8 +113,8 @@ class AttackSettings(BackendSettings):
     noise has full size in random directions, and agents are random or hostile.
 
     Attributes:
-        steps: Smallest number of steps in all; whole batches of `envs` episodes are run, at least one per attack case
-            and mode of the shield.
+        steps: Budget: whole batches of `envs` episodes are run as long as they fit. Where it does not allow one per
+            attack case and mode of the shield, batches are smaller, and cases are left out if they get too small.
         out: Output folder; an interrupted campaign continues where it stopped, and one with more steps adds to it.
         random_plants: Number of random plants, each behind four kinds of channels.
         envs: Number of episodes in a batch, simulated side by side.
@@ -158,7 +162,7 @@ class AttackSettings(BackendSettings):
             raise ValueError(f"--delta must be between {SMALLEST_DELTA:g} and 0.5, got {self.delta:g}")
         if not 1.0 <= self.steps < 1e15:
             raise ValueError(f"--steps must be at least 1 and below 1e15, got {self.steps:g}")
-        require_least(self, random_plants=0, envs=4, seed=0)
+        require_least(self, random_plants=0, envs=FEWEST_ENVS, seed=0)
         if self.unshielded and self.mode is not None:
             raise ValueError(f"give either --mode {self.mode} or --unshielded, not both")
         require_horizon(self.horizon, self.mode)

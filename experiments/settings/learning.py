@@ -216,7 +216,7 @@ class EvaluateSettings:
 
     Attributes:
         model: Folder of a trained agent, such as models/shielded-0 in the output of `ncs compare`, or the output of
-            `ncs train`.
+            `ncs train`; or the zip that `model.save` of stable-baselines3 wrote, with --env.
         env: Id of the environment the agent was trained in; module:id, to import the module that registers it.
         shield: Mode of the shield, by default that of the agent's training; "none" for no shield; "monitor" changes
             nothing and counts what it would have done.

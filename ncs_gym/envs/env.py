@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -20,7 +21,7 @@ from ncs_gym.envs.settings import (
     start_option,
     starting_set,
 )
-from ncs_gym.envs.spaces import entries_within, observation_space, read_action
+from ncs_gym.envs.spaces import entries_within, observation_space, observed_of, read_action, read_observed
 from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
@@ -32,7 +33,7 @@ from ncs_gym.network.packet_transmission import ChannelState
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import LinearProcess, Process
 from ncs_gym.processes.simulation import PlantSimulation
-from ncs_gym.rendering import Annotation, Renderer
+from ncs_gym.rendering import Annotation, Renderer, sent_at
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.tasks.task import Task
 from ncs_gym.uncertainty.disturbance import Disturbance
@@ -66,7 +67,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     | entries | meaning | unit |
     |---|---|---|
     | first n | the estimate x_hat (`info["estimate"]`) | those of the state |
-    | rest | the task's own, perfectly known entries | those of the task |
+    | next | the task's own, perfectly known entries | those of the task |
+    | rest | with `observe=("age", "error")`: age of the newest sample used, half-widths of the error | steps, states |
 
     ## Step
     x+ = A x + B u + d (where an unstable plant runs away, up to `plant.state_limit`). The sensor measures y = H x+ + v;
@@ -126,6 +128,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         downlink: The network between controller and actuator (docs/contracts.md); ideal by default.
         downlink_contract: What is assumed of the downlink, which may then break it; by default what the downlink's
             settings guarantee.
+        observe: What observations hold besides, after the task's entries: "age", that of the newest sample used
+            [steps], and "error", the n half-widths of the error's ellipsoid E(Sigma_k) [units of the states].
 
     Attributes:
         downlink_protocol: How commands are sent over the downlink, with c as its `lead`; None for an ideal downlink.
@@ -159,6 +163,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     estimator: Estimator = setting("estimator")
     horizon: int = setting("horizon")
     noise: str = setting("noise")
+    observe: tuple[str, ...] = setting("observe")
     process: Process = setting("process", "_process_given")
     downlink: Channel | None = setting("downlink")
     downlink_contract: ChannelContract | None = setting("downlink_contract")
@@ -180,6 +185,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         process: Process | None = None,
         downlink: Channel | None = None,
         downlink_contract: ChannelContract | None = None,
+        observe: Sequence[str] = (),
     ) -> None:
         self._plant = expect(plant, LinearPlant, "plant")
         self._channel = Channel() if channel is None else expect(channel, Channel, "channel")
@@ -219,9 +225,9 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._horizon = as_count(horizon, "horizon", low=1, high=LONGEST_HORIZON)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)
         steps = self._horizon + len(self._pending)
-        self.observation_space = observation_space(
-            plant, self._task, self._error_set, self._initial_set, steps, len(self._pending)
-        )
+        self._observe, lead = read_observed(observe), len(self._pending)
+        sets = self._error_set, self._initial_set
+        self.observation_space = observation_space(plant, self._task, *sets, steps, lead, self._observe)
         self._low, self._high = self.observation_space.low, self.observation_space.high
         self.steps = self.episodes = 0
         self.start: Ellipsoid | np.ndarray = self._initial_set
@@ -302,7 +308,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         terminated = self._process.terminated or (self._terminate_on_violation and info["cost"] > 0.0)
         self._consistent, self._over = True, terminated or self._process.truncated
         if self.renderer is not None:
-            self.renderer.record(info, self._task_state, self._channel_state, packets)
+            sent = sent_at(self.steps, self._channel_state, packets)
+            self.renderer.record(info, self._task_state, sent)
         return self._observation(), reward, terminated, self._process.truncated, info
 
     def render(self) -> np.ndarray | None:
@@ -373,8 +380,11 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         task_state = self._task_state
         for u in self._pending:
             task_state = self._task.predict(self._plant, task_state, u)
-        own, bounds = self._task.observe(task_state), (self._low, self._high)
-        within, self._warned = entries_within(self._task, self._belief[0], own, *bounds, self._warned, self._horizon)
+        own, more = self._task.observe(task_state), observed_of(self._known, self._observe)
+        bounds = self._low, self._high
+        within, self._warned = entries_within(
+            self._task, self._belief[0], own, more, *bounds, self._warned, self._horizon
+        )
         return within.astype(np.float32)
 
     def _info(self, inputs: Inputs, worst: np.ndarray, *, arrived: bool) -> dict[str, Any]:

@@ -17,6 +17,8 @@ from ncs_gym.validation import as_numbers, shown
 
 # The default start covers this fraction of the half-width of the safe box in every direction.
 START_FRACTION = 0.1
+# What can be observed besides estimate and task.
+OBSERVED = "age", "error"
 # Widens the observation box: float32 rounding, and estimates a little off the reachable set.
 OBSERVATION_MARGIN = 1.01
 
@@ -31,7 +33,13 @@ def default_initial_set(plant: LinearPlant) -> Ellipsoid:
 
 
 def observation_space(
-    plant: LinearPlant, task: Task, error_set: ErrorSet, initial_set: Ellipsoid, horizon: int, lead: int = 0
+    plant: LinearPlant,
+    task: Task,
+    error_set: ErrorSet,
+    initial_set: Ellipsoid,
+    horizon: int,
+    lead: int = 0,
+    observe: tuple[str, ...] = (),
 ) -> Box:
     """Returns the finite box of estimate and task entries that can be reached within some steps, float32.
 
@@ -46,6 +54,7 @@ def observation_space(
         initial_set: Bounds the starts.
         horizon: Number of steps.
         lead: c, the number of steps from a decision to its effect, of which observations tell.
+        observe: What is observed besides; see `read_observed`.
 
     Raises:
         ValueError: If an entry is beyond float32's range, so that observations would be infinite, or always zero.
@@ -66,13 +75,37 @@ def observation_space(
             pushed = np.abs(plant.B) @ plant.u_max + plant.disturbance.support(np.eye(plant.n))
             known = np.maximum(known, np.abs(plant.A) @ known + pushed)
         estimate = np.minimum(estimate, known + errors)
-    bound = OBSERVATION_MARGIN * np.concatenate([estimate, task.observation_bound(plant, horizon)])
+    known = {"age": np.array([float(horizon)]), "error": errors}
+    more = [known[name] for name in observe]
+    bound = OBSERVATION_MARGIN * np.concatenate([estimate, task.observation_bound(plant, horizon), *more])
     numbers = np.finfo(np.float32)
     if not ((bound >= numbers.tiny) & (bound <= numbers.max)).all():
         raise ValueError(
             f"observations of up to {shown(bound.tolist())} are out of float32's range: choose other units"
         )
-    return Box(-bound.astype(np.float32), bound.astype(np.float32), dtype=np.float32)
+    high = bound.astype(np.float32)
+    low = -high
+    low[len(low) - sum(map(len, more)) :] = 0.0
+    return Box(low, high, dtype=np.float32)
+
+
+def read_observed(observe: Any) -> tuple[str, ...]:
+    """Returns what is observed besides estimate and task: "age", of the newest sample used, and "error", its radii.
+
+    Raises:
+        ValueError: If it is something else, or named twice.
+    """
+    names = tuple(observe) if isinstance(observe, (list, tuple)) else (observe,)
+    if not all(isinstance(each, str) and each in OBSERVED for each in names) or len(set(names)) < len(names):
+        raise ValueError(f"observe must be a list of some of {list(OBSERVED)}, got {shown(observe)}")
+    return names
+
+
+def observed_of(known: Any, observe: tuple[str, ...]) -> list[np.ndarray]:
+    """Returns these entries of what is known (`Known`), shape (entries,) each, or (entries, N) of N environments."""
+    entries = {"age": lambda: np.asarray(known.age, dtype=np.float64)[None]}
+    entries["error"] = lambda: np.sqrt(np.diagonal(known.error_shape, axis1=-2, axis2=-1)).T
+    return [entries[name]() for name in observe]
 
 
 def nearest_action(inputs: np.ndarray, limits: np.ndarray) -> np.ndarray:
@@ -91,7 +124,14 @@ def expressible(inputs: np.ndarray, limits: np.ndarray) -> np.ndarray:
 
 
 def entries_within(
-    task: Task, estimates: np.ndarray, own: Any, low: np.ndarray, high: np.ndarray, warned: bool, horizon: int
+    task: Task,
+    estimates: np.ndarray,
+    own: Any,
+    more: list[np.ndarray],
+    low: np.ndarray,
+    high: np.ndarray,
+    warned: bool,
+    horizon: int,
 ) -> tuple[np.ndarray, bool]:
     """Returns observation entries, clipped to the space, and whether it was ever warned of clipping the task's.
 
@@ -99,6 +139,7 @@ def entries_within(
         task: Gives the name.
         estimates: Shape (n,) or (n, N).
         own: The task's entries, shape (extra,) or (extra, N).
+        more: What is observed besides.
         low: Bounds, shape (n + extra,) or (n + extra, 1).
         high: Bounds, likewise.
         warned: Whether it was warned before.
@@ -107,16 +148,17 @@ def entries_within(
     Raises:
         ValueError: If the task has another number of entries than it has bounds.
     """
-    entries = np.concatenate([estimates, own])
+    entries = np.concatenate([estimates, own, *more])
     if len(entries) != len(low):
+        bounds = len(low) - len(entries) + len(own)
         raise ValueError(
-            f"{type(task).__name__}: observe returns {len(entries) - len(estimates)} entries, observation_bound the "
-            f"bounds of {len(low) - len(estimates)}: it must return the largest absolute value of each"
+            f"{type(task).__name__}: observe returns {len(own)} entries, observation_bound the bounds of {bounds}: it "
+            "must return the largest absolute value of each"
         )
     within = np.minimum(np.maximum(entries, low), high)
-    if not warned and len(entries) > len(estimates):
-        first = len(estimates)
-        if np.count_nonzero(beyond := within[first:] != entries[first:]):
+    if not warned and len(own):
+        first, last = len(estimates), len(estimates) + len(own)
+        if np.count_nonzero(beyond := within[first:last] != entries[first:last]):
             entry = int(np.argwhere(beyond)[0][0])
             bound = float(np.ravel(high)[first + entry])
             warnings.warn(

@@ -10,11 +10,11 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, SAMPLE_ROUNDING, NCSEnv, RenderModeError
+from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, SAMPLE_ROUNDING, NCSEnv
 from ncs_gym.envs.episode_channels import covering, downlinks, uplinks
 from ncs_gym.envs.info import Constraints, Known, loop_info
 from ncs_gym.envs.settings import CHANNELS, vector_reset_options
-from ncs_gym.envs.spaces import entries_within, read_actions
+from ncs_gym.envs.spaces import entries_within, observed_of, read_actions
 from ncs_gym.estimation.arrival_histories import ErrorTable, arrival_histories
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.vector_estimator import VectorEstimator
@@ -25,6 +25,7 @@ from ncs_gym.network.packet_transmission import VectorChannelState
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import Process
 from ncs_gym.processes.simulation import PlantSimulation
+from ncs_gym.rendering import Annotation, PacketRecord
 from ncs_gym.tasks.task import Task
 from ncs_gym.uncertainty.disturbance import Disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
@@ -46,6 +47,7 @@ class NCSVectorEnv(VectorEnv):
         channel: A channel, or a list of N, one for each environment; likewise `downlink`. `channel`, `downlink` and by
             default the contract are then those of the widest of them (`ncs_gym.network.channel.widest`).
         downlink: See `channel`.
+        rendered_env: Number of the environment that is drawn, with a `render_mode`.
         settings: The others of `NCSEnv`.
 
     Attributes:
@@ -73,6 +75,7 @@ class NCSVectorEnv(VectorEnv):
     allow_assumption_violation: bool = setting("allow_assumption_violation", "_single.allow_assumption_violation")
     horizon: int = setting("horizon", "_single.horizon")
     noise: str = setting("noise", "_single.noise")
+    observe: tuple[str, ...] = setting("observe", "_single.observe")
     process: Process = setting("process", "_single.process")
     contract: ChannelContract | None = setting("contract")
     certificate_contract: ChannelContract | None = setting("certificate_contract")
@@ -91,15 +94,15 @@ class NCSVectorEnv(VectorEnv):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         channel: Channel | Sequence[Channel] | None = None,
         downlink: Channel | Sequence[Channel] | None = None,
+        rendered_env: int = 0,
         **settings: Any,
     ) -> None:
         self.num_envs = as_count(num_envs, "num_envs", low=1)
         limit = max_episode_steps
         self._max_episode_steps = None if limit is None else as_count(limit, "max_episode_steps", low=1)
         self._autoreset_mode = _autoreset_mode(autoreset_mode)
-        self.metadata = NCSEnv.metadata | {"autoreset_mode": self._autoreset_mode, "render_modes": []}
-        if settings.get("render_mode") is not None:
-            raise RenderModeError("a vector environment draws nothing: use gym.make(..., render_mode=...)")
+        self.metadata = NCSEnv.metadata | {"autoreset_mode": self._autoreset_mode}
+        self.rendered_env = as_count(rendered_env, "rendered_env", low=0, high=self.num_envs - 1)
         own = [self._one_each(each, name) for name, each in zip(CHANNELS, (channel, downlink), strict=True)]
         if self._max_episode_steps is not None:
             own_horizon = settings.get("horizon", DEFAULT_HORIZON)
@@ -107,7 +110,7 @@ class NCSVectorEnv(VectorEnv):
         settings |= {name: each and widest(each) for name, each in zip(CHANNELS, own, strict=True)}
         self._single = single = NCSEnv(**settings)
         self._plant, self._channel, self._task = single.plant, single.channel, single.task
-        self._contract, self._error_set, self.render_mode = single.contract, single.error_set, None
+        self._contract, self._error_set, self.render_mode = single.contract, single.error_set, single.render_mode
         self.single_observation_space = single.observation_space
         self.single_action_space = single.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -205,6 +208,7 @@ class NCSVectorEnv(VectorEnv):
         self._worst = np.where(mask, self._plant.constraint_values(self._state), self._worst)
         info = self._info(no_inputs(self._plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), mask)
         self._consistent = True
+        self._draw(info, begins=mask, moved=False)
         return self._observation(), info
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -238,8 +242,40 @@ class NCSVectorEnv(VectorEnv):
         observation = self._observation()
         if self._autoreset_mode is AutoresetMode.SAME_STEP and self._done.any():
             observation, info = self._restarted(observation, info)
+            restarted = self._ended and self._ended[0]
         self._consistent = True
+        self._draw(info, begins=restarted)
         return observation, reward, terminated, truncated, info
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Returns the picture of `rendered_env` for each environment (`RecordVideo(record_first_only=True)`).
+
+        Raises:
+            gymnasium.error.ResetNeeded: If there was no reset.
+        """
+        if self._single.renderer is None or not self._consistent:
+            self._single.render()  # says what is missing
+            return None
+        picture = self._single.renderer.render()
+        return None if picture is None else (picture,) * self.num_envs
+
+    def annotate(self, annotation: Annotation) -> None:
+        """Shows what a shield knows of `rendered_env` in the picture of the next step or reset."""
+        self._single.annotate(annotation)
+
+    def _draw(self, info: dict[str, Any], begins: np.ndarray | None, *, moved: bool = True) -> None:
+        """Hands what happened in `rendered_env` to the renderer, if there is one."""
+        renderer, e = self._single.renderer, self.rendered_env
+        if renderer is None:
+            return
+        own = {key: value[e] for key, value in info.items() if not key.startswith(("_", "final"))}
+        task_state = np.copy(self._task_state[..., e])[()]
+        if begins is not None and begins[e]:
+            renderer.begin(own, task_state)
+        elif moved:
+            step = int(self.steps[e])
+            sends, arrival = self._channel_state.arrival_of(e, step)
+            renderer.record(own, task_state, PacketRecord(step, arrival) if sends else None)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Closes the process."""
@@ -353,9 +389,10 @@ class NCSVectorEnv(VectorEnv):
         task_state = self._task_state
         for u in self._downlink_state.committed.pending:
             task_state = self._task.predict_many(self._plant, task_state, u)
-        own, bounds = self._task.observe_many(task_state), (self._low, self._high)
+        own, more = self._task.observe_many(task_state), observed_of(self._known, self._single.observe)
+        bounds = self._low, self._high
         within, self._warned = entries_within(
-            self._task, self._belief[0], own, *bounds, self._warned, self._single.horizon
+            self._task, self._belief[0], own, more, *bounds, self._warned, self._single.horizon
         )
         return within.astype(np.float32).T
 

@@ -207,6 +207,13 @@ class VectorChannelState:
         self._delays = [delays, *self._delays[:-1]]
         return sends
 
+    def arrival_of(self, e: int, step: int) -> tuple[bool, int | None]:
+        """Returns whether environment e sent at its present step, and at which step that arrives; None if never."""
+        period = self.channel.send_period
+        sends = step % int(period if isinstance(period, int) else period[e]) == 0
+        delay = int(self._delays[0][e])
+        return sends, step + delay if sends and delay >= 0 else None
+
     def discard(self, chosen: Any) -> None:
         """Loses the samples that were just sent by some environments."""
         self._delays[0][chosen] = -1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -174,16 +174,18 @@ class EpisodeRecord:
         self._packets: deque[PacketRecord] = deque(maxlen=RECENT_STEPS)
         self._input: np.ndarray | None = None
         self._committed: np.ndarray | None = None
+        note = self._next_annotation
+        if note is not None and note.proposed is not None:  # nothing is at a start, also where a step led to it
+            self._next_annotation = replace(note, proposed=None, intervened=False, interventions=0)
         self._store(info, task_state)
 
-    def add(self, info: Mapping[str, Any], task_state: Any, network: ChannelState, arrived: list[Packet]) -> None:
+    def add(self, info: Mapping[str, Any], task_state: Any, sent: PacketRecord | None) -> None:
         """Adds a step.
 
         Args:
             info: The info that the environment returns for this step; its arrays are copied.
             task_state: State of the task after this step.
-            network: State of the channel after the exchange of this step.
-            arrived: Packets that arrived at this step.
+            sent: What became of the sample of this step; None where none is sent.
         """
         self._step += 1
         if isinstance(self._task, SpeedTracking):
@@ -191,9 +193,8 @@ class EpisodeRecord:
         self._input, self._committed = info["input"].copy(), info["input_committed"].copy()
         self._store(info, task_state)
         self._interventions.append(self._annotation is not None and self._annotation.intervened)
-        if network.sends_at(self._step):
-            arrival = _arrival(self._step, network.in_flight, arrived)
-            self._packets.append(PacketRecord(self._step, arrival))
+        if sent is not None:
+            self._packets.append(sent)
 
     def frame(self) -> FrameRecord:
         """Returns what a frame of the present step shows."""
@@ -229,6 +230,11 @@ class EpisodeRecord:
         self._input_missing = bool(info["downlink_broken"])
         self._missing_inputs += self._input_missing
         self._task_state = task_state
+
+
+def sent_at(step: int, network: ChannelState, arrived: list[Packet]) -> PacketRecord | None:
+    """Returns what became of the sample of a step, after the exchange of that step; None if none was sent."""
+    return PacketRecord(step, _arrival(step, network.in_flight, arrived)) if network.sends_at(step) else None
 
 
 def _arrival(stamp: int, in_flight: Mapping[int, list[Packet]], arrived: list[Packet]) -> int | None:

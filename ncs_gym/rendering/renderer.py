@@ -7,14 +7,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ncs_gym.network.channel import Packet
-from ncs_gym.network.packet_transmission import ChannelState
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas, Window
 from ncs_gym.rendering.cart_pole import CartPoleDrawing
 from ncs_gym.rendering.constraint_bars import ConstraintBarsDrawing
-from ncs_gym.rendering.episode_record import Annotation, EpisodeRecord, FrameRecord
+from ncs_gym.rendering.episode_record import Annotation, EpisodeRecord, FrameRecord, PacketRecord
 from ncs_gym.rendering.panel import draw_header, draw_legend, draw_panel
 from ncs_gym.rendering.phase_plane import PhasePlane, TimePlot
 from ncs_gym.rendering.truck_trailer import TruckTrailerDrawing
@@ -69,19 +67,18 @@ class Renderer:
         self._episode.begin(info, task_state)
         self._show()
 
-    def record(self, info: Mapping[str, Any], task_state: Any, network: ChannelState, arrived: list[Packet]) -> None:
+    def record(self, info: Mapping[str, Any], task_state: Any, sent: PacketRecord | None) -> None:
         """Adds a step of the episode.
 
         Args:
             info: The info that `step` returns.
             task_state: State of the task after this step.
-            network: State of the channel after the exchange of this step.
-            arrived: Packets that arrived at this step.
+            sent: What became of the sample of this step; None where none is sent.
 
         Raises:
             gymnasium.error.DependencyNotInstalled: If pygame is missing and the mode is "human".
         """
-        self._episode.add(info, task_state, network, arrived)
+        self._episode.add(info, task_state, sent)
         self._show()
 
     def annotate(self, annotation: Annotation) -> None:

@@ -146,7 +146,7 @@ class SafetyFilter(ReadOnlyArrays):
                 return decision
         n, m = self.plant.n, self.plant.m
         plans = None if self.lookahead is None else self.lookahead.as_stored(stored)[..., None]
-        decided = self.decide_many(_as_column(estimate, n), errors.batch(), _as_column(proposed, m), plans)
+        decided = self.decide_columns(_as_column(estimate, n), errors.batch(), _as_column(proposed, m), plans)
         one = Decision(*(array[..., 0].tolist() for array in decided))
         plan = decided.plan[..., 0]
         plan = plan[~np.isnan(plan[:, 0])] if len(plan) else self._no_plan
@@ -172,7 +172,7 @@ class SafetyFilter(ReadOnlyArrays):
         return Decision(closest, True, True, False, margin, REASONS[PROJECTED], self._no_plan)
 
     @np.errstate(all="ignore")  # what is not finite passes no test
-    def decide_many(
+    def decide_columns(
         self, estimates: np.ndarray, errors: PredictedErrors, proposed: np.ndarray, stored: np.ndarray | None = None
     ) -> Decision:
         """Returns the inputs to apply in N environments, and what `Decision` says about them, as new arrays.
@@ -201,6 +201,47 @@ class SafetyFilter(ReadOnlyArrays):
         if self.lookahead is not None and stored is not None:
             self.lookahead.complete(decided, sets, estimates, errors, proposed, stored)
         return decided
+
+    def decide_many(
+        self, estimates: Any, error_shapes: Any, proposals: Any, stored: np.ndarray | None = None
+    ) -> Decision:
+        """Returns what `decide` does for N control loops at once; the loop is the first axis of all arrays.
+
+        Args:
+            estimates: x_hat, shape (N, n).
+            error_shapes: Sigma_k, shape (N, n, n), or (n, n) for all.
+            proposals: Inputs, shape (N, m) [physical units].
+            stored: In mode "lookahead" the `plan` of the last decisions, shape (N, horizon, m); None for none.
+
+        Returns:
+            A `Decision` of arrays: `input` of shape (N, m), `plan` (N, horizon, m), `reason` of texts, and truth values
+            and margins of shape (N,). Rows that are not finite are "invalid", as single ones are.
+
+        Raises:
+            ValueError: If an argument does not consist of numbers of these shapes.
+        """
+        (n,), (m,) = self.test.single
+        numbers = {"estimates": estimates, "error_shapes": error_shapes, "proposals": proposals}
+        arrays = {name: _as_array(value) for name, value in numbers.items()}
+        count = len(arrays["estimates"]) if arrays["estimates"].ndim == 2 else 0
+        shapes = {"estimates": [(count, n)], "error_shapes": [(n, n), (count, n, n)], "proposals": [(count, m)]}
+        if stored is not None:
+            arrays["stored"], shapes["stored"] = _as_array(stored), [(count, self.horizon or 0, m)]
+        for name, array in arrays.items():
+            if array.shape not in shapes[name] or not count:
+                wanted = " or ".join(str(shape).replace(f"({count},", "(N,", 1) for shape in shapes[name])
+                raise ValueError(f"{name} must be numbers of shape {wanted}, got {array.shape}; N = {count}")
+        one_shape = arrays["error_shapes"].ndim == 2
+        errors = self.errors_of_many(arrays["error_shapes"][None] if one_shape else arrays["error_shapes"])
+        errors = errors.of(np.zeros(count, np.intp)) if one_shape else errors
+        columns = [np.array(arrays[name].T, order="C") for name in ("estimates", "proposals")]
+        plans = None if stored is None else np.array(arrays["stored"].transpose(1, 2, 0))
+        decided = self.decide_columns(columns[0], errors, columns[1], plans)
+        return decided._replace(
+            input=np.array(decided.input.T, order="C"),
+            reason=np.array(REASONS)[decided.reason],
+            plan=decided.plan.transpose(2, 0, 1),
+        )
 
     def _tell_of_shapes(self, estimate: Any, proposed: Any) -> None:
         """Warns the caller of `decide` of what is no single estimate or input; what is decided then is K x_hat."""

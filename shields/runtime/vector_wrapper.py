@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -13,9 +15,9 @@ from ncs_gym.envs.info import Known
 from ncs_gym.envs.spaces import nearest_action, read_actions
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network import CommittedInputs
-from ncs_gym.validation import as_number, setting, shown
+from ncs_gym.validation import as_number, setting
 from shields.certificate import Certificate
-from shields.runtime.decisions import Decision
+from shields.runtime.decisions import NO_PLAN, Decision
 from shields.runtime.guarantee import (
     CODES,
     EXPLANATIONS,
@@ -29,10 +31,12 @@ from shields.runtime.one_step import PredictedErrors, norms
 from shields.runtime.safety_filter import SafetyFilter
 from shields.runtime.starts import StartKnown, first_observations, first_store, starts_known
 from shields.runtime.wrapper import (
+    annotation_of,
     certificate_for,
     environment_behind,
     hint_for,
     premises_of,
+    recorded_certificate,
     require_same,
     warned_of,
 )
@@ -57,7 +61,8 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
 
     Args:
         env: An `NCSVectorEnv`, possibly wrapped; not by wrappers that change actions.
-        certificate: None synthesizes one for the environment's plant and contract, once per process.
+        certificate: A certificate, its `document`, or the path of its file; None synthesizes one for the environment's
+            plant and contract, once per process. A spec holds the document, so that it is JSON.
         mode: "project", "lookahead", "switch", "boundary" or "monitor"; see `SafetyFilter`.
         penalty: Subtracted from the reward per intervention counted, >= 0.
         horizon: Longest plan of mode "lookahead", in steps; see `SafetyFilter`.
@@ -77,13 +82,15 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
     def __init__(
         self,
         env: VectorEnv,
-        certificate: Certificate | None = None,
+        certificate: Certificate | Mapping[str, Any] | str | os.PathLike[str] | None = None,
         mode: str = "project",
         penalty: float = 0.0,
         horizon: int | None = None,
         on_unproved: str = "warn",
     ) -> None:
-        given = {"certificate": certificate, "mode": mode, "penalty": penalty, "horizon": horizon}
+        recorded = recorded_certificate(certificate)
+        certificate = None if certificate is None else Certificate.read(certificate)
+        given = {"certificate": recorded, "mode": mode, "penalty": penalty, "horizon": horizon}
         RecordConstructorArgs.__init__(self, **given, on_unproved=on_unproved)
         inner = self._inner = self._environment_in(env)
         if env.single_action_space != inner.single_action_space:
@@ -91,8 +98,6 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         VectorWrapper.__init__(self, env)
         self.penalty = as_number(penalty, "penalty", low=0.0)
         self._lost = LostGuarantee(on_unproved, self.num_envs)
-        if certificate is not None and not isinstance(certificate, Certificate):
-            raise ValueError(f"certificate must be a Certificate or None, got {shown(certificate)}")
         self._certificate = (
             certificate_for(inner.plant, inner.certificate_contract) if certificate is None else certificate
         )
@@ -127,6 +132,8 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             GuaranteeLostError: If x in S is not proved and that is to be raised; the episodes have begun then.
         """
         before, self._clock = self._clock or self._interrupted, self._clock and self._interrupted
+        if self._inner.render_mode is not None:
+            self._inner.annotate(annotation_of(self._filter, None, 0, NO_PLAN, intervened=False))
         try:
             # gymnasium's annotation leaves out the lists that its own vector environments take.
             observation, info = self.env.reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
@@ -168,9 +175,11 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         if self._clock is None:
             raise gym.error.ResetNeeded("call reset before the first step")
         actions, proposed = read_actions(self._filter.plant, actions, self.num_envs)
-        decided = self._filter.decide_many(self._report.estimate, self._report.errors, proposed, self._stored)
+        decided = self._filter.decide_columns(self._report.estimate, self._report.errors, proposed, self._stored)
         if self._filter.mode != "monitor" and np.count_nonzero(decided.intervened):
             actions = overridden(actions, decided, self._filter.plant.u_max)
+        if self._inner.render_mode is not None:
+            self._annotate(decided, proposed)
         before, self._clock = self._clock, self._interrupted
         observation, rewards, terminated, truncated, info = self.env.step(actions)
         now, state = self._read_clock(), self._state
@@ -218,6 +227,14 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         """Returns what decisions and the guarantee need of what the innermost environment knows."""
         errors = self._errors_of(self._inner.error_shapes[1])
         return LoopObservation(np.array(known.estimate, order="C"), errors, known.alarm, known.age)
+
+    def _annotate(self, decided: Decision, proposed: np.ndarray) -> None:
+        """Tells the picture of the step that follows what the shield does in the environment that is drawn."""
+        e = self._inner.rendered_env
+        plan, acted = decided.plan[..., e], bool(decided.intervened[e])
+        plan = plan[~np.isnan(plan[:, 0])] if len(plan) else plan
+        count = int(self._interventions[e]) + acted
+        self._inner.annotate(annotation_of(self._filter, proposed[:, e].copy(), count, plan, intervened=acted))
 
     def _errors_of(self, numbers: np.ndarray) -> PredictedErrors:
         """Returns what is known of the error shapes with these numbers in the environment's table."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Mapping
 from math import hypot
 from typing import Any, TypeVar
 
@@ -72,7 +73,8 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
 
     Args:
         env: An `NCSEnv`, possibly wrapped.
-        certificate: None synthesizes one for the environment's plant and contract, once per process.
+        certificate: A certificate, its `document`, or the path of its file; None synthesizes one for the environment's
+            plant and contract, once per process. A spec holds the document, so that it is JSON.
         mode: "project", "lookahead", "switch", "boundary" or "monitor"; see `SafetyFilter`.
         penalty: Subtracted from the reward per intervention counted, >= 0.
         horizon: Longest plan of mode "lookahead", in steps; see `SafetyFilter`.
@@ -92,13 +94,15 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
     def __init__(
         self,
         env: gym.Env,
-        certificate: Certificate | None = None,
+        certificate: Certificate | Mapping[str, Any] | str | os.PathLike[str] | None = None,
         mode: str = "project",
         penalty: float = 0.0,
         horizon: int | None = None,
         on_unproved: str = "warn",
     ) -> None:
-        given = {"certificate": certificate, "mode": mode, "penalty": penalty, "horizon": horizon}
+        recorded = recorded_certificate(certificate)
+        certificate = None if certificate is None else Certificate.read(certificate)
+        given = {"certificate": recorded, "mode": mode, "penalty": penalty, "horizon": horizon}
         RecordConstructorArgs.__init__(self, **given, on_unproved=on_unproved)
         inner = self._inner = self._environment_in(env)
         if env.action_space != inner.action_space:
@@ -106,8 +110,6 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         gym.Wrapper.__init__(self, env)
         self.penalty = as_number(penalty, "penalty", low=0.0)
         self._lost = LostGuarantee(on_unproved)
-        if certificate is not None and not isinstance(certificate, Certificate):
-            raise ValueError(f"certificate must be a Certificate or None, got {shown(certificate)}")
         self._certificate = (
             certificate_for(inner.plant, inner.certificate_contract) if certificate is None else certificate
         )
@@ -196,16 +198,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
 
     def _annotate(self, proposed: np.ndarray | None, interventions: int, plan: np.ndarray, *, intervened: bool) -> None:
         """Tells the picture of the step that follows what the shield does in it."""
-        note = Annotation(
-            safe_set=self._certificate.safe_set,
-            label=self._filter.mode,
-            proposed=proposed,
-            intervened=intervened,
-            interventions=interventions,
-            protects=self._filter.mode != "monitor",
-            plan=None if self._filter.lookahead is None else plan.copy(),
-        )
-        self._inner.annotate(note)
+        self._inner.annotate(annotation_of(self._filter, proposed, interventions, plan, intervened=intervened))
 
     def _info(self, proposed: np.ndarray, applied: np.ndarray, margin: float, *, intervened: bool) -> dict[str, Any]:
         reason = self._monitored.reason
@@ -221,6 +214,36 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             "episode_interventions": self._interventions,
             "episode_guaranteed": self._proved / (self._inner.steps + 1),
         }
+
+
+def annotation_of(
+    safety_filter: SafetyFilter, proposed: np.ndarray | None, interventions: int, plan: np.ndarray, *, intervened: bool
+) -> Annotation:
+    """Returns what a picture shows of a shield in a step, or at a reset, where nothing is proposed."""
+    return Annotation(
+        safe_set=safety_filter.certificate.safe_set,
+        label=safety_filter.mode,
+        proposed=proposed,
+        intervened=intervened,
+        interventions=interventions,
+        protects=safety_filter.mode != "monitor",
+        plan=None if safety_filter.lookahead is None else plan.copy(),
+    )
+
+
+def recorded_certificate(given: Any) -> Any:
+    """Returns what a spec says of a certificate that is given: JSON values.
+
+    Raises:
+        ValueError: If it is neither a certificate, nor its document, nor a path.
+    """
+    if given is None or isinstance(given, Mapping):
+        return given
+    if isinstance(given, Certificate):
+        return given.document
+    if isinstance(given, (str, os.PathLike)):
+        return os.fspath(given)
+    raise ValueError(f"certificate must be a Certificate, its document or path, or None, got {shown(given)}")
 
 
 def certificate_for(

@@ -215,8 +215,12 @@ def small(monkeypatch):
     )
 
 
+# Steps in which each kind of both cases comes in once.
+ROUND = 6 * 16 * 200
+
+
 def settings(out, **changes):
-    return AttackSettings(**{"steps": 1, "out": out, "random_plants": 1, "envs": 16, **changes})
+    return AttackSettings(**{"steps": ROUND, "out": out, "random_plants": 1, "envs": 16, **changes})
 
 
 def document(folder):
@@ -231,6 +235,15 @@ def test_results_do_not_depend_on_worker_processes(tmp_path, small, capsys):
         attack(settings(tmp_path / "none"))
     assert document(tmp_path / "none") == document(tmp_path / "two")
     assert document(tmp_path / "none")["total"]["steps"] == 6 * 16 * 200
+
+
+@pytest.mark.parametrize(
+    ("steps", "envs", "batches", "left_out"), [(20_000, 16, 6, 0), (7_000, 5, 7, 0), (2_500, 4, 3, 1)]
+)
+def test_a_budget_of_steps_is_kept(tmp_path, small, capsys, without_workers, steps, envs, batches, left_out):
+    attack(settings(tmp_path, steps=steps, envs=16))
+    assert document(tmp_path)["total"]["steps"] == batches * envs * 200 <= steps
+    assert ("1 of 2 cases are not attacked" in capsys.readouterr().out) is bool(left_out)
 
 
 def stored(folder):
@@ -251,11 +264,11 @@ def test_interrupted_campaign_goes_on(tmp_path, small, capsys, without_workers):
     assert "4 of 6 runs were finished before" in capsys.readouterr().err
     attack(settings(tmp_path))  # all there
     assert "step/s" not in capsys.readouterr().err
-    attack(settings(tmp_path, steps=6 * 16 * 200 + 1))
+    attack(settings(tmp_path, steps=7 * 16 * 200))
     assert document(tmp_path)["total"]["steps"] == 7 * 16 * 200
     assert len(stored(tmp_path)) == 7
     finished = (tmp_path / "certify.json").read_bytes()
-    for changes in ({"steps": 1}, {"mode": "switch"}):
+    for changes in ({"steps": ROUND}, {"mode": "switch"}):
         with pytest.raises(OtherResultsError, match=next(iter(changes))):
             attack(settings(tmp_path, **changes))
         assert (tmp_path / "certify.json").read_bytes() == finished
@@ -401,7 +414,7 @@ def test_the_certificate_of_a_case_fits_its_plant_and_contract():
 
 def test_earlier_name_of_the_command_is_the_same_command(tmp_path, small, without_workers):
     for name in ("attack", "certify"):
-        run = ncs(name, "--steps", 1, "--random-plants", 1, "--envs", 16, "--out", tmp_path / "out")
+        run = ncs(name, "--steps", ROUND, "--random-plants", 1, "--envs", 16, "--out", tmp_path / "out")
         assert run.returncode == 0, run.stderr
     assert "step/s" not in run.stderr  # all there, in the folder of the other name
     helps = [ncs(name, "--help").stdout for name in ("attack", "certify")]

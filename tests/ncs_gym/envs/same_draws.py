@@ -133,7 +133,7 @@ def scalar_versions(many: NCSVectorEnv, kind: type[ScriptedEnv] = ScriptedEnv) -
         "noise",
     )
     settings = {name: getattr(single, name) for name in names}
-    settings["allow_assumption_violation"] = single.allow_assumption_violation
+    settings |= {name: getattr(single, name) for name in ("allow_assumption_violation", "observe")}
     if single.downlink is not None:
         settings |= {"downlink": single.downlink, "downlink_contract": single.downlink_protocol.contract}
     singles = [kind(**settings) for _ in range(many.num_envs)]

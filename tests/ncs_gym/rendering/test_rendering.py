@@ -416,11 +416,6 @@ def test_sb3_makes_environments_that_can_be_drawn_without_a_warning():
         assert envs.render().shape == (2 * theme.HEIGHT, theme.WIDTH, 3)
 
 
-def test_vector_environments_say_that_they_draw_nothing():
-    with pytest.raises(ValueError, match="a vector environment draws nothing"):
-        gym.make_vec("ncs_gym/TruckTrailer-v0", num_envs=2, render_mode="rgb_array")
-
-
 def test_drawn_environments_can_be_copied_and_pickled():
     env = make().unwrapped
     env.reset(seed=0)

@@ -98,7 +98,7 @@ def policy(name: str, env: SafetyShield, rng: np.random.Generator):
         corners = rng.integers(-1, 2, (4, plant.m)).astype(np.float64)
         estimates, alike = np.tile(info["estimate"][:, None], 4), np.zeros(4, np.int64)
         errors = env.filter.errors_of(info["error_shape"]).batch().of(alike)
-        inputs = env.filter.decide_many(estimates, errors, plant.u_max[:, None] * corners.T).input
+        inputs = env.filter.decide_columns(estimates, errors, plant.u_max[:, None] * corners.T).input
         nominal = plant.A @ estimates + plant.B @ inputs
         return corners[int(np.argmax((nominal * (certificate.M @ nominal)).sum(axis=0)))].astype(np.float32)
 

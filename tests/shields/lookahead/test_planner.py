@@ -244,7 +244,7 @@ def test_decisions_one_by_one_equal_those_of_a_batch(name):
         length = int(rng.integers(1, shield.horizon))
         stored[:length, :, e] = plant.u_max * rng.uniform(-1, 1, (length, plant.m)).astype(np.float32)
     estimates[::9] *= 3.0
-    many = shield.decide_many(estimates.T, shield.errors_of_many(shapes), proposed.T, stored)
+    many = shield.decide_columns(estimates.T, shield.errors_of_many(shapes), proposed.T, stored)
     for e in range(count):
         plan = stored[..., e]
         one = shield.decide(estimates[e], shapes[e], proposed[e], plan[~np.isnan(plan[:, 0])])
@@ -262,7 +262,7 @@ def test_a_single_proposal_that_a_gain_continues_is_kept_without_a_batch(name, m
     shield, rng = shield_of(name), np.random.default_rng(7)
     cases = list(zip(*beliefs(shield, rng, 150), strict=True))
     kept = [(case, one) for case in cases if (one := shield.decide(*case)).reason == "planned" and not one.intervened]
-    monkeypatch.setattr(SafetyFilter, "decide_many", None)
+    monkeypatch.setattr(SafetyFilter, "decide_columns", None)
     decided = 0
     for (x_hat, shape, proposed), expected in kept:
         try:

@@ -98,7 +98,7 @@ def test_a_projected_input_leaves_nothing_of_an_earlier_plan(monkeypatch):
         errors, padded = shield.errors_of(shape).batch(), shield.lookahead.as_stored(stored)[..., None]
         alone, batch = (
             shield.decide(x_hat, shape, u, stored),
-            shield.decide_many(x_hat[:, None], errors, u[:, None], padded),
+            shield.decide_columns(x_hat[:, None], errors, u[:, None], padded),
         )
         np.testing.assert_array_equal(alone.input, batch.input[:, 0])
         if alone.reason == "projected":

@@ -146,7 +146,7 @@ def test_batches_decide_as_single_loops(name, mode):
     shield = SafetyFilter(certificate, plant, mode)
     estimates, shape, proposals = situations(shield, 64)
     errors = shield.errors_of(shape).batch().of(np.zeros(64, np.int64))
-    many = shield.decide_many(np.ascontiguousarray(estimates.T), errors, np.ascontiguousarray(proposals.T))
+    many = shield.decide_columns(np.ascontiguousarray(estimates.T), errors, np.ascontiguousarray(proposals.T))
     reasons = set()
     for k in range(64):
         one = shield.decide(estimates[k], shape, proposals[k])

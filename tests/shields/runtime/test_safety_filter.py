@@ -19,7 +19,7 @@ TWO_STATES = random_plant(3, 2, 1)
 
 def many(shield, estimates, shapes, inputs):
     """The decisions about rows of estimates (N, n) and inputs (N, m) and as many shapes, in one batch."""
-    return shield.decide_many(estimates.T, shield.errors_of_many(shapes), inputs.T)
+    return shield.decide_columns(estimates.T, shield.errors_of_many(shapes), inputs.T)
 
 
 def worst_next_level(certificate, plant, estimate, shape, u, rng, tries=20):

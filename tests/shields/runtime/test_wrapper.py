@@ -45,6 +45,7 @@ KEYS = {
     "shield_guaranteed": bool,
     "shield_reason": str,
     "episode_interventions": int,
+    "episode_guaranteed": float,
 }
 
 
@@ -234,7 +235,9 @@ def test_wrong_certificates_are_refused(certificate, tmp_path):
     with pytest.raises(CertificateError, match="does not verify"):
         shielded(replace(certificate, L=1.5 * certificate.L))
     with pytest.raises(ValueError, match="must be a Certificate"):
-        shielded("certificate.json")
+        shielded(3)
+    with pytest.raises(CertificateError, match="cannot read certificate"):
+        shielded(str(tmp_path / "missing.json"))
     certificate.save(tmp_path / "c.json")
     shielded(Certificate.load(tmp_path / "c.json"))
 

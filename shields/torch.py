@@ -1,0 +1,167 @@
+"""The projection of mode "project" as a layer of a PyTorch model; nothing else in `shields` imports torch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from ncs_gym import LinearPlant
+from shields.certificate import Certificate
+from shields.runtime.one_step import ReachableSets
+from shields.runtime.polytope_step import PolytopeSets, SetsOnGrid
+from shields.runtime.safety_filter import SafetyFilter
+
+# A constraint counts as attained by the closest input within this much, relative to what it bounds.
+ATTAINED = 1e-9
+
+
+class SafeLayer(nn.Module):
+    """Maps actions to those that the shield would apply, for batches of tensors, with exact gradients.
+
+    The output is the input of `SafetyFilter.decide_many` in mode "project", in units of the limits. Its derivative with
+    respect to the actions is that of the projection: the identity where an action passes; for one input zero where it
+    is moved to the end of the interval; for several what the active limits, rows of the polytope and the tangent of the
+    ellipsoid leave free (implicit differentiation of the conditions of Karush, Kuhn and Tucker). Where K x_hat takes
+    the action's place it is zero. Where constraints meet it is that of one side. No gradient flows to estimates.
+
+    For policies that are trained through the shield and critics that are asked about projected actions. It takes the
+    place of no shield: keep one around the environment.
+
+    Args:
+        certificate: Verified exactly here.
+        plant: The plant it was made for.
+        error_shape: Sigma, shape (n, n), for calls without error shapes; by default the certificate's largest.
+
+    Attributes:
+        filter: What decides.
+
+    Raises:
+        CertificateError: If the certificate does not verify for the plant.
+        ValueError: If the error shape is no positive semidefinite matrix, or there is none.
+    """
+
+    def __init__(self, certificate: Certificate, plant: LinearPlant, error_shape: Any = None) -> None:
+        super().__init__()
+        self.filter = SafetyFilter(certificate, plant)
+        shape = certificate.Sigma if error_shape is None else error_shape
+        if shape is None:
+            raise ValueError("a certificate of the published method carries no error set: give error_shape")
+        self._shape = np.array(shape, dtype=np.float64)
+        if not np.isfinite(self.filter.errors_of(self._shape).radius):
+            raise ValueError(f"error_shape must be positive semidefinite, shape ({plant.n}, {plant.n})")
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> SafeLayer:
+        return self  # nothing in it is learned
+
+    def forward(
+        self, actions: torch.Tensor, estimates: torch.Tensor, error_shapes: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """Returns the actions that are applied, shape (N, m), of the type and on the device of those given.
+
+        Args:
+            actions: Shape (N, m), in units of the limits; clipped to [-1, 1] first.
+            estimates: x_hat, shape (N, n) [physical units].
+            error_shapes: Sigma_k, shape (N, n, n); None for that of the layer.
+
+        Raises:
+            ValueError: If a shape is wrong.
+        """
+        clipped = actions.clamp(-1.0, 1.0)
+        shapes = self._shape if error_shapes is None else _numbers(error_shapes)
+        safe: torch.Tensor = _Projected.apply(clipped, self.filter, _numbers(estimates), shapes)  # pyright: ignore
+        return safe
+
+
+class _Projected(torch.autograd.Function):
+    """The decisions of a filter, and the derivative of what is projected."""
+
+    @staticmethod
+    def forward(ctx: Any, actions: torch.Tensor, shield: SafetyFilter, estimates: Any, shapes: Any) -> torch.Tensor:
+        limits, numbers = shield.plant.u_max, _numbers(actions)
+        decided = shield.decide_many(estimates, shapes, limits * numbers)
+        safe = np.where(decided.intervened[:, None], decided.input / limits, numbers)
+        jacobians = decided.passed[:, None, None] * np.eye(len(limits))
+        moved = np.flatnonzero(decided.passed & decided.intervened)
+        if moved.size and ctx.needs_input_grad[0]:
+            chosen = shapes if shapes.ndim == 2 else shapes[moved]
+            jacobians[moved] = projection_jacobians(shield, estimates[moved], chosen, limits * numbers[moved])
+        ctx.save_for_backward(torch.as_tensor(jacobians, dtype=actions.dtype, device=actions.device))
+        return torch.as_tensor(safe, dtype=actions.dtype, device=actions.device)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor, None, None, None]:
+        (jacobians,) = ctx.saved_tensors
+        return torch.einsum("ki,kij->kj", gradients[0], jacobians), None, None, None
+
+
+def projection_jacobians(
+    shield: SafetyFilter, estimates: np.ndarray, error_shapes: np.ndarray, proposals: np.ndarray
+) -> np.ndarray:
+    """Returns the derivatives of projected actions with respect to proposed ones, in units of the limits, (N, m, m).
+
+    For inputs that do not pass and have a closest one that does. With the active linear constraints a u = b the
+    projection moves in their null space only, spanned by the columns of V. If it lies on |o + E u| = r with multiplier
+    t, and q = E'(o + E u), then V'(I + t E'E) V dz + V'q dt = V'dw and q'V dz = 0, du = V dz, where w is the proposal.
+    Of several inputs on an ellipsoid and a grid the shield alternates projections; this is then what the constraints
+    that hold at the end leave free.
+
+    Args:
+        shield: In mode "project".
+        estimates: Shape (N, n).
+        error_shapes: Shape (N, n, n) or (n, n).
+        proposals: Shape (N, m) [physical units].
+    """
+    limits, count = shield.plant.u_max, len(estimates)
+    found = np.zeros((count, len(limits), len(limits)))
+    if len(limits) == 1:  # it is moved to an end of the interval
+        return found
+    errors = shield.errors_of_many(np.broadcast_to(error_shapes, (count, *error_shapes.shape[-2:])))
+    sets = shield.test.reachable(np.array(estimates.T, order="C"), errors)
+    wanted = np.array(proposals.T, order="C")
+    closest = sets.closest(wanted, shield.projection_margin)
+    ball_of = sets.first if isinstance(sets, SetsOnGrid) else sets if isinstance(sets, ReachableSets) else None
+    rows_of = sets.grid if isinstance(sets, SetsOnGrid) else sets if isinstance(sets, PolytopeSets) else None
+    for e in range(count):
+        u, held = closest[:, e], np.abs(closest[:, e]) >= (1.0 - ATTAINED) * limits
+        active, ball = np.eye(len(limits))[held], None
+        if ball_of is not None:
+            test, weighting = ball_of.test, ball_of.weighting[..., e]
+            effect, center = weighting @ test.effect, weighting @ (ball_of.offset[:, e] + test.effect @ u)
+            radius = float(ball_of.radius[e]) - shield.projection_margin
+            if np.sqrt(center @ center) >= (1.0 - ATTAINED) * radius:
+                ball = effect, effect.T @ center
+        if rows_of is not None:
+            test, room = rows_of.test, rows_of.room[:, e] - rows_of.rounding[e] - shield.projection_margin
+            center = np.abs(test.moved @ estimates[e] + test.effect @ u)
+            active = np.vstack([active, test.effect[center >= room - ATTAINED * np.maximum(room, 1e-3)]])
+        found[e] = _jacobian(_null_space(active, limits), ball, wanted[:, e] - u)
+    return found * limits / limits[:, None]  # d(u / limits) / d(w / limits)
+
+
+def _jacobian(free: np.ndarray, ball: tuple[np.ndarray, np.ndarray] | None, moved: np.ndarray) -> np.ndarray:
+    """Returns the derivative of one projection, (m, m), given the null space V and, on the ellipsoid, E and q."""
+    if ball is None or not free.size:
+        return free @ free.T
+    effect, normal = ball[0] @ free, free.T @ ball[1]
+    square = float(normal @ normal)
+    if square == 0.0:
+        return free @ free.T
+    multiplier = max(float(normal @ (free.T @ moved)) / square, 0.0)
+    inverse = np.linalg.inv(np.eye(free.shape[1]) + multiplier * effect.T @ effect)
+    along = inverse @ normal
+    return free @ (inverse - np.outer(along, along) / float(normal @ along)) @ free.T
+
+
+def _null_space(active: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    """Returns orthonormal columns of the inputs that active rows, shape (k, m), leave free, shape (m, m - rank)."""
+    if not len(active):
+        return np.eye(len(limits))
+    sizes, rows = np.linalg.svd(active / np.linalg.norm(active, axis=1, keepdims=True))[1:]
+    return rows[np.count_nonzero(sizes > 1e-9) :].T
+
+
+def _numbers(tensor: Any) -> np.ndarray:
+    return tensor.detach().cpu().double().numpy() if isinstance(tensor, torch.Tensor) else np.asarray(tensor, float)

@@ -1,0 +1,85 @@
+"""Trainings that go on from an agent, keep what they learned when they are interrupted, and learn what was applied."""
+
+import numpy as np
+import pytest
+from stable_baselines3.common.callbacks import BaseCallback
+
+from agents import Agent, LoopConfig, ShieldSettings, train
+from ncs_gym import truck_trailer
+from tests.certificates import certificate_of
+
+CRUISE = "ncs_gym/TruckTrailerCruise-v0"
+SMALL = {"n_envs": 8, "n_steps": 16, "batch_size": 128, "n_epochs": 2}
+REPLAY = {"n_envs": 4, "learning_starts": 40, "gradient_steps": 1, "buffer_size": 1000}
+
+
+@pytest.fixture(scope="module")
+def loop():
+    return LoopConfig(env=CRUISE, shield=ShieldSettings(certificate_of(truck_trailer(mass=4000.0))))
+
+
+class Interrupting(BaseCallback):
+    """Ctrl-C after some steps."""
+
+    def _on_step(self):
+        if self.num_timesteps >= 1000:
+            raise KeyboardInterrupt
+        return True
+
+
+def test_training_goes_on_from_an_agent(loop):
+    first = train(loop, 512, 0, hyperparams=SMALL).agent
+    observations = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    still = train(loop, 128, 1, hyperparams=SMALL | {"learning_rate": 1e-12}, start=first).agent
+    np.testing.assert_allclose(still.act(observations), first.act(observations), atol=0.05)
+    moved = train(loop, 512, 1, hyperparams=SMALL, start=first).agent
+    assert moved.checksum != first.checksum
+    other = train(loop, 128, 1, hyperparams=SMALL | {"learning_rate": 1e-12}).agent
+    assert np.abs(other.act(observations) - first.act(observations)).max() > 0.05
+    with pytest.raises(ValueError, match="the agent to go on from is PPO of"):
+        train(loop, 512, 0, "A2C", start=first)
+    with pytest.raises(ValueError, match="has other networks"):
+        train(loop, 512, 0, hyperparams=SMALL | {"policy_kwargs": {"net_arch": [8]}}, start=first)
+
+
+def test_interrupted_training_leaves_what_it_learned(loop, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        train(loop, 100_000, 0, hyperparams=SMALL, callbacks=[Interrupting()], checkpoints=tmp_path)
+    kept = Agent.load(tmp_path)
+    assert kept.act(np.zeros(3)).shape == (1,)
+    assert (tmp_path / "certificate.json").exists()
+    assert train(loop, 128, 0, hyperparams=SMALL, start=kept).steps == 128
+
+
+def test_training_leaves_checkpoints_on_the_way(loop, tmp_path):
+    class Looking(BaseCallback):
+        seen = 0
+
+        def _on_step(self):
+            Looking.seen += (tmp_path / "agent.json").exists()
+            return True
+
+    train(loop, 2560, 0, hyperparams=SMALL, callbacks=[Looking()], checkpoints=tmp_path)
+    assert Looking.seen > 100
+
+
+@pytest.mark.parametrize("algorithm", ["SAC", "TD3"])
+def test_replay_buffers_hold_what_was_applied_if_asked_to(loop, algorithm):
+    class Keeping(BaseCallback):
+        def __init__(self):
+            super().__init__()
+            self.applied = []
+
+        def _on_step(self):
+            self.applied += self.training_env.unwrapped.batch_info["input_committed"].tolist()
+            return True
+
+    keeping, limit = Keeping(), truck_trailer().u_max
+    agent = train(loop, 400, 0, algorithm, REPLAY | {"stored_action": "applied"}, callbacks=[keeping]).agent
+    stored = agent.model.replay_buffer
+    actions = stored.actions[: stored.pos].reshape(-1, 1)
+    np.testing.assert_allclose(actions * limit, np.array(keeping.applied), atol=1e-5)
+    proposed = train(loop, 400, 0, algorithm, REPLAY).agent.model.replay_buffer
+    assert not np.allclose(proposed.actions[: stored.pos].reshape(-1, 1), actions, atol=1e-3)
+    with pytest.raises(ValueError, match="stored_action must be"):
+        train(loop, 400, 0, algorithm, REPLAY | {"stored_action": "both"})

@@ -1,0 +1,96 @@
+"""The projection as a layer of PyTorch, and batches of decisions: equal to the shield's, with exact gradients."""
+
+import numpy as np
+import pytest
+import torch
+
+from ncs_gym import ChannelContract, batch_reactor, truck_trailer
+from shields import SafetyFilter, synthesize
+from shields.torch import SafeLayer
+from tests.certificates import certificate_of
+from tests.plants import random_plant
+
+
+@pytest.fixture(scope="module", params=["one input", "two inputs", "three inputs", "polytope"])
+def setting(request):
+    """A plant, its certificate, estimates, inputs and error shapes where many proposals are projected."""
+    plant = {"one input": truck_trailer(mass=4000.0)}.get(request.param)
+    if plant is None:
+        plant = random_plant(0, 4, 3 if request.param == "three inputs" else 2)
+    certificate = synthesize(plant, safe_set="polytope") if request.param == "polytope" else certificate_of(plant)
+    rng = np.random.default_rng(0)
+    estimates = 0.95 * certificate.ellipsoid.sample(rng, 60)
+    if request.param == "polytope":
+        estimates = 0.7 * plant.half_widths * rng.uniform(-1, 1, (60, plant.n))
+    shapes = rng.uniform(0.01, 0.6, 60)[:, None, None] * certificate.Sigma
+    return plant, certificate, estimates, shapes, rng.uniform(-1.3, 1.3, (60, plant.m))
+
+
+def test_batches_of_decisions_are_those_of_single_ones(setting):
+    plant, certificate, estimates, shapes, actions = setting
+    shield, inputs = SafetyFilter(certificate, plant), np.clip(actions, -1, 1) * plant.u_max
+    inputs[0], estimates = np.nan, estimates.copy()
+    many = shield.decide_many(estimates, shapes, inputs)
+    for e, (x_hat, shape, u) in enumerate(zip(estimates, shapes, inputs, strict=True)):
+        one = shield.decide(x_hat, shape, u)
+        np.testing.assert_allclose(many.input[e], one.input, rtol=1e-6, atol=1e-9)
+        assert (many.intervened[e], many.passed[e], many.reason[e]) == (one.intervened, one.passed, one.reason)
+    of_one_shape = shield.decide_many(estimates, shapes[3], inputs)
+    np.testing.assert_array_equal(of_one_shape.input[3], many.input[3])
+    for wrong in [(estimates[0], shapes, inputs), (estimates, shapes[:5], inputs), (estimates, shapes, inputs[:, :0])]:
+        with pytest.raises(ValueError, match="must be numbers of shape"):
+            shield.decide_many(*wrong)
+
+
+def test_layer_applies_what_the_shield_applies(setting):
+    plant, certificate, estimates, shapes, actions = setting
+    layer = SafeLayer(certificate, plant)
+    safe = layer(torch.tensor(actions), torch.tensor(estimates), torch.tensor(shapes))
+    decided = layer.filter.decide_many(estimates, shapes, np.clip(actions, -1, 1) * plant.u_max)
+    np.testing.assert_allclose(safe.numpy() * plant.u_max, decided.input, rtol=1e-12)
+    assert (decided.reason == "projected").sum() >= 5
+    assert (decided.reason == "safe").sum() >= 3
+    single = layer(torch.tensor(actions, dtype=torch.float32), torch.tensor(estimates), torch.tensor(shapes))
+    assert single.dtype is torch.float32
+    own = layer(torch.tensor(actions), torch.tensor(estimates))
+    assert not np.array_equal(own.numpy(), safe.numpy())
+
+
+def test_gradients_are_those_of_the_projection(setting):
+    plant, certificate, estimates, shapes, actions = setting
+    layer, checked, curved = SafeLayer(certificate, plant), 0, 0
+    steps = 1e-3 * np.eye(plant.m)  # much more than what rounding to float32 moves
+    for x_hat, shape, action in zip(estimates, shapes, actions, strict=True):
+        known = torch.tensor(x_hat[None]), torch.tensor(shape[None])
+
+        def safe(each, known=known):
+            return layer(torch.as_tensor(each)[None], *known)[0]
+
+        jacobian = torch.autograd.functional.jacobian(safe, torch.tensor(action)).numpy()
+        middle = safe(action).numpy()
+        forward = np.array([safe(action + step).numpy() - middle for step in steps]).T / 1e-3
+        backward = np.array([middle - safe(action - step).numpy() for step in steps]).T / 1e-3
+        if np.abs(forward - backward).max() > 0.02:
+            continue  # a constraint begins or ends to be active here
+        np.testing.assert_allclose(jacobian, 0.5 * (forward + backward), atol=2e-3)
+        checked += 1
+        curved += 0.01 < np.abs(jacobian).max() < 0.99
+    assert checked >= 45
+    assert curved >= 3 or plant.m == 1
+
+
+def test_fallback_and_unusable_estimates_have_no_gradient():
+    plant = truck_trailer(mass=4000.0)
+    layer = SafeLayer(certificate_of(plant), plant)
+    actions = torch.zeros((2, 1), requires_grad=True)
+    safe = layer(actions, torch.tensor([[9.0, 0.0], [np.nan, 0.0]]))
+    safe.sum().backward()
+    assert actions.grad is not None
+    np.testing.assert_array_equal(actions.grad.numpy(), np.zeros((2, 1)))
+    assert safe[1].item() == 0.0
+
+
+def test_error_shapes_that_are_none_are_refused():
+    plant = batch_reactor()
+    with pytest.raises(ValueError, match="positive semidefinite"):
+        SafeLayer(certificate_of(plant, ChannelContract(3, 1e-3)), plant, -np.eye(4))
