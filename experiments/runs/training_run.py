@@ -5,11 +5,11 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -19,7 +19,7 @@ from agents.hyperparams import rollout_steps
 from agents.loop import LoopConfig
 from agents.results import Episode, TrainingPoint, Trajectory
 from agents.sharing.agent_file import AGENT_FILES, write_files
-from experiments.baselines import controller
+from experiments.baselines import controller, tuned_weights
 from experiments.runs.environments import import_module, module_digest
 from experiments.runs.provenance import versions
 from experiments.runs.scenarios import AS_TRAINED, under
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
 # Counts are numbers that floats and tables hold exactly.
 _LARGEST_COUNT = 2**53
-PolicyKind = Literal["trained", "untrained", "zero input", "K x_hat", "random", "proportional", "lqr"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +42,7 @@ class TrainingRun:
     Attributes:
         arm: Name of the arm that the run belongs to.
         policy_kind: "trained" is a trained agent; "untrained" an agent with its initial weights; the others are
-            controllers (`experiments.baselines.CONTROLLERS`).
+            controllers (`experiments.baselines.CONTROLLERS` and `REGULATORS`).
         training_loop: Control loop that the policy is trained in, with its penalties.
         loop: Control loop that the policy is evaluated in.
         module: Module of the user's that registers the environment, imported where the run is executed; empty for none.
@@ -62,7 +61,7 @@ class TrainingRun:
     """
 
     arm: str
-    policy_kind: PolicyKind
+    policy_kind: str
     training_loop: LoopConfig
     loop: LoopConfig
     module: str = ""
@@ -269,7 +268,7 @@ def _judged(run: TrainingRun, result: RunResult) -> Iterator[tuple[str, object, 
 
 def _described(loop: LoopConfig, certificate: str) -> dict[str, Any]:
     """Returns a control loop as JSON values, what belongs to the certificate under the name given to that."""
-    values = {each.name: getattr(loop, each.name) for each in fields(loop)}
+    values = dict(vars(loop))
     for name in ("shield", "filter"):
         values[name] = values[name] and vars(values[name]) | {"certificate": certificate}
     residual = loop.residual_gain is not None
@@ -302,4 +301,5 @@ def _policy(run: TrainingRun, agent: Agent | None) -> Policy:
     """Returns what acts in the evaluation of a run: an agent, or for None the run's controller, which begins anew."""
     if agent is not None:
         return lambda observations, infos: agent.act(observations)
-    return controller(run.policy_kind, ncs_env(run.loop.single()), run.certificate.K, run.evaluation_seed)
+    weights = tuned_weights(run.loop.env, run.arm)
+    return controller(run.policy_kind, ncs_env(run.loop.single()), run.certificate.K, run.evaluation_seed, weights)
