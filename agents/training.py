@@ -168,7 +168,8 @@ def _go_on(start: Agent, loop: LoopConfig, algorithm: str, model: BaseAlgorithm,
             f"the agent to go on from is {start.algorithm} of {start.env}, this is {algorithm} of {loop.env}"
         )
     try:
-        model.set_parameters(start.model.get_parameters(), exact_match=True, device="cpu")
+        parameters: Any = start.model.get_parameters()
+        model.set_parameters(parameters, exact_match=True, device="cpu")
     except (ValueError, RuntimeError) as error:
         raise ValueError(f"the agent to go on from has other networks: {str(error).splitlines()[0]}") from error
     statistics = env.obs_rms

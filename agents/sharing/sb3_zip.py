@@ -54,7 +54,8 @@ def load_sb3_zip(path: Path, env_id: str) -> Agent:
             f"the policy_kwargs in {path} are pickled, and pickles are not read: load it yourself, and evaluate it "
             "with agents.evaluate"
         )
-    cls, replay = algorithm_class(algorithm), {"buffer_size": 1} if algorithm in ("TQC", "SAC", "TD3") else {}
+    cls = algorithm_class(algorithm)
+    replay: dict[str, Any] = {"buffer_size": 1} if algorithm in ("TQC", "SAC", "TD3") else {}
     try:
         model = cls(
             "MlpPolicy", SB3VecEnv(LoopConfig(env=env_id).vector(2)), policy_kwargs=policy, device="cpu", **replay

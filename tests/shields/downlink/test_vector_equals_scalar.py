@@ -30,7 +30,7 @@ class Follower(ScriptedEnv):
         self.follow(self.many, self.index)
         if np.isnan(self.many.starts[self.index]).any():
             self.start = self.initial_set
-        info = self._info(no_inputs(self.plant.m), arrived=False)
+        info = self._info(no_inputs(self.plant.m), self.plant.constraint_values(self._state), arrived=False)
         return self._observation(), info
 
 
