@@ -53,7 +53,7 @@ class ShieldSettings:
     @property
     def arguments(self) -> dict[str, Any]:
         """Arguments of `SafetyShield` and `VectorSafetyShield` after the environment."""
-        return {name: getattr(self, name) for name in [each.name for each in fields(self)]}
+        return dict(vars(self))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,6 +27,14 @@ def to_json(value: Any) -> Any:
     return None if value != value else value
 
 
+def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Returns JSON values by their dotted names, without the objects that hold others."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        found |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return found
+
+
 def from_json(value: Any, kind: Any, name: str = "", *, null: float | None = None) -> Any:
     """Returns a JSON value as a value of a type.
 

@@ -85,7 +85,7 @@ class MonteCarloBatch:
             steps=campaign.batch_steps,
             episodes=campaign.envs,
             unproved=int(np.count_nonzero(~info["shield_guaranteed"])),
-            outside_starts=int(np.count_nonzero(_levels(safe_set, info) > 1.0)),
+            outside_starts=int(np.count_nonzero(safe_set.gauge(info["state"]) > 1.0)),
         )
         kept, broken = np.ones(campaign.envs, np.bool_), np.zeros(campaign.envs, np.bool_)
         for step in range(EPISODE_STEPS):
@@ -93,7 +93,7 @@ class MonteCarloBatch:
             claimed, kept = _claimed_and_kept(info, kept)
             if not campaign.shielded:  # nothing is claimed, and everything counted
                 claimed[:] = True
-            outside, reached = _outside_and_reached(campaign, info, _levels(safe_set, info))
+            outside, reached = _outside_and_reached(campaign, info, safe_set.gauge(info["state"]))
             counts += _step_counts(info, outside, claimed, kept)
             broken |= claimed & (outside.box | (outside.safe_set & (not campaign.looks_ahead)))
             if step >= SETTLING_STEPS:
@@ -159,14 +159,18 @@ def _step_counts(info: dict[str, Any], outside: _Outside, claimed: np.ndarray, k
 
 
 def _begin(campaign: Campaign, shield: VectorSafetyShield, seed: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Starts the episodes of a batch and returns their infos.
+    """Starts the episodes of a batch, on the boundary of the safe set, and returns their infos.
 
     In mode "lookahead" half of the starts are drawn from the box; those for which no first plan is certified, of which
     nothing is claimed, are replaced by others on the boundary of the set that episodes start in.
     """
-    if not campaign.looks_ahead:
-        return shield.reset(seed=seed)[1]
     plant, certificate, count = shield.filter.plant, shield.certificate, campaign.envs
+    if not campaign.looks_ahead:
+        polytope, env = certificate.polytope, shield.env.unwrapped
+        assert isinstance(env, NCSVectorEnv)
+        if polytope is None or env.single.downlink is not None:  # behind a downlink the first inputs are zero
+            return shield.reset(seed=seed)[1]
+        return shield.reset(seed=seed, options={"state": (1.0 - 1e-9) * polytope.sample_boundary(rng, count)})[1]
     _, info = shield.reset(seed=seed, options={"state": starts_in_box(rng, plant, certificate, count)})
     if not info["shield_guaranteed"].all():
         env = shield.env.unwrapped
@@ -174,11 +178,6 @@ def _begin(campaign: Campaign, shield: VectorSafetyShield, seed: int, rng: np.ra
         states = (1.0 - 1e-9) * env.single.initial_set.sample_boundary(rng, count)
         _, info = shield.reset(options={"state": states, "reset_mask": ~info["shield_guaranteed"]})
     return info
-
-
-def _levels(safe_set: Any, info: dict[str, Any]) -> np.ndarray:
-    """Returns how far out the true states are in the set that a shield keeps: 1 on its boundary, shape (N,)."""
-    return safe_set.gauge(info["state"])
 
 
 @lru_cache(maxsize=1)  # a shield's tables may take a hundred megabytes

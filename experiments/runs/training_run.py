@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
 # Counts are numbers that floats and tables hold exactly.
 _LARGEST_COUNT = 2**53
-# "trained", "untrained", or a name in `experiments.baselines.CONTROLLERS` or `REGULATORS`.
-PolicyKind = str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +61,7 @@ class TrainingRun:
     """
 
     arm: str
-    policy_kind: PolicyKind
+    policy_kind: str
     training_loop: LoopConfig
     loop: LoopConfig
     module: str = ""
@@ -270,7 +268,7 @@ def _judged(run: TrainingRun, result: RunResult) -> Iterator[tuple[str, object, 
 
 def _described(loop: LoopConfig, certificate: str) -> dict[str, Any]:
     """Returns a control loop as JSON values, what belongs to the certificate under the name given to that."""
-    values = {each.name: getattr(loop, each.name) for each in fields(loop)}
+    values = dict(vars(loop))
     for name in ("shield", "filter"):
         values[name] = values[name] and vars(values[name]) | {"certificate": certificate}
     residual = loop.residual_gain is not None

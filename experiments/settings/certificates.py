@@ -9,7 +9,7 @@ from typing import Literal
 import tyro
 
 from experiments.settings.backend import BackendSettings
-from experiments.settings.steps import StepCount, require_horizon
+from experiments.settings.steps import StepCount, require_horizon, require_least
 from ncs_gym import ChannelContract
 from ncs_gym.plants.linear_plant import SMALLEST_DELTA
 
@@ -158,10 +158,7 @@ class AttackSettings(BackendSettings):
             raise ValueError(f"--delta must be between {SMALLEST_DELTA:g} and 0.5, got {self.delta:g}")
         if not 1.0 <= self.steps < 1e15:
             raise ValueError(f"--steps must be at least 1 and below 1e15, got {self.steps:g}")
-        for name, least in (("random_plants", 0), ("envs", 4), ("seed", 0)):
-            if getattr(self, name) < least:
-                flag = name.replace("_", "-")
-                raise ValueError(f"--{flag} must be at least {least}, got {getattr(self, name)}")
+        require_least(self, random_plants=0, envs=4, seed=0)
         if self.unshielded and self.mode is not None:
             raise ValueError(f"give either --mode {self.mode} or --unshielded, not both")
         require_horizon(self.horizon, self.mode)
@@ -202,3 +199,7 @@ class ReproduceSettings:
     steps: StepCount = 200
     force: bool = False
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        require_least(self, starts=1, steps=1, seed=0)

@@ -12,7 +12,7 @@ from agents.hyperparams import DEFAULTS, read_hyperparams, tuned_hyperparams, tu
 from agents.loop import LagrangianSettings
 from experiments.settings.assignments import Assignments
 from experiments.settings.backend import BackendSettings
-from experiments.settings.steps import OptionalStepCount, require_horizon
+from experiments.settings.steps import OptionalStepCount, require_horizon, require_least
 from ncs_gym.validation import shown
 
 # Training steps where none belong to tuned hyperparameters.
@@ -138,14 +138,7 @@ class LearningSettings:
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
-        for name in ("seeds", "steps", "episodes"):
-            if (value := getattr(self, name, None)) is not None and value < 1:
-                raise ValueError(f"--{name} must be at least 1, got {value}")
-        if self.seed < 0:
-            raise ValueError(f"--seed must be >= 0, got {self.seed}")
-        for name in ("intervention_penalty", "violation_penalty"):
-            if not 0.0 <= getattr(self, name) < float("inf"):
-                raise ValueError(f"--{name.replace('_', '-')} must be >= 0, got {getattr(self, name)}")
+        require_least(self, seeds=1, steps=1, episodes=1, seed=0, intervention_penalty=0, violation_penalty=0)
         arms = getattr(self, "arm", ""), *getattr(self, "arms", ()), *getattr(self, "baselines", ())
         require_horizon(self.horizon, self.mode, *arms)
 
@@ -249,9 +242,6 @@ class EvaluateSettings:
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
-        if self.episodes < 1:
-            raise ValueError(f"--episodes must be at least 1, got {self.episodes}")
-        if self.seed < 0:
-            raise ValueError(f"--seed must be >= 0, got {self.seed}")
+        require_least(self, episodes=1, seed=0)
         if self.shield != "as-trained":  # otherwise the agent knows
             require_horizon(self.horizon, self.shield)

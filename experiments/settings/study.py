@@ -9,7 +9,7 @@ from typing import Literal
 from experiments.baselines.margins import MARGINS
 from experiments.settings.backend import BackendSettings
 from experiments.settings.learning import Algorithm, Baselines, LearningSettings, Scenarios
-from experiments.settings.steps import StepCount
+from experiments.settings.steps import StepCount, require_least
 
 # Environments in which the network decides.
 NETWORK_ENVS = ("ncs_gym/CSTR-v0", "ncs_gym/Convoy-v0", "ncs_gym/LaneKeeping-v0")
@@ -123,12 +123,7 @@ class StudySettings(BackendSettings):
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
         BackendSettings.__post_init__(self)
-        for name in ("seeds", "episodes"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("seed", "channel_episodes"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"--{name.replace('_', '-')} must be >= 0, got {getattr(self, name)}")
+        require_least(self, seeds=1, episodes=1, seed=0, channel_episodes=0)
         if not 0.0 < self.budget <= 1.0:
             raise ValueError(f"--budget must be in (0, 1], got {self.budget}")
         if not self.envs or len(set(map(short_name, self.envs))) != len(self.envs):

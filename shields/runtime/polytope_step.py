@@ -27,7 +27,7 @@ from shields.runtime.projection import closest_between
 # Projections onto either of two sets of inputs, in turn.
 ALTERNATIONS = 8
 # Entries of an array that are worked on together: as many as a processor keeps near.
-BLOCK = 32_768
+BLOCK = 524_288
 
 
 class PolytopeTest:

@@ -72,11 +72,23 @@ def starts_in_box(plant: LinearPlant, initial: Ellipsoid | np.ndarray) -> bool:
 
 def _between(bounds: np.ndarray, initial: Ellipsoid | np.ndarray) -> bool:
     """Returns whether |g x| <= 1 for all rows g, shape (r, n), and all possible starts."""
+    if not isinstance(initial, Ellipsoid) and (verdict := _surely_between(bounds, initial)) is not None:
+        return verdict  # a thousand times faster than in rational arithmetic
     rows = rational(bounds)
     if isinstance(initial, Ellipsoid):
         shape = rational(initial.shape_matrix)
         return all(quadratic([row], shape) <= 1 for row in rows)
     return all(abs(product) <= 1 for (product,) in multiply(rows, transpose(rational(initial))))
+
+
+@np.errstate(all="ignore")  # what is not finite is no verdict
+def _surely_between(bounds: np.ndarray, state: np.ndarray) -> bool | None:
+    """Returns whether |g x| <= 1 for all rows g, shape (r, n), and one state; None where rounding could decide it."""
+    products, sizes = np.abs(bounds @ state), np.abs(bounds) @ np.abs(state)
+    room = (len(state) + 2) * float(np.finfo(float).eps) * sizes + float(np.finfo(float).tiny)
+    if (products + room <= 1.0).all():
+        return True
+    return False if (products - room > 1.0).any() else None
 
 
 def start_known(safety_filter: SafetyFilter, initial: Ellipsoid | np.ndarray | None) -> StartKnown:

@@ -445,7 +445,7 @@ def test_help_shows_every_setting_and_what_a_settings_file_gives(smoke):
         (["compare", "--steps", "many"], "many"),
         (["compare", "--steps", "0"], "--steps must be at least 1"),
         (["compare", "--jobs", "-1"], "--jobs must be at least 1"),
-        (["compare", "--seed", "-1"], "--seed must be >= 0"),
+        (["compare", "--seed", "-1"], "--seed must be at least 0"),
         (["compare", "--violation-penalty", "nan"], "--violation-penalty must be"),
         (["compare", "--hyperparams", "gamma"], "expected NAME=VALUE"),
         (["compare", "--engine", "hope"], "hope"),
