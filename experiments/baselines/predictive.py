@@ -67,6 +67,8 @@ class PredictiveFilter:
             reach, end = _tube(certificate, plant, self._root, horizon)
             self._room, self._radius = self._room - reach, self._radius - end
         self._room_and_end = np.vstack([self._room, np.ones(self._room.shape[1])])  # its last row is for ends in P
+        grid = self._prediction.grid
+        self._between = np.ones((horizon, 0 if grid is None else grid.free.shape[1]))
 
     def __call__(self, estimates: np.ndarray, proposed: np.ndarray, begun: np.ndarray) -> np.ndarray:
         """Returns the inputs to apply, shape (N, m).
@@ -107,7 +109,7 @@ class PredictiveFilter:
         missed = np.abs(plant.box_rows @ plant.A @ estimate) - np.abs(plant.box_rows @ plant.B) @ plant.u_max
         if not (missed <= self._room[0]).all() or self._radius <= 0.0:  # no input brings the next state into the box
             return None
-        plan = self._program.solve(estimate, self._room_and_end, self._root, self._radius, proposed)
+        plan = self._program.solve(estimate, self._room_and_end, self._root, self._radius, self._between, proposed)
         if plan is None:
             return None
         plan = np.clip(plan, -plant.u_max, plant.u_max)

@@ -9,7 +9,6 @@ from experiments.settings.certificates import (
     SynthesizeSettings,
     VerifySettings,
 )
-from experiments.settings.channel import changed_channel
 from experiments.settings.learning import (
     CompareSettings,
     EvaluateSettings,
@@ -37,7 +36,6 @@ __all__ = [
     "SynthesizeSettings",
     "TrainSettings",
     "VerifySettings",
-    "changed_channel",
     "config_defaults",
     "save_settings",
     "settings_json",
