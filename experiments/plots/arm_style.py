@@ -36,6 +36,8 @@ _CONTROLLER_MARKERS = {
     "zero input": "2",
     "untrained": "3",
 }
+# Filters that share the color of another one.
+_HOLLOW = ("trusting:lookahead", "psf:tube")
 _SOLID, _DOTTED, _DASHED = "-", (0, (1.0, 1.3)), (0, (4.5, 1.6))
 # Length of a dash that stands for a price of 1 per violating step, in line widths; it doubles with every factor of ten.
 _PRICE_DASH = 6.0
@@ -77,14 +79,14 @@ class ArmStyle:
         if name == "monitor" or not arm.filters_training:
             return cls(color, _DOTTED, marker if arm.filters_training else "h", hollow=True, size=11.0)
         if not arm.is_trained:
-            hollow = arm.mode == "trusting:lookahead"
+            hollow = str(arm.mode).startswith(_HOLLOW)
             return cls(color, _DASHED, _CONTROLLER_MARKERS[arm.policy.partition(":")[0]], hollow, size=9.0)
         if arm.violation_weight is not None:
             decades = np.log10(max(arm.violation_weight, 1e-9))
             dash = float(np.clip(_PRICE_DASH * 2.0**decades, 0.5, 50.0))
             size = float(np.clip(_PRICE_SIZE + _PRICE_GROWTH * decades, 3.0, 14.0))
             return cls(color, (0, (dash, 1.6)), marker, hollow=True, size=size)
-        changed = arm.penalizes_interventions or arm.is_residual or arm.mode == "trusting:lookahead"
+        changed = arm.penalizes_interventions or arm.is_residual or str(arm.mode).startswith(_HOLLOW)
         return cls(color, _DASHED if changed else _SOLID, marker, hollow=changed, size=10.0 if changed else 7.0)
 
     @property

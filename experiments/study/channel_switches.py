@@ -20,7 +20,7 @@ from ncs_gym import Channel, ChannelContract
 # The impairments, by the names under which tables list them.
 SWITCHES = ("loss", "delay", "rate", "rounding")
 # What acts: regulators, and of a comparison's agents those that it trained.
-SWITCHED_REGULATORS = ("lqr", "lqr+psf:20", "lqr+trusting:20", "lqr+lookahead")
+SWITCHED_REGULATORS = ("lqr", "lqr+trusting:20", "lqr+lookahead")
 SWITCHED_AGENTS = ("unshielded", "trusting:20", "lookahead")
 # A sample every second step, where the rate is an impairment and the environment's own channel has none.
 SLOW = 2

@@ -4,8 +4,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from experiments.baselines import CONTROLLERS, controller
+from experiments.baselines import CONTROLLERS, RegulatorWeights, controller, tuned_weights
 from experiments.baselines.controllers import equilibrium
+from experiments.settings.study import NETWORK_ENVS, REGULATED_ARMS
 from ncs_gym.envs.env import ncs_env
 
 SETPOINTS = ("ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0")
@@ -83,3 +84,50 @@ def test_actions_of_every_controller_fit_every_environment(name, env_id):
     actions = policy(observations, {"estimate": observations[:, :n].astype(np.float64)})
     assert actions.shape == (7, m)
     assert np.abs(actions).max() <= 1.0
+
+
+def nominal(env, name, weights, steps=150):
+    """Largest |c_j x| on the way from rest to the outermost target, without disturbance, and the inputs applied."""
+    policy, plant = controller(name, env, np.zeros((1, 2)), 0, weights), env.plant
+    x, applied, reached = np.zeros(plant.n), [np.zeros(plant.m)], 0.0
+    targets = np.full(1 + env.task.preview, env.task.reach)
+    for _ in range(steps):
+        observed = np.concatenate([x, targets, applied[-1] if env.task.change_price else []])
+        applied.append(plant.u_max * policy(observed[None], {"estimate": x[None]})[0])
+        x = plant.A @ x + plant.B @ applied[-1]
+        reached = max(reached, float(np.abs(plant.box_rows @ x).max()))
+    return reached, np.array(applied)
+
+
+@pytest.mark.parametrize("env_id", ["ncs_gym/LaneKeeping-v0", "ncs_gym/CSTR-v0", "ncs_gym/Convoy-v0"])
+def test_governor_keeps_limits_and_margins_that_its_regulator_leaves(env_id):
+    env, weights = env_of(env_id), RegulatorWeights(1e-3, 0.0)
+    free, _ = nominal(env, "lqr", weights)
+    governed, _ = nominal(env, "governor", weights)
+    with_margin, _ = nominal(env, "governor:20", weights)
+    assert governed <= 1.0 + 1e-6
+    assert with_margin <= 0.8 + 1e-6
+    assert with_margin < free
+
+
+def test_regulator_moves_before_a_target_that_it_knows_does():
+    env = env_of("ncs_gym/LaneKeeping-v0")
+    policy = controller("lqr", env, np.zeros((1, 2)), 0)
+    later = np.concatenate([np.zeros(2), np.zeros(4), np.full(env.task.preview - 3, 0.4)])
+    estimate = {"estimate": np.zeros((1, 2))}
+    assert policy(later[None], estimate)[0, 0] > 0.01
+    assert policy(np.zeros_like(later)[None], estimate)[0, 0] == 0.0
+
+
+def test_price_of_changes_makes_the_regulator_change_less():
+    env = env_of("ncs_gym/Convoy-v0")
+    _, bold = nominal(env, "lqr", RegulatorWeights(0.01, 0.01))
+    _, calm = nominal(env, "lqr", RegulatorWeights(3.0, 0.01))
+    assert np.abs(np.diff(calm, axis=0)).max() < 0.5 * np.abs(np.diff(bold, axis=0)).max()
+
+
+def test_every_arm_of_the_study_has_weights_of_its_own():
+    for env_id in NETWORK_ENVS:
+        weights = {arm: tuned_weights(env_id, arm) for arm in REGULATED_ARMS}
+        assert len(set(weights.values())) > 2
+    assert tuned_weights("ncs_gym/CartPole-v0", "lqr") == RegulatorWeights()
