@@ -227,7 +227,7 @@ class SB3VecEnv(VecEnv):
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Returns a frame per environment, None where the vector environment renders none."""
-        frames = self.vector_env.render() if self.vector_env.render_mode is not None else None
+        frames: Any = self.vector_env.render() if self.vector_env.render_mode is not None else None
         if frames is not None and isinstance(self.vector_env.unwrapped, NCSVectorEnv):
             return frames[:1]  # all are the picture of the environment that was chosen
         if frames is None:
