@@ -15,43 +15,43 @@ import numpy as np
 
 from ncs_gym import Estimator, LinearPlant
 from ncs_gym.envs.env import NCSEnv, ncs_env
-from ncs_gym.estimation.arrival_patterns import ArrivalPatterns
-from ncs_gym.estimation.error_statistics_table import NumberedUpdate
+from ncs_gym.estimation.arrival_histories import ArrivalHistories, histories_of
+from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
 from ncs_gym.registration import registered_ids
 
 KINDS = ("Kalman", "set-membership", "certified", "skipped")
 
 
-class CountingPatterns(ArrivalPatterns):
-    """A graph of arrival patterns that counts, for every update that an estimator makes, which gain it takes."""
+def count_gains(env: NCSEnv, histories: ArrivalHistories) -> Counter[str]:
+    """Returns counts of which gain an estimator takes, of every update that it looks up in a graph from now on."""
+    counts: Counter[str] = Counter()
+    kinds: dict[int, str] = {}
+    sensor = env.plant.kalman_covariances[1] + env.channel.quantization_step**2 / 12.0 * np.eye(env.plant.p)
+    table, update = histories.table, histories.table.update
 
-    def __init__(self, env: NCSEnv) -> None:
-        recursion = env.estimator._patterns.recursion
-        super().__init__(recursion, env.channel)
-        self.counts: Counter[str] = Counter()
-        self._sensor = env.plant.kalman_covariances[1] + env.channel.quantization_step**2 / 12.0 * np.eye(env.plant.p)
-        self._kinds: dict[int, str] = {}
-
-    def update(self, statistics: int) -> NumberedUpdate:
-        """Returns what an update makes of some statistics, by their number."""
-        found = super().update(statistics)
-        if statistics not in self._kinds:
-            self._kinds[statistics] = self._kind(statistics, found.gain)
-        self.counts[self._kinds[statistics]] += 1
+    def counted(number: int) -> tuple[np.ndarray, np.ndarray]:
+        found = update(number)
+        if number not in kinds:
+            kinds[number] = kind_of(found[0], table.statistics(number), histories.recursion, sensor)
+        counts[kinds[number]] += 1
         return found
 
-    def _kind(self, statistics: int, gain: np.ndarray) -> str:
-        """Returns which of the gains one is, by computing the others anew."""
-        covariance, shape, age = self.table.statistics[statistics]
-        if np.allclose(gain, kalman_gain(self.recursion.plant, covariance, self._sensor), rtol=1e-9, atol=1e-12):
-            return "Kalman"
-        if np.array_equal(gain, self.recursion.sets.gain(shape)):
-            return "set-membership"
-        ages = self.recursion.error_set.ages
-        if ages is not None and 1 <= age <= len(ages.gains) and np.array_equal(gain, ages.gains[age - 1]):
-            return "certified"
-        assert not gain.any()
-        return "skipped"
+    table.update = counted
+    return counts
+
+
+def kind_of(gain: np.ndarray, statistics: ErrorStatistics, recursion: ErrorRecursion, sensor: np.ndarray) -> str:
+    """Returns which of the gains one is, by computing the others anew."""
+    covariance, shape, age = statistics
+    if np.allclose(gain, kalman_gain(recursion.plant, covariance, sensor), rtol=1e-9, atol=1e-12):
+        return "Kalman"
+    if np.array_equal(gain, recursion.sets.gain(shape)):
+        return "set-membership"
+    ages = recursion.error_set.ages
+    if ages is not None and 1 <= age <= len(ages.gains) and np.array_equal(gain, ages.gains[age - 1]):
+        return "certified"
+    assert not gain.any()
+    return "skipped"
 
 
 def kalman_gain(plant: LinearPlant, covariance: np.ndarray, sensor: np.ndarray) -> np.ndarray:
@@ -63,15 +63,16 @@ def kalman_gain(plant: LinearPlant, covariance: np.ndarray, sensor: np.ndarray) 
 def gains_taken(env_id: str, episodes: int, seed: int = 0) -> Counter[str]:
     """Returns how often each kind of gain is taken in some episodes under random actions."""
     env = ncs_env(gym.make(env_id, terminate_on_violation=False))
-    patterns = CountingPatterns(env)
-    env._estimator = Estimator(env.plant, env.channel, patterns=patterns)
+    histories = histories_of(env.plant, env.channel, env.error_set)
+    counts = count_gains(env, histories)
+    env._estimator = Estimator(env.plant, env.channel, histories=histories)
     env.action_space.seed(seed)
     for episode in range(episodes):
         env.reset(seed=seed + episode)
         for _ in range(gym.spec(env_id).max_episode_steps or 200):
             env.step(env.action_space.sample())
-    assert env.estimator._patterns is patterns  # no pattern was forgotten, with it the counts
-    return patterns.counts
+    assert env.estimator._histories is histories  # no history was forgotten, with it the counts
+    return counts
 
 
 def main() -> None:

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
 from ncs_gym import LinearPlant, Regulation, SetpointTracking, SpeedTracking
+from ncs_gym.plants.lqr import lqr_gain
 from ncs_gym.tasks.task import Task
 
 EFFORTS = tuple(10.0**power for power in (-4, -3, -2, -1, 0))
@@ -58,8 +58,9 @@ def linear_controllers(plant: LinearPlant, task: Task) -> list[LinearController]
 
 def regulator(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
     """K, shape (m, n), of u = K x that minimizes the sum of x'Qx + u'Ru."""
-    P = solve_discrete_are(A, B, Q, R)
-    return -np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    gain = lqr_gain(A, B, Q, R)
+    assert gain is not None
+    return gain
 
 
 def setpoint(plant: LinearPlant, output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,8 @@ from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet
 from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
 from ncs_gym.network.downlink import Actuator, Command, Echo
-from ncs_gym.network.escape_probability import escape_probability
+from ncs_gym.network.gaussian_bound import bound_violation_probability
+from ncs_gym.network.gaussian_bound import bound_violation_probability as escape_probability  # noqa: F401  its former name
 from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
@@ -72,11 +73,11 @@ __all__ = [
     "UnusedPacketsWarning",
     "VectorRandomChannel",
     "batch_reactor",
+    "bound_violation_probability",
     "cart_pole",
     "certified_error_set",
     "contract_of",
     "convoy",
-    "escape_probability",
     "lane_keeping",
     "linear_model",
     "register_plant",

@@ -18,7 +18,7 @@ from ncs_gym import (
     LinearProcess,
     NCSEnv,
     Process,
-    escape_probability,
+    bound_violation_probability,
     exact,
     truck_trailer,
 )
@@ -68,7 +68,7 @@ class AttackCase:
 
     def escape_probability(self) -> float:
         """Returns the bound on the probability that Gaussian noise drives an episode out of S."""
-        return escape_probability(self.plant, self.channel, EPISODE_STEPS)
+        return bound_violation_probability(self.plant, self.channel, EPISODE_STEPS)
 
     @property
     def certificate_contract(self) -> ChannelContract | None:

@@ -9,11 +9,11 @@ from functools import cache, partial
 from importlib import resources
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
 from agents.evaluation import Policy
 from experiments.baselines.margins import MARGINS
 from ncs_gym import LinearPlant, NCSEnv, SetpointTracking, SpeedTracking
+from ncs_gym.plants.lqr import lqr_gain
 
 # Steps that a reference governor looks ahead.
 GOVERNED_STEPS = 100
@@ -245,10 +245,14 @@ def equilibrium(plant: LinearPlant, output: np.ndarray) -> tuple[np.ndarray, np.
 def _optimal_gain(
     A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray, N: np.ndarray | None = None
 ) -> np.ndarray:
-    """Returns the gain, shape (m, n), of u = gain x that minimizes the sum of x'Qx + u'Ru + 2 x'Nu."""
-    N = np.zeros_like(B) if N is None else N
-    P = solve_discrete_are(A, B, Q, R, s=N)
-    return -np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A + N.T)
+    """Returns the gain of `lqr_gain`.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    if (gain := lqr_gain(A, B, Q, R, N)) is None:
+        raise ValueError("there is no linear-quadratic regulator: the inputs cannot stabilize the plant")
+    return gain
 
 
 # Those whose weights are tuned, made from an environment and weights.

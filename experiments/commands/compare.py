@@ -34,7 +34,7 @@ from experiments.runs import (
 )
 from experiments.runs.experiment import certificate_line
 from experiments.settings import CompareSettings
-from ncs_gym import escape_probability
+from ncs_gym import bound_violation_probability
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, SafetyFilter, verify
 from shields.runtime.starts import starts_known
@@ -157,7 +157,7 @@ def _gaussian_noise(loop: LoopConfig, certificate: Certificate, arms: Mapping[st
     lead, is_promised = (0, True) if protocol is None else (protocol.lead, protocol.contract is not None)
     known = starts_known(SafetyFilter(certificate, env.plant), env.initial_set, lead)
     begins_inside = is_promised and all(each.in_safe_set for each in known)
-    bound = escape_probability(env.plant, env.channel, steps) if begins_inside else 1.0
+    bound = bound_violation_probability(env.plant, env.channel, steps) if begins_inside else 1.0
     claimed = {name: arm for name, arm in arms.items() if arm["shielded"] and arm["mode"] != "lookahead"}
     return gaussian_summary(bound, steps, claimed)
 

@@ -13,7 +13,7 @@ import numpy as np
 from experiments.paper.paper_example import PaperExample
 from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.estimation import VectorEstimator
-from ncs_gym.estimation.arrival_patterns import arrival_patterns
+from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.network.packet_transmission import VectorChannelState
 from ncs_gym.processes.simulation import PlantSimulation
 from ncs_gym.registration import CASE_STUDY_CHANNEL
@@ -85,7 +85,7 @@ def discarded(example: PaperExample, plant: LinearPlant, mean: np.ndarray) -> De
 
 def replayed(example: PaperExample, plant: LinearPlant, mean: np.ndarray) -> VectorEstimator:
     """Returns this project's filter, which goes back to the step of a late sample and replays what came after."""
-    estimator = VectorEstimator(plant, arrival_patterns(plant, CASE_STUDY_CHANNEL, None), mean.shape[1])
+    estimator = VectorEstimator(plant, arrival_histories(plant, CASE_STUDY_CHANNEL, None), mean.shape[1])
     estimator.begin(slice(None), mean)
     return estimator
 

@@ -11,10 +11,17 @@ from gymnasium.spaces import Box
 
 from ncs_gym.envs.episode_channels import EpisodeChannels, covering, downlinks, uplinks
 from ncs_gym.envs.info import Constraints, Known, loop_info
-from ncs_gym.envs.reset_options import CHANNELS, start_option
-from ncs_gym.envs.settings import expect, loop_contracts, require_own_equations, require_suitable, starting_set
+from ncs_gym.envs.settings import (
+    CHANNELS,
+    expect,
+    loop_contracts,
+    require_own_equations,
+    require_suitable,
+    start_option,
+    starting_set,
+)
 from ncs_gym.envs.spaces import entries_within, observation_space, read_action
-from ncs_gym.estimation.arrival_patterns import arrival_patterns
+from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel
@@ -113,8 +120,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             the extra `[render]` (docs/rendering.md).
         horizon: Steps the observation space is sized for; give it beside a longer `max_episode_steps`.
         noise: "truncated"; "gaussian" for process noise, sensor noise and first errors without a bound: what is
-            proved then holds but for a probability that `escape_probability` bounds (docs/shield.md); or "extreme" for
-            sensor noise and first errors as large as assumed, in random directions.
+            proved then holds but for a probability that `bound_violation_probability` bounds (docs/shield.md); or
+            "extreme" for sensor noise and first errors as large as assumed, in random directions.
         process: What really moves (docs/beyond_linear.md); the plant's own equations by default.
         downlink: The network between controller and actuator (docs/contracts.md); ideal by default.
         downlink_contract: What is assumed of the downlink, which may then break it; by default what the downlink's
@@ -191,16 +198,16 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._contract, self._protocol, self._certificate_contract = contracts
         self._downlink = downlink
         self._downlink_contract = None if self._protocol is None else self._protocol.contract
-        patterns = arrival_patterns(plant, self._channel, self._certificate_contract)
-        self._error_set = patterns.recursion.error_set
-        if not patterns.uses_samples:
+        histories = arrival_histories(plant, self._channel, self._certificate_contract)
+        self._error_set = histories.recursion.error_set
+        if not histories.uses_samples:
             warnings.warn(
                 f"no packet is of use: with a quantization step of {self._channel.quantization_step:g} and this sensor "
                 "noise samples move the estimate by less than 1 % of what they differ by, so that it is a prediction",
                 UnusedPacketsWarning,
                 stacklevel=3,
             )
-        self._estimator = Estimator(plant, self._channel, patterns=patterns)
+        self._estimator = Estimator(plant, self._channel, histories=histories)
         self._downlink_state = DownlinkState(self._protocol, plant.m)
         self._uplinks, self._downlinks = uplinks([self._channel], self._channel), downlinks([downlink], self._protocol)
         self._noise = as_noise(noise, plant)
@@ -356,8 +363,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def _estimator_for(self, channel: Channel) -> Estimator:
         """Returns an estimator of the episodes to come, for packets of other delays."""
-        patterns = arrival_patterns(self._plant, channel, self._certificate_contract)
-        return Estimator(self._plant, channel, patterns=patterns, after=self._estimator)
+        histories = arrival_histories(self._plant, channel, self._certificate_contract)
+        return Estimator(self._plant, channel, histories=histories, after=self._estimator)
 
     def _drawn_start(self, rng: np.random.Generator) -> np.ndarray:
         return (1.0 - SAMPLE_ROUNDING) * self._initial_set.sample(rng)

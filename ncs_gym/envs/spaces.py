@@ -75,6 +75,21 @@ def observation_space(
     return Box(-bound.astype(np.float32), bound.astype(np.float32), dtype=np.float32)
 
 
+def nearest_action(inputs: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    """Returns the float32 actions whose inputs are nearest to some, clipped to [-1, 1].
+
+    Args:
+        inputs: Of any shape [physical units].
+        limits: u_max, of a shape that goes with it.
+    """
+    return np.minimum(np.maximum(inputs / limits, -1.0), 1.0).astype(np.float32)
+
+
+def expressible(inputs: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    """Returns the inputs of the nearest float32 actions; see `nearest_action`."""
+    return limits * nearest_action(inputs, limits)
+
+
 def entries_within(
     task: Task, estimates: np.ndarray, own: Any, low: np.ndarray, high: np.ndarray, warned: bool, horizon: int
 ) -> tuple[np.ndarray, bool]:

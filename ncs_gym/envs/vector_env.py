@@ -13,11 +13,10 @@ from gymnasium.vector.utils import batch_space
 from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, SAMPLE_ROUNDING, NCSEnv, RenderModeError
 from ncs_gym.envs.episode_channels import covering, downlinks, uplinks
 from ncs_gym.envs.info import Constraints, Known, loop_info
-from ncs_gym.envs.reset_options import CHANNELS, vector_reset_options
+from ncs_gym.envs.settings import CHANNELS, vector_reset_options
 from ncs_gym.envs.spaces import entries_within, read_actions
-from ncs_gym.estimation.arrival_patterns import arrival_patterns
+from ncs_gym.estimation.arrival_histories import ErrorTable, arrival_histories
 from ncs_gym.estimation.error_bound import ErrorSet
-from ncs_gym.estimation.error_statistics_table import StatisticsTable
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.channel import Channel, widest
 from ncs_gym.network.contract import ChannelContract
@@ -36,7 +35,7 @@ class NCSVectorEnv(VectorEnv):
     """N copies of `NCSEnv` with the same semantics, spaces and info keys; every info value has N as its first axis.
 
     Inside, the environment is the last axis, so that A x + B u stands as in the formulas. What depends only on when
-    packets arrive is looked up (`ArrivalPatterns`); it is worked out when a pattern occurs for the first time.
+    packets arrive is looked up (`ArrivalHistories`); it is worked out when a history occurs for the first time.
 
     Args:
         num_envs: N.
@@ -124,8 +123,8 @@ class NCSVectorEnv(VectorEnv):
         count = self.num_envs
         self._uplinks = uplinks(own[0] or [self._channel] * count, self._channel)
         self._downlinks = downlinks(own[1] or [None] * count, self._protocol)
-        patterns = arrival_patterns(self._plant, self._channel, self._certificate_contract)
-        self._estimator = VectorEstimator(self._plant, patterns, self.num_envs)
+        histories = arrival_histories(self._plant, self._channel, self._certificate_contract)
+        self._estimator = VectorEstimator(self._plant, histories, self.num_envs)
         self._downlink_state = VectorDownlinkState(self._protocol, self._plant.m, self.num_envs)
         self._belief = self._predicted_estimates()
         self._state = np.zeros((self._plant.n, self.num_envs))
@@ -148,12 +147,12 @@ class NCSVectorEnv(VectorEnv):
         return tuple(self._downlinks.now)
 
     @property
-    def error_shapes(self) -> tuple[StatisticsTable, np.ndarray]:
+    def error_shapes(self) -> tuple[ErrorTable, np.ndarray]:
         """A table whose `shapes` (k, n, n) are the distinct error shapes so far, and the number there of each one now.
 
         The table grows; it is another object after shapes were forgotten.
         """
-        return self._estimator.patterns.table, self._belief[1]
+        return self._estimator.histories.table, self._belief[1]
 
     @property
     def known(self) -> Known:
@@ -315,14 +314,14 @@ class NCSVectorEnv(VectorEnv):
 
     def _prepare_estimator(self, *, all_begin: bool) -> None:
         """Makes the estimator one for the delays of all present channels; it forgets nothing unless all begin."""
-        known = self._estimator.patterns.channel
+        known = self._estimator.histories.channel
         used = [self._channel] if self._uplinks.is_plain else [*self._uplinks.now, *([] if all_begin else [known])]
         if (wanted := covering(used, self._channel)) != known:
-            patterns = arrival_patterns(self._plant, wanted, self._certificate_contract)
+            histories = arrival_histories(self._plant, wanted, self._certificate_contract)
             if all_begin:
-                self._estimator = VectorEstimator(self._plant, patterns, self.num_envs)
+                self._estimator = VectorEstimator(self._plant, histories, self.num_envs)
             else:
-                self._estimator.follow(patterns)
+                self._estimator.follow(histories)
 
     def _one_each(self, value: Any, name: str) -> list[Channel] | None:
         """Returns a channel that is given for all environments, or for each, as a list of N; None for None.

@@ -1,7 +1,7 @@
 """The delay-aware Kalman filter and the ellipsoids that its error never leaves (set-membership estimation).
 
 `error_bound` and `error_bounds_by_age` compute the certified error sets offline; `kalman_filter` and
-`set_membership` move covariance and running ellipsoid through predictions and updates; `arrival_patterns` looks up
+`set_membership` move covariance and running ellipsoid through predictions and updates; `arrival_histories` looks up
 whatever depends only on when packets arrive; `estimator` and `vector_estimator` carry the means, and `innovation_test`
 raises an alarm where a measurement contradicts the assumed bounds.
 """

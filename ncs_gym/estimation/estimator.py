@@ -8,10 +8,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ncs_gym.estimation.arrival_patterns import ArrivalPatterns, arrival_patterns, patterns_of
+from ncs_gym.estimation.arrival_histories import (
+    NO_SAMPLE,
+    UNKNOWN,
+    ArrivalHistories,
+    arrival_histories,
+    histories_of,
+)
 from ncs_gym.estimation.error_bound import ErrorSet, require_error_set
-from ncs_gym.estimation.error_statistics_table import NO_SAMPLE, UNKNOWN
-from ncs_gym.estimation.kalman_filter import ErrorStatistics
+from ncs_gym.estimation.kalman_filter import ErrorStatistics, filterpy_filter
 from ncs_gym.network.channel import Channel, Packet
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.validation import frozen, setting
@@ -40,13 +45,13 @@ class Estimator:
     The packets of a step are applied at the steps their samples were taken at, and everything after is replayed. Next
     to mean and covariance runs a hard ellipsoid E(Sigma_k) that holds the error at every step and never leaves the
     certified E(Sigma) (theory.md section 3): predictions and updates are accepted only inside it. What depends only on
-    when packets arrive is looked up (`ArrivalPatterns`).
+    when packets arrive is looked up (`ArrivalHistories`).
 
     Args:
         plant: The plant, whose inputs the estimator knows exactly.
         channel: Gives the quantizer's error and the longest delay, hence the replay buffer.
         error_set: E(Sigma) with its rate; computed from the plant by default.
-        patterns: A graph of the caller's in place of the shared one.
+        histories: A graph of the caller's in place of the shared one.
         after: An estimator whose episodes are counted on.
 
     Attributes:
@@ -70,18 +75,18 @@ class Estimator:
         plant: LinearPlant,
         channel: Channel,
         error_set: ErrorSet | None = None,
-        patterns: ArrivalPatterns | None = None,
+        histories: ArrivalHistories | None = None,
         after: Estimator | None = None,
     ) -> None:
         self._plant, self._channel, self._buffer = plant, channel, channel.longest_delay
-        if patterns is None:
+        if histories is None:
             if error_set is None:
-                patterns = arrival_patterns(plant, channel, None)
+                histories = arrival_histories(plant, channel, None)
             else:
                 require_error_set(error_set, plant)
-                patterns = patterns_of(plant, channel, error_set)
-        self._patterns = self._usual = patterns
-        self._error_set = self._patterns.recursion.error_set
+                histories = histories_of(plant, channel, error_set)
+        self._histories = self._usual = histories
+        self._error_set = self._histories.recursion.error_set
         ages = self._error_set.ages
         if ages is not None and not ages.contract.is_fine_enough_for(channel):
             raise ValueError(f"the channel rounds more coarsely than the contract of the error set: {ages.contract}")
@@ -103,7 +108,7 @@ class Estimator:
         """
         self.episode += not self._is_new
         self._is_new = False
-        self._patterns = self._usual
+        self._histories = self._usual
         self._begin(mean)
 
     def restart(self, mean: np.ndarray, age: int) -> None:
@@ -116,7 +121,7 @@ class Estimator:
         shape = self._error_set.shape_at(age)
         assert shape is not None
         first = ErrorStatistics(self._plant.kalman_covariances[2].copy(), shape.copy(), age)
-        self._patterns = patterns_of(self._plant, self._channel, self._error_set, first=first)
+        self._histories = histories_of(self._plant, self._channel, self._error_set, first=first)
         self._begin(mean, self.step, age)
 
     def _begin(self, mean: np.ndarray, step: int = 0, age: int = 0) -> None:
@@ -124,7 +129,7 @@ class Estimator:
         self.step, self.age = step, age
         self.alarm = False
         self.mean = frozen(np.array(mean, dtype=np.float64))
-        self._pattern = self._patterns.root
+        self._history = self._histories.root
         # By age: means before updates, inputs that led there, and samples.
         self._priors: deque[np.ndarray] = deque(maxlen=self._buffer + 1)
         self._inputs: deque[np.ndarray] = deque(maxlen=self._buffer + 1)
@@ -132,14 +137,25 @@ class Estimator:
 
     @property
     def shape(self) -> np.ndarray:
-        """Sigma_k, shape (n, n): x_hat - x lies in E(Sigma_k)."""
-        return self._patterns.error_statistics(self._pattern).shape
+        """Sigma_k, shape (n, n), read-only: x_hat - x lies in E(Sigma_k)."""
+        histories = self._histories
+        return histories.table.shape(histories.present.item(self._history))
 
     @property
     def belief(self) -> Belief:
         """What is known about the state now."""
-        statistics = self._patterns.error_statistics(self._pattern)
-        return Belief(self.mean.copy(), statistics.covariance.copy(), statistics.shape.copy(), self.step - self.age)
+        histories = self._histories
+        covariance, shape, _ = histories.table.statistics(histories.present.item(self._history))
+        return Belief(self.mean.copy(), covariance.copy(), shape.copy(), self.step - self.age)
+
+    def as_filterpy(self) -> Any:
+        """Returns the present estimate as a `filterpy.kalman.KalmanFilter` with the model of this estimator, a copy.
+
+        The estimator itself looks covariances and gains up by when packets arrived, which an object that is moved step
+        by step cannot; between two arrivals the two do the same.
+        """
+        mean, covariance, _, _ = self.belief
+        return filterpy_filter(self._histories.recursion, mean, covariance)
 
     def advance(self, u: np.ndarray, packets: Iterable[Packet]) -> None:
         """Moves one step on: predicts with the input really applied, then takes in what arrived.
@@ -157,12 +173,16 @@ class Estimator:
         self._priors.appendleft(self.mean)
         self._inputs.appendleft(u)
         self._samples.appendleft(None)
-        pattern = present = self._patterns.after_step(self._pattern)
+        history = present = self._histories.after_step(self._history)
         for packet in packets:
-            pattern = self._take_in(packet, pattern)
-        self._pattern = present if pattern == present else self._replayed(pattern)
-        if self._patterns.is_full:
-            self._patterns, (self._pattern,) = self._patterns.keeping(np.array([self._pattern]))
+            history = self._take_in(packet, history)
+        self._history = present if history == present else self._replayed(history)
+        if self._histories.is_full:
+            full = self._histories
+            self._histories, kept = full.keeping(np.array([self._history]))
+            self._history = kept.item()
+            if self._usual is full:  # or it would stay in memory, and be full again after every reset
+                self._usual = self._histories
 
     def predicted(self, inputs: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimate, shape (n,), and error shape, (n, n), after the next steps, given their inputs, (m,) each.
@@ -173,47 +193,49 @@ class Estimator:
         mean = self.mean
         for u in inputs:
             mean = self._predicted(mean, u)
-        patterns = self._patterns
-        number = patterns.predicted(patterns.statistics_of(self._pattern), len(inputs))
-        return mean, patterns.table.statistics[number].shape
+        histories = self._histories
+        number = histories.predicted(histories.present.item(self._history), len(inputs))
+        return mean, histories.table.shape(number)
 
-    def _take_in(self, packet: Packet, pattern: int) -> int:
-        """Returns the pattern with one more packet, and keeps its sample."""
+    def _take_in(self, packet: Packet, history: int) -> int:
+        """Returns the history with one more packet, and keeps its sample."""
         if packet.episode != self.episode:
-            return pattern
+            return history
         age = self.step - packet.stamp
-        after = self._patterns.after_arrival(pattern, age)
-        if after == pattern:
-            return pattern
+        after = self._histories.after_arrival(history, age)
+        if after == history:
+            return history
         if not np.isfinite(packet.measurement).all():
             self.alarm = True  # no sensor within the assumptions sends this
-            return pattern
+            return history
         self._samples[age] = packet.measurement
         return after
 
     @np.errstate(invalid="ignore", over="ignore")  # an infinite weight of a residual of zero, a huge residual
-    def _replayed(self, pattern: int) -> int:
-        """Replays from the oldest new sample on, keeps whichever history is better, and returns the pattern then."""
-        replay, H = self._patterns.replay(pattern), self._plant.H
-        mean, means = self._priors[replay.oldest], {}
-        for age in range(replay.oldest, -1, -1):
+    def _replayed(self, history: int) -> int:
+        """Replays from the oldest new sample on, keeps whichever history is better, and returns the history then."""
+        histories, H = self._histories, self._plant.H
+        target, oldest = histories.after_replay(history), histories.replay_from.item(history)
+        used, table = histories.used[:, history].tolist(), histories.table
+        mean, means = self._priors[oldest], {}
+        for age in range(oldest, -1, -1):
             means[age] = mean
-            statistics, sample = replay.used[age], self._samples[age]
+            statistics, sample = used[age], self._samples[age]
             if statistics != NO_SAMPLE and sample is not None:
                 residual = sample - H.dot(mean)
-                _, gain, quick_test = self._patterns.update(statistics)
+                gain, quick_test = table.update(statistics)
                 if not residual.dot(quick_test.dot(residual)) <= 1.0:
                     self._test_exactly(residual, statistics)
                 mean = mean + gain.dot(residual)
             if age > 0:
                 mean = self._predicted(mean, self._inputs[age - 1])
-        if replay.accepted:
+        if histories.accepted.item(history):
             self.mean = frozen(mean)
             for age, prior in means.items():
                 self._priors[age] = prior
-        if replay.new_age != UNKNOWN:
-            self.age = replay.new_age
-        return replay.target
+        if (new_age := histories.new_age.item(history)) != UNKNOWN:
+            self.age = new_age
+        return target
 
     def _predicted(self, mean: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Returns A x_hat + B u, shape (n,); an unstable plant's within the limit of its states."""
@@ -225,6 +247,6 @@ class Estimator:
 
         The ellipsoid of shape H Sigma H' + N, which the quick test is about, lies inside that sum.
         """
-        table = self._patterns.table
-        test, spread = table.test, table.test.spread(table.statistics[statistics].shape)
+        table = self._histories.table
+        test, spread = table.test, table.test.spread(table.shape(statistics))
         self.alarm |= bool(test.are_impossible(residual[None], spread)[0])

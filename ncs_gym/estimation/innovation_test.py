@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ncs_gym.estimation.set_membership import solved
 from ncs_gym.uncertainty.minkowski_sum import common_axes, outside_sum
 
 # An innovation this far beyond its exact bound counts as rounding, not as an alarm.
 ALARM_TOLERANCE = 1e-9
-# Up to this condition number an inverse says which residuals are possible to within 1e-3.
+# Up to this condition number, in the norm of Frobenius, an inverse says which residuals are possible to within 1e-3.
 MAX_CONDITION_NUMBER = 1e7
 
 
@@ -36,9 +35,14 @@ class InnovationTest:
         """
         bound = spread + self._noise
         extent = np.sqrt(bound.diagonal())
-        if not _condition(bound / np.outer(extent, extent)) <= MAX_CONDITION_NUMBER:  # in units of its own; NaN fails
-            return np.diag(np.full(len(bound), np.inf))
-        return solved(bound, np.eye(len(bound)))
+        units = extent[:, None] * extent
+        try:
+            scaled = bound / units  # in units of its own
+            inverse = np.linalg.inv(scaled)
+            is_sure = np.vdot(scaled, scaled) * np.vdot(inverse, inverse) <= MAX_CONDITION_NUMBER**2  # NaN is not
+        except np.linalg.LinAlgError:
+            is_sure = False
+        return inverse / units if is_sure else np.diag(np.full(len(bound), np.inf))
 
     def axes(self, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the axes common to H Sigma_k H' and N, in which many residuals are tested; see `common_axes`."""
@@ -47,11 +51,3 @@ class InnovationTest:
     def are_impossible(self, residuals: np.ndarray, spread: np.ndarray) -> np.ndarray:
         """Returns which residuals, shape (k, p), lie outside the Minkowski sum, shape (k,); NaN lies outside."""
         return outside_sum(residuals, spread, self._noise, ALARM_TOLERANCE)
-
-
-def _condition(matrix: np.ndarray) -> float:
-    """Returns the condition number of a symmetric matrix; NaN where it has no eigenvalues."""
-    if not np.isfinite(matrix).all():
-        return float("nan")
-    values = np.abs(np.linalg.eigvalsh(matrix))
-    return float(values.max() / values.min()) if values.min() > 0.0 else float("inf")

@@ -1,7 +1,12 @@
-"""The Kalman filter without its mean: covariance, gain and error ellipsoid, which do not depend on what is measured."""
+"""The Kalman filter without its mean: covariance, gain and error ellipsoid, which do not depend on what is measured.
+
+The recursion of the covariance is two pure functions. filterpy's filter keeps a mean, which there is none of here, and
+changes in place, which what many estimators share must not; `filterpy_filter` makes one of an estimate.
+"""
 
 from __future__ import annotations
 
+from math import ceil, isfinite, log2
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +20,25 @@ from ncs_gym.uncertainty.shape_matrices import is_inside
 LARGEST_COVARIANCE = 1e12
 # Factors of covariances keep this many bits, so that covariances recur when a pattern of arrivals does.
 COVARIANCE_BITS = 6
+
+
+def predicted_covariance(P: np.ndarray, A: np.ndarray, Q: np.ndarray) -> np.ndarray:
+    """Returns A P A' + Q, shape (n, n): the covariance one step later."""
+    return A.dot(P).dot(A.T) + Q
+
+
+def updated_covariance(P: np.ndarray, H: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the gain K = P H' (H P H' + R)^-1, shape (n, p), and the covariance (I-KH) P (I-KH)' + K R K', (n, n).
+
+    The products are taken in filterpy's order, so that both agree to the last bit.
+
+    Raises:
+        LinAlgError: If H P H' + R is singular.
+    """
+    spread = P.dot(H.T)
+    gain = spread.dot(np.linalg.inv(H.dot(spread) + R))
+    kept = np.eye(len(P)) - gain.dot(H)
+    return gain, kept.dot(P).dot(kept.T) + gain.dot(R).dot(gain.T)
 
 
 class ErrorStatistics(NamedTuple):
@@ -68,7 +92,8 @@ class ErrorRecursion:
     ) -> None:
         self.plant, self.error_set, self._bits = plant, error_set, covariance_bits
         self.sets = SetMembership(plant, quantization_step, error_set, shape_step)
-        self._kalman, self._first = _kalman_filter(plant, quantization_step), first
+        self.Q, self.R = plant.kalman_covariances[0], _sensor_covariance(plant, quantization_step)
+        self._first = first
 
     @property
     def first(self) -> ErrorStatistics:
@@ -80,12 +105,10 @@ class ErrorRecursion:
     def predicted(self, statistics: ErrorStatistics) -> ErrorStatistics:
         """Returns the statistics one step later, without a sample."""
         covariance, shape, age = statistics
-        kalman = self._kalman
-        kalman.x, kalman.P = np.zeros(self.plant.n), covariance
-        kalman.predict()
         # The covariance of an unstable plant grows without end in an outage; it picks gains and may stop growing.
-        if np.vdot(self.plant.weight, kalman.P) < LARGEST_COVARIANCE:
-            covariance = kalman.P
+        grown = predicted_covariance(covariance, self.plant.A, self.Q)
+        if np.vdot(self.plant.weight, grown) < LARGEST_COVARIANCE:
+            covariance = grown
         return ErrorStatistics(_rounded(covariance, self._bits), self.sets.predicted(shape, age), age + 1)
 
     def updated(self, statistics: ErrorStatistics) -> Update | None:
@@ -121,16 +144,14 @@ class ErrorRecursion:
         return bool(np.vdot(weight, replayed.shape) <= np.vdot(weight, present.shape))
 
     def _kalman_update(self, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Returns gain and covariance by filterpy; None if it is too ill-conditioned (after a long outage)."""
-        kalman = self._kalman
-        kalman.x, kalman.P = np.zeros(self.plant.n), covariance
+        """Returns gain and covariance of the Kalman filter; None if it is too ill-conditioned (after a long outage)."""
         try:
-            kalman.update(np.zeros(self.plant.p))
+            gain, covariance = updated_covariance(covariance, self.plant.H, self.R)
         except np.linalg.LinAlgError:
             return None
-        if not (np.isfinite(kalman.K).all() and np.isfinite(kalman.P).all()):
+        if not (isfinite(gain.sum()) and isfinite(covariance.sum())):
             return None
-        return kalman.K, _rounded(kalman.P, self._bits)
+        return gain, _rounded(covariance, self._bits)
 
 
 def _rounded(covariance: np.ndarray, bits: int) -> np.ndarray:
@@ -139,23 +160,31 @@ def _rounded(covariance: np.ndarray, bits: int) -> np.ndarray:
         factor = np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError:
         return covariance
-    steps = np.exp2(np.ceil(0.5 * np.log2(covariance.diagonal())) - bits)[:, None]
+    steps = np.array([[2.0 ** (ceil(0.5 * log2(variance)) - bits)] for variance in covariance.diagonal().tolist()])
     factor = steps * np.rint(factor / steps)
-    return factor @ factor.T
+    return factor.dot(factor.T)
 
 
-def _kalman_filter(plant: LinearPlant, quantization_step: float) -> Any:
-    """Returns filterpy's `KalmanFilter`, which has no types, with every matrix set.
+def _sensor_covariance(plant: LinearPlant, quantization_step: float) -> np.ndarray:
+    """Returns R, shape (p, p): the plant's for this purpose plus q^2/12 of a quantizer, invertible."""
+    R = plant.kalman_covariances[1] + quantization_step**2 / 12.0 * np.eye(plant.p)
+    if np.linalg.eigvalsh(R)[0] <= 0.0:  # perfect sensors: keep the innovation covariance invertible
+        R = R + FLAT_INFLATION * np.diag((np.abs(plant.H) @ plant.half_widths) ** 2)
+    return R
 
-    The covariances are the plant's own for this purpose, and that of the sensor plus q^2/12 of a quantizer.
+
+def filterpy_filter(recursion: ErrorRecursion, mean: np.ndarray, covariance: np.ndarray) -> Any:
+    """Returns filterpy's `KalmanFilter`, which has no types, with every matrix of the model and an estimate.
+
+    Args:
+        recursion: Gives the plant, Q and R.
+        mean: x_hat, shape (n,).
+        covariance: P, shape (n, n).
     """
     from filterpy.kalman import KalmanFilter  # takes long to import
 
-    kalman: Any = KalmanFilter(dim_x=plant.n, dim_z=plant.p)
-    kalman.F, kalman.H = plant.A, plant.H
-    process, sensor, _ = plant.kalman_covariances
-    kalman.Q = process
-    kalman.R = sensor + quantization_step**2 / 12.0 * np.eye(plant.p)
-    if np.linalg.eigvalsh(kalman.R)[0] <= 0.0:  # perfect sensors: keep the innovation covariance invertible
-        kalman.R = kalman.R + FLAT_INFLATION * np.diag((np.abs(plant.H) @ plant.half_widths) ** 2)
+    plant = recursion.plant
+    kalman: Any = KalmanFilter(dim_x=plant.n, dim_z=plant.p, dim_u=plant.m)
+    kalman.x, kalman.P, kalman.Q, kalman.R = mean.copy(), covariance.copy(), recursion.Q.copy(), recursion.R.copy()
+    kalman.F, kalman.B, kalman.H = plant.A.copy(), plant.B.copy(), plant.H.copy()
     return kalman

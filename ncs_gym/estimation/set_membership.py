@@ -63,8 +63,8 @@ class SetMembership:
             age: Steps since the newest sample used was taken.
         """
         A, D, certified = self.plant.A, self.plant.disturbance.shape_matrix, self.error_set.shape_at(age + 1)
-        extent = self._abs_A @ np.sqrt(shape.diagonal())
-        moved = enlarged_by_rounding(A @ shape @ A.T, extent)
+        extent = self._abs_A.dot(np.sqrt(shape.diagonal()))
+        moved = enlarged_by_rounding(A.dot(shape).dot(A.T), extent)
         predicted = self.rounded_up(outer_sum(moved, D, self.plant.weight))
         if certified is None:
             return self._bounded(predicted)
@@ -84,11 +84,11 @@ class SetMembership:
 
     def updated(self, shape: np.ndarray, gain: np.ndarray) -> np.ndarray:
         """Returns (I-TH) Sigma_k (I-TH)'/mu + T N T'/(1-mu) with the trace-optimal mu: sound for any gain T, (n, p)."""
-        kept = self._identity - gain @ self.plant.H
+        kept = self._identity - gain.dot(self.plant.H)
         size = np.abs(gain)
         extent = np.sqrt(shape.diagonal())
-        carried = enlarged_by_rounding(kept @ shape @ kept.T, extent + size @ (self._abs_H @ extent))
-        noise = enlarged_by_rounding(gain @ self.noise @ gain.T, size @ self._noise_extent)
+        carried = enlarged_by_rounding(kept.dot(shape).dot(kept.T), extent + size.dot(self._abs_H.dot(extent)))
+        noise = enlarged_by_rounding(gain.dot(self.noise).dot(gain.T), size.dot(self._noise_extent))
         total = INFLATION * outer_sum(carried, noise, self.plant.weight) + self.plant.estimate_rounding
         return self.rounded_up(total)
 
@@ -116,13 +116,14 @@ class SetMembership:
         """
         inward, outward, size = self._to_ball, self._ball, len(shape)
         extent = np.sqrt(np.abs(shape.diagonal()))
-        inner = enlarged_by_rounding(inward @ shape @ inward.T, self._abs_to_ball @ extent)
+        inner = enlarged_by_rounding(inward.dot(shape).dot(inward.T), self._abs_to_ball.dot(extent))
         inner.flat[:: size + 1] += size * self._step
         inner = self._step * np.rint(inner / self._step)
-        rounded = enlarged_by_rounding(outward @ inner @ outward.T, self._abs_ball @ np.sqrt(inner.diagonal()))
+        reach = self._abs_ball.dot(np.sqrt(inner.diagonal()))
+        rounded = enlarged_by_rounding(outward.dot(inner).dot(outward.T), reach)
         # Both products together move the shape S by at most E S + S E', |E| at most `ball_error`; with s the extent and
         # a = max |E| s / s that is at most 2 n a diag(s^2).
-        turned = float(np.max(self._ball_error @ extent / np.maximum(extent, 1e-300)))
+        turned = (self._ball_error.dot(extent) / np.maximum(extent, 1e-300)).max().item()
         rounded.flat[:: size + 1] += 2.0 * size * turned * extent**2
         return rounded
 

@@ -9,10 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym.estimation.arrival_patterns import ArrivalPatterns
-from ncs_gym.estimation.error_statistics_table import NO_SAMPLE, UNKNOWN
+from ncs_gym.estimation.arrival_histories import NO_REPLAY, NO_SAMPLE, UNKNOWN, ArrivalHistories
 from ncs_gym.estimation.innovation_test import ALARM_TOLERANCE
-from ncs_gym.estimation.pattern_arrays import NO_REPLAY
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.minkowski_sum import outside_sum_in_axes
 from ncs_gym.validation import frozen
@@ -23,44 +21,44 @@ class VectorEstimator:
 
     Args:
         plant: The plant.
-        patterns: The graph of arrival patterns, shared with all other estimators of the plant and channel.
+        histories: The graph of arrival histories, shared with all other estimators of the plant and channel.
         size: N.
 
     Attributes:
         mean: x_hat, shape (n, N).
         age: Steps since the newest sample used was taken, shape (N,).
         alarm: Whether a measurement contradicted the assumed bounds in the episode, shape (N,).
-        patterns: The graph in use; another one after patterns were forgotten.
-        pattern: Number of each environment's pattern, shape (N,).
+        histories: The graph in use; another one after histories were forgotten.
+        history: Number of each environment's history, shape (N,).
     """
 
-    def __init__(self, plant: LinearPlant, patterns: ArrivalPatterns, size: int) -> None:
-        self.plant, self.patterns = plant, patterns
+    def __init__(self, plant: LinearPlant, histories: ArrivalHistories, size: int) -> None:
+        self.plant, self.histories = plant, histories
         self.mean, self.age = np.zeros((plant.n, size)), np.zeros(size, np.int64)
-        self.alarm, self.pattern = np.zeros(size, np.bool_), np.full(size, patterns.root)
+        self.alarm, self.history = np.zeros(size, np.bool_), np.full(size, histories.root)
         self._limit = plant.state_limit[:, None] if np.isfinite(plant.state_limit).all() else None
         # By age: means before updates, inputs that led there, and samples (None where nobody sent).
-        self._priors: deque[np.ndarray] = deque(maxlen=patterns.buffer + 1)
-        self._inputs: deque[np.ndarray] = deque(maxlen=patterns.buffer + 1)
-        self._samples: deque[np.ndarray | None] = deque(maxlen=patterns.buffer + 1)
+        self._priors: deque[np.ndarray] = deque(maxlen=histories.buffer + 1)
+        self._inputs: deque[np.ndarray] = deque(maxlen=histories.buffer + 1)
+        self._samples: deque[np.ndarray | None] = deque(maxlen=histories.buffer + 1)
 
     @property
     def statistics(self) -> np.ndarray:
-        """Numbers of the error statistics, whose shapes are `patterns.table.shapes`, shape (N,)."""
-        return self.patterns.arrays.present.take(self.pattern)
+        """Numbers of the error statistics, whose shapes are `histories.table.shapes`, shape (N,)."""
+        return self.histories.present.take(self.history)
 
-    def follow(self, patterns: ArrivalPatterns) -> None:
+    def follow(self, histories: ArrivalHistories) -> None:
         """Goes on with a graph for more delays, that of the same plant."""
-        self.patterns, self.pattern = patterns, patterns.taking_over(self.patterns, self.pattern)
+        self.histories, self.history = histories, histories.taking_over(self.histories, self.history)
         for name in ("_priors", "_inputs", "_samples"):
-            setattr(self, name, deque(getattr(self, name), maxlen=patterns.buffer + 1))
+            setattr(self, name, deque(getattr(self, name), maxlen=histories.buffer + 1))
 
     def begin(self, chosen: Any, mean: np.ndarray) -> None:
         """Starts episodes in some environments with first estimates, shape (n, count)."""
         self.mean = self.mean.copy()  # the old array is kept as a mean before an update
         self.mean[:, chosen] = mean
         frozen(self.mean)
-        self.age[chosen], self.alarm[chosen], self.pattern[chosen] = 0, False, self.patterns.root
+        self.age[chosen], self.alarm[chosen], self.history[chosen] = 0, False, self.histories.root
 
     def advance(self, u: np.ndarray, samples: np.ndarray | None, arrivals: list[tuple[int, np.ndarray]]) -> None:
         """Moves one step on: predicts with the inputs really applied, then takes in what arrived.
@@ -70,17 +68,18 @@ class VectorEstimator:
             samples: What was measured at this step, shape (p, N); None if nobody sends.
             arrivals: Ages of samples that arrive now, oldest first, each with the environments, shape (N,).
         """
-        if self.patterns.is_full:
-            self.patterns, self.pattern = self.patterns.keeping(self.pattern)
+        if self.histories.is_full:
+            self.histories, self.history = self.histories.keeping(self.history)
         self.mean = frozen(self._predicted(self.mean, u))
         self._priors.appendleft(self.mean)
         self._inputs.appendleft(u)
         self._samples.appendleft(samples)
         self.age += 1
-        patterns = self.patterns
-        self.pattern = self._follow(self.pattern, "next", patterns.after_step)
+        histories = self.histories
+        self.history = self._follow(self.history, "next", histories.after_step)
         for age, arrives in arrivals:
-            self.pattern = self._follow(self.pattern, "arrival", partial(patterns.after_arrival, age=age), arrives, age)
+            work_out = partial(histories.after_arrival, age=age)
+            self.history = self._follow(self.history, "arrival", work_out, arrives, age)
         if arrivals:
             self._replay()
 
@@ -98,43 +97,47 @@ class VectorEstimator:
             mean, statistics, inputs = mean[:, chosen], statistics[chosen], [u[:, chosen] for u in inputs]
         for u in inputs:
             mean = self._predicted(mean, u)
-        return mean, self.patterns.predicted_many(statistics, len(inputs))
+        return mean, self.histories.predicted_many(statistics, len(inputs))
 
     def _follow(
         self,
-        pattern: np.ndarray,
+        history: np.ndarray,
         table: str,
         work_out: Callable[[int], Any],
         where: np.ndarray | None = None,
         age: int | None = None,
     ) -> np.ndarray:
-        """Returns the patterns, shape (N,), that patterns lead to; missing entries of the table are worked out first.
+        """Returns the histories, shape (N,), that some lead to; entries of the table that are unknown are worked out.
 
         Args:
-            pattern: Where to go from, shape (N,).
-            table: Name of one of the `PatternArrays`.
-            work_out: Called with the number of a pattern whose entry is missing.
+            history: Where to go from, shape (N,).
+            table: Name of one of the arrays of `ArrivalHistories`.
+            work_out: Called with the number of a history whose entry is missing.
             where: Which environments move, shape (N,); all by default.
             age: Of the samples that arrive, if any.
         """
-        row = None if age is None else age - self.patterns.channel.delay
-        after = self.patterns.arrays.row(table, row).take(pattern)
+
+        def looked_up() -> np.ndarray:
+            array = getattr(self.histories, table)
+            return (array if age is None else array[age]).take(history)
+
+        after = looked_up()
         missing = after == UNKNOWN if where is None else (after == UNKNOWN) & where
         if missing.any():
-            for number in np.unique(pattern[missing]).tolist():
+            for number in np.unique(history[missing]).tolist():
                 work_out(number)
-            after = self.patterns.arrays.row(table, row).take(pattern)
-        return after if where is None else np.where(where, after, pattern)
+            after = looked_up()
+        return after if where is None else np.where(where, after, history)
 
     def _replay(self) -> None:
         """Replays from the oldest new sample on, and keeps whichever history is better.
 
         Environments without new samples are carried along: they use no sample and keep what they have.
         """
-        target = self._follow(self.pattern, "target", self.patterns.replay)
-        arrays, H = self.patterns.arrays, self.plant.H
-        begins, accepted = arrays.replay_from.take(self.pattern), arrays.accepted.take(self.pattern)
-        used, new_age = arrays.used.take(self.pattern, axis=1), arrays.new_age.take(self.pattern)
+        target = self._follow(self.history, "target", self.histories.after_replay)
+        histories, H = self.histories, self.plant.H
+        begins, accepted = histories.replay_from.take(self.history), histories.accepted.take(self.history)
+        used, new_age = histories.used.take(self.history, axis=1), histories.new_age.take(self.history)
         oldest = int(begins.max())
         if oldest == NO_REPLAY:
             return
@@ -147,10 +150,10 @@ class VectorEstimator:
             if samples is not None and statistics.any():
                 residual = samples - H.dot(mean)
                 self._monitor(residual, statistics)
-                mean = mean + np.einsum("ijk,jk->ik", self.patterns.table.gains.take(statistics, axis=2), residual)
+                mean = mean + np.einsum("ijk,jk->ik", histories.table.gains.take(statistics, axis=2), residual)
         self.mean = frozen(np.where(accepted, mean, self.mean))
         self.age = np.where(new_age == UNKNOWN, self.age, new_age)
-        self.pattern = target
+        self.history = target
 
     def _predicted(self, mean: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Returns A x_hat + B u; unstable plants' within the limit of their states."""
@@ -164,7 +167,7 @@ class VectorEstimator:
             residual: y - H x_hat, shape (p, N).
             statistics: Numbers of the statistics before the update, shape (N,); NO_SAMPLE where there is none.
         """
-        table = self.patterns.table
+        table = self.histories.table
         weights = table.quick_tests.take(statistics, axis=2)
         with np.errstate(invalid="ignore"):  # an infinite weight of a residual of zero
             quick = np.einsum("ik,ijk,jk->k", residual, weights, residual)

@@ -2,8 +2,8 @@
 
 `channel` has the settings (packet loss, quantization, transmission period, delay and jitter), `packet_transmission`
 what happens to packets during an episode, `contract` what a channel guarantees about the age of samples,
-`packet_reception` which packets a receiver can use, and `escape_probability` says how likely Gaussian noise is to leave
-its bounds, given how many samples a channel takes. `downlink` is the way of the commands, with the inputs that are
+`packet_reception` which packets a receiver can use, and `gaussian_bound` says how likely Gaussian noise is to leave its
+bounds, given how many samples a channel takes. `downlink` is the way of the commands, with the inputs that are
 committed ahead.
 """
 
@@ -18,7 +18,7 @@ from ncs_gym.network.downlink import (
     Echo,
     downlink_protocol,
 )
-from ncs_gym.network.escape_probability import escape_probability
+from ncs_gym.network.gaussian_bound import bound_violation_probability
 from ncs_gym.network.packet_reception import DiscardedPackets, UnusedPacketsWarning
 from ncs_gym.network.packet_transmission import ChannelState
 
@@ -37,7 +37,7 @@ __all__ = [
     "GilbertElliott",
     "Packet",
     "UnusedPacketsWarning",
+    "bound_violation_probability",
     "contract_of",
     "downlink_protocol",
-    "escape_probability",
 ]

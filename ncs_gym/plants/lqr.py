@@ -6,6 +6,22 @@ import numpy as np
 from scipy.linalg import solve_discrete_are
 
 
+def lqr_gain(
+    A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray, N: np.ndarray | None = None
+) -> np.ndarray | None:
+    """Returns K, shape (m, n), of u = K x that minimizes the sum of x'Qx + u'Ru + 2 x'Nu; N is 0 by default.
+
+    None where the Riccati equation has no solution that scipy finds.
+    """
+    try:
+        P = solve_discrete_are(A, B, Q, R, s=N)
+        answer = B.T @ P @ A if N is None else B.T @ P @ A + N.T
+        gain = -np.linalg.solve(R + B.T @ P @ B, answer)
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    return gain if np.isfinite(gain).all() else None
+
+
 def regulator_gain(A: np.ndarray, B: np.ndarray, effort: float, decay: float) -> np.ndarray | None:
     """Returns K, shape (m, n), of u = K x that minimizes the sum of (|x|^2 + effort |u|^2) / decay^k.
 
@@ -20,10 +36,4 @@ def regulator_gain(A: np.ndarray, B: np.ndarray, effort: float, decay: float) ->
     Returns:
         The gain; None where the Riccati equation has no solution that scipy finds.
     """
-    A, B, m = A / np.sqrt(decay), B / np.sqrt(decay), B.shape[1]
-    try:
-        P = solve_discrete_are(A, B, np.eye(len(A)), effort * np.eye(m))
-        gain = -np.linalg.solve(effort * np.eye(m) + B.T @ P @ B, B.T @ P @ A)
-    except (np.linalg.LinAlgError, ValueError):
-        return None
-    return gain if np.isfinite(gain).all() else None
+    return lqr_gain(A / np.sqrt(decay), B / np.sqrt(decay), np.eye(len(A)), effort * np.eye(B.shape[1]))

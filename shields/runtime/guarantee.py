@@ -119,7 +119,7 @@ class GuaranteeMonitor:
             unmoved: Whether the environment has not moved since.
             report: What is observed.
         """
-        broken = _first(unmoved * 0, unmoved == False, OTHER_STEPS)  # noqa: E712
+        broken = _first(unmoved * 0, _not(unmoved), OTHER_STEPS)
         return self._observe(self._within_limits(broken, report), known_inside, report, 0)
 
     def cover(self, state: MonitorState, earlier: Iterable[tuple[Any, LoopObservation]]) -> MonitorState:
@@ -133,7 +133,7 @@ class GuaranteeMonitor:
         broken, wait = state.broken, state.wait
         for ahead, (inside, report) in enumerate(earlier):
             seen = self._observe(self._within_limits(broken, report), inside, report, 0)
-            broken, wait = seen.broken, np.maximum(wait, (seen.inside == False) * (ahead + 1))  # noqa: E712
+            broken, wait = seen.broken, np.maximum(wait, _not(seen.inside) * (ahead + 1))
         return state._replace(broken=broken, wait=wait)
 
     def advance(
@@ -155,10 +155,10 @@ class GuaranteeMonitor:
             report: What is observed after the step.
             on_time: Behind a downlink, whether the input applied is the one decided for this step.
         """
-        broken = _first(state.broken, moved_once == False, OTHER_STEPS)  # noqa: E712
-        broken = _first(broken, same_input == False, OTHER_INPUT)  # noqa: E712
+        broken = _first(state.broken, _not(moved_once), OTHER_STEPS)
+        broken = _first(broken, _not(same_input), OTHER_INPUT)
         if on_time is not True:
-            broken = _first(broken, on_time == False, LATE_INPUT)  # noqa: E712
+            broken = _first(broken, _not(on_time), LATE_INPUT)
         inside = decision.passed
         if not _all(inside):
             # A stored plan was certified for every error that it can meet: it needs no certified error set on its way.
@@ -177,12 +177,12 @@ class GuaranteeMonitor:
             reason = _first(reason, True, NO_ERROR_SET)
         if not self._is_promised:
             reason = _first(reason, True, NO_DOWNLINK_CONTRACT)
-        reason = _first(reason, state.inside == False, NOT_KNOWN_INSIDE)  # noqa: E712
+        reason = _first(reason, _not(state.inside), NOT_KNOWN_INSIDE)
         if self._lead:
             reason = _first(reason, state.wait > 0, NOT_KNOWN_INSIDE)
         if _all(state.certified):
             return reason
-        is_large = state.certified == False  # noqa: E712
+        is_large = _not(state.certified)
         reason = _first(reason, is_large & (age > self._largest_age), OLD_SAMPLE)
         return _first(reason, is_large, LARGE_ERROR)
 
@@ -192,7 +192,7 @@ class GuaranteeMonitor:
             return broken
         sizes = (np.abs(report.estimate) + report.errors.half_widths)[-self._under_way :]
         limits = self._limits if sizes.ndim == 1 else self._limits[:, None]
-        return _first(broken, _rows_all(sizes <= limits) == False, LEFT_MODEL)  # noqa: E712
+        return _first(broken, _not(_rows_all(sizes <= limits)), LEFT_MODEL)
 
     def _observe(self, broken: Any, inside: Any, report: LoopObservation, wait: Any) -> MonitorState:
         """Takes in the alarm, the running ellipsoid, and what the estimate alone proves."""
@@ -204,14 +204,19 @@ class GuaranteeMonitor:
         if not _all(within):
             near = _rows_all(within)
             usable = (self._test.columns.dot(size) < FARTHEST) & (errors.radius == errors.radius)
-            broken = _first(_first(broken, usable == False, UNUSABLE), near == False, FAR_OUT)  # noqa: E712
+            broken = _first(_first(broken, _not(usable), UNUSABLE), _not(near), FAR_OUT)
         if not _all(inside):
             inside = inside | self._test.knows_inside(estimate, errors, MARGIN)
             if self._is_local:
-                broken = _first(broken, inside == False, LEFT_MODEL)  # noqa: E712
+                broken = _first(broken, _not(inside), LEFT_MODEL)
         if self._lead:
-            wait = (inside & (wait > 1)) * (wait - 1) + (inside == False) * (self._lead + 1)  # noqa: E712
+            wait = (inside & (wait > 1)) * (wait - 1) + _not(inside) * (self._lead + 1)
         return MonitorState(broken, inside, errors.certified, wait)
+
+
+def _not(condition: Any) -> Any:
+    """Returns the opposite of one truth value, or of every one of an array."""
+    return not condition if isinstance(condition, bool) else ~condition
 
 
 def _rows_all(conditions: np.ndarray) -> Any:

@@ -11,7 +11,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 import numpy as np
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid, Estimator, LinearPlant, Packet, UnusedPacketsWarning
-from ncs_gym.estimation.arrival_patterns import arrival_patterns
+from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.first_estimate import first_estimate
 from ncs_gym.network import AppliedInputs, Command, CommittedInputs, Echo, downlink_protocol
 from ncs_gym.network.contract import MAX_AGE, warn_of_broken_contract
@@ -150,7 +150,7 @@ class SafeLoop:
             raise ValueError(f"channel must be a Channel (its contract is the certificate's), got {shown(channel)}")
         self._lost = LostGuarantee(on_unproved)
         self._contract = certificate.contract
-        self._estimator = Estimator(plant, channel, patterns=arrival_patterns(plant, channel, self._contract))
+        self._estimator = Estimator(plant, channel, histories=arrival_histories(plant, channel, self._contract))
         protocol = downlink_protocol(downlink, downlink_contract)
         self._monitored = MonitoredFilter(self._filter, protocol)
         self._lead = self._monitored.lead

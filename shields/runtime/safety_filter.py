@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ncs_gym import LinearPlant
+from ncs_gym.envs.spaces import expressible
 from ncs_gym.validation import ReadOnlyArrays, as_count, as_numbers, read_only, shown
 from shields.certificate import Certificate
 from shields.runtime.decisions import FALLBACK, INVALID, PROJECTED, REASONS, SAFE, UNSAFE, Decision
@@ -300,7 +301,7 @@ class SafetyFilter(ReadOnlyArrays):
     def _expressible(self, inputs: np.ndarray) -> np.ndarray:
         """Returns the nearest u_max * float32 actions, shape (m, N) or (m,)."""
         limits = self.plant.u_max if inputs.ndim == 1 else self.plant.u_max[:, None]
-        return limits * np.minimum(np.maximum(inputs / limits, -1.0), 1.0).astype(np.float32)
+        return expressible(inputs, limits)
 
 
 def _as_array(value: Any) -> np.ndarray:

@@ -10,12 +10,11 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 
 from ncs_gym.envs.info import Known
-from ncs_gym.envs.spaces import read_actions
+from ncs_gym.envs.spaces import nearest_action, read_actions
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network import CommittedInputs
 from ncs_gym.validation import as_number, setting, shown
 from shields.certificate import Certificate
-from shields.downlink.schedule import as_decided
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import (
     CODES,
@@ -182,7 +181,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         known = self._inner.known
         self._report = self._observed(known)
         due = None if self._schedule is None else self._schedule.due(decided.input)
-        same_input, on_time = as_decided(known, decided.input, due)
+        same_input, on_time = _as_decided(known, decided.input, due)
         self._state = self._monitor.advance(state, decided, moved_once, same_input, self._report, on_time)
         self._interventions = self._interventions + decided.intervened
         added, charged, self._stored = {}, decided.intervened, decided.plan.copy()
@@ -278,7 +277,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         report = LoopObservation(known.estimate[:, done], errors, known.alarm[done], known.age[done])
         state = MonitorState(*(array[done] for array in state))
         decided = Decision(*(array[..., done] for array in decided))
-        same_input, on_time = as_decided(known, decided.input, None if due is None else due[:, done])
+        same_input, on_time = _as_decided(known, decided.input, None if due is None else due[:, done])
         state = self._monitor.advance(state, decided, moved_once[done], same_input, report, on_time)
         own = self._info(decided, proposed[:, done], state, self._interventions[done], report.age, done)
         proved = self._proved[done] + own["shield_guaranteed"]
@@ -339,10 +338,23 @@ def _moved(before: Clock, now: Clock) -> tuple[np.ndarray, np.ndarray]:
     return restarted, once & (now.ticks == before.ticks + 1)
 
 
+def _as_decided(known: Known, decided: np.ndarray, due: np.ndarray | None) -> tuple[np.ndarray, Any]:
+    """Returns where the input taken is the one decided and, behind a downlink, the one applied the one that was due.
+
+    Args:
+        known: Of the innermost environment, after the step.
+        decided: Inputs decided in this step, shape (m, N).
+        due: Inputs decided for this step, shape (m, N); None without a downlink, where True stands for the second.
+    """
+    if due is None:
+        return (known.applied == decided).all(axis=0), True
+    return (known.committed == decided).all(axis=0), (known.applied == due).all(axis=0)
+
+
 def overridden(actions: Any, decided: Decision, limits: np.ndarray) -> np.ndarray:
     """Returns the actions, shape (N, m), with those that stand for the inputs decided where the shield intervened."""
     numbers = np.asarray(actions)
     numbers = numbers.astype(np.float32 if numbers.dtype == np.float32 else np.float64)
     chosen = np.flatnonzero(decided.intervened)
-    numbers[chosen] = (decided.input[:, chosen].T / limits).astype(np.float32)
+    numbers[chosen] = nearest_action(decided.input[:, chosen].T, limits)
     return numbers

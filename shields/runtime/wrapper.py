@@ -14,7 +14,7 @@ from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, S
 
 from ncs_gym import Annotation, Channel, ChannelContract, LinearPlant, NCSEnv, NCSVectorEnv
 from ncs_gym.envs.info import Known
-from ncs_gym.envs.spaces import read_action
+from ncs_gym.envs.spaces import nearest_action, read_action
 from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.validation import as_number, setting, shown
 from shields.certificate import Certificate
@@ -167,7 +167,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         (episode, step), self._clock = self._clock, INTERRUPTED
         decision = self._monitored.decide(proposed)
         if decision.intervened and self._filter.mode != "monitor":
-            action = (decision.input / self._filter.plant.u_max).astype(np.float32)
+            action = nearest_action(decision.input, self._filter.plant.u_max)
         if self._is_drawn:
             count = self._interventions + decision.intervened
             self._annotate(proposed, count, decision.plan, intervened=decision.intervened)

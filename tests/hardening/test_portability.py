@@ -20,7 +20,7 @@ import pytest
 
 import ncs_gym
 from agents import Agent
-from ncs_gym import LinearPlant
+from benchmarks.portability import random_plant
 from shields import Certificate, SafetyFilter, verify
 from shields.verification.rational_matrix import add, congruence, is_positive_semidefinite, rational, scale, subtract
 from tests.certificates import ROOT, certificate_of
@@ -36,25 +36,12 @@ IDS = ("TruckTrailer", "TruckTrailerCruise", "CartPole", "BatchReactor", "Pendul
 DATA = Path(__file__).resolve().parent.parent / "data" / "certificates"
 
 
-def random_plant(index):
-    """A plant from a continuous-time model of 2 to 6 states; a contract is needed where it is unstable."""
-    rng = np.random.default_rng([7, index])
-    n, m = 2 + index % 5, 1 + index // 5 % 2
-    A, B = rng.standard_normal((n, n)), rng.standard_normal((n, m))
-    if index % 3:
-        A = A - 0.5 * float(np.abs(A).sum(axis=1).max()) * np.eye(n)
-    bounds = {"disturbance_bound": 0.004 * np.ones(n), "sensor_bound": 0.003 * np.ones(n), "initial_bound": 0.003}
-    model = (A, B, np.eye(n), np.zeros((n, m)))
-    return LinearPlant.from_statespace(model, 0.1, box=np.ones(n), u_max=np.full(m, 2.0), **bounds)
-
-
 def all_plants():
     """Registered and random plants by name, with the contracts of their certificates."""
     registered = {name: gym.make(f"ncs_gym/{name}-v0").unwrapped for name in IDS}
     found = {name: (env.plant, env.certificate_contract) for name, env in registered.items()}
     for index in range(50):
-        contract = ncs_gym.ChannelContract(1 + index % 3) if index % 3 == 0 or index % 2 else None
-        found[f"random plant {index}"] = random_plant(index), contract
+        found[f"random plant {index}"] = random_plant(index)
     return found
 
 

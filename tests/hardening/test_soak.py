@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, Estimator, NCSEnv, NCSVectorEnv, Packet
-from ncs_gym.estimation import arrival_patterns
-from ncs_gym.estimation.arrival_patterns import ArrivalPatterns
+from ncs_gym.estimation import arrival_histories
+from ncs_gym.estimation.arrival_histories import ArrivalHistories
 from ncs_gym.estimation.estimator import Belief
 
 EPISODE = 300
@@ -58,7 +58,7 @@ class Diary:
             for u, arrived in self.told[e]:
                 fresh.advance(u, sorted(arrived, key=lambda packet: packet.stamp))
                 packets += len(arrived)
-            statistics = estimator.patterns.table.statistics[estimator.statistics[e]]
+            statistics = estimator.histories.table.statistics(estimator.statistics[e])
             np.testing.assert_array_equal(info["error_shape"][e], fresh.belief.shape)
             np.testing.assert_array_equal(statistics.covariance, fresh.belief.covariance)
             np.testing.assert_allclose(info["estimate"][e], fresh.belief.mean, rtol=0.0, atol=1e-12)
@@ -122,7 +122,7 @@ def restored(env):
     """A fresh estimator, with a graph of its own, in the state of an environment's."""
     old, new = env.estimator, Estimator(env.plant, env.channel, env.error_set)
     new.step, new.age, new.alarm, new.mean = old.step, old.age, old.alarm, old.mean
-    new._pattern = new._patterns._adopted(old._patterns, [old._pattern])[old._pattern]
+    new._history = new._histories._adopted(old._histories, [old._history])[old._history]
     new._priors, new._inputs, new._samples = old._priors.copy(), old._inputs.copy(), old._samples.copy()
     return new
 
@@ -133,16 +133,16 @@ def test_a_long_run_neither_grows_nor_drifts(loaded):
 
 
 @pytest.mark.parametrize("kind", ["many", "one"])
-def test_a_graph_that_forgets_patterns_does_not_drift(loaded, monkeypatch, kind):
-    monkeypatch.setattr(arrival_patterns, "_shared", {})
-    monkeypatch.setattr(arrival_patterns, "MAX_PATTERNS", 300 if kind == "many" else 60)
-    graphs, keeping = [], ArrivalPatterns.keeping
+def test_a_graph_that_forgets_histories_does_not_drift(loaded, monkeypatch, kind):
+    monkeypatch.setattr(arrival_histories, "_shared", {})
+    monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 300 if kind == "many" else 60)
+    graphs, keeping = [], ArrivalHistories.keeping
 
-    def counted(graph, patterns):
+    def counted(graph, histories):
         graphs.append(graph)
-        return keeping(graph, patterns)
+        return keeping(graph, histories)
 
-    monkeypatch.setattr(ArrivalPatterns, "keeping", counted)
+    monkeypatch.setattr(ArrivalHistories, "keeping", counted)
     if kind == "many":
         soak_many(loaded, 16, 1000, 900)
     else:
@@ -165,9 +165,9 @@ def test_a_million_steps_of_one_environment_neither_grow_nor_drift(loaded):
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [1, 256])
 def test_a_million_steps_with_forgetting_do_not_grow(size, loaded, monkeypatch):
-    monkeypatch.setattr(arrival_patterns, "_shared", {})
-    monkeypatch.setattr(arrival_patterns, "MAX_PATTERNS", 4000)
-    # Where many samples are late, patterns hardly recur: the graph is full again and again.
+    monkeypatch.setattr(arrival_histories, "_shared", {})
+    monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 4000)
+    # Where many samples are late, histories hardly recur: the graph is full again and again.
     settings = {"plant": loaded, "channel": Channel(0.5, jitter=4)}
     env = NCSEnv(**settings) if size == 1 else NCSVectorEnv(size, max_episode_steps=EPISODE, **settings)
     env.reset(seed=0)
@@ -179,6 +179,6 @@ def test_a_million_steps_with_forgetting_do_not_grow(size, loaded, monkeypatch):
             env.reset()
         if k % (50_000 // size) == 0:
             sizes.append(resident())
-            forgotten.add(id(env.estimator._patterns if size == 1 else env._estimator.patterns))
+            forgotten.add(id(env.estimator._histories if size == 1 else env._estimator.histories))
     assert len(forgotten) > 3
     assert max(sizes[8:]) - max(sizes[4:8]) < MOST_GROWTH

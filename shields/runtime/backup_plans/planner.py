@@ -9,9 +9,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import LinAlgError, solve_discrete_are
 
 from ncs_gym import LinearPlant
+from ncs_gym.envs.spaces import expressible
+from ncs_gym.plants.lqr import lqr_gain
 from shields.runtime.backup_plans.plan_check import PlanTest, Prediction, Tightening
 from shields.runtime.backup_plans.program import PlanProgram
 from shields.runtime.one_step import OneStepTest
@@ -182,18 +183,7 @@ class Planner:
 
 def regulator(plant: LinearPlant, input_weight: float = INPUT_WEIGHT) -> np.ndarray | None:
     """Returns the gain, shape (m, n), of a linear-quadratic regulator; None if there is none."""
-    R = input_weight * np.diag(plant.u_max**-2.0)
-    try:
-        P = solve_discrete_are(plant.A, plant.B, plant.weight, R)
-        gain = -np.linalg.solve(R + plant.B.T @ P @ plant.B, plant.B.T @ P @ plant.A)
-    except (LinAlgError, ValueError):
-        return None
-    return gain if np.isfinite(gain).all() else None
-
-
-def expressible(inputs: np.ndarray, limits: np.ndarray) -> np.ndarray:
-    """Returns the nearest u_max * float32 actions; the last axis is the input's."""
-    return limits * np.minimum(np.maximum(inputs / limits, -1.0), 1.0).astype(np.float32)
+    return lqr_gain(plant.A, plant.B, plant.weight, input_weight * np.diag(plant.u_max**-2.0))
 
 
 def closed_loop(plant: LinearPlant, gain: np.ndarray, steps: int) -> np.ndarray:

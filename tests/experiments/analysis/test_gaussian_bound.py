@@ -14,7 +14,7 @@ from experiments.commands.compare import _findings, _gaussian_noise
 from experiments.runs import certificate_of, loop_config, run_of_arm
 from experiments.runs.training_run import RunResult
 from experiments.settings import CompareSettings
-from ncs_gym import Channel, LinearPlant, escape_probability, register_plant
+from ncs_gym import Channel, LinearPlant, bound_violation_probability, register_plant
 
 # Its safe box is 2 % wider than the bound of its noise: a draw that leaves its ellipsoid by more makes the state leave.
 DECLARED = {
@@ -72,7 +72,11 @@ def test_comparison_under_gaussian_noise_plays_it_and_states_the_bound(setup):
     result = run.execute(lambda steps: None)
     arms = arm_summaries(episodes_table([result, replace(result, arm="monitor")]), "project")
     summary = _gaussian_noise(*setup, arms)
-    assert summary["escape_probability"] == escape_probability(PLANT, CHANNEL, STEPS) == pytest.approx(STEPS * 2e-3)
+    assert (
+        summary["escape_probability"]
+        == bound_violation_probability(PLANT, CHANNEL, STEPS)
+        == pytest.approx(STEPS * 2e-3)
+    )
     arm = summary["arms"]["shielded"]
     assert 0.5 < arm["episodes_outside_set"] / arm["episodes"] / summary["escape_probability"] <= 1.0
     assert list(summary["arms"]) == ["shielded"]

@@ -24,7 +24,7 @@ from ncs_gym import (
     cart_pole,
     truck_trailer,
 )
-from ncs_gym.estimation import arrival_patterns
+from ncs_gym.estimation import arrival_histories
 from tests import arrays
 from tests.ncs_gym.envs.same_draws import compare
 from tests.plants import random_plant
@@ -120,13 +120,13 @@ def test_alarms_are_raised_where_the_scalar_estimator_raises_them():
 
 @pytest.mark.parametrize("name", ["TruckTrailerCruise", "BatchReactor"])
 def test_a_graph_that_forgets_changes_nothing(name, monkeypatch):
-    monkeypatch.setattr(arrival_patterns, "_shared", {})
-    monkeypatch.setattr(arrival_patterns, "MAX_PATTERNS", 40)
+    monkeypatch.setattr(arrival_histories, "_shared", {})
+    monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 40)
     env = make(name, 3, channel=Channel(loss=0.3, max_consecutive_losses=2, jitter=2), max_episode_steps=None).unwrapped
-    before = env._estimator.patterns
+    before = env._estimator.histories
     compare(env, 200)
-    assert env._estimator.patterns is not before
-    assert len(env._estimator.patterns) <= 60
+    assert env._estimator.histories is not before
+    assert len(env._estimator.histories) <= 60
 
 
 def steps_of(env, count, seed=0):
@@ -152,14 +152,14 @@ KINDS = {
 @pytest.mark.parametrize("most", [1 << 17, 60])
 @pytest.mark.parametrize("kind", KINDS)
 def test_environments_that_share_a_graph_do_not_notice_each_other(kind, most, monkeypatch):
-    monkeypatch.setattr(arrival_patterns, "MAX_PATTERNS", most)
-    monkeypatch.setattr(arrival_patterns, "_shared", {})
+    monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", most)
+    monkeypatch.setattr(arrival_histories, "_shared", {})
     alone = KINDS[kind]()
     alone.reset(seed=1)
     wanted = list(steps_of(alone, 120))
-    monkeypatch.setattr(arrival_patterns, "_shared", {})
+    monkeypatch.setattr(arrival_histories, "_shared", {})
     envs = [KINDS[kind](), KINDS["scalar"](), KINDS["vector"]()]
-    graphs = {id(getattr(env, "estimator", None) and env.estimator._patterns) for env in envs[:2] if kind == "scalar"}
+    graphs = {id(getattr(env, "estimator", None) and env.estimator._histories) for env in envs[:2] if kind == "scalar"}
     assert len(graphs) <= 1
     for seed, env in enumerate(envs, 1):
         env.reset(seed=seed)
@@ -190,12 +190,12 @@ def test_threads_share_a_graph(most, monkeypatch):
     alone, together = {}, {}
     for seed in range(4):
         run(seed, alone)
-    monkeypatch.setattr(arrival_patterns, "MAX_PATTERNS", most)
+    monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", most)
     interval = sys.getswitchinterval()
     try:
         sys.setswitchinterval(1e-6)
         for _ in range(2):
-            monkeypatch.setattr(arrival_patterns, "_shared", {})
+            monkeypatch.setattr(arrival_histories, "_shared", {})
             threads = [threading.Thread(target=run, args=(seed, together)) for seed in range(4)]
             for thread in threads:
                 thread.start()
@@ -208,15 +208,15 @@ def test_threads_share_a_graph(most, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("plant", "channel"),
+    ("plant", "channel", "most"),
     [
-        (truck_trailer(), Channel(loss=0.3, delay=100, jitter=500)),  # a pattern takes 20 kB
-        (random_plant(5, 12, 1, p=1), Channel(loss=0.3, jitter=5)),  # statistics take 7 kB and hardly recur
+        (truck_trailer(), Channel(loss=0.3, delay=100, jitter=500), 1 << 22),  # a history takes 20 kB
+        (random_plant(5, 12, 1, p=1), Channel(loss=0.3, jitter=5), 1 << 21),  # statistics take 3 kB and hardly recur
     ],
 )
-def test_graphs_of_long_buffers_and_large_plants_hold_fewer_patterns(plant, channel, monkeypatch):
-    monkeypatch.setattr(arrival_patterns, "_shared", {})
-    monkeypatch.setattr(arrival_patterns, "MAX_NUMBERS", 1 << 19)
+def test_graphs_of_long_buffers_and_large_plants_hold_fewer_histories(plant, channel, most, monkeypatch):
+    monkeypatch.setattr(arrival_histories, "_shared", {})
+    monkeypatch.setattr(arrival_histories, "MAX_BYTES", most)
     env = NCSEnv(plant, channel)
     env.reset(seed=0)
     sizes, graphs, action = [], set(), np.zeros(plant.m, np.float32)
@@ -226,47 +226,47 @@ def test_graphs_of_long_buffers_and_large_plants_hold_fewer_patterns(plant, chan
         for _ in range(400):
             env.step(action)
             sizes.append(tracemalloc.get_traced_memory()[0] - before)
-            graphs.add(id(env.estimator._patterns))
+            graphs.add(id(env.estimator._histories))
     finally:
         tracemalloc.stop()
     assert len(graphs) > 1
-    assert 0.4 < max(sizes) / (8 * arrival_patterns.MAX_NUMBERS) < 1.6
+    assert 0.4 < max(sizes) / most < 1.6
 
 
 def test_graphs_that_nobody_uses_any_more_are_freed(monkeypatch):
     # The environment for one that a vector environment holds is never stepped: it stays in the first graph.
-    monkeypatch.setattr(arrival_patterns, "_shared", {})
-    monkeypatch.setattr(arrival_patterns, "MAX_PATTERNS", 100)
+    monkeypatch.setattr(arrival_histories, "_shared", {})
+    monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 100)
     env, graphs = NCSVectorEnv(3, **OVERTAKING), weakref.WeakSet()
     env.reset(seed=0)
     for _ in steps_of(env, 500):
-        graphs.add(env._estimator.patterns)
+        graphs.add(env._estimator.histories)
     gc.collect()
     assert len(graphs) <= 3
-    assert env.single.estimator._patterns is not env._estimator.patterns
+    assert env.single.estimator._histories is not env._estimator.histories
 
 
 def test_graphs_of_many_plants_are_not_kept_for_ever(monkeypatch):
     shared = {}
-    monkeypatch.setattr(arrival_patterns, "_shared", shared)
-    monkeypatch.setattr(arrival_patterns, "MAX_GRAPHS", 3)
+    monkeypatch.setattr(arrival_histories, "_shared", shared)
+    monkeypatch.setattr(arrival_histories, "MAX_GRAPHS", 3)
     plants = [truck_trailer(mass=mass) for mass in (1000.0, 1100.0, 1200.0, 1300.0)]
-    graphs = [arrival_patterns.arrival_patterns(plant, Channel(loss=0.1), None) for plant in plants]
+    graphs = [arrival_histories.arrival_histories(plant, Channel(loss=0.1), None) for plant in plants]
     assert list(shared.values()) == graphs[1:]
-    assert arrival_patterns.arrival_patterns(plants[1], Channel(loss=0.9), None) is graphs[1]
+    assert arrival_histories.arrival_histories(plants[1], Channel(loss=0.9), None) is graphs[1]
     assert list(shared.values()) == [*graphs[2:], graphs[1]]
 
 
 def test_a_graph_has_room_for_many_environments(monkeypatch):
-    # With fewer patterns than environments it would be forgotten at every step.
-    monkeypatch.setattr(arrival_patterns, "_shared", {})
-    monkeypatch.setattr(arrival_patterns, "MAX_PATTERNS", 20)
+    # With fewer histories than environments it would be forgotten at every step.
+    monkeypatch.setattr(arrival_histories, "_shared", {})
+    monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 20)
     env = NCSVectorEnv(100, plant=truck_trailer(), channel=Channel(loss=0.3, jitter=3))
     env.reset(seed=0)
     graphs = []
     for _ in range(100):
         env.step(np.zeros((100, 1), np.float32))
-        graphs.append(env._estimator.patterns)
+        graphs.append(env._estimator.histories)
     assert 2 < len(set(map(id, graphs))) < 60
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ncs_gym import Channel, ChannelContract, LinearPlant, certified_error_set
-from ncs_gym.estimation.arrival_patterns import patterns_of
+from ncs_gym.estimation.arrival_histories import histories_of
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from tests.ncs_gym.envs.same_draws import holding_gain
 
@@ -72,7 +72,7 @@ class Attack:
         error: x_hat - x, shape (n, N).
         largest: The largest gauge of an error in its running ellipsoid so far.
         seen: Error shapes that occurred, as bytes of float64, each with its true age. (Numbers of statistics belong to
-            a graph of patterns, and there is a new one when it has grown large.)
+            a graph of histories, and there is a new one when it has grown large.)
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class Attack:
     ) -> None:
         self.plant, self.rng, self.count = plant, np.random.default_rng(seed), count
         self.error_set = certified_error_set(plant, contract)
-        self.many = VectorEstimator(plant, patterns_of(plant, channel, self.error_set), count)
+        self.many = VectorEstimator(plant, histories_of(plant, channel, self.error_set), count)
         self.traffic = Traffic(channel, None if contract is None else contract.max_age, count)
         self.noise = plant.sensor_error_with(channel.quantization_step).shape_matrix
         self.axes = self._axes()
@@ -101,7 +101,7 @@ class Attack:
         plant, many = self.plant, self.many
         if self.step % AIM == 0:
             self.axes = self._axes()
-        shapes = many.patterns.table.shapes.take(many.statistics, axis=0)
+        shapes = many.histories.table.shapes.take(many.statistics, axis=0)
         u = self.gain @ many.mean + 0.05 * self.rng.uniform(-1.0, 1.0, (plant.m, self.count)) * plant.u_max[:, None]
         # A third of the environments aims at a direction some steps ahead, the others push the error outwards.
         aims = np.arange(self.count) % 3 == 0
@@ -121,7 +121,7 @@ class Attack:
 
     def _check(self) -> None:
         many = self.many
-        shapes = many.patterns.table.shapes.take(many.statistics, axis=0)
+        shapes = many.histories.table.shapes.take(many.statistics, axis=0)
         inward = np.linalg.solve(shapes, self.error.T[:, :, None])[:, :, 0].T
         self.largest = max(self.largest, float(np.sqrt((self.error * inward).sum(axis=0)).max()))
         assert self.largest <= 1.0

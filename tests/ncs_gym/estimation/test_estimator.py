@@ -15,13 +15,14 @@ from ncs_gym import (
     Estimator,
     LinearPlant,
     Packet,
+    batch_reactor,
     cart_pole,
     certified_error_set,
     truck_trailer,
 )
-from ncs_gym.estimation.arrival_patterns import patterns_of
+from ncs_gym.estimation.arrival_histories import histories_of
 from ncs_gym.estimation.innovation_test import InnovationTest
-from ncs_gym.estimation.kalman_filter import ErrorRecursion
+from ncs_gym.estimation.kalman_filter import ErrorRecursion, predicted_covariance, updated_covariance
 from ncs_gym.estimation.set_membership import SetMembership, enlarged_by_rounding
 from ncs_gym.network.channel import GilbertElliott
 from ncs_gym.network.packet_transmission import ChannelState
@@ -75,7 +76,7 @@ def test_estimate_equals_batch_least_squares_with_late_and_reordered_packets(see
     plant = replace(plant, measurement_noise_cov=1e-7 * np.eye(plant.p))
     channel = Channel(loss=0.3, quantization_step=0.001, delay=1, jitter=3)
     rng = np.random.default_rng(seed)
-    estimator = Estimator(plant, channel, patterns=patterns_of(plant, channel, roomy(plant), **FINE))
+    estimator = Estimator(plant, channel, histories=histories_of(plant, channel, roomy(plant), **FINE))
     first = rng.standard_normal(3)
     estimator.reset(first)
     link, inputs, used = ChannelState(channel, rng), [], []
@@ -99,7 +100,7 @@ def test_order_of_arrival_does_not_matter():
     samples = {stamp: 0.05 * rng.standard_normal(2) for stamp in (1, 2, 3, 4)}
     channel, ends = Channel(delay=8), []
     for order in itertools.permutations(samples):
-        estimator = Estimator(plant, channel, patterns=patterns_of(plant, channel, roomy(plant), **FINE))
+        estimator = Estimator(plant, channel, histories=histories_of(plant, channel, roomy(plant), **FINE))
         for _ in range(4):
             estimator.advance(np.zeros(1), [])
         estimator.advance(np.array([0.5]), [Packet(stamp, samples[stamp]) for stamp in order])
@@ -414,11 +415,28 @@ def test_shape_without_any_extent_is_rounded_up_to_a_finite_one():
     assert values[1] < 0.01 * np.linalg.eigvalsh(sets.error_set.Sigma)[1]
 
 
+@pytest.mark.parametrize("plant", [truck_trailer(), cart_pole(), batch_reactor()])
+def test_covariances_and_gains_are_those_of_filterpy(plant):
+    estimator = Estimator(plant, Channel(quantization_step=0.01), certified_error_set(plant, ChannelContract(3, 0.01)))
+    estimator.reset(0.01 * np.ones(plant.n))
+    u, y, theirs = 0.1 * plant.u_max, 0.02 * np.ones(plant.p), estimator.as_filterpy()
+    P = estimator.belief.covariance
+    theirs.predict(u)
+    estimator.advance(u, [])
+    np.testing.assert_allclose(theirs.x, estimator.mean, rtol=1e-12)
+    P = predicted_covariance(P, plant.A, theirs.Q)
+    np.testing.assert_allclose(theirs.P, P, rtol=1e-12)
+    theirs.update(y)
+    gain, P = updated_covariance(P, plant.H, theirs.R)
+    np.testing.assert_allclose(theirs.K, gain, rtol=1e-9)
+    np.testing.assert_allclose(theirs.P, P, rtol=1e-9, atol=1e-15)
+
+
 @pytest.mark.parametrize("perfect", [(True, True), (True, False)])
 def test_perfect_sensors_get_a_little_noise_in_their_own_units(perfect):
     # Otherwise a filter that knows the state has a singular innovation covariance.
     plant = truck_trailer(H=np.diag([2.0, 3.0]), measurement_noise_cov=np.diag(np.where(perfect, 0.0, 1e-4)))
-    noise = ErrorRecursion(plant, 0.0, certified_error_set(plant))._kalman.R - plant.measurement_noise_cov
+    noise = ErrorRecursion(plant, 0.0, certified_error_set(plant)).R - plant.measurement_noise_cov
     np.testing.assert_allclose(noise, FLAT_INFLATION * np.diag((plant.half_widths * [2.0, 3.0]) ** 2), rtol=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""Estimators that look up arrival patterns equal one that works everything out, whatever arrives when."""
+"""Estimators that look up arrival histories equal one that works everything out, whatever arrives when."""
 
 import copy
 import pickle
@@ -21,8 +21,8 @@ from ncs_gym import (
     certified_error_set,
     truck_trailer,
 )
-from ncs_gym.estimation import arrival_patterns
-from ncs_gym.estimation.arrival_patterns import patterns_of
+from ncs_gym.estimation import arrival_histories
+from ncs_gym.estimation.arrival_histories import histories_of
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.packet_transmission import ChannelState
@@ -80,8 +80,8 @@ def assert_equal(estimator, plain, step):
 def compare(plant, channel, error_set, seed, steps):
     """Runs both; returns the ages and how often the alarm was raised."""
     rng = np.random.default_rng(seed)
-    patterns = patterns_of(plant, channel, error_set)
-    one = Estimator(plant, channel, patterns=patterns)
+    histories = histories_of(plant, channel, error_set)
+    one = Estimator(plant, channel, histories=histories)
     other = PlainEstimator(plant, channel, ErrorRecursion(plant, channel.quantization_step, error_set))
     alarms, ages = 0, []
     for episode in range(2):  # the second one finds what the first one left, and packets of the first
@@ -154,14 +154,14 @@ def test_an_alarm_is_raised_where_the_plain_estimator_raises_it():
 
 @pytest.mark.parametrize("name", CASES)
 def test_forgetting_in_the_middle_of_an_episode_changes_nothing(name, monkeypatch):
-    monkeypatch.setattr(arrival_patterns, "MAX_PATTERNS", 30)
-    forgotten, keeping = [], arrival_patterns.ArrivalPatterns.keeping
+    monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 30)
+    forgotten, keeping = [], arrival_histories.ArrivalHistories.keeping
 
-    def counted(graph, patterns):
+    def counted(graph, histories):
         forgotten.append(len(graph))
-        return keeping(graph, patterns)
+        return keeping(graph, histories)
 
-    monkeypatch.setattr(arrival_patterns.ArrivalPatterns, "keeping", counted)
+    monkeypatch.setattr(arrival_histories.ArrivalHistories, "keeping", counted)
     plant, channel, contract = CASES[name]
     compare(plant, channel, certified_error_set(plant, contract), 1, 300)
     assert len(forgotten) >= 5
@@ -171,8 +171,8 @@ def test_forgetting_in_the_middle_of_an_episode_changes_nothing(name, monkeypatc
 @pytest.mark.parametrize("name", CASES)
 def test_duplicates_and_packets_from_nowhere_change_nothing(name):
     plant, channel, contract = CASES[name]
-    patterns, rng = patterns_of(plant, channel, certified_error_set(plant, contract)), np.random.default_rng(4)
-    one, other = (Estimator(plant, channel, patterns=patterns) for _ in range(2))
+    histories, rng = histories_of(plant, channel, certified_error_set(plant, contract)), np.random.default_rng(4)
+    one, other = (Estimator(plant, channel, histories=histories) for _ in range(2))
     link, arrived, copies = ChannelState(channel, rng), [], 0
     for step in range(1, 400):
         sample = 1e-3 * rng.standard_normal(plant.p) if link.sends_at(step) else None
@@ -197,7 +197,7 @@ def test_duplicates_and_packets_from_nowhere_change_nothing(name):
 def test_a_copy_goes_on_like_the_original(name):
     plant, channel, contract = CASES[name]
     error_set, rng = certified_error_set(plant, contract), np.random.default_rng(2)
-    one = Estimator(plant, channel, patterns=patterns_of(plant, channel, error_set))
+    one = Estimator(plant, channel, histories=histories_of(plant, channel, error_set))
     steps = list(traffic(plant, channel, rng, 120))
     for u, packets in steps[:60]:
         one.advance(u, packets)
@@ -209,7 +209,7 @@ def test_a_copy_goes_on_like_the_original(name):
             for value, wanted in zip(each.belief, one.belief, strict=True):
                 arrays.assert_equal(value, wanted, f"step {step}")
             assert (each.age, each.alarm) == (one.age, one.alarm)
-    assert copies[0]._patterns is one._patterns is not copies[1]._patterns
+    assert copies[0]._histories is one._histories is not copies[1]._histories
 
 
 def samples_of(plains, rng, plant, step, channel):
@@ -224,10 +224,10 @@ def samples_of(plains, rng, plant, step, channel):
 @pytest.mark.parametrize("most", [1 << 17, 40])
 @pytest.mark.parametrize("name", CASES)
 def test_vector_estimator_equals_the_plain_ones(name, most, monkeypatch):
-    monkeypatch.setattr(arrival_patterns, "MAX_PATTERNS", most)
+    monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", most)
     plant, channel, contract = CASES[name]
     error_set, rng, count = certified_error_set(plant, contract), np.random.default_rng(3), 4
-    many = VectorEstimator(plant, patterns_of(plant, channel, error_set), count)
+    many = VectorEstimator(plant, histories_of(plant, channel, error_set), count)
     recursion = ErrorRecursion(plant, channel.quantization_step, error_set)
     plains = [PlainEstimator(plant, channel, recursion) for _ in range(count)]
     history = []
@@ -252,13 +252,13 @@ def test_vector_estimator_equals_the_plain_ones(name, most, monkeypatch):
             ]
             plain.advance(u[:, index], packets)
             assert_one_of_many(many, index, plain, step)
-    assert (len(many.patterns) < 200) or most > 40
+    assert (len(many.histories) < 200) or most > 40
 
 
 def assert_one_of_many(many, index, plain, step):
-    statistics = many.patterns.table.statistics[many.statistics[index]]
+    statistics = many.histories.table.statistics(many.statistics[index])
     arrays.assert_equal(statistics.shape, plain.statistics.shape, f"step {step}")
     arrays.assert_equal(statistics.covariance, plain.statistics.covariance)
-    arrays.assert_equal(many.patterns.table.shapes[many.statistics[index]], plain.statistics.shape)
+    arrays.assert_equal(many.histories.table.shapes[many.statistics[index]], plain.statistics.shape)
     arrays.assert_close(many.mean[:, index], plain.mean, rtol=1e-10, atol=1e-10)
     assert (many.age[index], many.alarm[index]) == (plain.age, plain.alarm)

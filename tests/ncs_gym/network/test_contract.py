@@ -22,8 +22,8 @@ from ncs_gym import (
     contract_of,
     truck_trailer,
 )
-from ncs_gym.estimation import set_membership
-from ncs_gym.estimation.arrival_patterns import patterns_of
+from ncs_gym.estimation import kalman_filter, set_membership
+from ncs_gym.estimation.arrival_histories import histories_of
 from ncs_gym.estimation.error_bound import require_error_set
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
@@ -145,13 +145,13 @@ def test_unstable_plant_needs_a_promise():
 def test_update_falls_back_to_the_certified_gain_and_never_skips(monkeypatch):
     plant, contract = PLANTS["batch reactor"]
     channel = Channel(loss=0.5, max_consecutive_losses=3)
-    patterns = patterns_of(plant, channel, certified_error_set(plant, contract))
-    estimator, recursion = Estimator(plant, channel, patterns=patterns), patterns.recursion
+    histories = histories_of(plant, channel, certified_error_set(plant, contract))
+    estimator, recursion = Estimator(plant, channel, histories=histories), histories.recursion
     # Bad gains: neither the Kalman nor the set-membership gain will do.
     monkeypatch.setattr(recursion.sets, "gain", lambda shape: np.full((4, 2), 50.0))
     rng, x = np.random.default_rng(0), 1e-4 * np.ones(4)
     estimator.reset(x.copy())
-    monkeypatch.setattr(recursion._kalman, "update", lambda z: setattr(recursion._kalman, "K", np.full((4, 2), 50.0)))
+    monkeypatch.setattr(kalman_filter, "updated_covariance", lambda P, H, R: (np.full((4, 2), 50.0), P))
     link, used = ChannelState(channel, rng), 0
     for step in range(1, 100):  # the plant is unstable and not controlled; only the error matters here
         x = plant.A @ x + (1 - 1e-9) * plant.nominal_disturbance.sample_boundary(rng)

@@ -14,8 +14,8 @@ from ncs_gym import (
     LinearPlant,
     NCSEnv,
     NCSVectorEnv,
+    bound_violation_probability,
     cart_pole,
-    escape_probability,
     truck_trailer,
 )
 from ncs_gym.registration import registered_ids
@@ -97,7 +97,7 @@ def test_plant_that_declares_bounds_only_is_refused():
     for make in (lambda: NCSEnv(plant, noise="gaussian"), lambda: NCSVectorEnv(2, plant=plant, noise="gaussian")):
         with pytest.raises(ValueError, match="needs a covariance"):
             make()
-    assert escape_probability(plant, Channel(), 10**6) == 0.0
+    assert bound_violation_probability(plant, Channel(), 10**6) == 0.0
 
 
 @pytest.mark.parametrize("noise", ["Gaussian", None, 1, ["gaussian"]])
@@ -152,31 +152,31 @@ def test_a_disturbance_in_place_of_the_process_noise_stays_inside_its_bound():
 
 
 @pytest.mark.parametrize(("delta", "steps", "period"), [(1e-9, 200, 2), (1e-3, 7, 3), (0.05, 3, 1), (1e-12, 10**9, 1)])
-def test_escape_probability_is_the_sum_over_all_draws_rounded_up(delta, steps, period):
+def test_bound_violation_probability_is_the_sum_over_all_draws_rounded_up(delta, steps, period):
     plant = truck_trailer(delta=delta)
     wanted = (steps + steps // period + 1) * Fraction(delta)
-    bound = escape_probability(plant, Channel(send_period=period, loss=0.9, delay=3), steps)
+    bound = bound_violation_probability(plant, Channel(send_period=period, loss=0.9, delay=3), steps)
     assert Fraction(bound) >= wanted
     assert bound == pytest.approx(float(wanted), rel=2e-4 if delta < 1e-11 else 1e-9)
 
 
-def test_escape_probability_counts_only_what_is_gaussian():
+def test_bound_violation_probability_counts_only_what_is_gaussian():
     channel = Channel(send_period=10)
     for name, draws in (("process_noise_cov", 100), ("measurement_noise_cov", 10), ("initial_cov", 1)):
         plant = LinearPlant(
             **CALM | {"delta": 1e-4}, gamma=0.1, sensor_bound=0.1, initial_bound=0.1, **{name: [[1e-3]]}
         )
-        assert escape_probability(plant, channel, 100) == pytest.approx(draws * 1e-4, rel=1e-9)
-    assert escape_probability(truck_trailer(), channel, 10**6) == 1.0
-    assert escape_probability(truck_trailer(delta=1e-3), channel, 0) == pytest.approx(1e-3, rel=1e-9)
+        assert bound_violation_probability(plant, channel, 100) == pytest.approx(draws * 1e-4, rel=1e-9)
+    assert bound_violation_probability(truck_trailer(), channel, 10**6) == 1.0
+    assert bound_violation_probability(truck_trailer(delta=1e-3), channel, 0) == pytest.approx(1e-3, rel=1e-9)
 
 
 @pytest.mark.parametrize("steps", [-1, 1.5, "many"])
-def test_escape_probability_refuses_other_arguments(steps):
+def test_bound_violation_probability_refuses_other_arguments(steps):
     with pytest.raises(ValueError, match="steps"):
-        escape_probability(truck_trailer(), Channel(), steps)
+        bound_violation_probability(truck_trailer(), Channel(), steps)
     with pytest.raises(ValueError, match="expected a LinearPlant and a Channel"):
-        escape_probability(Channel(), truck_trailer(), 1)
+        bound_violation_probability(Channel(), truck_trailer(), 1)
 
 
 def test_share_of_episodes_with_an_escape_is_what_the_bound_says():
@@ -193,7 +193,7 @@ def test_share_of_episodes_with_an_escape_is_what_the_bound_says():
         escaped |= plant.process_noise.bound.gauge(env._process.draw_disturbance(rng, zero, none, memory).T) > 1.0
         if step % channel.send_period == 0:
             escaped |= plant.sensor_noise.bound.gauge(env._process.measure(rng, zero).T) > 1.0
-    bound = escape_probability(plant, channel, steps)
+    bound = bound_violation_probability(plant, channel, steps)
     assert 0.8 * bound < escaped.mean() < bound
 
 

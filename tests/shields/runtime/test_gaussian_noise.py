@@ -10,8 +10,8 @@ from ncs_gym import (
     NCSEnv,
     NCSVectorEnv,
     batch_reactor,
+    bound_violation_probability,
     cart_pole,
-    escape_probability,
     truck_trailer,
 )
 from shields import SafetyShield, VectorSafetyShield
@@ -98,7 +98,7 @@ def share_of_exits(plant, noise, mode="project"):
 
 def test_share_of_episodes_that_leave_the_safe_set_is_below_the_union_bound_and_close_to_it():
     plant = tight_plant(DELTA)
-    bound = escape_probability(plant, Channel(loss=0.3), STEPS)
+    bound = bound_violation_probability(plant, Channel(loss=0.3), STEPS)
     assert bound == pytest.approx(STEPS * DELTA)  # nothing but the process noise is Gaussian
     assert 0.5 * bound < share_of_exits(plant, "gaussian") <= bound
     assert share_of_exits(plant, "truncated") == 0.0

@@ -493,7 +493,7 @@ def test_unstable_plant_without_its_error_set_is_refused_with_the_remedy():
 
 @pytest.mark.parametrize("name", ["truck", "cart-pole"])
 def test_memory_does_not_grow(name):
-    # What is kept of arrival patterns depends only on which were met: the same steps once more meet no new one.
+    # What is kept of arrival histories depends only on which were met: the same steps once more meet no new one.
     plant, _, channel = LOOPS[name]
     loop, before = loop_of(name), 0
     for _ in range(2):

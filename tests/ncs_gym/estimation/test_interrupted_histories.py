@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, Estimator, Packet, certified_error_set, truck_trailer
-from ncs_gym.estimation import error_statistics_table, pattern_arrays
-from ncs_gym.estimation.arrival_patterns import patterns_of
+from ncs_gym.estimation import arrival_histories
+from ncs_gym.estimation.arrival_histories import histories_of
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from tests.interruptions import interrupt, places
 
@@ -15,18 +15,17 @@ PLANT = truck_trailer(mass=4000.0)
 CHANNEL = Channel(delay=1, jitter=1)
 STEPS = 12
 # Where what is shared is written.
-SHARED = "arrival_patterns.py", "pattern_arrays.py", "error_statistics_table.py"
+SHARED = ("arrival_histories.py",)
 
 
 @pytest.fixture(autouse=True)
 def _small_tables(monkeypatch):
     """Tables that have to grow soon."""
-    for module in (error_statistics_table, pattern_arrays):
-        monkeypatch.setattr(module, "_FIRST_CAPACITY", 8)
+    monkeypatch.setattr(arrival_histories, "_FIRST_CAPACITY", 8)
 
 
 def graph():
-    return patterns_of(PLANT, CHANNEL, certified_error_set(PLANT))
+    return histories_of(PLANT, CHANNEL, certified_error_set(PLANT))
 
 
 def traffic(rng):
@@ -36,9 +35,9 @@ def traffic(rng):
         yield rng.uniform(-1, 1, PLANT.m), rng.uniform(-0.1, 0.1, PLANT.n), ages
 
 
-def alone(patterns, seed):
+def alone(histories, seed):
     """Means, shapes and ages of an estimator."""
-    estimator, samples, seen = Estimator(PLANT, CHANNEL, patterns=patterns), [np.zeros(PLANT.n)], []
+    estimator, samples, seen = Estimator(PLANT, CHANNEL, histories=histories), [np.zeros(PLANT.n)], []
     for step, (u, sample, ages) in enumerate(traffic(np.random.default_rng(seed)), 1):
         samples.append(sample)
         estimator.advance(u, [Packet(step - age, samples[step - age]) for age in ages])
@@ -46,13 +45,13 @@ def alone(patterns, seed):
     return np.array(seen)
 
 
-def together(patterns, seed):
+def together(histories, seed):
     """The same of two vectorized ones, of which the second hears nothing."""
-    estimator, seen = VectorEstimator(PLANT, patterns, 2), []
+    estimator, seen = VectorEstimator(PLANT, histories, 2), []
     for u, sample, ages in traffic(np.random.default_rng(seed)):
         arrivals = [(age, np.array([True, False])) for age in ages]
         estimator.advance(np.stack([u, u], axis=1), np.stack([sample, sample], axis=1), arrivals)
-        shapes = estimator.patterns.table.shapes[estimator.statistics]
+        shapes = estimator.histories.table.shapes[estimator.statistics]
         seen.append([*estimator.mean.ravel(), *shapes.ravel(), *estimator.age])
     return np.array(seen)
 
@@ -63,10 +62,10 @@ def check(fill, stride):
     tried = 0
     for place in places(partial(fill, graph(), 0), stride, *SHARED):
         for later in (0, 499):  # a line that is executed early, and one in the middle
-            patterns = graph()
-            tried += interrupt(place + later, partial(fill, patterns, 0))
+            histories = graph()
+            tried += interrupt(place + later, partial(fill, histories, 0))
             for use, wanted in expected.items():
-                np.testing.assert_array_equal(use(patterns, 1), wanted)
+                np.testing.assert_array_equal(use(histories, 1), wanted)
     assert tried > 10
 
 

@@ -11,7 +11,7 @@ from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.validation import as_count, shown
 
 
-def escape_probability(plant: LinearPlant, channel: Channel, steps: int) -> float:
+def bound_violation_probability(plant: LinearPlant, channel: Channel, steps: int) -> float:
     """Returns a bound on the probability that Gaussian noise leaves a bound of the certificate within some steps.
 
     T delta_w + N delta_v + delta_0 (docs/shield_proof.md, "Gaussian noise"), the union bound over every draw of process

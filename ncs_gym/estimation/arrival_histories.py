@@ -1,0 +1,473 @@
+"""Arrival histories: everything of an estimator but its means, worked out once for whatever arrived when.
+
+Covariances, gains, error shapes and the choice between two replays depend only on when packets arrive, never on what
+they say. Histories form a graph: its nodes are what arrived when, as far as it still matters, its edges are steps in
+time and arrivals. The scalar estimator follows it one node at a time, the vectorized one for all environments at once.
+
+Everything is kept by number in a few large arrays. A graph of many small objects would keep the garbage collector busy
+for tens of milliseconds at a time, and would take several times the memory.
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+import weakref
+from hashlib import blake2b
+from typing import Any
+
+import numpy as np
+
+from ncs_gym.estimation.error_bound import ErrorSet, certified_error_set
+from ncs_gym.estimation.innovation_test import InnovationTest
+from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
+from ncs_gym.network.channel import Channel
+from ncs_gym.network.contract import ChannelContract
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.validation import frozen
+
+# Number of what is not worked out yet; also the age at which a history without new samples begins its replay.
+UNKNOWN = NO_REPLAY = -1
+# Number of the statistics that stand for "no sample is used here": their gain is zero.
+NO_SAMPLE = 0
+# Histories are forgotten but for those in use when there are this many, or when all takes about this much memory.
+MAX_HISTORIES, MAX_BYTES = 1 << 17, 20 << 20
+# A graph takes at least this many times the histories it began with, or it would be forgotten at every step.
+SMALLEST_GROWTH = 4
+# Some sample of these many steps should move an estimate by this share of its distance from the sample.
+FIRST_STEPS, SMALLEST_SHARE = 50, 0.01
+# Of more plants and channels than this, graphs are kept only as long as an estimator uses them.
+MAX_GRAPHS = 32
+# Numbers that arrays have room for to begin with; the room doubles when it is used up.
+_FIRST_CAPACITY = 256
+# What a dictionary takes for a key of bytes and its number, without those bytes.
+_BYTES_PER_KEY = 150
+# Bytes of the hash that statistics are found by: that two of them ever have the same one is out of the question.
+_HASH_SIZE = 16
+
+# The arrays of a table, whose last or first axis is the number.
+_BY_NUMBER_LAST = "gains", "quick_tests"
+_BY_NUMBER = (
+    *("_gains", "_by_columns", "_quick_tests", "_covariances", "_shapes"),
+    *("_after_step", "_after_update", "_recurs", "_ages"),
+)
+# Those of a graph, whose last axis is the history.
+_BY_HISTORY = (
+    *("present", "replay_from", "target", "new_age", "accepted", "arrival", "used"),
+    *("_priors", "_held", "_recurs", "next"),
+)
+
+
+class ErrorTable:
+    """The distinct error statistics met so far, and what a prediction and an update make of each, worked out once.
+
+    The recursion rounds statistics, so that they recur; equal ones have one number. Reading what is there needs no
+    lock; whoever adds to the table holds that of the graph it belongs to.
+
+    Args:
+        recursion: Moves the error statistics.
+        oldest: Ages above this make no difference.
+
+    Attributes:
+        recursion: The same.
+        test: The innovation test.
+        gains: Of an update, by number, shape (n, p, capacity); zero until it is worked out.
+        quick_tests: W of the quick innovation test, by number, shape (p, p, capacity); zero until it is worked out.
+    """
+
+    def __init__(self, recursion: ErrorRecursion, oldest: int) -> None:
+        n, p, size = recursion.plant.n, recursion.plant.p, _FIRST_CAPACITY
+        self.recursion, self._oldest = recursion, oldest
+        self.test = InnovationTest(recursion.plant.H, recursion.sets.noise)
+        self._count = 0
+        self._numbers: dict[bytes, int] = {}
+        self._axes: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self.gains, self.quick_tests = np.zeros((n, p, size)), np.zeros((p, p, size))
+        self._ages, self._after_step, self._after_update = np.zeros((3, size), np.int64)
+        # The same once more, for one at a time. Gains in the order in memory in which they were made: the last bit of a
+        # product depends on it, and who runs an experiment again expects the same numbers.
+        self._gains, self._by_columns = np.zeros((size, n * p)), np.zeros(size, np.bool_)
+        self._quick_tests = np.zeros((size, p, p))
+        self._covariances, self._shapes = np.zeros((2, size, n, n))
+        self._recurs = np.zeros(size, np.bool_)  # whether statistics were met more than once
+        self._after_update[self._add(recursion.first)] = NO_SAMPLE  # which no other statistics are equal to
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def bytes_each(self) -> int:
+        """What the statistics of one number take, about."""
+        n, p = self.recursion.plant.n, self.recursion.plant.p
+        return _BYTES_PER_KEY + _HASH_SIZE + 8 * (2 * n**2 + 2 * n * p + 2 * p**2 + 3) + 2
+
+    @property
+    def shapes(self) -> np.ndarray:
+        """The error shapes Sigma_k by number, shape (count, n, n), read-only: many estimators share them."""
+        return frozen(self._shapes[: self._count])
+
+    def shape(self, number: int) -> np.ndarray:
+        """Returns an error shape Sigma_k, shape (n, n), read-only."""
+        return frozen(self._shapes[number])
+
+    def statistics(self, number: int) -> ErrorStatistics:
+        """Returns statistics by their number, read-only."""
+        return ErrorStatistics(frozen(self._covariances[number]), self.shape(number), self._ages.item(number))
+
+    def age_matters(self, age: int) -> bool:
+        """Returns whether an age is told apart from all larger ones."""
+        return age < self._oldest
+
+    def number_of(self, statistics: ErrorStatistics) -> int:
+        """Returns the number of statistics, a new one if they have not occurred."""
+        age = min(statistics.age, self._oldest)
+        whole = b"".join((statistics.covariance.tobytes(), statistics.shape.tobytes(), age.to_bytes(4, "little")))
+        key = blake2b(whole, digest_size=_HASH_SIZE).digest()
+        number = self._numbers.get(key)
+        if number is None:
+            number = self._add(statistics._replace(age=age))
+            self._numbers[key] = number  # last: if this is interrupted, the statistics have not occurred
+        else:
+            self._recurs[number] = True
+        return number
+
+    def after_step(self, number: int) -> int:
+        """Returns the number of the statistics one step later."""
+        after = self._after_step.item(number)
+        if after == UNKNOWN:
+            after = self.number_of(self.recursion.predicted(self.statistics(number)))
+            self._after_step[number] = after
+        else:
+            self._recurs[after] = True
+        return after
+
+    def after_update(self, number: int) -> int:
+        """Returns the number of the statistics after an update; the same where the sample must not be used."""
+        after = self._after_update.item(number)
+        if after == UNKNOWN:
+            statistics, after = self.statistics(number), number
+            quick_test = self.test.inverse_of_bound(self.test.spread(statistics.shape))
+            if (update := self.recursion.updated(statistics)) is not None:
+                after = self.number_of(update.statistics)
+                self.gains[..., number], self._gains[number] = update.gain, update.gain.ravel(order="K")
+                self._by_columns[number] = not update.gain.flags.c_contiguous
+            self.quick_tests[..., number] = self._quick_tests[number] = quick_test
+            self._after_update[number] = after  # last: another thread may look it up, and then wants the rest too
+        else:
+            self._recurs[after] = True
+        return after
+
+    def update(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the gain of an update that is worked out, shape (n, p), and W of its quick test, (p, p).
+
+        The gain is zero where the sample must not be used.
+        """
+        gain, (n, p, _) = self._gains[number], self.gains.shape
+        gain = gain.reshape(p, n).T if self._by_columns[number] else gain.reshape(n, p)
+        return gain, self._quick_tests[number]
+
+    def mark(self, numbers: np.ndarray) -> None:
+        """Notes that statistics, shape (k,), and what updates make of them recur."""
+        self._recurs[numbers] = True
+        after = self._after_update[numbers]
+        self._recurs[after[after != UNKNOWN]] = True
+
+    def recurring(self, most: int) -> ErrorTable:
+        """Returns a table of the statistics that were met more than once, at most some number of them.
+
+        Those met longest ago come first: what recurs in one table after the other stays.
+        """
+        table = ErrorTable(self.recursion, self._oldest)
+        kept = np.flatnonzero(self._recurs[1 : self._count])[:most] + 1
+        numbers = np.full(self._count + 1, UNKNOWN)  # in the new table; that of UNKNOWN, the last one, is UNKNOWN
+        numbers[NO_SAMPLE], numbers[kept] = NO_SAMPLE, np.arange(1, len(kept) + 1)
+        kept = np.append(NO_SAMPLE, kept)
+        room = np.zeros(_FIRST_CAPACITY, np.int64)
+        for name in (*_BY_NUMBER_LAST, *_BY_NUMBER):
+            axis = -1 if name in _BY_NUMBER_LAST else 0
+            setattr(table, name, np.concatenate([getattr(self, name).take(part, axis) for part in (kept, room)], axis))
+        table._after_step, table._after_update = numbers[table._after_step], numbers[table._after_update]
+        table._recurs[:], table._count = False, len(kept)
+        renumbered = numbers.tolist()
+        table._numbers = {key: renumbered[old] for key, old in self._numbers.items() if renumbered[old] != UNKNOWN}
+        return table
+
+    def innovation_axes(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the axes in which residuals before an update of some statistics are tested exactly."""
+        if number not in self._axes:
+            self._axes[number] = self.test.axes(self.test.spread(self.shape(number)))
+        return self._axes[number]
+
+    def _add(self, statistics: ErrorStatistics) -> int:
+        """Returns the number of new statistics."""
+        number = self._count
+        if number == len(self._ages):
+            for name in _BY_NUMBER_LAST:
+                setattr(self, name, _with_room(getattr(self, name), number))
+            for name in _BY_NUMBER:  # the last one tells how much
+                setattr(self, name, _with_room(getattr(self, name), number, axis=0))
+        self._covariances[number], self._shapes[number], self._ages[number] = statistics
+        self._after_step[number] = self._after_update[number] = UNKNOWN
+        self._gains[number], self._by_columns[number], self._recurs[number] = 0.0, False, False
+        self.gains[..., number] = 0.0
+        self._count = number + 1
+        return number
+
+
+class ArrivalHistories:
+    """The graph of arrival histories of a plant behind a channel, filled as histories are met.
+
+    A history is what an estimator remembers besides means, inputs and samples: the error statistics of its present
+    estimate, those before the update at the step of each age, which of the samples of these steps it holds, and the age
+    of the oldest one that arrived at this step and is not used yet. Two histories that agree in all this have one
+    number. Arrays that estimators look up are UNKNOWN where nothing is worked out yet.
+
+    Args:
+        recursion: Moves the error statistics.
+        channel: Gives the length of the replay buffer.
+        table: Error statistics to begin with; none by default.
+
+    Attributes:
+        recursion: The same.
+        channel: The same.
+        buffer: Age of the oldest sample that is of use [steps].
+        root: Number of the history at the start of an episode.
+        table: The distinct error statistics met so far.
+        is_full: Whether it is time to forget histories that are not in use (`keeping`).
+        present: Statistics of the present estimate, shape (capacity,).
+        replay_from: Age at which the replay of new samples begins, shape (capacity,); NO_REPLAY without any.
+        next: History one step later, shape (capacity,).
+        arrival: History after a sample of each age 0..buffer arrived, shape (buffer + 1, capacity).
+        target: History after the replay of new samples, shape (capacity,); the same where there is nothing to replay.
+        accepted: Whether that replay is kept, shape (capacity,).
+        new_age: Age of the newest sample used after it, shape (capacity,); UNKNOWN where that does not change.
+        used: Statistics before the update at each age, NO_SAMPLE without one, shape (buffer + 1, capacity).
+    """
+
+    def __init__(self, recursion: ErrorRecursion, channel: Channel, table: ErrorTable | None = None) -> None:
+        self.recursion, self.channel = recursion, channel
+        self.buffer, ages, size = channel.longest_delay, recursion.error_set.ages, _FIRST_CAPACITY
+        # Ages above this make no difference: neither to a certified set nor to what the buffer holds.
+        oldest = max(self.buffer + 1, 0 if ages is None else len(ages.shapes))
+        self.table = ErrorTable(recursion, oldest) if table is None else table
+        held_ages = self.buffer + 1
+        self._key = f"{held_ages + 2}q{held_ages}?"
+        self._count = 0
+        self._numbers: dict[bytes, int] = {}
+        self._bytes_each = _BYTES_PER_KEY + struct.calcsize(self._key) + 8 * (6 + 3 * held_ages) + 1 + held_ages
+        self.present, self.replay_from, self.next, self.target, self.new_age = np.zeros((5, size), np.int64)
+        self.arrival, self.used, self._priors = np.zeros((3, held_ages, size), np.int64)
+        self._held, self.accepted = np.zeros((held_ages, size), np.bool_), np.zeros(size, np.bool_)
+        self._recurs = np.zeros(size, np.bool_)  # whether a step led here more than once
+        self._ahead: dict[int, np.ndarray] = {}  # by number of steps, then by number of the statistics
+        self._lock = threading.RLock()
+        # Weak, or an estimator that never moves on from this graph would keep all that came after it.
+        self._successor: weakref.ref[ArrivalHistories] | None = None
+        self._adopted_count, self.is_full = 0, False
+        first = self.table.number_of(recursion.first)
+        self.root = self._number_of(first, (UNKNOWN,) * held_ages, (False,) * held_ages, NO_REPLAY)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> ArrivalHistories:
+        return self  # shared by all estimators; nothing in it belongs to one of them
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leaves out the lock, which cannot be pickled."""
+        return vars(self) | {"_lock": None, "_successor": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state | {"_lock": threading.RLock()})
+
+    def after_step(self, history: int) -> int:
+        """Returns the number of the history one step later, before anything arrives."""
+        after = self.next.item(history)
+        if after == UNKNOWN:
+            with self._lock:
+                present, priors, held, _ = self._history(history)
+                predicted = self.table.after_step(present)
+                after = self._number_of(predicted, (predicted, *priors[:-1]), (False, *held[:-1]), NO_REPLAY)
+                self.next[history] = after
+        else:
+            self._recurs[after] = True
+        return after
+
+    def after_arrival(self, history: int, age: int) -> int:
+        """Returns the number of the history with one more sample, of some age; the same where it is of no use.
+
+        Samples older than the buffer, from before the first step or received before are of no use.
+        """
+        if not 0 <= age <= self.buffer:
+            return history
+        after = self.arrival.item(age, history)
+        if after == UNKNOWN:
+            with self._lock:
+                present, priors, held, replay_from = self._history(history)
+                after = history
+                if priors[age] != UNKNOWN and not held[age]:
+                    held = (*held[:age], True, *held[age + 1 :])
+                    after = self._number_of(present, priors, held, max(replay_from, age))
+                self.arrival[age, history] = after
+        return after
+
+    def after_replay(self, history: int) -> int:
+        """Returns the number of the history once the samples that arrived at this step are used, or are not."""
+        target = self.target.item(history)
+        if target == UNKNOWN:
+            with self._lock:
+                target = self._replayed(history)
+        return target
+
+    def predicted(self, statistics: int, steps: int) -> int:
+        """Returns the number of what some steps without a sample make of statistics, by their number."""
+        with self._lock:
+            for _ in range(steps):
+                statistics = self.table.after_step(statistics)
+        return statistics
+
+    def predicted_many(self, statistics: np.ndarray, steps: int) -> np.ndarray:
+        """Returns what `predicted` does for many statistics, given and returned by their numbers, shape (N,)."""
+        if steps == 0:
+            return statistics
+        known = self._ahead.get(steps, np.full(0, UNKNOWN))
+        if (count := len(self.table)) > len(known):
+            known = self._ahead[steps] = np.concatenate([known, np.full(count, UNKNOWN)])
+        ahead = known.take(statistics)
+        unknown = ahead == UNKNOWN
+        if unknown.any():
+            for number in np.unique(statistics[unknown]).tolist():
+                known[number] = self.predicted(number, steps)
+            ahead = known.take(statistics)
+        return ahead
+
+    @property
+    def uses_samples(self) -> bool:
+        """Whether a sample of one of the first steps moves the estimate towards it, if it arrives at once."""
+        number, H = self.present.item(self.root), self.recursion.plant.H
+        with self._lock:
+            for _ in range(FIRST_STEPS):
+                number = self.table.after_step(number)
+                self.table.after_update(number)
+                if np.diagonal(H @ self.table.update(number)[0]).max() >= SMALLEST_SHARE:
+                    return True
+        return False
+
+    def keeping(self, histories: np.ndarray) -> tuple[ArrivalHistories, np.ndarray]:
+        """Returns a graph with some histories, shape (k,), only, and their numbers there.
+
+        Error statistics that recurred are kept as well, since they take the longest to work out.
+        """
+        with self._lock:
+            successor = None if self._successor is None else self._successor()
+            if successor is None or successor.is_full:
+                self.table.mark(self.present[: self._count][self._recurs[: self._count]])
+                table = self.table.recurring(MAX_BYTES // (4 * self.table.bytes_each))
+                successor = ArrivalHistories(self.recursion, self.channel, table)
+                self._successor = weakref.ref(successor)
+            for key, shared in list(_shared.items()):
+                if shared is self:
+                    _shared[key] = successor
+        numbers = successor._adopted(self, np.unique(histories).tolist())
+        return successor, np.array([numbers[each] for each in histories.tolist()], np.int64)
+
+    def taking_over(self, other: ArrivalHistories, histories: np.ndarray) -> np.ndarray:
+        """Returns the numbers here of histories, shape (k,), of a graph with fewer delays of the same plant."""
+        numbers = self._adopted(other, np.unique(histories).tolist())
+        return np.array([numbers[each] for each in histories.tolist()], np.int64)
+
+    def _adopted(self, other: ArrivalHistories, histories: list[int]) -> dict[int, int]:
+        """Returns the numbers of another graph's histories."""
+
+        def same(number: int) -> int:
+            return number if number == UNKNOWN else self.table.number_of(other.table.statistics(number))
+
+        numbers, older = {}, self.buffer - other.buffer
+        with self._lock:
+            for each in histories:
+                present, priors, held, replay_from = other._history(each)
+                known = (*map(same, priors), *[UNKNOWN] * older)
+                numbers[each] = self._number_of(same(present), known, (*held, *[False] * older), replay_from)
+            self._adopted_count, self.is_full = max(self._adopted_count, len(histories)), False
+        return numbers
+
+    def _history(self, number: int) -> tuple[int, tuple[int, ...], tuple[bool, ...], int]:
+        """Returns what a history is: present statistics, priors and samples held by age, and where a replay begins."""
+        priors, held = self._priors[:, number].tolist(), self._held[:, number].tolist()
+        return self.present.item(number), tuple(priors), tuple(held), self.replay_from.item(number)
+
+    def _number_of(self, present: int, priors: tuple[int, ...], held: tuple[bool, ...], replay_from: int) -> int:
+        """Returns the number of a history, a new one if it has not occurred."""
+        key = struct.pack(self._key, present, replay_from, *priors, *held)
+        number = self._numbers.get(key)
+        if number is None:
+            number = self._count
+            if number == len(self.next):
+                for name in _BY_HISTORY:  # the last one tells how much
+                    setattr(self, name, _with_room(getattr(self, name), number))
+            self.present[number], self.replay_from[number] = present, replay_from
+            self._priors[:, number], self._held[:, number] = priors, held
+            self.next[number] = self.arrival[:, number] = self.new_age[number] = UNKNOWN
+            self.target[number] = number if replay_from == NO_REPLAY else UNKNOWN
+            self.accepted[number], self._recurs[number], self.used[:, number] = False, False, NO_SAMPLE
+            self._count = number + 1
+            self._numbers[key] = number  # last: if this is interrupted, the history has not occurred
+            size = self._count * self._bytes_each + len(self.table) * self.table.bytes_each
+            is_large = self._count >= MAX_HISTORIES or size >= MAX_BYTES
+            self.is_full = is_large and self._count >= SMALLEST_GROWTH * self._adopted_count
+        return number
+
+    def _replayed(self, history: int) -> int:
+        """Works out the history from its oldest new sample on, and whether it is kept; returns the number then."""
+        present, priors, held, oldest = self._history(history)
+        table, replayed, used, number = self.table, list(priors), [NO_SAMPLE] * (oldest + 1), present
+        for age in range(oldest, -1, -1):
+            number = replayed[age]
+            if held[age]:
+                used[age] = number
+                number = table.after_update(number)
+            if age > 0:
+                replayed[age - 1] = table.after_step(number)
+        accepted = self.recursion.prefers(table.statistics(number), table.statistics(present))
+        if accepted:
+            present, priors = number, tuple(replayed)
+            age = table.statistics(number).age
+            self.new_age[history] = age if table.age_matters(age) else UNKNOWN
+        target = self._number_of(present, priors, held, NO_REPLAY)
+        self.accepted[history], self.used[: oldest + 1, history] = accepted, used
+        self.target[history] = target  # last: another thread may look it up, and then wants the rest too
+        return target
+
+
+def _with_room(array: np.ndarray, count: int, axis: int = -1) -> np.ndarray:
+    """Returns an array with room for twice as many numbers along an axis; the same if it has it already."""
+    if array.shape[axis] > count:  # growing was interrupted before
+        return array
+    return np.concatenate([array, np.zeros_like(array)], axis=axis)
+
+
+_shared: dict[tuple[str, Channel, ChannelContract | None], ArrivalHistories] = {}
+
+
+def arrival_histories(plant: LinearPlant, channel: Channel, contract: ChannelContract | None) -> ArrivalHistories:
+    """Returns the graph that all estimators of a plant behind a channel share in this process.
+
+    Raises:
+        UnstablePlantError: If the plant is not Schur stable and there is no contract.
+        ErrorSetError: If no error set is found.
+    """
+    # Only delays and quantization matter to it, not how packets are lost or when they are sent.
+    kept = Channel(quantization_step=channel.quantization_step, delay=channel.delay, jitter=channel.jitter)
+    key = plant.fingerprint, kept, contract
+    histories = _shared.pop(key, None)
+    if histories is None:
+        histories = histories_of(plant, kept, certified_error_set(plant, contract))
+    _shared[key] = histories
+    if len(_shared) > MAX_GRAPHS:  # the one that was asked for the longest ago
+        _shared.pop(next(iter(_shared)), None)
+    return histories
+
+
+def histories_of(plant: LinearPlant, channel: Channel, error_set: ErrorSet, **precision: Any) -> ArrivalHistories:
+    """Returns a graph of its own; see `ErrorRecursion` for the precision of covariances and shapes."""
+    return ArrivalHistories(ErrorRecursion(plant, channel.quantization_step, error_set, **precision), channel)
