@@ -28,7 +28,7 @@ from shields import Certificate, SafetyFilter, VectorSafetyShield, synthesize
 from shields.synthesis.certification import with_polytope
 
 IDS = {"TruckTrailer": 8, "TruckTrailerCruise": 8, "CartPole": 4, "BatchReactor": 4}
-BLOCKS, REPEATS = 40, 50
+BLOCKS, REPEATS = 200, 10
 
 
 def behind(name: str, plant: LinearPlant, certificate: Certificate, steps: int) -> tuple[float, float]:
@@ -77,6 +77,8 @@ def stepping(name: str, plant: LinearPlant, number: int) -> Callable[[], object]
     env = gym.make(path, **settings).unwrapped if number == 1 else gym.make_vec(path, num_envs=number, **settings)
     action = 0.0 * env.action_space.sample()
     env.reset(seed=0)
+    for _ in range(300):  # patterns of arrivals are worked out when they occur first
+        env.step(action)
     return lambda: env.step(action)
 
 
@@ -110,12 +112,14 @@ def main() -> None:
         works += [[stepping(name, plant, number) for plant in plants] for number in (1, 64)]
         times = [ratios(pair) for pair in works]
         for k, (plant, certificate) in enumerate(zip(plants, found, strict=True)):
-            recorded, polytope = certificate.provenance, certificate.polytope
+            recorded, rows = (
+                certificate.provenance,
+                0 if certificate.polytope is None else len(certificate.polytope.rows),
+            )
             overridden, reward = behind(name, plant, certificate, options.steps)
             print(
                 f"{name:<20} {plant.between_samples or 1:>2} {recorded['share_of_box']:>6.1%}"
-                f" {recorded.get('polytope_share_of_box', np.nan):>6.1%}"
-                f" {0 if polytope is None else len(polytope.rows):>5}"
+                f" {recorded.get('polytope_share_of_box', np.nan):>6.1%} {rows:>5}"
                 f" {seconds[k]:>5.1f} {overridden:>11.1%} {reward:>8.4f} {left(name, plant, options.steps):>6.3f}"
                 f" {times[0][k]:>9.2f} {times[1][k]:>6.2f} {times[2][k]:>10.2f}",
                 flush=True,

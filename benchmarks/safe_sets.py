@@ -1,16 +1,22 @@
 """How much of its box each safe set fills, next to what no controller can exceed; a picture of the sets.
 
     python benchmarks/safe_sets.py [--ids CartPole BatchReactor] [--points 512] [--picture docs/images/safe-sets.png]
+    python benchmarks/safe_sets.py --gains
 
 "bound" is the share of states from which some inputs within the limits keep the plant in the box for `STEPS` steps if
 the state is known and nothing disturbs it: a linear program for each of `--points` states spread over the box. The
 picture shows sections through the origin: states that are not on an axis are zero.
+
+With `--gains` it prints instead what the largest polytope of other gains than the certified one fills: of
+linear-quadratic regulators, by the weight of inputs (in units of their limits) against states (in units of the box).
+The error sets stay, which do not depend on the gain.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -23,12 +29,16 @@ from scipy.stats import qmc
 import ncs_gym  # noqa: F401  (registers the environments)
 from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below, with_unit
 from ncs_gym import LinearPlant
-from shields import Certificate, synthesize
+from shields import Certificate, Infeasible, synthesize
+from shields.runtime.backup_plans.planner import regulator
+from shields.synthesis.invariant_polytope import invariant_polytope, share_in_polytope
 
 IDS = ("TruckTrailerCruise", "CartPole", "BatchReactor", "Pendulum")
 # The two states that are shown where there are more: angle and rate of the pole; the reactor's first and third.
 PLANES = {"CartPole": (2, 3), "BatchReactor": (0, 2)}
 STEPS = 100
+# Weights of inputs against states in the regulators of `--gains`.
+WEIGHTS = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 # Sets, and their colors, apart for color-blind readers (Okabe and Ito).
 COLORS = {"upper bound": "#999999", "polytope": "#0072b2", "ellipsoid": "#d55e00"}
 
@@ -85,7 +95,7 @@ def row(name: str, certificate: Certificate, viability: Viability, plant: Linear
 
 def picture(cases: dict[str, tuple[LinearPlant, Certificate, Viability]]) -> CaptionedFigure:
     """Sections of the sets, a panel for each environment."""
-    angles = np.linspace(0.0, np.pi, 90, endpoint=False)
+    angles = np.linspace(0.0, np.pi, 120, endpoint=False)  # the corners of the box among them
     with matplotlib.rc_context(STYLE):
         figure, handles = CaptionedFigure((3.1 * len(cases), 3.3)), {}
         panels = np.atleast_1d(figure.subplots(1, len(cases)))
@@ -95,15 +105,32 @@ def picture(cases: dict[str, tuple[LinearPlant, Certificate, Viability]]) -> Cap
             directions[:, plane] = np.column_stack([np.cos(angles), np.sin(angles)]) * plant.half_widths[list(plane)]
             for each, reach in reaches(certificate, viability).items():
                 half = directions[:, plane] * np.array([reach(v) for v in directions])[:, None]
-                handles[each] = axes.fill(*np.concatenate([half, -half]).T, color=COLORS[each], alpha=0.35, lw=0)[0]
-                axes.plot(*np.concatenate([half, -half, half[:1]]).T, color=COLORS[each], lw=1.3)
-            (i, j), widths = plane, plant.half_widths
-            box = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * widths[list(plane)]
+                outline = np.concatenate([half, -half, half[:1]]).T
+                if each != "ellipsoid":
+                    axes.fill(*outline, color=COLORS[each], alpha=0.25, lw=0)
+                (handles[each],) = axes.plot(*outline, color=COLORS[each], lw=1.5)
+            box = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * plant.half_widths[list(plane)]
             (handles["safe box"],) = axes.plot(*box.T, color="#222222", lw=1.0, ls="--")
-            names = [with_unit(plant.state_names[k], plant.state_units[k]) for k in (i, j)]
+            names = [with_unit(plant.state_names[k], plant.state_units[k]) for k in plane]
             label(axes, *names, name)
         legend_below(figure, handles)
         return figure
+
+
+def print_shares_of_gains(names: list[str]) -> None:
+    """Prints the shares of the polytopes of several gains, a row for each environment."""
+    print(f"{'share of the box, by gain':28}{'certified':>10}" + "".join(f"{f'LQR {w:g}':>10}" for w in WEIGHTS))
+    for name in names:
+        env = gym.make(f"ncs_gym/{name}-v0").unwrapped
+        certificate = synthesize(env.plant, contract=env.certificate_contract, safe_set="ellipsoid")
+        texts = []
+        for gain in (certificate.K, *(regulator(env.plant, weight) for weight in WEIGHTS)):
+            try:
+                polytope = invariant_polytope(replace(certificate, K=gain), env.plant, lambda line: None)
+                texts.append(f"{share_in_polytope(polytope, env.plant):10.1%}")
+            except Infeasible:
+                texts.append(f"{'none':>10}")
+        print(f"{name:28}{''.join(texts)}", flush=True)
 
 
 def main() -> None:
@@ -111,7 +138,11 @@ def main() -> None:
     parser.add_argument("--ids", nargs="*", default=IDS)
     parser.add_argument("--points", type=int, default=512)
     parser.add_argument("--picture", type=Path, default=None, help="PNG file")
+    parser.add_argument("--gains", action="store_true", help="compare gains instead")
     options = parser.parse_args()
+    if options.gains:
+        print_shares_of_gains(options.ids)
+        return
     cases = {}
     print("share of the box    ellipsoid polytope    bound")
     for name in options.ids:

@@ -16,7 +16,7 @@ from ncs_gym.plants.linear_plant import inflated
 from ncs_gym.validation import shown
 from shields.certificate import Certificate, Proof, Updates
 from shields.certificate_text import size_of
-from shields.errors import Infeasible, SynthesisInterrupted
+from shields.errors import CertificateError, Infeasible, SynthesisInterrupted
 from shields.synthesis.alternating_optimization import largest_set, with_best_gain
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem, design_problem
 from shields.synthesis.diagnosis import infeasibility, with_feasible_bounds
@@ -128,6 +128,8 @@ def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progre
         reason = f"in exact arithmetic {failed.name} fails by {-failed.margin:.3g}"
     except Infeasible as none:
         reason = str(none)
+    except (ArithmeticError, ValueError, CertificateError) as error:  # numbers that a linear program cannot hold
+        reason = f"its numbers are out of reach of float64 ({error})"
     except KeyboardInterrupt as interrupt:
         message = "interrupted while a polytope was sought; the certificate has the ellipsoid"
         raise SynthesisInterrupted(message, certificate) from interrupt

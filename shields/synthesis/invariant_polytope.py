@@ -51,10 +51,27 @@ def invariant_polytope(certificate: Certificate, plant: LinearPlant, progress: C
         Infeasible: If there is none within `MOST_ROWS` rows and `LONGEST_SEARCH` seconds; the message says why.
     """
     step = _ClosedLoop(certificate, plant)
-    rows = step.first_rows()
-    kept = len(plant.box_rows)
-    if plant.grid_rows is not None:  # those of the grid may imply those of the box, which need not be followed then
-        rows, _ = _without_implied(rows, kept)
+    return _rounded(step, invariant_rows(step.first_rows(), step.predecessor, len(plant.box_rows), progress))
+
+
+def invariant_rows(
+    rows: np.ndarray,
+    predecessor: Callable[[np.ndarray], np.ndarray],
+    kept: int,
+    progress: Callable[[str], object] = lambda line: None,
+) -> np.ndarray:
+    """Returns the rows of the largest polytope in another one whose states stay in it, shape (r, n).
+
+    Args:
+        rows: Of the other one, |row z| <= 1, shape (k, n), in coordinates of similar size.
+        predecessor: Of a row, shape (n,), what states fulfil exactly if the next ones fulfil the row for sure.
+        kept: So many of the first rows stay even where others imply them; such rows are not followed then.
+        progress: Called with a line of text now and then.
+
+    Raises:
+        Infeasible: If there are none within `MOST_ROWS` rows and `LONGEST_SEARCH` seconds, or `predecessor` raises it.
+    """
+    rows, _ = _without_implied(rows, kept)
     deadline, following = time.monotonic() + LONGEST_SEARCH, 0
     while following < len(rows):
         if following < kept and _largest(np.delete(rows, following, axis=0), rows[following])[0] <= 1.0 + _IMPLIED:
@@ -63,17 +80,17 @@ def invariant_polytope(certificate: Certificate, plant: LinearPlant, progress: C
         if len(rows) > MOST_ROWS:  # what later ones imply leads nowhere else, either
             rows, following = _without_implied(rows, kept, following)
             if len(rows) > _LEAST_PRUNED * MOST_ROWS:
-                raise _none(f"it would need more than {MOST_ROWS} rows")
+                raise _none(f"it would need more than {MOST_ROWS} rows, fewer with longer steps or less disturbance")
         if time.monotonic() > deadline:
-            raise _none(f"its search took longer than {LONGEST_SEARCH:g} s")
+            raise _none(f"its search took longer than {LONGEST_SEARCH:g} s, less with fewer states or longer steps")
         if following % 50 == 0:
             progress(f"polytope: {len(rows)} rows")
-        row = step.predecessor(rows[following])
+        row = predecessor(rows[following])
         if _largest(rows, row)[0] > 1.0 + _IMPLIED:
             rows = np.concatenate([rows, row[None]])
         following += 1
     progress(f"polytope: which of {len(rows)} rows count")
-    return _rounded(step, _without_implied(rows, kept)[0])
+    return _without_implied(rows, kept)[0]
 
 
 def share_in_polytope(polytope: Polytope, plant: LinearPlant) -> float | None:
@@ -138,10 +155,10 @@ class _ClosedLoop:
         """
         allowed = self._plant.u_max * (1.0 - float(ACTION_ROUNDING) - _RESERVE) - self._reach(self._K)
         if (allowed <= 0.0).any():
-            raise _none("the error of the estimate alone takes an input beyond its limit")
+            raise _none("the error of the estimate alone takes an input beyond its limit; better sensors leave room")
         rows, (images, left) = np.concatenate([self._plant.box_rows, self._K / allowed[:, None]]), self._on_grid()
         if (left <= 0.0).any():
-            raise _none("errors and disturbances alone leave the box between two samples")
+            raise _none("errors and disturbances alone leave the box between two samples; smaller bounds leave room")
         return np.concatenate([rows, images / left[:, None]]) * self.widths
 
     def _on_grid(self) -> tuple[np.ndarray, np.ndarray]:
@@ -160,7 +177,7 @@ class _ClosedLoop:
         left = 1.0 - _RESERVE - float(self._reach(pushed @ self._K)) - math.sqrt(physical @ self._D @ physical)
         left -= float(ACTION_ROUNDING) * float(np.abs(pushed) @ self._plant.u_max)
         if left <= 0.0:
-            raise _none("errors and disturbances alone leave one of its faces")
+            raise _none("errors and disturbances alone leave one of its faces; smaller bounds leave room")
         return (physical @ self.next) * self.widths / left
 
     def _reach(self, rows: np.ndarray) -> np.ndarray:

@@ -68,13 +68,15 @@ def test_file_holds_the_polytope_and_one_without_is_as_before(tmp_path):
     assert "the polytope" not in str(certificate)
 
 
-def test_default_is_the_ellipsoid_bit_for_bit():
+def test_default_has_a_polytope_around_the_same_ellipsoid_bit_for_bit():
     plant = random_plant(3, 2, 1)
-    plain = synthesize(plant)
-    wide = synthesize(plant, safe_set="polytope")
-    assert plain == synthesize(plant, safe_set="ellipsoid")
+    plain = synthesize(plant, safe_set="ellipsoid")
+    wide = synthesize(plant)
+    assert wide == synthesize(plant, safe_set="polytope")
     assert plain.polytope is None
+    assert "none was sought" in str(plain)
     assert wide.polytope is not None
+    assert "none was sought" not in str(wide)
     np.testing.assert_array_equal(wide.L, plain.L)
 
 
@@ -216,7 +218,11 @@ def test_without_a_polytope_within_the_limits_the_certificate_says_why(monkeypat
     monkeypatch.setattr(search, "MOST_ROWS", 50)
     narrow = with_polytope(certificate, plant)
     assert narrow.polytope is None
-    assert "more than 50 rows; shields keep the state in the ellipsoid" in " ".join(str(narrow).split())
+    text = " ".join(str(narrow).split())
+    assert (
+        "more than 50 rows, fewer with longer steps or less disturbance; shields keep the state in the ellipsoid"
+        in text
+    )
     monkeypatch.setattr(search, "MOST_ROWS", 400)
     monkeypatch.setattr(search, "LONGEST_SEARCH", -1.0)
     assert "longer than" in with_polytope(certificate, plant).provenance["no_polytope"]
@@ -232,7 +238,7 @@ def test_errors_that_leave_a_face_alone_leave_no_polytope():
 
 def test_interrupted_search_keeps_the_ellipsoid():
     plant = random_plant(3, 2, 1)
-    certificate = synthesize(plant)
+    certificate = synthesize(plant, safe_set="ellipsoid")
 
     def interrupt(line):
         raise KeyboardInterrupt
@@ -242,7 +248,19 @@ def test_interrupted_search_keeps_the_ellipsoid():
     assert caught.value.certificate == certificate
 
 
-@pytest.mark.parametrize("wrong", ["Polytope", None, 3, ["polytope"]])
+def test_numbers_out_of_reach_leave_the_ellipsoid(monkeypatch):
+    certificate, plant = found("BatchReactor")[1:]
+
+    def failing(*_, **__):
+        raise ValueError("A_ub must not contain values inf, nan, or None")
+
+    monkeypatch.setattr(search, "linprog", failing)
+    narrow = with_polytope(certificate, plant)
+    assert narrow.polytope is None
+    assert "out of reach of float64" in narrow.provenance["no_polytope"]
+
+
+@pytest.mark.parametrize("wrong", ["Polytope", 0, 3, ["polytope"]])
 def test_unknown_kinds_of_sets_are_refused(wrong):
     with pytest.raises(ValueError, match="safe_set must be"):
         synthesize(random_plant(3, 2, 1), safe_set=wrong)

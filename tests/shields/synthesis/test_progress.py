@@ -23,7 +23,7 @@ def interrupting_at(stage):
 
 def test_every_stage_says_what_is_sought_and_the_volume_reached(loaded):
     lines = []
-    certificate = synthesize(loaded, progress=lines.append)
+    certificate = synthesize(loaded, safe_set="ellipsoid", progress=lines.append)
     assert lines[0] == "error set"
     assert lines[1].startswith("initial design 1 of 14: ")
     assert any(line.startswith("alternation 1 of at most 40: ") for line in lines)
