@@ -35,7 +35,7 @@ LAYERS = {
         {"json_documents", "polytope"},
         {"certificate"},
         {"verification", "paper", "synthesis"},
-        {"runtime", "downlink"},
+        {"runtime"},
         {"nodes"},
     ),
     "agents": (
