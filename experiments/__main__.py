@@ -34,6 +34,7 @@ COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
     "render": ("RenderSettings", "experiments.commands.render:render", {"render": ("pygame",)}),
     "synthesize": ("SynthesizeSettings", "experiments.commands.synthesize:synthesize", {}),
     "verify": ("VerifySettings", "experiments.commands.verify:verify", {}),
+    "requirements": ("RequirementsSettings", "experiments.commands.requirements:requirements", {}),
     "attack": ("CertifySettings", "experiments.commands.attack:attack", {}),
     "audit": ("AuditSettings", "experiments.commands.audit:audit", {}),
     "reproduce": ("ReproduceSettings", "experiments.commands.reproduce:reproduce", {}),

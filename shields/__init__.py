@@ -15,7 +15,7 @@ from shields.runtime import Decision, SafeLoop, SafetyFilter, SafetyShield, Vect
 from shields.verification import Condition, Report, verify
 
 if TYPE_CHECKING:
-    from shields.synthesis import certify, synthesize
+    from shields.synthesis import Network, Requirement, Requirements, certify, requirements, synthesize
 
 __all__ = [
     "Certificate",
@@ -26,22 +26,26 @@ __all__ = [
     "GuaranteeLostWarning",
     "Infeasible",
     "Multipliers",
+    "Network",
     "Polytope",
     "Proof",
     "Report",
+    "Requirement",
+    "Requirements",
     "SafeLoop",
     "SafetyFilter",
     "SafetyShield",
     "Updates",
     "VectorSafetyShield",
     "certify",
+    "requirements",
     "synthesize",
     "verify",
 ]
 
 
 # Imported at first use: these need the solver.
-_LAZY = {"certify": "synthesis", "synthesize": "synthesis"}
+_LAZY = dict.fromkeys(("Network", "Requirement", "Requirements", "certify", "requirements", "synthesize"), "synthesis")
 
 
 def __getattr__(name: str) -> Any:

@@ -6,6 +6,7 @@ from experiments.settings.certificates import (
     AuditSettings,
     CertifySettings,
     ReproduceSettings,
+    RequirementsSettings,
     SynthesizeSettings,
     VerifySettings,
 )
@@ -30,6 +31,7 @@ __all__ = [
     "LearningSettings",
     "RenderSettings",
     "ReproduceSettings",
+    "RequirementsSettings",
     "StudySettings",
     "SweepSettings",
     "SynthesizeSettings",
