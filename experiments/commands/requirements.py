@@ -76,11 +76,9 @@ def requirements(settings: RequirementsSettings) -> None:
         for name, table in zip(("share", "tolerance"), tables, strict=False):
             figure = table.figure(today)
             figures[name] = (figure.caption, figure.png)
-        certificates = {
-            str(point.certificate.checksum): point.certificate for point in found.points if point.certificate
-        }
-        for checksum, certificate in certificates.items():
-            certificate.save(store.place_of(checksum))
+        for point in found.points:
+            if point.certificate is not None:
+                point.certificate.save(store.place_of(point.certificate.checksum))
         cheapest = found.cheapest(settings.keep / 100.0)
         summary = found.document | {
             "command": "requirements",
@@ -93,11 +91,9 @@ def requirements(settings: RequirementsSettings) -> None:
         write_results(settings.out, summary, figures=figures)
     for table in tables:
         print(table.text, end="\n\n")
-    for sentence in (
-        *map(_boundary_text, found.largest_ages),
-        _today_text(found, today),
-        _cheapest_text(found, settings),
-    ):
+    sentences = [*map(_boundary_text, found.largest_ages), _today_text(found, today)]
+    sentences += [_cheapest_text(found, settings.keep, None), _cheapest_text(found, settings.keep, today)]
+    for sentence in sentences:
         if sentence:
             print(wrapped(sentence))
     print(f"files: {settings.out}")
@@ -328,11 +324,12 @@ def _today_text(found: Requirements, today: Network | None) -> str:
     return "" if index is None else f"Today: {_description(found.points[index])}."
 
 
-def _cheapest_text(found: Requirements, settings: RequirementsSettings) -> str:
-    cheapest = found.cheapest(settings.keep / 100.0)
+def _cheapest_text(found: Requirements, keep: float, bearing: Network | None) -> str:
+    cheapest = found.cheapest(keep / 100.0, bearing)
     if cheapest is None:
-        return "No certificate was found for any of these networks."
-    return f"Cheapest that keeps {settings.keep:g} % of the largest share: {_description(cheapest)}."
+        return "" if bearing else "No certificate was found for any of these networks."
+    what = "Cheapest" if bearing is None else "Cheapest that bears the losses and delays of today"
+    return f"{what}, with at least {keep:g} % of the largest share: {_description(cheapest)}."
 
 
 def _description(point: Requirement) -> str:

@@ -16,7 +16,7 @@ from experiments.plots.figure_style import STYLE, CaptionedFigure, label
 from experiments.plots.heatmaps import draw_field
 
 _COLUMNS = 3
-_BOUNDARY, _TODAY = "#c1272d", "#111111"
+_BOUNDARY, _TODAY = "#c1272d", "#ff9800"
 
 
 def requirements_map(
@@ -44,11 +44,11 @@ def requirements_map(
         max(0.9 + (0.42 * len(rows[1]) + 0.6) * down, 2.8),
     )
     caption = (
-        f"A field is a network, its number the {quantity}, proved by a certificate. In the empty fields, beyond the red "
-        "line, no certificate was found, which does not prove that there is none."
+        f"A field is a network, its number the {quantity}, proved by a certificate. In the empty fields, beyond the "
+        "red line, no certificate was found, which does not prove that there is none."
     )
     if today is not None:
-        caption += " The black frame is the channel of today."
+        caption += " The orange frame is the channel of today."
     with matplotlib.rc_context(STYLE), matplotlib.rc_context({"axes.grid": False}):
         figure = CaptionedFigure(size, caption)
         axes = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
@@ -60,7 +60,7 @@ def requirements_map(
             _draw_boundary(axis, np.isfinite(panel))
             if today is not None and today[0] == title:
                 corner = (today[2] - 0.5, today[1] - 0.5)
-                axis.add_patch(Rectangle(corner, 1.0, 1.0, fill=False, color=_TODAY, linewidth=2.0, zorder=3))
+                axis.add_patch(Rectangle(corner, 1.0, 1.0, fill=False, color=_TODAY, linewidth=3.0, zorder=3))
             axis.set_xticks(range(len(columns[1])), [_shown(value) for value in columns[1]])
             axis.set_yticks(range(len(rows[1])), [_shown(value) for value in rows[1]])
             axis.tick_params(length=0)

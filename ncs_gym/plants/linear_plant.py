@@ -392,9 +392,7 @@ class LinearPlant(ReadOnlyArrays):
         A, B = statespace.zero_order_hold(Ac, Bc, dt)
         of_constant = [statespace.zero_order_hold(Ac, np.eye(self.n), step)[1] for step in (dt, self.dt)]
         if np.linalg.cond(of_constant[1]) > LARGEST_CONDITION:
-            raise ValueError(
-                f"a step of {self.dt:g} s hides how disturbances act in continuous time: give a shorter dt"
-            )
+            raise ValueError(f"a step of {self.dt:g} s hides how disturbances act in continuous time: shorten dt")
         G = exact.product(of_constant[0], exact.inverse(of_constant[1]))
         ball = Ellipsoid(self.gamma * np.eye(self.n))
         bound = _ellipsoid_around_sum(ball, self.disturbance_bound, self.relative_weight)

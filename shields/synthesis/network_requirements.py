@@ -88,6 +88,22 @@ class Network:
         return inf if self.contract is None else self.contract.max_age
 
     @property
+    def most_losses(self) -> float:
+        """Most packets that are lost in a row, infinite without a limit."""
+        return inf if self.losses is None else self.losses
+
+    def bears(self, other: Network) -> bool:
+        """Returns whether this network may lose as many packets as another one, and delay samples and inputs as long.
+
+        Delays are compared in seconds.
+        """
+        late, late_inputs = (
+            size(self) * self.sampling_period >= (1.0 - 1e-9) * size(other) * other.sampling_period
+            for size in (lambda each: each.delay + each.jitter, lambda each: each.input_delay)
+        )
+        return self.most_losses >= other.most_losses and late and late_inputs
+
+    @property
     def packets_per_second(self) -> float:
         """Samples that are sent in a second."""
         return 1.0 / (self.send_period * self.sampling_period)
@@ -163,23 +179,29 @@ class Requirements:
         """The largest share of the box that any network keeps."""
         return max(point.share for point in self.points)
 
-    def cheapest(self, keep: float = 0.9) -> Requirement | None:
+    def cheapest(self, keep: float = 0.9, bearing: Network | None = None) -> Requirement | None:
         """Returns the network with the fewest packets per second that keeps this fraction of the largest share.
 
         Among several the one with the fewest bits per second, then the one that may lose and delay most. None if
-        nothing certifies.
+        there is none.
+
+        Args:
+            keep: Fraction of the largest share, in (0, 1].
+            bearing: Only networks that may lose and delay as much as this one count; None for all.
 
         Raises:
             ValueError: If the fraction is not in (0, 1].
         """
         as_number(keep, "keep", low=0.0, high=1.0, low_open=True)
-        enough = [p for p in self.points if p.certificate is not None and p.share >= keep * self.largest_share]
+        least = keep * self.largest_share
+        enough = [point for point in self.points if point.certificate is not None and point.share >= least]
+        if bearing is not None:
+            enough = [point for point in enough if point.network.bears(bearing)]
 
         def cost(point: Requirement) -> tuple[float, ...]:
             network = point.network
-            forgiving = inf if network.losses is None else network.losses
             late = network.delay + network.jitter + network.input_delay
-            return network.packets_per_second, point.bits_per_second, -forgiving, -late
+            return network.packets_per_second, point.bits_per_second, -network.most_losses, -late
 
         return min(enough, key=cost, default=None)
 
@@ -266,8 +288,9 @@ class Search:
         """Returns nearly the largest factor on all radii for which a certificate verifies; at least 1."""
         problem, _ = design_problem(self.plant, _contract(age, self.quantization_step))
         gain = max_margin_gain(problem, problem.covering_error_shape)
-        for share in _FACTOR_STEPS if gain is not None else ():
-            factor = float(f"{share * gain.margin:.3g}")
+        margin = 0.0 if gain is None else gain.margin
+        for share in _FACTOR_STEPS:
+            factor = float(f"{share * margin:.3g}")
             if factor <= 1.0:
                 break
             plant = with_radii(self.plant, disturbance=factor, noise=factor)
