@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
@@ -19,7 +19,7 @@ from shields.certificate_text import size_of
 from shields.errors import Infeasible, SynthesisInterrupted
 from shields.synthesis.alternating_optimization import largest_set, with_best_gain
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem, design_problem
-from shields.synthesis.diagnosis import infeasibility, with_feasible_bounds
+from shields.synthesis.diagnosis import infeasibility, is_feasible, with_feasible_bounds
 from shields.synthesis.invariant_polytope import invariant_polytope, share_in_polytope
 from shields.synthesis.max_margin_gain import max_margin_gain
 from shields.synthesis.multipliers import best_input_multipliers, best_multipliers, with_best_multipliers
@@ -37,6 +37,8 @@ _DIGITS, _SHOWN_DIGITS = 12, 6
 Progress = Callable[[str], object]
 # Alternations of a search that begins near the design of a similar problem.
 _FEW_ALTERNATIONS = 4
+# Where no certificate is found, these fractions of the input limits are tried: wide limits can mislead the search.
+_LIMIT_FRACTIONS = (0.5, 0.25, 0.1)
 # Multipliers from which those of a given set and gain are sought.
 _INITIAL_MULTIPLIERS = (0.9, 0.03, 0.07)
 
@@ -51,6 +53,7 @@ def synthesize(
     dkappa: float = 0.02,
     drho: float = 0.05,
     search: str = "first",
+    candidates: Sequence[Certificate] = (),
 ) -> Certificate:
     """Returns a verified certificate.
 
@@ -68,6 +71,9 @@ def synthesize(
         dkappa: Grid step of kappa ("paper").
         drho: Grid step of rho ("paper").
         search: "first" feasible grid point, as printed, or "largest" volume over the grid ("paper").
+        candidates: Certificates of tighter problems (closer limits, larger bounds, an older age, a coarser
+            quantization). The search is local; no set that one of them proves here is larger than the result's, so that
+            more room is never less ("certified").
 
     Raises:
         Infeasible: If no certificate is found; it names the binding condition and the shortfall.
@@ -80,6 +86,8 @@ def synthesize(
         raise ValueError(f"method must be 'certified' or 'paper', got {shown(method)}")
     if not (isinstance(safe_set, str) and safe_set in ("ellipsoid", "polytope")):
         raise ValueError(f"safe_set must be 'ellipsoid' or 'polytope', got {shown(safe_set)}")
+    if not all(isinstance(each, Certificate) and each.method == "certified" for each in candidates):
+        raise ValueError("candidates must be certificates of method 'certified'")
     if method == "paper" and safe_set != "ellipsoid":
         raise ValueError("method 'paper' has an ellipsoid: safe_set='polytope' is for method 'certified'")
     if method == "paper":
@@ -96,7 +104,8 @@ def synthesize(
             f"None, got {shown(contract)}"
         )
     report = progress or (lambda line: None)
-    certificate = _largest_certificate(plant, contract, report)
+    known = [each for given in candidates if (each := carried_over(given, plant, contract)) is not None]
+    certificate = _largest_certificate(plant, contract, report, known)
     return certificate if safe_set == "ellipsoid" else with_polytope(certificate, plant, report)
 
 
@@ -230,12 +239,39 @@ def _is_certifiable(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> bool:
         return False
 
 
-def _largest_certificate(plant: LinearPlant, contract: ChannelContract | None, progress: Progress) -> Certificate:
-    """Returns the verified certificate of the largest set found."""
+def _largest_certificate(
+    plant: LinearPlant, contract: ChannelContract | None, progress: Progress, known: Sequence[Certificate]
+) -> Certificate:
+    """Returns the verified certificate of the largest set found, or the largest of known ones."""
+    try:
+        return max([*known, _found_certificate(plant, contract, progress, bool(known))], key=_volume)
+    except Infeasible:
+        if not known:
+            raise
+        return max(known, key=_volume)
+
+
+def _volume(certificate: Certificate) -> float:
+    return float(np.linalg.slogdet(certificate.L)[1])
+
+
+def _found_certificate(
+    plant: LinearPlant, contract: ChannelContract | None, progress: Progress, is_known: bool
+) -> Certificate:
+    """Returns the verified certificate of the largest set found.
+
+    Args:
+        plant: The plant.
+        contract: The channel contract.
+        progress: Called with a line of text per stage.
+        is_known: Whether some certificate is known, so that nobody asks why none was found.
+    """
     progress("error set")
     try:
         problem, errors = design_problem(plant, contract)
     except Infeasible as infeasible:
+        if is_known:
+            raise
         raise _with_hints(infeasible, plant, contract, progress) from infeasible
     failure, slack = None, 0.0
     reached: tuple[str, CandidateDesign | None] = "start", None
@@ -261,7 +297,23 @@ def _largest_certificate(plant: LinearPlant, contract: ChannelContract | None, p
         stage, design = reached
         best = design and _certificate(plant, problem, with_best_gain(problem, design), errors, slack)
         raise _interrupted(plant, stage, best) from interrupt
+    if is_known:
+        raise failure or infeasibility(problem)
+    tighter = _with_closer_limits(plant, contract)
+    if tighter is not None:
+        return tighter
     raise failure or _with_hints(infeasibility(problem), plant, contract, progress)
+
+
+def _with_closer_limits(plant: LinearPlant, contract: ChannelContract | None) -> Certificate | None:
+    """Returns a certificate that is found with closer input limits and holds for the plant's own; None if none is."""
+    for fraction in _LIMIT_FRACTIONS if plant.remainder is None else ():
+        closer = replace(plant, u_max=fraction * plant.u_max)
+        found = nearby_certificate(closer, contract) if is_feasible(closer, contract) else None
+        certificate = found and carried_over(found, plant, contract)
+        if certificate is not None:
+            return certificate
+    return None
 
 
 def _finished(problem: DesignProblem, found: CandidateDesign, slack: float) -> Iterator[CandidateDesign]:
