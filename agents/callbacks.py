@@ -189,7 +189,9 @@ def _counted(callback: BaseCallback) -> dict[str, Any]:
     env: VecEnv = callback.training_env
     while isinstance(env, VecEnvWrapper):
         env = env.venv
-    if isinstance(env, SB3VecEnv):
+    if isinstance(env, SB3VecEnv) and "cost" in env.batch_info:
         return env.batch_info
     infos = callback.locals["infos"]
+    if not infos or "cost" not in infos[0]:
+        raise ValueError('SafetyCallback counts "cost" of every info, which the infos of these environments have not')
     return {key: [info[key] for info in infos] for key in _COUNTED if key in infos[0]}

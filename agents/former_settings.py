@@ -1,4 +1,4 @@
-"""The only place that knows the former names of hyperparameters: files and programs written with them stay readable."""
+"""The only place that knows former names of settings: files and programs written with them stay readable."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ _RENAMED = {
     "entropy": "ent_coef",
     "noise": "noise_std",
 }
+_RENAMED_SETTINGS = {"references": "baselines", "conditions": "scenarios"}
 # The groups of settings that a file had, and those of a command line with an algorithm that took them.
 _GROUPS = ("ppo", "a2c", "off_policy")
 FORMER_FLAGS = {"--ppo": "PPO", "--a2c": "A2C", "--off-policy": "TD3"}
@@ -44,7 +45,8 @@ def from_former(algorithm: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def from_former_file(settings: dict[str, Any]) -> dict[str, Any]:
-    """Returns a command's settings of JSON with the groups `ppo`, `a2c` and `off_policy` as `hyperparams`."""
+    """Returns a command's settings of JSON by their present names, hyperparameters as `hyperparams`."""
+    settings = {_RENAMED_SETTINGS.get(name, name): value for name, value in settings.items()}
     if not any(group in settings for group in _GROUPS):
         return settings
     algorithm = str(settings.get("algo", "PPO"))

@@ -53,7 +53,7 @@ class ShieldSettings:
     @property
     def arguments(self) -> dict[str, Any]:
         """Arguments of `SafetyShield` and `VectorSafetyShield` after the environment."""
-        return {name: getattr(self, name) for name in [each.name for each in fields(self)]}
+        return dict(vars(self))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +93,8 @@ class LoopConfig:
         residual_gain: Normalized gain, shape (m, n), to whose action an agent in training adds its own.
 
     Raises:
-        ValueError: If the shield is something else than its settings, or another filter is given beside it.
+        ValueError: If the shield is something else than its settings, another filter is given beside it, or the id is
+            not registered.
     """
 
     env: str
@@ -110,6 +111,13 @@ class LoopConfig:
             raise ValueError(f"shield must be ShieldSettings(certificate), got {type(self.shield).__name__}")
         if self.shield is not None and self.filter is not None:
             raise ValueError("give either a shield or a filter: two of them would override each other")
+        try:
+            gym.spec(self.env)
+        except (gym.error.Error, ImportError, AttributeError) as error:
+            raise ValueError(
+                f"{shown(self.env)} is no registered environment: import the module that registers it, or write "
+                "module:id"
+            ) from error
         given = {name: value for name, value in self.kwargs.items() if value is not None}
         object.__setattr__(self, "kwargs", given)
 
@@ -178,6 +186,8 @@ class CostPenalty(VectorWrapper):
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Steps the environments; the cost of an episode's last step is read from its final info."""
         observation, rewards, terminated, truncated, info = self.env.step(actions)
+        if "cost" not in info:
+            raise ValueError('a penalty of violations needs environments with "cost" in their infos, these have none')
         cost, done = info["cost"], terminated | truncated
         if "final_info" in info:
             cost = np.where(done, info["final_info"]["cost"], cost)

@@ -13,15 +13,26 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 from ncs_gym import NCSVectorEnv
+from ncs_gym.envs.reset_options import CHANNELS
 
 # Vector environments whose reset takes options={"reset_mask": ...} and resets only the environments in the mask.
 _WITH_RESET_MASK = (NCSVectorEnv, SyncVectorEnv, AsyncVectorEnv)
 # Infos of an episode's last step that become part of info["episode"], as with `Monitor(info_keywords=...)`.
-_EPISODE_KEYS = ("episode_violations", "is_success")
+_EPISODE_KEYS = ("episode_violations", "is_success", "episode_guaranteed")
 # Infos in the dicts of every step, asked for or not: what algorithms for constrained problems read.
 _STEP_KEYS = ("cost",)
 # Attributes that change with the episodes of an `NCSVectorEnv`, but never in its scalar prototype.
-_STATEFUL_ATTRIBUTES = ("steps", "episodes", "np_random", "starts", "spec", "num_envs", "metadata")
+_STATEFUL_ATTRIBUTES = (
+    "steps",
+    "episodes",
+    "episode_channel",
+    "episode_downlink",
+    "np_random",
+    "starts",
+    "spec",
+    "num_envs",
+    "metadata",
+)
 
 
 class SB3VecEnv(VecEnv):
@@ -33,10 +44,11 @@ class SB3VecEnv(VecEnv):
     Other NEXT_STEP environments take a step to reset: with `allow_reset_transitions=True` the learner sees that step,
     once per episode, as a transition of reward 0 from the last observation of an episode to the first of the next.
 
-    Like `Monitor` it adds `info["episode"]` (`r`, `l`, `t`) to the last step of an episode, with `episode_violations`
-    and `is_success` where there are such infos. Filling a dict per environment and step is slow. Therefore the dicts
-    hold by default only what the library needs, and `cost` where there is such an info: `batch_info` has all values of
-    the last step as arrays, and `info_keys` names further values to be copied into the dicts.
+    Like `Monitor` it adds `info["episode"]` (`r`, `l`, `t`) to the last step of an episode, with `episode_violations`,
+    `is_success` and `episode_guaranteed` where there are such infos. Filling a dict per environment and step is slow.
+    Therefore the dicts hold by default only what the library needs, and `cost` where there is such an info:
+    `batch_info` has all values of the last step as arrays, and `info_keys` names further values to be copied into the
+    dicts.
 
     Args:
         vector_env: The vector environment.
@@ -86,6 +98,7 @@ class SB3VecEnv(VecEnv):
         seeds: Any = None if self._seeds[0] is None else self._seeds
         if seeds is not None and not isinstance(self.vector_env.unwrapped, _WITH_RESET_MASK[1:]):
             seeds = seeds[0]
+        self._kept = {name: option for name, option in options.items() if name in CHANNELS}
         observation, info = self.vector_env.reset(seed=seeds, options=options or None)
         self._require_known_keys(info)
         self._reset_seeds()
@@ -131,7 +144,7 @@ class SB3VecEnv(VecEnv):
         if done.any():
             self._returns[done], self._lengths[done] = 0.0, 0
             if self._masks and self._mode is not AutoresetMode.SAME_STEP:
-                fresh, reset_info = self.vector_env.reset(options={"reset_mask": done.copy()})
+                fresh, reset_info = self.vector_env.reset(options={"reset_mask": done.copy(), **self._kept})
                 observation = np.where(done.reshape(-1, *[1] * (observation.ndim - 1)), fresh, observation)
                 for e in np.flatnonzero(done).tolist():
                     self.reset_infos[e] = {key: value[e] for key, value in _dense(reset_info).items()}

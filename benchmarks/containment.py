@@ -55,7 +55,7 @@ def main() -> None:
     print(f"{'environment':26s}{'policy':30s}{'norm':>8s}{'shield':>8s}{'exact':>8s}{'exact [us]':>12s}", flush=True)
     for env_id in ("ncs_gym/TruckTrailer-v0", "ncs_gym/TruckTrailerCruise-v0"):
         plant = gym.make(env_id).unwrapped.plant
-        env = SafetyShield(gym.make(env_id), synthesize(plant))
+        env = SafetyShield(gym.make(env_id), synthesize(plant, safe_set="ellipsoid"))
         for name, act in policies(np.random.default_rng(0)).items():
             turned_down, seconds = np.zeros(3), 0.0
             for episode in range(options.episodes):

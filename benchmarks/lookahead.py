@@ -1,6 +1,8 @@
 """What mode "lookahead" admits and what it costs, against mode "project" and the same program in cvxpy.
 
-    python benchmarks/lookahead.py [--sections beliefs loop training] [--beliefs 2000] [--steps 150000]
+    python benchmarks/lookahead.py [--sections beliefs loop training] [--safe-set ellipsoid] [--beliefs 2000]
+
+Plans end in the safe set of the certificate: the polytope or, with `--safe-set ellipsoid`, the ellipsoid in it.
 
 Section "loop" runs 64 environments in both modes with random actions and with actions pushed towards the upper limits,
 and says how often and how far inputs were changed and how long a frame takes. Section "training" trains PPO on the
@@ -10,7 +12,8 @@ batch reactor behind both modes and runs every agent behind both. Times are CPU 
 Beliefs are a true state drawn uniformly from the box, an error on the boundary of the error ellipsoid that is met in
 the middle of an episode (the one of median size), and the estimate that follows. A belief is admitted if some input is
 certified: by a plan of at most N steps, or for the second column by the one-step test alone. The upper bound plans for
-the true state without disturbance, with N inputs and the same end: no shield with this safe set admits more.
+the true state without disturbance, with N inputs and the same end: no shield with this safe set admits more. "in S" is
+the share of true states that lie in the safe set.
 Times are of beliefs that fail the one-step test, for proposals drawn uniformly from the limits: with nothing stored
 ("search", the solver is called unless a candidate begins with the proposal), and with the plan found stored ("stored").
 "too far" is how much farther from the proposal the input is then than the search with the solver finds, in u_max.
@@ -20,6 +23,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from functools import cache
 from typing import NamedTuple
 
 import cvxpy as cp
@@ -29,12 +33,15 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents import SB3VecEnv
 from agents.algorithms import build_model
+from agents.hyperparams import complete_hyperparams
 from ncs_gym import Ellipsoid, LinearPlant
-from shields import SafetyFilter, VectorSafetyShield
-from shields.runtime.wrapper import certificate_for
+from shields import Certificate, SafetyFilter, VectorSafetyShield, synthesize
 
-# Environment, horizon.
-CASES = (("TruckTrailer", 3), ("TruckTrailerCruise", 3), ("CartPole", 12), ("BatchReactor", 6))
+# Environment, horizon; where plans end in the ellipsoid more steps pay on the cart-pole.
+CASES = {
+    "ellipsoid": (("TruckTrailer", 3), ("TruckTrailerCruise", 3), ("CartPole", 12), ("BatchReactor", 6)),
+    "polytope": (("TruckTrailer", 3), ("TruckTrailerCruise", 3), ("CartPole", 6), ("BatchReactor", 6)),
+}
 EPISODES, STEPS = 5, 60
 # So many beliefs are given to cvxpy.
 CVXPY = 60
@@ -63,7 +70,7 @@ class PlainProgram:
         self.plans = shield.lookahead.planner.test
         self.start, self.proposed = cp.Parameter(plant.n), cp.Parameter(plant.m)
         self.room, self.weighting, self.radius = (
-            cp.Parameter((steps, len(plant.box_rows))),
+            cp.Parameter((steps, len(self.plans.prediction.rows))),
             cp.Parameter((plant.n, plant.n)),
             cp.Parameter(),
         )
@@ -71,8 +78,12 @@ class PlainProgram:
         self.weighted = cp.Variable(plant.n)
         constraints = [self.c[0] == self.start, cp.abs(self.u) <= np.tile(plant.u_max, (steps, 1))]
         constraints += [self.c[1:] == self.c[:-1] @ plant.A.T + self.u @ plant.B.T]
-        constraints += [cp.abs(self.c[1:-1] @ plant.box_rows.T) <= self.room[:-1]] if steps > 1 else []
-        constraints += [self.weighted == self.weighting @ self.c[-1], cp.norm(self.weighted) <= self.radius]
+        rows, count = self.plans.prediction.rows, len(plant.box_rows)
+        constraints += [cp.abs(self.c[1:-1] @ plant.box_rows.T) <= self.room[:-1, :count]] if steps > 1 else []
+        if self.plans.prediction.ends:
+            constraints += [self.weighted == self.weighting @ self.c[-1], cp.norm(self.weighted) <= self.radius]
+        else:
+            constraints += [cp.abs(rows @ self.c[-1]) <= self.room[-1]]
         self.problem = cp.Problem(cp.Minimize(cp.sum_squares(self.u[0] - self.proposed)), constraints)
 
     def solve(self, estimate: np.ndarray, shape: np.ndarray, proposed: np.ndarray) -> bool:
@@ -81,18 +92,20 @@ class PlainProgram:
         if not (np.isfinite(radius[0, -1]) and radius[0, -1] > 0.0):
             return False
         self.start.value, self.proposed.value = estimate, proposed
-        self.room.value, self.weighting.value, self.radius.value = room[0], known.weighting[0, -1], radius[0, -1]
+        self.room.value, self.radius.value = room[0], radius[0, -1]
+        if self.plans.prediction.ends:
+            self.weighting.value = known.weighting[0, -1]
         return solved(self.problem)
 
 
 class FreePlan:
     """Whether N inputs bring a known state into S through the box if nothing disturbs it."""
 
-    def __init__(self, plant: LinearPlant, root: np.ndarray, steps: int) -> None:
+    def __init__(self, plant: LinearPlant, root: np.ndarray, norm: float, steps: int) -> None:
         self.start, u, c = cp.Parameter(plant.n), cp.Variable((steps, plant.m)), cp.Variable((steps + 1, plant.n))
         constraints = [c[0] == self.start, cp.abs(u) <= np.tile(plant.u_max, (steps, 1))]
         constraints += [c[1:] == c[:-1] @ plant.A.T + u @ plant.B.T, cp.abs(c[1:] @ plant.box_rows.T) <= 1.0]
-        self.problem = cp.Problem(cp.Minimize(cp.norm(root @ c[-1])), constraints)
+        self.problem = cp.Problem(cp.Minimize(cp.norm(root @ c[-1], norm)), constraints)
 
     def exists(self, state: np.ndarray) -> bool:
         self.start.value = state
@@ -133,9 +146,16 @@ def timed(decide, beliefs: list[tuple[np.ndarray, ...]]) -> np.ndarray:
     return times.min(axis=0)
 
 
-def report(name: str, horizon: int, count: int) -> str:
-    env = gym.make(f"ncs_gym/{name}-v0")
-    plant, certificate = env.unwrapped.plant, certificate_for(env.unwrapped.plant, env.unwrapped.certificate_contract)
+@cache
+def certified(name: str, safe_set: str) -> Certificate:
+    """Returns the certificate of a registered environment."""
+    env = gym.make(f"ncs_gym/{name}-v0").unwrapped
+    return synthesize(env.plant, contract=env.certificate_contract, safe_set=safe_set)
+
+
+def report(name: str, safe_set: str, horizon: int, count: int) -> str:
+    env, certificate = gym.make(f"ncs_gym/{name}-v0"), certified(name, safe_set)
+    plant = env.unwrapped.plant
     shield = SafetyFilter(certificate, plant, "lookahead", horizon)
     project = SafetyFilter(certificate, plant)
     beliefs = drawn(env, count)
@@ -143,7 +163,7 @@ def report(name: str, horizon: int, count: int) -> str:
     cases = [(x_hat, beliefs.shape, u) for x_hat, u in zip(beliefs.estimates, beliefs.proposed, strict=True)]
     one_step = np.mean([project.decide(*each).passed for each in cases])
     admitted = np.mean([shield.decide(*each).passed for each in cases])
-    free = FreePlan(plant, shield.test.root, horizon)
+    free = FreePlan(plant, shield.test.root, 2 if certificate.polytope is None else np.inf, horizon)
     bound = np.mean([free.exists(state) for state in beliefs.states[: 4 * CVXPY]])
     searched = [each for each in cases if shield.decide(*each).reason != "safe"]
     if not searched:
@@ -172,9 +192,10 @@ def report(name: str, horizon: int, count: int) -> str:
     )
 
 
-def shielded(name: str, mode: str, horizon: int, **settings) -> VectorSafetyShield:
+def shielded(name: str, safe_set: str, mode: str, horizon: int, **settings) -> VectorSafetyShield:
     env = gym.make_vec(f"ncs_gym/{name}-v0", num_envs=ENVS, **settings)
-    return VectorSafetyShield(env, mode=mode, horizon=horizon if mode == "lookahead" else None, on_unproved="ignore")
+    longest = horizon if mode == "lookahead" else None
+    return VectorSafetyShield(env, certified(name, safe_set), mode, horizon=longest, on_unproved="ignore")
 
 
 def driven(env, act, steps: int) -> tuple[float, ...]:
@@ -189,13 +210,13 @@ def driven(env, act, steps: int) -> tuple[float, ...]:
     return 1e6 * (time.process_time() - start) / (steps * ENVS), *(sums / steps)
 
 
-def loop() -> None:
+def loop(safe_set: str) -> None:
     print("environment            actions     us per frame: project lookahead   overridden            correction")
-    for name, horizon in CASES[1:]:
+    for name, horizon in CASES[safe_set][1:]:
         for actions, mean, spread in (("random", 0.0, None), ("pushed", 0.8, 0.5)):
             results = []
             for mode in MODES:
-                env, rng = shielded(name, mode, horizon), np.random.default_rng(SEED)
+                env, rng = shielded(name, safe_set, mode, horizon), np.random.default_rng(SEED)
                 shape = env.action_space.shape
 
                 def act(_, rng=rng, shape=shape, mean=mean, spread=spread):
@@ -211,14 +232,14 @@ def loop() -> None:
             )
 
 
-def training(steps: int) -> None:
-    name, horizon = CASES[-1]
-    settings, agents, rates = dict(n_envs=ENVS), {}, {}
+def training(safe_set: str, steps: int) -> None:
+    name, horizon = CASES[safe_set][-1]
+    hyperparams, agents, rates = complete_hyperparams("PPO", {"n_envs": ENVS}), {}, {}
     for count in (1, steps):  # what only the first training of a process takes time for is not measured
         for mode in MODES:
-            env = SB3VecEnv(shielded(name, mode, horizon, autoreset_mode="SameStep"))
-            normalized = VecNormalize(env, gamma=settings.discount)
-            model, start = build_model("PPO", normalized, settings, SEED), time.process_time()
+            env = SB3VecEnv(shielded(name, safe_set, mode, horizon, autoreset_mode="SameStep"))
+            normalized = VecNormalize(env, gamma=hyperparams["gamma"])
+            model, start = build_model("PPO", normalized, hyperparams, SEED), time.process_time()
             model.learn(count)
             rates[mode] = model.num_timesteps / (time.process_time() - start)
             agents[mode] = model, normalized
@@ -230,7 +251,7 @@ def training(steps: int) -> None:
             def act(observation, model=model, normalized=normalized):
                 return model.predict(normalized.normalize_obs(observation), deterministic=True)[0]
 
-            _, share, correction, reward = driven(shielded(name, mode, horizon), act, 2 * MEASURED)
+            _, share, correction, reward = driven(shielded(name, safe_set, mode, horizon), act, 2 * MEASURED)
             print(
                 f"trained behind {trained:9s} run behind {mode:9s}: overridden {share:6.1%}, correction "
                 f"{correction:.3f}, reward per step {reward:.4f}",
@@ -241,6 +262,7 @@ def training(steps: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sections", nargs="+", choices=SECTIONS, default=SECTIONS)
+    parser.add_argument("--safe-set", choices=CASES, default="polytope")
     parser.add_argument("--beliefs", type=int, default=2000)
     parser.add_argument("--steps", type=int, default=150_000)
     options = parser.parse_args()
@@ -251,12 +273,12 @@ def main() -> None:
             f"{'one step':>9s}{'search':>7s}{'99%':>6s}{'stored':>7s}"
             f"{'cvxpy':>6s}{'search':>8s}{'stored':>8s}{'too far':>8s}"
         )
-        for name, horizon in CASES:
-            print(report(name, horizon, options.beliefs), flush=True)
+        for name, horizon in CASES[options.safe_set]:
+            print(report(name, options.safe_set, horizon, options.beliefs), flush=True)
     if "loop" in options.sections:
-        loop()
+        loop(options.safe_set)
     if "training" in options.sections:
-        training(options.steps)
+        training(options.safe_set, options.steps)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Microseconds per decision of mode "lookahead" in closed loop, against one cvxpy program per decision.
 
-    python benchmarks/lookahead_decisions.py [--steps 100]
+    python benchmarks/lookahead_decisions.py [--safe-set ellipsoid] [--steps 100]
 
 64 environments run behind the shield with random actions. Every decision they meet is timed as they make it, in a batch
 of 64, and again one by one for some of them, as the wrapper of a single environment makes it. "searched" are those
@@ -35,8 +35,8 @@ class Recorded(SafetyFilter):
         return decided
 
 
-def row(name: str, horizon: int, steps: int) -> str:
-    env, rng = shielded(name, "lookahead", horizon), np.random.default_rng(0)
+def row(name: str, safe_set: str, horizon: int, steps: int) -> str:
+    env, rng = shielded(name, safe_set, "lookahead", horizon), np.random.default_rng(0)
     env._filter = Recorded(env.filter.certificate, env.filter.plant, "lookahead", horizon)
     env.reset(seed=0)
     for _ in range(WARM + steps):
@@ -71,14 +71,15 @@ def singles(estimates: np.ndarray, errors: PredictedErrors, proposed: np.ndarray
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=100)
-    steps = parser.parse_args().steps
+    parser.add_argument("--safe-set", choices=CASES, default="polytope")
+    options = parser.parse_args()
     print(f"{'us per decision: one by one':>54s}{'batches of 64':>15s}{'cvxpy / median of':>32s}")
     print(
         f"{'environment':18s}{'N':>3s}{'searched':>9s}{'median':>9s}{'99%':>6s}{'searched':>9s}"
         f"{'median':>9s}{'99%':>6s}{'cvxpy':>8s}{'one by one':>12s}{'in batches':>12s}"
     )
-    for name, horizon in CASES:
-        print(row(name, horizon, steps), flush=True)
+    for name, horizon in CASES[options.safe_set]:
+        print(row(name, options.safe_set, horizon, options.steps), flush=True)
 
 
 if __name__ == "__main__":

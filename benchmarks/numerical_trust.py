@@ -54,7 +54,7 @@ def outcome(plant: LinearPlant) -> str:
         AssertionError: If a certificate does not verify.
     """
     try:
-        certificate = synthesize(plant)
+        certificate = synthesize(plant, safe_set="ellipsoid")
     except Infeasible as infeasible:
         return f"infeasible: {infeasible.binding}"
     report = verify(certificate, plant)

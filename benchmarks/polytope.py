@@ -74,7 +74,7 @@ def main() -> None:
     )
     for name in options.ids:
         env = gym.make(f"ncs_gym/{name}-v0").unwrapped
-        plain = synthesize(env.plant, contract=env.certificate_contract)
+        plain = synthesize(env.plant, contract=env.certificate_contract, safe_set="ellipsoid")
         begin = time.perf_counter()
         wide = with_polytope(plain, env.plant)
         found = time.perf_counter() - begin

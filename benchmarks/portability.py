@@ -40,7 +40,7 @@ def make(folder: Path, count: int) -> None:
     for index in range(count):
         plant, contract = random_plant(index)
         try:
-            synthesize(plant, contract=contract).save(folder / f"{index}.json")
+            synthesize(plant, contract=contract, safe_set="ellipsoid").save(folder / f"{index}.json")
         except Infeasible:
             continue
 

@@ -14,16 +14,16 @@ import tempfile
 import time
 import tracemalloc
 import warnings
+from contextlib import nullcontext
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
 
 from agents.loop import LoopConfig, ShieldSettings
-from experiments.backends import ray_backend, ray_cluster
-from experiments.backends.job import Job
-from experiments.runs import RunStore, TrainingRun, execute_run, versions
+from experiments.backends import ray_backend
+from experiments.backends.execution import execute
+from experiments.runs import RunStore, TrainingRun
 from experiments.settings import BackendSettings, SweepSettings
 from ncs_gym.envs.env import ncs_env
 from shields import synthesize
@@ -33,31 +33,22 @@ ENV = "ncs_gym/TruckTrailerCruise-v0"
 
 def through_ray(function, runs: list[TrainingRun], store: RunStore | None = None) -> tuple[float, float]:
     """Milliseconds per run: until all are collected, and of the driver's processor."""
-    task, expected = ray_backend._remote(function, BackendSettings(engine="ray")), versions()
+    task = ray_backend._remote(function, BackendSettings(engine="ray"))
 
-    def execute(some: list[TrainingRun]) -> int:
+    def execute_all(some: list[TrainingRun]) -> int:
         collected = set()
 
-        def keep(job: Job, result) -> None:
-            run = of_job[job]
+        def keep(run: TrainingRun, result) -> None:
             collected.add(run.index)
             if store is not None:
                 store.save(run, result)
 
-        of_job = {Job(run.name, run.total_steps, partial(execute_run, run)): run for run in some}
-        ray_cluster.execute_submitted(
-            of_job,
-            lambda job: task.remote(expected, pickle.dumps(job.work)),
-            ray_backend._finished,
-            ray_backend._result,
-            ray_backend._cancel,
-            keep,
-        )
+        execute(some, nullcontext(ray_backend.RayCluster(task)), keep)
         return len(collected)
 
-    execute(runs[:50])  # starts the workers
+    execute_all(runs[:50])  # starts the workers
     start, busy = time.perf_counter(), time.process_time()
-    assert execute(runs) == len(runs)
+    assert execute_all(runs) == len(runs)
     took, used = time.perf_counter() - start, time.process_time() - busy
     return 1e3 * took / len(runs), 1e3 * used / len(runs)
 
@@ -110,7 +101,7 @@ def main() -> None:
     count = parser.parse_args().runs
     warnings.simplefilter("ignore")
     run = example(episodes=100)
-    result = execute_run(run, lambda steps: None)
+    result = run.execute(lambda steps: None)
     runs = [replace(run, index=index) for index in range(count)]
 
     def empty(expected, content):
@@ -141,7 +132,7 @@ def main() -> None:
     print(f"settings of a run: {len(pickle.dumps(run)) / 1e3:.1f} kB pickled, {memory(run, 1000):.1f} kB in memory")
     start = time.perf_counter()
     defaults = SweepSettings()
-    execute_run(replace(run, steps=defaults.training_steps, settings=defaults.all_hyperparams), lambda steps: None)
+    replace(run, steps=defaults.training_steps, settings=defaults.all_hyperparams).execute(lambda steps: None)
     print(f"a run of ncs sweep with its default budget: {time.perf_counter() - start:.1f} s on one core")
 
 

@@ -94,7 +94,7 @@ def microseconds(decide, cases: list, repeats: int) -> float:
 
 def compare(name: str, env: NCSEnv, steps: int) -> None:
     """Prints a line for a plant: our time by outcome, the conic filter's, and whether the inputs agree."""
-    shield = SafetyFilter(synthesize(env.plant), env.plant)
+    shield = SafetyFilter(synthesize(env.plant, safe_set="ellipsoid"), env.plant)
     conic = ConicFilter(shield)
     cases = recorded(env, shield, steps)
     by_reason = defaultdict(list)

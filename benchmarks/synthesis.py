@@ -39,7 +39,7 @@ def measure(name: str, plants: list[LinearPlant]) -> None:
     for plant in plants:
         start = time.perf_counter()
         try:
-            certificate = synthesize(plant, progress=line.set_description_str)
+            certificate = synthesize(plant, safe_set="ellipsoid", progress=line.set_description_str)
         except Infeasible:
             missing += 1
         else:

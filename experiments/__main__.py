@@ -32,10 +32,11 @@ COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
     "evaluate": ("EvaluateSettings", "experiments.commands.evaluate:evaluate", _TRAINING),
     "sweep": ("SweepSettings", "experiments.commands.sweep:sweep", _TRAINING),
     "render": ("RenderSettings", "experiments.commands.render:render", {"render": ("pygame",)}),
+    "loop": ("LoopSettings", "experiments.commands.loop:loop", {}),
     "synthesize": ("SynthesizeSettings", "experiments.commands.synthesize:synthesize", {}),
     "verify": ("VerifySettings", "experiments.commands.verify:verify", {}),
     "requirements": ("RequirementsSettings", "experiments.commands.requirements:requirements", {}),
-    "attack": ("CertifySettings", "experiments.commands.attack:attack", {}),
+    "attack": ("AttackSettings", "experiments.commands.attack:attack", {}),
     "audit": ("AuditSettings", "experiments.commands.audit:audit", {}),
     "reproduce": ("ReproduceSettings", "experiments.commands.reproduce:reproduce", {}),
 }
@@ -78,12 +79,10 @@ def _parse(arguments: list[str]) -> object:
 
     from experiments import settings
     from experiments.settings.assignments import beside_those_of_file, with_assignments
-    from experiments.settings.help_levels import at_help_level
 
-    if arguments:
-        arguments = [_ALIASES.get(arguments[0], arguments[0]), *arguments[1:]]
+    arguments = [_ALIASES.get(each, each) if at == 0 else each for at, each in enumerate(arguments)]
+    arguments = ["--help" if each == "--help-all" else each for each in arguments]  # its former name
     kinds = {name: getattr(settings, kind) for name, (kind, _, _) in COMMANDS.items()}
-    arguments, kinds = at_help_level(arguments, kinds)
     arguments = with_assignments(arguments)
     command, rest = "".join(arguments[:1]), arguments[1:]
     if hasattr(kinds.get(command), "config"):

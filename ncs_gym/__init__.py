@@ -1,13 +1,16 @@
 """Plants behind imperfect networks as Gymnasium environments; importing registers the ids."""
 
 from ncs_gym.envs.env import NCSEnv
+from ncs_gym.envs.episode_channels import RandomChannel, VectorRandomChannel
+from ncs_gym.envs.spaces import ClippedObservationWarning
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlantError, certified_error_set
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet
 from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
-from ncs_gym.network.downlink import Actuator, Command
+from ncs_gym.network.downlink import Actuator, Command, Echo
 from ncs_gym.network.escape_probability import escape_probability
+from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
 from ncs_gym.plants.linear_plant import LinearPlant, NoNoiseWarning
@@ -36,8 +39,10 @@ __all__ = [
     "BrokenContractWarning",
     "Channel",
     "ChannelContract",
+    "ClippedObservationWarning",
     "Command",
     "Disturbance",
+    "Echo",
     "Ellipsoid",
     "ErrorSet",
     "ErrorSetError",
@@ -52,6 +57,7 @@ __all__ = [
     "NoNoiseWarning",
     "Packet",
     "Process",
+    "RandomChannel",
     "Regulation",
     "Remainder",
     "SetpointTracking",
@@ -60,6 +66,8 @@ __all__ = [
     "SphereDisturbance",
     "Task",
     "UnstablePlantError",
+    "UnusedPacketsWarning",
+    "VectorRandomChannel",
     "batch_reactor",
     "cart_pole",
     "certified_error_set",

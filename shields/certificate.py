@@ -14,6 +14,7 @@ from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_number, as_setting,
 from shields.certificate_text import (
     METHODS,
     assumptions_of,
+    claim_text,
     contract_text,
     counted,
     interruption_of,
@@ -149,6 +150,8 @@ class Certificate(ReadOnlyArrays):
         rounding: Multiplier s of D_u, which is D enlarged by the rounding of actions to float32; None for "paper".
         updates: What a channel contract adds to the proofs; None without a contract.
         polytope: The polytope that a shield keeps in place of S; None without one, and for "paper".
+        between_samples: The plant's: the state is claimed to be in the box at all times if it is given, None claims it
+            at the sampling instants.
         method: Method of the synthesis, "certified" or "paper".
         fingerprint: Fingerprint of the plant that the certificate belongs to.
         kappa: Contraction factor of OP; this and the next three are None unless the method is "paper".
@@ -165,6 +168,7 @@ class Certificate(ReadOnlyArrays):
     rounding: float | None = None
     updates: Updates | None = None
     polytope: Polytope | None = None
+    between_samples: int | None = None
     method: str
     fingerprint: str
     kappa: float | None = None
@@ -207,6 +211,8 @@ class Certificate(ReadOnlyArrays):
             raise ValueError(f"one of method {self.method!r} has other entries: {', '.join(wrong)}")
         if self.updates is not None and self.method == "paper":
             raise ValueError("one of method 'paper' has no channel contract")
+        if self.between_samples is not None and (self.method == "paper" or type(self.between_samples) is not int):
+            raise ValueError("its between_samples must be a whole number, and one of method 'paper' has none")
         if self.polytope is not None and (self.method == "paper" or not isinstance(self.polytope, Polytope)):
             raise ValueError("its polytope must be a Polytope, and one of method 'paper' has none")
 
@@ -319,8 +325,9 @@ class Certificate(ReadOnlyArrays):
             ("method", METHODS[self.method]),
             ("plant", f"{counted(n, 'state')}, {counted(m, 'input')}, fingerprint {self.fingerprint[:16]}"),
             ("safe set", self._safe_set_text()),
+            ("claim", claim_text(self.between_samples)),
             ("size", size_of(recorded)),
-            ("polytope", missing_polytope_of(recorded)),
+            ("polytope", missing_polytope_of(recorded) if self.proofs and self.polytope is None else ""),
             ("fallback", "u = K x_hat"),
             ("contract", contract_text(self.method, self.contract)),
             ("tolerance", tolerance_of(recorded)),
@@ -370,8 +377,9 @@ def _content_of(certificate: Certificate) -> dict[str, Any]:
     Under a contract the arrays of all ages stand in `ages`, and those of the largest age are repeated before.
     """
     c, last = certificate, certificate.multipliers
-    polytope = {} if c.polytope is None else {"polytope": polytope_content(c.polytope)}
-    return polytope | {
+    optional = {} if c.polytope is None else {"polytope": polytope_content(c.polytope)}
+    optional |= {} if c.between_samples is None else {"between_samples": c.between_samples}
+    return optional | {
         "L": c.L.tolist(),
         "K": c.K.tolist(),
         "Sigma": None if c.Sigma is None else c.Sigma.tolist(),
@@ -418,6 +426,7 @@ def _fields_of(content: dict[str, Any]) -> dict[str, Any]:
         return fields
     stated = Multipliers(**content["multipliers"])
     fields["rounding"] = stated.rounding
+    fields["between_samples"] = content.get("between_samples")
     if content.get("polytope") is not None:
         fields["polytope"] = polytope_of(content["polytope"])
     own = Sigma, stated.error, [stated.state, stated.estimate, stated.disturbance], stated.inputs

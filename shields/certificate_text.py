@@ -50,6 +50,13 @@ def table(title: str, rows: list[tuple[str, str]]) -> str:
     return "\n".join(lines)
 
 
+def claim_text(between_samples: int | None) -> str:
+    """Returns when the state is claimed to be in the safe box."""
+    if between_samples is None:
+        return "in the safe box at the sampling instants; nothing is claimed of the times between them"
+    return f"in the safe box at all times ({between_samples} of each step, and a bound on what is between them)"
+
+
 def contract_text(method: str, contract: ChannelContract | None, input_delay: int = 0) -> str:
     """Returns what the channel has to promise.
 
@@ -84,9 +91,9 @@ def assumptions_of(recorded: dict[str, Any]) -> str:
 
 
 def missing_polytope_of(recorded: dict[str, Any]) -> str:
-    """Returns why there is no polytope, if one was asked for."""
+    """Returns why there is no polytope."""
     reason = recorded.get("no_polytope")
-    return f"none: {reason}; shields keep the state in the ellipsoid" if isinstance(reason, str) else ""
+    return f"none: {reason}; shields keep the state in the ellipsoid" if isinstance(reason, str) else "none was sought"
 
 
 def interruption_of(recorded: dict[str, Any]) -> str:

@@ -17,7 +17,7 @@ from ncs_gym import ChannelContract, LinearPlant
 from shields import Certificate
 
 ROOT = Path(__file__).resolve().parent.parent
-_certificates: dict[tuple[str, ChannelContract | None], Certificate] = {}
+_certificates: dict[tuple[str, ChannelContract | None, str], Certificate] = {}
 _kept: Callable[[str, Callable[[Path], None]], Path] | None = None
 
 
@@ -43,11 +43,13 @@ def keep_certificates(folder_of: Callable[[str, Callable[[Path], None]], Path]) 
     _kept = folder_of
 
 
-def certificate_of(plant: LinearPlant, contract: ChannelContract | None = None) -> Certificate:
+def certificate_of(
+    plant: LinearPlant, contract: ChannelContract | None = None, safe_set: str = "ellipsoid"
+) -> Certificate:
     """The certificate of a plant under a contract, synthesized once for a state of the source."""
-    key = plant.fingerprint, contract
+    key = plant.fingerprint, contract, safe_set
     if key not in _certificates:
-        _certificates[key] = _read_or_synthesized(plant, contract)
+        _certificates[key] = _read_or_synthesized(plant, contract, safe_set)
     return _certificates[key]
 
 
@@ -58,15 +60,17 @@ def with_proof(certificate: Certificate, age: int = -1, **changes: Any) -> Certi
     return replace(certificate, proofs=tuple(proofs))
 
 
-def _read_or_synthesized(plant: LinearPlant, contract: ChannelContract | None) -> Certificate:
+def _read_or_synthesized(plant: LinearPlant, contract: ChannelContract | None, safe_set: str) -> Certificate:
     from shields import synthesize  # what is kept needs no solver
 
     if _kept is None:
-        return synthesize(plant, contract=contract)
-    name = hashlib.sha256(f"{plant.fingerprint} {contract}".encode()).hexdigest()[:16]
-    folder = _kept(
-        f"certificate-{name}", lambda folder: synthesize(plant, contract=contract).save(folder / "certificate.json")
-    )
+        return synthesize(plant, contract=contract, safe_set=safe_set)
+    name = hashlib.sha256(f"{plant.fingerprint} {contract} {safe_set}".encode()).hexdigest()[:16]
+
+    def fill(folder: Path) -> None:
+        synthesize(plant, contract=contract, safe_set=safe_set).save(folder / "certificate.json")
+
+    folder = _kept(f"certificate-{name}", fill)
     return Certificate.load(folder / "certificate.json")
 
 

@@ -43,6 +43,10 @@ RUNS = {
     ),
     "plain_loop.py": ([], [r"overridden: \d+ of 1000; closest to the limit: 0\.\d+", "proved to be safe: True"]),
     "quick_start.py": ([], ["violating steps: 0", r"overridden actions: [1-9]", "the proof held: True"]),
+    "random_networks.py": (
+        ["--steps", "6400"],
+        [rf"trained on the {name}, worst network: return {NUMBER}, violating steps: 0" for name in ("best", "range")],
+    ),
     "recurrent_ppo.py": (["--steps", "1024"], [rf"mean return of the last 4 episodes: {NUMBER}", "violating steps: 0"]),
     "sb3_ten_lines.py": (
         ["--steps", "210"],
@@ -75,6 +79,7 @@ RUNS = {
 }
 TRAINING = {
     "own_plant.py",
+    "random_networks.py",
     "recurrent_ppo.py",
     "sb3_processes.py",
     "sb3_ten_lines.py",

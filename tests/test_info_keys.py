@@ -31,9 +31,9 @@ def kinds(mode):
     return {key: kind for key, kind in listed.items() if key != "shield_plan_length" or mode == "lookahead"}
 
 
-def infos(env, steps):
+def infos(env, steps, share=0.1):
     """What reset and the steps of an environment report."""
-    action = env.action_space.high
+    action = share * env.action_space.high
     return [env.reset(seed=0)[1], *(env.step(action)[-1] for _ in range(steps))]
 
 
@@ -96,7 +96,7 @@ def test_page_names_what_the_end_of_an_episode_adds():
 
 def test_correction_is_what_the_page_says(loop):
     env_id, certificate = loop
-    steps = infos(SafetyShield(gym.make(env_id), certificate), 100)
+    steps = infos(SafetyShield(gym.make(env_id), certificate), 100, share=1.0)
     assert any(info["shield_correction"] > 0.0 for info in steps)
     for info in steps:
         correction = np.linalg.norm(info["input_committed"] - info["input_proposed"])

@@ -14,11 +14,12 @@ import pytest
 
 from agents.agent import Agent
 from agents.loop import LoopConfig
-from agents.sharing.agent_file import AgentError, digest
+from agents.sharing.agent_file import AgentError
 from agents.training import untrained
 from experiments.__main__ import _parse
 from experiments.settings import CompareSettings, StudySettings, config_defaults, save_settings, settings_json
 from shields import Certificate, CertificateError
+from shields.json_documents import digest
 from tests.command import assert_one_sentence, ncs
 
 ROOT = Path(__file__).resolve().parent.parent

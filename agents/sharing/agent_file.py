@@ -10,6 +10,7 @@ from typing import Any
 
 from ncs_gym.validation import shown
 from shields.atomic_write import write_atomically
+from shields.json_documents import digest
 from shields.runtime.safety_filter import LONGEST_HORIZON, MODES
 
 # Files of an agent: no other name is read or written for one, whoever made the list of names.
@@ -94,8 +95,3 @@ def shield_from_json(content: dict[str, Any] | None) -> tuple[str | None, int | 
     if mode not in MODES or not (horizon is None or (type(horizon) is int and 1 <= horizon <= LONGEST_HORIZON)):
         raise AgentError("the agent is damaged: there is no shield of that mode and horizon")
     return mode, horizon
-
-
-def digest(content: Any) -> str:
-    """Returns the SHA-256 of JSON content, whatever the order of its keys."""
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

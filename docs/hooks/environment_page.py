@@ -17,7 +17,6 @@ import numpy as np
 from gymnasium.envs.registration import load_env_creator
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearPlant, NCSEnv
-from ncs_gym.envs.spaces import FARTHEST_OBSERVED
 from shields import Certificate, SafetyShield, verify
 
 # Characters in a line of a block that fit the page.
@@ -113,7 +112,7 @@ def _observations(env: NCSEnv) -> str:
         low, high = (_with_unit(bound[index], units, index) for bound in (space.low, space.high))
         rows.append(f"| {index} | {name} | {low} | {high} |")
     task = " [Rewards](#rewards) says what the task adds." if extra else ""
-    cap = "" if plant.spectral_radius < 1.0 else f", at most {FARTHEST_OBSERVED:,.0f} half-widths of the safe box"
+    cap = "" if plant.spectral_radius < 1.0 else " within a step of leaving the safe box; what is beyond is clipped"
     return "\n".join(rows) + f"\n\nThe limits are what can be reached within an episode{cap}.{task}"
 
 

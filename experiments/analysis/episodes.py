@@ -11,7 +11,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from experiments.runs.evaluation_conditions import AS_TRAINED
+from experiments.runs.scenarios import AS_TRAINED
 from experiments.runs.training_run import RunResult
 
 # Key of the metadata in a file, and entries of summary.json that it holds.
@@ -35,11 +35,11 @@ def episodes_table(results: Iterable[RunResult], **common: Any) -> pd.DataFrame:
     """
     rows = [
         common
-        | {"arm": result.arm, "run": result.index, "condition": condition}
+        | {"arm": result.arm, "run": result.index, "condition": scenario}
         | vars(episode)
         | {name: getattr(result, name) for name in TRAINING}
         for result in results
-        for condition, played in ({AS_TRAINED: result.episodes} | result.conditions).items()
+        for scenario, played in ({AS_TRAINED: result.episodes} | result.scenarios).items()
         for episode in played
     ]
     table = pd.DataFrame(rows)

@@ -9,7 +9,7 @@ import pandas as pd
 from experiments.analysis.episodes import TRAINING
 from experiments.analysis.statistics import bootstrap_interval, clopper_pearson, interquartile_mean, mean_interval
 from experiments.runs.arms import Arm, is_shield
-from experiments.runs.evaluation_conditions import AS_TRAINED
+from experiments.runs.scenarios import AS_TRAINED
 
 # Columns of which a run has a sum, and a mean over its episodes.
 _COUNTED = ["steps", "violation_steps", "estimate_violation_steps", "interventions", "planned", "guaranteed"]
@@ -42,7 +42,7 @@ def arm_summary(episodes: pd.DataFrame, mode: str | None, *, fixed_policy: bool)
     episodes. The bootstrap intervals are over the same values. `eval_episodes_outside_set` counts episodes in which the
     true state left the safe set. `plan_rate` is the share of steps that live from a plan: after whose decision inputs
     of a certified plan are in store (mode "lookahead", 0 in others). `conditions` holds the same numbers of the
-    evaluation under each other condition.
+    evaluation in each other scenario.
 
     Args:
         episodes: Rows of the arm in what `episodes_table` returns.
@@ -69,7 +69,7 @@ def arm_summary(episodes: pd.DataFrame, mode: str | None, *, fixed_policy: bool)
 
 
 def _evaluated(episodes: pd.DataFrame, *, fixed_policy: bool) -> dict[str, Any]:
-    """Returns what a summary says of the evaluation episodes of an arm under one condition."""
+    """Returns what a summary says of the evaluation episodes of an arm in one scenario."""
     runs, count = episodes.groupby("run"), len(episodes)
     means, sums = runs[_AVERAGED].mean(), runs[_COUNTED].sum()
     total = {name: int(number) for name, number in sums.sum().items()}

@@ -34,25 +34,25 @@ _OUTCOMES = (
 )
 
 
-def summary_text(arms: dict[str, dict[str, Any]], references: dict[str, dict[str, Any]]) -> str:
-    """Returns the table for a terminal; references stand below a rule.
+def summary_text(arms: dict[str, dict[str, Any]], baselines: dict[str, dict[str, Any]]) -> str:
+    """Returns the table for a terminal; baselines stand below a rule.
 
     Violating episodes have their exact interval, the return has Student's (`experiments.analysis.summary`). "Left S"
     counts episodes in which the true state was outside the safe set at some step, "from a plan" the steps after whose
     decision the shield of mode "lookahead" had inputs of a certified plan in store. The columns about the training are
     left out where nothing was trained.
     """
-    rows = _rows(arms | references)
-    if not any(arm["train_steps"] for arm in (arms | references).values()):
+    rows = _rows(arms | baselines)
+    if not any(arm["train_steps"] for arm in (arms | baselines).values()):
         rows = _without_training(rows)
     return text_table(rows, rules=(len(_HEADERS), len(_HEADERS) + len(arms)))
 
 
-def condition_text(condition: str, arms: dict[str, dict[str, Any]], references: dict[str, dict[str, Any]]) -> str:
-    """Returns the table of the evaluation under a condition, with its name in the corner."""
-    rows = _rows({name: arm | arm["conditions"][condition] for name, arm in (arms | references).items()})
+def scenario_text(scenario: str, arms: dict[str, dict[str, Any]], baselines: dict[str, dict[str, Any]]) -> str:
+    """Returns the table of the evaluation in a scenario, with its name in the corner."""
+    rows = _rows({name: arm | arm["conditions"][scenario] for name, arm in (arms | baselines).items()})
     rows = _without_training(rows)
-    rows[0] = [f"{condition}:", *[""] * (len(rows[0]) - 1)]
+    rows[0] = [f"{scenario}:", *[""] * (len(rows[0]) - 1)]
     return text_table(rows, rules=(len(_HEADERS), len(_HEADERS) + len(arms)))
 
 

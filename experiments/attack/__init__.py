@@ -2,7 +2,7 @@
 
 from experiments.attack.attack_cases import AttackCase
 from experiments.attack.campaign import Campaign
-from experiments.attack.monte_carlo_batch import MonteCarloBatch, run_batch
+from experiments.attack.monte_carlo_batch import MonteCarloBatch
 from experiments.attack.safety_counts import SafetyCounts
 
-__all__ = ["AttackCase", "Campaign", "MonteCarloBatch", "SafetyCounts", "run_batch"]
+__all__ = ["AttackCase", "Campaign", "MonteCarloBatch", "SafetyCounts"]

@@ -59,8 +59,8 @@ class Campaign:
 
     @property
     def key(self) -> str:
-        """SHA-256 of everything that the counts depend on except the certificates and the channels."""
-        given = {name: value for name, value in asdict(self).items() if value is not None}
+        """SHA-256 of everything that the counts depend on except certificates, plants and channels."""
+        given = {name: value for name, value in asdict(self).items() if value is not None and name != "plant"}
         return digest(given | {"versions": versions()})
 
     @property

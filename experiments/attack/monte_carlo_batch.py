@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -17,6 +19,7 @@ from experiments.attack.worst_case import GaussianVectorEnv, HostileAgents, Wors
 from ncs_gym import NCSVectorEnv
 from ncs_gym.registration import EPISODE_STEPS
 from shields import Certificate, VectorSafetyShield
+from shields.json_documents import digest
 
 # Episodes start on the boundary of S; the largest level is taken from this step on.
 SETTLING_STEPS = 20
@@ -24,63 +27,95 @@ SETTLING_STEPS = 20
 
 @dataclass(frozen=True)
 class MonteCarloBatch:
-    """A batch of episodes of one attack case.
+    """A batch of episodes of one attack case, a run like any other.
 
     Attributes:
+        campaign: Settings of the campaign.
         case: Name of the attack case.
         index: Number of the batch within its case, from 0 on.
+        certificate: Certificate of the case.
     """
 
+    campaign: Campaign
     case: str
     index: int
+    certificate: Certificate
 
+    parts = ("attack",)
+    result_type = SafetyCounts
+    leaves = ()
 
-def run_batch(
-    campaign: Campaign,
-    batch: MonteCarloBatch,
-    certificate: Path,
-    on_progress: Callable[[int], object] = lambda steps: None,
-) -> SafetyCounts:
-    """Returns the counts of a batch, the same in any process and after any other batch.
+    @property
+    def name(self) -> str:
+        """Name of the batch in file names, progress lines and messages."""
+        return re.sub(r"[^\w.+-]+", "-", f"{self.case}-{self.index}")
 
-    Args:
-        campaign: Settings of the campaign.
-        batch: The batch.
-        certificate: File with the certificate of the batch's case.
-        on_progress: Called with the number of steps taken since its last call.
+    @property
+    def key(self) -> str:
+        """SHA-256 of everything that the counts depend on: the campaign, the case and versions of packages."""
+        attacked = self.campaign.cases()[self.case]
+        channels = f"{attacked.channel} {attacked.downlink}"  # what a module registers may change
+        return digest([self.campaign.key, self.case, self.index, self.certificate.checksum, channels])
 
-    Raises:
-        CertificateError: If the certificate is damaged or does not verify for the case's plant.
-    """
-    shields = list(_shields(campaign, batch.case, certificate).values())
-    shield = shields[batch.index % len(shields)]
-    plant = shield.filter.plant
-    safe_set = shield.filter.kept_set
-    seeds = np.random.SeedSequence([campaign.seed, zlib.crc32(batch.case.encode()), batch.index])
-    seed, policy_seed = seeds.generate_state(2, np.uint64).tolist()
-    rng = np.random.default_rng(policy_seed)
-    info = _begin(campaign, shield, seed >> 1, rng)
-    agents = HostileAgents(campaign.envs, plant, shield.certificate, rng)
-    counts = SafetyCounts(
-        steps=campaign.batch_steps,
-        episodes=campaign.envs,
-        unproved=int(np.count_nonzero(~info["shield_guaranteed"])),
-        outside_starts=int(np.count_nonzero(_levels(safe_set, info) > 1.0)),
-    )
-    kept, broken = np.ones(campaign.envs, np.bool_), np.zeros(campaign.envs, np.bool_)
-    for step in range(EPISODE_STEPS):
-        *_, info = shield.step(agents.act(info["estimate"]))
-        claimed, kept = _claimed_and_kept(info, kept)
-        if not campaign.shielded:  # nothing is claimed, and everything counted
-            claimed[:] = True
-        outside, reached = _outside_and_reached(campaign, info, _levels(safe_set, info))
-        counts += _step_counts(info, outside, claimed, kept)
-        broken |= claimed & (outside.box | (outside.safe_set & (not campaign.looks_ahead)))
-        if step >= SETTLING_STEPS:
-            level = float(np.nan_to_num(reached, nan=np.inf).max(initial=0.0, where=claimed))
-            counts += SafetyCounts(level=level)
-        on_progress(campaign.envs)
-    return counts + SafetyCounts(broken_episodes=int(broken.sum()))
+    @property
+    def total_steps(self) -> int:
+        """Number of steps in the batch."""
+        return self.campaign.batch_steps
+
+    def execute(self, on_progress: Callable[[int], None], log_folder: Path | None = None) -> SafetyCounts:
+        """Returns the counts, the same in any process and after any other batch.
+
+        Args:
+            on_progress: Called with the number of steps taken since its last call.
+            log_folder: Not used.
+
+        Raises:
+            CertificateError: If the certificate does not verify for the case's plant.
+        """
+        campaign = self.campaign
+        shields = list(_shields(campaign, self.case, self.certificate).values())
+        shield = shields[self.index % len(shields)]
+        plant, safe_set = shield.filter.plant, shield.filter.certificate.safe_set
+        seeds = np.random.SeedSequence([campaign.seed, zlib.crc32(self.case.encode()), self.index])
+        seed, policy_seed = seeds.generate_state(2, np.uint64).tolist()
+        rng = np.random.default_rng(policy_seed)
+        info = _begin(campaign, shield, seed >> 1, rng)
+        agents = HostileAgents(campaign.envs, plant, shield.certificate, rng)
+        counts = SafetyCounts(
+            steps=campaign.batch_steps,
+            episodes=campaign.envs,
+            unproved=int(np.count_nonzero(~info["shield_guaranteed"])),
+            outside_starts=int(np.count_nonzero(safe_set.gauge(info["state"]) > 1.0)),
+        )
+        kept, broken = np.ones(campaign.envs, np.bool_), np.zeros(campaign.envs, np.bool_)
+        for step in range(EPISODE_STEPS):
+            *_, info = shield.step(agents.act(info["estimate"]))
+            claimed, kept = _claimed_and_kept(info, kept)
+            if not campaign.shielded:  # nothing is claimed, and everything counted
+                claimed[:] = True
+            outside, reached = _outside_and_reached(campaign, info, safe_set.gauge(info["state"]))
+            counts += _step_counts(info, outside, claimed, kept)
+            broken |= claimed & (outside.box | (outside.safe_set & (not campaign.looks_ahead)))
+            if step >= SETTLING_STEPS:
+                level = float(np.nan_to_num(reached, nan=np.inf).max(initial=0.0, where=claimed))
+                counts += SafetyCounts(level=level)
+            on_progress(campaign.envs)
+        return counts + SafetyCounts(broken_episodes=int(broken.sum()))
+
+    def require(self, result: SafetyCounts) -> None:
+        """Returns if counts can be this batch's.
+
+        Raises:
+            ValueError: If a batch of so many episodes cannot have counted this.
+        """
+        steps, envs = self.campaign.batch_steps, self.campaign.envs
+        most = dict.fromkeys(("episodes", "broken_episodes", "outside_starts"), envs) | {"level": math.inf}
+        most["unproved"] = steps + envs  # which counts starts, too
+        for name, count in vars(result).items():
+            if not 0 <= count <= most.get(name, steps):
+                raise ValueError(f"{name} of a batch cannot be {count}")
+        if (result.steps, result.episodes) != (steps, envs) or result.lapsed_violations > result.lapsed:
+            raise ValueError("these are no counts of a whole batch")
 
 
 class _Outside(NamedTuple):
@@ -124,14 +159,18 @@ def _step_counts(info: dict[str, Any], outside: _Outside, claimed: np.ndarray, k
 
 
 def _begin(campaign: Campaign, shield: VectorSafetyShield, seed: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Starts the episodes of a batch and returns their infos.
+    """Starts the episodes of a batch, on the boundary of the safe set, and returns their infos.
 
     In mode "lookahead" half of the starts are drawn from the box; those for which no first plan is certified, of which
     nothing is claimed, are replaced by others on the boundary of the set that episodes start in.
     """
-    if not campaign.looks_ahead:
-        return shield.reset(seed=seed)[1]
     plant, certificate, count = shield.filter.plant, shield.certificate, campaign.envs
+    if not campaign.looks_ahead:
+        polytope, env = certificate.polytope, shield.env.unwrapped
+        assert isinstance(env, NCSVectorEnv)
+        if polytope is None or env.single.downlink is not None:  # behind a downlink the first inputs are zero
+            return shield.reset(seed=seed)[1]
+        return shield.reset(seed=seed, options={"state": (1.0 - 1e-9) * polytope.sample_boundary(rng, count)})[1]
     _, info = shield.reset(seed=seed, options={"state": starts_in_box(rng, plant, certificate, count)})
     if not info["shield_guaranteed"].all():
         env = shield.env.unwrapped
@@ -141,28 +180,25 @@ def _begin(campaign: Campaign, shield: VectorSafetyShield, seed: int, rng: np.ra
     return info
 
 
-def _levels(safe_set: Any, info: dict[str, Any]) -> np.ndarray:
-    """Returns how far out the true states are in the set that a shield keeps: 1 on its boundary, shape (N,)."""
-    return safe_set.gauge(info["state"])
-
-
 @lru_cache(maxsize=1)  # a shield's tables may take a hundred megabytes
-def _shields(campaign: Campaign, case: str, certificate: Path) -> dict[str, VectorSafetyShield]:
+def _shields(campaign: Campaign, case: str, certificate: Certificate) -> dict[str, VectorSafetyShield]:
     """Returns the shields of all kinds of batches: those of S around the same environments, one for each mode.
 
     In mode "lookahead" disturbances push out of S in every other batch, and towards the box in between.
 
     Raises:
-        CertificateError: If the certificate is damaged or does not verify for the case's plant.
+        CertificateError: If the certificate does not verify for the case's plant.
     """
-    chosen, loaded = campaign.cases()[case], Certificate.load(certificate)
+    chosen = campaign.cases()[case]
     settings = {each.name: getattr(chosen, each.name) for each in fields(chosen)}
     kind = GaussianVectorEnv if campaign.gaussian else WorstCaseVectorEnv
-    env = kind(campaign.envs, loaded, **settings)
+    env = kind(campaign.envs, certificate, **settings)
     if campaign.looks_ahead:
-        other = env if campaign.gaussian else WorstCaseVectorEnv(campaign.envs, loaded, pushes_to_box=True, **settings)
+        other = (
+            env if campaign.gaussian else WorstCaseVectorEnv(campaign.envs, certificate, pushes_to_box=True, **settings)
+        )
         envs = {"to the box": other, "out of S": env}
         planning = {"mode": "lookahead", "horizon": campaign.horizon, "on_unproved": "ignore"}
-        return {name: VectorSafetyShield(each, loaded, **planning) for name, each in envs.items()}
+        return {name: VectorSafetyShield(each, certificate, **planning) for name, each in envs.items()}
     modes = (campaign.mode,) if campaign.mode else SHIELD_MODES if campaign.shielded else ("monitor",)
-    return {mode: VectorSafetyShield(env, loaded, mode, on_unproved="ignore") for mode in modes}
+    return {mode: VectorSafetyShield(env, certificate, mode, on_unproved="ignore") for mode in modes}

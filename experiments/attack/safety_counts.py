@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from typing import Any, ClassVar
 
 from experiments.analysis.statistics import clopper_pearson
 
@@ -31,6 +31,7 @@ class SafetyCounts:
         lapsed_violations: Number of lapsed steps whose true state lay outside the safe box.
     """
 
+    files: ClassVar[dict[str, bytes]] = {}  # a batch leaves none
     steps: int = 0
     episodes: int = 0
     exits: int = 0
@@ -51,6 +52,12 @@ class SafetyCounts:
         }
         sums["level"] = max(self.level, other.level)
         return SafetyCounts(**sums)
+
+    @property
+    def outcome(self) -> str:
+        """How many episodes were broken, in one line; empty if none was."""
+        broken = self.broken_episodes
+        return f"{broken:,} of {self.episodes:,} episodes left the set or the box" if broken else ""
 
     @property
     def margin(self) -> float:

@@ -100,11 +100,11 @@ class GaussianVectorEnv(NCSVectorEnv):
 
 
 def starts_in_box(rng: np.random.Generator, plant: LinearPlant, certificate: Certificate, count: int) -> np.ndarray:
-    """Returns starts, shape (count, n): half on the boundary of S, half drawn uniformly from the box.
+    """Returns starts, shape (count, n): half on the boundary of the safe set, half drawn uniformly from the box.
 
     In directions that no row of the box limits, `half_widths` limit them.
     """
-    states = (1.0 - 1e-9) * certificate.ellipsoid.sample_boundary(rng, count)
+    states = (1.0 - 1e-9) * certificate.safe_set.sample_boundary(rng, count)
     chosen, missing = np.arange(count) % 2 == 1, np.arange(count) % 2 == 1
     while missing.any():
         states[missing] = rng.uniform(-1.0, 1.0, (int(missing.sum()), plant.n)) * plant.half_widths

@@ -1,60 +1,55 @@
-"""Executes the jobs of an experiment, and keeps its results so that it goes on where it was interrupted."""
+"""Executes runs, and keeps their results so that an experiment goes on where it was interrupted."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future
+from contextlib import AbstractContextManager
 from dataclasses import replace
-from functools import partial
+from itertools import islice
 from pathlib import Path
+from queue import Empty, Queue
+from typing import Any, Protocol
 
 from tqdm import tqdm
 
-from experiments.backends import worker_processes
-from experiments.backends.job import Job, OnResult
-from experiments.runs import RunResult, RunStore, TrainingRun, execute_run
+from experiments.backends.worker_processes import local_workers
+from experiments.runs import RunStore
+from experiments.runs.run import Run
 from experiments.settings import BackendSettings
 
 # Period of the progress bar on a terminal and in a file [s].
 _TERMINAL_PERIOD, _FILE_PERIOD = 0.5, 20.0
+# How often the reports of runs are read [s].
+_READING_PERIOD = 0.5
+# Largest number of runs that are submitted and not finished: more than a cluster executes at once, so that no core
+# waits for the driver and a cluster that grows on demand sees that there is more to do.
+MAX_SUBMITTED = 10_000
 
 
-def execute(jobs: Sequence[Job], settings: BackendSettings, on_result: OnResult, *, counted: str | None = None) -> None:
-    """Executes jobs, with a progress bar on stderr; the first failure stops the others and is raised.
+class Executor(Protocol):
+    """Executes runs elsewhere, as a context that stops what it executes when it is left by an exception."""
 
-    Args:
-        jobs: Jobs with different names.
-        settings: Where they are executed.
-        on_result: Called here with each job and its result when it is finished.
-        counted: What the steps belong to, in front of the bar; None if there is only one thing.
+    def submit(self, run: Run) -> Future[Any]:
+        """Returns the future result of a run."""
+        ...
 
-    Raises:
-        RunError: If a job fails.
-        ClusterError: If a cluster cannot execute the jobs.
-    """
-    period = _TERMINAL_PERIOD if sys.stderr.isatty() else _FILE_PERIOD
-    with tqdm(
-        total=sum(job.steps for job in jobs),
-        desc=counted,
-        unit="step",
-        unit_scale=True,
-        mininterval=period,
-        miniters=0,
-        file=sys.stderr,
-    ) as bar:
-        if settings.engine == "ray":
-            from experiments.backends import ray_backend  # needs the extra "ray"
+    def reports(self) -> Iterable[int | str]:
+        """Returns what came since the last call: numbers of steps taken, and the texts of warnings."""
+        ...
 
-            ray_backend.execute_all(jobs, settings, on_result, bar.update)
-        else:
-            worker_processes.execute_all(jobs, settings.jobs, on_result, bar.update)
+    def failure(self, run: Run, error: BaseException) -> BaseException:
+        """Returns what to raise where a run ended with an error."""
+        ...
 
 
-def results_of(runs: Sequence[TrainingRun], folder: Path, settings: BackendSettings) -> list[RunResult]:
+def results_of(runs: Sequence[Run], folder: Path, settings: BackendSettings) -> list[Any]:
     """Returns the results of all runs, in their order, without the agents' files; each is stored when it is finished.
 
     Args:
-        runs: Training runs with different names.
+        runs: Runs with different names.
         folder: Output folder with the results of finished runs.
         settings: Where the other runs are executed.
 
@@ -64,40 +59,94 @@ def results_of(runs: Sequence[TrainingRun], folder: Path, settings: BackendSetti
         ClusterError: If a cluster cannot execute the runs.
         OSError: If the folder cannot be written.
     """
-    by_name = {run.name: run for run in runs}
-    if len(by_name) < len(runs):
-        raise ValueError("two training runs have the same name")
+    if len({run.name for run in runs}) < len(runs):
+        raise ValueError("two runs have the same name")
     store = RunStore(folder)
     results = {run.name: _without_files(result) for run in runs if (result := store.load(run)) is not None}
     missing = [run for run in runs if run.name not in results]
     if results:
         print(f"{len(results)} of {len(runs)} runs were finished before", file=sys.stderr)
 
-    def keep(job: Job, result: RunResult) -> None:
-        store.save(by_name[job.name], result)
-        results[job.name] = _without_files(result)
-        tqdm.write(f"{job.name}: {_described(result)}", file=sys.stderr)
+    def keep(run: Run, result: Any) -> None:
+        store.save(run, result)
+        results[run.name] = _without_files(result)
+        if result.outcome:
+            tqdm.write(f"{run.name}: {result.outcome}", file=sys.stderr)
 
     if missing:
-        logs = folder / "tensorboard" if settings.engine == "local" else None  # nodes do not write into the folder
-        jobs = [_job(run, logs and logs / run.name) for run in missing]
-        counted = "training and evaluation" if any(run.trains for run in missing) else "evaluation"
-        execute(jobs, settings, keep, counted=counted)
+        execute(missing, executor_of(settings, len(missing), folder / "tensorboard"), keep)
     return [results[run.name] for run in runs]
 
 
-def _job(run: TrainingRun, log_folder: Path | None) -> Job:
-    return Job(run.name, run.total_steps, partial(execute_run, run, log_folder=log_folder))
+def executor_of(settings: BackendSettings, runs: int, log_folder: Path) -> AbstractContextManager[Executor]:
+    """Returns where so many runs are executed; TensorBoard's events are left by workers of this machine alone."""
+    if settings.engine == "ray":
+        from experiments.backends.ray_backend import joined_cluster  # needs the extra "ray"
+
+        return joined_cluster(settings)
+    return local_workers(min(settings.jobs, runs), log_folder)
 
 
-def _described(result: RunResult) -> str:
-    """Returns the outcome of a run in one line."""
-    violating = sum(episode.violation_steps > 0 for episode in result.episodes)
-    mean = sum(episode.episode_return for episode in result.episodes) / len(result.episodes)
-    training = f"{result.train_violation_steps:,} violating training steps, " if result.train_steps else ""
-    return f"{training}{violating} of {len(result.episodes)} episodes violating, return {mean:z.2f}"
+def execute(
+    runs: Sequence[Run], where: AbstractContextManager[Executor], on_result: Callable[[Any, Any], object]
+) -> None:
+    """Executes runs, with a progress bar on stderr.
+
+    Args:
+        runs: The runs, which begin in this order.
+        where: What executes them.
+        on_result: Called here with each run and its result when it is finished.
+
+    Raises:
+        RunError: If a run fails: the first failure stops the others, and what finished beside it is kept.
+        ClusterError: If a cluster cannot execute the runs.
+    """
+    waiting, submitted = iter(runs), {}
+    done: Queue[Future[Any]] = Queue()
+    with _progress_bar(runs) as bar, where as executor:
+        while True:
+            for run in islice(waiting, MAX_SUBMITTED - len(submitted)):
+                submitted[future := executor.submit(run)] = run
+                future.add_done_callback(done.put)
+            if not submitted:
+                return
+            finished = _taken(done, _READING_PERIOD)
+            for report in executor.reports():
+                if isinstance(report, str):
+                    warnings.warn(report, stacklevel=1)
+                else:
+                    bar.update(report)
+            for future in sorted(finished, key=lambda each: each.exception() is not None):
+                run, error = submitted.pop(future), future.exception()
+                if error is not None:
+                    raise executor.failure(run, error) from error
+                on_result(run, future.result())
 
 
-def _without_files(result: RunResult) -> RunResult:
+def _progress_bar(runs: Sequence[Run]) -> tqdm:
+    """Returns a bar of the steps of all runs."""
+    return tqdm(
+        total=sum(run.total_steps for run in runs),
+        desc=" and ".join(dict.fromkeys(part for run in runs for part in run.parts)),
+        unit="step",
+        unit_scale=True,
+        mininterval=_TERMINAL_PERIOD if sys.stderr.isatty() else _FILE_PERIOD,
+        miniters=0,
+        file=sys.stderr,
+    )
+
+
+def _taken(queue: Queue[Future[Any]], timeout: float) -> list[Future[Any]]:
+    """Returns what a queue holds, after waiting for the first of it."""
+    taken = []
+    try:
+        taken.append(queue.get(timeout=timeout))
+        while True:
+            taken.append(queue.get_nowait())
+    except Empty:
+        return taken
+
+
+def _without_files(result: Any) -> Any:
     """Returns a result without the agent's files, which are on disk: those of many runs would fill the memory."""
-    return replace(result, files={})
+    return replace(result, files={}) if result.files else result

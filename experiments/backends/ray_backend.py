@@ -1,4 +1,4 @@
-"""Executes jobs on a Ray cluster. Scheduling and retries are Ray's; the driver alone writes results."""
+"""Executes runs on a Ray cluster. Scheduling and retries are Ray's; the driver alone writes results."""
 
 from __future__ import annotations
 
@@ -7,59 +7,93 @@ import os
 import pickle
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import chdir, contextmanager, suppress
 from pathlib import Path
+from queue import Empty, Queue
 from typing import Any
 
 import ray  # pyright: ignore[reportMissingImports]
-from ray.exceptions import LocalRayletDiedError, RayError, RayTaskError  # pyright: ignore[reportMissingImports]
+from ray.exceptions import LocalRayletDiedError, RayTaskError  # pyright: ignore[reportMissingImports]
 
-from experiments.backends.job import Job, OnResult
-from experiments.backends.ray_cluster import execute_submitted, portable_task, require_answer
+from experiments.backends.ray_cluster import portable_task, require_answer
 from experiments.errors import ClusterError, RunError
 from experiments.runs import versions
+from experiments.runs.run import Run
 from experiments.settings import BackendSettings
 from experiments.settings.backend import OWN_CLUSTER
 
 # How often Ray repeats a run whose worker died.
 RETRIES = 3
-# How long the driver waits for a result before it updates the progress bar [s].
-_WAITING_PERIOD = 0.5
 _SOURCE_FOLDER = Path(__file__).resolve().parents[2]
 
 
-def execute_all(
-    jobs: Sequence[Job], settings: BackendSettings, on_result: OnResult, on_progress: Callable[[int], object]
-) -> None:
-    """Executes all jobs; the first failure stops the others and is raised.
+@contextmanager
+def joined_cluster(settings: BackendSettings) -> Iterator[RayCluster]:
+    """Yields a cluster, an `execution.Executor`.
 
     Args:
-        jobs: The jobs.
-        settings: Address of the cluster and resources of a job.
-        on_result: Called with every job and its result when it is finished.
-        on_progress: Called with the number of steps taken since its last call.
+        settings: Address of the cluster and resources of a run.
 
     Raises:
         ClusterError: If the cluster cannot be reached, is too small, or has other versions.
-        RunError: If a job fails, or its workers die more often than Ray retries.
     """
-    expected = versions()
-
-    def wait(references: list[Any]) -> list[Any]:
-        on_progress(0)
-        return _finished(references)
-
-    def collect(job: Job, result: Any) -> None:
-        on_result(job, result)
-        on_progress(job.steps)
-
     with _connected(settings.ray_address):
         _require_large_node(settings)
-        task = _remote(portable_task(), settings)
-        execute_submitted(
-            jobs, lambda job: task.remote(expected, pickle.dumps(job.work)), wait, _result, _cancel, collect
-        )
+        cluster = RayCluster(_remote(portable_task(), settings))
+        try:
+            yield cluster
+        finally:
+            cluster.cancel()
+
+
+class RayCluster:
+    """Executes runs as tasks of a cluster.
+
+    Args:
+        task: Remote function of the expected versions and a pickled run.
+    """
+
+    def __init__(self, task: Any) -> None:
+        self._task, self._versions = task, versions()
+        self._references: dict[Future[Any], Any] = {}
+        self._steps: Queue[int] = Queue()
+
+    def submit(self, run: Run) -> Future[Any]:
+        """Returns the future result of a run."""
+        reference = self._task.remote(self._versions, pickle.dumps(run))
+        future = reference.future()
+        self._references[future] = reference
+
+        def finish(future: Future[Any]) -> None:
+            self._references.pop(future, None)
+            self._steps.put(run.total_steps)
+
+        future.add_done_callback(finish)
+        return future
+
+    def reports(self) -> Iterator[int]:
+        """Yields the steps of runs that are finished, at least one number, so that the bar shows the time."""
+        yield 0
+        with suppress(Empty):
+            while True:
+                yield self._steps.get_nowait()
+
+    def failure(self, run: Run, error: BaseException) -> BaseException:
+        """Returns the error of a run: that of the cluster if the node has other versions or Ray has ended here."""
+        if isinstance(error, RayTaskError):
+            cause: Any = error.cause  # pyright: ignore[reportAttributeAccessIssue]
+            return cause if isinstance(cause, ClusterError) else RunError.of(run.name, cause)
+        if isinstance(error, LocalRayletDiedError):
+            return ClusterError("Ray has ended on this machine: the same command goes on from what is stored")
+        lost = f"its worker died, {RETRIES} retries included ({type(error).__name__})"
+        return RunError(f"run {run.name}: {lost}")
+
+    def cancel(self) -> None:
+        """Stops what is not finished at once, also what is being executed."""
+        for reference in list(self._references.values()):
+            ray.cancel(reference, force=True)
 
 
 @contextmanager
@@ -107,42 +141,10 @@ def _require_large_node(settings: BackendSettings) -> None:
         request = _remote(lambda: None, settings).remote()  # a cluster grows by unmet demand
         if ray.wait([request], timeout=settings.ray_wait)[0]:
             return
-        _cancel([request])
+        ray.cancel(request, force=True)
     cores, gpus = (max((node.get(name, 0.0) for node in nodes), default=0.0) for name in wanted)
     raise ClusterError(
         f"no node of the cluster has the {wanted['CPU']:g} cores and {wanted['GPU']:g} gpus of a run (--cpus-per-run, "
         f"--gpus-per-run): the most that one has is {cores:g} cores, {gpus:g} gpus; --ray-wait SECONDS waits for a "
         "cluster that grows"
     )
-
-
-def _finished(references: list[Any]) -> list[Any]:
-    """Returns all references that are finished; after a while it also returns none."""
-    finished, _ = ray.wait(references, timeout=_WAITING_PERIOD, fetch_local=False)
-    return ray.wait(references, num_returns=len(references), timeout=0, fetch_local=False)[0] if finished else []
-
-
-def _result(job: Job, reference: Any) -> Any:
-    """Returns the result of a finished job.
-
-    Raises:
-        ClusterError: If the node that executed it has other versions, or Ray has ended here.
-        RunError: If it failed.
-    """
-    try:
-        return ray.get(reference)
-    except RayTaskError as error:
-        if isinstance(error.cause, ClusterError):
-            raise error.cause from error
-        raise RunError.of(job.name, error.cause) from error
-    except LocalRayletDiedError as error:
-        raise ClusterError("Ray has ended on this machine: the same command goes on from what is stored") from error
-    except RayError as error:
-        lost = f"its worker died, {RETRIES} retries included ({type(error).__name__})"
-        raise RunError(f"run {job.name}: {lost}") from error
-
-
-def _cancel(references: list[Any]) -> None:
-    """Stops jobs at once, also those that are being executed."""
-    for reference in references:
-        ray.cancel(reference, force=True)

@@ -1,4 +1,4 @@
-"""What the Ray backend does without Ray: it looks for an answer, orders the work, and executes a job on a node."""
+"""What the Ray backend does without Ray: it looks for an answer, and executes a run on a node."""
 
 from __future__ import annotations
 
@@ -7,19 +7,14 @@ import platform
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
-from itertools import islice
+from collections.abc import Callable
 from typing import Any
 
-from experiments.backends.job import Job, OnResult
-from experiments.errors import ClusterError, RunError
+from experiments.errors import ClusterError
 from experiments.runs import versions
 
 # Time that a machine has to accept a connection, and a cluster to be joined; Ray itself tries for minutes [s].
 CONNECT_TIMEOUT, JOIN_TIMEOUT = 10.0, 30.0
-# Largest number of jobs that are submitted and not finished: more than a cluster executes at once, so that no core
-# waits for the driver and a cluster that grows on demand sees that there is more to do.
-MAX_SUBMITTED = 10_000
 # Joins a cluster and leaves it again; prints why it cannot.
 _JOIN = """
 import ray, sys
@@ -55,50 +50,6 @@ def require_answer(address: str) -> None:
         raise ClusterError(f"the cluster at --ray-address {address} cannot be joined: {reason}")
 
 
-def execute_submitted(
-    jobs: Iterable[Job],
-    submit: Callable[[Job], Any],
-    wait: Callable[[list[Any]], Iterable[Any]],
-    result_of: Callable[[Job, Any], Any],
-    cancel: Callable[[list[Any]], None],
-    on_result: OnResult,
-) -> None:
-    """Executes all jobs; the first failure is raised after what finished beside it, and cancels the others.
-
-    Args:
-        jobs: The jobs; at most `MAX_SUBMITTED` are submitted and not finished.
-        submit: Starts a job on the cluster and returns a reference to its result.
-        wait: Returns the references that are finished; after a while it also returns none.
-        result_of: Returns the result of a finished job, or raises its failure.
-        cancel: Stops the jobs of references that are not finished.
-        on_result: Called with every job and its result when it is finished.
-
-    Raises:
-        RunError: If a job failed.
-        ClusterError: If a node has other versions.
-    """
-    rest, submitted = iter(jobs), {}
-    try:
-        while True:
-            for job in islice(rest, MAX_SUBMITTED - len(submitted)):
-                submitted[submit(job)] = job
-            if not submitted:
-                return
-            finished = [(submitted.pop(reference), reference) for reference in wait(list(submitted))]
-            failure = None
-            for job, reference in finished:
-                try:
-                    result = result_of(job, reference)
-                except (RunError, ClusterError) as error:
-                    failure = failure or error
-                else:
-                    on_result(job, result)
-            if failure is not None:
-                raise failure
-    finally:
-        cancel(list(submitted))
-
-
 def portable_task() -> Callable[[dict[str, str], bytes], Any]:
     """Returns `_execute_on_node` in a function that Ray sends as code: it can say that a node lacks this package."""
 
@@ -116,11 +67,11 @@ def portable_task() -> Callable[[dict[str, str], bytes], Any]:
 
 
 def _execute_on_node(expected: dict[str, str], content: bytes) -> Any:
-    """Returns the result of a pickled job, which is unpickled only if this node has the driver's classes.
+    """Returns the result of a pickled run, which is unpickled only if this node has the driver's classes.
 
     Args:
         expected: The driver's `versions()`; results are stored under its key.
-        content: Pickled `Job.work`.
+        content: Pickled run.
 
     Raises:
         ClusterError: If this node has other versions.
@@ -134,4 +85,4 @@ def _execute_on_node(expected: dict[str, str], content: bytes) -> Any:
             if name == "source":
                 difference = "another source of ncs-gym than the driver"
             raise ClusterError(f"node {platform.node()} has {difference}: install the same on every node")
-    return pickle.loads(content)(lambda steps: None)
+    return pickle.loads(content).execute(lambda steps: None)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 
+from experiments.baselines.certainty_equivalent import CertaintyEquivalentFilter
 from experiments.baselines.predictive import PredictiveFilter
-from experiments.baselines.trusting import TrustingFilter
 from ncs_gym import NCSVectorEnv
 from shields import Certificate
 
@@ -20,8 +20,8 @@ Rule = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 # How each filter is made from a certificate and its plant.
 FILTERS: dict[str, Callable[..., Rule]] = {
-    "trusting": TrustingFilter,
-    "trusting:lookahead": partial(TrustingFilter, mode="lookahead"),
+    "trusting": CertaintyEquivalentFilter,
+    "trusting:lookahead": partial(CertaintyEquivalentFilter, mode="lookahead"),
     "psf": PredictiveFilter,
 }
 

@@ -4,23 +4,18 @@ from __future__ import annotations
 
 import json
 import math
-import time
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 
 from tqdm import tqdm
 
-from experiments.attack import MonteCarloBatch, SafetyCounts, run_batch
+from experiments.attack import MonteCarloBatch, SafetyCounts
 from experiments.attack.attack_cases import AttackCase
 from experiments.attack.campaign import Campaign
-from experiments.attack.counts_store import CountsStore
 from experiments.attack.counts_table import GAUSSIAN_LEGEND, counts_table, gaussian_table, require_safe, require_within
-from experiments.backends.execution import execute
-from experiments.backends.job import Job
+from experiments.backends.execution import results_of
 from experiments.runs import claim_folder, versions
-from experiments.settings import BackendSettings, CertifySettings
+from experiments.settings import AttackSettings
 from experiments.settings.certificates import changed_contract
 from ncs_gym.network import downlink_protocol
 from shields import Certificate
@@ -28,14 +23,14 @@ from shields.atomic_write import write_atomically
 from shields.runtime.safety_filter import DEFAULT_HORIZON
 
 
-def attack(settings: CertifySettings) -> None:
+def attack(settings: AttackSettings) -> None:
     """Runs `ncs attack`.
 
     Raises:
         SafetyBroken: If a shielded state left S or its box (in mode "lookahead": its box), or a proof did not hold,
             although the channels kept their contracts; with Gaussian noise, if more episodes did so than the bound on
             their probability allows.
-        ResultsError: If the stored counts are damaged.
+        ResultsError: If a stored result is damaged.
         FolderInUseError: If another command is writing to the output folder.
         OtherResultsError: If the output folder holds finished results of other settings.
         ValueError: If there is no environment of the given id, the plant's file cannot be read, or nothing is
@@ -43,6 +38,7 @@ def attack(settings: CertifySettings) -> None:
         Infeasible: If there is no certificate for the plant.
         CertificateError: If a certificate in the folder is damaged.
         RunError: If a batch fails.
+        ClusterError: If a cluster cannot execute the batches.
         OSError: If the folder cannot be written.
     """
     campaign = _campaign(settings)
@@ -53,28 +49,23 @@ def attack(settings: CertifySettings) -> None:
         _attack_in_folder(settings, campaign, cases)
 
 
-def _attack_in_folder(settings: CertifySettings, campaign: Campaign, cases: dict[str, AttackCase]) -> None:
+def _attack_in_folder(settings: AttackSettings, campaign: Campaign, cases: dict[str, AttackCase]) -> None:
     """Executes the batches that are missing, prints the table and writes the counts; raises as `attack` says."""
-    certificates = _certificate_files(cases, settings.out / "certificates")
-    keys = {case: f"{campaign.key} {Certificate.load(file).checksum}" for case, file in certificates.items()}
-    if campaign.env is not None:  # what a module registers may change
-        keys = {case: f"{key} {cases[case].channel} {cases[case].downlink}" for case, key in keys.items()}
-    store = CountsStore(settings.out / "tallies.jsonl", keys, campaign.envs)
-    batches = _batches(list(cases), settings.steps / campaign.batch_steps, campaign.kinds_of_batches)
-    missing = [each for planned in batches.values() for each in planned if each not in store.counts]
-    start, steps = time.perf_counter(), campaign.batch_steps * len(missing)
-    execute_batches(campaign, missing, certificates, store, settings.jobs)
-    seconds = time.perf_counter() - start
-    counts = {case: sum((store.counts[each] for each in planned), SafetyCounts()) for case, planned in batches.items()}
+    certificates = _certificates(cases, settings.out / "certificates")
+    numbers = _numbers_of_batches(len(cases), settings.steps / campaign.batch_steps, campaign.kinds_of_batches)
+    batches = [
+        MonteCarloBatch(campaign, case, index, certificate)
+        for (case, certificate), number in zip(certificates.items(), numbers, strict=True)
+        for index in range(number)
+    ]
+    counts = dict.fromkeys(cases, SafetyCounts())
+    for batch, counted in zip(batches, results_of(batches, settings.out, settings), strict=True):
+        counts[batch.case] += counted
     total = sum(counts.values(), SafetyCounts())
     print(counts_table(counts, looks_ahead=campaign.looks_ahead))
     limits = {name: case.escape_probability() for name, case in cases.items()} if campaign.gaussian else {}
     if limits:
         print("", gaussian_table(counts, limits), GAUSSIAN_LEGEND, sep="\n")
-    if steps > 0:
-        rate = steps / seconds
-        speed = f"{rate / 1e6:.2f} million" if rate >= 1e5 else f"{rate:,.0f}"
-        print(f"{steps:,} steps in {seconds:.0f} s: {speed} per second")
     document = {"settings": asdict(campaign), "versions": versions(), "total": total.document()}
     document["cases"] = {case: each.document() for case, each in counts.items()}
     if limits:
@@ -86,35 +77,7 @@ def _attack_in_folder(settings: CertifySettings, campaign: Campaign, cases: dict
         require_safe(total, looks_ahead=campaign.looks_ahead)
 
 
-def execute_batches(
-    campaign: Campaign,
-    missing: Sequence[MonteCarloBatch],
-    certificates: Mapping[str, Path],
-    store: CountsStore,
-    workers: int,
-) -> None:
-    """Executes batches in worker processes, and stores the counts of each that is finished.
-
-    Args:
-        campaign: Settings of the campaign.
-        missing: Batches to execute; a worker prepares a case once for all batches of it in a row.
-        certificates: File with the certificate of each case.
-        store: Store of the counts.
-        workers: Number of worker processes.
-
-    Raises:
-        RunError: If a batch fails.
-        OSError: If the counts cannot be written.
-    """
-    jobs = {}
-    for batch in missing:
-        work = partial(run_batch, campaign, batch, certificates[batch.case])
-        jobs[Job(f"{batch.case}, batch {batch.index}", campaign.batch_steps, work)] = batch
-    if jobs:
-        execute(list(jobs), BackendSettings(jobs=workers), lambda job, counts: store.add(jobs[job], counts))
-
-
-def _campaign(settings: CertifySettings) -> Campaign:
+def _campaign(settings: AttackSettings) -> Campaign:
     return Campaign(
         seed=settings.seed,
         random_plants=settings.random_plants,
@@ -123,7 +86,7 @@ def _campaign(settings: CertifySettings) -> Campaign:
         gaussian=settings.noise == "gaussian",
         delta=settings.delta,
         env=settings.env,
-        plant=None if settings.plant is None else str(settings.plant),
+        plant=settings.plant and str(settings.plant.resolve()),  # workers may have another working folder
         contract=changed_contract(None, settings.max_age, settings.quantization_step),
         mode=settings.mode,
         horizon=(settings.horizon or DEFAULT_HORIZON) if settings.mode == "lookahead" else None,
@@ -145,29 +108,27 @@ def _require_claims(cases: dict[str, AttackCase]) -> None:
             )
 
 
-def _certificate_files(cases: dict[str, AttackCase], folder: Path) -> dict[str, Path]:
-    """Returns a file with the certificate of each case; certificates that are missing are synthesized."""
+def _certificates(cases: dict[str, AttackCase], folder: Path) -> dict[str, Certificate]:
+    """Returns the certificate of each case; those that the folder lacks are synthesized and written there."""
     folder.mkdir(parents=True, exist_ok=True)
-    files = {}
+    found = {}
     for name, case in tqdm(cases.items(), desc="certificates", leave=False, disable=None):
         contract = case.certificate_contract
         suffix = "" if contract is None else f"-{contract.max_age}-{contract.quantization_step:g}"
-        files[name] = folder / f"{case.plant.fingerprint[:16]}{suffix}.json"
-        if not files[name].exists():
-            case.certificate.save(files[name])
-    return files
+        file = folder / f"{case.plant.fingerprint[:16]}{suffix}.json"
+        if not file.exists():
+            case.certificate.save(file)
+        found[name] = Certificate.load(file)
+    return found
 
 
-def _batches(cases: list[str], count: float, least: int) -> dict[str, list[MonteCarloBatch]]:
-    """Returns the batches of each case, as evenly as possible, earlier cases first.
+def _numbers_of_batches(cases: int, count: float, least: int) -> list[int]:
+    """Returns the number of batches of each case, as even as possible, more for earlier cases.
 
     Args:
-        cases: Names of the cases.
+        cases: Number of cases.
         count: Smallest number of batches in all.
         least: Smallest number of batches of each case.
     """
-    each, extra = divmod(max(math.ceil(count), least * len(cases)), len(cases))
-    return {
-        name: [MonteCarloBatch(name, index) for index in range(each + (number < extra))]
-        for number, name in enumerate(cases)
-    }
+    each, extra = divmod(max(math.ceil(count), least * cases), cases)
+    return [each + (number < extra) for number in range(cases)]

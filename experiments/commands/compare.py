@@ -13,7 +13,7 @@ from agents.loop import LoopConfig
 from experiments.analysis.episodes import episodes_table, parquet, training_table
 from experiments.analysis.gaussian_bound import gaussian_sentences, gaussian_summary
 from experiments.analysis.summary import arm_summaries, covered_fraction, paired_differences
-from experiments.analysis.tables import condition_text, decimals_of, summary_text
+from experiments.analysis.tables import decimals_of, scenario_text, summary_text
 from experiments.analysis.terminal_text import wrapped
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
@@ -59,7 +59,7 @@ def compare(settings: CompareSettings) -> None:
     settings = _with_full_names(short_version(settings, **_SMOKE))
     loop = loop_config(settings.env, settings.channel, noise=settings.noise)
     require_trainable(settings, loop)
-    certificate = certificate_of(loop, settings.certificate)
+    certificate = certificate_of(loop, settings.certificate, settings.safe_set)
     with claim_folder("compare", settings.completed):
         _compare_in_folder(settings, loop, certificate)
 
@@ -99,26 +99,26 @@ def _with_full_names(settings: CompareSettings) -> CompareSettings:
     Raises:
         ValueError: If an arm is unknown or is given twice, or there is none.
     """
-    arms, references = (
-        tuple(Arm.of(name, settings.mode).name for name in names) for names in (settings.arms, settings.references)
+    arms, baselines = (
+        tuple(Arm.of(name, settings.mode).name for name in names) for names in (settings.arms, settings.baselines)
     )
     if len(set(arms)) != len(arms) or not arms:
         raise ValueError(f"--arms must be different ones, at least one, got {' '.join(settings.arms) or 'none'}")
-    references = tuple(name for name in dict.fromkeys(references) if name not in arms)
-    return replace(settings, arms=arms, references=references)
+    baselines = tuple(name for name in dict.fromkeys(baselines) if name not in arms)
+    return replace(settings, arms=arms, baselines=baselines)
 
 
 def _tables(summary: dict[str, Any]) -> str:
-    """Returns the tables for a terminal: training and evaluation, then one per other condition."""
-    arms, references = summary["arms"], summary["references"]
-    conditions = next(iter(arms.values()))["conditions"]
-    others = [condition_text(condition, arms, references) for condition in conditions]
-    return "\n\n".join([summary_text(arms, references), *others])
+    """Returns the tables for a terminal: training and evaluation, then one per other scenario."""
+    arms, baselines = summary["arms"], summary["references"]
+    scenarios = next(iter(arms.values()))["conditions"]
+    others = [scenario_text(scenario, arms, baselines) for scenario in scenarios]
+    return "\n\n".join([summary_text(arms, baselines), *others])
 
 
 def _training_runs(settings: CompareSettings, loop: LoopConfig, certificate: Certificate) -> list[TrainingRun]:
-    """Returns the runs of every arm and of the reference policies, those that train first because they take longer."""
-    names = settings.arms + settings.references
+    """Returns the runs of every arm and of the baselines, those that train first because they take longer."""
+    names = settings.arms + settings.baselines
     runs = [run_of_arm(settings, loop, certificate, name, index) for index in range(settings.seeds) for name in names]
     return sorted(runs, key=lambda run: run.policy_kind != "trained")
 
@@ -139,7 +139,7 @@ def _summary(
     compared = episodes[episodes["arm"].isin(settings.arms)]
     return {
         "arms": {name: arms[name] for name in settings.arms},
-        "references": {name: arms[name] for name in settings.references},
+        "references": {name: arms[name] for name in settings.baselines},
         "paired_differences": {"baseline": baseline, "arms": paired_differences(compared, baseline)},
     } | (gaussian | experiment_provenance("compare", settings, loop, certificate, runs))
 

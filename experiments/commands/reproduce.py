@@ -19,16 +19,10 @@ def reproduce(settings: ReproduceSettings) -> None:
     """Runs `ncs reproduce`.
 
     Raises:
-        ValueError: If a setting is out of range.
         FolderInUseError: If another command is writing to the output folder.
         OtherResultsError: If the output folder holds finished results of other settings.
         OSError: If the output folder cannot be written.
     """
-    for name in ("starts", "steps"):
-        if getattr(settings, name) < 1:
-            raise ValueError(f"--{name} must be at least 1, got {getattr(settings, name)}")
-    if settings.seed < 0:
-        raise ValueError(f"--seed must be >= 0, got {settings.seed}")
     with claim_folder("reproduce", settings):
         _reproduce_in_folder(settings)
 

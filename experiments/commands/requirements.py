@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 from math import inf
@@ -16,8 +16,7 @@ from tqdm import tqdm
 
 import shields
 from experiments.analysis.terminal_text import text_table, wrapped
-from experiments.backends.execution import execute
-from experiments.backends.job import Job
+from experiments.backends.execution import execute, executor_of
 from experiments.errors import ResultsError
 from experiments.plots.requirements_map import requirements_map
 from experiments.runs import claim_folder, prepare_output, write_results
@@ -154,10 +153,10 @@ class _Store:
         write_atomically(self._file(search), json.dumps({"key": _key(search), "answers": entries}, indent=1) + "\n")
 
     def load(self, search: Search) -> dict[float, Answer] | None:
-        """Returns the answers of a search; None if there are none, or a certificate does not verify.
+        """Returns the answers of a search; None if there are none.
 
         Raises:
-            ResultsError: If the file is damaged.
+            ResultsError: If the file is damaged, or a certificate does not verify.
         """
         file = self._file(search)
         if not file.exists():
@@ -171,9 +170,8 @@ class _Store:
                 age = inf if entry["age"] is None else int(entry["age"])
                 checksum = entry["certificate"]
                 certificate = None if checksum is None else Certificate.load(self.place_of(checksum))
-                if certificate is not None and not shields.verify(certificate, search.plant).valid:
-                    return None
                 answers[age] = Answer(certificate, bool(entry["searched"]), entry["tolerance"])
+            _SearchRun(search).require(answers)
             return answers
         except (KeyError, TypeError, ValueError, RecursionError) as error:
             raise ResultsError(f"{file} is damaged; delete it to repeat its search") from error
@@ -195,28 +193,51 @@ def _answers(searches: Sequence[Search], settings: RequirementsSettings, store: 
     """Returns the answers of all searches, in their order; each is stored when it is finished."""
     answers = {search.name: known for search in searches if (known := store.load(search)) is not None}
     missing = {search.name: search for search in searches if search.name not in answers}
+    if answers:
+        print(f"{len(answers)} of {len(searches)} searches were finished before", file=sys.stderr)
 
-    def keep(job: Job, result: dict[float, Answer]) -> None:
-        store.save(missing[job.name], result)
-        answers[job.name] = result
+    def keep(run: _SearchRun, result: dict[float, Answer]) -> None:
+        store.save(run.search, result)
+        answers[run.name] = result
         largest = max((age for age, answer in result.items() if answer.certificate is not None), default=None)
         outcome = "none found" if largest is None else f"certified up to age {largest:g}"
-        tqdm.write(f"{job.name}: {outcome}", file=sys.stderr)
+        tqdm.write(f"{run.name}: {outcome}", file=sys.stderr)
 
     if missing:
-        jobs = [Job(name, _PARTS * len(search.ages), _Work(search)) for name, search in missing.items()]
-        execute(jobs, settings, keep, counted="certificates, in thousandths")
+        executor = executor_of(settings, len(missing), store.folder / "tensorboard")
+        execute([_SearchRun(search) for search in missing.values()], executor, keep)
     return [answers[search.name] for search in searches]
 
 
 @dataclass(frozen=True)
-class _Work:
-    """A search as the work of a job, which counts thousandths of an age."""
+class _SearchRun:
+    """A search as a `Run`, whose steps are thousandths of an age."""
 
     search: Search
+    parts: tuple[str, ...] = ("certificates, in thousandths",)
+    result_type: type = dict
+    leaves: tuple[str, ...] = ()
 
-    def __call__(self, report: Any) -> dict[float, Answer]:
-        return self.search(lambda count: report(_PARTS * count))
+    @property
+    def name(self) -> str:
+        return self.search.name
+
+    @property
+    def key(self) -> str:
+        return _key(self.search)
+
+    @property
+    def total_steps(self) -> int:
+        return _PARTS * len(self.search.ages)
+
+    def execute(self, on_progress: Callable[[int], None], log_folder: Path | None = None) -> dict[float, Answer]:
+        return self.search(lambda count: on_progress(_PARTS * count))
+
+    def require(self, result: Any) -> None:
+        """Raises ValueError unless every certificate verifies."""
+        for answer in result.values():
+            if answer.certificate is not None and not shields.verify(answer.certificate, self.search.plant).valid:
+                raise ValueError("certificate")
 
 
 @dataclass(frozen=True)

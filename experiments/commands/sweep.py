@@ -108,7 +108,7 @@ def sweep(settings: SweepSettings) -> None:
         Arm.of(name, settings.mode)
     loops = [point.loop(settings) for point in points]
     require_trainable(settings, loops[0])
-    certificates = [certificate_of(loop, settings.certificate) for loop in loops]
+    certificates = [certificate_of(loop, settings.certificate, settings.safe_set) for loop in loops]
     with claim_folder("sweep", settings.completed):
         _sweep_in_folder(settings, points, loops, certificates)
 

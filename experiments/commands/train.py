@@ -44,7 +44,7 @@ def train(settings: TrainSettings) -> None:
     Arm.of(settings.arm, settings.mode)
     loop = loop_config(settings.env, settings.channel)
     require_trainable(settings, loop)
-    certificate = certificate_of(loop, settings.certificate)
+    certificate = certificate_of(loop, settings.certificate, settings.safe_set)
     with claim_folder("train", settings.completed):
         _train_in_folder(settings, loop, certificate)
 

@@ -109,7 +109,7 @@ def designs() -> list[StateFeedback]:
     """Returns the three designs: printed, certified, and OP's."""
     example = PaperExample()
     plant = example.plant
-    ours = synthesize(plant)
+    ours = synthesize(plant, safe_set="ellipsoid")
     scale = _OP_SCALE * largest_scale(FeasibilityScan(plant), plant)
     scaled = replace(
         plant,

@@ -9,6 +9,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from experiments.analysis.statistics import CONFIDENCE, RESAMPLES
+from experiments.json_values import flat
 from experiments.plots.arm_style import ArmStyle
 from experiments.runs.arms import Arm
 from shields import Report
@@ -83,7 +84,7 @@ def _rendered(
             command=command,
             summary=summary,
             settings=settings,
-            shown_settings=_flat(settings),
+            shown_settings={name: _text(value) for name, value in flat(settings).items()},
             verification=verification,
             images=[_image(caption, png) for caption, png in figures.items()],
             percent=f"{100 * CONFIDENCE:.0f}\N{NO-BREAK SPACE}%",
@@ -147,17 +148,11 @@ def _image(caption: str, png: bytes) -> dict[str, Any]:
     }
 
 
-def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, str]:
-    """Returns nested settings as text by dotted name."""
-    flat: dict[str, str] = {}
-    for name, value in values.items():
-        if isinstance(value, dict):
-            flat |= _flat(value, f"{prefix}{name}.")
-        elif isinstance(value, list):
-            flat[prefix + name] = " ".join(map(str, value)) or "none"
-        else:
-            flat[prefix + name] = "none" if value is None else str(value)
-    return flat
+def _text(value: Any) -> str:
+    """Returns a setting as text."""
+    if isinstance(value, list):
+        return " ".join(map(str, value)) or "none"
+    return "none" if value is None else str(value)
 
 
 def _decimal(value: float, sign: str = "") -> str:

@@ -11,7 +11,7 @@ from experiments.runs.experiment import (
 from experiments.runs.output_folder import claim_folder, prepare_output, require_place, write_results
 from experiments.runs.provenance import versions
 from experiments.runs.run_store import RunStore
-from experiments.runs.training_run import RunResult, TrainingRun, execute_run
+from experiments.runs.training_run import RunResult, TrainingRun
 
 __all__ = [
     "Arm",
@@ -21,7 +21,6 @@ __all__ = [
     "by_arm",
     "certificate_of",
     "claim_folder",
-    "execute_run",
     "experiment_provenance",
     "loop_config",
     "prepare_output",

@@ -8,7 +8,7 @@ from functools import cache
 
 from agents.loop import LoopConfig, ShieldSettings
 from experiments.baselines import CONTROLLERS, FILTERS, EstimateFilterSettings
-from experiments.runs.training_run import PolicyKind, RunResult
+from experiments.runs.training_run import RunResult
 from experiments.settings import LearningSettings
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate
@@ -47,7 +47,7 @@ class Arm:
 
     name: str
     mode: str | None = None
-    policy: PolicyKind = "trained"
+    policy: str = "trained"
     penalizes_interventions: bool = False
     penalizes_violations: bool = False
     violation_weight: float | None = None
@@ -141,8 +141,7 @@ def _arms(mode: str) -> dict[str, Arm]:
     filters |= {name: name for name in ("lookahead", *FILTERS)}
     trained = list(_trained_arms(filters))
     arms = [*trained, *(replace(arm, name=arm.name + _RESIDUAL, is_residual=True) for arm in trained)]
-    policies: tuple[PolicyKind, ...] = (*CONTROLLERS, "untrained")  # type: ignore[assignment]
-    for policy in policies:
+    for policy in (*CONTROLLERS, "untrained"):
         arms += [Arm(policy, policy=policy)]
         arms += [Arm(f"{policy}+{name}", own, policy) for name, own in filters.items()]
     return {arm.name.replace(" ", "-"): arm for arm in arms}

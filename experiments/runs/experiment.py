@@ -10,8 +10,8 @@ from typing import Any
 from agents.loop import LoopConfig
 from experiments.runs.arms import Arm
 from experiments.runs.environments import module_and_id, registered_env
-from experiments.runs.evaluation_conditions import other_conditions
 from experiments.runs.provenance import versions
+from experiments.runs.scenarios import other_scenarios
 from experiments.runs.synthesis_status import synthesis_status
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import Assignments, BackendSettings, LearningSettings, changed_channel, settings_json
@@ -73,12 +73,13 @@ def require_trainable(settings: LearningSettings, loop: LoopConfig) -> None:
         training.require_trainable(loop, settings.training_steps, settings.algo, settings.all_hyperparams)
 
 
-def certificate_of(loop: LoopConfig, file: Path | None = None) -> Certificate:
+def certificate_of(loop: LoopConfig, file: Path | None = None, safe_set: str | None = None) -> Certificate:
     """Returns a certificate for the plant of a control loop, under the contract of its channels.
 
     Args:
         loop: The control loop.
         file: File of the certificate, which is verified; None synthesizes one.
+        safe_set: Of one that is synthesized: "polytope", "ellipsoid" or None; see `shields.synthesize`.
 
     Raises:
         ValueError: If the environment cannot have its keyword arguments.
@@ -88,7 +89,7 @@ def certificate_of(loop: LoopConfig, file: Path | None = None) -> Certificate:
     env = ncs_env(loop.single())
     if file is None:
         with synthesis_status() as show:
-            return certificate_for(env.plant, env.certificate_contract, show)
+            return certificate_for(env.plant, env.certificate_contract, show, safe_set)
     certificate = Certificate.load(file)
     require_valid(certificate, env.plant)
     return certificate
@@ -113,11 +114,12 @@ def run_of_arm(
         grid_point: Name of the point of a sweep's grid.
 
     Raises:
-        ValueError: If the arm or a condition is unknown.
+        ValueError: If the arm or a scenario is unknown.
     """
     arm = Arm.of(arm_name, settings.mode)
     training_loop, loop = arm.loops(loop, certificate, settings)
     origin = f"synthesized for plant {certificate.fingerprint} under {certificate.contract}"
+    origin += "" if certificate.polytope is None else " with a polytope"
     return TrainingRun(
         arm=arm.name,
         policy_kind=arm.policy,
@@ -130,7 +132,7 @@ def run_of_arm(
         episodes=settings.episodes,
         certificate=certificate,
         certificate_basis=origin if settings.certificate is None else "",
-        conditions=other_conditions(settings.evaluated_under),
+        scenarios=other_scenarios(settings.evaluated_under),
         algorithm=settings.algo,
         settings=settings.all_hyperparams,
         grid_point=grid_point,
@@ -153,7 +155,7 @@ def experiment_provenance(
     if env.downlink is not None:
         channel += f" Commands: {env.downlink.description}"
     return {
-        "units": {run.name: run.key for run in runs},
+        "runs": {run.name: run.key for run in runs},
         "seeds": {run.index: {"training": run.training_seed, "evaluation": run.evaluation_seed} for run in runs},
         "settings": {name: value for name, value in content.items() if name not in INCIDENTAL_SETTINGS},
         "plant": {"fingerprint": env.plant.fingerprint, "spectral_radius": env.plant.spectral_radius},

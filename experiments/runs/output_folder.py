@@ -19,20 +19,21 @@ from filelock import FileLock, Timeout
 
 from agents.former_settings import from_former_file
 from experiments.errors import FolderInUseError, OtherResultsError, ResultsError
+from experiments.json_values import flat
 from experiments.runs.experiment import INCIDENTAL_SETTINGS
 from experiments.settings import save_settings, settings_json
 from experiments.settings.settings_file import FORMAT as SETTINGS_FORMAT
 from shields.atomic_write import write_atomically
 
 # Files by which a folder is known to hold something finished.
-_FINISHED = ("summary.json", "certify.json", "units/*.json")
+_FINISHED = ("summary.json", "certify.json", "runs/*.json", "units/*.json")  # the last of earlier versions
 _FINISHED_PARTS = {"study": ("*/summary.json",)}
 # Settings that results do not depend on; what "smoke" changes is compared by itself.
 _IGNORED = {*INCIDENTAL_SETTINGS, "smoke", "page", "quote"}
 # Settings that may grow in the same folder, because the results that are there become part of the larger ones.
 _GROWING = {
-    "compare": ("seeds", "arms", "references"),
-    "study": ("seeds", "arms", "references", "envs"),
+    "compare": ("seeds", "arms", "baselines"),
+    "study": ("seeds", "arms", "baselines", "envs"),
     "sweep": ("seeds", "arms", "losses", "delays", "quantization_steps", "burst_lengths", "downlink_losses"),
     "certify": ("steps",),
 }
@@ -214,7 +215,10 @@ def _require_same(folder: Path, command: str, settings: Any) -> None:
     if kept_command != command:
         raise OtherResultsError(f"{folder} holds finished results of ncs {kept_command}: {advice}")
     defaults = settings_json(command, type(settings)())["settings"]
-    before, now = _flat(defaults | kept), _flat(settings_json(command, settings)["settings"])
+    before, now = (
+        flat({name: value for name, value in each.items() if name not in _IGNORED})
+        for each in (defaults | kept, settings_json(command, settings)["settings"])
+    )
     growing = _GROWING.get(command, ())
     others = [
         f"{name} {_shown(before.get(name))}, now {_shown(now.get(name))}"
@@ -224,19 +228,6 @@ def _require_same(folder: Path, command: str, settings: Any) -> None:
     if others:
         listed = "; ".join([*others[:_MOST_LISTED], *(["..."] if len(others) > _MOST_LISTED else [])])
         raise OtherResultsError(f"{folder} holds finished results of other settings ({listed}): {advice}")
-
-
-def _flat(settings: dict[str, Any]) -> dict[str, Any]:
-    """Returns settings that results depend on, those of a group by their dotted names."""
-
-    def entries(values: dict[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-        for name, value in values.items():
-            if isinstance(value, dict):
-                yield from entries(value, f"{prefix}{name}.")
-            else:
-                yield prefix + name, value
-
-    return dict(entries({name: value for name, value in settings.items() if name not in _IGNORED}, ""))
 
 
 def _contains(now: Any, before: Any) -> bool:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import shutil
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -17,19 +18,21 @@ from agents.evaluation import Policy, evaluate
 from agents.hyperparams import rollout_steps
 from agents.loop import LoopConfig
 from agents.results import Episode, TrainingPoint, Trajectory
-from agents.sharing.agent_file import write_files
+from agents.sharing.agent_file import AGENT_FILES, write_files
 from experiments.baselines import controller
 from experiments.runs.environments import import_module, module_digest
-from experiments.runs.evaluation_conditions import AS_TRAINED, under
 from experiments.runs.provenance import versions
+from experiments.runs.scenarios import AS_TRAINED, under
 from ncs_gym.envs.env import ncs_env
+from ncs_gym.validation import LARGEST_NUMBER, shown
 from shields import Certificate
 from shields.json_documents import digest
 
 if TYPE_CHECKING:
     from agents.agent import Agent
 
-PolicyKind = Literal["trained", "untrained", "zero input", "K x_hat", "random", "proportional", "lqr"]
+# Counts are numbers that floats and tables hold exactly.
+_LARGEST_COUNT = 2**53
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +53,7 @@ class TrainingRun:
         certificate: Certificate of shield or filter, which also defines x'Mx and the gain of controllers.
         certificate_basis: What the certificate was synthesized from, in words; empty for one that was given. Its last
             digits may depend on the machine, and a run that another machine finished is still the same run.
-        conditions: Conditions that the policy is evaluated under besides that of its training.
+        scenarios: Scenarios that the policy is evaluated under besides that of its training.
         algorithm: Name of the learning algorithm, one of `agents.hyperparams.ALGORITHMS`.
         settings: Hyperparameters of the learning algorithm.
         grid_point: Name of the point of a sweep's grid; part of the run's name only.
@@ -58,7 +61,7 @@ class TrainingRun:
     """
 
     arm: str
-    policy_kind: PolicyKind
+    policy_kind: str
     training_loop: LoopConfig
     loop: LoopConfig
     module: str = ""
@@ -68,11 +71,26 @@ class TrainingRun:
     episodes: int
     certificate: Certificate
     certificate_basis: str = ""
-    conditions: tuple[str, ...] = ()
+    scenarios: tuple[str, ...] = ()
     algorithm: str
     settings: dict[str, Any]
     grid_point: str = ""
     agent_files: dict[str, bytes] = field(default_factory=dict)
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """What the steps belong to."""
+        return ("training", "evaluation") if self.trains else ("evaluation",)
+
+    @property
+    def result_type(self) -> type[RunResult]:
+        """Type of the result."""
+        return RunResult
+
+    @property
+    def leaves(self) -> tuple[str, ...]:
+        """Names of the files of the agent that is trained."""
+        return AGENT_FILES if self.trains else ()
 
     @property
     def trains(self) -> bool:
@@ -112,11 +130,69 @@ class TrainingRun:
     @property
     def total_steps(self) -> int:
         """Training steps, in whole rollouts, and evaluation steps."""
-        evaluation = self.episodes * (gym.spec(self.loop.env).max_episode_steps or 1) * (1 + len(self.conditions))
+        evaluation = self.episodes * (gym.spec(self.loop.env).max_episode_steps or 1) * (1 + len(self.scenarios))
         if not self.trains:
             return evaluation
         rollout = rollout_steps(self.algorithm, self.settings)
         return -(-self.steps // rollout) * rollout + evaluation
+
+    def execute(self, on_progress: Callable[[int], None], log_folder: Path | None = None) -> RunResult:
+        """Returns the result; only TensorBoard's events are written.
+
+        Args:
+            on_progress: Called with the number of training and evaluation steps taken since its last call.
+            log_folder: Folder of TensorBoard's events, those of each run in a folder of its name; earlier ones of this
+                run are removed.
+        """
+        if self.module:
+            import_module(self.module)
+        trained = None
+        if self.trains:
+            from agents.training import (
+                train,
+            )  # imports torch, which the process that only collects results does without
+
+            logs = log_folder and log_folder / self.name
+            if logs is not None:
+                shutil.rmtree(logs, ignore_errors=True)
+            trained = train(
+                self.training_loop,
+                self.steps,
+                self.training_seed,
+                self.algorithm,
+                self.settings,
+                log_folder=logs,
+                on_progress=on_progress,
+            )
+        agent = trained.agent if trained else _agent_of(self)
+        evaluations = {}
+        for scenario in (AS_TRAINED, *self.scenarios):
+            loop, policy = under(scenario, self.loop), _policy(self, agent)  # a random policy begins anew each time
+            level = self.certificate.polytope or self.certificate.M
+            evaluations[scenario] = evaluate(loop, policy, self.episodes, self.evaluation_seed, level, on_progress)
+        evaluation = evaluations.pop(AS_TRAINED)
+        return RunResult(
+            arm=self.arm,
+            index=self.index,
+            train_steps=trained.steps if trained else 0,
+            train_violation_steps=trained.violation_steps if trained else 0,
+            train_interventions=trained.interventions if trained else 0,
+            history=trained.history if trained else [],
+            episodes=evaluation.episodes,
+            trajectory=evaluation.trajectory,
+            files=trained.agent.files() if trained else {},
+            scenarios={scenario: each.episodes for scenario, each in evaluations.items()},
+        )
+
+    def require(self, result: RunResult) -> None:
+        """Returns if a result can be this run's.
+
+        Raises:
+            ValueError: If it has a value that the run cannot have had; the message names the first.
+        """
+        for name, value, holds in _judged(self, result):
+            if not holds:
+                raise ValueError(f"{name} of this run cannot be {shown(value)}")
 
     def _seeds(self) -> list[int]:
         """Returns two 31-bit numbers that depend on the experiment's seed and the run's index, not on the arm."""
@@ -137,7 +213,7 @@ class RunResult:
         episodes: Evaluation episodes.
         trajectory: Trajectory of the first evaluation episode.
         files: Contents of the trained agent's files by name; empty if nothing was trained.
-        conditions: Evaluation episodes under other conditions than that of the training, by the condition's name.
+        scenarios: Evaluation episodes under other scenarios than that of the training, by the scenario's name.
     """
 
     arm: str
@@ -148,64 +224,55 @@ class RunResult:
     history: list[TrainingPoint]
     episodes: list[Episode]
     trajectory: Trajectory
-    files: dict[str, bytes]
-    conditions: dict[str, list[Episode]] = field(default_factory=dict)
+    files: dict[str, bytes] = field(default_factory=dict)
+    scenarios: dict[str, list[Episode]] = field(default_factory=dict)
+
+    @property
+    def outcome(self) -> str:
+        """What came out, in one line."""
+        violating = sum(episode.violation_steps > 0 for episode in self.episodes)
+        mean = sum(episode.episode_return for episode in self.episodes) / len(self.episodes)
+        training = f"{self.train_violation_steps:,} violating training steps, " if self.train_steps else ""
+        return f"{training}{violating} of {len(self.episodes)} episodes violating, return {mean:z.2f}"
+
+
+def _judged(run: TrainingRun, result: RunResult) -> Iterator[tuple[str, object, bool]]:
+    """Yields the values of a result by name, and whether they can be those of a run."""
+    yield "arm", result.arm, result.arm == run.arm
+    yield "index", result.index, result.index == run.index
+    steps = result.train_steps
+    yield "train_steps", steps, run.steps <= steps <= _LARGEST_COUNT if run.trains else steps == 0
+    for name in ("train_violation_steps", "train_interventions"):
+        yield name, getattr(result, name), 0 <= getattr(result, name) <= steps
+    yield "history", result.history, bool(result.history) == bool(steps)
+    for before, after in pairwise([TrainingPoint(0, 0.0, 0, 0), *result.history]):
+        counted = after.violation_steps, after.interventions
+        falls = after.violation_steps < before.violation_steps or after.interventions < before.interventions
+        yield "history", after, before.steps < after.steps <= steps and max(counted) <= after.steps and not falls
+    yield "scenarios", result.scenarios, result.scenarios.keys() == set(run.scenarios)
+    others = {f"scenarios, {name}": episodes for name, episodes in result.scenarios.items()}
+    for name, episodes in {"episodes": result.episodes, **others}.items():
+        indices = [each.index for each in episodes]
+        yield name, indices, indices == list(range(run.episodes))
+        for each in episodes:
+            counts = each.violation_steps, each.estimate_violation_steps, each.interventions, each.planned
+            counted = 1 <= each.steps <= _LARGEST_COUNT and 0 <= min(counts) <= max(counts) <= each.steps
+            numbers = abs(each.episode_return) < LARGEST_NUMBER and 0.0 <= each.largest_level < LARGEST_NUMBER
+            yield name, each, counted and numbers
+    (m, n), length = run.certificate.K.shape, result.episodes[0].steps
+    shapes = {"states": (length + 1, n), "estimates": (length + 1, n), "inputs": (length, m), "proposed": (length, m)}
+    for name, array in vars(result.trajectory).items():
+        shape, kind = (shapes[name], np.float64) if name in shapes else ((length,), np.bool_)
+        yield f"trajectory, {name}", array, array.shape == shape and array.dtype == kind
 
 
 def _described(loop: LoopConfig, certificate: str) -> dict[str, Any]:
     """Returns a control loop as JSON values, what belongs to the certificate under the name given to that."""
-    values = {each.name: getattr(loop, each.name) for each in fields(loop)}
+    values = dict(vars(loop))
     for name in ("shield", "filter"):
         values[name] = values[name] and vars(values[name]) | {"certificate": certificate}
     residual = loop.residual_gain is not None
     return values | {"lagrangian": loop.lagrangian and asdict(loop.lagrangian), "residual_gain": residual}
-
-
-def execute_run(run: TrainingRun, on_progress: Callable[[int], None], log_folder: Path | None = None) -> RunResult:
-    """Returns the result of a training run; only TensorBoard's events are written.
-
-    Args:
-        run: Settings of the run.
-        on_progress: Called with the number of training and evaluation steps taken since its last call.
-        log_folder: Folder of TensorBoard's events; earlier events in it are removed.
-    """
-    if run.module:
-        import_module(run.module)
-    trained = None
-    if run.trains:
-        from agents.training import train  # imports torch, which the process that only collects results does without
-
-        if log_folder is not None:
-            shutil.rmtree(log_folder, ignore_errors=True)
-        trained = train(
-            run.training_loop,
-            run.steps,
-            run.training_seed,
-            run.algorithm,
-            run.settings,
-            log_folder=log_folder,
-            on_progress=on_progress,
-        )
-    agent = trained.agent if trained else _agent_of(run)
-    evaluations = {}
-    for condition in (AS_TRAINED, *run.conditions):
-        loop, policy = under(condition, run.loop), _policy(run, agent)  # a random policy begins anew each time
-        evaluations[condition] = evaluate(
-            loop, policy, run.episodes, run.evaluation_seed, run.certificate.polytope or run.certificate.M, on_progress
-        )
-    evaluation = evaluations.pop(AS_TRAINED)
-    return RunResult(
-        arm=run.arm,
-        index=run.index,
-        train_steps=trained.steps if trained else 0,
-        train_violation_steps=trained.violation_steps if trained else 0,
-        train_interventions=trained.interventions if trained else 0,
-        history=trained.history if trained else [],
-        episodes=evaluation.episodes,
-        trajectory=evaluation.trajectory,
-        files=trained.agent.files() if trained else {},
-        conditions={condition: each.episodes for condition, each in evaluations.items()},
-    )
 
 
 def _agent_of(run: TrainingRun) -> Agent | None:

@@ -3,8 +3,8 @@
 from experiments.settings.assignments import Assignments
 from experiments.settings.backend import BackendSettings
 from experiments.settings.certificates import (
+    AttackSettings,
     AuditSettings,
-    CertifySettings,
     ReproduceSettings,
     RequirementsSettings,
     SynthesizeSettings,
@@ -17,18 +17,20 @@ from experiments.settings.learning import (
     LearningSettings,
     TrainSettings,
 )
+from experiments.settings.network_loop import LoopSettings
 from experiments.settings.rendering import RenderSettings
 from experiments.settings.settings_file import config_defaults, save_settings, settings_json
 from experiments.settings.study import StudySettings, SweepSettings
 
 __all__ = [
     "Assignments",
+    "AttackSettings",
     "AuditSettings",
     "BackendSettings",
-    "CertifySettings",
     "CompareSettings",
     "EvaluateSettings",
     "LearningSettings",
+    "LoopSettings",
     "RenderSettings",
     "ReproduceSettings",
     "RequirementsSettings",

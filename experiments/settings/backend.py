@@ -6,6 +6,8 @@ import re
 from dataclasses import dataclass, fields
 from typing import Literal
 
+from experiments.settings.steps import require_least
+
 # Address that starts a Ray cluster of its own on this machine.
 OWN_CLUSTER = "local"
 _ADDRESS = re.compile(r"local|auto|[\w.-]+:\d{1,5}|\[[0-9a-fA-F:]+\]:\d{1,5}")
@@ -34,14 +36,9 @@ class BackendSettings:
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range or belongs to another engine."""
-        if self.jobs < 1:
-            raise ValueError(f"--jobs must be at least 1, got {self.jobs}")
+        require_least(self, jobs=1, ray_wait=0, cpus_per_run=0.0001)
         if not _ADDRESS.fullmatch(self.ray_address):
             raise ValueError(f"--ray-address must be local, auto or HOST:PORT, got {self.ray_address!r}")
-        if not 0.0 <= self.ray_wait < float("inf"):
-            raise ValueError(f"--ray-wait must be >= 0, got {self.ray_wait}")
-        if not 0.0001 <= self.cpus_per_run < float("inf"):
-            raise ValueError(f"--cpus-per-run must be at least 0.0001, got {self.cpus_per_run}")
         whole = self.gpus_per_run <= 1.0 or self.gpus_per_run.is_integer()
         if not 0.0 <= self.gpus_per_run < float("inf") or not whole:
             raise ValueError(f"--gpus-per-run must be in [0, 1] or a whole number, got {self.gpus_per_run}")

@@ -9,7 +9,7 @@ from typing import Literal
 import tyro
 
 from experiments.settings.backend import BackendSettings
-from experiments.settings.steps import StepCount, require_horizon
+from experiments.settings.steps import StepCount, require_horizon, require_least
 from ncs_gym import ChannelContract
 from ncs_gym.plants.linear_plant import SMALLEST_DELTA
 
@@ -24,7 +24,8 @@ class SynthesizeSettings:
         plant: File of a plant that `LinearPlant.save` wrote, in place of an environment's.
         method: Synthesis method: ours, whose result is verified exactly, or the published one as printed.
         safe_set: What a shield with this certificate keeps: the ellipsoid, or the largest polytope that the same gain
-            keeps in the safe box, which leaves the policy more room.
+            keeps in the safe box, which leaves the policy more room. By default the polytope; the published method has
+            an ellipsoid.
         out: File for the certificate (JSON).
         max_age: Largest measurement age of the channel contract [steps]; by default the environment's contract, none
             for the plant of a file.
@@ -36,7 +37,7 @@ class SynthesizeSettings:
     env: str | None = None
     plant: Path | None = None
     method: Literal["certified", "paper"] = "certified"
-    safe_set: Literal["ellipsoid", "polytope"] = "ellipsoid"
+    safe_set: Literal["polytope", "ellipsoid"] | None = None
     out: Path = Path("certificate.json")
     max_age: int | None = None
     quantization_step: float | None = None
@@ -99,7 +100,7 @@ def _refuse_both(env: str | None, plant: Path | None) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CertifySettings:
+class AttackSettings(BackendSettings):
     """Attacks shielded control loops within the assumptions, and counts the states that leave the safe set or box.
 
     The plants are those of the registered environments (--env attacks those with other environments inside) and random
@@ -113,7 +114,6 @@ class CertifySettings:
         out: Output folder; an interrupted campaign continues where it stopped, and one with more steps adds to it.
         random_plants: Number of random plants, each behind four kinds of channels.
         envs: Number of episodes in a batch, simulated side by side.
-        jobs: Number of worker processes.
         mode: Mode of the shield; by default project, switch and boundary in turn. The claim of lookahead is the box:
             states may leave S, and half of the episodes are drawn from all of the box.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
@@ -128,8 +128,7 @@ class CertifySettings:
             up, or every kind of channel without one.
         max_age: Largest measurement age of the contract of --plant [steps]; no contract by default.
         quantization_step: Coarsest quantization that the contract of --plant allows.
-        force: Replace the finished results of another campaign in the output folder, which otherwise is refused; counts
-            of batches are kept.
+        force: Replace the finished results of another campaign in the output folder, which otherwise is refused.
         seed: Seed of the campaign, >= 0.
     """
 
@@ -137,7 +136,6 @@ class CertifySettings:
     out: Path = Path("runs/certify")
     random_plants: int = 4
     envs: int = 4096
-    jobs: int = 2
     mode: Literal["project", "lookahead", "switch", "boundary"] | None = None
     horizon: int | None = None
     unshielded: bool = False
@@ -152,6 +150,7 @@ class CertifySettings:
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range or contradicts another."""
+        BackendSettings.__post_init__(self)
         _refuse_both(self.env, self.plant)
         if self.plant is None and (self.max_age is not None or self.quantization_step is not None):
             raise ValueError("--max-age and --quantization-step belong to --plant: environments have contracts already")
@@ -159,10 +158,7 @@ class CertifySettings:
             raise ValueError(f"--delta must be between {SMALLEST_DELTA:g} and 0.5, got {self.delta:g}")
         if not 1.0 <= self.steps < 1e15:
             raise ValueError(f"--steps must be at least 1 and below 1e15, got {self.steps:g}")
-        for name, least in (("random_plants", 0), ("envs", 4), ("jobs", 1), ("seed", 0)):
-            if getattr(self, name) < least:
-                flag = name.replace("_", "-")
-                raise ValueError(f"--{flag} must be at least {least}, got {getattr(self, name)}")
+        require_least(self, random_plants=0, envs=4, seed=0)
         if self.unshielded and self.mode is not None:
             raise ValueError(f"give either --mode {self.mode} or --unshielded, not both")
         require_horizon(self.horizon, self.mode)
@@ -203,6 +199,10 @@ class ReproduceSettings:
     steps: StepCount = 200
     force: bool = False
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        require_least(self, starts=1, steps=1, seed=0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import tyro
 
@@ -12,12 +12,15 @@ from agents.hyperparams import DEFAULTS, read_hyperparams, tuned_hyperparams, tu
 from agents.loop import LagrangianSettings
 from experiments.settings.assignments import Assignments
 from experiments.settings.backend import BackendSettings
-from experiments.settings.steps import OptionalStepCount, require_horizon
+from experiments.settings.steps import OptionalStepCount, require_horizon, require_least
 from ncs_gym.validation import shown
 
 # Training steps where none belong to tuned hyperparameters.
 _DEFAULT_STEPS = 150_000
 Algorithm = Literal["PPO", "A2C", "SAC", "TD3", "TRPO", "TQC", "CrossQ"]
+# Settings with the flags that they had before.
+Baselines = Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--references"])]
+Scenarios = Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--conditions"])]
 Mode = Literal["project", "lookahead", "switch", "boundary"]
 
 
@@ -41,6 +44,7 @@ class LearningSettings:
         intervention_penalty: Subtracted from the training reward per intervention, in arms with "+penalty".
         violation_penalty: Subtracted from the training reward per violating step, in the arm "penalized".
         certificate: Certificate file to use instead of synthesizing one.
+        safe_set: What the shield keeps if its certificate is synthesized: the polytope, or the ellipsoid inside it.
         channel: Changes of the environment's channel: loss, burst_length (mean number of packets lost in a row), delay,
             jitter and send_period [steps], quantization_step, max_consecutive_losses.
         hyperparams: Hyperparameters of the learning algorithm, by their names in stable-baselines3: gamma=0.99
@@ -64,6 +68,7 @@ class LearningSettings:
     intervention_penalty: float = 0.1
     violation_penalty: float = 1.0
     certificate: Path | None = None
+    safe_set: Literal["polytope", "ellipsoid"] = "polytope"
     channel: Assignments = field(default_factory=dict)
     hyperparams: Assignments = field(default_factory=dict)
     conf_file: Path | None = None
@@ -73,7 +78,7 @@ class LearningSettings:
 
     @property
     def evaluated_under(self) -> tuple[str, ...]:
-        """Conditions that policies are evaluated under, besides that of the training."""
+        """Scenarios that policies are evaluated in, besides that of the training."""
         return ()
 
     @property
@@ -133,15 +138,8 @@ class LearningSettings:
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
-        for name in ("seeds", "steps", "episodes"):
-            if (value := getattr(self, name, None)) is not None and value < 1:
-                raise ValueError(f"--{name} must be at least 1, got {value}")
-        if self.seed < 0:
-            raise ValueError(f"--seed must be >= 0, got {self.seed}")
-        for name in ("intervention_penalty", "violation_penalty"):
-            if not 0.0 <= getattr(self, name) < float("inf"):
-                raise ValueError(f"--{name.replace('_', '-')} must be >= 0, got {getattr(self, name)}")
-        arms = getattr(self, "arm", ""), *getattr(self, "arms", ()), *getattr(self, "references", ())
+        require_least(self, seeds=1, steps=1, episodes=1, seed=0, intervention_penalty=0, violation_penalty=0)
+        arms = getattr(self, "arm", ""), *getattr(self, "arms", ()), *getattr(self, "baselines", ())
         require_horizon(self.horizon, self.mode, *arms)
 
 
@@ -159,13 +157,13 @@ class CompareSettings(BackendSettings, LearningSettings):
         seeds: Number of paired training runs per arm.
         arms: unshielded, monitor (unshielded, counts what the shield would have done), penalized (unshielded, with a
             penalty per violation), penalized:WEIGHT, lagrangian (PPO-Lagrangian adapts that penalty), shielded,
-            shielded:MODE, lookahead, trusting and trusting:lookahead (the shield without its error set), psf (a nominal
-            predictive safety filter).
+            shielded:MODE, lookahead, trusting and trusting:lookahead (certainty-equivalent: without an error set), psf
+            (a nominal predictive safety filter).
             shield-at-test, trusting-at-test and psf-at-test are trained unshielded; +penalty costs reward per
             intervention, +residual adds the agent's action to K x_hat. Controllers that are not trained: proportional,
             lqr, random, K-x_hat, zero-input and untrained, alone or behind a filter as in proportional+shielded.
-        references: Arms that are listed below the others and not drawn.
-        conditions: What policies are evaluated under besides "as trained": worst-case-disturbance, worse-channel (more
+        baselines: Arms that are listed below the others and not drawn.
+        scenarios: What policies are evaluated under besides "as trained": worst-case-disturbance, worse-channel (more
             loss, later packets, within the contract), gaussian (noise without a bound).
         noise: "gaussian" draws noise that the certificate's bounds do not hold for always, and prints next to the
             episodes that left the safe set the bound on their probability.
@@ -174,7 +172,7 @@ class CompareSettings(BackendSettings, LearningSettings):
     out: Path = Path("runs/compare")
     seeds: int = 3
     arms: tuple[str, ...] = ("unshielded", "penalized", "trusting", "shielded")
-    references: tuple[str, ...] = (
+    baselines: Baselines = (
         "zero input",
         "K x_hat",
         "untrained",
@@ -182,13 +180,13 @@ class CompareSettings(BackendSettings, LearningSettings):
         "proportional+trusting",
         "proportional+shielded",
     )
-    conditions: tuple[str, ...] = ("as trained",)
+    scenarios: Scenarios = ("as trained",)
     noise: Literal["truncated", "gaussian"] = "truncated"
 
     @property
     def evaluated_under(self) -> tuple[str, ...]:
-        """Conditions that policies are evaluated under, besides that of the training."""
-        return self.conditions
+        """Scenarios that policies are evaluated in, besides that of the training."""
+        return self.scenarios
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
@@ -241,9 +239,6 @@ class EvaluateSettings:
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
-        if self.episodes < 1:
-            raise ValueError(f"--episodes must be at least 1, got {self.episodes}")
-        if self.seed < 0:
-            raise ValueError(f"--seed must be >= 0, got {self.seed}")
+        require_least(self, episodes=1, seed=0)
         if self.shield != "as-trained":  # otherwise the agent knows
             require_horizon(self.horizon, self.shield)

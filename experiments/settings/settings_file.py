@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import types
-from dataclasses import asdict, is_dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any
 
 from agents.former_settings import from_former_file
 from experiments.errors import SettingsError
+from experiments.json_values import from_json
 from ncs_gym.validation import MAX_QUOTED_LENGTH, shown
 from shields.atomic_write import write_atomically
 
@@ -99,7 +99,7 @@ def _load(path: Path, command: str, kind: type, names_folder: bool) -> Any:
                 "alone, and give --env module:id if you trust the module"
             )
     try:
-        settings = _from_json(from_former_file(values), kind)
+        settings = _read(from_former_file(values), kind)
         if not names_folder and not _is_near(settings.out, path):
             raise ValueError(f"out = {shown(str(settings.out))} lies neither here nor beside the file: give --out")
         return settings
@@ -114,49 +114,8 @@ def _is_near(folder: Path, path: Path) -> bool:
     return place.is_relative_to(Path.cwd().resolve()) or place == path.parent.resolve()
 
 
-def _from_json(value: Any, kind: Any, name: str = "") -> Any:
-    """Returns a JSON value as a value of a type.
-
-    Args:
-        value: The JSON value.
-        kind: Type that it has to have: a dataclass, or the type of one of its fields.
-        name: Dotted name of the field.
-
-    Raises:
-        TypeError: If the value is none of the type; the message names the field.
-        ValueError: If the value is out of range.
-    """
-    if is_dataclass(kind) and isinstance(value, dict):
-        fields = {field: hint for field, hint in get_type_hints(kind).items() if field not in _OF_THE_CALL}
-        prefix = f"{name}." if name else ""
-        return kind(**{key: _from_json(each, fields.get(key), prefix + key) for key, each in value.items()})  # type: ignore[operator]
-    origin, parameters = get_origin(kind), get_args(kind)
-    if origin in (Union, types.UnionType):
-        chosen = types.NoneType if value is None else next(each for each in parameters if each is not types.NoneType)
-        return _from_json(value, chosen, name)
-    if origin is dict and isinstance(value, dict):
-        return {key: _plain(each, f"{name}.{key}") for key, each in value.items()}
-    if origin is tuple and isinstance(value, list):
-        return tuple(_from_json(each, parameters[0], name) for each in value)
-    if kind is Path and isinstance(value, str):
-        return Path(value)
-    if (origin is Literal and value in parameters) or (
-        kind in (bool, int, str, types.NoneType) and type(value) is kind
-    ):
-        return value
-    if kind is float and type(value) in (int, float) and float(value) == value:  # not NaN, not rounded
-        return float(value)
-    raise TypeError(f"{name} = {json.dumps(value)}")
-
-
-def _plain(value: Any, name: str) -> Any:
-    """Returns a JSON value without NaN and infinity.
-
-    Raises:
-        TypeError: If there is one in it; the message names the field.
-    """
-    try:
-        json.dumps(value, allow_nan=False)
-    except ValueError as error:
-        raise TypeError(f"{name} = {json.dumps(value)}") from error
-    return value
+def _read(values: dict[str, Any], kind: type) -> Any:
+    """Returns the settings that a file gives; raises as `from_json` does, also if one is of the call alone."""
+    for name in values.keys() & set(_OF_THE_CALL):
+        raise TypeError(f"{name} = {json.dumps(values[name])}")
+    return from_json(values, kind)

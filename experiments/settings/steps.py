@@ -1,10 +1,9 @@
-"""Numbers of steps that commands share: counts, of which 100000 is also written 1e5, and the check of a horizon."""
+"""Numbers that commands share: counts of steps, of which 100000 is also written 1e5, and checks of what is given."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from decimal import Decimal, InvalidOperation
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.constructors import PrimitiveConstructorSpec
 
@@ -30,24 +29,32 @@ def _step_count(texts: list[str]) -> int:
     return int(number)
 
 
-def _step_count_or_none(texts: list[str]) -> int | None:
-    """Returns None for the text None, otherwise what `_step_count` does."""
-    return None if texts == ["None"] else _step_count(texts)
-
-
-def _argument(metavar: str, read: Callable[[list[str]], int | None]) -> PrimitiveConstructorSpec[int | None]:
-    """Returns how the parser reads and shows a number of steps."""
+def _argument(metavar: str) -> PrimitiveConstructorSpec[int | None]:
+    """Returns how the parser reads and shows a number of steps, or None if the metavar has that, too."""
+    optional = "None" in metavar
     return PrimitiveConstructorSpec(
         nargs=1,
         metavar=metavar,
-        instance_from_str=read,
-        is_instance=lambda value: value is None or type(value) is int,
+        instance_from_str=lambda texts: None if optional and texts == ["None"] else _step_count(texts),
+        is_instance=lambda value: type(value) is int or (optional and value is None),
         str_from_instance=lambda value: [str(value)],
     )
 
 
-StepCount = Annotated[int, _argument("INT", _step_count)]
-OptionalStepCount = Annotated[int | None, _argument("{None}|INT", _step_count_or_none)]
+StepCount = Annotated[int, _argument("INT")]
+OptionalStepCount = Annotated[int | None, _argument("{None}|INT")]
+
+
+def require_least(settings: Any, **least: float) -> None:
+    """Returns if settings are at least so large; None may be anything, and a setting that is not there, too.
+
+    Raises:
+        ValueError: If one is smaller, infinite or NaN.
+    """
+    for name, low in least.items():
+        value = getattr(settings, name, None)
+        if value is not None and not low <= value < float("inf"):
+            raise ValueError(f"--{name.replace('_', '-')} must be at least {low:g}, got {value}")
 
 
 def require_horizon(horizon: int | None, *modes: str | None) -> None:

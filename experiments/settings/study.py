@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from experiments.settings.backend import BackendSettings
-from experiments.settings.learning import Algorithm, LearningSettings
-from experiments.settings.steps import StepCount
+from experiments.settings.learning import Algorithm, Baselines, LearningSettings, Scenarios
+from experiments.settings.steps import StepCount, require_least
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +56,7 @@ class SweepSettings(BackendSettings, LearningSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class StudySettings(BackendSettings):
-    """Compares arms in several environments and under several conditions, with the statistics to judge them by.
+    """Compares arms in several environments and under several scenarios, with the statistics to judge them by.
 
     Every environment is a comparison of its own (`ncs compare`) in a folder below the output folder, with the settings
     of that command; then linear controllers and trained agents meet worse and better channels, behind filters with and
@@ -70,11 +71,12 @@ class StudySettings(BackendSettings):
         seed: Seed of the study, >= 0.
         seeds: Number of paired training runs per arm and environment.
         budget: Fraction of the training steps of each environment, in (0, 1].
-        episodes: Evaluation episodes per run and condition.
+        episodes: Evaluation episodes per run and scenario.
         algo: Learning algorithm.
         arms: Trained arms; see `ncs compare`.
-        references: Arms in which nothing is trained.
-        conditions: What policies are evaluated under besides "as trained".
+        baselines: Arms in which nothing is trained.
+        scenarios: What policies are evaluated under besides "as trained".
+        safe_set: What shields keep: the ellipsoid, as in the published study, or the polytope that other commands take.
         channel_episodes: Episodes per point of the figure about channels; 0 leaves it out.
         page: Also write the page of Markdown to this file, its figures into the folder images beside it, and its
             numbers into the file with the ending .json.
@@ -105,7 +107,7 @@ class StudySettings(BackendSettings):
         "shielded",
         "lookahead",
     )
-    references: tuple[str, ...] = (
+    baselines: Baselines = (
         "zero input",
         "K x_hat",
         "random+shielded",
@@ -118,7 +120,8 @@ class StudySettings(BackendSettings):
         "lqr+shielded",
         "lqr+lookahead",
     )
-    conditions: tuple[str, ...] = ("worst-case-disturbance", "worse-channel", "gaussian")
+    scenarios: Scenarios = ("worst-case-disturbance", "worse-channel", "gaussian")
+    safe_set: Literal["polytope", "ellipsoid"] = "ellipsoid"
     channel_episodes: int = 100
     page: Path | None = None
     quote: tuple[Path, ...] = ()
@@ -128,12 +131,7 @@ class StudySettings(BackendSettings):
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
         BackendSettings.__post_init__(self)
-        for name in ("seeds", "episodes"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("seed", "channel_episodes"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"--{name.replace('_', '-')} must be >= 0, got {getattr(self, name)}")
+        require_least(self, seeds=1, episodes=1, seed=0, channel_episodes=0)
         if not 0.0 < self.budget <= 1.0:
             raise ValueError(f"--budget must be in (0, 1], got {self.budget}")
         if not self.envs or len(set(map(short_name, self.envs))) != len(self.envs):

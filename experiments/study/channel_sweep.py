@@ -20,14 +20,14 @@ from experiments.runs import (
     run_of_arm,
 )
 from experiments.runs.environments import registered_env
-from experiments.runs.evaluation_conditions import AS_TRAINED
+from experiments.runs.scenarios import AS_TRAINED
 from experiments.settings import Assignments, CompareSettings, changed_channel
 
 # The filters, in pairs without and with the error set, by the count in the rows that tells whether they do what they
 # are for: the first keep S, the others may leave it and keep the box.
 FILTERS_BY_COUNT = {"outside_set": ("trusting", "shielded"), "violating": ("trusting:lookahead", "lookahead")}
 SWEPT_FILTERS = tuple(name for pair in FILTERS_BY_COUNT.values() for name in pair)
-SWEPT_CONDITIONS = (AS_TRAINED, "worst-case disturbance")
+SWEPT_SCENARIOS = (AS_TRAINED, "worst-case disturbance")
 _LOSSES, _DELAYS, _QUANTIZATION = (0.0, 0.15, 0.3, 0.5, 0.7, 0.9), (0, 1, 2, 3, 4), (0.0, 0.5, 1.0, 2.0, 4.0)
 # Agents per filter: what their trainings differ by shows, and the sweep takes minutes.
 MOST_AGENTS = 5
@@ -73,7 +73,7 @@ def trained_agents(settings: CompareSettings) -> dict[str, AgentFiles]:
         ResultsError: If the agents are missing or damaged.
     """
     loop, store = loop_config(settings.env, settings.channel), RunStore(settings.out)
-    certificate = certificate_of(loop, settings.certificate)
+    certificate = certificate_of(loop, settings.certificate, settings.safe_set)
     arms = {Arm.of(name, settings.mode).name for name in settings.arms}
     agents: dict[str, AgentFiles] = {}
     count = min(settings.seeds, MOST_AGENTS)
@@ -104,7 +104,7 @@ def channel_sweep(settings: CompareSettings, agents: Mapping[str, AgentFiles]) -
         ClusterError: If a cluster cannot execute the runs.
         OSError: If the folder cannot be written.
     """
-    settings = replace(settings, conditions=SWEPT_CONDITIONS[1:])
+    settings = replace(settings, scenarios=SWEPT_SCENARIOS[1:])
     runs_at = {point: _runs(point, settings, agents) for point in _points(settings.env)}
     results = iter(results_of([run for runs in runs_at.values() for run in runs], settings.out, settings))
     return [row for point, runs in runs_at.items() for row in _rows(point, [next(results) for _ in runs])]
@@ -133,7 +133,7 @@ def _points(env_id: str) -> list[_Point]:
 def _runs(point: _Point, settings: CompareSettings, agents: Mapping[str, AgentFiles]) -> list[TrainingRun]:
     """Returns the runs at a point; nothing is trained in them."""
     loop = loop_config(settings.env, point.change)
-    certificate = certificate_of(loop, settings.certificate)
+    certificate = certificate_of(loop, settings.certificate, settings.safe_set)
 
     def run(settings: CompareSettings, name: str, index: int) -> TrainingRun:
         return run_of_arm(settings, loop, certificate, name, index, grid_point=point.name)

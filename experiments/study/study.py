@@ -1,4 +1,4 @@
-"""`ncs study`: the same arms in several environments and under several conditions, and what can be concluded."""
+"""`ncs study`: the same arms in several environments and under several scenarios, and what can be concluded."""
 
 from __future__ import annotations
 
@@ -83,8 +83,9 @@ def _comparison_settings(settings: StudySettings, env_id: str) -> CompareSetting
         episodes=settings.episodes,
         algo=settings.algo,
         arms=settings.arms,
-        references=settings.references,
-        conditions=settings.conditions,
+        baselines=settings.baselines,
+        scenarios=settings.scenarios,
+        safe_set=settings.safe_set,
         force=settings.force,
         **backend,
     )

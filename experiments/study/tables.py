@@ -175,7 +175,7 @@ def budget_text(summary: dict[str, Any]) -> str:
     """Returns what was spent in each environment, one line each."""
     return "\n".join(
         f"{name}: {env['seeds']} {'run' if env['seeds'] == 1 else 'runs'} per arm, {env['steps']:,} training steps "
-        f"each, {env['episodes']} episodes per run and condition"
+        f"each, {env['episodes']} episodes per run and scenario"
         for name, env in summary["environments"].items()
     )
 

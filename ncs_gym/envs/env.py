@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
+from ncs_gym.envs.episode_channels import EpisodeChannels, covering, downlinks, uplinks
 from ncs_gym.envs.info import Constraints, Known, loop_info
-from ncs_gym.envs.reset_options import start_option
+from ncs_gym.envs.reset_options import CHANNELS, start_option
 from ncs_gym.envs.settings import expect, loop_contracts, require_own_equations, require_suitable, starting_set
-from ncs_gym.envs.spaces import observation_space, read_action
+from ncs_gym.envs.spaces import entries_within, observation_space, read_action
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.downlink import DownlinkProtocol, DownlinkState, Inputs, no_inputs
+from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from ncs_gym.network.packet_transmission import ChannelState
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import LinearProcess, Process
@@ -33,7 +36,7 @@ from ncs_gym.validation import as_count, as_flag, setting, shown
 # Keeps the rounding of a sampled start inside the initial set.
 SAMPLE_ROUNDING = 1e-9
 # The steps the observation space is sized for are gone through one by one.
-LONGEST_HORIZON = 100_000
+DEFAULT_HORIZON, LONGEST_HORIZON = 200, 100_000
 RENDER_MODES = ["human", "rgb_array"]
 RENDER_FPS = 30
 
@@ -50,7 +53,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     Finite actions outside the box are clipped.
 
     ## Observation space
-    A finite `Box` of float32, sized by what the plant and the task can reach within `horizon` steps:
+    A finite `Box` of float32, sized by what the plant and the task can reach within `horizon` steps, for an unstable
+    plant by what one step out of the safe box can reach. What is beyond is clipped, in `info` it is not:
 
     | entries | meaning | unit |
     |---|---|---|
@@ -67,7 +71,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
 
     ## Starting state
     Uniform in `initial_set`, or `options={"state": x0}`. The first estimate is off by Gaussian noise
-    (truncated unless `noise` says otherwise) and a uniform draw from the plant's `initial_bound`.
+    (truncated unless `noise` says otherwise) and a uniform draw from the plant's `initial_bound`. Other options of
+    `reset` give the episode another channel.
 
     ## Episode end
     Terminates on a violation of the safe box only with `terminate_on_violation`, or with an environment that is the
@@ -106,7 +111,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             if the plant is unstable, none if it is stable. A channel that may break it is allowed.
         render_mode: "human" shows every step in a window, "rgb_array" makes `render` return an image; both need
             the extra `[render]` (docs/rendering.md).
-        horizon: Steps the observation space is sized for.
+        horizon: Steps the observation space is sized for; give it beside a longer `max_episode_steps`.
         noise: "truncated", or "gaussian" for process noise, sensor noise and first errors without a bound: what is
             proved then holds but for a probability that `escape_probability` bounds (docs/shield.md).
         process: What really moves (docs/beyond_linear.md); the plant's own equations by default.
@@ -119,6 +124,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         certificate_contract: Contract that a certificate for this environment rests on: `contract` with c steps added.
         steps: Steps taken in this episode.
         episodes: Episodes begun.
+        episode_channel: The channel of this episode, `channel` unless an option of the reset gave another one.
+        episode_downlink: The downlink of this episode, likewise.
         start: What the start of this episode is known to lie in: `initial_set`, or the state given as an option.
 
     Raises:
@@ -160,7 +167,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         allow_assumption_violation: bool = False,
         contract: ChannelContract | None = None,
         render_mode: str | None = None,
-        horizon: int = 200,
+        horizon: int = DEFAULT_HORIZON,
         noise: str = "truncated",
         process: Process | None = None,
         downlink: Channel | None = None,
@@ -185,8 +192,16 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._downlink_contract = None if self._protocol is None else self._protocol.contract
         patterns = arrival_patterns(plant, self._channel, self._certificate_contract)
         self._error_set = patterns.recursion.error_set
+        if not patterns.uses_samples:
+            warnings.warn(
+                f"no packet is of use: with a quantization step of {self._channel.quantization_step:g} and this sensor "
+                "noise samples move the estimate by less than 1 % of what they differ by, so that it is a prediction",
+                UnusedPacketsWarning,
+                stacklevel=3,
+            )
         self._estimator = Estimator(plant, self._channel, patterns=patterns)
         self._downlink_state = DownlinkState(self._protocol, plant.m)
+        self._uplinks, self._downlinks = uplinks([self._channel], self._channel), downlinks([downlink], self._protocol)
         self._noise = as_noise(noise, plant)
         truncated = self._noise == "truncated"
         self._process_given = LinearProcess() if process is None else expect(process, Process, "process")
@@ -197,11 +212,13 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._horizon = as_count(horizon, "horizon", low=1, high=LONGEST_HORIZON)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)
         steps = self._horizon + len(self._pending)
-        self.observation_space = observation_space(plant, self._task, self._error_set, self._initial_set, steps)
+        self.observation_space = observation_space(
+            plant, self._task, self._error_set, self._initial_set, steps, len(self._pending)
+        )
         self._low, self._high = self.observation_space.low, self.observation_space.high
         self.steps = self.episodes = 0
         self.start: Ellipsoid | np.ndarray = self._initial_set
-        self._consistent = False
+        self._consistent = self._warned = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -210,12 +227,17 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
 
         Args:
             seed: Seeds `np_random`, the only source of randomness.
-            options: {"state": x0} starts at x0, shape (n,).
+            options: {"state": x0} starts at x0, shape (n,). {"channel": c}, {"downlink": c} give this episode another
+                channel, a `Channel` or a function (rng) -> Channel that draws one. Contract, error set and spaces stay
+                those that the environment was made with: a channel that cannot keep the contract may break it, as ever,
+                one that rounds more coarsely than the environment's own, or delays commands by more than its
+                downlink commits ahead, is refused.
 
         Raises:
-            ValueError: If an option is unknown or x0 has a wrong shape or is not finite.
+            ValueError: If an option is unknown or wrong, or the environment cannot have the channel.
         """
         start = start_option(options, self._plant.n)
+        read = [links.read((options or {}).get(name), name) for name, links in self._links()]
         super().reset(seed=seed)
         self._consistent = False
         if seed is not None:
@@ -225,13 +247,19 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._state, self.start = self._process.start(rng, first, initial)
         self._task_state = self._task.begin(rng, self._plant)
         self._disturbance_memory = self._process.begin(rng)
-        self._channel_state = ChannelState(self._channel, rng)
+        for (_, links), sources in zip(self._links(), read, strict=True):
+            links.give(sources)
+            links.begin(rng)
+        channel = self.episode_channel
+        self._channel_state = ChannelState(channel, rng)
+        if (channel.delay, channel.jitter) != (self._estimator.channel.delay, self._estimator.channel.jitter):
+            self._estimator = self._estimator_for(covering([channel], self._channel))
         self._estimator.reset(self._state + self._process.first_error(rng))
-        self._downlink_state.begin(rng, self._estimator.episode)
+        self._downlink_state.begin(rng, self._estimator.episode, self.episode_downlink)
         self.steps = 0
         self.episodes += 1
         self._violations = 0.0
-        self._consistent = True
+        self._consistent, self._over = True, False
         values = self._plant.constraint_values(self._state)
         info = self._info(no_inputs(self._plant.m), values, arrived=False)
         if self.renderer is not None:
@@ -243,11 +271,13 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
 
         Raises:
             ValueError: If the action is not finite or wrongly shaped; nothing has moved then.
-            gymnasium.error.ResetNeeded: If there was no reset, or an earlier step failed half-way.
+            gymnasium.error.ResetNeeded: If there was no reset, an earlier step failed half-way, or ended the episode.
         """
         _, decided = read_action(self._plant, action)
         if not self._consistent:
             raise gym.error.ResetNeeded("call reset: there was none, or an earlier step failed half-way")
+        if self._over:
+            raise gym.error.ResetNeeded("the episode is over, as the step before said: call reset")
         self._consistent = False
         rng = self.np_random
         inputs = self._downlink_state.exchange(rng, self.steps, decided)
@@ -263,7 +293,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         worst = self._plant.worst_constraint_values(before, u, self._state)
         info = self._info(inputs, worst, arrived=bool(packets))
         terminated = self._process.terminated or (self._terminate_on_violation and info["cost"] > 0.0)
-        self._consistent = True
+        self._consistent, self._over = True, terminated or self._process.truncated
         if self.renderer is not None:
             self.renderer.record(info, self._task_state, self._channel_state, packets)
         return self._observation(), reward, terminated, self._process.truncated, info
@@ -286,6 +316,16 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         """Shows what a shield knows in the picture of the next step or reset; nothing where nothing is drawn."""
         if self.renderer is not None:
             self.renderer.annotate(annotation)
+
+    @property
+    def episode_channel(self) -> Channel:
+        """The channel of this episode."""
+        return self._uplinks.now[0]
+
+    @property
+    def episode_downlink(self) -> Channel | None:
+        """The downlink of this episode; None for an ideal one."""
+        return self._downlinks.now[0]
 
     @property
     def known(self) -> Known:
@@ -311,6 +351,14 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         """Returns estimate, (n,), and error shape, (n, n), of the time at which the next decision takes effect."""
         return self._estimator.predicted(self._pending)
 
+    def _links(self) -> list[tuple[str, EpisodeChannels]]:
+        return list(zip(CHANNELS, (self._uplinks, self._downlinks), strict=True))
+
+    def _estimator_for(self, channel: Channel) -> Estimator:
+        """Returns an estimator of the episodes to come, for packets of other delays."""
+        patterns = arrival_patterns(self._plant, channel, self._certificate_contract)
+        return Estimator(self._plant, channel, patterns=patterns, after=self._estimator)
+
     def _drawn_start(self, rng: np.random.Generator) -> np.ndarray:
         return (1.0 - SAMPLE_ROUNDING) * self._initial_set.sample(rng)
 
@@ -318,8 +366,9 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         task_state = self._task_state
         for u in self._pending:
             task_state = self._task.predict(self._plant, task_state, u)
-        entries = np.concatenate([self._belief[0], self._task.observe(task_state)])
-        return np.minimum(np.maximum(entries, self._low), self._high).astype(np.float32)
+        own, bounds = self._task.observe(task_state), (self._low, self._high)
+        within, self._warned = entries_within(self._task, self._belief[0], own, *bounds, self._warned, self._horizon)
+        return within.astype(np.float32)
 
     def _info(self, inputs: Inputs, worst: np.ndarray, *, arrived: bool) -> dict[str, Any]:
         values = worst if self._plant.between_samples is None else self._plant.constraint_values(self._state)

@@ -8,6 +8,8 @@ import numpy as np
 
 from ncs_gym.validation import as_numbers, as_vector, shown
 
+CHANNELS = "channel", "downlink"
+
 
 def start_option(options: dict[str, Any] | None, n: int) -> np.ndarray | None:
     """Returns options["state"] as a finite array of shape (n,), or None without one.
@@ -15,7 +17,7 @@ def start_option(options: dict[str, Any] | None, n: int) -> np.ndarray | None:
     Raises:
         ValueError: If an option is unknown, has a wrong shape or is not finite.
     """
-    options = _known_options(options, {"state"})
+    options = _known_options(options, {"state", *CHANNELS})
     if "state" not in options:
         return None
     return as_vector(options["state"], n, "options['state']")
@@ -27,7 +29,7 @@ def vector_reset_options(options: dict[str, Any] | None, count: int, n: int) -> 
     Raises:
         ValueError: If an option is unknown, has a wrong shape or is not finite.
     """
-    options = _known_options(options, {"state", "reset_mask"})
+    options = _known_options(options, {"state", "reset_mask", *CHANNELS})
     given = options.get("reset_mask", np.ones(count, np.bool_))
     mask = np.zeros(0, np.bool_) if as_numbers(given) is None else np.array(given)
     if mask.shape != (count,) or mask.dtype != np.bool_ or not mask.any():

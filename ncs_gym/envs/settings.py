@@ -70,6 +70,12 @@ def require_suitable(task: Task, plant: LinearPlant) -> None:
     """Raises ValueError unless a task suits the plant."""
     if problem := task.check(plant):
         raise ValueError(f"{type(task).__name__}: {problem}")
+    kind = type(task)
+    if kind.observe is not Task.observe and kind.observation_bound is Task.observation_bound:
+        raise ValueError(
+            f"{kind.__name__}: observe is defined, observation_bound is not: it must return the largest absolute value "
+            "of each of these entries within the horizon"
+        )
 
 
 def require_own_equations(process: Process | None, plant: LinearPlant) -> None:

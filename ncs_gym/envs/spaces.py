@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from math import isfinite
 from typing import Any
 
@@ -16,10 +17,12 @@ from ncs_gym.validation import as_numbers, shown
 
 # The default start covers this fraction of the half-width of the safe box in every direction.
 START_FRACTION = 0.1
-# Observations of an unstable plant end this many half-widths of the box out: what lies beyond is lost anyway.
-FARTHEST_OBSERVED = 1e6
 # Widens the observation box: float32 rounding, and estimates a little off the reachable set.
 OBSERVATION_MARGIN = 1.01
+
+
+class ClippedObservationWarning(UserWarning):
+    """Entries of a task are beyond the observation space, which agents do not see."""
 
 
 def default_initial_set(plant: LinearPlant) -> Ellipsoid:
@@ -27,11 +30,22 @@ def default_initial_set(plant: LinearPlant) -> Ellipsoid:
     return Ellipsoid(START_FRACTION**2 * np.linalg.inv(plant.weight))
 
 
-def observation_space(plant: LinearPlant, task: Task, error_set: ErrorSet, initial_set: Ellipsoid, horizon: int) -> Box:
+def observation_space(
+    plant: LinearPlant, task: Task, error_set: ErrorSet, initial_set: Ellipsoid, horizon: int, lead: int = 0
+) -> Box:
     """Returns the finite box of estimate and task entries that can be reached within some steps, float32.
 
     The reach of x_hat is that of x from the initial set under every input and disturbance within the horizon,
-    plus the certified error.
+    plus the certified error. For an unstable plant it ends where one step out of the safe box, or a start, can end
+    (with a downlink c + 1 steps): what runs away further is clipped, so that rescaled observations still say something.
+
+    Args:
+        plant: The plant.
+        task: Gives entries of its own.
+        error_set: Bounds the errors.
+        initial_set: Bounds the starts.
+        horizon: Number of steps.
+        lead: c, the number of steps from a decision to its effect, of which observations tell.
 
     Raises:
         ValueError: If an entry is beyond float32's range, so that observations would be infinite, or always zero.
@@ -44,9 +58,14 @@ def observation_space(plant: LinearPlant, task: Task, error_set: ErrorSet, initi
     reach = np.vstack([np.zeros(plant.n), added.cumsum(axis=0)]) + initial_set.support(unforced)
     ages = error_set.ages
     shapes = error_set.Sigma[None] if ages is None else ages.shapes
-    estimate = reach.max(axis=0) + np.sqrt(np.diagonal(shapes, axis1=1, axis2=2).max(axis=0))
-    start = initial_set.support(np.eye(plant.n))
-    estimate = np.minimum(estimate, np.maximum(FARTHEST_OBSERVED * plant.half_widths, start))
+    errors = np.sqrt(np.diagonal(shapes, axis1=1, axis2=2).max(axis=0))
+    estimate = reach.max(axis=0) + errors
+    if plant.spectral_radius >= 1.0:
+        known = np.maximum(plant.half_widths, initial_set.support(np.eye(plant.n)))
+        for _ in range(lead + 1):
+            pushed = np.abs(plant.B) @ plant.u_max + plant.disturbance.support(np.eye(plant.n))
+            known = np.maximum(known, np.abs(plant.A) @ known + pushed)
+        estimate = np.minimum(estimate, known + errors)
     bound = OBSERVATION_MARGIN * np.concatenate([estimate, task.observation_bound(plant, horizon)])
     numbers = np.finfo(np.float32)
     if not ((bound >= numbers.tiny) & (bound <= numbers.max)).all():
@@ -54,6 +73,45 @@ def observation_space(plant: LinearPlant, task: Task, error_set: ErrorSet, initi
             f"observations of up to {shown(bound.tolist())} are out of float32's range: choose other units"
         )
     return Box(-bound.astype(np.float32), bound.astype(np.float32), dtype=np.float32)
+
+
+def entries_within(
+    task: Task, estimates: np.ndarray, own: Any, low: np.ndarray, high: np.ndarray, warned: bool, horizon: int
+) -> tuple[np.ndarray, bool]:
+    """Returns observation entries, clipped to the space, and whether it was ever warned of clipping the task's.
+
+    Args:
+        task: Gives the name.
+        estimates: Shape (n,) or (n, N).
+        own: The task's entries, shape (extra,) or (extra, N).
+        low: Bounds, shape (n + extra,) or (n + extra, 1).
+        high: Bounds, likewise.
+        warned: Whether it was warned before.
+        horizon: Steps that the bounds are about.
+
+    Raises:
+        ValueError: If the task has another number of entries than it has bounds.
+    """
+    entries = np.concatenate([estimates, own])
+    if len(entries) != len(low):
+        raise ValueError(
+            f"{type(task).__name__}: observe returns {len(entries) - len(estimates)} entries, observation_bound the "
+            f"bounds of {len(low) - len(estimates)}: it must return the largest absolute value of each"
+        )
+    within = np.minimum(np.maximum(entries, low), high)
+    if not warned and len(entries) > len(estimates):
+        first = len(estimates)
+        if np.count_nonzero(beyond := within[first:] != entries[first:]):
+            entry = int(np.argwhere(beyond)[0][0])
+            bound = float(np.ravel(high)[first + entry])
+            warnings.warn(
+                f"entry {entry} of {type(task).__name__} is beyond its observation_bound of {bound:.6g} and is clipped "
+                f"in observations: bound what {horizon} steps can reach, and give horizon=... if episodes are longer",
+                ClippedObservationWarning,
+                stacklevel=4,
+            )
+            warned = True
+    return within, warned
 
 
 def read_action(plant: LinearPlant, action: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -9,15 +10,16 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from ncs_gym.envs.env import SAMPLE_ROUNDING, NCSEnv, RenderModeError
+from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, SAMPLE_ROUNDING, NCSEnv, RenderModeError
+from ncs_gym.envs.episode_channels import covering, downlinks, uplinks
 from ncs_gym.envs.info import Constraints, Known, loop_info
-from ncs_gym.envs.reset_options import vector_reset_options
-from ncs_gym.envs.spaces import read_actions
+from ncs_gym.envs.reset_options import CHANNELS, vector_reset_options
+from ncs_gym.envs.spaces import entries_within, read_actions
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.error_statistics_table import StatisticsTable
 from ncs_gym.estimation.vector_estimator import VectorEstimator
-from ncs_gym.network.channel import Channel
+from ncs_gym.network.channel import Channel, widest
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.downlink import DownlinkProtocol, Inputs, VectorDownlinkState, no_inputs
 from ncs_gym.network.packet_transmission import VectorChannelState
@@ -38,13 +40,19 @@ class NCSVectorEnv(VectorEnv):
 
     Args:
         num_envs: N.
-        max_episode_steps: Truncation; None never truncates.
+        max_episode_steps: Truncation; None never truncates. A `horizon` that is shorter becomes as long.
         autoreset_mode: `AutoresetMode.NEXT_STEP` or "NextStep" (the step after an episode's last ignores the action
             and returns the new episode's first observation), "SameStep" (`final_obs` and `final_info` hold the last
             ones) or "Disabled" (reset with `options={"reset_mask": ...}`).
-        settings: Those of `NCSEnv`.
+        channel: A channel, or a list of N, one for each environment; likewise `downlink`. `channel`, `downlink` and by
+            default the contract are then those of the widest of them (`ncs_gym.network.channel.widest`).
+        downlink: See `channel`.
+        settings: The others of `NCSEnv`.
 
     Attributes:
+        episode_channels: The channels of the present episodes, N of them; those the environments were made with unless
+            options of a reset gave others.
+        episode_downlinks: The downlinks, likewise.
         single: The scalar environment with these settings; never stepped.
         steps: Steps taken in each episode, shape (N,).
         episodes: Episodes begun in each environment, shape (N,).
@@ -82,6 +90,8 @@ class NCSVectorEnv(VectorEnv):
         *,
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        channel: Channel | Sequence[Channel] | None = None,
+        downlink: Channel | Sequence[Channel] | None = None,
         **settings: Any,
     ) -> None:
         self.num_envs = as_count(num_envs, "num_envs", low=1)
@@ -91,6 +101,11 @@ class NCSVectorEnv(VectorEnv):
         self.metadata = NCSEnv.metadata | {"autoreset_mode": self._autoreset_mode, "render_modes": []}
         if settings.get("render_mode") is not None:
             raise RenderModeError("a vector environment draws nothing: use gym.make(..., render_mode=...)")
+        own = [self._one_each(each, name) for name, each in zip(CHANNELS, (channel, downlink), strict=True)]
+        if self._max_episode_steps is not None:
+            own_horizon = settings.get("horizon", DEFAULT_HORIZON)
+            settings["horizon"] = max(own_horizon, min(self._max_episode_steps, LONGEST_HORIZON))
+        settings |= {name: each and widest(each) for name, each in zip(CHANNELS, own, strict=True)}
         self._single = single = NCSEnv(**settings)
         self._plant, self._channel, self._task = single.plant, single.channel, single.task
         self._contract, self._error_set, self.render_mode = single.contract, single.error_set, None
@@ -106,6 +121,9 @@ class NCSVectorEnv(VectorEnv):
         )
         self._downlink, self._protocol = single.downlink, single.downlink_protocol
         self._certificate_contract = single.certificate_contract
+        count = self.num_envs
+        self._uplinks = uplinks(own[0] or [self._channel] * count, self._channel)
+        self._downlinks = downlinks(own[1] or [None] * count, self._protocol)
         patterns = arrival_patterns(self._plant, self._channel, self._certificate_contract)
         self._estimator = VectorEstimator(self._plant, patterns, self.num_envs)
         self._downlink_state = VectorDownlinkState(self._protocol, self._plant.m, self.num_envs)
@@ -115,9 +133,19 @@ class NCSVectorEnv(VectorEnv):
         self._violations, self._done = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
         self.steps, self.episodes = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, np.int64)
         self.starts = np.full((self.num_envs, self._plant.n), np.nan)
-        self.ticks, self._consistent = 0, False
+        self.ticks, self._consistent, self._warned = 0, False, False
         self._known: Known
         self._ended: tuple[np.ndarray, Known] | None = None
+
+    @property
+    def episode_channels(self) -> tuple[Channel, ...]:
+        """The channels of the present episodes."""
+        return tuple(self._uplinks.now)
+
+    @property
+    def episode_downlinks(self) -> tuple[Channel | None, ...]:
+        """The downlinks of the present episodes; None for ideal ones."""
+        return tuple(self._downlinks.now)
 
     @property
     def error_shapes(self) -> tuple[StatisticsTable, np.ndarray]:
@@ -153,11 +181,16 @@ class NCSVectorEnv(VectorEnv):
         Args:
             seed: Seeds `np_random`, the only source of randomness of all environments.
             options: {"state": x0} starts at x0, shape (n,) or (N, n); {"reset_mask": (N,)} says which environments.
+                {"channel": c}, {"downlink": c} give these environments other channels, one for all or a list of N, in
+                which None stands for an environment's own; see `NCSEnv.reset`. Episodes that begin by themselves keep
+                them, or draw anew; every call of `reset` without the option goes back to the environments' own.
 
         Raises:
-            ValueError: If an option is unknown, has a wrong shape or is not finite.
+            ValueError: If an option is unknown or wrong, or the environments cannot have the channel.
         """
         mask, starts = vector_reset_options(options, self.num_envs, self._plant.n)
+        links = list(zip(CHANNELS, (self._uplinks, self._downlinks), strict=True))
+        read = [each.read((options or {}).get(name), name) for name, each in links]
         if isinstance(seed, (list, tuple, np.ndarray)):
             seeds = [as_count(each, "each seed", low=0, high=2**64) for each in seed]
             seed = int(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0] >> 1)
@@ -167,6 +200,8 @@ class NCSVectorEnv(VectorEnv):
         if not (self._consistent or mask.all()):
             raise gym.error.ResetNeeded("reset all environments first")
         self._consistent, self._ended = False, None
+        for (_, each), sources in zip(links, read, strict=True):
+            each.give(sources, np.flatnonzero(mask).tolist())
         self._begin(mask, starts)
         self._worst = np.where(mask, self._plant.constraint_values(self._state), self._worst)
         info = self._info(no_inputs(self._plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), mask)
@@ -230,7 +265,7 @@ class NCSVectorEnv(VectorEnv):
         self.ticks += 1
         sends, samples = self._channel_state.send(rng, self.steps), None
         if sends.any():
-            samples = self._channel.quantize(self._process.measure(rng, self._state))
+            samples = self._channel_state.channel.quantize(self._process.measure(rng, self._state))
             if not np.isfinite(samples.sum()):  # no sensor within the assumptions sends this
                 damaged = np.asarray(~np.isfinite(samples).all(axis=0))
                 self._channel_state.discard(damaged)
@@ -263,18 +298,46 @@ class NCSVectorEnv(VectorEnv):
         initial, states = (self._single.initial_set, first_states) if starts is None else (None, starts[mask].T)
         states, known = self._process.start_many(rng, states, initial, mask)
         task_state, memory = self._task.begin_many(rng, self._plant, count), self._process.begin(rng, count)
+        channels, downlinks = self._uplinks.begin(rng, mask), self._downlinks.begin(rng, mask)
         if count == self.num_envs:
             self._task_state, self._disturbance_memory = task_state, memory
-            self._channel_state = VectorChannelState(self._channel, rng, count)
+            self._channel_state = VectorChannelState(channels or self._channel, rng, count)
         else:
             self._task_state[..., mask], self._disturbance_memory[..., mask] = task_state, memory
-            self._channel_state.begin(rng, mask)
+            self._channel_state.begin(rng, mask, channels)
+        self._prepare_estimator(all_begin=count == self.num_envs)
         self._state[:, mask] = states
         self._estimator.begin(mask, states + first_errors)
-        self._downlink_state.begin(rng, mask)
+        self._downlink_state.begin(rng, mask, downlinks)
         self.steps[mask], self._violations[mask], self._done[mask] = 0, 0.0, False
         self.episodes[mask] += 1
         self.starts[mask] = known
+
+    def _prepare_estimator(self, *, all_begin: bool) -> None:
+        """Makes the estimator one for the delays of all present channels; it forgets nothing unless all begin."""
+        known = self._estimator.patterns.channel
+        used = [self._channel] if self._uplinks.is_plain else [*self._uplinks.now, *([] if all_begin else [known])]
+        if (wanted := covering(used, self._channel)) != known:
+            patterns = arrival_patterns(self._plant, wanted, self._certificate_contract)
+            if all_begin:
+                self._estimator = VectorEstimator(self._plant, patterns, self.num_envs)
+            else:
+                self._estimator.follow(patterns)
+
+    def _one_each(self, value: Any, name: str) -> list[Channel] | None:
+        """Returns a channel that is given for all environments, or for each, as a list of N; None for None.
+
+        Raises:
+            ValueError: If it is none of these.
+        """
+        if value is None:
+            return None
+        each = list(value) if isinstance(value, (list, tuple)) else [value] * self.num_envs
+        if len(each) != self.num_envs or not all(isinstance(channel, Channel) for channel in each):
+            raise ValueError(
+                f"{name} must be of type Channel, or a list of {self.num_envs} of these, got {shown(value)}"
+            )
+        return each
 
     def _predicted_estimates(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimates, (n, N), and numbers of error statistics, (N,), of the times of the next effects."""
@@ -291,10 +354,11 @@ class NCSVectorEnv(VectorEnv):
         task_state = self._task_state
         for u in self._downlink_state.committed.pending:
             task_state = self._task.predict_many(self._plant, task_state, u)
-        entries = np.concatenate([self._belief[0], self._task.observe_many(task_state)])
-        observation = np.empty(entries.shape, np.float32)
-        np.minimum(np.maximum(entries, self._low), self._high, out=observation, casting="same_kind")
-        return observation.T
+        own, bounds = self._task.observe_many(task_state), (self._low, self._high)
+        within, self._warned = entries_within(
+            self._task, self._belief[0], own, *bounds, self._warned, self._single.horizon
+        )
+        return within.astype(np.float32).T
 
     def _info(self, inputs: Inputs, arrived: np.ndarray, counted: np.ndarray | None) -> dict[str, Any]:
         """Returns the infos; the costs of environments that are not `counted`, shape (N,), do not count once more."""

@@ -26,6 +26,8 @@ from ncs_gym.plants.linear_plant import LinearPlant
 MAX_PATTERNS, MAX_NUMBERS = 1 << 17, 1 << 25
 # A graph takes at least this many times the patterns it began with, or it would be forgotten at every step.
 SMALLEST_GROWTH = 4
+# Some sample of these many steps should move an estimate by this share of its distance from the sample.
+FIRST_STEPS, SMALLEST_SHARE = 50, 0.01
 # Of more plants and channels than this, graphs are kept only as long as an estimator uses them.
 MAX_GRAPHS = 32
 
@@ -153,6 +155,16 @@ class ArrivalPatterns:
             ahead = known.take(statistics)
         return ahead
 
+    @property
+    def uses_samples(self) -> bool:
+        """Whether a sample of one of the first steps moves the estimate towards it, if it arrives at once."""
+        number, H = self.statistics_of(self.root), self.recursion.plant.H
+        for _ in range(FIRST_STEPS):
+            number = self.predicted(number, 1)
+            if np.diagonal(H @ self.update(number).gain).max() >= SMALLEST_SHARE:
+                return True
+        return False
+
     def statistics_of(self, pattern: int) -> int:
         """Returns the number of the statistics of the present estimate."""
         return self._patterns[pattern].present
@@ -171,8 +183,15 @@ class ArrivalPatterns:
             numbers = successor._adopted(self, np.unique(patterns).tolist())
         return successor, np.array([numbers[each] for each in patterns.tolist()], np.int64)
 
+    def taking_over(self, other: ArrivalPatterns, patterns: np.ndarray) -> np.ndarray:
+        """Returns the numbers here of patterns, shape (k,), of a graph with fewer delays of the same plant."""
+        with self._lock:
+            numbers = self._adopted(other, np.unique(patterns).tolist())
+        return np.array([numbers[each] for each in patterns.tolist()], np.int64)
+
     def _adopted(self, other: ArrivalPatterns, patterns: list[int]) -> dict[int, int]:
         """Returns the numbers of another graph's patterns."""
+        older = self.buffer - other.buffer
 
         def same(number: int) -> int:
             return number if number == UNKNOWN else self.table.number_of(other.table.statistics[number])
@@ -180,7 +199,8 @@ class ArrivalPatterns:
         numbers = {}
         for each in patterns:
             present, priors, held, replay_from = other._patterns[each]
-            adopted = Pattern(same(present), tuple(map(same, priors)), held, replay_from)
+            known = (*map(same, priors), *[UNKNOWN] * older)
+            adopted = Pattern(same(present), known, (*held, *[False] * older), replay_from)
             numbers[each] = self._number_of_pattern(adopted)
         self._adopted_count, self.is_full = max(self._adopted_count, len(patterns)), False
         return numbers

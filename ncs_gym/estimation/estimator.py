@@ -11,6 +11,7 @@ import numpy as np
 from ncs_gym.estimation.arrival_patterns import ArrivalPatterns, arrival_patterns, patterns_of
 from ncs_gym.estimation.error_bound import ErrorSet, require_error_set
 from ncs_gym.estimation.error_statistics_table import NO_SAMPLE, UNKNOWN
+from ncs_gym.estimation.kalman_filter import ErrorStatistics
 from ncs_gym.network.channel import Channel, Packet
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.validation import frozen, setting
@@ -46,6 +47,7 @@ class Estimator:
         channel: Gives the quantizer's error and the longest delay, hence the replay buffer.
         error_set: E(Sigma) with its rate; computed from the plant by default.
         patterns: A graph of the caller's in place of the shared one.
+        after: An estimator whose episodes are counted on.
 
     Attributes:
         step: Steps since the start of the episode.
@@ -69,6 +71,7 @@ class Estimator:
         channel: Channel,
         error_set: ErrorSet | None = None,
         patterns: ArrivalPatterns | None = None,
+        after: Estimator | None = None,
     ) -> None:
         self._plant, self._channel, self._buffer = plant, channel, channel.longest_delay
         if patterns is None:
@@ -77,13 +80,13 @@ class Estimator:
             else:
                 require_error_set(error_set, plant)
                 patterns = patterns_of(plant, channel, error_set)
-        self._patterns = patterns
+        self._patterns = self._usual = patterns
         self._error_set = self._patterns.recursion.error_set
         ages = self._error_set.ages
         if ages is not None and not ages.contract.is_fine_enough_for(channel):
             raise ValueError(f"the channel rounds more coarsely than the contract of the error set: {ages.contract}")
         self._limit = plant.state_limit if np.isfinite(plant.state_limit).all() else None
-        self.episode, self._is_new = 0, True
+        self.episode, self._is_new = (0, True) if after is None else (after.episode, after._is_new)
         self._begin(np.zeros(plant.n))
 
     def saved(self) -> dict[str, Any]:
@@ -100,11 +103,25 @@ class Estimator:
         """
         self.episode += not self._is_new
         self._is_new = False
+        self._patterns = self._usual
         self._begin(mean)
 
-    def _begin(self, mean: np.ndarray) -> None:
-        """Forgets everything but a first estimate, shape (n,)."""
-        self.step = self.age = 0
+    def restart(self, mean: np.ndarray, age: int) -> None:
+        """Begins anew at this step of the episode; samples taken before it are discarded from now on.
+
+        Args:
+            mean: An estimate, shape (n,), whose error lies in the certified set of an age.
+            age: Steps since the newest sample used was taken.
+        """
+        shape = self._error_set.shape_at(age)
+        assert shape is not None
+        first = ErrorStatistics(self._plant.kalman_covariances[2].copy(), shape.copy(), age)
+        self._patterns = patterns_of(self._plant, self._channel, self._error_set, first=first)
+        self._begin(mean, self.step, age)
+
+    def _begin(self, mean: np.ndarray, step: int = 0, age: int = 0) -> None:
+        """Forgets everything but an estimate, shape (n,), at a step."""
+        self.step, self.age = step, age
         self.alarm = False
         self.mean = frozen(np.array(mean, dtype=np.float64))
         self._pattern = self._patterns.root

@@ -54,6 +54,7 @@ class ErrorRecursion:
         covariance_bits: Bits that are kept of the factors of covariances (a gain's optimality is of second order in
             them).
         shape_step: What shapes are rounded up to, as a fraction of the certified set's square extent.
+        first: The statistics at the start; by default those of a first estimate.
     """
 
     def __init__(
@@ -63,14 +64,17 @@ class ErrorRecursion:
         error_set: ErrorSet,
         covariance_bits: int = COVARIANCE_BITS,
         shape_step: float = SHAPE_STEP,
+        first: ErrorStatistics | None = None,
     ) -> None:
         self.plant, self.error_set, self._bits = plant, error_set, covariance_bits
         self.sets = SetMembership(plant, quantization_step, error_set, shape_step)
-        self._kalman = _kalman_filter(plant, quantization_step)
+        self._kalman, self._first = _kalman_filter(plant, quantization_step), first
 
     @property
     def first(self) -> ErrorStatistics:
-        """The statistics of the first estimate, whose error lies in E(r0^2 I)."""
+        """The statistics at the start: by default those of a first estimate, whose error lies in E(r0^2 I)."""
+        if self._first is not None:
+            return self._first
         return ErrorStatistics(self.plant.kalman_covariances[2].copy(), self.plant.initial_error.shape_matrix.copy(), 0)
 
     def predicted(self, statistics: ErrorStatistics) -> ErrorStatistics:

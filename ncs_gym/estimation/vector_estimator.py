@@ -49,6 +49,12 @@ class VectorEstimator:
         """Numbers of the error statistics, whose shapes are `patterns.table.shapes`, shape (N,)."""
         return self.patterns.arrays.present.take(self.pattern)
 
+    def follow(self, patterns: ArrivalPatterns) -> None:
+        """Goes on with a graph for more delays, that of the same plant."""
+        self.patterns, self.pattern = patterns, patterns.taking_over(self.patterns, self.pattern)
+        for name in ("_priors", "_inputs", "_samples"):
+            setattr(self, name, deque(getattr(self, name), maxlen=patterns.buffer + 1))
+
     def begin(self, chosen: Any, mean: np.ndarray) -> None:
         """Starts episodes in some environments with first estimates, shape (n, count)."""
         self.mean = self.mean.copy()  # the old array is kept as a mean before an update

@@ -9,13 +9,22 @@ committed ahead.
 
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet
 from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
-from ncs_gym.network.downlink import Actuator, Command, CommittedInputs, DownlinkProtocol, downlink_protocol
+from ncs_gym.network.downlink import (
+    Actuator,
+    AppliedInputs,
+    Command,
+    CommittedInputs,
+    DownlinkProtocol,
+    Echo,
+    downlink_protocol,
+)
 from ncs_gym.network.escape_probability import escape_probability
-from ncs_gym.network.packet_reception import DiscardedPackets
+from ncs_gym.network.packet_reception import DiscardedPackets, UnusedPacketsWarning
 from ncs_gym.network.packet_transmission import ChannelState
 
 __all__ = [
     "Actuator",
+    "AppliedInputs",
     "BrokenContractWarning",
     "Channel",
     "ChannelContract",
@@ -24,8 +33,10 @@ __all__ = [
     "CommittedInputs",
     "DiscardedPackets",
     "DownlinkProtocol",
+    "Echo",
     "GilbertElliott",
     "Packet",
+    "UnusedPacketsWarning",
     "contract_of",
     "downlink_protocol",
     "escape_probability",

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from math import inf
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -136,6 +138,21 @@ class Channel:
         """Returns the measurement, of any shape, rounded to multiples of the quantization step."""
         q = self.quantization_step
         return np.rint(measurement / q) * q if q > 0.0 else measurement
+
+
+def widest(channels: Sequence[Channel]) -> Channel:
+    """Returns the channel whose samples become the oldest, with the coarsest quantization step of all.
+
+    One that promises nothing is wider than any that does; among equals it is the one with the longest delay.
+    """
+
+    def oldest(channel: Channel) -> tuple[float, int]:
+        losses = channel.most_consecutive_losses
+        age = inf if losses is None else (losses + 1) * channel.send_period + channel.longest_delay
+        return age, channel.longest_delay
+
+    coarsest = max(channel.quantization_step for channel in channels)
+    return replace(max(channels, key=oldest), quantization_step=coarsest)
 
 
 def _steps(number: int) -> str:

@@ -65,7 +65,7 @@ def contract_of(channel: Channel) -> ChannelContract | None:
 
 
 def warn_of_broken_contract(
-    contract: ChannelContract | None, channel: Channel, lead: int, *, counts_losses: bool = False
+    contract: ChannelContract | None, channel: Channel, lead: int, *, counts_losses: bool = False, stacklevel: int = 3
 ) -> None:
     """Warns the caller of the calling constructor if a channel cannot keep the contract that a certificate assumes.
 
@@ -73,10 +73,21 @@ def warn_of_broken_contract(
         contract: That of the certificate; None for none.
         channel: The channel of the samples.
         lead: c, the number of steps from a decision to its effect.
-        counts_losses: Whether the losses and the jitter that the channel promises not to exceed count. Without them it
-            is warned only of what breaks the contract although no packet is lost.
+        counts_losses: Whether losses and jitter count, as of a real channel; one that may lose any number of packets
+            in a row promises nothing. Without them it is warned only of what breaks the contract although no packet is
+            lost.
+        stacklevel: As for `warnings.warn`.
     """
     promised = contract_of(channel) if counts_losses else None
+    if contract is not None and counts_losses and promised is None and channel.most_consecutive_losses is None:
+        warnings.warn(
+            "the channel may lose any number of packets in a row, but the certificate's contract allows the newest "
+            f"sample to be {_steps(contract.max_age)} old in all, so that the guarantee is likely to be lost: say what "
+            "the network promises by max_consecutive_losses",
+            BrokenContractWarning,
+            stacklevel=stacklevel,
+        )
+        return
     age = channel.send_period - 1 + channel.delay if promised is None else promised.max_age
     if contract is None or age + lead <= contract.max_age:
         return
@@ -86,7 +97,7 @@ def warn_of_broken_contract(
         f"{_steps(contract.max_age)} in all, so that the guarantee is likely to be lost: give a certificate of "
         f"ChannelContract(max_age={age + lead}), or of a larger max_age where packets are lost",
         BrokenContractWarning,
-        stacklevel=3,
+        stacklevel=stacklevel,
     )
 
 

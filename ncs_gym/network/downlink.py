@@ -6,8 +6,9 @@ directions").
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from hashlib import blake2b
 from operator import index
 from typing import Any, NamedTuple
 
@@ -20,6 +21,8 @@ from ncs_gym.validation import as_count, as_numbers, read_only, shown
 
 # Stamp of the newest command where none has arrived.
 NEVER = -(2**31)
+# Digest of the inputs before the first step.
+NO_INPUTS = bytes(16)
 
 
 @dataclass(frozen=True)
@@ -97,6 +100,20 @@ def downlink_protocol(downlink: Channel | None, contract: ChannelContract | None
     return DownlinkProtocol(downlink, lead, contract)
 
 
+def require_fitting_downlink(protocol: DownlinkProtocol | None, downlink: Channel) -> None:
+    """Returns if a downlink may take the place of a protocol's, whose c and contract stay; it may break the contract.
+
+    Raises:
+        ValueError: If there is no downlink to take the place of, or what is given is none, or delays commands by more
+            than c steps.
+    """
+    if protocol is None:
+        raise ValueError(
+            "the environment has an ideal downlink, and commits no inputs ahead: make it with downlink=Channel(...)"
+        )
+    downlink_protocol(downlink, ChannelContract(protocol.lead))
+
+
 class Command(NamedTuple):
     """What is sent to the actuator at one step.
 
@@ -111,26 +128,65 @@ class Command(NamedTuple):
     episode: int = 0
 
 
+class Echo(NamedTuple):
+    """What an actuator says that it has applied since the start of an episode.
+
+    Attributes:
+        steps: k: it is about the inputs of steps 0 .. k-1.
+        missing: In how many of them the committed input had not arrived, or no input was applied at all.
+        digest: `digest_of_inputs` of what was applied; the same number of steps with other inputs has another one.
+        episode: Number of that episode.
+    """
+
+    steps: int
+    missing: int
+    digest: bytes
+    episode: int = 0
+
+
+def digest_of_inputs(before: bytes, u: np.ndarray | None) -> bytes:
+    """Returns 16 bytes that stand for all inputs of an episode so far, given those for all but the last one, (m,).
+
+    Args:
+        before: The digest before this step; `NO_INPUTS` at the start.
+        u: What was applied; None for a step at which nothing was.
+    """
+    return blake2b(before + (b"" if u is None else (u + 0.0).astype("<f8").tobytes()), digest_size=16).digest()
+
+
 class Actuator:
     """Applies at each step the input that was committed for it, or zero if no command with it has arrived.
 
-    Commands may be lost, late, duplicated or overtake each other: what is committed for a step is the same in each
-    command that holds it, so that the newest is enough. The first c inputs of an episode are zero by agreement.
+    Commands may be lost, late, early, duplicated or overtake each other: what is committed for a step is the same in
+    each command that holds it, so that the first to arrive is enough. The first c inputs of an episode are zero by
+    agreement. What cannot be true is refused: a command stamped far ahead of the step that comes next, or with an input
+    beyond the limits.
 
     Args:
         lead: c, the number of steps from a decision to its effect.
         inputs: m, the number of inputs.
+        u_max: Largest size of each input, a number or shape (m,) [physical units]; None where the plant limits them.
 
     Attributes:
+        lead, inputs: c and m.
         missing: Whether the input applied last was zero because the committed one had not arrived.
+        refused: How many commands of this episode were refused.
+        echo: What was applied since the start of the episode, for `SafeLoop.receive(echoes=...)`.
 
     Raises:
-        ValueError: If an argument is no whole number of its range.
+        ValueError: If an argument is no whole number of its range, or the limits are no sizes of m inputs.
     """
 
-    def __init__(self, lead: int, inputs: int) -> None:
-        self._lead = as_count(lead, "lead", low=0)
-        self._nothing = np.zeros(as_count(inputs, "inputs", low=1))
+    def __init__(self, lead: int, inputs: int, u_max: Any = None) -> None:
+        self.lead = as_count(lead, "lead", low=0)
+        self.inputs = as_count(inputs, "inputs", low=1)
+        self._nothing = np.zeros(self.inputs)
+        self._limits = np.full_like(self._nothing, np.inf)
+        if u_max is not None:
+            limits = as_numbers(u_max)
+            if limits is None or limits.shape not in ((), self._nothing.shape) or not (limits >= 0.0).all():
+                raise ValueError(f"u_max must be a size, or one of each of the {inputs} inputs, got {shown(u_max)}")
+            self._limits = self._limits.clip(max=limits)
         self.start()
 
     def start(self, episode: int = 0) -> None:
@@ -139,11 +195,12 @@ class Actuator:
         Raises:
             ValueError: If the number of the episode is no whole number from 0 on.
         """
-        self._episode, self._newest = as_count(episode, "episode", low=0), None
-        self.missing = False
+        self.echo = Echo(0, 0, NO_INPUTS, as_count(episode, "episode", low=0))
+        self._committed: dict[int, np.ndarray] = {}
+        self.missing, self.refused = False, 0
 
     def receive(self, commands: Iterable[Command]) -> None:
-        """Takes in what arrived, in any order; commands that are not newer than the newest are of no use.
+        """Takes in what arrived, in any order.
 
         Raises:
             ValueError: If what is given are no commands for this actuator; nothing has changed then.
@@ -152,22 +209,39 @@ class Actuator:
             raise ValueError(
                 f"commands must be a list of Command(stamp, inputs), empty if nothing arrived, got {shown(commands)}"
             )
-        for command in [_as_command(each, (self._lead + 1, len(self._nothing))) for each in commands]:
-            if command.episode == self._episode and (self._newest is None or command.stamp > self._newest.stamp):
-                self._newest = command
+        now = self.echo.steps
+        for command in [_as_command(each, (self.lead + 1, len(self._nothing))) for each in commands]:
+            if command.episode != self.echo.episode:
+                continue
+            if command.stamp > now + self.lead + 1 or (np.abs(command.inputs) > self._limits).any():
+                self.refused += 1
+                continue
+            for ahead, u in enumerate(command.inputs, command.stamp):
+                if ahead >= now:
+                    self._committed.setdefault(ahead, u)
 
     def apply(self, step: int) -> np.ndarray:
         """Returns the input to apply at a step, shape (m,) [physical units], as a new array.
+
+        Steps that were left out since the last call count as missing, but for the first c, which are zero by agreement.
 
         Raises:
             ValueError: If the step is no whole number from 0 on.
         """
         step = as_count(step, "step", low=0)
-        ahead = self._lead + 1 if self._newest is None else step - self._newest.stamp
-        self.missing = not 0 <= ahead <= self._lead and step >= self._lead
-        if self._newest is None or self.missing or step < self._lead:
-            return self._nothing.copy()
-        return self._newest.inputs[ahead].copy()
+        committed = self._committed.get(step) if step >= self.lead else self._nothing
+        self.missing = committed is None
+        u = (self._nothing if committed is None else committed).copy()
+        steps, missing, digest, episode = self.echo
+        if step >= steps:
+            for _ in range(steps, min(step, self.lead)):
+                digest = digest_of_inputs(digest, self._nothing)
+            left_out = step - max(steps, min(step, self.lead))
+            if left_out > 0:
+                missing, digest = missing + left_out, digest_of_inputs(digest, None)
+            self.echo = Echo(step + 1, missing + self.missing, digest_of_inputs(digest, u), episode)
+            self._committed = {ahead: each for ahead, each in self._committed.items() if ahead >= step}
+        return u
 
 
 def _as_command(value: Any, shape: tuple[int, int]) -> Command:
@@ -188,6 +262,21 @@ def _as_command(value: Any, shape: tuple[int, int]) -> Command:
             f"inputs of shape {shape}, got {shown(value)}"
         )
     return Command(stamp, np.array(numbers), episode)
+
+
+def as_echo(value: Any) -> Echo:
+    """Returns an echo.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    try:
+        steps, missing, digest, episode = value
+        if isinstance(digest, bytes):
+            return Echo(index(steps), index(missing), digest, index(episode))
+    except (TypeError, ValueError):
+        pass
+    raise ValueError(f"an echo is what Actuator.echo says, got {shown(value)}")
 
 
 class CommittedInputs:
@@ -240,6 +329,51 @@ class CommittedInputs:
         return due
 
 
+class AppliedInputs:
+    """Compares what an actuator says it applied with what was decided, in one control loop.
+
+    Args:
+        oldest: How many steps an echo may be old to count; None if no echoes are expected.
+
+    Attributes:
+        is_other: Whether an echo of this episode contradicts what was decided.
+    """
+
+    def __init__(self, oldest: int | None) -> None:
+        self._oldest = oldest
+        self.start()
+
+    def start(self) -> None:
+        """Starts an episode."""
+        self.is_other, self._confirmed = False, 0
+        self._digests: tuple[bytes, ...] = (
+            NO_INPUTS,
+        )  # after the newest number of steps, then one step less, and so on
+
+    def saved(self) -> dict[str, Any]:
+        """Returns all that changes, as attributes to be put back."""
+        return vars(self).copy()
+
+    def add(self, u: np.ndarray) -> None:
+        """Takes in the input that was due in the step that has gone by, shape (m,)."""
+        if self._oldest is not None:
+            self._digests = (digest_of_inputs(self._digests[0], u), *self._digests[: self._oldest])
+
+    def compare(self, echoes: Iterable[Echo], step: int, episode: int) -> None:
+        """Takes in what arrived by a step; echoes from ahead of it, too old or of another episode say nothing."""
+        for echo in echoes:
+            age = step - echo.steps
+            if echo.episode != episode or self._oldest is None or not 0 <= age < len(self._digests):
+                continue
+            if echo.missing or echo.digest != self._digests[age]:
+                self.is_other = True
+            self._confirmed = max(self._confirmed, echo.steps)
+
+    def is_confirmed(self, step: int) -> bool:
+        """Returns whether what was applied is known to be what was decided, up to the largest age of an echo."""
+        return self._oldest is None or step - self._confirmed <= self._oldest
+
+
 class Inputs(NamedTuple):
     """The inputs of one step; of many environments, arrays whose last axis is the environment.
 
@@ -279,8 +413,9 @@ class DownlinkState:
         self._actuator, self.committed = Actuator(lead, inputs), CommittedInputs(lead, inputs)
         self.in_flight: ChannelState
 
-    def begin(self, rng: np.random.Generator, episode: int = 0) -> None:
-        """Starts an episode."""
+    def begin(self, rng: np.random.Generator, episode: int = 0, channel: Channel | None = None) -> None:
+        """Starts an episode, over another channel than that of the protocol if one is given."""
+        self._channel = channel or self._channel
         if self._channel is not None:
             self.in_flight, self._episode = ChannelState(self._channel, rng), episode
             self._actuator.start(episode)
@@ -318,14 +453,20 @@ class VectorDownlinkState:
         self._newest, self._on_time = np.full(size, NEVER, np.int64), np.zeros(size, np.bool_)
         self._channel_state: VectorChannelState
 
-    def begin(self, rng: np.random.Generator, chosen: np.ndarray) -> None:
-        """Starts episodes in some environments, given by a mask of shape (N,)."""
+    def begin(self, rng: np.random.Generator, chosen: np.ndarray, channels: Sequence[Channel] | None = None) -> None:
+        """Starts episodes in some environments, given by a mask of shape (N,).
+
+        Args:
+            rng: Source of randomness.
+            chosen: The mask.
+            channels: Those of all N environments from now on, the others' being as before; None for all as before.
+        """
         if self._channel is None:
             return
         if chosen.all():
-            self._channel_state = VectorChannelState(self._channel, rng, self._size)
+            self._channel_state = VectorChannelState(channels or self._channel, rng, self._size)
         else:
-            self._channel_state.begin(rng, chosen)
+            self._channel_state.begin(rng, chosen, channels)
         self._newest[chosen] = NEVER
         self.committed.start(chosen)
 

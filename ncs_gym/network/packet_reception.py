@@ -12,6 +12,10 @@ from ncs_gym.network.channel import Packet
 from ncs_gym.validation import as_numbers, shown
 
 
+class UnusedPacketsWarning(UserWarning):
+    """Packets arrive that no estimate uses."""
+
+
 class DiscardedPackets(NamedTuple):
     """How many packets of an episode were discarded, by reason; a packet that comes twice is not counted.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,19 +25,70 @@ class LossState(NamedTuple):
     consecutive: Any
 
 
-def first_loss_state(channel: Channel, rng: np.random.Generator, size: int | None = None) -> LossState:
+class StackedBursts(NamedTuple):
+    """What `GilbertElliott` has, for each of N channels, shape (N,) each; a constant loss is a chain that stays."""
+
+    p_good_to_bad: np.ndarray
+    p_bad_to_good: np.ndarray
+    loss_good: np.ndarray
+    loss_bad: np.ndarray
+    stationary_bad: np.ndarray
+
+
+class StackedChannels:
+    """What `Channel` has, for each of N channels that differ, as arrays of shape (N,).
+
+    Args:
+        channels: N of them.
+    """
+
+    def __init__(self, channels: Sequence[Channel]) -> None:
+        def stacked(*names: str) -> list[np.ndarray]:
+            return [np.array([getattr(each, name) for each in channels]) for name in names]
+
+        self.quantization_step, self.send_period, self.delay, jitter = stacked(
+            "quantization_step", "send_period", "delay", "jitter"
+        )
+        self.jitter: Any = jitter if jitter.any() else 0  # without any, nothing is drawn
+        limits = [each.max_consecutive_losses for each in channels]
+        self.max_consecutive_losses = np.array([UNLIMITED if most is None else most for most in limits])
+        losses = [each.loss for each in channels]
+        self.loss: Any = np.array([0.0 if isinstance(each, GilbertElliott) else each for each in losses])
+        if any(isinstance(each, GilbertElliott) for each in losses):
+            chains = [each if isinstance(each, GilbertElliott) else _staying(each) for each in losses]
+            names = StackedBursts._fields
+            self.loss = StackedBursts(*(np.array([getattr(each, name) for each in chains]) for name in names))
+        self.shortest_delay, self.longest_delay = int(self.delay.min()), int((self.delay + jitter).max())
+
+    def quantize(self, measurements: np.ndarray) -> np.ndarray:
+        """Returns measurements, shape (p, N), each rounded to multiples of its channel's quantization step."""
+        q = self.quantization_step
+        return np.where(q > 0.0, np.rint(measurements / np.where(q > 0.0, q, 1.0)) * q, measurements)
+
+
+def side_by_side(channels: Sequence[Channel]) -> Channel | StackedChannels:
+    """Returns channels as one that stands for all of them: itself if all are equal."""
+    first = channels[0]
+    return first if all(each is first or each == first for each in channels) else StackedChannels(channels)
+
+
+def first_loss_state(
+    channel: Channel | StackedChannels, rng: np.random.Generator, size: int | None = None
+) -> LossState:
     """Returns the loss process at the start of an episode; a chain starts in its stationary distribution."""
     bad = False if size is None else np.zeros(size, np.bool_)
-    if isinstance(channel.loss, GilbertElliott):
+    if isinstance(channel.loss, (GilbertElliott, StackedBursts)):
         bad = rng.random(size) < channel.loss.stationary_bad
     return LossState(bad, 0 if size is None else np.zeros(size, np.int64))
 
 
-def transmit(channel: Channel, rng: np.random.Generator, state: LossState, sends: Any) -> tuple[LossState, Any]:
+def transmit(
+    channel: Channel | StackedChannels, rng: np.random.Generator, state: LossState, sends: Any
+) -> tuple[LossState, Any]:
     """Moves the loss process one step on and sends a packet; the same text for one channel and for N.
 
     Args:
-        channel: The settings.
+        channel: The settings, of N channels also stacked.
         rng: Source of randomness.
         state: The loss process before the step.
         sends: Whether a packet is sent at this step, a bool or shape (N,).
@@ -47,7 +99,7 @@ def transmit(channel: Channel, rng: np.random.Generator, state: LossState, sends
     size = sends.shape if isinstance(sends, np.ndarray) else None
     bad, consecutive = state
     loss: Any = channel.loss
-    if isinstance(loss, GilbertElliott):
+    if isinstance(loss, (GilbertElliott, StackedBursts)):
         bad = bad != (rng.random(size) < loss.p_good_to_bad + (loss.p_bad_to_good - loss.p_good_to_bad) * bad)
         loss = loss.loss_good + (loss.loss_bad - loss.loss_good) * bad
         state = LossState(bad, consecutive)
@@ -57,7 +109,7 @@ def transmit(channel: Channel, rng: np.random.Generator, state: LossState, sends
     lost = sends * (rng.random(size) < loss) * (consecutive < (UNLIMITED if most is None else most))
     arrives = sends * (1 - lost)
     delay: Any = channel.delay
-    if channel.jitter:
+    if isinstance(channel.jitter, np.ndarray) or channel.jitter:
         delay = delay + rng.random(size) * (channel.jitter + 1) // 1
     return LossState(bad, (consecutive + lost) * (1 - arrives)), arrives * (delay + 1) - 1
 
@@ -114,21 +166,36 @@ class VectorChannelState:
     """The channels of N environments.
 
     Args:
-        channel: The settings.
+        channel: The settings, of all channels or of each of them.
         rng: Draws the first states of Gilbert-Elliott chains.
         size: N.
+
+    Attributes:
+        channel: These settings, stacked if they differ.
     """
 
-    def __init__(self, channel: Channel, rng: np.random.Generator, size: int) -> None:
-        self.channel, self._size = channel, size
-        self._loss_state = first_loss_state(channel, rng, size)
+    def __init__(self, channel: Channel | Sequence[Channel], rng: np.random.Generator, size: int) -> None:
+        self.channel = channel if isinstance(channel, Channel) else side_by_side(channel)
+        self._size = size
+        self._loss_state = first_loss_state(self.channel, rng, size)
         # For the samples of each age, after how many steps they arrive.
-        self._delays = [np.full(size, -1) for _ in range(channel.longest_delay + 1)]
+        self._delays = [np.full(size, -1) for _ in range(self.channel.longest_delay + 1)]
 
-    def begin(self, rng: np.random.Generator, chosen: Any) -> None:
-        """Starts episodes in some environments; what is on its way there never arrives."""
-        count = np.arange(self._size)[chosen].size
-        for kept, first in zip(self._loss_state, first_loss_state(self.channel, rng, count), strict=True):
+    def begin(self, rng: np.random.Generator, chosen: Any, channels: Sequence[Channel] | None = None) -> None:
+        """Starts episodes in some environments; what is on its way there never arrives.
+
+        Args:
+            rng: Source of randomness.
+            chosen: Mask or indices of the environments.
+            channels: Those of all N environments from now on, the others' being the same as before; None for all the
+                same as before, where they do not differ.
+        """
+        indices = np.arange(self._size)[chosen]
+        begun: Any = self.channel
+        if channels is not None:
+            self.channel, begun = side_by_side(channels), side_by_side([channels[e] for e in indices.tolist()])
+            self._delays += [np.full(self._size, -1) for _ in range(self.channel.longest_delay + 1 - len(self._delays))]
+        for kept, first in zip(self._loss_state, first_loss_state(begun, rng, indices.size), strict=True):
             kept[chosen] = first
         for delays in self._delays:
             delays[chosen] = -1
@@ -146,9 +213,15 @@ class VectorChannelState:
 
     def arrivals(self) -> list[tuple[int, np.ndarray]]:
         """Returns the ages of the samples that arrive now, oldest first, each with the environments (N,)."""
-        found = []
-        for age in range(self.channel.longest_delay, self.channel.delay - 1, -1):
+        found, channel = [], self.channel
+        shortest = channel.shortest_delay if isinstance(channel, StackedChannels) else channel.delay
+        for age in range(len(self._delays) - 1, shortest - 1, -1):
             arrives = self._delays[age] == age
             if arrives.any():
                 found.append((age, arrives))
         return found
+
+
+def _staying(loss: float) -> GilbertElliott:
+    """Returns a chain that never moves and loses packets with a constant probability."""
+    return GilbertElliott(p_good_to_bad=0.0, p_bad_to_good=0.0, loss_good=loss, loss_bad=loss)

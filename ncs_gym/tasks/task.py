@@ -50,7 +50,10 @@ class Task(ReadOnlyArrays, ABC):
         return np.zeros((0, *np.shape(task_state)[1:]))
 
     def observation_bound(self, plant: LinearPlant, horizon: int) -> np.ndarray:
-        """Returns the largest absolute value of each extra entry within `horizon` steps, shape (extra,)."""
+        """Returns the largest absolute value of each extra entry within `horizon` steps, shape (extra,).
+
+        A task with `observe` has to have it. What is beyond is clipped, with a warning.
+        """
         return np.zeros(0)
 
     @abstractmethod

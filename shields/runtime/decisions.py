@@ -16,7 +16,7 @@ NO_PLAN = read_only(np.empty((0, 0)))
 class Decision(NamedTuple):
     """What the shield decided; of many decisions, arrays whose last axis is the environment.
 
-    S is the set that is kept: with a certificate that has a polytope, that polytope, except in mode "lookahead".
+    S is the certificate's safe set: its polytope, or its ellipsoid if it has none.
 
     Attributes:
         input: Input to apply, shape (m,), within the limits; u_max times a float32 action if not the proposed one.

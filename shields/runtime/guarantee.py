@@ -25,10 +25,13 @@ NOT_KNOWN_INSIDE = "the state is not known to be in the safe set"
 LEFT_MODEL = "the state is not known to have stayed where the bound of the linear model's remainder holds"
 LATE_INPUT = "the downlink broke its contract: an input decided earlier was not applied"
 NO_DOWNLINK_CONTRACT = "the downlink has no contract: nothing says that inputs arrive in time"
+# Of loops that learn from samples where they are, and from echoes what was applied; no monitor says so.
+UNKNOWN_START = "the samples do not yet tell where the state is"
+NOT_CONFIRMED = "the actuator has not confirmed for too long that it applies what is decided"
 # Codes of `GuaranteeMonitor.reasons`; 0 while the proof holds.
 EXPLANATIONS = (
     "", ALARM, OTHER_INPUT, OTHER_STEPS, LARGE_ERROR, FAR_OUT, UNUSABLE, NO_ERROR_SET, NOT_KNOWN_INSIDE,
-    LEFT_MODEL, LATE_INPUT, NO_DOWNLINK_CONTRACT, OLD_SAMPLE,
+    LEFT_MODEL, LATE_INPUT, NO_DOWNLINK_CONTRACT, OLD_SAMPLE, UNKNOWN_START, NOT_CONFIRMED,
 )  # fmt: skip
 CODES = {explanation: code for code, explanation in enumerate(EXPLANATIONS)}
 
@@ -69,6 +72,8 @@ class LoopObservation(NamedTuple):
 
 class GuaranteeMonitor:
     """Whether x in S is proved now, and why not (docs/shield.md, "How you see that an assumption broke").
+
+    S is the certificate's safe set: its polytope, or its ellipsoid if it has none.
 
     In mode "lookahead" it is whether x is in the box now and stays there: "in S, or in the box with a certified tail
     stored". Whoever hands the store from decision to decision drops it where the input applied is another one.

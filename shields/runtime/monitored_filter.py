@@ -58,20 +58,23 @@ class MonitoredFilter:
         known: Sequence[StartKnown],
         unmoved: bool = True,
         beliefs: Sequence[tuple[np.ndarray, np.ndarray]] = (),
+        pending: tuple[np.ndarray, ...] = (),
     ) -> None:
-        """Begins an episode.
+        """Begins an episode, or anew within one.
 
         Args:
             report: What is observed.
             known: What is known of x_0 .. x_c (`starts_known`).
             unmoved: Whether the plant has not moved since.
             beliefs: Estimates and error shapes of x_0 .. x_{c-1}, before the first decision takes effect.
+            pending: The inputs decided for the next c steps, none of them at the start of an episode.
         """
         self.report = report
         self._stored, is_safe = first_store(self.filter, report.estimate, report.errors, known[-1])
         self._state = self._monitor.start(is_safe, unmoved, report)
         if self._schedule is not None:
             self._schedule.start()
+            self._schedule.pending = pending or self._schedule.pending
             reports = [self.reported(mean.copy(), shape, alarm=False) for mean, shape in beliefs]
             pairs = zip(known[:-1], reports, strict=True)
             inside = [known_inside(self.filter, start, each.estimate, each.errors) for start, each in pairs]

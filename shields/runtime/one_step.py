@@ -119,6 +119,10 @@ class OneStepTest:
         level = norms(self.root.dot(estimates)) + errors.largest
         return level <= 1.0 - margin - self.rounding * self.own_columns.dot(np.abs(estimates))
 
+    def keeps_between(self, estimate: np.ndarray, errors: PredictedErrors, margin: float) -> bool:
+        """Returns whether the box is kept until the next sample, where that counts (`EllipsoidOnGrid`); here not."""
+        return True
+
 
 class ReachableSets(NamedTuple):
     """Where next states lie: in {A x_hat + B u} + E(Sigma_pred), for each of N environments.

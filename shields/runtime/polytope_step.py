@@ -12,11 +12,22 @@ import numpy as np
 from ncs_gym import LinearPlant
 from ncs_gym.validation import read_only
 from shields.polytope import Polytope
-from shields.runtime.one_step import FARTHEST, SMALLEST_RADIUS, PredictedErrors, judged_shapes
+from shields.runtime.between_samples import grid_test, supports
+from shields.runtime.one_step import (
+    FARTHEST,
+    SMALLEST_RADIUS,
+    OneStepTest,
+    PredictedErrors,
+    ReachableSet,
+    ReachableSets,
+    judged_shapes,
+)
 from shields.runtime.projection import closest_between
 
+# Projections onto either of two sets of inputs, in turn.
+ALTERNATIONS = 8
 # Entries of an array that are worked on together: as many as a processor keeps near.
-BLOCK = 32_768
+BLOCK = 524_288
 
 
 class PolytopeTest:
@@ -26,16 +37,19 @@ class PolytopeTest:
 
         |g (A x_hat + B u)| + sqrt(g A Sigma_k A' g') + sqrt(g D g') + rounding <= 1.
 
+    Where the box counts between samples, too, the rows of the grid (`GridTest`) stand below those of P.
+
     It has what `OneStepTest` has, for P in place of S: the filter calls either, and hands on what they return.
 
     Args:
-        polytope: P.
+        polytope: P; None for the rows of the grid alone.
         plant: Gives A, B, D and the limits.
 
     Attributes:
         root: G, shape (r, n).
-        moved, effect: G A and G B, shapes (r, n) and (r, m); joint: both beside each other.
-        disturbed: sqrt(g D g') with the rounding of computing it, shape (r,).
+        moved, effect: G A and G B, shapes (r, n) and (r, m), and then the rows of the grid; joint: both beside each
+            other.
+        disturbed: sqrt(g D g') with the rounding of computing it, and what stands for it on the grid, shape (r,).
         rounding: Bound on the rounding of a product with G, relative to the product of absolute values.
         columns, own_columns: Largest entries of the columns of |G| |A| and of |G|, shape (n,).
         pushed: Largest |G| |B| |u| within the limits.
@@ -45,22 +59,25 @@ class PolytopeTest:
     """
 
     @np.errstate(all="ignore")  # what is not finite leaves no room
-    def __init__(self, polytope: Polytope, plant: LinearPlant) -> None:
+    def __init__(self, polytope: Polytope | None, plant: LinearPlant) -> None:
         self.plant = plant
         self.single, self.limits = ((plant.n,), (plant.m,)), plant.u_max.tolist()
-        self.root = polytope.rows
-        self.moved = read_only(self.root @ plant.A)
-        self.effect = read_only(self.root @ plant.B)
+        grid = grid_test(plant)
+        self.root = np.empty((0, plant.n)) if polytope is None else polytope.rows
+        self.moved = read_only(np.concatenate([self.root @ plant.A, grid.moved]))
+        self.effect = read_only(np.concatenate([self.root @ plant.B, grid.effect]))
         self.joint = read_only(np.hstack([self.moved, self.effect]))
         self.rounding = 8.0 * (plant.n + plant.m) * float(np.finfo(float).eps)
         size = np.abs(self.root)
-        self.columns = read_only((size @ np.abs(plant.A)).max(axis=0))
-        self.own_columns = read_only(size.max(axis=0))
-        self.pushed = float((size @ np.abs(plant.B) @ plant.u_max).max())
+        pushes = np.concatenate([size @ np.abs(plant.B), np.abs(grid.effect)]) @ plant.u_max
+        self.columns = read_only(np.concatenate([size @ np.abs(plant.A), np.abs(grid.moved)]).max(axis=0))
+        self.own_columns = read_only(size.max(axis=0, initial=0.0))
+        self.pushed = float(pushes.max())
         self.shift = float((np.abs(self.effect) @ plant.u_max).max())
         D = plant.disturbance.shape_matrix
         extent = float(self.own_columns @ np.sqrt(np.diag(D)))
-        self.disturbed = read_only(_supports(self.root, D[None], self.rounding * extent**2)[:, 0])
+        disturbed = supports(self.root, D[None], self.rounding * extent**2)[:, 0]
+        self.disturbed = read_only(np.concatenate([disturbed, grid.disturbed]))
 
     @np.errstate(all="ignore")  # what overflows leaves no room, what underflows does not count
     def predicted(self, shapes: np.ndarray, certified_shapes: np.ndarray) -> Any:
@@ -73,9 +90,9 @@ class PolytopeTest:
         symmetric, usable, inside = judged_shapes(shapes, certified_shapes)
         half_widths = np.sqrt(np.diagonal(symmetric, axis1=1, axis2=2))
         spread, own_spread = half_widths @ self.columns, half_widths @ self.own_columns
-        reach = _supports(self.moved, symmetric, self.rounding * spread**2) + self.disturbed[:, None]
+        reach = supports(self.moved, symmetric, self.rounding * spread**2) + self.disturbed[:, None]
         room = 1.0 - reach * (1.0 + self.rounding) - self.rounding * (spread + self.pushed)
-        own = _supports(self.root, symmetric, self.rounding * own_spread**2)
+        own = supports(self.root, symmetric, self.rounding * own_spread**2)
         usable &= np.isfinite(room).all(axis=0) & np.isfinite(own).all(axis=0)
         unusable = np.where(usable, 0.0, np.nan)
         return PolytopeErrors(
@@ -116,6 +133,19 @@ class PolytopeTest:
         """
         level = (np.abs(self.root.dot(estimates)) + errors.own).max(axis=0)
         return level <= 1.0 - margin - self.rounding * self.own_columns.dot(np.abs(estimates))
+
+    @np.errstate(all="ignore")
+    def keeps_between(self, estimate: np.ndarray, errors: Any, margin: float) -> bool:
+        """Returns whether the box is kept between this sample and the next one under no input, if that counts.
+
+        Args:
+            estimate: x_hat, shape (n,).
+            errors: What is known of its Sigma_k.
+            margin: In units of the box.
+        """
+        first = len(self.root)
+        rounding = self.rounding * float(self.columns.dot(np.abs(estimate)))
+        return bool((np.abs(self.moved[first:].dot(estimate)) <= errors.room[first:] - rounding - margin).all())
 
 
 class PolytopeErrors(NamedTuple):
@@ -169,7 +199,7 @@ class PolytopeSets(NamedTuple):
         Both are the least room - |g (A x_hat + B u)| over the rows: x+ is in P unless it is negative.
         """
         joint, least = np.concatenate([self.estimates, inputs]), np.empty(inputs.shape[1])
-        block = max(1, BLOCK // len(self.test.root))
+        block = max(1, BLOCK // len(self.test.moved))
         for start in range(0, len(least), block):
             part = slice(start, start + block)
             center = self.test.joint @ joint[:, part]
@@ -191,7 +221,7 @@ class PolytopeSets(NamedTuple):
         NaN where there is none.
         """
         limits, count = self.test.plant.u_max, inputs.shape[1]
-        block = max(1, BLOCK // (len(self.test.root) * len(limits)))
+        block = max(1, BLOCK // (len(self.test.moved) * len(limits)))
         if len(limits) > 1 and count > block:
             parts = [np.arange(start, min(start + block, count)) for start in range(0, count, block)]
             return np.hstack([self.some(part).closest(inputs[:, part], margin) for part in parts])
@@ -201,6 +231,110 @@ class PolytopeSets(NamedTuple):
         if len(limits) == 1:
             return closest_between(inputs, offset, rows[..., None], room)
         return closest_between(inputs, offset, np.repeat(rows[..., None], count, axis=-1), room)
+
+
+class EllipsoidOnGrid(OneStepTest):
+    """`OneStepTest` for a plant whose box counts between samples, too: its rows of the grid have to hold as well.
+
+    Args:
+        L: Shape of S.
+        plant: With a grid.
+
+    Attributes:
+        grid: The test of these rows.
+    """
+
+    def __init__(self, L: np.ndarray, plant: LinearPlant) -> None:
+        super().__init__(L, plant)
+        self.grid = PolytopeTest(None, plant)
+        self.shift = max(self.shift, self.grid.shift)
+
+    def predicted(self, shapes: np.ndarray, certified_shapes: np.ndarray) -> Any:
+        """Returns the `GridErrors` of error shapes."""
+        room = self.grid.predicted(shapes, certified_shapes[:0]).room
+        return GridErrors(*super().predicted(shapes, certified_shapes), room=room)
+
+    def reachable(self, estimates: np.ndarray, errors: Any) -> Any:
+        """Returns the `SetsOnGrid` of next states and of states until then."""
+        return SetsOnGrid(super().reachable(estimates, errors), self.grid.reachable(estimates, errors))
+
+    def reachable_alone(self, estimate: np.ndarray, errors: Any) -> Any:
+        """Returns what `reachable` does for one estimate, shape (n,); None if nothing passes."""
+        first, grid = super().reachable_alone(estimate, errors), self.grid.reachable_alone(estimate, errors)
+        return None if first is None or grid is None else SetOnGrid(first, grid)
+
+    def keeps_between(self, estimate: np.ndarray, errors: Any, margin: float) -> bool:
+        """Returns what `PolytopeTest.keeps_between` does."""
+        return self.grid.keeps_between(estimate, errors, margin)
+
+
+class GridErrors(NamedTuple):
+    """`PredictedErrors`, and the `room` of `PolytopeErrors` for the rows of the grid, shape (g, k)."""
+
+    weighting: np.ndarray
+    radius: Any
+    half_widths: np.ndarray
+    largest: Any
+    certified: Any
+    shape: np.ndarray
+    room: np.ndarray
+
+    of, single, batch = PredictedErrors.of, PredictedErrors.single, PredictedErrors.batch
+    followed_by = PredictedErrors.followed_by
+
+
+class SetsOnGrid(NamedTuple):
+    """Where next states lie, and where states are between now and then, for each of N environments.
+
+    Attributes:
+        first: The sets of next states.
+        grid: What the rows of the grid allow.
+    """
+
+    first: ReachableSets
+    grid: PolytopeSets
+
+    @property
+    def radius(self) -> np.ndarray:
+        """That of the first, shape (N,)."""
+        return self.first.radius
+
+    def some(self, chosen: np.ndarray) -> SetsOnGrid:
+        """Returns those of some environments, given by their indices."""
+        return SetsOnGrid(self.first.some(chosen), self.grid.some(chosen))
+
+    def slack(self, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the smaller slack and margin of inputs u, shape (m, N); each has shape (N,)."""
+        return tuple(map(np.minimum, self.first.slack(inputs), self.grid.slack(inputs)))  # pyright: ignore
+
+    def smallest_slack(self) -> np.ndarray:
+        """Returns the slack of the worst input within the limits, shape (N,)."""
+        return np.minimum(self.first.smallest_slack(), self.grid.smallest_slack())
+
+    def closest(self, inputs: np.ndarray, margin: float) -> np.ndarray:
+        """Returns inputs within the limits, shape (m, N), near given ones with a slack of `margin`.
+
+        A single input is in two intervals, and the closest point of one to the closest of the other is that of both.
+        Of several inputs projections alternate: what comes out need not be the closest, and is tested by who asks.
+        """
+        for _ in range(1 if len(inputs) == 1 else ALTERNATIONS):
+            inputs = self.grid.closest(self.first.closest(inputs, margin), margin)
+        return inputs
+
+
+class SetOnGrid(NamedTuple):
+    """`SetsOnGrid` of a single environment."""
+
+    first: ReachableSet
+    grid: PolytopeSet
+
+    def slack(self, u: np.ndarray) -> tuple[float, float]:
+        """Returns the smaller slack and margin of an input u, shape (m,)."""
+        return tuple(map(min, self.first.slack(u), self.grid.slack(u)))  # pyright: ignore
+
+    def closest(self, u: float, margin: float) -> float:
+        """Returns what `SetsOnGrid.closest` does for plants with a single input."""
+        return self.grid.closest(self.first.closest(u, margin), margin)
 
 
 class PolytopeSet(NamedTuple):
@@ -227,15 +361,3 @@ class PolytopeSet(NamedTuple):
         """Returns what `PolytopeSets.closest` does for plants with a single input."""
         sets = PolytopeSets(self.test, self.estimate[:, None], self.room[:, None], np.zeros(1), self.room[:1])
         return float(sets.closest(np.array([[u]]), margin)[0, 0])
-
-
-def _supports(rows: np.ndarray, shapes: np.ndarray, rounding: Any) -> np.ndarray:
-    """Returns upper bounds of sqrt(g S g') for rows g, (r, n), and shapes S, (k, n, n): shape (r, k).
-
-    Args:
-        rows: g, shape (r, n).
-        shapes: S, shape (k, n, n).
-        rounding: What computing g S g' is off by at most, for all rows, shape (k,) or a number.
-    """
-    squares = ((rows @ shapes) * rows).sum(axis=-1).T
-    return np.sqrt(np.maximum(squares, 0.0) + rounding)

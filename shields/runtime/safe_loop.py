@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import warnings
+from collections.abc import Callable, Iterable, Sequence
 from enum import Enum, auto
 from functools import wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
-from ncs_gym import Channel, ChannelContract, Ellipsoid, Estimator, LinearPlant, Packet
+from ncs_gym import Channel, ChannelContract, Ellipsoid, Estimator, LinearPlant, Packet, UnusedPacketsWarning
 from ncs_gym.estimation.arrival_patterns import arrival_patterns
-from ncs_gym.network import Command, CommittedInputs, downlink_protocol
-from ncs_gym.network.contract import warn_of_broken_contract
+from ncs_gym.estimation.first_estimate import first_estimate
+from ncs_gym.network import AppliedInputs, Command, CommittedInputs, Echo, downlink_protocol
+from ncs_gym.network.contract import MAX_AGE, warn_of_broken_contract
+from ncs_gym.network.downlink import as_echo
 from ncs_gym.network.packet_reception import DiscardedPackets, as_packet
-from ncs_gym.validation import as_numbers, as_vector, setting, shown
+from ncs_gym.validation import as_count, as_flag, as_numbers, as_vector, setting, shown
 from shields.certificate import Certificate
 from shields.certificate_text import contract_text, counted, size_of, table
 from shields.errors import GuaranteeLostError, GuaranteeLostWarning
 from shields.runtime.decisions import Decision
-from shields.runtime.guarantee import LoopObservation
+from shields.runtime.guarantee import LATE_INPUT, NOT_CONFIRMED, OTHER_INPUT, UNKNOWN_START, LoopObservation
 from shields.runtime.lost_guarantee import LostGuarantee
 from shields.runtime.monitored_filter import MonitoredFilter
 from shields.runtime.safety_filter import SafetyFilter
-from shields.runtime.starts import starts_known
+from shields.runtime.starts import StartKnown, starts_known
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -49,17 +52,18 @@ def _transaction(method: Callable[Concatenate[SafeLoop, P], T]) -> Callable[Conc
 
     @wraps(method)
     def call(loop: SafeLoop, /, *args: P.args, **kwargs: P.kwargs) -> T:
-        phase, discarded = loop._phase, loop._discarded
-        before = [(part, part.saved()) for part in (loop._estimator, loop._monitored, loop._inputs, loop._lost)]
+        phase, discarded, unknown = loop._phase, loop._discarded, loop._unknown
+        parts = (loop._estimator, loop._monitored, loop._inputs, loop._applied, loop._lost)
+        before = [(part, part.saved()) for part in parts]
         try:
             return method(loop, *args, **kwargs)
-        except (GuaranteeLostError, GuaranteeLostWarning):  # the latter where warnings are errors
+        except (GuaranteeLostError, GuaranteeLostWarning, UnusedPacketsWarning):  # warnings where they are errors
             raise
         except BaseException:  # Ctrl-C, the timeout of a signal and panics of native code are no Exceptions
             loop._phase = _Phase.STOPPED
             for part, saved in before:
                 vars(part).update(saved)
-            loop._phase, loop._discarded = phase, discarded
+            loop._phase, loop._discarded, loop._unknown = phase, discarded, unknown
             raise
 
     return call
@@ -82,10 +86,12 @@ class SafeLoop:
     `start`; a packet carries the number of the step at which its sample was taken, and that of the episode.
 
     The guarantee is that of `SafetyShield`, under the same assumptions (docs/shield.md): `guaranteed` says whether the
-    state is proved to be in S at this step, `reason` why not, `print(loop)` both. What the loop cannot see is that the
-    clock misses a step, that the actuator applies something else (unless it is told), or that packets carry wrong
-    stamps. A certificate under a channel contract brings its error sets along. Not for use by several threads at once.
-    Where `start`, `receive` or `decide` is interrupted, by whatever it may be, nothing has happened: call it again.
+    state is proved to be in the certificate's safe set S at this step, `reason` why not, `print(loop)` both. What the
+    loop cannot see is that the clock misses a step, that the actuator applies something else (unless it is told, or
+    hears `echoes`), or that packets carry wrong stamps. A certificate under a channel contract brings its error sets
+    along. Not for use by several threads at once. A loop can be pickled between two calls, and goes on from there
+    where it is loaded. Where `start`, `receive` or `decide` is interrupted, by whatever it may be, nothing has
+    happened: call it again.
 
     Behind a downlink that is late or loses commands, send `command` after each `decide` instead, and let an
     `ncs_gym.Actuator` apply what it holds (docs/contracts.md, "Both directions"). What is decided takes effect `lead`
@@ -100,6 +106,9 @@ class SafeLoop:
         horizon: Longest plan of mode "lookahead", in steps; see `SafetyFilter`.
         downlink: The channel from here to the actuator; None if what is decided is applied at once.
         downlink_contract: What is assumed of it; by default what its settings guarantee.
+        echo_age: How many steps the newest echo of the actuator may be old: beyond it, and for the rest of the episode
+            once an echo contradicts what was decided, nothing is proved. None if there are no echoes: then what is
+            said holds if everything that is decided is applied.
         on_unproved: What `start` and `receive` do, once per episode and reason, where the state is not proved safe:
             "warn" with a `GuaranteeLostWarning`, "raise" a `GuaranteeLostError`, "ignore" for who reads `guaranteed`.
             When one is raised, the call has come to its end: go on with `decide`.
@@ -109,6 +118,7 @@ class SafeLoop:
         contract: Channel contract of the certificate; None without one. Behind a downlink it counts c steps more than
             that of the channel.
         lead: c, the number of steps from a decision to its effect; 0 without a downlink.
+        echo_age: The largest age of an echo [steps]; None without echoes.
 
     Raises:
         CertificateError: If the certificate does not verify for the plant.
@@ -119,6 +129,7 @@ class SafeLoop:
     filter: SafetyFilter = setting("filter")
     contract: ChannelContract | None = setting("contract")
     lead: int = setting("lead")
+    echo_age: int | None = setting("echo_age")
 
     def __init__(
         self,
@@ -130,6 +141,7 @@ class SafeLoop:
         downlink: Channel | None = None,
         downlink_contract: ChannelContract | None = None,
         on_unproved: str = "warn",
+        echo_age: int | None = None,
     ) -> None:
         self._filter = SafetyFilter(certificate, plant, mode, horizon)
         if not isinstance(channel, Channel):
@@ -140,9 +152,13 @@ class SafeLoop:
         protocol = downlink_protocol(downlink, downlink_contract)
         self._monitored = MonitoredFilter(self._filter, protocol)
         self._lead = self._monitored.lead
-        warn_of_broken_contract(self._contract, channel, self._lead, counts_losses=self._lead > 0)
+        warn_of_broken_contract(self._contract, channel, self._lead, counts_losses=True)
         self._inputs = CommittedInputs(self._lead, plant.m)
-        self._discarded = DiscardedPackets()
+        self._echo_age = None if echo_age is None else as_count(echo_age, "echo_age", low=0, high=MAX_AGE)
+        self._applied = AppliedInputs(self._echo_age)
+        # Samples by stamp and inputs, the newest first, from which the state is to be found; None once it is known.
+        self._unknown: tuple[dict[int, np.ndarray], tuple[np.ndarray, ...]] | None = None
+        self._discarded, self._told_of_late = DiscardedPackets(), False
         self._phase = _Phase.STOPPED
 
     def __str__(self) -> str:
@@ -152,6 +168,7 @@ class SafeLoop:
         if self._contract is not None and self.measurement_age > self._contract.max_age - self._lead:
             age += ", older than the contract allows"
         proved = "the state stays in the box" if mode == "lookahead" else "the state is in S"
+        proved += "" if self._echo_age is not None else ", if everything that is decided is applied"
         is_started = self._phase is not _Phase.STOPPED
         rows = [
             ("mode", mode if horizon is None else f"{mode}, horizon {counted(horizon, 'step')}"),
@@ -164,18 +181,24 @@ class SafeLoop:
         return table("Safe loop: estimator, safety filter and monitor of the guarantee", rows)
 
     @_transaction
-    def start(self, x_hat0: Any, initial_set: Ellipsoid | np.ndarray | None = None) -> None:
+    def start(self, x_hat0: Any, initial_set: Ellipsoid | np.ndarray | None = None, *, known: bool = True) -> None:
         """Starts an episode at step 0; also how one is begun anew after the guarantee was lost.
+
+        It is a claim: that the error of x_hat0 lies in `plant.initial_error`. Who does not know that, because the
+        controller was restarted while the plant moved, says `known=False`. Then x_hat0 is a guess to decide from, and
+        nothing is proved until the samples of this episode alone prove where the state is (docs/deployment.md).
 
         Packets of earlier episodes are discarded from now on: `episode` is the number of the new one.
 
         Args:
-            x_hat0: First estimate, shape (n,), whose error lies in `plant.initial_error`.
+            x_hat0: First estimate, shape (n,), whose error lies in `plant.initial_error` if it is known.
             initial_set: What the state is known to lie in besides, an ellipsoid or the state itself, shape (n,). It
                 counts where x_hat0 alone does not prove that the state is in S (in mode "lookahead": in the box).
+            known: Whether all that is claimed.
 
         Raises:
-            ValueError: If an argument is not finite or does not fit the plant; nothing has changed then.
+            ValueError: If an argument is not finite or does not fit the plant, or an initial set is given for a state
+                that is not known; nothing has changed then.
             GuaranteeLostError: If the state is not proved safe and that is to be raised; the episode has begun then.
         """
         n = self._filter.plant.n
@@ -184,19 +207,22 @@ class SafeLoop:
             initial_set = as_vector(initial_set, n, "initial_set")
         if isinstance(initial_set, Ellipsoid) and initial_set.dim != n:
             raise ValueError(f"initial_set must have dimension {n}, got {initial_set.dim}")
-        known = starts_known(self._filter, initial_set, self._lead)
+        if not as_flag(known, "known") and initial_set is not None:
+            raise ValueError("initial_set says what is known of the state: leave it out, or leave out known=False")
+        inside = starts_known(self._filter, initial_set, self._lead)
         self._phase = _Phase.STOPPED
         self._estimator.reset(mean)
         self._discarded = DiscardedPackets()
         self._inputs.start()
-        earlier = [self._estimator.predicted(self._inputs.pending[:ahead]) for ahead in range(self._lead)]
-        self._monitored.begin(self._report(), known, beliefs=earlier)
+        self._applied.start()
+        self._unknown = None if known else ({}, ())
+        self._begin(inside)
         self._phase = _Phase.STARTED
         self._lost.begin()
         self._lost.tell_of(self.reason)
 
     @_transaction
-    def receive(self, packets: Iterable[Packet] = (), applied: Any = None) -> np.ndarray:
+    def receive(self, packets: Iterable[Packet] = (), applied: Any = None, echoes: Iterable[Echo] = ()) -> np.ndarray:
         """Returns the estimate at this control step, shape (n,): predicted from the last one, then corrected.
 
         Behind a downlink it is that of the step at which the input decided next takes effect.
@@ -209,6 +235,8 @@ class SafeLoop:
             applied: What the actuator applied since the last decision, shape (m,), if that may be something else than
                 was decided for this time. If it is, the estimate follows it and the guarantee ends; if it is no finite
                 input, the estimate follows the decision.
+            echoes: What the actuator says that it has applied (`Actuator.echo`), where `echo_age` is given: as many as
+                arrived, in any order.
 
         Raises:
             RuntimeError: If `start` was not called, or nothing was decided since the last call.
@@ -224,6 +252,7 @@ class SafeLoop:
                 f"packets must be a list of Packet(stamp, measurement), empty if nothing arrived, got {shown(packets)}"
             )
         arrived = [as_packet(each, self._filter.plant.p) for each in given]
+        heard = [as_echo(each) for each in echoes]
         phase = self._require_started()
         if phase is _Phase.RECEIVED:
             raise RuntimeError("receive was called twice in a step: hand over all packets of a step in one call")
@@ -231,12 +260,28 @@ class SafeLoop:
             self._phase = _Phase.STOPPED
             decided, due = np.array(self._monitored.decided), self._inputs.pop()
             told = due if applied is None else _as_input(applied, due.shape)
-            self._estimator.advance(due if told is None else told, arrived)
+            taken = due if told is None else told
+            self._applied.add(due)
+            self._estimator.advance(taken, arrived)
             self._monitored.advance(told, True, self._report(), decided)
+            if self._unknown is not None:
+                samples, inputs = self._unknown
+                self._unknown = samples, (taken, *inputs[: self._filter.plant.n + self._estimator.buffer])
+        self._applied.compare(heard, self.steps, self.episode)
+        if self._unknown is not None:
+            self._find(arrived)
         oldest = self._estimator.channel.longest_delay
         self._discarded = self._discarded.with_those_of(arrived, self.steps, self.episode, oldest)
         self._phase = _Phase.RECEIVED
         estimate = self.estimate
+        if self._discarded.too_late and not self._told_of_late:
+            self._told_of_late = True
+            warnings.warn(
+                f"a packet was discarded: it came later than the {oldest} steps that the channel of this loop delays "
+                "any; give SafeLoop the channel with its longest delay (`discarded` counts such packets)",
+                UnusedPacketsWarning,
+                stacklevel=3,
+            )
         self._lost.tell_of(self.reason)
         return estimate
 
@@ -269,13 +314,15 @@ class SafeLoop:
             raise RuntimeError("call decide before command: it sends what was decided at this step")
         return self._inputs.command(self.steps, self.episode)
 
-    def step(self, proposed: Any, packets: Iterable[Packet] = (), applied: Any = None) -> Decision:
+    def step(
+        self, proposed: Any, packets: Iterable[Packet] = (), applied: Any = None, echoes: Iterable[Echo] = ()
+    ) -> Decision:
         """Returns the decision at this control step: `receive`, then `decide`, which is left if that is interrupted.
 
         Raises:
             GuaranteeLostError: As from `receive`; `decide` is left then.
         """
-        self.receive(packets, applied)
+        self.receive(packets, applied, echoes)
         return self.decide(proposed)
 
     @property
@@ -286,7 +333,14 @@ class SafeLoop:
     @property
     def reason(self) -> str:
         """Why it is not; empty while it is."""
-        return NOT_STARTED if self._phase is _Phase.STOPPED else self._monitored.reason
+        if self._phase is _Phase.STOPPED:
+            return NOT_STARTED
+        if self._applied.is_other:
+            return LATE_INPUT if self._lead else OTHER_INPUT
+        if self._unknown is not None:
+            return UNKNOWN_START
+        unconfirmed = "" if self._applied.is_confirmed(self.steps) else NOT_CONFIRMED
+        return self._monitored.reason or unconfirmed
 
     @property
     def plan_length(self) -> int:
@@ -330,6 +384,29 @@ class SafeLoop:
         if self._phase is _Phase.STOPPED:
             raise RuntimeError(NOT_STARTED)
         return self._phase
+
+    def _begin(self, known: Sequence[StartKnown]) -> None:
+        """Begins to follow whether the state is proved safe, with what is known of x_0 .. x_c."""
+        pending = self._inputs.pending
+        earlier = [self._estimator.predicted(pending[:ahead]) for ahead in range(self._lead)]
+        self._monitored.begin(self._report(), known, beliefs=earlier, pending=pending)
+
+    def _find(self, packets: Iterable[Packet]) -> None:
+        """Takes in samples of a state that is not known, and begins anew where they prove where it is."""
+        assert self._unknown is not None
+        (samples, inputs), step, plant = self._unknown, self.steps, self._filter.plant
+        for packet in packets:
+            if packet.episode == self.episode and packet.stamp >= 0 and np.isfinite(packet.measurement).all():
+                samples = {packet.stamp: packet.measurement} | samples
+        samples = {stamp: y for stamp, y in samples.items() if 0 <= step - stamp <= len(inputs)}
+        self._unknown = samples, inputs
+        noise = plant.sensor_error_with(self._estimator.channel.quantization_step).shape_matrix
+        by_age = {step - stamp: y for stamp, y in samples.items()}
+        found = first_estimate(plant, self._estimator.error_set, by_age, inputs, noise)
+        if found is not None:
+            self._unknown = None
+            self._estimator.restart(*found)
+            self._begin(starts_known(self._filter, None, self._lead))
 
     def _report(self) -> LoopObservation:
         """Returns what the estimator says now."""

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ncs_gym import Ellipsoid, LinearPlant
+from ncs_gym import LinearPlant
 from ncs_gym.validation import ReadOnlyArrays, as_count, as_numbers, read_only, shown
 from shields.certificate import Certificate
-from shields.polytope import Polytope
 from shields.runtime.decisions import FALLBACK, INVALID, PROJECTED, REASONS, SAFE, UNSAFE, Decision
 from shields.runtime.one_step import (
     MOST_INPUTS_WITH_VERTICES,
@@ -20,7 +20,7 @@ from shields.runtime.one_step import (
     ReachableSets,
     require_computable,
 )
-from shields.runtime.polytope_step import PolytopeTest
+from shields.runtime.polytope_step import EllipsoidOnGrid, PolytopeTest
 from shields.verification import ACTION_ROUNDING, require_valid
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class SafetyFilter(ReadOnlyArrays):
         horizon: Longest plan of mode "lookahead", in steps; None is 6. Other modes take none.
 
     Attributes:
-        test: The one-step test, for the polytope if there is one, except in mode "lookahead".
+        test: The one-step test, for the polytope if there is one.
         lookahead: What finds and certifies the plans of mode "lookahead"; None in others.
 
     Raises:
@@ -85,9 +85,9 @@ class SafetyFilter(ReadOnlyArrays):
             raise ValueError(f'mode "boundary" takes at most {MOST_INPUTS_WITH_VERTICES} inputs, got {self.plant.m}')
         require_valid(self.certificate, self.plant)
         require_computable(self.certificate, self.plant)
-        # Plans of mode "lookahead" end in the ellipsoid.
-        polytope = None if self.mode == "lookahead" else self.certificate.polytope
-        test = OneStepTest(self.certificate.L, self.plant) if polytope is None else PolytopeTest(polytope, self.plant)
+        polytope = self.certificate.polytope
+        kind = OneStepTest if self.plant.grid_rows is None else EllipsoidOnGrid
+        test = kind(self.certificate.L, self.plant) if polytope is None else PolytopeTest(polytope, self.plant)
         object.__setattr__(self, "test", test)
         object.__setattr__(self, "_no_plan", read_only(np.empty((0, self.plant.m))))
         object.__setattr__(self, "lookahead", self._lookahead())
@@ -108,18 +108,7 @@ class SafetyFilter(ReadOnlyArrays):
         given = DEFAULT_HORIZON if self.horizon is None else self.horizon
         horizon = as_count(given, "horizon", low=1, high=LONGEST_HORIZON)
         object.__setattr__(self, "horizon", horizon)
-        assert isinstance(self.test, OneStepTest)
         return Lookahead(self.test, self.certificate.K, horizon, MARGIN)
-
-    @property
-    def polytope(self) -> Polytope | None:
-        """The polytope that is kept in place of S; None in mode "lookahead", whose plans end in S."""
-        return self.certificate.polytope if self.lookahead is None else None
-
-    @property
-    def kept_set(self) -> Ellipsoid | Polytope:
-        """The set that the one-step test keeps the state in."""
-        return self.certificate.ellipsoid if self.polytope is None else self.polytope
 
     @cached_property
     def projection_margin(self) -> float:
@@ -139,6 +128,8 @@ class SafetyFilter(ReadOnlyArrays):
                 step has passed since. What is no plan of at most `horizon` inputs within the limits counts as none.
         """
         x_hat, proposed = _as_array(estimate).copy(), _as_array(input_proposed).copy()  # read once
+        if (x_hat.shape, proposed.shape) != self.test.single:
+            self._tell_of_shapes(estimate, input_proposed)
         return self.decide_knowing(x_hat, self.errors_of(error_shape), proposed, stored)
 
     def decide_knowing(
@@ -210,6 +201,18 @@ class SafetyFilter(ReadOnlyArrays):
             self.lookahead.complete(decided, sets, estimates, errors, proposed, stored)
         return decided
 
+    def _tell_of_shapes(self, estimate: Any, proposed: Any) -> None:
+        """Warns the caller of `decide` of what is no single estimate or input; what is decided then is K x_hat."""
+        for name, value, (size,) in zip(("estimate", "input"), (estimate, proposed), self.test.single, strict=True):
+            if (array := _as_array(value)).shape != (size,):
+                got = f"shape {array.shape}" if array.size else f"a {type(value).__name__}"
+                warnings.warn(
+                    f"decide takes one {name}, numbers of shape ({size},), got {got}: it falls back to K x_hat "
+                    "(decide_many takes batches, shields.torch.SafeLayer tensors)",
+                    stacklevel=3,
+                )
+                return
+
     def first_plan(self, estimate: np.ndarray, errors: PredictedErrors) -> np.ndarray:
         """Returns a certified plan that may be stored before the first decision, shape (k, m); empty without one."""
         if self.lookahead is None:
@@ -244,7 +247,7 @@ class SafetyFilter(ReadOnlyArrays):
 
     @np.errstate(all="ignore")
     def knows_inside(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
-        """Returns whether |x_hat|_M + sqrt(lambda_max(M Sigma_k)) <= 1, which proves that x is in S."""
+        """Returns whether estimate and error shape prove that x is in the certificate's safe set."""
         x_hat, errors = _as_array(estimate), self.errors_of(error_shape)
         return x_hat.shape == (self.plant.n,) and bool(self.test.knows_inside(x_hat, errors, MARGIN))
 

@@ -14,7 +14,6 @@ from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.estimation.set_membership import enlarged_by_rounding
 from ncs_gym.uncertainty.shape_matrices import outer_sum
 from shields.certificate import Certificate
-from shields.polytope import Polytope
 from shields.runtime.guarantee import LoopObservation
 from shields.runtime.one_step import PredictedErrors
 from shields.runtime.safety_filter import MARGIN, SafetyFilter
@@ -35,7 +34,7 @@ class StartKnown(NamedTuple):
     """What is known of the start of an episode before any estimate.
 
     Attributes:
-        in_safe_set: Whether every possible start lies in S.
+        in_safe_set: Whether every possible start lies in the certificate's safe set: in S, or in P if it has one.
         in_box: Whether every possible start lies in the safe box.
     """
 
@@ -43,17 +42,16 @@ class StartKnown(NamedTuple):
     in_box: bool
 
 
-def starts_inside(certificate: Certificate, initial: Ellipsoid | np.ndarray, polytope: Polytope | None = None) -> bool:
-    """Returns whether all possible starts lie in S, or in a polytope, decided in exact arithmetic.
+def starts_inside(certificate: Certificate, initial: Ellipsoid | np.ndarray) -> bool:
+    """Returns whether all possible starts lie in the safe set of a certificate, decided in exact arithmetic.
 
     Args:
-        certificate: Gives S = E(L).
-        initial: An ellipsoid E(P), inside S exactly if L - P >= 0; or a single state, shape (n,), inside S exactly if
-            [1, x'; x, L] >= 0.
-        polytope: What a shield keeps in place of S; None for S.
+        certificate: Gives its polytope, or S = E(L).
+        initial: An ellipsoid E(X), inside S exactly if L - X >= 0; or a single state, shape (n,), inside S exactly if
+            [1, x'; x, L] >= 0. Inside a polytope they are exactly if they are between all its pairs of faces.
     """
-    if polytope is not None:
-        return _between(polytope.rows, initial)
+    if certificate.polytope is not None:
+        return _between(certificate.polytope.rows, initial)
     L = rational(certificate.L)
     if isinstance(initial, Ellipsoid):
         return is_positive_semidefinite(subtract(L, rational(initial.shape_matrix)))
@@ -74,6 +72,8 @@ def starts_in_box(plant: LinearPlant, initial: Ellipsoid | np.ndarray) -> bool:
 
 def _between(bounds: np.ndarray, initial: Ellipsoid | np.ndarray) -> bool:
     """Returns whether |g x| <= 1 for all rows g, shape (r, n), and all possible starts."""
+    if not isinstance(initial, Ellipsoid) and (verdict := _surely_between(bounds, initial)) is not None:
+        return verdict  # a thousand times faster than in rational arithmetic
     rows = rational(bounds)
     if isinstance(initial, Ellipsoid):
         shape = rational(initial.shape_matrix)
@@ -81,11 +81,21 @@ def _between(bounds: np.ndarray, initial: Ellipsoid | np.ndarray) -> bool:
     return all(abs(product) <= 1 for (product,) in multiply(rows, transpose(rational(initial))))
 
 
+@np.errstate(all="ignore")  # what is not finite is no verdict
+def _surely_between(bounds: np.ndarray, state: np.ndarray) -> bool | None:
+    """Returns whether |g x| <= 1 for all rows g, shape (r, n), and one state; None where rounding could decide it."""
+    products, sizes = np.abs(bounds @ state), np.abs(bounds) @ np.abs(state)
+    room = (len(state) + 2) * float(np.finfo(float).eps) * sizes + float(np.finfo(float).tiny)
+    if (products + room <= 1.0).all():
+        return True
+    return False if (products - room > 1.0).any() else None
+
+
 def start_known(safety_filter: SafetyFilter, initial: Ellipsoid | np.ndarray | None) -> StartKnown:
     """Returns what is known of starts in an ellipsoid E(P), of one state, shape (n,), or of any (None)."""
     if initial is None:
         return StartKnown(False, False)
-    inside = starts_inside(safety_filter.certificate, initial, safety_filter.polytope)
+    inside = starts_inside(safety_filter.certificate, initial)
     return StartKnown(inside, inside or starts_in_box(safety_filter.plant, initial))
 
 
@@ -95,11 +105,11 @@ def starts_known(
     """Returns what is known of x_0 .. x_c, given where starts are possible.
 
     x_0 is decided in exact arithmetic. With x_0 in {z} + E(P), x_1 lies in {A z} + E(A P A'/nu + D/(1-nu)) for every nu
-    in (0, 1), and so on; whether that lies in S, or in the box, is decided by the tests that judge estimates, with
-    their margins for rounding.
+    in (0, 1), and so on; whether that lies in the safe set, or in the box, is decided by the tests that judge
+    estimates, with their margins for rounding.
 
     Args:
-        safety_filter: Gives S, the box and the plant.
+        safety_filter: Gives the safe set, the box and the plant.
         initial: An ellipsoid, one state, shape (n,), or None for any start.
         lead: c.
     """
@@ -111,7 +121,9 @@ def starts_known(
         center, shape = np.zeros(plant.n), initial.shape_matrix
     else:
         center, shape = np.asarray(initial, dtype=np.float64), np.zeros((plant.n, plant.n))
-    for _ in range(lead):
+    for ahead in range(lead):
+        if not safety_filter.test.keeps_between(center, safety_filter.errors_of(shape), MARGIN):
+            known[ahead] = StartKnown(False, False)
         center, shape = _moved(plant, center, shape)
         errors = safety_filter.errors_of(shape)
         inside = bool(safety_filter.test.knows_inside(center, errors, MARGIN))
@@ -120,17 +132,19 @@ def starts_known(
 
 
 def known_inside(safety_filter: SafetyFilter, known: StartKnown, estimate: np.ndarray, errors: PredictedErrors) -> bool:
-    """Returns whether one of the states x_0 .. x_{c-1} is known to be in S; in mode "lookahead" in the box.
+    """Returns whether one of the states x_0 .. x_{c-1} is known to be in the safe set; in mode "lookahead" in the box.
 
     Args:
-        safety_filter: Gives S and the box.
+        safety_filter: Gives both.
         known: What is known of it from where starts are possible.
         estimate: Its estimate, shape (n,).
         errors: What is known of the error shape of that.
     """
-    if known.in_safe_set or bool(safety_filter.test.knows_inside(estimate, errors, MARGIN)):
+    if known.in_safe_set or (known.in_box and safety_filter.lookahead is not None):
         return True
-    return safety_filter.lookahead is not None and (known.in_box or _in_box(safety_filter, estimate, errors))
+    if not safety_filter.test.keeps_between(estimate, errors, MARGIN):
+        return False
+    return bool(safety_filter.test.knows_inside(estimate, errors, MARGIN)) or _in_box(safety_filter, estimate, errors)
 
 
 def first_observations(
@@ -141,7 +155,7 @@ def first_observations(
     """Returns of x_0 .. x_{c-1} in k environments whether each is known to be inside, (k,), and what is observed.
 
     Args:
-        safety_filter: Gives S and the box.
+        safety_filter: Gives the safe set and the box.
         known: What is known of x_0 .. x_c in each of the environments from where its starts are possible.
         beliefs: Of x_0 .. x_{c-1}, estimates, shape (n, k), and what is known of the error shapes.
     """
@@ -165,8 +179,8 @@ def first_store(
 
     The state is that at which the first decision takes effect, without a downlink the start.
 
-    It is where it is known to be in S; in mode "lookahead" also where it is known to be in the box, by what starts are
-    possible or by the estimate, and a first plan is certified.
+    It is where it is known to be in the safe set; in mode "lookahead" also where it is known to be in the box, by what
+    starts are possible or by the estimate, and a first plan is certified.
 
     Args:
         safety_filter: Decides.

@@ -13,7 +13,6 @@ from ncs_gym.envs.info import Known
 from ncs_gym.envs.spaces import read_actions
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network import CommittedInputs
-from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.validation import as_number, setting, shown
 from shields.certificate import Certificate
 from shields.downlink.schedule import as_decided
@@ -30,7 +29,14 @@ from shields.runtime.lost_guarantee import LostGuarantee
 from shields.runtime.one_step import PredictedErrors, norms
 from shields.runtime.safety_filter import SafetyFilter
 from shields.runtime.starts import StartKnown, first_observations, first_store, starts_known
-from shields.runtime.wrapper import certificate_for, environment_behind, hint_for, premises_of, require_same
+from shields.runtime.wrapper import (
+    certificate_for,
+    environment_behind,
+    hint_for,
+    premises_of,
+    require_same,
+    warned_of,
+)
 
 REASONS = np.array(EXPLANATIONS, dtype=object)
 
@@ -94,14 +100,14 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         self._filter = SafetyFilter(self._certificate, inner.plant, mode, horizon)
         self._monitor = GuaranteeMonitor(self._filter, inner.downlink_protocol)
         self._lead = 0 if inner.downlink_protocol is None else inner.downlink_protocol.lead
-        warn_of_broken_contract(self._certificate.contract, inner.channel, self._lead)
+        self._channels = warned_of({*inner.episode_channels}, set(), self._certificate, self._lead)
         self._start_known = starts_known(self._filter, inner.single.initial_set, self._lead)
         count, nothing = self.num_envs, np.zeros(self.num_envs, np.bool_)
         self._schedule = (
             None if inner.downlink_protocol is None else CommittedInputs(self._lead, (inner.plant.m, count))
         )
         self._state = MonitorState(np.full(count, CODES[OTHER_STEPS]), nothing, nothing, np.zeros(count, np.int64))
-        self._interventions = np.zeros(count, np.int64)
+        self._interventions, self._proved = np.zeros((2, count), np.int64)
         # Plans stored in mode "lookahead", NaN beyond their ends.
         self._stored = np.full((self._filter.horizon or 0, inner.plant.m, count), np.nan)
         self._table: Any = None
@@ -131,6 +137,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             raise
         inner = self._environment_in(self.env)
         require_same(self._made_for, premises_of(inner, inner.single))
+        self._channels = warned_of({*inner.episode_channels}, self._channels, self._certificate, self._lead)
         now = self._read_clock()
         restarted = now.episodes != before.episodes
         unmoved = (now.steps == before.steps) & (now.ticks == before.ticks)
@@ -145,7 +152,9 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         self._start(restarted, now.steps == 0)
         self._clock = now
         idle = idle._replace(plan=self._stored)
-        info = info | self._info(idle, idle.input, self._state, self._interventions, self._report.age)
+        own = self._info(idle, idle.input, self._state, self._interventions, self._report.age)
+        self._proved = np.where(restarted, own["shield_guaranteed"], self._proved)
+        info = info | own | {"episode_guaranteed": self._proved / (now.steps + 1)}
         self._lost.tell()
         return observation, info
 
@@ -167,6 +176,9 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         observation, rewards, terminated, truncated, info = self.env.step(actions)
         now, state = self._read_clock(), self._state
         restarted, moved_once = _moved(before, now)
+        if np.count_nonzero(restarted):
+            channels = {*self._inner.episode_channels}
+            self._channels = warned_of(channels, self._channels, self._certificate, self._lead)
         known = self._inner.known
         self._report = self._observed(known)
         due = None if self._schedule is None else self._schedule.due(decided.input)
@@ -180,7 +192,9 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             charged = charged & ~restarted
             if (ended := self._inner.ended) is not None:  # SAME_STEP: the step ended episodes before it began the next
                 final = info.get("final_info", {})
-                added["final_info"] = self._final_info(final, ended, state, decided, proposed, moved_once, due)
+                added["final_info"] = self._final_info(
+                    final, ended, state, decided, proposed, moved_once, due, before.steps
+                )
                 charged = decided.intervened.copy()
             self._start(restarted, moved_once)
             decided.input[:, restarted], proposed[:, restarted], decided.intervened[restarted] = 0.0, 0.0, False
@@ -189,7 +203,9 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         if self.penalty:
             rewards = rewards - self.penalty * charged
         decided = decided._replace(plan=self._stored)
-        info = info | added | self._info(decided, proposed, self._state, self._interventions, self._report.age)
+        own = self._info(decided, proposed, self._state, self._interventions, self._report.age)
+        self._proved = np.where(restarted, 0, self._proved) + own["shield_guaranteed"]
+        info = info | added | own | {"episode_guaranteed": self._proved / (now.steps + 1)}
         self._lost.tell()
         return observation, rewards, terminated, truncated, info
 
@@ -252,6 +268,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         proposed: np.ndarray,
         moved_once: np.ndarray,
         due: np.ndarray | None,
+        steps: np.ndarray,
     ) -> dict[str, Any]:
         """Returns final_info with the shield's keys of the last steps of episodes that ended (SAME_STEP)."""
         final, (is_done, known) = dict(info), ended
@@ -264,6 +281,8 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         same_input, on_time = as_decided(known, decided.input, None if due is None else due[:, done])
         state = self._monitor.advance(state, decided, moved_once[done], same_input, report, on_time)
         own = self._info(decided, proposed[:, done], state, self._interventions[done], report.age, done)
+        proved = self._proved[done] + own["shield_guaranteed"]
+        own["episode_guaranteed"] = proved / (steps[done] + 2)
         for key, value in own.items():
             final[key] = np.full((self.num_envs, *value.shape[1:]), "" if value.dtype == object else 0, value.dtype)
             final[key][done], final[f"_{key}"] = value, is_done.copy()

@@ -12,7 +12,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv
 from gymnasium.wrappers import Autoreset, MaxAndSkipObservation, RepeatAction, StickyAction
 
-from ncs_gym import Annotation, ChannelContract, LinearPlant, NCSEnv, NCSVectorEnv
+from ncs_gym import Annotation, Channel, ChannelContract, LinearPlant, NCSEnv, NCSVectorEnv
 from ncs_gym.envs.info import Known
 from ncs_gym.envs.spaces import read_action
 from ncs_gym.network.contract import warn_of_broken_contract
@@ -36,17 +36,18 @@ INTERRUPTED = (-1, -1)
 # What of an environment a shield's proof rests on.
 PREMISES = "plant", "channel", "contract", "downlink_protocol", "certificate_contract", "process", "initial_set"
 
-_synthesized: dict[tuple[str, ChannelContract | None], Certificate] = {}
+_synthesized: dict[tuple[str, ChannelContract | None, str | None], Certificate] = {}
 
 
 class SafetyShield(gym.Wrapper, RecordConstructorArgs):
     """Overrides an action whenever the safe set could be left (docs/shield.md).
 
     The action passes unchanged if every state the estimate allows stays in S; otherwise "project" applies the closest
-    input that keeps it there, "switch" (and "project" where there is none) the certified u = K x_hat. From a start in S
-    the true state then stays in S for ever, for any policy, disturbance and channel within the assumptions;
-    `info["shield_guaranteed"]` says whether they still hold as far as can be seen. "boundary" trusts the agent only
-    where no input at all could leave S. "monitor" never changes the action and counts what "switch" would have done.
+    input that keeps it there, "switch" (and "project" where there is none) the certified u = K x_hat. S is the
+    certificate's safe set: its polytope, or its ellipsoid if it has none. From a start in S the true state then stays
+    in S for ever, for any policy, disturbance and channel within the assumptions; `info["shield_guaranteed"]` says
+    whether they still hold as far as can be seen. "boundary" trusts the agent only where no input at all could leave S.
+    "monitor" never changes the action and counts what "switch" would have done.
 
     Wrap it directly around what `gym.make` returns; wrappers that change or repeat actions go outside it.
 
@@ -60,6 +61,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
     | `shield_guaranteed` | bool | - | whether x in S is proved now (in mode "lookahead": x in the box, to stay) |
     | `shield_reason` | str | - | why it is not; empty while it is |
     | `episode_interventions` | int | steps | number of steps of this episode with `shield_intervened` |
+    | `episode_guaranteed` | float | - | share of the states of this episode, the first included, proved as now |
     | `shield_plan_length` | int | steps | in mode "lookahead" only: number of inputs stored for later steps |
 
     In mode "lookahead" an input passes too if a certified plan that begins with it keeps the state in the box until it
@@ -111,7 +113,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         )
         self._filter = SafetyFilter(self._certificate, inner.plant, mode, horizon)
         self._monitored = MonitoredFilter(self._filter, inner.downlink_protocol)
-        warn_of_broken_contract(self._certificate.contract, inner.channel, self._monitored.lead)
+        self._channels = warned_of({inner.channel}, set(), self._certificate, self._monitored.lead)
         self._clock: tuple[int, int] | None = None
         self._start: Any = None
         self._known: tuple[StartKnown, ...] = ()
@@ -136,12 +138,13 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             raise
         inner = self._environment_in(self.env)
         require_same(self._made_for, premises_of(inner, inner))
+        self._channels = warned_of({inner.episode_channel}, self._channels, self._certificate, self._monitored.lead)
         clock, report = self._read_clock(), self._observed(inner.known)
         start = self._inner.start
         if start is not self._start:  # decided exactly, which takes longer than a step; starts are read-only
             self._start, self._known = start, starts_known(self._filter, start, self._monitored.lead)
         self._monitored.begin(report, self._known, clock[1] == 0, self._inner.beliefs()[:-1])
-        self._interventions = 0
+        self._interventions = self._proved = 0
         u = np.zeros(self._filter.plant.m)
         margin = self._filter.margin(report.estimate, inner.known.error_shape, u)
         self._clock = clock
@@ -194,7 +197,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
     def _annotate(self, proposed: np.ndarray | None, interventions: int, plan: np.ndarray, *, intervened: bool) -> None:
         """Tells the picture of the step that follows what the shield does in it."""
         note = Annotation(
-            safe_set=self._filter.kept_set,
+            safe_set=self._certificate.safe_set,
             label=self._filter.mode,
             proposed=proposed,
             intervened=intervened,
@@ -206,6 +209,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
 
     def _info(self, proposed: np.ndarray, applied: np.ndarray, margin: float, *, intervened: bool) -> dict[str, Any]:
         reason = self._monitored.reason
+        self._proved += not reason
         ahead = {} if self._filter.lookahead is None else {"shield_plan_length": self._monitored.plan_length}
         return ahead | {
             "shield_intervened": intervened,
@@ -215,28 +219,47 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             "shield_guaranteed": not reason,
             "shield_reason": reason,
             "episode_interventions": self._interventions,
+            "episode_guaranteed": self._proved / (self._inner.steps + 1),
         }
 
 
 def certificate_for(
-    plant: LinearPlant, contract: ChannelContract | None = None, progress: Callable[[str], object] | None = None
+    plant: LinearPlant,
+    contract: ChannelContract | None = None,
+    progress: Callable[[str], object] | None = None,
+    safe_set: str | None = None,
 ) -> Certificate:
-    """Returns a synthesized certificate, made once per process, plant and channel contract.
+    """Returns a synthesized certificate, made once per process, plant, channel contract and kind of safe set.
 
     Args:
         plant: The plant.
         contract: Channel contract; None for none.
         progress: Called with a line of text per stage of the synthesis.
+        safe_set: "polytope", "ellipsoid" or None; see `synthesize`.
 
     Raises:
         Infeasible: If none is found.
     """
-    key = plant.fingerprint, contract
+    key = plant.fingerprint, contract, safe_set
     if key not in _synthesized:
         from shields.synthesis import synthesize  # the solver, which who has a certificate does without
 
-        _synthesized[key] = synthesize(plant, contract=contract, progress=progress)
+        _synthesized[key] = synthesize(plant, contract=contract, safe_set=safe_set, progress=progress)
     return _synthesized[key]
+
+
+def warned_of(now: set[Channel], before: set[Channel], certificate: Certificate, lead: int) -> set[Channel]:
+    """Returns the channels of the present episodes; warns the caller's caller of new ones that break the contract.
+
+    Args:
+        now: These channels.
+        before: Those that were looked at before.
+        certificate: Rests on a contract.
+        lead: c.
+    """
+    for channel in now - before:
+        warn_of_broken_contract(certificate.contract, channel, lead, stacklevel=4)
+    return now
 
 
 def premises_of(inner: NCSEnv | NCSVectorEnv, single: NCSEnv) -> dict[str, Any]:

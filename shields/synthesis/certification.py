@@ -20,7 +20,7 @@ from shields.errors import Infeasible, SynthesisInterrupted
 from shields.synthesis.alternating_optimization import largest_set, with_best_gain
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem, design_problem
 from shields.synthesis.diagnosis import infeasibility, is_feasible, with_feasible_bounds
-from shields.synthesis.invariant_polytope import invariant_polytope, share_in_polytope
+from shields.synthesis.invariant_polytope import grid_in_closed_loop, invariant_polytope, share_in_polytope
 from shields.synthesis.max_margin_gain import max_margin_gain
 from shields.synthesis.multipliers import best_input_multipliers, best_multipliers, with_best_multipliers
 from shields.synthesis.round_numbers import in_round_numbers
@@ -30,6 +30,9 @@ from shields.verification import Report, verify
 
 # Relative tightenings of the semidefinite programs, tried in turn until the result verifies exactly.
 _SLACKS = (1e-6, 1e-5, 1e-4, 1e-3)
+# Where a set leaves the box between samples, one in a box that is smaller by what is missing and this is sought, so
+# many times at most.
+_BETWEEN_RESERVE, _MOST_BOXES = 1e-3, 8
 # Significant digits of the numbers of a certificate: what differs between processors beyond them is cut off. Sizes
 # that are for people have fewer.
 _DIGITS, _SHOWN_DIGITS = 12, 6
@@ -48,7 +51,7 @@ def synthesize(
     method: str = "certified",
     *,
     contract: ChannelContract | None = None,
-    safe_set: str = "ellipsoid",
+    safe_set: str | None = None,
     progress: Progress | None = None,
     dkappa: float = 0.02,
     drho: float = 0.05,
@@ -64,9 +67,10 @@ def synthesize(
         plant: The plant with its bounds, Schur stable for "certified" without a contract.
         method: "certified" or "paper".
         contract: Channel contract; with one, the error sets depend on the age of the newest sample ("certified").
-        safe_set: What a shield keeps: "ellipsoid", or "polytope", the largest one that the same gain keeps in the box
-            (docs/theory.md, "Polytopes"). Where there is none within limits of rows and time the ellipsoid stays, and
-            the printed certificate says why ("certified").
+        safe_set: What a shield keeps: "polytope", the largest one that the gain of the ellipsoid keeps in the box
+            (docs/theory.md, "Polytopes"), or "ellipsoid". Where there is no polytope within limits of rows and time the
+            ellipsoid stays, and the printed certificate says why. None is "polytope" for "certified"; "paper" has an
+            ellipsoid.
         progress: Called with a line of text per stage: what is sought, and the volume reached so far ("certified").
         dkappa: Grid step of kappa ("paper").
         drho: Grid step of rho ("paper").
@@ -84,11 +88,11 @@ def synthesize(
         raise ValueError(f"plant must be a LinearPlant, got {type(plant).__name__}")
     if not (isinstance(method, str) and method in ("certified", "paper")):
         raise ValueError(f"method must be 'certified' or 'paper', got {shown(method)}")
-    if not (isinstance(safe_set, str) and safe_set in ("ellipsoid", "polytope")):
-        raise ValueError(f"safe_set must be 'ellipsoid' or 'polytope', got {shown(safe_set)}")
+    if not (safe_set is None or (isinstance(safe_set, str) and safe_set in ("ellipsoid", "polytope"))):
+        raise ValueError(f"safe_set must be 'polytope', 'ellipsoid' or None, got {shown(safe_set)}")
     if not all(isinstance(each, Certificate) and each.method == "certified" for each in candidates):
         raise ValueError("candidates must be certificates of method 'certified'")
-    if method == "paper" and safe_set != "ellipsoid":
+    if method == "paper" and safe_set == "polytope":
         raise ValueError("method 'paper' has an ellipsoid: safe_set='polytope' is for method 'certified'")
     if method == "paper":
         from shields.paper.certificate import paper_certificate  # nothing else here uses the paper's method
@@ -204,9 +208,25 @@ def nearby_certificate(
         alternations: How often the set is enlarged at most.
     """
     try:
-        problem, errors = design_problem(plant, contract)
+        certificate = _nearby(plant, contract, start, alternations)
     except Infeasible:
-        return None
+        certificate = None
+    return certificate or (None if start is None else carried_over(start, plant, contract))
+
+
+def _nearby(
+    plant: LinearPlant,
+    contract: ChannelContract | None,
+    start: Certificate | None,
+    alternations: int,
+    tightened: tuple[np.ndarray, ...] = (),
+) -> Certificate | None:
+    """Returns what `nearby_certificate` searches, in the boxes of `_found_certificate`.
+
+    Raises:
+        Infeasible: If the plant has no error set, or the state leaves every box between two samples.
+    """
+    problem, errors = design_problem(plant, contract, tightened[-1] if tightened else None)
     near = None
     if start is not None:
         lx, le, ld = start.proofs[-1].shares.tolist()
@@ -214,11 +234,14 @@ def nearby_certificate(
     for slack in _SLACKS:
         found = largest_set(problem, slack, lambda stage, design: None, near, alternations)
         if found is None:
-            break
+            return None
         certificate = _certificate(plant, problem, with_best_gain(problem, found), errors, slack)
+        box_rows = _tightened_box(certificate, plant, tightened)
+        if box_rows is not None:
+            return _nearby(plant, contract, start, alternations, (*tightened, box_rows))
         if verify(certificate, plant).valid:
             return certificate
-    return None if start is None else carried_over(start, plant, contract)
+    return None
 
 
 def _design_at(
@@ -243,36 +266,47 @@ def _largest_certificate(
     plant: LinearPlant, contract: ChannelContract | None, progress: Progress, known: Sequence[Certificate]
 ) -> Certificate:
     """Returns the verified certificate of the largest set found, or the largest of known ones."""
+
+    def volume(certificate: Certificate) -> float:
+        return float(np.linalg.slogdet(certificate.L)[1])
+
     try:
-        return max([*known, _found_certificate(plant, contract, progress, bool(known))], key=_volume)
-    except Infeasible:
-        if not known:
-            raise
-        return max(known, key=_volume)
+        return max([*known, _found_certificate(plant, contract, progress)], key=volume)
+    except Infeasible as infeasible:
+        if known:
+            return max(known, key=volume)
+        was_sought = "share_of_radii" in infeasible.details
+        if was_sought and (certificate := _with_closer_limits(plant, contract)) is not None:
+            return certificate
+        if was_sought or infeasible.binding == "E1":
+            raise _with_hints(infeasible, plant, contract, progress) from infeasible
+        raise
 
 
-def _volume(certificate: Certificate) -> float:
-    return float(np.linalg.slogdet(certificate.L)[1])
+def _with_closer_limits(plant: LinearPlant, contract: ChannelContract | None) -> Certificate | None:
+    """Returns a certificate that is found with closer input limits and holds for the plant's own; None if none is."""
+    for fraction in _LIMIT_FRACTIONS if plant.remainder is None else ():
+        closer = replace(plant, u_max=fraction * plant.u_max)
+        found = nearby_certificate(closer, contract) if is_feasible(closer, contract) else None
+        certificate = found and carried_over(found, plant, contract)
+        if certificate is not None:
+            return certificate
+    return None
 
 
 def _found_certificate(
-    plant: LinearPlant, contract: ChannelContract | None, progress: Progress, is_known: bool
+    plant: LinearPlant, contract: ChannelContract | None, progress: Progress, tightened: tuple[np.ndarray, ...] = ()
 ) -> Certificate:
     """Returns the verified certificate of the largest set found.
 
     Args:
         plant: The plant.
-        contract: The channel contract.
+        contract: Channel contract, if there is one.
         progress: Called with a line of text per stage.
-        is_known: Whether some certificate is known, so that nobody asks why none was found.
+        tightened: The boxes that sets were sought in so far, rows (k, n), and one more; empty for the plant's own.
     """
     progress("error set")
-    try:
-        problem, errors = design_problem(plant, contract)
-    except Infeasible as infeasible:
-        if is_known:
-            raise
-        raise _with_hints(infeasible, plant, contract, progress) from infeasible
+    problem, errors = design_problem(plant, contract, tightened[-1] if tightened else None)
     failure, slack = None, 0.0
     reached: tuple[str, CandidateDesign | None] = "start", None
 
@@ -289,6 +323,9 @@ def _found_certificate(
             for design in _finished(problem, found, slack):
                 report("exact verification", design)
                 certificate = _certificate(plant, problem, design, errors, slack)
+                box_rows = _tightened_box(certificate, plant, tightened)
+                if box_rows is not None:
+                    return _found_certificate(plant, contract, progress, (*tightened, box_rows))
                 verification = verify(certificate, plant)
                 if verification.valid:
                     return _with_tolerated_scale(certificate, problem)
@@ -297,23 +334,32 @@ def _found_certificate(
         stage, design = reached
         best = design and _certificate(plant, problem, with_best_gain(problem, design), errors, slack)
         raise _interrupted(plant, stage, best) from interrupt
-    if is_known:
-        raise failure or infeasibility(problem)
-    tighter = _with_closer_limits(plant, contract)
-    if tighter is not None:
-        return tighter
-    raise failure or _with_hints(infeasibility(problem), plant, contract, progress)
+    raise failure or infeasibility(problem)
 
 
-def _with_closer_limits(plant: LinearPlant, contract: ChannelContract | None) -> Certificate | None:
-    """Returns a certificate that is found with closer input limits and holds for the plant's own; None if none is."""
-    for fraction in _LIMIT_FRACTIONS if plant.remainder is None else ():
-        closer = replace(plant, u_max=fraction * plant.u_max)
-        found = nearby_certificate(closer, contract) if is_feasible(closer, contract) else None
-        certificate = found and carried_over(found, plant, contract)
-        if certificate is not None:
-            return certificate
-    return None
+def _tightened_box(
+    certificate: Certificate, plant: LinearPlant, tightened: tuple[np.ndarray, ...]
+) -> np.ndarray | None:
+    """Returns rows of a smaller box, shape (k, n), if the set leaves the plant's between samples; None if it does not.
+
+    Raises:
+        Infeasible: If it still does after several boxes.
+    """
+    grid = grid_in_closed_loop(plant, certificate.K, certificate.error_shapes, certificate.disturbances()[0])
+    if not len(grid.left):
+        return None
+    reach = np.sqrt(((grid.images @ certificate.L) * grid.images).sum(axis=1)) / np.maximum(grid.left, 1e-300)
+    over = reach.reshape(-1, len(plant.box_rows)).max(axis=0)
+    if over.max() <= 1.0 - 0.1 * _BETWEEN_RESERVE:
+        return None
+    if len(tightened) == _MOST_BOXES or grid.left.min() <= 0.0:
+        raise Infeasible(
+            "(B) the state leaves the box between two samples: a shorter dt, more grid points (between_samples=), or "
+            "less disturbance would help, and between_samples=None asks for the sampling instants alone",
+            "B",
+            float(over.max() - 1.0),
+        )
+    return (tightened[-1] if tightened else plant.box_rows) * np.maximum(over / (1.0 - _BETWEEN_RESERVE), 1.0)[:, None]
 
 
 def _finished(problem: DesignProblem, found: CandidateDesign, slack: float) -> Iterator[CandidateDesign]:
@@ -355,13 +401,14 @@ def _interrupted(plant: LinearPlant, stage: str, best: Certificate | None) -> Sy
 
 
 def _with_tolerated_scale(certificate: Certificate, problem: DesignProblem) -> Certificate:
-    """Returns the certificate with a record of how much larger all radii could be for some other set and gain."""
+    """Returns the certificate with a record of how much larger all radii could be for some set and gain.
+
+    It is 1 at least, because this certificate exists: the search for a larger one is local, and covers the error sets
+    of all ages by one.
+    """
     gain = max_margin_gain(problem, problem.covering_error_shape, searches=1)
-    if gain is None or gain.margin < 1.0:  # the search for it is local, and covers the error sets of all ages by one
-        return certificate
-    return replace(
-        certificate, provenance=certificate.provenance | {"tolerated_scale": float(exact.rounded(gain.margin, 3))}
-    )
+    scale = 1.0 if gain is None else max(gain.margin, 1.0)
+    return replace(certificate, provenance=certificate.provenance | {"tolerated_scale": float(exact.rounded(scale, 3))})
 
 
 def _failed_verification(report: Report) -> Infeasible:
@@ -389,6 +436,7 @@ def _certificate(
         rounding=problem.rounding,
         proofs=_proofs(problem, design, errors),
         updates=_updates(errors),
+        between_samples=plant.between_samples,
         method="certified",
         fingerprint=plant.fingerprint,
         provenance={
@@ -396,8 +444,16 @@ def _certificate(
             "solver": f"Clarabel {version('clarabel')} through cvxpy {version('cvxpy')}",
             "slack": slack,
         }
-        | _description(plant, L, float(np.exp(0.5 * design.log_det))),
+        | _description(plant, L, float(np.exp(0.5 * design.log_det)) * _share_of_ellipsoid(plant, problem)),
     )
+
+
+def _share_of_ellipsoid(plant: LinearPlant, problem: DesignProblem) -> float:
+    """Returns the volume of the largest ellipsoid in the box that a set was sought in; that of the plant's box is 1."""
+    if plant.grid_rows is None:
+        return 1.0
+    own = np.linalg.cholesky(largest_box_ellipsoid(plant.box_rows))
+    return float(np.exp(np.log(np.diag(problem.transform)).sum() - np.log(np.diag(own)).sum()))
 
 
 def _description(plant: LinearPlant, L: np.ndarray, volume: float) -> dict[str, Any]:

@@ -113,8 +113,15 @@ class CandidateDesign:
     log_det: float
 
 
-def design_problem(plant: LinearPlant, contract: ChannelContract | None = None) -> tuple[DesignProblem, ErrorSet]:
+def design_problem(
+    plant: LinearPlant, contract: ChannelContract | None = None, box_rows: np.ndarray | None = None
+) -> tuple[DesignProblem, ErrorSet]:
     """Returns the scaled design problem, and the error set with its shapes a little larger than the environment's.
+
+    Args:
+        plant: The plant.
+        contract: Channel contract, if there is one.
+        box_rows: Rows of a box inside the plant's in which the set is sought, shape (k, n); the plant's own by default.
 
     Raises:
         Infeasible: If the plant has no error set or its safe box is unbounded.
@@ -140,7 +147,7 @@ def design_problem(plant: LinearPlant, contract: ChannelContract | None = None) 
     except ErrorSetError as error:
         raise Infeasible(str(error), "E1", 0.0) from error
     shapes = errors.Sigma[None] if errors.ages is None else errors.ages.shapes[:-1]
-    return _scaled(plant, shapes, largest_box_ellipsoid(plant.box_rows)), errors
+    return _scaled(plant, shapes, plant.box_rows if box_rows is None else box_rows), errors
 
 
 def _inflated(errors: ErrorSet) -> ErrorSet:
@@ -149,8 +156,9 @@ def _inflated(errors: ErrorSet) -> ErrorSet:
     return replace(errors, Sigma=INFLATION * errors.Sigma, ages=ages)
 
 
-def _scaled(plant: LinearPlant, error_shapes: np.ndarray, box: np.ndarray) -> DesignProblem:
-    """Returns the design problem for error sets (k, n, n) and the largest ellipsoid in the safe box (n, n)."""
+def _scaled(plant: LinearPlant, error_shapes: np.ndarray, box_rows: np.ndarray) -> DesignProblem:
+    """Returns the design problem for error sets (k, n, n) and a box (k, n), in which it finds the largest ellipsoid."""
+    box = largest_box_ellipsoid(box_rows)
     T = np.linalg.cholesky(box)
     D = plant.disturbance.shape_matrix
     step = plant.B * (float(ACTION_ROUNDING) * plant.u_max)
@@ -163,7 +171,7 @@ def _scaled(plant: LinearPlant, error_shapes: np.ndarray, box: np.ndarray) -> De
     return DesignProblem(
         A=inverse @ plant.A @ T,
         B=inverse @ plant.B @ np.diag(plant.u_max),
-        C=plant.box_rows @ T,
+        C=box_rows @ T,
         D_u=inverse @ D_u @ inverse.T,
         error_shapes=inverse @ error_shapes @ inverse.T,
         transform=T,

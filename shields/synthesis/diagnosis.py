@@ -103,11 +103,9 @@ def with_feasible_bounds(
         progress("no certificate: searching for two changes that have one")
         if (pair := _smallest_pair(plant, contract)) is not None:
             (first, second), factor = pair
-            together = (
-                f"; the smallest pair of changes that works: {first.what} and {second.what}, {factor:.3g} times each"
-            )
+            together = f"; the smallest pair of changes: {first.what} and {second.what}, {factor:.3g} times each"
             details |= {"pair_factor": factor}
-    changed = f"; each changed alone: {'; '.join(hints)}{together}" if hints else ""
+    changed = f"; each changed alone: {'; '.join(hints)}{together}" if hints else together
     asked = "" if contract is None else f" (asked: max_age = {contract.max_age})"
     text = f"{infeasible}{_limits_exceeded(plant)}{changed}{asked}"
     return Infeasible(text, infeasible.binding, infeasible.shortfall, details)

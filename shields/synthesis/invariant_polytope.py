@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linprog
@@ -28,6 +29,8 @@ LONGEST_SEARCH = 60.0
 _RESERVE = 1e-6
 # A row counts as implied by others up to this: a thousandth of the reserve.
 _IMPLIED = 1e-9
+# Where fewer rows than this share of the most are left of a search that has too many, it goes on.
+_LEAST_PRUNED = 0.9
 # Significant digits of rows and multipliers; what a row lacks by that is far below the reserve.
 _DIGITS = 10
 # The solver's own tolerances, next to units of 1.
@@ -49,10 +52,18 @@ def invariant_polytope(certificate: Certificate, plant: LinearPlant, progress: C
     """
     step = _ClosedLoop(certificate, plant)
     rows = step.first_rows()
+    kept = len(plant.box_rows)
+    if plant.grid_rows is not None:  # those of the grid may imply those of the box, which need not be followed then
+        rows, _ = _without_implied(rows, kept)
     deadline, following = time.monotonic() + LONGEST_SEARCH, 0
     while following < len(rows):
-        if len(rows) > MOST_ROWS:
-            raise _none(f"it would need more than {MOST_ROWS} rows")
+        if following < kept and _largest(np.delete(rows, following, axis=0), rows[following])[0] <= 1.0 + _IMPLIED:
+            following += 1
+            continue
+        if len(rows) > MOST_ROWS:  # what later ones imply leads nowhere else, either
+            rows, following = _without_implied(rows, kept, following)
+            if len(rows) > _LEAST_PRUNED * MOST_ROWS:
+                raise _none(f"it would need more than {MOST_ROWS} rows")
         if time.monotonic() > deadline:
             raise _none(f"its search took longer than {LONGEST_SEARCH:g} s")
         if following % 50 == 0:
@@ -62,7 +73,7 @@ def invariant_polytope(certificate: Certificate, plant: LinearPlant, progress: C
             rows = np.concatenate([rows, row[None]])
         following += 1
     progress(f"polytope: which of {len(rows)} rows count")
-    return _rounded(step, _without_implied(rows, len(plant.box_rows)))
+    return _rounded(step, _without_implied(rows, kept)[0])
 
 
 def share_in_polytope(polytope: Polytope, plant: LinearPlant) -> float | None:
@@ -76,6 +87,37 @@ def share_in_polytope(polytope: Polytope, plant: LinearPlant) -> float | None:
         return None
     points = 2.0 * qmc.Sobol(plant.n, scramble=False).random_base2(_POINTS_LOG2) - 1.0
     return float((polytope.gauge(points / np.abs(rows).sum(axis=0)) <= 1.0).mean())
+
+
+class ClosedLoopGrid(NamedTuple):
+    """What u = K x_hat makes of x at the times of a plant's grid; the g rows are ordered by time, then by box row.
+
+    Attributes:
+        images: c (A_tau + B_tau K), shape (g, n).
+        left: What |image x| may be so that |c x| stays below 1 - eta for all errors and disturbances, shape (g,).
+    """
+
+    images: np.ndarray
+    left: np.ndarray
+
+
+def grid_in_closed_loop(plant: LinearPlant, K: np.ndarray, errors: np.ndarray, D: np.ndarray) -> ClosedLoopGrid:
+    """Returns the rows of docs/shield_proof.md, "Between the samples"; none for a plant without a grid.
+
+    Args:
+        plant: The plant.
+        K: The gain, shape (m, n).
+        errors: Shapes of the error sets, (l, n, n).
+        D: Shape of the disturbance set, (n, n).
+    """
+    if plant.grid_rows is None:
+        return ClosedLoopGrid(np.empty((0, plant.n)), np.empty(0))
+    state, pushed, remainder = plant.grid_rows
+    answer = pushed @ K
+    reach = np.sqrt(np.einsum("...i,lij,...j->l...", answer, errors, answer).max(axis=0))
+    rho = np.sqrt(np.einsum("ji,ik,jk->j", plant.box_rows, D, plant.box_rows))
+    left = 1.0 - remainder - rho - reach - float(ACTION_ROUNDING) * (np.abs(pushed) @ plant.u_max)
+    return ClosedLoopGrid((state + answer).reshape(-1, plant.n), left.ravel())
 
 
 class _ClosedLoop:
@@ -97,7 +139,15 @@ class _ClosedLoop:
         allowed = self._plant.u_max * (1.0 - float(ACTION_ROUNDING) - _RESERVE) - self._reach(self._K)
         if (allowed <= 0.0).any():
             raise _none("the error of the estimate alone takes an input beyond its limit")
-        return np.concatenate([self._plant.box_rows, self._K / allowed[:, None]]) * self.widths
+        rows, (images, left) = np.concatenate([self._plant.box_rows, self._K / allowed[:, None]]), self._on_grid()
+        if (left <= 0.0).any():
+            raise _none("errors and disturbances alone leave the box between two samples")
+        return np.concatenate([rows, images / left[:, None]]) * self.widths
+
+    def _on_grid(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns what u = K x_hat makes of x at the times of the grid, rows (g, n), and what |row x| may be, (g,)."""
+        grid = grid_in_closed_loop(self._plant, self._K, self._errors, self._D)
+        return grid.images, grid.left - _RESERVE
 
     def predecessor(self, row: np.ndarray) -> np.ndarray:
         """Returns the row that states have to fulfil so that the next ones fulfil a row, both in units of the box.
@@ -125,12 +175,12 @@ class _ClosedLoop:
         return np.concatenate([box, rounded[len(box) :]])
 
     def multipliers(self, rows: np.ndarray) -> np.ndarray:
-        """Returns what writes every row after one step, and every row of the gain, as a sum of rows, (r + m, r)."""
-        scaled, limits = rows * self.widths, self._plant.u_max
-        images = np.concatenate([rows @ self.next, self._K / limits[:, None]]) * self.widths
+        """Returns what writes rows after one step, of the gain and on the grid as sums of rows, (r + m + g, r)."""
+        scaled, limits, gains = rows * self.widths, self._plant.u_max, slice(len(rows), len(rows) + self._plant.m)
+        images = np.concatenate([rows @ self.next, self._K / limits[:, None], self._on_grid()[0]]) * self.widths
         found = np.array([_largest(scaled, image)[1] for image in images])
         found[np.abs(found) < 1e-13] = 0.0
-        found[len(rows) :] *= limits[:, None]
+        found[gains] *= limits[:, None]
         return exact.rounded(found, _DIGITS + 2, axis=1)
 
 
@@ -154,13 +204,13 @@ def _largest(rows: np.ndarray, row: np.ndarray) -> tuple[float, np.ndarray]:
     return -found.fun, prices[: len(rows)] - prices[len(rows) :]
 
 
-def _without_implied(rows: np.ndarray, kept: int) -> np.ndarray:
-    """Returns rows without those that the others imply; the first `kept` stay."""
+def _without_implied(rows: np.ndarray, kept: int, count: int = 0) -> tuple[np.ndarray, int]:
+    """Returns rows without those that the others imply, and how many of the first `count` stay; the `kept` first do."""
     for i in range(len(rows) - 1, kept - 1, -1):
         others = np.delete(rows, i, axis=0)
         if _largest(others, rows[i])[0] <= 1.0 + _IMPLIED:
-            rows = others
-    return rows
+            rows, count = others, count - (i < count)
+    return rows, count
 
 
 def _rounded(step: _ClosedLoop, rows: np.ndarray) -> Polytope:

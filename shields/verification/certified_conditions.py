@@ -11,6 +11,7 @@ import numpy as np
 from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
 from shields.certificate import Certificate, Updates
+from shields.verification.between_samples import between_conditions
 from shields.verification.conditions import Condition, flag, matrix_condition, scalar_condition
 from shields.verification.polytope_conditions import polytope_conditions
 from shields.verification.rational_matrix import (
@@ -40,6 +41,8 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> list[C
         conditions += _safe_set_conditions(certificate, plant)
         if certificate.polytope is not None:
             conditions += polytope_conditions(certificate.polytope, certificate, plant)
+        if all(condition.holds for condition in conditions):
+            conditions += between_conditions(certificate, plant)
     return conditions
 
 

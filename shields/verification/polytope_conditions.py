@@ -12,10 +12,10 @@ from ncs_gym import LinearPlant
 from shields.certificate import Certificate
 from shields.polytope import Polytope
 from shields.verification.conditions import Condition, flag, scalar_condition
-from shields.verification.rational_matrix import Matrix, add, congruence, multiply, quadratic, rational
+from shields.verification.rational_matrix import Matrix, add, congruence, multiply, quadratic, rational, transpose
 
 # Rounding an action in [-1, 1] to float32 changes it by at most this.
-_ACTION_ROUNDING = Fraction(1, 2**24)
+ACTION_ROUNDING = Fraction(1, 2**24)
 # Binary digits behind the point of an upper bound of a root.
 _ROOT_DIGITS = 128
 
@@ -27,13 +27,14 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
     root of g BK Sigma (BK)' g' for all error sets, and d that of g D g' and what rounding the action does.
     """
     rows, box = polytope.rows, plant.box_rows
-    fits = rows.shape[1] == plant.n and polytope.multipliers.shape == (len(rows) + plant.m, len(rows))
+    images = len(rows) + plant.m + len(box) * (plant.between_samples or 0)
+    fits = rows.shape[1] == plant.n and polytope.multipliers.shape == (images, len(rows))
     yield flag("polytope: shapes", fits)
     if not fits:
         return
     leads = len(rows) >= len(box) and bool((rows[: len(box)] == box).all())
     yield flag("polytope: its first rows are those of the safe box", leads)
-    widths = _half_widths(rational(box))
+    widths = half_widths(rational(box))
     yield flag("polytope: the box bounds every state", widths is not None)
     if not leads or widths is None:
         return
@@ -44,19 +45,19 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
     limits = [Fraction(float(limit)) for limit in plant.u_max]
     multipliers = polytope.multipliers
     for i, image in enumerate(next_rows):
-        s = _root_above(max(quadratic([pushed[i]], error) for error in errors))
-        d = _root_above(quadratic([G[i]], D))
-        d += _ACTION_ROUNDING * sum((abs(b) * limit for b, limit in zip(pushed[i], limits, strict=True)), Fraction(0))
-        left = 1 - _reach(image, multipliers[i], G, widths) - s - d
+        s = root_above(max(quadratic([pushed[i]], error) for error in errors))
+        d = root_above(quadratic([G[i]], D))
+        d += ACTION_ROUNDING * sum((abs(b) * limit for b, limit in zip(pushed[i], limits, strict=True)), Fraction(0))
+        left = 1 - reach(image, multipliers[i], G, widths) - s - d
         yield scalar_condition(f"(P) sum |lambda| + |r| w + s + d <= 1 of row {i + 1}", left)
     for i, (gain, limit) in enumerate(zip(K, limits, strict=True)):
-        rho = limit * _root_above(max(error[i][i] for error in errors) / limit**2)
-        allowed = limit * (1 - _ACTION_ROUNDING)
-        left = allowed - _reach(gain, multipliers[len(rows) + i], G, widths) - rho
+        rho = limit * root_above(max(error[i][i] for error in errors) / limit**2)
+        allowed = limit * (1 - ACTION_ROUNDING)
+        left = allowed - reach(gain, multipliers[len(rows) + i], G, widths) - rho
         yield scalar_condition(f"(PU) input {i + 1} stays within u_max (1 - 2^-24) on the polytope", left)
 
 
-def _reach(image: list[Fraction], multipliers: np.ndarray, G: Matrix, widths: list[Fraction]) -> Fraction:
+def reach(image: list[Fraction], multipliers: np.ndarray, G: Matrix, widths: list[Fraction]) -> Fraction:
     """Returns sum |lambda| + sum_k |r_k| w_k, which bounds |image x| on the polytope."""
     rest, total = list(image), Fraction(0)
     for index in np.flatnonzero(multipliers):
@@ -66,34 +67,24 @@ def _reach(image: list[Fraction], multipliers: np.ndarray, G: Matrix, widths: li
     return total + sum((abs(left) * width for left, width in zip(rest, widths, strict=True)), Fraction(0))
 
 
-def _half_widths(box: Matrix) -> list[Fraction] | None:
-    """Returns bounds of |x_k| over |c_j x| <= 1 from n independent rows; None if there are none.
+def half_widths(box: Matrix) -> list[Fraction] | None:
+    """Returns bounds of |x_k| over |c_j x| <= 1; None if there are none.
 
-    With x = C^-1 y for these rows C and |y_j| <= 1 that is a sum of absolute values of a row of the inverse.
+    x = (C'C)^-1 C' y for |y_j| <= 1, so that is a sum of absolute values of a row of this matrix.
     """
-    n = len(box[0])
-    # Rows are reduced one after the other; what is appended records of which they are made.
-    reduced: list[tuple[int, list[Fraction]]] = []
-    for row in box:
-        rest = [*row, *(Fraction(int(k == len(reduced))) for k in range(n))]
-        for pivot, other in reduced:
-            factor = rest[pivot]
-            rest = [entry - factor * known for entry, known in zip(rest, other, strict=True)] if factor else rest
-        pivot = next((k for k in range(n) if rest[k]), None)
-        if pivot is None:
-            continue
-        rest = [entry / rest[pivot] for entry in rest]
-        reduced = [
-            (k, [entry - known[pivot] * new for entry, new in zip(known, rest, strict=True)]) for k, known in reduced
-        ]
-        reduced.append((pivot, rest))
-        if len(reduced) == n:
-            inverse = {k: known[n:] for k, known in reduced}
-            return [sum(map(abs, inverse[k]), Fraction(0)) for k in range(n)]
-    return None
+    turned, n = transpose(box), len(box[0])
+    rows = [gram + side for gram, side in zip(multiply(turned, box), turned, strict=True)]
+    for i in range(n):
+        if not (pivot := rows[i][i]):  # of a semidefinite matrix, which is singular then
+            return None
+        rows[i] = [entry / pivot for entry in rows[i]]
+        for other in range(n):
+            if other != i and (factor := rows[other][i]):
+                rows[other] = [entry - factor * own for entry, own in zip(rows[other], rows[i], strict=True)]
+    return [sum(map(abs, row[n:]), Fraction(0)) for row in rows]
 
 
-def _root_above(square: Fraction) -> Fraction:
+def root_above(square: Fraction) -> Fraction:
     """Returns an upper bound of the root of a number, at most 2^-128 above it; of one below zero, which none is, 0."""
     scaled = math.ceil(max(square, Fraction(0)) * 4**_ROOT_DIGITS)
     root = math.isqrt(scaled)

@@ -11,10 +11,11 @@ from agents.agent import Agent, Normalization
 from agents.evaluation import evaluate
 from agents.hyperparams import with_changes
 from agents.loop import LoopConfig, ShieldSettings
-from agents.sharing.agent_file import AgentError, digest
+from agents.sharing.agent_file import AgentError
 from agents.training import train
 from ncs_gym import Channel, GilbertElliott, truck_trailer
 from shields import Certificate
+from shields.json_documents import digest
 from tests.certificates import certificate_of
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"

@@ -169,10 +169,10 @@ def test_agent_and_finished_runs_of_one_processor_are_taken_by_another(tmp_path)
     )
     compare = (*compare, "--hyperparams", "n_envs=4", "n_steps=16", "batch_size=64")
     under("Haswell", *compare)
-    files = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("units/*.json")}
+    files = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("runs/*.json")}
     assert files
     under("Prescott", *compare, wide=False)
-    assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("units/*.json")} == files
+    assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("runs/*.json")} == files
     (folder,) = {file.parent for file in tmp_path.rglob("model.zip")}
     load = f"from agents import Agent; print(Agent.load({str(folder)!r}).env)"
     assert under("Prescott", "-c", load) == "ncs_gym/BatchReactor-v0\n"

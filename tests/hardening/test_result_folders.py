@@ -3,7 +3,7 @@
 import hashlib
 import json
 import os
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import pytest
 from hypothesis import example, given
@@ -14,16 +14,16 @@ from agents.sharing.agent_file import AgentError
 from experiments.analysis.episodes import episodes_table, parquet, training_table
 from experiments.analysis.summary import arm_summary
 from experiments.analysis.tables import summary_text
-from experiments.attack.counts_store import CountsStore
+from experiments.attack.campaign import Campaign
 from experiments.attack.counts_table import counts_table
 from experiments.attack.monte_carlo_batch import MonteCarloBatch
 from experiments.attack.safety_counts import SafetyCounts
 from experiments.errors import ResultsError
 from experiments.runs import claim_folder, prepare_output
 from experiments.runs.run_store import RunStore
-from experiments.runs.training_run import TrainingRun, _agent_of, execute_run
-from experiments.settings import CertifySettings, CompareSettings
-from shields.json_documents import digest
+from experiments.runs.training_run import TrainingRun, _agent_of
+from experiments.settings import AttackSettings, CompareSettings
+from shields.json_documents import document_of
 from tests.command import assert_one_sentence, ncs
 from tests.fuzz import JSON_VALUES, examples
 
@@ -57,7 +57,7 @@ def run(certificate):
         steps=256,
         episodes=2,
         certificate=certificate,
-        conditions=("gaussian",),
+        scenarios=("gaussian",),
         algorithm="PPO",
         settings=dict(n_envs=2, n_steps=64, batch_size=64, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8])),
     )
@@ -65,7 +65,7 @@ def run(certificate):
 
 @pytest.fixture(scope="module")
 def result(run):
-    return execute_run(run, lambda steps: None)
+    return run.execute(lambda steps: None)
 
 
 @pytest.fixture(scope="module")
@@ -77,15 +77,20 @@ def stored(run, result, tmp_path_factory):
 
 
 def file_of(folder, run):
-    return folder / "units" / f"{run.name}.json"
+    return folder / "runs" / f"{run.name}.json"
+
+
+def signed(content):
+    """The text of a file with a right checksum."""
+    return json.dumps(document_of("run", "ncs-gym run 3", content))
 
 
 def forged(folder, run, change):
     """Changes a stored result; the checksum is that of the new one."""
     path = file_of(folder, run)
     document = json.loads(path.read_bytes())
-    change(document["result"])
-    path.write_text(json.dumps(document | {"sha256": digest(document["result"])}))
+    change(document["run"]["result"])
+    path.write_text(signed(document["run"]))
 
 
 def everything_in(folder):
@@ -120,12 +125,12 @@ def test_files_of_other_names_are_not_written(name, run, result, tmp_path, monke
     assert everything_in(tmp_path) == before
 
 
-LINKS = ["units", "models", "models/shielded-0", "figures", "tensorboard", "channels", "units/shielded-0.json"]
+LINKS = ["runs", "models", "models/shielded-0", "figures", "tensorboard", "channels", "runs/shielded-0.json"]
 
 
 @pytest.mark.parametrize(
     ("command", "name"),
-    [*(("compare", name) for name in LINKS), *(("certify", name) for name in ("certificates", "tallies.jsonl"))],
+    [*(("compare", name) for name in LINKS), *(("certify", name) for name in ("certificates", "runs"))],
 )
 @pytest.mark.parametrize("is_there", [True, False])
 def test_links_in_an_output_folder_are_refused_before_anything_is_written(command, name, is_there, tmp_path):
@@ -143,10 +148,10 @@ def test_links_in_an_output_folder_are_refused_before_anything_is_written(comman
 
 
 def test_pipes_in_an_output_folder_are_refused_and_not_waited_for(tmp_path):
-    os.mkfifo(tmp_path / "tallies.jsonl")
+    os.mkfifo(tmp_path / "runs")
     with (
-        pytest.raises(ResultsError, match=r"tallies\.jsonl is neither a file nor a folder"),
-        claim_folder("certify", CertifySettings(out=tmp_path)),
+        pytest.raises(ResultsError, match=r"runs is neither a file nor a folder"),
+        claim_folder("certify", AttackSettings(out=tmp_path)),
     ):
         pass
 
@@ -166,13 +171,6 @@ def test_only_files_that_commands_write_are_removed_before_they_are_written_agai
     before = everything_in(tmp_path)
     prepare_output(tmp_path)
     assert everything_in(tmp_path) == before
-
-
-def test_counts_are_not_written_into_a_file_that_has_another_name_too(tmp_path):
-    (tmp_path / "mine").write_text("no line ends here")
-    os.link(tmp_path / "mine", tmp_path / "tallies.jsonl")
-    CountsStore(tmp_path / "tallies.jsonl", {"case": "key"}, 4).add(MonteCarloBatch("case", 0), COUNTS)
-    assert (tmp_path / "mine").read_text() == "no line ends here"
 
 
 CHANGES = [
@@ -204,10 +202,10 @@ CHANGES = [
     ("episodes", lambda c: c["episodes"][0].update(guaranteed=1)),
     ("episodes", lambda c: c["episodes"][0].update(more=1)),
     ("episodes", lambda c: c["episodes"].__setitem__(0, None)),
-    ("conditions", lambda c: c.update(conditions={})),
-    ("conditions", lambda c: c.update(conditions=["gaussian"])),
-    ("conditions", lambda c: c["conditions"].update(better=c["episodes"])),
-    ("conditions", lambda c: c["conditions"].update(gaussian=[])),
+    ("scenarios", lambda c: c.update(scenarios={})),
+    ("scenarios", lambda c: c.update(scenarios=["gaussian"])),
+    ("scenarios", lambda c: c["scenarios"].update(better=c["episodes"])),
+    ("scenarios", lambda c: c["scenarios"].update(gaussian=[])),
     ("trajectory", lambda c: c["trajectory"].pop("states")),
     ("trajectory", lambda c: c["trajectory"].update(states=[])),
     ("trajectory", lambda c: c["trajectory"]["states"].pop()),
@@ -220,7 +218,7 @@ CHANGES = [
     ("files", lambda c: c.update(files=["model.zip", "agent.json"])),
     ("files", lambda c: c["files"].update({"agent.json": None})),
     ("entries", lambda c: c.pop("history")),
-    ("entries", lambda c: c.update(more=1)),
+    ("more", lambda c: c.update(more=1)),
 ]
 
 
@@ -258,12 +256,11 @@ def replaced(value, at, by):
 def assert_refused_or_usable(data, folder, run):
     """What is not refused passes through everything that is made of results."""
     before = file_of(folder, run).read_bytes()
-    content = json.loads(before)["result"]
+    content = json.loads(before)["run"]["result"]
     at = data.draw(st.sampled_from(list(places_in(content))), label="at")
     other = replaced(content, at, data.draw(JSON_VALUES, label="by"))
-    document = json.loads(before) | {"result": other, "sha256": digest(other)}
     try:
-        file_of(folder, run).write_text(json.dumps(document))
+        file_of(folder, run).write_text(signed(json.loads(before)["run"] | {"result": other}))
         result = RunStore(folder).load(run)
     except ResultsError:
         return
@@ -290,53 +287,60 @@ def test_many_changed_results_are_refused_or_usable(data, stored, run):
     assert_refused_or_usable(data, stored, run)
 
 
-# A batch of four episodes.
-COUNTS = SafetyCounts(steps=800, episodes=4, interventions=10, level=0.5)
+# Counts of a batch of four episodes.
+COUNTS = {"steps": 800, "episodes": 4, "interventions": 10, "level": 0.5}
 
 
-def tally_line(**change):
-    """A line of tallies.jsonl with a right checksum."""
-    content = {"key": "key", "case": "case", "index": 0, "tally": asdict(COUNTS)} | change
-    return json.dumps({"sha256": digest(content), **content}) + "\n"
+@pytest.fixture(scope="module")
+def batch(certificate, tmp_path_factory):
+    """A batch, and the folder with its result, for tests that change it."""
+    campaign = Campaign(seed=0, random_plants=0, envs=4, shielded=True)
+    batch = MonteCarloBatch(campaign, "TruckTrailerCruise-v0, bursts", 0, certificate)
+    folder = tmp_path_factory.mktemp("batch")
+    RunStore(folder).save(batch, SafetyCounts(**COUNTS))
+    return batch, folder, file_of(folder, batch).read_bytes()
+
+
+def loaded(batch, **change):
+    """What is loaded of a batch with other counts."""
+    run, folder, content = batch
+    file_of(folder, run).write_bytes(content)
+    forged(folder, run, lambda counts: counts.update(change))
+    return RunStore(folder).load(run)
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        *({"index": wrong} for wrong in (-1, 0.0, True, None, [], "0", 10**400)),
-        *({"case": wrong} for wrong in ([], {})),
-        {"tally": []},
-        {"tally": {}},
-        {"tally": asdict(COUNTS) | {"more": 1}},
-        *({"tally": asdict(COUNTS) | {name: -1}} for name in asdict(COUNTS)),
-        *({"tally": asdict(COUNTS) | {name: "1"}} for name in asdict(COUNTS)),
-        *({"tally": asdict(COUNTS) | {name: 10**9}} for name in asdict(COUNTS) if name != "level"),
-        *({"tally": asdict(COUNTS) | {name: 0}} for name in ("steps", "episodes")),
-        {"tally": asdict(COUNTS) | {"level": float("nan")}},
-        {"tally": asdict(COUNTS) | {"exits": 1.0}},
-        {"tally": asdict(COUNTS) | {"exits": True}},
-        {"tally": asdict(COUNTS) | {"lapsed_violations": 1}},
+        {"more": 1},
+        *({name: -1} for name in vars(SafetyCounts())),
+        *({name: "1"} for name in vars(SafetyCounts())),
+        *({name: 10**9} for name in vars(SafetyCounts()) if name != "level"),
+        *({name: 0} for name in ("steps", "episodes")),
+        {"level": float("nan")},
+        {"level": None},
+        {"exits": 1.0},
+        {"exits": True},
+        {"lapsed_violations": 1},
+        {"files": {"model.zip": ""}},
     ],
 )
-def test_forged_counts_are_one_sentence(change, tmp_path):
-    (tmp_path / "tallies.jsonl").write_text(tally_line() + tally_line(**change))
-    with pytest.raises(ResultsError, match=r"line 2 of .*; delete it to repeat its batch"):
-        CountsStore(tmp_path / "tallies.jsonl", {"case": "key"}, 4)
+def test_forged_counts_are_one_sentence(change, batch):
+    assert loaded(batch) == SafetyCounts(**COUNTS)
+    with pytest.raises(ResultsError, match=r"is no result of its run .*: delete it to repeat the run"):
+        loaded(batch, **change)
 
 
-@given(change=st.dictionaries(st.sampled_from(sorted(asdict(COUNTS))), JSON_VALUES, min_size=1, max_size=3))
+@given(change=st.dictionaries(st.sampled_from(sorted(vars(SafetyCounts()))), JSON_VALUES, min_size=1, max_size=3))
 @example(change={"broken_episodes": 0})
 @examples(100)
-def test_changed_counts_are_refused_or_usable(tmp_path_factory, change):
-    path = tmp_path_factory.getbasetemp() / "tallies.jsonl"
-    path.write_text(tally_line(tally=asdict(COUNTS) | change))
+def test_changed_counts_are_refused_or_usable(batch, change):
     try:
-        counts = CountsStore(path, {"case": "key"}, 4).counts
+        counts = loaded(batch, **change)
     except ResultsError:
         return
-    total = sum(counts.values(), SafetyCounts())
-    counts_table({"case, own": total}, looks_ahead=False)
-    json.dumps(total.document())
+    counts_table({"case, own": counts}, looks_ahead=False)
+    json.dumps(counts.document(), allow_nan=False)
 
 
 @pytest.mark.parametrize(

@@ -10,16 +10,17 @@ from ncs_gym.validation import as_numbers
 from shields.runtime.backup_plans.planner import Planner, Plans
 from shields.runtime.decisions import INVALID, PLANNED, PROJECTED, REASONS, SAFE, STORED, Decision
 from shields.runtime.one_step import OneStepTest, PredictedErrors, ReachableSets, norms
+from shields.runtime.polytope_step import PolytopeTest
 
 
 class Lookahead:
     """Applies plans and stores what is left of them (docs/lookahead.md).
 
-    An input that passes the one-step test stays as it is, and nothing is stored any more: x+ is in S. One that begins a
-    certified plan stays as well, and what follows is stored (`keep`). Otherwise the decision of mode "project" is
-    changed (`complete`): among the projected input and the plans that are found, the input closest to the proposed one
-    is applied and what follows it in its plan is stored. Without any, the next stored input is applied; where nothing
-    is stored, K x_hat.
+    An input that passes the one-step test stays as it is, and nothing is stored any more: x+ is in the safe set. One
+    that begins a certified plan stays as well, and what follows is stored (`keep`). Otherwise the decision of mode
+    "project" is changed (`complete`): among the projected input and the plans that are found, the input closest to the
+    proposed one is applied and what follows it in its plan is stored. Without any, the next stored input is applied;
+    where nothing is stored, K x_hat.
 
     Args:
         test: The one-step test.
@@ -31,7 +32,7 @@ class Lookahead:
         planner: Finds the plans.
     """
 
-    def __init__(self, test: OneStepTest, gain: np.ndarray, horizon: int, margin: float) -> None:
+    def __init__(self, test: OneStepTest | PolytopeTest, gain: np.ndarray, horizon: int, margin: float) -> None:
         self._test, self._margin = test, margin
         self.planner = Planner(test, gain, horizon, margin)
 

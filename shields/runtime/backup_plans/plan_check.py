@@ -1,4 +1,4 @@
-"""Which backup plans are certified: inputs that keep every possible state in the box and end in the safe set.
+"""Which backup plans are certified: inputs that keep every possible state in the box and end in the safe set, S or P.
 
 `Prediction` says what the plant does within N steps, `Tightening` how far errors and disturbances reach around that,
 which depends on Sigma_k alone, and `PlanTest` decides. Arrays count environments on their first axis.
@@ -12,10 +12,14 @@ import numpy as np
 
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
 from ncs_gym.validation import read_only
-from shields.runtime.one_step import SMALLEST_RADIUS, OneStepTest, predicted_errors
+from shields.runtime.one_step import SMALLEST_RADIUS, OneStepTest, judged_shapes, predicted_errors
+from shields.runtime.polytope_step import PolytopeTest
 
-# Error shapes whose tightenings are remembered; they recur, since they depend only on what arrived when.
-MOST_REMEMBERED = 4096
+# Error shapes whose tightenings are remembered; they recur, since they depend only on what arrived when. Fewer where
+# those of one are many numbers.
+MOST_REMEMBERED, MOST_NUMBERS = 4096, 10_000_000
+# Entries of an array that are worked on together.
+BLOCK = 1_000_000
 
 
 class PlanTest:
@@ -23,11 +27,12 @@ class PlanTest:
 
     With c_0 = x_hat and c_{i+1} = A c_i + B u_i it is if |c c_i| + rho_i(c) <= 1 for the rows c of the box and i =
     1..j-1, which is the exact condition for every possible x_{k+i} to lie in the box, and c_j + E(Sigma_pred,j) lies in
-    S by the one-step test's condition. Then x_{k+j} is in S, hence in the box. For j = 1 it is the one-step test.
+    S by the one-step test's condition; of a certificate with a polytope P, |g c_j| + rho_j(g) <= 1 for the rows g of P,
+    which is exact, too. Then x_{k+j} is in S or P, hence in the box. For j = 1 it is the one-step test.
 
     Args:
         prediction: Of the plant.
-        margin: By which the test must be passed, in units of the box and of S.
+        margin: By which the test must be passed, in units of the box and of S or P.
 
     Attributes:
         prediction: The same.
@@ -36,10 +41,11 @@ class PlanTest:
     def __init__(self, prediction: Prediction, margin: float) -> None:
         self.prediction, self._margin = prediction, margin
         plant, ends = prediction.plant, prediction.ends
-        self._rows = plant.box_rows
-        sizes = np.abs(plant.box_rows) @ prediction.size_free
+        sizes = np.abs(prediction.rows) @ prediction.size_free
         self._row_rounding = (prediction.rounding[:, None, None] * sizes).reshape(-1, plant.n).T
-        self._end_rounding = np.array([end.rounding * end.columns for end in ends]).T
+        roundings = [end.rounding * end.columns for end in ends] or np.zeros((prediction.steps, plant.n))
+        self._end_rounding = np.array(roundings).T
+        self._most = min(MOST_REMEMBERED, max(1, MOST_NUMBERS // (prediction.steps * len(prediction.rows))))
         # Where in the table the tightenings of a shape are.
         self._remembered: dict[bytes, int] = {}
         self._table = tightenings(prediction, np.empty((0, plant.n, plant.n)))
@@ -49,7 +55,7 @@ class PlanTest:
         shapes = np.ascontiguousarray(shapes)
         keys = [shape.tobytes() for shape in shapes]
         new = {key: e for e, key in enumerate(keys) if key not in self._remembered}
-        if len(self._remembered) + len(new) > MOST_REMEMBERED:
+        if len(self._remembered) + len(new) > self._most:
             self._remembered.clear()
             new = {key: e for e, key in enumerate(keys)}
         if new:
@@ -62,7 +68,7 @@ class PlanTest:
 
     @np.errstate(all="ignore")  # what is not finite is not certified
     def room(self, estimates: np.ndarray, tightening: Tightening) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the largest |c_i c_j|, shape (E, N, k), and |T G c_j|, shape (E, N), that pass; NaN for no usable."""
+        """Returns the largest |row c_j|, shape (E, N, r), and |T G c_j|, shape (E, N), that pass; NaN for no usable."""
         size = np.abs(estimates)
         rounding = (size @ self._row_rounding).reshape(tightening.room.shape)
         box = tightening.room - rounding - self._margin
@@ -70,7 +76,7 @@ class PlanTest:
         return box, np.where(radius >= SMALLEST_RADIUS, radius - self._margin, np.nan)
 
     def judged(self, estimates: np.ndarray, tightening: Tightening, plans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns c_i c_j, shape (N, k, E, P), and T G c_j, shape (N, n, E, P): sums over long last axes are fast.
+        """Returns row c_j, shape (N, r, E, P), and T G c_j, shape (N, n, E, P): sums over long last axes are fast.
 
         Args:
             estimates: x_hat, shape (E, n).
@@ -79,7 +85,7 @@ class PlanTest:
         """
         centers = self.prediction.centers(estimates, plans)
         steps, n, count, number = centers.shape
-        values = self._rows @ centers.reshape(steps, n, -1)
+        values = self.prediction.rows @ centers.reshape(steps, n, -1)
         weighting = tightening.weighting.transpose(1, 2, 3, 0)[..., None]
         weighted = weighting[:, :, 0] * centers[:, 0, None]
         for i in range(1, n):
@@ -95,9 +101,19 @@ class PlanTest:
             tightening: Of the error shapes of each.
             plans: Inputs, shape (E, P, N, m) [physical units].
         """
-        box, radius = self.room(estimates, tightening)
+        block = max(1, BLOCK // (plans[:1, ..., 0].size * len(self.prediction.rows) or 1))
+        if len(plans) > block:
+            parts = [slice(start, start + block) for start in range(0, len(plans), block)]
+            each = [self.certified(estimates[e], Tightening(*(t[e] for t in tightening)), plans[e]) for e in parts]
+            return np.concatenate(each)
+        room, radius = self.room(estimates, tightening)
         values, weighted = self.judged(estimates, tightening, plans)
-        kept = _kept(values, weighted, box.transpose(1, 2, 0)[..., None], radius.T[..., None])
+        within = np.abs(values) <= room.transpose(1, 2, 0)[..., None]
+        inside = np.all(within[:, : len(self.prediction.plant.box_rows)], axis=1)
+        kept = np.sqrt((weighted * weighted).sum(axis=1)) <= radius.T[..., None]
+        if not self.prediction.ends:
+            kept &= np.all(within, axis=1)
+        kept[1:] &= np.logical_and.accumulate(inside[:-1], axis=0)
         return kept.transpose(1, 2, 0) & self._within_limits(plans)
 
     def _within_limits(self, plans: np.ndarray) -> np.ndarray:
@@ -116,21 +132,6 @@ class PlanTest:
         return bool((reach <= 1.0 - self._margin).all())
 
 
-def _kept(values: np.ndarray, weighted: np.ndarray, box: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Returns whether centers c_1..c_{j-1} are far enough inside the box, and c_j inside S, shape (N, ...).
-
-    Args:
-        values: c_i c_j, shape (N, k, ...) with axes of estimates and plans last, as in all others.
-        weighted: T G c_j, shape (N, n, ...).
-        box: Largest |c_i c_j|, shape (N, k, ...).
-        radius: Largest |T G c_j|, shape (N, ...).
-    """
-    inside = np.all(np.abs(values) <= box, axis=1)
-    kept = np.asarray(np.sqrt((weighted * weighted).sum(axis=1)) <= radius)
-    kept[1:] &= np.logical_and.accumulate(inside[:-1], axis=0)
-    return kept
-
-
 class Prediction:
     """The centers c_0 = x_hat, c_{j+1} = A c_j + B u_j of the states that can be reached, j = 1..N.
 
@@ -138,23 +139,27 @@ class Prediction:
     roundings of n-term sums, the sum over the inputs m terms per step.
 
     Args:
-        first: The one-step test, which gives the plant and the norm of S.
+        first: The one-step test, which gives the plant and the norm of S, or the rows of P.
         steps: N.
 
     Attributes:
         plant: The plant.
         steps: N.
+        rows: Rows whose values at the centers are judged, shape (r, n): the k rows of the box, and where plans end in P
+            its others.
         free: A^j, shape (N, n, n).
         forced: Block rows [A^{j-1} B, ..., B, 0, ...], shape (N, n, N m).
         size_free: |A|^j, shape (N, n, n).
         size_forced: sum_{i<j} |A|^i |B| u_max, shape (N, n).
         rounding: Relative rounding after j steps, shape (N,).
-        ends: The test of section "One step" for what is reached at j: c_j + E(Sigma_pred,j) lies in S; N of them.
+        ends: The test of section "One step" for what is reached at j: c_j + E(Sigma_pred,j) lies in S; N of them. None
+            where plans end in P, of which the rows decide.
     """
 
-    def __init__(self, first: OneStepTest, steps: int) -> None:
+    def __init__(self, first: OneStepTest | PolytopeTest, steps: int) -> None:
         plant, n, m = first.plant, first.plant.n, first.plant.m
         self.plant, self.steps = plant, steps
+        self.rows = first.root if isinstance(first, PolytopeTest) else plant.box_rows
         powers, sizes = [np.eye(n)], [np.eye(n)]
         for _ in range(steps):
             powers.append(plant.A @ powers[-1])
@@ -168,7 +173,8 @@ class Prediction:
         pushes = np.array([size @ np.abs(plant.B) @ plant.u_max for size in sizes[:-1]])
         self.size_forced = read_only(np.cumsum(pushes, axis=0))
         self.rounding = read_only(8.0 * (n + m) * (np.arange(1, steps + 1) + 2.0) * float(np.finfo(float).eps))
-        self.ends = tuple(EndTest(first, self, j) for j in range(steps))
+        ends = [] if isinstance(first, PolytopeTest) else [EndTest(first, self, j) for j in range(steps)]
+        self.ends = tuple(ends)
         self._free = np.ascontiguousarray(self.free.reshape(steps * n, n))
         self._forced = np.ascontiguousarray(self.forced.reshape(steps * n, steps * m))
 
@@ -223,14 +229,15 @@ class EndTest(OneStepTest):
 
 
 class Tightening(NamedTuple):
-    """What errors and disturbances leave of the box and of S, for E error shapes.
+    """What errors and disturbances leave of the box and of S or P, for E error shapes.
 
     Attributes:
-        room: 1 - rho_j(c_i) less the rounding that does not depend on the estimate, shape (E, N, k) for the k rows c_i
-            of the box; NaN for an unusable shape.
+        room: 1 - rho_j(row) less the rounding that does not depend on the estimate, shape (E, N, r) for the rows of the
+            `Prediction`; NaN for an unusable shape.
         weighting: T G, shape (E, N, n, n), with T of `PredictedErrors` after j steps: c_j is far enough inside S if
-            |T G c_j| is at most the radius.
-        radius: 1 - h less the rounding that does not depend on the estimate, shape (E, N); NaN for an unusable shape.
+            |T G c_j| is at most the radius. Of shape (E, N, 0, n) where plans end in P.
+        radius: 1 - h less the rounding that does not depend on the estimate, shape (E, N); 1 where plans end in P; NaN
+            for an unusable shape.
     """
 
     room: np.ndarray
@@ -240,7 +247,7 @@ class Tightening(NamedTuple):
 
 @np.errstate(all="ignore")  # what overflows leaves no room
 def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
-    """Returns the exact support of what is reached at c_j, for every row of the box, and the end's ellipsoid.
+    """Returns the exact support of what is reached at c_j, for every row, and the end's ellipsoid.
 
     rho_j(a) = sqrt(a' A^j Sigma_k A^j' a) + sum_{i<j} sqrt(a' A^i D A^i' a), rounded outward: with |S_pq| <= s_p s_q a
     computed b'Sb is off by at most a relative rounding of (|b|'s)^2, the powers in b included.
@@ -250,14 +257,18 @@ def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
         shapes: Sigma_k, shape (E, n, n).
     """
     plant, rounding = prediction.plant, prediction.rounding[:, None]
-    rows, sizes = plant.box_rows @ prediction.free, np.abs(plant.box_rows) @ prediction.size_free
-    earlier = np.concatenate([plant.box_rows[None], rows[:-1]])
-    earlier_sizes = np.concatenate([np.abs(plant.box_rows)[None], sizes[:-1]])
+    rows, sizes = prediction.rows @ prediction.free, np.abs(prediction.rows) @ prediction.size_free
+    earlier = np.concatenate([prediction.rows[None], rows[:-1]])
+    earlier_sizes = np.concatenate([np.abs(prediction.rows)[None], sizes[:-1]])
     disturbed = np.cumsum(_supports(earlier, earlier_sizes, plant.disturbance.shape_matrix[None], rounding)[0], axis=0)
     symmetric = 0.5 * (shapes + shapes.swapaxes(1, 2))
     reach = (_supports(rows, sizes, symmetric, rounding) + disturbed) * (1.0 + rounding)
-    pushed = rounding * (prediction.size_forced @ np.abs(plant.box_rows).T)
+    pushed = rounding * (prediction.size_forced @ np.abs(prediction.rows).T)
     nothing = np.empty((0, *shapes.shape[1:]))
+    if not prediction.ends:
+        usable = judged_shapes(shapes, nothing)[1] & np.isfinite(reach).all(axis=(1, 2))
+        ones = np.where(usable, 1.0, np.nan)[:, None] * np.ones(prediction.steps)
+        return Tightening(ones[..., None] - reach - pushed, np.empty((len(shapes), prediction.steps, 0, plant.n)), ones)
     errors = [predicted_errors(end, shapes, nothing) for end in prediction.ends]
     radius = np.stack([each.radius for each in errors], axis=1)
     unusable = np.where(np.isnan(radius).any(axis=1), np.nan, 0.0)

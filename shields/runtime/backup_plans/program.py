@@ -14,13 +14,14 @@ from shields.verification import ACTION_ROUNDING
 
 # Its types are not declared.
 _clarabel: Any = clarabel
-# What the program keeps away from the limits of the plan test, in units of the box and of S: the solver's precision.
+# What the program keeps away from the limits of the plan test, in units of the box and of S or P: the solver's
+# precision.
 SOLVER_RESERVE = 1e-7
 MOST_ITERATIONS = 60
 
 
 class PlanProgram:
-    """min |u_0 - proposed|^2 over plans of N inputs that pass the plan test: linear rows and one cone.
+    """min |u_0 - proposed|^2 over plans of N inputs that pass the plan test: linear rows, and one cone for an end in S.
 
     Variables are the inputs in units of their limits. The solver is set up once, with the pattern of the problem; then
     vectors and the entries of the cone are updated, so that a solution depends on its own data alone.
@@ -31,20 +32,21 @@ class PlanProgram:
 
     def __init__(self, prediction: Prediction) -> None:
         plant, length = prediction.plant, prediction.steps
-        self._n, self._m, self._length = plant.n, plant.m, length
+        self._m, self._length = plant.m, length
         self._limits, self._weights = plant.u_max, (plant.u_max / plant.u_max.max()) ** 2
         scale = np.tile(plant.u_max, length)
         self._free = prediction.free
         self._end = read_only(prediction.forced[-1] * scale)
         forced = prediction.forced[:-1] * scale
-        rows = (plant.box_rows @ forced).reshape(-1, len(scale))
+        self._C, self._G = plant.box_rows, prediction.rows[:0] if prediction.ends else prediction.rows
+        rows = np.concatenate([(self._C @ forced).reshape(-1, len(scale)), self._G @ self._end])
         self._rows = read_only(np.concatenate([rows, -rows]))
         self._reserve = SOLVER_RESERVE + float(ACTION_ROUNDING) * np.abs(rows).sum(axis=1)
-        root = prediction.ends[-1].root
+        root = prediction.ends[-1].root if prediction.ends else np.empty((0, plant.n))
+        self._cone = len(root) + 1 if len(root) else 0
         self._end_reserve = SOLVER_RESERVE + float(ACTION_ROUNDING) * float(
             np.linalg.norm(root @ self._end, axis=0).sum()
         )
-        self._C = plant.box_rows
         self._arrange(root)
         self._solver: Any = None
 
@@ -58,11 +60,12 @@ class PlanProgram:
         linear = np.concatenate([self._rows, identity, -identity])
         row, column = np.nonzero(linear)
         first = len(linear) + 1  # the row before holds the radius
-        cone_rows, cone_columns = (each.ravel() for each in np.indices((self._n, size)))
+        cone_rows, cone_columns = (each.ravel() for each in np.indices((len(root), size)))
         rows, columns = np.concatenate([row, first + cone_rows]), np.concatenate([column, cone_columns])
         self._entries = np.concatenate([linear[row, column], -(root @ self._end).ravel()])
         self._in_cone = slice(len(row), None)
-        numbered = csc_matrix((np.arange(1.0, len(rows) + 1.0), (rows, columns)), shape=(first + self._n, size))
+        shape = len(linear) + self._cone, size
+        numbered = csc_matrix((np.arange(1.0, len(rows) + 1.0), (rows, columns)), shape=shape)
         self._order = numbered.data.astype(np.intp) - 1
         numbered.data = self._entries[self._order]
         self._typical = numbered
@@ -74,8 +77,8 @@ class PlanProgram:
 
         Args:
             estimate: x_hat, shape (n,).
-            room: Largest |c_i c_j| for j = 1..N-1, shape (N-1, k).
-            weighting: T G of the last step, shape (n, n).
+            room: Largest |row c_j| for j = 1..N, shape (N, r).
+            weighting: T G of the last step, shape (n, n), or (0, n) for an end in P.
             radius: Largest |T G c_j| of the last step.
             proposed: Shape (m,).
         """
@@ -99,9 +102,10 @@ class PlanProgram:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns entries of the matrix, right-hand side and linear cost."""
         centers = self._free @ estimate
-        drift, allowed = (centers[:-1] @ self._C.T).ravel(), room.ravel() - self._reserve
+        drift = np.concatenate([(centers[:-1] @ self._C.T).ravel(), self._G @ centers[-1]])
+        allowed = np.concatenate([room[:-1, : len(self._C)].ravel(), room[-1, : len(self._G)]]) - self._reserve
         ones = np.ones(2 * self._length * self._m)
-        cone = np.concatenate([[radius - self._end_reserve], weighting @ centers[-1]])
+        cone = np.concatenate([[radius - self._end_reserve], weighting @ centers[-1]])[: self._cone]
         b = np.concatenate([allowed - drift, allowed + drift, ones, cone])
         q = np.zeros(self._length * self._m)
         q[: self._m] = -2.0 * self._weights * proposed / self._limits
@@ -119,6 +123,7 @@ class PlanProgram:
         P = np.zeros(size)
         P[: self._m] = 2.0 * self._weights
         count = len(self._rows) + 2 * size
-        cones = [_clarabel.NonnegativeConeT(count), _clarabel.SecondOrderConeT(self._n + 1)]
-        b = np.ones(count + self._n + 1)
+        cones = [_clarabel.NonnegativeConeT(count)]
+        cones += [_clarabel.SecondOrderConeT(self._cone)] if self._cone else []
+        b = np.ones(count + self._cone)
         return _clarabel.DefaultSolver(csc_matrix(np.diag(P)), np.zeros(size), self._typical, b, cones, settings)

@@ -12,6 +12,7 @@ from flint import fmpq
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
 from shields.verification.conditions import Condition
+from shields.verification.flint.between_samples import between_conditions
 from shields.verification.flint.bounds import bound_conditions
 from shields.verification.flint.exact import at_least_zero, definite, form, identity, is_so, mapped, matrix, number
 from shields.verification.flint.polytope import polytope_conditions
@@ -36,6 +37,7 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> Iterat
     yield from _safe_set_conditions(certificate, D, plant)
     if certificate.polytope is not None:
         yield from polytope_conditions(certificate.polytope, certificate, plant)
+    yield from between_conditions(certificate, plant)
 
 
 def _fits(certificate: Certificate, plant: LinearPlant) -> bool:

@@ -16,29 +16,28 @@ from shields.verification.flint.exact import form, is_so, mapped, matrix, number
 
 _FLOAT32 = fmpq(1, 2**24)
 # Binary digits of roots, far beyond what rows and multipliers keep from their limits.
-_PRECISION = 192
+PRECISION = 192
 
 
 def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
     """Checks (P) and (PU) without the code of the first engine; what cannot be stated is left out."""
     r, (k, n) = len(polytope.rows), plant.box_rows.shape
-    fits = polytope.rows.shape == (r, n) and polytope.multipliers.shape == (r + plant.m, r)
+    images = r + plant.m + k * (plant.between_samples or 0)
+    fits = polytope.rows.shape == (r, n) and polytope.multipliers.shape == (images, r)
     yield is_so("polytope: shapes", fits)
     if not fits:
         return
     leads = r >= k and all(a == b for a, b in zip(polytope.rows[:k].ravel(), plant.box_rows.ravel(), strict=True))
     yield is_so("polytope: its first rows are those of the safe box", leads)
     box = matrix(plant.box_rows)
-    is_bounded = box.rank() == n
-    yield is_so("polytope: the box bounds every state", is_bounded)
-    if not leads or not is_bounded:
+    widths = box_extents(box)
+    yield is_so("polytope: the box bounds every state", widths is not None)
+    if not leads or widths is None:
         return
-    # x = (C'C)^-1 C' (C x), and |C x| <= 1 entry by entry.
-    inverse = (box.transpose() * box).inv() * box.transpose()
-    widths = [sum((abs(inverse[i, j]) for j in range(k)), fmpq(0)) for i in range(n)]
     G, B, K = matrix(polytope.rows), matrix(plant.B), matrix(certificate.K)
-    Lambda, D = matrix(polytope.multipliers), matrix(certificate.disturbances()[0])
+    D = matrix(certificate.disturbances()[0])
     closed = matrix(plant.A) + B * K
+    Lambda = matrix(polytope.multipliers[: r + plant.m])
     rest = fmpq_mat((G * closed).tolist() + K.tolist()) - Lambda * G
     bounds = [
         sum((abs(Lambda[i, j]) for j in np.flatnonzero(polytope.multipliers[i]).tolist()), fmpq(0))
@@ -49,23 +48,32 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
     errors = [matrix(proof.Sigma) for proof in certificate.proofs]
     images, gains = [mapped(B * K, Sigma) for Sigma in errors], [mapped(K, Sigma) for Sigma in errors]
     before = ctx.prec
-    ctx.prec = _PRECISION
+    ctx.prec = PRECISION
     try:
         for i in range(r):
             row = fmpq_mat([G.tolist()[i]])
             largest = max(form(row, image) for image in images)
             rounding = sum((abs((row * B)[0, j]) * u_max[j] for j in range(plant.m)), fmpq(0)) * _FLOAT32
             left = arb(1 - bounds[i] - rounding) - arb(largest).sqrt() - arb(form(row, D)).sqrt()
-            yield _at_least_zero(f"(P) sum |lambda| + |r| w + s + d <= 1 of row {i + 1}", left)
+            yield at_least_zero_ball(f"(P) sum |lambda| + |r| w + s + d <= 1 of row {i + 1}", left)
         for i in range(plant.m):
             largest = max(gain[i, i] for gain in gains)
             left = arb(u_max[i] * (1 - _FLOAT32) - bounds[r + i]) - arb(largest).sqrt()
-            yield _at_least_zero(f"(PU) input {i + 1} stays within u_max (1 - 2^-24) on the polytope", left)
+            yield at_least_zero_ball(f"(PU) input {i + 1} stays within u_max (1 - 2^-24) on the polytope", left)
     finally:
         ctx.prec = before
 
 
-def _at_least_zero(name: str, ball: Any) -> Condition:
+def box_extents(box: Any) -> list[Any] | None:
+    """Returns bounds of |x_i| in the box; None if it does not bound all."""
+    if box.rank() < box.ncols():
+        return None
+    # x = (C'C)^-1 C' (C x), and |C x| <= 1 entry by entry.
+    inverse = (box.transpose() * box).inv() * box.transpose()
+    return [sum((abs(inverse[i, j]) for j in range(box.nrows())), fmpq(0)) for i in range(box.ncols())]
+
+
+def at_least_zero_ball(name: str, ball: Any) -> Condition:
     """Returns the condition that every number in a ball is not negative; a ball around zero does not hold."""
     holds = bool(ball >= 0)
     margin = float(ball.mid())

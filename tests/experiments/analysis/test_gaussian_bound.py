@@ -12,7 +12,7 @@ from experiments.analysis.statistics import clopper_pearson
 from experiments.analysis.summary import arm_summaries, arm_summary
 from experiments.commands.compare import _findings, _gaussian_noise
 from experiments.runs.experiment import certificate_of, loop_config, run_of_arm
-from experiments.runs.training_run import RunResult, execute_run
+from experiments.runs.training_run import RunResult
 from experiments.settings import CompareSettings
 from ncs_gym import Channel, LinearPlant, escape_probability, register_plant
 
@@ -69,14 +69,14 @@ def test_comparison_under_gaussian_noise_plays_it_and_states_the_bound(setup):
     assert run.loop.single().unwrapped.noise == run.loop.vector(2).unwrapped.single.noise == "gaussian"
     bounded = replace(run, loop=run.loop.with_kwargs(noise=None))
     assert run.key != bounded.key
-    result = execute_run(run, lambda steps: None)
+    result = run.execute(lambda steps: None)
     arms = arm_summaries(episodes_table([result, replace(result, arm="monitor")]), "project")
     summary = _gaussian_noise(*setup, arms)
     assert summary["escape_probability"] == escape_probability(PLANT, CHANNEL, STEPS) == pytest.approx(STEPS * 2e-3)
     arm = summary["arms"]["shielded"]
     assert 0.5 < arm["episodes_outside_set"] / arm["episodes"] / summary["escape_probability"] <= 1.0
     assert list(summary["arms"]) == ["shielded"]
-    assert max(each.largest_level for each in execute_run(bounded, lambda steps: None).episodes) <= 1.0
+    assert max(each.largest_level for each in bounded.execute(lambda steps: None).episodes) <= 1.0
 
 
 def test_proof_is_not_said_to_have_held_under_gaussian_noise():

@@ -4,8 +4,7 @@ import re
 
 import pytest
 
-from experiments.analysis.tables import condition_text, summary_text, sweep_table
-from experiments.backends.execution import _described
+from experiments.analysis.tables import scenario_text, summary_text, sweep_table
 from experiments.commands.compare import _findings
 from experiments.report.html import _decimal, _interval
 from experiments.study.summary import page_summary, study_summary
@@ -21,7 +20,7 @@ def comparison(runs=2):
     names = ("unshielded", "trusting", "shielded")
     results = {name: [run(name, violations=(0, 0), returns=TINY) for _ in range(runs)] for name in names}
     for each in (one for group in results.values() for one in group):
-        each.conditions["worst-case disturbance"] = each.episodes
+        each.scenarios["worst-case disturbance"] = each.episodes
     return summary_of(results, seeds=runs)
 
 
@@ -38,9 +37,9 @@ def test_no_table_prints_a_negative_zero(runs):
     study["scores"] = {"shielded": {"iqm": -1e-9, "ci95": [-1e-9, -1e-9]}}
     printed = [
         summary_text(summary["arms"], {}),
-        condition_text("worst-case disturbance", summary["arms"], {}),
+        scenario_text("worst-case disturbance", summary["arms"], {}),
         *_findings(summary),
-        _described(run("shielded", violations=(0, 0), returns=TINY)),
+        run("shielded", violations=(0, 0), returns=TINY).outcome,
         sweep_table([cell()]),
         *(evaluation_table(env), pairs_table(env)),
         *(price_table(study), simpler_table(study), scores_table(study)),

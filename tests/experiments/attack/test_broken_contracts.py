@@ -8,9 +8,9 @@ import pytest
 from experiments.attack import monte_carlo_batch
 from experiments.attack.attack_cases import attack_cases
 from experiments.attack.campaign import Campaign
-from experiments.attack.monte_carlo_batch import MonteCarloBatch, _claimed_and_kept, run_batch
+from experiments.attack.monte_carlo_batch import MonteCarloBatch, _claimed_and_kept
 from experiments.commands.attack import attack
-from experiments.settings.certificates import CertifySettings
+from experiments.settings.certificates import AttackSettings
 from ncs_gym import Channel
 from tests.certificates import certificate_of
 
@@ -19,15 +19,15 @@ CAMPAIGN = Campaign(seed=0, random_plants=0, envs=16, shielded=True)
 
 
 @pytest.fixture
-def attacked(monkeypatch, tmp_path):
+def attacked(monkeypatch):
     """Counts of a batch behind a channel that replaces the one that keeps the contract of the batch reactor."""
 
     def counts_behind(channel, campaign=CAMPAIGN, **changes):
         case = replace(attack_cases(0, 0)[NAME], channel=channel, **changes)
         monkeypatch.setattr(Campaign, "cases", lambda self: {NAME: case})
         monte_carlo_batch._shields.cache_clear()
-        certificate_of(case.plant, case.certificate_contract).save(tmp_path / "certificate.json")
-        return run_batch(campaign, MonteCarloBatch(NAME, 0), tmp_path / "certificate.json")
+        certificate = certificate_of(case.plant, case.certificate_contract)
+        return MonteCarloBatch(campaign, NAME, 0, certificate).execute(lambda steps: None)
 
     yield counts_behind
     monte_carlo_batch._shields.cache_clear()
@@ -108,5 +108,5 @@ def test_a_downlink_without_a_contract_is_refused(monkeypatch, tmp_path):
     case = replace(attack_cases(0, 0)[NAME], downlink=Channel(loss=0.3))
     monkeypatch.setattr(Campaign, "cases", lambda self: {NAME: case})
     with pytest.raises(ValueError, match="BatchReactor-v0, late: nothing is claimed behind a downlink without a contr"):
-        attack(CertifySettings(out=tmp_path / "out"))
+        attack(AttackSettings(out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()

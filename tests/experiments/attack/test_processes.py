@@ -4,7 +4,7 @@ import pytest
 
 from experiments.attack.attack_cases import attack_cases
 from experiments.attack.campaign import Campaign
-from experiments.attack.monte_carlo_batch import MonteCarloBatch, run_batch
+from experiments.attack.monte_carlo_batch import MonteCarloBatch
 from experiments.attack.safety_counts import SafetyCounts
 from ncs_gym.registration import EPISODE_STEPS, needing_extras
 from tests.certificates import certificate_of
@@ -16,7 +16,7 @@ KINDS = ("rare", "late", "its channel")
 MANY = 168
 
 
-def attacked(name, folder, envs, kinds=KINDS, *, shielded=True):
+def attacked(name, envs, kinds=KINDS, *, shielded=True):
     """Counts of one batch per kind of packets, each with another mode of the shield."""
     env_id = f"ncs_gym/{name}"
     if env_id in needing_extras():
@@ -25,9 +25,8 @@ def attacked(name, folder, envs, kinds=KINDS, *, shielded=True):
     cases, total = attack_cases(0, 0, env_id), SafetyCounts()
     for index, kind in enumerate(kinds):
         case = cases[f"{env_id}, {kind}"]
-        file = folder / f"{name}.json"
-        certificate_of(case.plant, case.contract).save(file)
-        total += run_batch(campaign, MonteCarloBatch(f"{env_id}, {kind}", index), file)
+        certificate = certificate_of(case.plant, case.contract)
+        total += MonteCarloBatch(campaign, f"{env_id}, {kind}", index, certificate).execute(lambda steps: None)
     return total
 
 
@@ -37,17 +36,17 @@ def assert_safe(counts):
     assert counts.level > 0.8  # the attack comes close
 
 
-def test_shielded_pendulum_never_leaves_the_safe_set_and_the_other_one_does(tmp_path):
-    assert_safe(attacked("Pendulum-v0", tmp_path, 8, KINDS[:1]))
-    counts = attacked("Pendulum-v0", tmp_path, 4, KINDS[:1], shielded=False)
+def test_shielded_pendulum_never_leaves_the_safe_set_and_the_other_one_does():
+    assert_safe(attacked("Pendulum-v0", 8, KINDS[:1]))
+    counts = attacked("Pendulum-v0", 4, KINDS[:1], shielded=False)
     assert counts.violations > 0
     assert counts.broken_episodes == counts.episodes
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_shielded_process_never_leaves_the_safe_set_in_a_long_attack(name, tmp_path):
-    counts = attacked(name, tmp_path, MANY)
+def test_shielded_process_never_leaves_the_safe_set_in_a_long_attack(name):
+    counts = attacked(name, MANY)
     assert counts.steps == 3 * MANY * EPISODE_STEPS > 1e5
     assert_safe(counts)
-    assert attacked(name, tmp_path, MANY, shielded=False).broken_episodes > 0
+    assert attacked(name, MANY, shielded=False).broken_episodes > 0

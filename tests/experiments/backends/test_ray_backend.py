@@ -1,6 +1,7 @@
 """A real Ray on this machine: what it does when processes die, and what a user sees."""
 
 import os
+import re
 import shutil
 import signal
 import socket
@@ -10,6 +11,7 @@ import time
 import zipfile
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -98,7 +100,7 @@ def until(condition, what):
 
 
 def stored(out):
-    return len(list((out / "units").glob("*.json")))
+    return len(list((out / "runs").glob("*.json")))
 
 
 def until_stored(out, count, run):
@@ -165,7 +167,7 @@ def test_killed_worker_costs_nothing(local, tmp_path):
         assert stored(out) < RUNS
     _, errors = run.communicate(timeout=TIMEOUT)
     assert run.returncode == 0, errors
-    assert sorted(lines_of_runs(errors)) == sorted(path.stem for path in (local / "units").glob("*.json"))
+    assert sorted(lines_of_runs(errors)) == sorted(path.stem for path in (local / "runs").glob("*.json"))
     assert_same(out, local)
 
 
@@ -211,7 +213,7 @@ def test_sweep_begun_locally_is_finished_on_ray(local, tmp_path):
     shutil.copytree(local, tmp_path / "out")
     for name in ("summary.json", "episodes.parquet"):
         (tmp_path / "out" / name).unlink()
-    for path in sorted((tmp_path / "out" / "units").glob("*.json"))[:3]:
+    for path in sorted((tmp_path / "out" / "runs").glob("*.json"))[:3]:
         path.unlink()
     run = ncs("sweep", *GRID, "--engine", "ray", "--out", tmp_path / "out")
     assert run.returncode == 0, run.stderr
@@ -246,6 +248,12 @@ def test_more_than_any_node_has_is_one_sentence_and_does_not_wait_forever(argume
     assert stored(tmp_path / "out") == 0
 
 
+def failure_of(function, *arguments):
+    """What is raised where the run "its-name" ends as a remote function does."""
+    error = function.remote(*arguments).future().exception(timeout=TIMEOUT)
+    return ray_backend.RayCluster(None).failure(SimpleNamespace(name="its-name"), error)
+
+
 def test_error_of_a_run_is_not_retried(own_ray, tmp_path):
     calls = str(tmp_path / "calls")
 
@@ -254,10 +262,9 @@ def test_error_of_a_run_is_not_retried(own_ray, tmp_path):
             file.write("call\n")
         raise KeyError("mine")
 
-    reference = ray_backend._remote(fail, ONE_CORE).remote()
-    with pytest.raises(RunError, match=r"run its-name: KeyError: 'mine' \(NCS_DEBUG=1") as error:
-        ray_backend._result(NAMED, reference)
-    assert "mine" in str(error.value.__cause__)
+    error = failure_of(ray_backend._remote(fail, ONE_CORE))
+    assert isinstance(error, RunError)
+    assert str(error).startswith("run its-name: KeyError: 'mine' (NCS_DEBUG=1")
     assert Path(calls).read_text() == "call\n"
 
 
@@ -269,16 +276,16 @@ def test_worker_that_always_dies_is_given_up_and_named(own_ray, tmp_path):
             file.write("call\n")
         os._exit(1)
 
-    reference = ray_backend._remote(die, ONE_CORE).remote()
-    with pytest.raises(RunError, match="run its-name: its worker died, 3 retries included"):
-        ray_backend._result(NAMED, reference)
+    error = failure_of(ray_backend._remote(die, ONE_CORE))
+    assert isinstance(error, RunError)
+    assert str(error).startswith("run its-name: its worker died, 3 retries included")
     assert Path(calls).read_text() == "call\n" * (1 + ray_backend.RETRIES)
 
 
 def test_node_with_another_source_is_refused_in_one_sentence(own_ray):
-    task = ray_backend._remote(portable_task(), ONE_CORE)
-    with pytest.raises(ClusterError, match="another source of ncs-gym than the driver"):
-        ray_backend._result(NAMED, task.remote(versions() | {"source": "other"}, b""))
+    error = failure_of(ray_backend._remote(portable_task(), ONE_CORE), versions() | {"source": "other"}, b"")
+    assert isinstance(error, ClusterError)
+    assert "another source of ncs-gym than the driver" in str(error)
 
 
 def test_node_without_this_package_is_named_in_one_sentence(own_ray, tmp_path):
@@ -297,9 +304,9 @@ def test_node_without_this_package_is_named_in_one_sentence(own_ray, tmp_path):
         finally:
             sys.path.remove(path)
 
-    reference = ray_backend._remote(bare, ONE_CORE).remote(str(tmp_path))
-    with pytest.raises(RunError, match=r"run its-name: node .* cannot import ncs-gym .*: install the same on every"):
-        ray_backend._result(NAMED, reference)
+    error = failure_of(ray_backend._remote(bare, ONE_CORE), str(tmp_path))
+    assert isinstance(error, RunError)
+    assert re.match(r"run its-name: node .* cannot import ncs-gym .*: install the same on every", str(error))
 
 
 def test_workers_compute_with_as_many_threads_as_local_ones(own_ray):
@@ -316,17 +323,6 @@ def test_workers_compute_with_as_many_threads_as_local_ones(own_ray):
     assert found == (os.environ.get("OMP_NUM_THREADS", str(os.cpu_count())), torch.get_num_threads())
 
 
-def test_everything_finished_is_noticed_at_once(own_ray):
-    references = [ray.put(number) for number in range(5)]
-    assert set(ray_backend._finished(references)) == set(references)
-    endless = ray_backend._remote(lambda: time.sleep(1000), HALF_A_CORE).remote()
-    assert ray_backend._finished([endless]) == []
-    assert ray_backend._finished([endless, references[0]]) == [references[0]]
-    ray_backend._cancel([endless])
-    with pytest.raises(ray.exceptions.RayError):
-        ray.get(endless, timeout=60)
-
-
 def test_listener_that_is_no_ray_is_one_sentence_in_bounded_time(monkeypatch):
     monkeypatch.setattr(ray_cluster, "JOIN_TIMEOUT", 4.0)
     start = time.monotonic()
@@ -335,13 +331,6 @@ def test_listener_that_is_no_ray_is_one_sentence_in_bounded_time(monkeypatch):
         with pytest.raises(ClusterError, match=f"no Ray answers at --ray-address {address} within 4 s"):
             require_answer(address)
     assert time.monotonic() - start < 20.0
-
-
-class _Named:
-    name = "its-name"
-
-
-NAMED = _Named()
 
 
 @contextmanager

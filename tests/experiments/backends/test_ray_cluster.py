@@ -4,18 +4,17 @@ import pickle
 import socket
 import sys
 import time
+from concurrent.futures import Future
 from dataclasses import replace
-from functools import partial
-from types import SimpleNamespace
 
 import pytest
 
 from agents.loop import LoopConfig
-from experiments.backends import ray_cluster
-from experiments.backends.execution import results_of
-from experiments.backends.ray_cluster import _execute_on_node, execute_submitted, portable_task, require_answer
+from experiments.backends import execution
+from experiments.backends.execution import execute, results_of
+from experiments.backends.ray_cluster import _execute_on_node, portable_task, require_answer
 from experiments.errors import ClusterError, RunError
-from experiments.runs import TrainingRun, execute_run, versions
+from experiments.runs import TrainingRun, versions
 from experiments.settings import BackendSettings
 
 
@@ -37,100 +36,81 @@ def run(certificate):
     )
 
 
-class FakeCluster:
-    """A cluster that executes two runs at a time, later ones first."""
+class FakeExecutor:
+    """Executes two runs at a time, later ones first, where the driver looks for reports."""
 
     def __init__(self, failures=None):
-        self.pending, self.cancelled, self.kept, self.read = [], [], [], 0
-        self.most, self.read_at_waits, self.failures = 0, [], failures or {}
+        self.pending, self.left, self.kept, self.most, self.failures = {}, None, [], 0, failures or {}
 
-    def runs(self, count):
-        for number in range(count):
-            self.read += 1
-            yield SimpleNamespace(name=str(number))
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.left = sorted(self.pending)
 
     def submit(self, run):
-        self.pending.append(run.name)
+        future = self.pending[run.index] = Future()
         self.most = max(self.most, len(self.pending))
-        return run.name
+        return future
 
-    def wait(self, references):
-        assert references == self.pending
-        self.read_at_waits.append(self.read)
-        done = self.pending[-2:]
-        del self.pending[-2:]
-        return done
+    def reports(self):
+        for index in sorted(self.pending)[-2:]:
+            future = self.pending.pop(index)
+            if index in self.failures:
+                future.set_exception(ValueError(self.failures[index]))
+            else:
+                future.set_result(index)
+            yield 1
 
-    def result(self, run, reference):
-        assert run.name == reference
-        if reference in self.failures:
-            raise self.failures[reference]
-        return int(reference)
+    def failure(self, run, error):
+        return RunError(f"run {run.index}: {error}")
 
-    def keep(self, run, result):
-        self.kept.append(result)
+    def execute(self, run, count):
+        execute([replace(run, index=index) for index in range(count)], self, lambda run, kept: self.kept.append(kept))
 
-    def execute(self, count):
-        execute_submitted(self.runs(count), self.submit, self.wait, self.result, self.cancelled.extend, self.keep)
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr(execution, "_READING_PERIOD", 0.01)
 
 
 @pytest.mark.parametrize(("count", "limit"), [(0, 4), (1, 4), (7, 1), (25, 4), (25, 100)])
-def test_every_run_is_collected_once_and_no_more_are_submitted_than_the_limit(count, limit, monkeypatch):
-    monkeypatch.setattr(ray_cluster, "MAX_SUBMITTED", limit)
-    fake = FakeCluster()
-    fake.execute(count)
+def test_every_run_is_collected_once_and_no_more_are_submitted_than_the_limit(count, limit, run, monkeypatch):
+    monkeypatch.setattr(execution, "MAX_SUBMITTED", limit)
+    fake = FakeExecutor()
+    fake.execute(run, count)
     assert sorted(fake.kept) == list(range(count))
     assert fake.most == min(count, limit)
-    assert fake.cancelled == []
+    assert fake.left == []
 
 
-def test_runs_are_read_only_as_far_as_they_may_be_submitted(monkeypatch):
-    monkeypatch.setattr(ray_cluster, "MAX_SUBMITTED", 5)
-    fake = FakeCluster()
-    fake.execute(9)
-    assert fake.read_at_waits[:3] == [5, 7, 9]
-
-
-@pytest.mark.parametrize("failure", [RunError("run 4"), ClusterError("run 4")])
-def test_failure_keeps_what_was_finished_beside_it_and_cancels_the_rest(failure, monkeypatch):
-    monkeypatch.setattr(ray_cluster, "MAX_SUBMITTED", 6)
-    fake = FakeCluster({"4": failure})
-    with pytest.raises(type(failure), match="run 4"):
-        fake.execute(9)
+def test_failure_keeps_what_was_finished_beside_it_and_stops_the_rest(run, monkeypatch):
+    monkeypatch.setattr(execution, "MAX_SUBMITTED", 6)
+    fake = FakeExecutor({4: "broken"})
+    with pytest.raises(RunError, match="run 4: broken") as error:
+        fake.execute(run, 9)
+    assert isinstance(error.value.__cause__, ValueError)
     assert fake.kept == [5]  # the fake finishes 4 and 5 at once
-    assert fake.cancelled == ["0", "1", "2", "3"]
+    assert fake.left == [0, 1]  # 2 and 3 were finished meanwhile
 
 
-def test_interruption_cancels_what_is_submitted(monkeypatch):
-    def interrupted(run, result):
-        raise KeyboardInterrupt
+def test_interruption_leaves_what_is_submitted_to_the_executor(run):
+    fake = FakeExecutor()
 
-    monkeypatch.setattr(ray_cluster, "MAX_SUBMITTED", 4)
-    fake = FakeCluster()
-    fake.keep = interrupted
+    class Interrupted(list):
+        def append(self, result):
+            raise KeyboardInterrupt
+
+    fake.kept = Interrupted()
     with pytest.raises(KeyboardInterrupt):
-        fake.execute(9)
-    assert fake.cancelled == ["0", "1"]
-
-
-def test_waiting_for_nothing_goes_on_waiting():
-    fake, silent = FakeCluster(), [3]
-    wait = fake.wait
-
-    def wait_in_vain(references):
-        silent[0] -= 1
-        return [] if silent[0] >= 0 else wait(references)
-
-    fake.wait = wait_in_vain
-    fake.execute(2)
-    assert silent == [-1]
-    assert sorted(fake.kept) == [0, 1]
+        fake.execute(run, 9)
+    assert fake.left == [0, 1, 2, 3, 4]
 
 
 def test_worker_returns_what_the_run_returns_here(run):
     result, expected = (
-        _execute_on_node(versions(), pickle.dumps(partial(execute_run, run))),
-        execute_run(run, lambda steps: None),
+        _execute_on_node(versions(), pickle.dumps(run)),
+        run.execute(lambda steps: None),
     )
     assert result.episodes == expected.episodes
     assert (result.trajectory.states == expected.trajectory.states).all()
@@ -185,4 +165,4 @@ def test_run_that_fails_locally_is_named_and_the_finished_are_kept(run, tmp_path
     with pytest.raises(RunError, match=r"run unshielded-1: n_steps must be a whole number >= 1, got 0") as error:
         results_of([run, bad], tmp_path, BackendSettings(jobs=1))
     assert isinstance(error.value.__cause__, ValueError)
-    assert [path.stem for path in (tmp_path / "units").glob("*.json")] == ["unshielded-0"]
+    assert [path.stem for path in (tmp_path / "runs").glob("*.json")] == ["unshielded-0"]

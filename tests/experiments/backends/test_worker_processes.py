@@ -3,17 +3,15 @@
 import threading
 import time
 from dataclasses import replace
-from functools import partial
 from queue import Queue
 
 import pytest
 
 from agents.loop import LoopConfig
-from experiments.backends.execution import results_of
-from experiments.backends.job import Job
-from experiments.backends.worker_processes import _execute, execute_all
+from experiments.backends.execution import execute, results_of
+from experiments.backends.worker_processes import _execute, local_workers
 from experiments.errors import RunStopped
-from experiments.runs.training_run import TrainingRun, execute_run
+from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings
 
 
@@ -36,23 +34,19 @@ def endless(certificate):
     )
 
 
-def job_of(run):
-    return Job(run.name, 0, partial(execute_run, run))
-
-
 def test_a_run_told_to_stop_gives_up_at_its_next_report(endless):
     reports, stop = Queue(), threading.Event()
     stop.set()
     with pytest.raises(RunStopped, match="zero-input-0"):
-        _execute(job_of(endless), reports, stop)
+        _execute(endless, reports, stop, None)
     assert reports.empty()
 
 
 def test_the_first_failure_stops_the_others_and_is_the_one_reported(endless):
     broken = replace(endless, arm="broken", loop=LoopConfig(env="ncs_gym/Nowhere-v0"))
-    begin, kept, jobs = time.monotonic(), [], [job_of(run) for run in (endless, broken)]
+    begin, kept = time.monotonic(), []
     with pytest.raises(Exception, match="Nowhere") as caught:
-        execute_all(jobs, 2, lambda job, result: kept.append(job), lambda steps: None)
+        execute([endless, broken], local_workers(2), lambda run, result: kept.append(run))
     assert not isinstance(caught.value, RunStopped)
     assert kept == []
     assert time.monotonic() - begin < 300.0

@@ -9,8 +9,8 @@ import pytest
 from agents.evaluation import evaluate
 from agents.loop import LoopConfig, ShieldSettings
 from experiments.baselines import FILTERS, EstimateFilterSettings, controller
+from experiments.baselines.certainty_equivalent import CertaintyEquivalentFilter
 from experiments.baselines.predictive import PredictiveFilter
-from experiments.baselines.trusting import TrustingFilter
 from ncs_gym.envs.env import ncs_env
 from shields import SafetyFilter
 from tests.certificates import certificate_of
@@ -21,7 +21,7 @@ NEVER = np.zeros(1, np.bool_)
 
 @pytest.fixture(scope="module")
 def trusting(certificate, loaded):
-    return TrustingFilter(certificate, loaded)
+    return CertaintyEquivalentFilter(certificate, loaded)
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +86,10 @@ def test_trusting_filter_decides_as_the_shield_without_an_error(certificate, loa
 
 
 def test_trusting_lookahead_keeps_its_plans_and_leaves_the_safe_set_on_purpose(certificate, loaded):
-    shield, trusting = SafetyFilter(certificate, loaded, "lookahead"), TrustingFilter(certificate, loaded, "lookahead")
+    shield, trusting = (
+        SafetyFilter(certificate, loaded, "lookahead"),
+        CertaintyEquivalentFilter(certificate, loaded, "lookahead"),
+    )
     state, stored, reasons = np.zeros(2), (), set()
     proposals = loaded.u_max * np.sign(np.repeat(np.random.default_rng(2).standard_normal(8), 6))[:, None]
     farthest = 0.0

@@ -9,14 +9,14 @@ import pytest
 from experiments.attack import monte_carlo_batch
 from experiments.attack.attack_cases import AttackCase, attack_cases
 from experiments.attack.campaign import Campaign
-from experiments.attack.counts_store import CountsStore
 from experiments.attack.counts_table import gaussian_table, require_within
-from experiments.attack.monte_carlo_batch import MonteCarloBatch, run_batch
+from experiments.attack.monte_carlo_batch import MonteCarloBatch
 from experiments.attack.safety_counts import SafetyCounts
 from experiments.commands import attack as command
 from experiments.commands.attack import attack
 from experiments.errors import OtherResultsError, ResultsError, RunError, SafetyBroken
-from experiments.settings.certificates import CertifySettings
+from experiments.runs import RunStore
+from experiments.settings.certificates import AttackSettings
 from ncs_gym import truck_trailer
 from ncs_gym.network.contract import contract_of
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
@@ -26,18 +26,22 @@ from tests.command import ncs
 from tests.workers import no_worker_processes
 
 CAMPAIGN = Campaign(seed=0, random_plants=1, envs=32, shielded=True)
-CRUISE = "TruckTrailerCruise-v0, overtaking"
+CRUISE, OTHER = "TruckTrailerCruise-v0, overtaking", "CartPole-v0, rare"
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory):
+def certificates(tmp_path_factory):
     folder = tmp_path_factory.mktemp("certificates")
     chosen = {
         name: case
         for name, case in attack_cases(0, 1).items()
         if name.startswith(("TruckTrailerCruise", "CartPole-v0"))
     }
-    return command._certificate_files(chosen, folder)
+    return command._certificates(chosen, folder)
+
+
+def counts_of(campaign, certificate, case, index=0):
+    return MonteCarloBatch(campaign, case, index, certificate).execute(lambda steps: None)
 
 
 def test_every_kind_of_plant_and_channel_is_attacked():
@@ -60,10 +64,10 @@ def test_contracts_are_used_up():
             assert contract_of(case.channel) == case.contract
 
 
-def test_batch_has_the_same_counts_after_any_other(files):
-    batches = [MonteCarloBatch(CRUISE, 0), MonteCarloBatch(CRUISE, 1), MonteCarloBatch("CartPole-v0, rare", 2)]
-    first = [run_batch(CAMPAIGN, batch, files[batch.case]) for batch in batches]
-    again = [run_batch(CAMPAIGN, batch, files[batch.case]) for batch in reversed(batches)]
+def test_batch_has_the_same_counts_after_any_other(certificates):
+    batches = [(CRUISE, 0), (CRUISE, 1), ("CartPole-v0, rare", 2)]
+    first = [counts_of(CAMPAIGN, certificates[case], case, index) for case, index in batches]
+    again = [counts_of(CAMPAIGN, certificates[case], case, index) for case, index in reversed(batches)]
     assert first == again[::-1]
     assert first[0] != first[1]
     total = sum(first, SafetyCounts())
@@ -73,9 +77,9 @@ def test_batch_has_the_same_counts_after_any_other(files):
     assert 0.99 < total.level <= 1.0
 
 
-def test_without_the_shield_the_attack_breaks_out_and_is_counted(files):
+def test_without_the_shield_the_attack_breaks_out_and_is_counted(certificates):
     watching = replace(CAMPAIGN, shielded=False)
-    counts = run_batch(watching, MonteCarloBatch(CRUISE, 0), files[CRUISE])
+    counts = counts_of(watching, certificates[CRUISE], CRUISE)
     assert counts.exits > 1000
     assert counts.violations > 1000
     assert counts.broken_episodes > 16
@@ -87,10 +91,10 @@ def test_without_the_shield_the_attack_breaks_out_and_is_counted(files):
 LOOKAHEAD = replace(CAMPAIGN, mode="lookahead", horizon=6)
 
 
-def test_lookahead_is_attacked_in_and_outside_the_safe_set_and_keeps_the_box(files):
-    batches = [MonteCarloBatch("CartPole-v0, rare", 0), MonteCarloBatch("CartPole-v0, rare", 1)]
-    first = [run_batch(LOOKAHEAD, batch, files[batch.case]) for batch in batches]
-    assert [run_batch(LOOKAHEAD, batch, files[batch.case]) for batch in reversed(batches)] == first[::-1]
+def test_lookahead_is_attacked_in_and_outside_the_safe_set_and_keeps_the_box(certificates):
+    case = "CartPole-v0, rare"
+    first = [counts_of(LOOKAHEAD, certificates[case], case, index) for index in (0, 1)]
+    assert [counts_of(LOOKAHEAD, certificates[case], case, index) for index in (1, 0)] == first[::-1]
     total = sum(first, SafetyCounts())
     assert (total.steps, total.episodes) == (2 * 32 * 200, 64)
     assert (total.violations, total.broken_episodes, total.unproved) == (0, 0, 0)
@@ -101,7 +105,7 @@ def test_lookahead_is_attacked_in_and_outside_the_safe_set_and_keeps_the_box(fil
     assert total.interventions > 0
 
 
-def test_lookahead_that_leaves_the_box_is_counted(files, monkeypatch):
+def test_lookahead_that_leaves_the_box_is_counted(certificates, monkeypatch):
     from shields.runtime.backup_plans.plan_check import PlanTest
 
     known = PlanTest.tightenings_of
@@ -109,19 +113,19 @@ def test_lookahead_that_leaves_the_box_is_counted(files, monkeypatch):
         PlanTest, "tightenings_of", lambda *given: (found := known(*given))._replace(room=np.ones_like(found.room))
     )
     monte_carlo_batch._shields.cache_clear()
-    counts = run_batch(LOOKAHEAD, MonteCarloBatch("CartPole-v0, late", 0), files["CartPole-v0, late"])
+    counts = counts_of(LOOKAHEAD, certificates["CartPole-v0, late"], "CartPole-v0, late")
     monte_carlo_batch._shields.cache_clear()
     assert counts.violations > 0
     assert 0 < counts.broken_episodes <= 32
     assert counts.level > 1.0
 
 
-def test_nature_pushes_lookahead_to_the_box_and_out_of_the_safe_set_in_turn(files):
-    shields = monte_carlo_batch._shields(LOOKAHEAD, CRUISE, files[CRUISE])
+def test_nature_pushes_lookahead_to_the_box_and_out_of_the_safe_set_in_turn(certificates):
+    shields = monte_carlo_batch._shields(LOOKAHEAD, CRUISE, certificates[CRUISE])
     sources = {name: shield.unwrapped._process.disturbance for name, shield in shields.items()}
     assert len(shields) == LOOKAHEAD.kinds_of_batches == 2
     assert sources["to the box"].M is None
-    np.testing.assert_array_equal(sources["out of S"].M, Certificate.load(files[CRUISE]).M)
+    np.testing.assert_array_equal(sources["out of S"].M, certificates[CRUISE].M)
     for shield in shields.values():
         assert (shield.filter.mode, shield.filter.horizon) == ("lookahead", 6)
 
@@ -133,11 +137,11 @@ def test_stored_counts_belong_to_their_mode_and_horizon():
     assert keys[0] == CAMPAIGN.key
 
 
-def test_nature_attains_every_bound(files):
+def test_nature_attains_every_bound(certificates):
     from experiments.attack.monte_carlo_batch import _shields
 
-    case, certificate = attack_cases(0, 1)[CRUISE], Certificate.load(files[CRUISE])
-    shield = _shields(CAMPAIGN, CRUISE, files[CRUISE])["project"]
+    case, certificate = attack_cases(0, 1)[CRUISE], certificates[CRUISE]
+    shield = _shields(CAMPAIGN, CRUISE, certificates[CRUISE])["project"]
     _, info = shield.reset(seed=1)
     np.testing.assert_allclose([certificate.safe_set.gauge(x) for x in info["state"]], 1.0, atol=1e-8)
     errors, initial = info["estimation_error"], Ellipsoid(case.plant.initial_noise.bound.shape_matrix)
@@ -159,8 +163,8 @@ def test_gaussian_nature_attains_what_is_bounded_and_draws_the_rest(tmp_path):
     from experiments.attack.monte_carlo_batch import _shields
 
     case = attack_cases(0, 1)[CRUISE].with_delta(GAUSSIAN.delta)
-    certificate = Certificate.load(command._certificate_files({CRUISE: case}, tmp_path)[CRUISE])
-    shield = _shields(GAUSSIAN, CRUISE, next(tmp_path.iterdir()))["project"]
+    certificate = command._certificates({CRUISE: case}, tmp_path)[CRUISE]
+    shield = _shields(GAUSSIAN, CRUISE, certificate)["project"]
     assert shield.filter.plant.delta == case.plant.delta == GAUSSIAN.delta
     _, info = shield.reset(seed=1)
     np.testing.assert_allclose([certificate.safe_set.gauge(x) for x in info["state"]], 1.0, atol=1e-8)
@@ -188,8 +192,7 @@ def test_counts_of_gaussian_noise_lie_within_the_bound_and_do_not_end_with_an_er
 
 def test_gaussian_noise_makes_a_shielded_state_leave_the_safe_set_and_is_counted(tmp_path):
     case = attack_cases(0, 1)[CRUISE].with_delta(GAUSSIAN.delta)
-    file = command._certificate_files({CRUISE: case}, tmp_path)[CRUISE]
-    counts = run_batch(GAUSSIAN, MonteCarloBatch(CRUISE, 0), file)
+    counts = counts_of(GAUSSIAN, command._certificates({CRUISE: case}, tmp_path)[CRUISE], CRUISE)
     assert counts.broken_episodes > 0
     assert counts.level > 1.0
     assert case.escape_probability() == 1.0
@@ -213,7 +216,7 @@ def small(monkeypatch):
 
 
 def settings(out, **changes):
-    return CertifySettings(**{"steps": 1, "out": out, "random_plants": 1, "envs": 16, **changes})
+    return AttackSettings(**{"steps": 1, "out": out, "random_plants": 1, "envs": 16, **changes})
 
 
 def document(folder):
@@ -230,21 +233,27 @@ def test_results_do_not_depend_on_worker_processes(tmp_path, small, capsys):
     assert document(tmp_path / "none")["total"]["steps"] == 6 * 16 * 200
 
 
+def stored(folder):
+    return {path.name for path in (folder / "runs").iterdir()}
+
+
 def test_interrupted_campaign_goes_on(tmp_path, small, capsys, without_workers):
     attack(settings(tmp_path))
-    whole = document(tmp_path)
-    log = tmp_path / "tallies.jsonl"
-    lines = log.read_bytes().splitlines(keepends=True)
-    log.write_bytes(b"".join(lines[:2]) + lines[2][:40])  # killed while it wrote the third
+    whole, batches = document(tmp_path), stored(tmp_path)
+    assert len(batches) == 6
+    (tmp_path / "certify.json").unlink()
+    for name in sorted(batches)[:2]:
+        (tmp_path / "runs" / name).unlink()
+    capsys.readouterr()
     attack(settings(tmp_path))
     assert document(tmp_path) == whole
-    assert len(log.read_bytes().splitlines()) == 6
-    capsys.readouterr()
+    assert stored(tmp_path) == batches
+    assert "4 of 6 runs were finished before" in capsys.readouterr().err
     attack(settings(tmp_path))  # all there
-    assert "per second" not in capsys.readouterr().out
+    assert "step/s" not in capsys.readouterr().err
     attack(settings(tmp_path, steps=6 * 16 * 200 + 1))
     assert document(tmp_path)["total"]["steps"] == 7 * 16 * 200
-    assert len(log.read_bytes().splitlines()) == 7
+    assert len(stored(tmp_path)) == 7
     finished = (tmp_path / "certify.json").read_bytes()
     for changes in ({"steps": 1}, {"mode": "switch"}):
         with pytest.raises(OtherResultsError, match=next(iter(changes))):
@@ -252,23 +261,23 @@ def test_interrupted_campaign_goes_on(tmp_path, small, capsys, without_workers):
         assert (tmp_path / "certify.json").read_bytes() == finished
     attack(settings(tmp_path, force=True))
     assert document(tmp_path) == whole
-    assert len(log.read_bytes().splitlines()) == 7
+    assert len(stored(tmp_path)) == 7
 
 
 def test_batch_that_fails_is_named_and_what_is_finished_is_kept(tmp_path, small, monkeypatch, without_workers):
-    monkeypatch.setattr(command, "run_batch", fails_for_the_cruise)
-    with pytest.raises(RunError, match=f"^run {CRUISE}, batch 1: no memory") as error:
+    execute = MonteCarloBatch.execute
+
+    def fails_once(batch, *reporting):
+        if (batch.case, batch.index) == (CRUISE, 1):
+            raise ValueError("no memory")
+        return execute(batch, *reporting)
+
+    monkeypatch.setattr(MonteCarloBatch, "execute", fails_once)
+    with pytest.raises(RunError, match=r"^run TruckTrailerCruise-v0-overtaking-1: no memory") as error:
         attack(settings(tmp_path))
     assert isinstance(error.value.__cause__, ValueError)
-    stored = [json.loads(line) for line in (tmp_path / "tallies.jsonl").read_bytes().splitlines()]
-    assert {(line["case"], line["index"]) for line in stored} >= {(CRUISE, 0), (CRUISE, 2)}
+    assert stored(tmp_path) >= {f"TruckTrailerCruise-v0-overtaking-{index}.json" for index in (0, 2)}
     assert not (tmp_path / "certify.json").exists()
-
-
-def fails_for_the_cruise(campaign, batch, certificate, on_progress):
-    if batch == MonteCarloBatch(CRUISE, 1):
-        raise ValueError("no memory")
-    return run_batch(campaign, batch, certificate, on_progress)
 
 
 def test_another_certificate_makes_stored_counts_void(tmp_path, small, without_workers):
@@ -279,37 +288,36 @@ def test_another_certificate_makes_stored_counts_void(tmp_path, small, without_w
         if certificate.fingerprint == truck_trailer().fingerprint:
             smaller_set(truck_trailer(), 0.95 * certificate.L, certificate.K).save(file)
     attack(settings(tmp_path))
-    assert len((tmp_path / "tallies.jsonl").read_bytes().splitlines()) == 9
     second = document(tmp_path)["cases"]
     assert second[CRUISE] == first[CRUISE]
     assert second["TruckTrailer-v0, perfect"] != first["TruckTrailer-v0, perfect"]
 
 
-def test_a_shield_that_fails_ends_with_an_error(tmp_path, small, monkeypatch, capsys):
-    monkeypatch.setattr(
-        command,
-        "execute_batches",
-        lambda campaign, missing, certificates, store, jobs: store.add(
-            MonteCarloBatch(CRUISE, 0), SafetyCounts(steps=3200, episodes=16, exits=2, broken_episodes=1, level=1.1)
-        ),
-    )
-    monkeypatch.setattr(command, "_batches", lambda names, count, least: {CRUISE: [MonteCarloBatch(CRUISE, 0)]})
+@pytest.fixture
+def counted(monkeypatch):
+    """Makes a campaign of one batch that is said to have counted something."""
+    case = attack_cases(0, 1)[CRUISE]
+    monkeypatch.setattr(Campaign, "cases", lambda self: {CRUISE: case})
+
+    def counts(**counts):
+        found = SafetyCounts(steps=3200, episodes=16, exits=2, **counts)
+        monkeypatch.setattr(command, "_numbers_of_batches", lambda *given: [1])
+        monkeypatch.setattr(command, "results_of", lambda batches, *where: [found])
+
+    return counts
+
+
+def test_a_shield_that_fails_ends_with_an_error(tmp_path, counted, capsys):
+    counted(broken_episodes=1, level=1.1)
     with pytest.raises(SafetyBroken, match="2 steps outside S, 0 outside the box, 0 without a proof"):
         attack(settings(tmp_path))
     assert "-1.0e-01" in capsys.readouterr().out
     attack(settings(tmp_path / "watching", unshielded=True))
 
 
-def test_exits_of_lookahead_are_allowed_and_violations_are_not(tmp_path, small, monkeypatch, capsys):
-    counts = {"steps": 3200, "episodes": 16, "exits": 2, "planned": 1600, "outside_starts": 3, "level": 0.75}
-
-    def executed(**more):
-        return lambda campaign, missing, certificates, store, jobs: store.add(
-            MonteCarloBatch(CRUISE, 0), SafetyCounts(**counts, **more)
-        )
-
-    monkeypatch.setattr(command, "_batches", lambda names, count, least: {CRUISE: [MonteCarloBatch(CRUISE, 0)]})
-    monkeypatch.setattr(command, "execute_batches", executed())
+def test_exits_of_lookahead_are_allowed_and_violations_are_not(tmp_path, counted, capsys):
+    counts = {"planned": 1600, "outside_starts": 3, "level": 0.75}
+    counted(**counts)
     attack(settings(tmp_path / "kept", mode="lookahead"))
     head, *lines = capsys.readouterr().out.splitlines()
     assert head == "3,200 steps, 200 in each episode"
@@ -321,28 +329,24 @@ def test_exits_of_lookahead_are_allowed_and_violations_are_not(tmp_path, small, 
         ({"violations": 1}, "1 outside the box, 0 without"),
         ({"unproved": 4}, "0 outside the box, 4 "),
     ):
-        monkeypatch.setattr(command, "execute_batches", executed(**more))
+        counted(**counts, **more)
         with pytest.raises(SafetyBroken, match=f"^{words}"):
             attack(settings(tmp_path / words, mode="lookahead"))
 
 
-def test_damaged_counts_are_refused(tmp_path):
-    path = tmp_path / "tallies.jsonl"
-    store = CountsStore(path, {"case": "key"}, 4)
-    for index in range(3):
-        store.add(MonteCarloBatch("case", index), SafetyCounts(steps=800, episodes=4, exits=index))
+def test_damaged_counts_are_refused_and_those_of_other_settings_not_taken(tmp_path, certificates):
+    batch, store = MonteCarloBatch(CAMPAIGN, CRUISE, 0, certificates[CRUISE]), RunStore(tmp_path)
+    counts = SafetyCounts(steps=32 * 200, episodes=32, exits=3, level=0.5)
+    store.save(batch, counts)
+    assert store.load(batch) == counts
+    for other in (replace(batch, campaign=replace(CAMPAIGN, seed=1)), replace(batch, certificate=certificates[OTHER])):
+        assert store.load(other) is None
+    path = tmp_path / "runs" / f"{batch.name}.json"
     whole = path.read_bytes()
-    assert CountsStore(path, {"case": "key"}, 4).counts == store.counts
-    assert CountsStore(path, {"case": "other", "else": "key"}, 4).counts == {}
-    second = whole.splitlines(keepends=True)[1]
-    start = whole.index(second)
-    for position in range(start, start + len(second) - 1):
+    for position in range(len(whole) - 1):
         path.write_bytes(whole[:position] + bytes([whole[position] ^ 1]) + whole[position + 1 :])
-        with pytest.raises(ResultsError, match=r"line [23] of .* was altered"):
-            CountsStore(path, {"case": "key"}, 4)
-    path.write_bytes(whole + b'{"sha256": "torn')
-    assert CountsStore(path, {"case": "key"}, 4).counts == store.counts
-    assert path.read_bytes() == whole
+        with pytest.raises(ResultsError, match=r"is no result of its run .*: delete it to repeat the run"):
+            store.load(batch)
 
 
 def test_counts_add_up_and_bound_the_probability():
@@ -399,7 +403,7 @@ def test_earlier_name_of_the_command_is_the_same_command(tmp_path, small, withou
     for name in ("attack", "certify"):
         run = ncs(name, "--steps", 1, "--random-plants", 1, "--envs", 16, "--out", tmp_path / "out")
         assert run.returncode == 0, run.stderr
-    assert "per second" not in run.stdout  # all there, in the folder of the other name
+    assert "step/s" not in run.stderr  # all there, in the folder of the other name
     helps = [ncs(name, "--help").stdout for name in ("attack", "certify")]
     assert helps[0] == helps[1]
     assert "ncs attack" in helps[0]

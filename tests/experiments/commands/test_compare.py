@@ -228,7 +228,7 @@ def test_results_are_grouped_by_arm_in_the_order_of_runs():
 
 
 def test_folder_is_made_and_an_earlier_summary_removed(tmp_path):
-    (tmp_path / "units").mkdir()
+    (tmp_path / "runs").mkdir()
     (tmp_path / "figures").mkdir()
     for name in (
         "summary.json",
@@ -240,7 +240,7 @@ def test_folder_is_made_and_an_earlier_summary_removed(tmp_path):
         (tmp_path / name).write_text("{}")
     prepare_output(tmp_path)
     assert not any((tmp_path / "figures").iterdir())
-    assert {path.name for path in tmp_path.iterdir()} == {"units", "figures"}
+    assert {path.name for path in tmp_path.iterdir()} == {"runs", "figures"}
 
 
 @pytest.mark.parametrize(

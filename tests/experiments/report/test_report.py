@@ -271,7 +271,7 @@ def test_the_shield_is_explained_as_its_mode_acts(mode):
 
 
 def test_every_condition_has_a_table_and_every_arm_an_explanation():
-    change = {"conditions": {"gaussian": run("shielded", violations=(3, 0)).episodes}}
+    change = {"scenarios": {"gaussian": run("shielded", violations=(3, 0)).episodes}}
     page = Reader(comparison("shielded", "trusting", "lagrangian", "lqr+psf", "shield at test", change=change))
     table = {row[0]: row[1:] for row in page.tables["Evaluation: gaussian"]}
     assert table["trusting"][:2] == ["3 of 650.0 % [11.8, 88.2]", "9"]

@@ -103,23 +103,19 @@ def test_residual_agents_add_to_the_certified_gain_outside_of_the_filter(run_of,
 
 @pytest.mark.parametrize("name", ["trusting", "shield at test", "lagrangian", "shielded+residual", "lqr+trusting"])
 def test_every_arm_plays(run_of, name):
-    from experiments.runs import execute_run
-
     tiny = dict(n_envs=2, n_steps=64, batch_size=64, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8]))
-    result = execute_run(run_of(name, steps=256, episodes=2, hyperparams=tiny), lambda steps: None)
+    result = run_of(name, steps=256, episodes=2, hyperparams=tiny).execute(lambda steps: None)
     assert (result.arm, len(result.episodes)) == (name, 2)
     assert result.train_steps == (0 if name.startswith("lqr") else 256)
     assert (result.episodes[0].guaranteed, result.episodes[1].guaranteed) == (2 * (name[:6] == "shield",))
 
 
 def test_predictive_filter_acts_on_trained_agents_in_training_or_at_test_alone():
-    from experiments.runs import execute_run
-
     tiny = dict(n_envs=2, n_steps=64, batch_size=64, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8]))
     settings, loop = CompareSettings(steps=512, episodes=2, hyperparams=tiny), loop_config("ncs_gym/BatchReactor-v0")
     certificate = certificate_of(loop)
     unshielded, filtered, at_test = (
-        execute_run(run_of_arm(settings, loop, certificate, name, 0), lambda steps: None)
+        run_of_arm(settings, loop, certificate, name, 0).execute(lambda steps: None)
         for name in ("unshielded", "psf", "psf at test")
     )
     assert [each.train_interventions > 0 for each in (unshielded, filtered, at_test)] == [False, True, False]

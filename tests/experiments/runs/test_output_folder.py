@@ -14,7 +14,7 @@ import pytest
 from experiments.errors import FolderInUseError, OtherResultsError
 from experiments.runs import claim_folder as folder_of
 from experiments.settings import (
-    CertifySettings,
+    AttackSettings,
     CompareSettings,
     ReproduceSettings,
     StudySettings,
@@ -51,10 +51,10 @@ def finished(command, settings, file="summary.json"):
         ("train", TrainSettings, {"arm": "unshielded"}, "arm"),
         ("sweep", SweepSettings, {"losses": (0.0, 0.3)}, "losses"),
         ("sweep", SweepSettings, {"quantization_steps": (0.1,)}, "quantization_steps"),
-        ("certify", CertifySettings, {"mode": "switch"}, "mode"),
+        ("certify", AttackSettings, {"mode": "switch"}, "mode"),
         ("study", StudySettings, {"budget": 0.5}, "budget"),
         ("study", StudySettings, {"channel_episodes": 3}, "channel_episodes"),
-        ("certify", CertifySettings, {"steps": 1e7}, "steps"),
+        ("certify", AttackSettings, {"steps": 1e7}, "steps"),
         ("reproduce", ReproduceSettings, {"starts": 3}, "starts"),
     ],
 )
@@ -78,7 +78,7 @@ def test_folder_with_results_of_other_settings_is_refused(command, kind, change,
         ("compare", CompareSettings, {"seeds": 4, "arms": (*CompareSettings.arms, "psf")}),
         ("sweep", SweepSettings, {"engine": "ray", "ray_address": "auto", "cpus_per_run": 0.5}),
         ("sweep", SweepSettings, {"losses": (0.9, 0.0, 0.3, 0.6), "burst_lengths": (0.0, 5.0)}),
-        ("certify", CertifySettings, {"steps": 1e9, "jobs": 1}),
+        ("certify", AttackSettings, {"steps": 1e9, "jobs": 1}),
         ("study", StudySettings, {"seeds": 20, "page": Path("docs/results.md"), "smoke": True}),
     ],
 )
@@ -91,8 +91,8 @@ def test_single_finished_runs_are_kept_and_a_folder_without_any_is_taken(tmp_pat
     settings = CompareSettings(out=tmp_path)
     claim_folder("compare", settings)
     claim_folder("compare", replace(settings, seed=1))
-    (tmp_path / "units").mkdir()
-    (tmp_path / "units" / "shielded-0.json").write_text("{}")
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "shielded-0.json").write_text("{}")
     with pytest.raises(OtherResultsError, match="seed 1, now 2"):
         claim_folder("compare", replace(settings, seed=2))
 

@@ -9,7 +9,7 @@ from experiments.backends.execution import results_of
 from experiments.baselines import EstimateFilterSettings
 from experiments.errors import ResultsError
 from experiments.runs.run_store import RunStore
-from experiments.runs.training_run import TrainingRun, execute_run
+from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings
 
 
@@ -33,7 +33,7 @@ def run(certificate):
 
 @pytest.fixture(scope="module")
 def result(run):
-    return execute_run(run, lambda steps: None)
+    return run.execute(lambda steps: None)
 
 
 @pytest.fixture
@@ -99,7 +99,7 @@ def test_grid_point_is_no_part_of_the_settings(run):
 
 
 def test_damaged_results_are_one_sentence(store, run, tmp_path):
-    path = tmp_path / "units" / f"{run.name}.json"
+    path = tmp_path / "runs" / f"{run.name}.json"
     text = path.read_text()
     for damaged in ("", "{", "[]", text[: len(text) // 2], text.replace('"index": 1', '"index": 0', 1)):
         path.write_text(damaged)
@@ -116,7 +116,7 @@ def test_result_without_its_agent_is_refused(store, run, tmp_path):
 def test_half_stored_result_of_other_settings_leaves_nothing_behind(store, run, result, monkeypatch):
     # Killed between the agent's files and the run's.
     def killed(path, content):
-        if path.suffix == ".json" and path.parent.name == "units":
+        if path.suffix == ".json" and path.parent.name == "runs":
             raise KeyboardInterrupt
         path.write_bytes(content)
 
@@ -142,25 +142,25 @@ def test_nothing_stored_is_nothing_loaded(run, tmp_path):
 
 
 def test_stored_file_is_data_only(store, run, tmp_path):
-    document = json.loads((tmp_path / "units" / f"{run.name}.json").read_text())
-    assert document["key"] == run.key
-    assert set(document["result"]["files"]) == {"model.zip", "agent.json"}
+    document = json.loads((tmp_path / "runs" / f"{run.name}.json").read_text())
+    assert document["run"]["key"] == run.key
+    assert set(document["run"]["result"]["files"]) == {"model.zip", "agent.json"}
 
 
 def test_finished_runs_are_not_run_again(store, run, result, tmp_path, monkeypatch, capsys):
     ran = []
 
-    def record(jobs, workers, on_result, on_progress):
-        for job in jobs:
-            ran.append(job.name)
-            on_result(job, replace(result, index=2))
+    def record(runs, where, keep):
+        for each in runs:
+            ran.append(each.name)
+            keep(each, replace(result, index=2))
 
-    monkeypatch.setattr("experiments.backends.worker_processes.execute_all", record)
+    monkeypatch.setattr("experiments.backends.execution.execute", record)
     missing = replace(run, index=2)
     results = results_of([run, missing], tmp_path, BackendSettings(jobs=1))
     assert ran == [missing.name]
     assert [one.index for one in results] == [1, 2]
-    assert [one.files for one in results] == [{}, {}]  # those of many units would fill the memory
+    assert [one.files for one in results] == [{}, {}]  # those of many runs would fill the memory
     assert "1 of 2 runs were finished before" in capsys.readouterr().err
     results_of([missing, run], tmp_path, BackendSettings(jobs=1))
     assert ran == [missing.name]

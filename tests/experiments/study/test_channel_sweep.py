@@ -7,9 +7,9 @@ import pytest
 
 from experiments.backends.execution import results_of
 from experiments.errors import ResultsError
-from experiments.runs import certificate_of, execute_run, loop_config, run_of_arm
+from experiments.runs import certificate_of, loop_config, run_of_arm
 from experiments.settings import CompareSettings, changed_channel
-from experiments.study.channel_sweep import SWEPT_CONDITIONS, SWEPT_FILTERS, channel_sweep, trained_agents
+from experiments.study.channel_sweep import SWEPT_FILTERS, SWEPT_SCENARIOS, channel_sweep, trained_agents
 from experiments.study.channel_sweep import _points as points_of
 from experiments.study.figures import sweep_figure
 from experiments.study.tables import channels_table
@@ -76,12 +76,12 @@ def test_a_finished_sweep_is_read_again(rows):
     sides = {each["side"] for each in rows[0]}
     assert sides == {"loss", "delay", "quantization_step"}
     assert {(r["arm"], r["condition"]) for r in rows[0]} == {
-        (f"lqr+{name}", condition) for name in SWEPT_FILTERS for condition in SWEPT_CONDITIONS
+        (f"lqr+{name}", condition) for name in SWEPT_FILTERS for condition in SWEPT_SCENARIOS
     }
 
 
 def test_agents_do_on_the_own_channel_what_they_did_in_the_comparison(trained, sweep_of_agents):
-    of_agents = {r["arm"]: r for r in sweep_of_agents[1] if r["condition"] == SWEPT_CONDITIONS[0]}
+    of_agents = {r["arm"]: r for r in sweep_of_agents[1] if r["condition"] == SWEPT_SCENARIOS[0]}
     for name in SWEPT_FILTERS:
         episodes = [episode for result in trained[1] if result.arm == name for episode in result.episodes]
         row = of_agents[name]
@@ -120,9 +120,9 @@ def test_a_run_with_an_agent_trains_nothing_and_is_another_with_another_agent(tr
     first, second = (replace(run, agent_files=files) for files in agents["shielded"])
     assert len({run.key, first.key, second.key}) == 3
     assert first.total_steps == run.episodes * 200 < run.total_steps
-    result = execute_run(first, lambda steps: None)
+    result = first.execute(lambda steps: None)
     assert (result.train_steps, result.files, len(result.episodes)) == (0, {}, 2)
-    assert result.episodes != execute_run(second, lambda steps: None).episodes
+    assert result.episodes != second.execute(lambda steps: None).episodes
 
 
 def test_figure_has_a_panel_for_every_side_and_measure(rows):

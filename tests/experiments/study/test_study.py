@@ -28,8 +28,8 @@ def finished(tmp_path_factory):
         channel_episodes=2,
         jobs=1,
         arms=("unshielded", "shielded"),
-        references=("random+shielded", "lqr+trusting", "lqr+shielded"),
-        conditions=("worst-case-disturbance",),
+        baselines=("random+shielded", "lqr+trusting", "lqr+shielded"),
+        scenarios=("worst-case-disturbance",),
     )
     with no_worker_processes(), mock.patch.multiple("experiments.study.channel_sweep", **ONE_CHANNEL):
         study(settings)

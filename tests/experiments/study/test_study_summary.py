@@ -42,7 +42,7 @@ def comparison(seeds=5, spread=0.1, **changed):
         counts = (int(name in VIOLATING), 0)
         results[name] = [run(name, i, counts, (offset, offset)) for i, offset in enumerate(offsets)]
         for each in results[name]:
-            each.conditions["worst-case disturbance"] = each.episodes
+            each.scenarios["worst-case disturbance"] = each.episodes
     summary = json.loads(json.dumps(summary_of(results, seeds=seeds)))
     summary["references"] = {name: summary["arms"].pop(name) for name in RETURNS if name not in TRAINED}
     return summary

@@ -76,12 +76,13 @@ class ScriptedEnv(NCSEnv):
         """Begins in the state of an episode of the vector that has just begun."""
         self.many, self.index = many, index
         self.np_random = np.random.default_rng(0)
-        self.reset(options={"state": many._state[:, index]})
+        links = {"channel": many.episode_channels[index], "downlink": many.episode_downlinks[index]}
+        self.reset(options={"state": many._state[:, index], **links})
         self._process = ScriptedProcess(self.plant, self.disturbance, self.allow_assumption_violation)
         self.estimator.reset(many._estimator.mean[:, index])
         self._task_state = np.copy(many._task_state[..., index])[()]
         self._disturbance_memory = np.copy(many._disturbance_memory[..., index])[()]
-        self._channel_state = ChannelState(self.channel, np.random.default_rng(0))
+        self._channel_state = ChannelState(self.episode_channel, np.random.default_rng(0))
         self._channel_state._loss_state = LossState(*(kept[index] for kept in many._channel_state._loss_state))
         self._downlink_state.begin(np.random.default_rng(0))
         if self.downlink is not None:
@@ -150,9 +151,9 @@ def holding_gain(plant: LinearPlant) -> np.ndarray:
     return regulator_gain(inverse @ plant.A @ scale, inverse @ plant.B * plant.u_max, 1, 1) @ inverse
 
 
-def compare(many: NCSVectorEnv, steps: int) -> int:
+def compare(many: NCSVectorEnv, steps: int, options: dict[str, Any] | None = None) -> int:
     """Steps a vector and, with the same draws, scalar ones; compares everything; returns how many alarms there were."""
-    many.reset(seed=3)
+    many.reset(seed=3, options=options)
     singles, rng, gain = scalar_versions(many), np.random.default_rng(0), holding_gain(many.plant)
     width, alarms, estimates = 0.1 if gain.any() else 1.2, 0, np.zeros((many.num_envs, many.plant.n))
     for number in range(steps):

@@ -34,10 +34,14 @@ UNSTABLE = {
 }
 CASES = [(name, channel) for name in STABLE for channel in CHANNELS]
 CASES += [(name, channel) for name in UNSTABLE for channel in EDGES]
+# The same with a certificate whose polytope is where plans end.
+IN_POLYTOPE = ", polytope"
+CASES += [(name + IN_POLYTOPE, "overtaking") for name in UNSTABLE] + [("n=6 m=2" + IN_POLYTOPE, "bursts")]
 
 
 def case(name: str, channel: str):
     """Plant, horizon, channel and contract."""
+    name = name.removesuffix(IN_POLYTOPE)
     if name in STABLE:
         return *STABLE[name], CHANNELS[channel], None
     edge = EDGES[channel]
@@ -52,7 +56,7 @@ def box_ellipsoid(plant, share: float) -> Ellipsoid:
 class WeakestPoint:
     """The disturbance that is worst for the plan under way: for the row and the step with the least room.
 
-    Every other time it pushes the end of the plan out of S instead.
+    Every other time it pushes the end of the plan out of the safe set instead.
     """
 
     def __init__(self):
@@ -70,7 +74,11 @@ class WeakestPoint:
             pulled.append(plant.box_rows @ power)
             rooms.append(1.0 - np.abs(plant.box_rows @ center) - spread)
         if self.shield is not None and rng.random() < 0.5:
-            return bound.extreme_point(power.T @ self.shield.certificate.M @ center)
+            polytope = self.shield.certificate.polytope
+            if polytope is None:
+                return bound.extreme_point(power.T @ self.shield.certificate.M @ center)
+            rooms = 1.0 - polytope.F @ center - bound.support(polytope.F @ power)
+            return bound.extreme_point(power.T @ polytope.F[np.argmin(rooms)])
         step, row = np.unravel_index(np.argmin(rooms), np.shape(rooms))
         return bound.extreme_point(np.copysign(1.0, values[step][row]) * pulled[step][row])
 
@@ -82,7 +90,7 @@ def extremal_env(name: str, channel: str, share: float = 0.95, **settings):
     inner = ExtremalNoise(
         plant, network, disturbance=adversary, contract=contract, initial_set=box_ellipsoid(plant, share)
     )
-    certificate = certificate_of(plant, contract)
+    certificate = certificate_of(plant, contract, "polytope" if name.endswith(IN_POLYTOPE) else "ellipsoid")
     env = SafetyShield(inner, certificate, mode="lookahead", horizon=horizon, **settings)
     adversary.shield = env
     return env

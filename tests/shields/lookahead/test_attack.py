@@ -15,6 +15,7 @@ from tests.shields.lookahead.adversary import CASES, OUTSIDE, WeakestPoint, atta
 from tests.shields.lookahead.test_planner import FAILURES, break_solver
 
 POLICIES = ("random", "outwards", "constant")
+MOST_TRIED = "cruise", "cart-pole", "batch reactor"
 
 
 def attack_for_long(env):
@@ -36,14 +37,14 @@ def test_no_state_that_is_guaranteed_leaves_the_box(name, channel, episodes):
     assert total(counts)["planned"] > 0 or name == "n=3 m=2"  # there every input that matters passes today's test
 
 
-@pytest.mark.parametrize("name", ["cruise", "cart-pole", "batch reactor"])
+@pytest.mark.parametrize("name", [*MOST_TRIED, "cart-pole, polytope", "batch reactor, polytope"])
 def test_the_attack_comes_close_and_lives_from_plans_and_stored_tails(name):
     env = extremal_env(name, "overtaking")
     counts = total([attack(env, policy, 7, 10, 60) for policy in POLICIES])
     assert counts["closest"] / len(POLICIES) > 0.98
-    assert counts["outside S"] > 0.2 * counts["guaranteed"]
+    assert counts["outside S"] > (0.1 if name.endswith("polytope") else 0.2) * counts["guaranteed"]
     assert counts["stored"] > 20
-    if name != "cruise":  # S fills most of its box
+    if name not in ("cruise", "batch reactor, polytope"):  # there the safe set fills most of the box
         assert counts["starts"] > 0
 
 
@@ -64,11 +65,11 @@ def without_tightening(prediction, shapes):
 def without_a_step_of_disturbance(prediction, shapes):
     """The last step's disturbance is left out of every row."""
     known, plant = tightenings(prediction, shapes), prediction.plant
-    return known._replace(room=known.room + plant.disturbance.support(plant.box_rows))
+    return known._replace(room=known.room + plant.disturbance.support(prediction.rows))
 
 
 @pytest.mark.parametrize("mutation", [without_tightening, without_a_step_of_disturbance])
-@pytest.mark.parametrize("name", ["cruise", "cart-pole", "batch reactor"])
+@pytest.mark.parametrize("name", [*MOST_TRIED, "cart-pole, polytope", "batch reactor, polytope"])
 def test_plans_checked_with_less_are_caught_leaving_the_box(name, mutation, monkeypatch):
     monkeypatch.setattr(plan_test, "tightenings", mutation)
     env = extremal_env(name, "overtaking" if name != "cruise" else "blackout")

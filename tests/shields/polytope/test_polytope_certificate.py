@@ -22,7 +22,7 @@ from shields.json_documents import document_of
 from shields.polytope import Polytope
 from shields.synthesis import invariant_polytope as search
 from shields.synthesis.certification import with_polytope
-from shields.verification.polytope_conditions import _half_widths, _root_above
+from shields.verification.polytope_conditions import half_widths, root_above
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 
@@ -273,18 +273,18 @@ def test_random_plants_have_polytopes_that_verify_and_hold_under_extreme_points(
         assert image + wide.error_set.support(row @ plant.B @ wide.K) + plant.disturbance.support(row) <= 1.0
 
 
-def test_half_widths_and_roots_are_upper_bounds():
+def testhalf_widths_and_roots_are_upper_bounds():
     rng = np.random.default_rng(0)
     for n in (1, 2, 4):
         rows = rng.standard_normal((n + 2, n)).round(3)
         exact_rows = [[Fraction(float(x)) for x in row] for row in rows]
-        widths = np.array([float(width) for width in _half_widths(exact_rows)])
+        widths = np.array([float(width) for width in half_widths(exact_rows)])
         points = rng.standard_normal((5000, n))
         points /= np.abs(points @ rows.T).max(axis=1)[:, None]
         assert (np.abs(points).max(axis=0) <= widths * (1 + 1e-12)).all()
-    assert _half_widths([[Fraction(1), Fraction(1)], [Fraction(2), Fraction(2)]]) is None
+    assert half_widths([[Fraction(1), Fraction(1)], [Fraction(2), Fraction(2)]]) is None
     for square in (Fraction(2), Fraction(1, 3), Fraction(0), Fraction(10) ** -40, Fraction(10) ** 30):
-        root = _root_above(square)
+        root = root_above(square)
         assert root * root >= square
         assert root - Fraction(1, 2**127) <= 0 or (root - Fraction(1, 2**127)) ** 2 <= square
 

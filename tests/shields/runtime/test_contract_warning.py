@@ -5,8 +5,17 @@ import warnings
 import gymnasium as gym
 import pytest
 
-from ncs_gym import BrokenContractWarning, Channel, ChannelContract, NCSEnv, NCSVectorEnv, cart_pole
-from shields import SafeLoop, SafetyShield, VectorSafetyShield
+from ncs_gym import (
+    BrokenContractWarning,
+    Channel,
+    ChannelContract,
+    NCSEnv,
+    NCSVectorEnv,
+    RandomChannel,
+    VectorRandomChannel,
+    cart_pole,
+)
+from shields import GuaranteeLostWarning, SafeLoop, SafetyShield, VectorSafetyShield
 from tests.certificates import certificate_of
 
 PLANT, CONTRACT = cart_pole(), ChannelContract(4)
@@ -49,12 +58,14 @@ def test_channel_that_breaks_the_contract_without_any_loss_is_pointed_out(make, 
     [
         (Channel(delay=4), None),
         (Channel(send_period=3, delay=2), None),
-        (Channel(loss=0.9, jitter=9), None),  # it may keep the contract, if seldom
+        (Channel(loss=0.9, jitter=9), None),
         (Channel(delay=1), DOWNLINK),
         (Channel(loss=0.5), DOWNLINK),
     ],
 )
 def test_channel_that_may_keep_the_contract_is_taken_without_a_warning(make, channel, downlink):
+    if make is loop and channel.loss:
+        pytest.skip("a real channel that may lose any number of packets in a row is pointed out")
     with warnings.catch_warnings():
         warnings.simplefilter("error", BrokenContractWarning)
         make(channel, downlink)
@@ -69,7 +80,57 @@ def test_real_loop_behind_a_downlink_counts_what_its_uplink_promises():
         loop(uplink, None)
 
 
+@pytest.mark.parametrize(
+    ("channel", "words"),
+    [
+        (Channel(loss=0.3, delay=1, max_consecutive_losses=7), "newest sample become 8 steps old"),
+        (Channel(loss=0.3, delay=1), "may lose any number of packets in a row, .* by max_consecutive_losses"),
+    ],
+)
+def test_real_loop_points_out_losses_that_break_the_contract(channel, words):
+    with pytest.warns(BrokenContractWarning, match=words) as caught:
+        loop(channel, None)
+    assert [each.filename for each in caught] == [__file__]
+
+
 def test_certificate_of_the_registered_contract_is_compared_with_the_channel_asked_for():
     env = gym.make("ncs_gym/CartPole-v0", channel=Channel(delay=9))
     with pytest.warns(BrokenContractWarning, match="become 9 steps old"):
         SafetyShield(env, certificate_of(env.unwrapped.plant, env.unwrapped.contract))
+
+
+@pytest.mark.parametrize("make", [shield, vector_shield])
+def test_channel_of_an_episode_that_breaks_the_contract_is_pointed_out_once(make):
+    env, late = make(Channel(), None), Channel(delay=9)
+    for _ in range(2):
+        with pytest.warns(BrokenContractWarning, match="become 9 steps old") as caught:
+            env.reset(seed=0, options={"channel": late})
+        assert [each.filename for each in caught if each.category is BrokenContractWarning] == [__file__]
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", BrokenContractWarning)
+            env.reset(options={"channel": late})
+            env.reset(options={"channel": Channel(delay=4)})
+
+
+@pytest.mark.parametrize("outside", [True, False])
+def test_shield_keeps_its_guarantee_over_drawn_channels_and_says_where_it_is_lost(outside):
+    fitting = [Channel(), Channel(loss=0.5, delay=1, max_consecutive_losses=2), Channel(delay=4, quantization_step=0)]
+
+    def shielded(env, vector):
+        drawn, safe = (VectorRandomChannel, VectorSafetyShield) if vector else (RandomChannel, SafetyShield)
+        certificate = certificate_of(PLANT, CONTRACT)
+        return drawn(safe(env, certificate), fitting) if outside else safe(drawn(env, fitting), certificate)
+
+    many = shielded(NCSVectorEnv(8, plant=PLANT, contract=CONTRACT, max_episode_steps=20), vector=True)
+    many.reset(seed=0)
+    for _ in range(100):
+        info = many.step(many.action_space.sample())[4]
+        assert info["shield_guaranteed"].all()
+        assert not info["cost"].any()
+    one = shielded(NCSEnv(PLANT, contract=CONTRACT), vector=False)
+    for seed in range(6):
+        one.reset(seed=seed)
+        assert all(one.step(one.action_space.sample())[4]["shield_guaranteed"] for _ in range(20))
+    one.reset(seed=0, options={"channel": Channel(loss=1.0)})
+    with pytest.warns(GuaranteeLostWarning, match="older than the contract"):
+        [one.step(one.action_space.sample()) for _ in range(10)]

@@ -145,7 +145,7 @@ def test_plant_without_a_continuous_model_cannot_be_resampled():
 
 @pytest.mark.parametrize("wrong", [{"losses": []}, {"delays": [1, 1]}, {"losses": [-1]}, {"disturbances": [0.0]}])
 def test_impossible_values_are_refused(wrong):
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match=r"different values|losses|disturbance"):
         requirements(servo(), **wrong)
 
 

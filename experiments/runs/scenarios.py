@@ -1,4 +1,4 @@
-"""The conditions under which agents are evaluated, by name."""
+"""The scenarios under which agents are evaluated, by name."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from ncs_gym import Channel, ChannelContract, GilbertElliott
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.network import contract_of
 
-# The condition that agents are trained under.
+# The scenario that agents are trained under.
 AS_TRAINED = "as trained"
 
 
-def condition_named(name: str) -> str:
-    """Returns a condition's name as it is printed; hyphens stand for spaces.
+def scenario_named(name: str) -> str:
+    """Returns a scenario's name as it is printed; hyphens stand for spaces.
 
     Raises:
         ValueError: If it is unknown.
@@ -23,29 +23,29 @@ def condition_named(name: str) -> str:
     for known in (AS_TRAINED, *_CHANGES):
         if known.replace("-", " ") == name.replace("-", " "):
             return known
-    raise ValueError(f"unknown condition {name!r}; known are {', '.join((AS_TRAINED, *_CHANGES))}")
+    raise ValueError(f"unknown scenario {name!r}; known are {', '.join((AS_TRAINED, *_CHANGES))}")
 
 
-def other_conditions(names: Sequence[str]) -> tuple[str, ...]:
-    """Returns the different conditions that are named, without that of the training.
+def other_scenarios(names: Sequence[str]) -> tuple[str, ...]:
+    """Returns the different scenarios that are named, without that of the training.
 
     Raises:
         ValueError: If one is unknown.
     """
-    return tuple(dict.fromkeys(name for each in names if (name := condition_named(each)) != AS_TRAINED))
+    return tuple(dict.fromkeys(name for each in names if (name := scenario_named(each)) != AS_TRAINED))
 
 
-def under(condition: str, loop: LoopConfig) -> LoopConfig:
-    """Returns a control loop under a condition; everything else stays the same.
+def under(scenario: str, loop: LoopConfig) -> LoopConfig:
+    """Returns a control loop under a scenario; everything else stays the same.
 
     Args:
-        condition: A name that `condition_named` returns.
+        scenario: A name that `scenario_named` returns.
         loop: The control loop as it was in training.
 
     Raises:
-        ValueError: If the condition is unknown, or the channel cannot be worse within the contract.
+        ValueError: If the scenario is unknown, or the channel cannot be worse within the contract.
     """
-    return loop if condition == AS_TRAINED else _CHANGES[condition_named(condition)](loop)
+    return loop if scenario == AS_TRAINED else _CHANGES[scenario_named(scenario)](loop)
 
 
 def worse_channel(channel: Channel, contract: ChannelContract | None) -> Channel:

@@ -10,9 +10,9 @@ import pytest
 from agents.loop import LoopConfig
 from experiments.analysis.episodes import episodes_table
 from experiments.analysis.summary import arm_summary
-from experiments.analysis.tables import condition_text, summary_text
-from experiments.runs import RunStore, execute_run, run_of_arm
-from experiments.runs.evaluation_conditions import condition_named, other_conditions, under, worse_channel
+from experiments.analysis.tables import scenario_text, summary_text
+from experiments.runs import RunStore, run_of_arm
+from experiments.runs.scenarios import other_scenarios, scenario_named, under, worse_channel
 from experiments.settings import CompareSettings
 from ncs_gym import AdversarialDisturbance, Channel, ChannelContract, GilbertElliott
 from ncs_gym.envs.env import ncs_env
@@ -21,16 +21,16 @@ CRUISE, CART_POLE, REACTOR = (f"ncs_gym/{name}-v0" for name in ("TruckTrailerCru
 ALL = ("worst-case disturbance", "worse channel", "gaussian")
 
 
-def run_of(certificate, name, conditions=ALL, episodes=8):
-    settings = CompareSettings(conditions=conditions, episodes=episodes)
+def run_of(certificate, name, scenarios=ALL, episodes=8):
+    settings = CompareSettings(scenarios=scenarios, episodes=episodes)
     return run_of_arm(settings, LoopConfig(env=CRUISE), certificate, name, 0)
 
 
 def test_names_take_hyphens_and_the_condition_of_training_is_no_other_one():
-    assert condition_named("worst-case-disturbance") == "worst-case disturbance"
-    assert other_conditions(("as-trained", "worse-channel", "worse channel")) == ("worse channel",)
-    with pytest.raises(ValueError, match="unknown condition 'worse'; known are as trained, worst-case disturbance"):
-        condition_named("worse")
+    assert scenario_named("worst-case-disturbance") == "worst-case disturbance"
+    assert other_scenarios(("as-trained", "worse-channel", "worse channel")) == ("worse channel",)
+    with pytest.raises(ValueError, match="unknown scenario 'worse'; known are as trained, worst-case disturbance"):
+        scenario_named("worse")
 
 
 def test_each_condition_changes_one_thing_in_both_kinds_of_environment():
@@ -70,29 +70,26 @@ def test_worse_channel_uses_what_the_contract_leaves_and_bursts_get_denser():
 @pytest.fixture(scope="module")
 def results(certificate):
     names = ("proportional", "proportional+trusting", "proportional+shielded", "random")
-    return {name: execute_run(run_of(certificate, name), lambda steps: None) for name in names}
+    return {name: run_of(certificate, name).execute(lambda steps: None) for name in names}
 
 
-def test_conditions_are_stored_beside_the_evaluation_as_trained(certificate, results, tmp_path):
+def test_scenarios_are_stored_beside_the_evaluation_as_trained(certificate, results, tmp_path):
     run, result = run_of(certificate, "proportional+shielded"), results["proportional+shielded"]
-    assert tuple(result.conditions) == ALL
-    alone = execute_run(run_of(certificate, "proportional+shielded", ()), lambda steps: None)
-    assert (alone.episodes, alone.conditions) == (result.episodes, {})
-    for condition, episodes in result.conditions.items():
-        assert (
-            episodes
-            == execute_run(run_of(certificate, run.arm, (condition,)), lambda steps: None).conditions[condition]
-        )
+    assert tuple(result.scenarios) == ALL
+    alone = run_of(certificate, "proportional+shielded", ()).execute(lambda steps: None)
+    assert (alone.episodes, alone.scenarios) == (result.episodes, {})
+    for scenario, episodes in result.scenarios.items():
+        assert episodes == run_of(certificate, run.arm, (scenario,)).execute(lambda steps: None).scenarios[scenario]
         assert episodes != result.episodes
     store = RunStore(tmp_path)
     store.save(run, result)
-    assert store.load(run).conditions == result.conditions
-    assert store.load(replace(run, conditions=ALL[:1])) is None
+    assert store.load(run).scenarios == result.scenarios
+    assert store.load(replace(run, scenarios=ALL[:1])) is None
 
 
 def test_shield_holds_where_the_filter_that_trusts_the_estimate_breaks(results):
     outside = {
-        name: [sum(each.largest_level > 1.0 for each in result.conditions[condition]) for condition in ALL]
+        name: [sum(each.largest_level > 1.0 for each in result.scenarios[scenario]) for scenario in ALL]
         for name, result in results.items()
     }
     assert outside["proportional+shielded"] == [0, 0, 0]
@@ -100,12 +97,12 @@ def test_shield_holds_where_the_filter_that_trusts_the_estimate_breaks(results):
     assert outside["proportional+trusting"][0] > sum(
         each.largest_level > 1.0 for each in results["proportional+trusting"].episodes
     )
-    assert all(each.guaranteed for each in results["proportional+shielded"].conditions["worst-case disturbance"])
+    assert all(each.guaranteed for each in results["proportional+shielded"].scenarios["worst-case disturbance"])
 
 
-def test_random_policy_acts_alike_under_every_condition(certificate):
+def test_random_policy_acts_alike_under_every_scenario(certificate):
     run = run_of(certificate, "random", ("as trained",))
-    first, again = (execute_run(run, lambda steps: None).trajectory.inputs for _ in range(2))
+    first, again = (run.execute(lambda steps: None).trajectory.inputs for _ in range(2))
     np.testing.assert_array_equal(first, again)
 
 
@@ -131,7 +128,7 @@ def test_small_returns_are_printed_with_two_significant_digits(results, mean, ha
     assert max(map(len, printed.splitlines())) <= 100
 
 
-def test_summary_and_table_have_a_block_per_condition(results):
+def test_summary_and_table_have_a_block_per_scenario(results):
     modes = {"proportional": None, "proportional+trusting": "trusting", "proportional+shielded": "project"}
     arms = {name: arm_summary(episodes_table([results[name]]), mode, fixed_policy=True) for name, mode in modes.items()}
     json.dumps(arms, allow_nan=False)
@@ -140,7 +137,7 @@ def test_summary_and_table_have_a_block_per_condition(results):
     }
     pushed = arms["proportional+trusting"]["conditions"]["worst-case disturbance"]
     assert pushed["eval_violation_steps"] > arms["proportional+trusting"]["eval_violation_steps"]
-    text = condition_text("worst-case disturbance", arms, {})
+    text = scenario_text("worst-case disturbance", arms, {})
     assert text.startswith("worst-case disturbance:")
     assert f" {pushed['eval_violation_steps']:,} " in text
     for printed in (text, summary_text(arms, {})):

@@ -1,4 +1,4 @@
-"""The shield's one-step test with the estimate taken for the true state."""
+"""The certainty-equivalent filter: the shield's one-step test with the estimate taken for the true state."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from shields import Certificate
 from shields.runtime.safety_filter import SafetyFilter
 
 
-class TrustingFilter:
+class CertaintyEquivalentFilter:
     """Decides as the shield does, with Sigma_k = 0 in the place of the true error ellipsoid.
 
     This is what a safety filter does that is handed an estimate as if it were the state. Everything else is kept: the

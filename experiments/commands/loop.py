@@ -1,0 +1,235 @@
+"""`ncs loop`: runs a control loop over a network in real time, as processes of its own."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.commands import short_version
+from experiments.network_loop.log import rows_of
+from experiments.network_loop.processes import (
+    NetworkLoop,
+    network_channels,
+    run_controller_node,
+    run_network,
+    run_plant,
+)
+from experiments.runs.environments import import_module, module_and_id, registered_env
+from experiments.runs.synthesis_status import synthesis_status
+from experiments.settings import LoopSettings
+from ncs_gym import NCSEnv
+from ncs_gym.network import contract_of, downlink_protocol
+from ncs_gym.network.wire import SHORTEST_KEY
+from shields import Certificate
+from shields.atomic_write import write_atomically
+from shields.runtime.wrapper import certificate_for
+from shields.verification import require_valid
+
+# Budget of `--smoke`.
+_SMOKE = {"steps": 100}
+# Seconds that a process may take to end, and between two lines of the view.
+_PATIENCE, _PERIOD = 10.0, 1.0
+
+
+def loop(settings: LoopSettings) -> None:
+    """Runs `ncs loop`.
+
+    Raises:
+        ValueError: If a setting is wrong, or the key too short.
+        Infeasible: If there is no certificate for the plant behind this network.
+        CertificateError: If a given certificate is damaged or does not verify.
+        OSError: If a file cannot be read or written, or an address is in use.
+        RuntimeError: If a process ended by itself.
+    """
+    settings = short_version(settings, **_SMOKE)
+    env = registered_env(settings.env)
+    settings.out.mkdir(parents=True, exist_ok=True)
+    for file in [*settings.out.glob("*-[0-9][0-9][0-9]*.csv")]:
+        file.unlink()
+    network_loop = _network_loop(settings, env)
+    others = {"all": (run_plant, run_network), "plant": (run_plant, run_network), "controller": ()}[settings.role]
+    context = multiprocessing.get_context("spawn")
+    processes = [context.Process(target=_in_process, args=(run, network_loop, settings.env)) for run in others]
+    for process in processes:
+        process.start()
+    try:
+        if settings.role == "plant":
+            print(f"the plant waits for a controller at {settings.host}, port {settings.port}; end it with Ctrl-C")
+            while all(process.is_alive() for process in processes):
+                time.sleep(_PERIOD / 4)
+        else:
+            with _view(settings, env) as show:
+                run_controller_node(network_loop, show=show)
+        if not all(process.is_alive() for process in processes):
+            raise RuntimeError("a process of the loop ended by itself; its message is above")
+    finally:
+        for process in processes:
+            process.terminate()
+        for process in processes:
+            process.join(_PATIENCE)
+            if process.is_alive():
+                process.kill()
+    if settings.role == "all":
+        summary = summary_of(settings.out)
+        write_atomically(settings.out / "summary.json", json.dumps(summary, indent=1) + "\n")
+        print("\n".join(f"{name:>28}  {value}" for name, value in summary.items()))
+
+
+def _in_process(run: Callable[[NetworkLoop], None], network_loop: NetworkLoop, env: str) -> None:
+    """Runs a process of the loop; the module that registers the environment is imported in each."""
+    if module_and_id(env)[0]:
+        import_module(module_and_id(env)[0])
+    run(network_loop)
+
+
+def _network_loop(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
+    """Returns the loop that all processes understand, with its certificate in the folder."""
+    given = _given(settings, env)
+    uplink, downlink = given.promised
+    protocol = downlink_protocol(downlink, None)
+    assert protocol is not None
+    contract = None if env.contract is None else protocol.behind(contract_of(uplink))
+    if settings.certificate is None:
+        with synthesis_status() as show:
+            certificate = certificate_for(env.plant, contract, show)
+    else:
+        certificate = Certificate.load(settings.certificate)
+        require_valid(certificate, env.plant)
+    certificate.save(given.certificate)
+    return given
+
+
+def _given(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
+    uplink, downlink = network_channels(env)
+    key = os.urandom(32) if settings.key_file is None else settings.key_file.read_bytes()
+    if len(key) < SHORTEST_KEY:
+        raise ValueError(f"{settings.key_file} must hold at least {SHORTEST_KEY} bytes")
+    here, port = "127.0.0.1", settings.port
+    return NetworkLoop(
+        env=settings.env,
+        certificate=settings.out / "certificate.json",
+        uplink=uplink,
+        downlink=downlink,
+        room=settings.room,
+        key=key,
+        seed=settings.seed,
+        speed=settings.speed,
+        policy=settings.policy,
+        mode=settings.shield,
+        horizon=settings.horizon,
+        mischief=settings.mischief,
+        until_worst=settings.worst,
+        controller=(settings.host, port),
+        sensor=(here, port + 1),
+        actuator=(here, port + 2),
+        listen=(here if settings.role == "all" else "0.0.0.0", port),
+        out=settings.out,
+        steps=settings.steps,
+    )
+
+
+class _view:
+    """Shows the loop while it runs: a table with rich if it is installed, else a line per second; or nothing."""
+
+    def __init__(self, settings: LoopSettings, env: NCSEnv) -> None:
+        self._names, self._rows = env.plant.state_names, env.plant.half_widths
+        self._is_shown = settings.live == "yes" or (settings.live == "auto" and sys.stdout.isatty())
+        self._next, self._seen, self._live = 0.0, Counter[str](), None
+
+    def __enter__(self) -> Callable[[dict[str, Any]], None] | None:
+        if not self._is_shown:
+            return None
+        try:
+            from rich.live import Live
+
+            self._live = Live(refresh_per_second=8)
+            self._live.start()
+        except ImportError:
+            pass
+        return self._show
+
+    def __exit__(self, *error: object) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def _show(self, row: dict[str, Any]) -> None:
+        self._seen["overridden"] += row["intervened"]
+        now = time.monotonic()
+        if now < self._next:
+            return
+        self._next = now + (_PERIOD if self._live is None else _PERIOD / 8)
+        proved = "proved" if row["guaranteed"] else f"NOT PROVED: {row['reason']}"
+        margin = f"margin {row['margin']:.2f}, newest sample {row['age']} steps old"
+        counts = f"overridden {self._seen['overridden']}, missing {row['missing']}, late {row['skipped']}"
+        line = f"step {row['step']}: {proved}; {margin}; {counts}, refused {row['refused']}"
+        if self._live is None:
+            print(line, flush=True)
+            return
+        from rich.table import Table
+
+        table = Table(title=line)
+        for title in ("state", "estimate", "of the box"):
+            table.add_column(title, min_width=12)
+        for name, width in zip(self._names, self._rows, strict=True):
+            share = row[f"x_hat_{name}"] / width
+            place = min(max(round(15 * (1 + share)), 0), 30)
+            bar = "".join("#" if i == place else "|" if i in (0, 15, 30) else "-" for i in range(31))
+            table.add_row(name, f"{row[f'x_hat_{name}']:.4f}", f"{bar} {share:+.0%}")
+        self._live.update(table)
+
+
+def summary_of(folder: Path) -> dict[str, Any]:
+    """Returns what the logs of plant and controller say together.
+
+    A step is broken once an input was missing: from then on nothing is claimed of the episode, and until the controller
+    hears of it what it says is void.
+    """
+    proved: dict[tuple[str, str], str] = {}
+    counts: Counter[str] = Counter()
+    ages, times = Counter[int](), []
+    for row in rows_of(folder, "controller"):
+        proved[row["episode"], row["step"]] = row["guaranteed"]
+        counts["steps"] += 1
+        counts["proved"] += row["guaranteed"] == "1"
+        counts["overridden"] += row["intervened"] == "1"
+        counts["reason: " + row["reason"]] += bool(row["reason"])
+        ages[int(row["age"])] += 1
+        times.append(int(row["microseconds"]))
+        last = row
+    last_of: dict[str, int] = {}
+    for row in rows_of(folder, "plant"):
+        step, missing, key = int(row["step"]), int(row["missing"]), (row["episode"], row["step"])
+        last_of[row["episode"]] = missing
+        counts["plant"] += 1
+        counts["outside"] += row["outside"] == "1"
+        counts["outside, proved"] += row["outside"] == "1" and proved.get(key) == "1" and missing == 0
+        counts["proved, missed"] += proved.get(key) == "1" and missing > 0
+        counts["drift"] = step
+    summary = {
+        "episodes": len({episode for episode, _ in proved}),
+        "steps of the controller": counts["steps"],
+        "steps of the plant": counts["plant"],
+        "proved": counts["proved"],
+        "outside the box": counts["outside"],
+        "outside although proved": counts["outside, proved"],
+        "overridden": counts["overridden"],
+        "inputs missing": sum(last_of.values()),
+        "proved, a miss not yet heard": counts["proved, missed"],
+        "decided too late": int(last["skipped"]) if counts["steps"] else 0,
+        "datagrams refused": int(last["refused"]) if counts["steps"] else 0,
+        "oldest sample in use": max(ages, default=0),
+    }
+    if times:
+        q = np.quantile(times, [0.5, 0.999, 1.0]).round().astype(int).tolist()
+        summary["ms into the step, 50/99.9/100 %"] = " / ".join(f"{each / 1000:.2f}" for each in q)
+    reasons = {name.removeprefix("reason: "): count for name, count in counts.items() if name.startswith("reason: ")}
+    return summary | {f"not proved, {name}": count for name, count in reasons.items() if count}

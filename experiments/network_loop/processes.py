@@ -1,0 +1,281 @@
+"""The processes of `ncs loop`: a simulated plant with sensor and actuator, a bad network, and a controller."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.network_loop.impairment import Impairment, open_line
+from experiments.network_loop.log import StepLog
+from experiments.runs.environments import registered_env
+from experiments.runs.policies import policy_by_name
+from ncs_gym import Actuator, AdversarialDisturbance, Channel, NCSEnv
+from ncs_gym.network import downlink_protocol
+from ncs_gym.network.contract import contract_of
+from ncs_gym.network.wire import Wire
+from ncs_gym.processes.simulation import PlantSimulation
+from shields import Certificate, SafeLoop
+from shields.nodes import (
+    ActuatorNode,
+    ControllerNode,
+    SensorNode,
+    StepClock,
+    UdpTransport,
+    run_controller,
+    run_plant_side,
+)
+
+# Steps by which an echo may be older than the oldest sample; what is allowed where nothing is promised.
+ECHO_ROOM, ECHO_AGE = 5, 50
+# Steps in a row that are not proved after which the controller begins another episode.
+RENEWED = 250
+# Steps between two changes of direction of the controller "push".
+PUSH = 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkLoop:
+    """A control loop over a network, in a form that every process of it understands.
+
+    Attributes:
+        env: Id of the environment whose plant is simulated.
+        certificate: File of the certificate.
+        uplink: What the network does to samples and echoes.
+        downlink: What it does to commands.
+        room: Steps by which both may be later than that, because the processes are: what is promised counts them.
+        key: What the nodes share.
+        seed: Of network, disturbance and controller.
+        speed: Steps of the plant per duration of a step.
+        policy: Name of the controller.
+        mode, horizon: Of the shield.
+        mischief: Of `Impairment`.
+        until_worst: Of `Impairment`.
+        controller, sensor, actuator: Addresses at which the controller hears, and the network hears for it.
+        listen: Address at which the controller binds.
+        out: Folder of the logs.
+        steps: After how many steps the controller ends; None for never.
+    """
+
+    env: str
+    certificate: Path
+    uplink: Channel
+    downlink: Channel
+    room: int
+    key: bytes
+    seed: int
+    speed: float
+    policy: str
+    mode: str
+    horizon: int | None
+    mischief: float
+    until_worst: bool
+    controller: tuple[str, int]
+    sensor: tuple[str, int]
+    actuator: tuple[str, int]
+    listen: tuple[str, int]
+    out: Path
+    steps: int | None
+
+    @property
+    def promised(self) -> tuple[Channel, Channel]:
+        """Uplink and downlink with the room for late processes."""
+        return tuple(replace(each, jitter=each.jitter + self.room) for each in (self.uplink, self.downlink))  # pyright: ignore
+
+    @property
+    def lead(self) -> int:
+        """c, the number of steps from a decision to its effect."""
+        protocol = downlink_protocol(self.promised[1], None)
+        assert protocol is not None
+        return protocol.lead
+
+    def dt(self, env: NCSEnv) -> float:
+        """Returns the duration of a step in real time [s]."""
+        return env.plant.dt / self.speed
+
+    def safe_loop(self, env: NCSEnv) -> SafeLoop:
+        """Returns the loop."""
+        uplink, downlink = self.promised
+        contract = contract_of(uplink)
+        age = ECHO_AGE if contract is None else contract.max_age + ECHO_ROOM
+        settings = {"downlink": downlink, "echo_age": age, "on_unproved": "ignore"}
+        certificate = Certificate.load(self.certificate)
+        return SafeLoop(certificate, env.plant, uplink, self.mode, self.horizon, **settings)
+
+
+def network_channels(env: NCSEnv) -> tuple[Channel, Channel]:
+    """Returns uplink and downlink of an environment as a real network has them: what is sent now arrives a step later.
+
+    Without a downlink of its own it has one like its uplink.
+    """
+    up = env.channel
+    down = env.downlink or Channel(loss=up.loss, jitter=up.jitter, max_consecutive_losses=up.max_consecutive_losses)
+    if down.most_consecutive_losses is None:  # nothing can be committed ahead without a promise
+        down = Channel(loss=down.loss, delay=down.delay, jitter=down.jitter, max_consecutive_losses=2)
+
+    def late(channel: Channel) -> Channel:
+        settings = {name: getattr(channel, name) for name in ("loss", "quantization_step", "jitter")}
+        return Channel(**settings, delay=max(channel.delay, 1), max_consecutive_losses=channel.max_consecutive_losses)
+
+    return late(up), late(down)
+
+
+def run_plant(loop: NetworkLoop) -> None:
+    """Simulates the plant in real time, until the process is ended."""
+    asyncio.run(_plant(loop, _told_to_stop()))
+
+
+def run_network(loop: NetworkLoop) -> None:
+    """Does to the datagrams what networks do, until the process is ended."""
+    asyncio.run(_network(loop, _told_to_stop()))
+
+
+def run_controller_node(
+    loop: NetworkLoop, known: bool = True, show: Callable[[dict[str, Any]], None] | None = None
+) -> None:
+    """Runs the controller in real time, until it has made its steps or the process is ended."""
+    asyncio.run(_controller(loop, known, show, _told_to_stop()))
+
+
+def _told_to_stop() -> Callable[[], bool]:
+    """Returns whether SIGTERM or SIGINT has come; a process has no pauses for garbage from now on."""
+    told: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda number, frame: told.append(number))
+    gc.collect()
+    gc.freeze()
+    return lambda: bool(told)
+
+
+async def _plant(loop: NetworkLoop, is_over: Callable[[], bool]) -> None:
+    env = registered_env(loop.env)
+    plant, rng = env.plant, np.random.default_rng([loop.seed, 1])
+    certificate = Certificate.load(loop.certificate)
+    linear = plant.remainder is None
+    disturbance = AdversarialDisturbance(certificate.M) if linear else env.disturbance
+    simulation = PlantSimulation(plant, disturbance, False, process=env.process)
+    wire, clock = Wire(plant, loop.lead, loop.key), StepClock(loop.dt(env))
+    sensor = SensorNode(wire, await UdpTransport.open(peer=loop.sensor), clock)
+    actuator = Actuator(loop.lead, plant.m, plant.u_max)
+    node = ActuatorNode(wire, await UdpTransport.open(peer=loop.actuator), clock, actuator)
+    names = [*(f"x_{name}" for name in plant.state_names), *(f"u_{name}" for name in plant.input_names)]
+    log = StepLog(loop.out, "plant", ["time", "episode", "step", *names, "missing", "outside", "drift"])
+    start, episode, last, released = np.zeros(plant.n), 0, 0, False
+    state, memory = start, simulation.begin(rng)
+
+    def act(step: int) -> None:
+        nonlocal state, episode, last, memory, released
+        if clock.episode != episode:
+            episode, last = clock.episode, step - 1
+        released |= episode != 0 and step >= 0
+        controlled, outside = sensor.episode != 0 and step >= 0, bool((plant.constraint_values(state) > 0.0).any())
+        if not released or (outside and not controlled):
+            # It is held at the start before the first episode, and again where it left the box without a controller.
+            state, memory, last = simulation.start(rng, start, None)[0], simulation.begin(rng), step - 1
+        for each in range(last + 1, step + 1):  # what is simulated here was not late
+            sensor.send(each, loop.uplink.quantize(simulation.measure(rng, state)))
+            u = node.apply(each)
+            if released:
+                outside = bool((plant.constraint_values(state) > 0.0).any())
+                row = [f"{time.time():.6f}", episode, each, *state.tolist(), *u.tolist(), actuator.echo.missing]
+                log.write([*row, int(outside), f"{clock.drift:.2e}"])
+                state = simulation.advance(rng, state, u, each, memory)
+        last = step
+
+    await run_plant_side([sensor, node], act, is_over)
+    log.close()
+
+
+async def _network(loop: NetworkLoop, is_over: Callable[[], bool]) -> None:
+    env = registered_env(loop.env)
+
+    def one_way(channel: Channel, number: int) -> Impairment:
+        rng = np.random.default_rng([loop.seed, 2, number])
+        return Impairment(channel, loop.dt(env), rng, loop.mischief, loop.until_worst)
+
+    ways = [one_way(channel, i) for i, channel in enumerate((loop.uplink, loop.downlink, loop.uplink, loop.downlink))]
+    await open_line(loop.sensor, loop.controller, *ways[:2])
+    await open_line(loop.actuator, loop.controller, *ways[2:])
+    while not is_over():
+        await asyncio.sleep(0.05)
+
+
+async def _controller(
+    loop: NetworkLoop, known: bool, show: Callable[[dict[str, Any]], None] | None, is_over: Callable[[], bool]
+) -> None:
+    env = registered_env(loop.env)
+    plant, wire = env.plant, Wire(env.plant, loop.lead, loop.key)
+    transport = await UdpTransport.open(local=loop.listen)
+    node = ControllerNode(loop.safe_loop(env), wire, transport, StepClock(loop.dt(env)), np.zeros(plant.n), known=known)
+    inputs = plant.input_names
+    columns = ["time", "episode", "step", "guaranteed", "reason", *(f"x_hat_{name}" for name in plant.state_names)]
+    columns += [*(f"proposed_{name}" for name in inputs), *(f"u_{name}" for name in inputs)]
+    columns += ["intervened", "margin", "age", "arrived", "missing", "skipped", "refused", "microseconds"]
+    log = StepLog(loop.out, "controller", columns)
+    packets = StepLog(loop.out, "packets", ["episode", "sent", "received"])
+    propose = controller_named(loop.policy, loop.env, env, loop.seed)
+    steps = unproved = 0
+
+    def on_step(node: ControllerNode, proposed: Any) -> None:
+        nonlocal steps, unproved
+        safe, decision = node.loop, node.decision
+        estimate = safe.estimate.tolist()
+        values = [None] * plant.m if proposed is None else np.asarray(proposed, dtype=np.float64).tolist()
+        row = [f"{time.time():.6f}", node.episode, safe.steps, int(safe.guaranteed), safe.reason, *estimate, *values]
+        row += [*decision.input.tolist(), int(decision.intervened), float(decision.margin), safe.measurement_age]
+        took = node.clock.time_of(safe.steps), asyncio.get_running_loop().time()
+        row += [" ".join(map(str, node.arrived)), node.missing, node.skipped, node.refused.total()]
+        log.write([*row, round(1e6 * (took[1] - took[0]))])
+        for stamp in node.arrived:
+            packets.write([node.episode, stamp, safe.steps])
+        if show is not None:
+            show(dict(zip(columns, row, strict=False)))
+        steps, unproved = steps + 1, 0 if safe.guaranteed else unproved + 1
+        if unproved == RENEWED:
+            node.begin(safe.estimate, known=False)
+            unproved = 0
+
+    def has_ended() -> bool:
+        return is_over() or (loop.steps is not None and steps >= loop.steps)
+
+    await run_controller(node, propose, on_step, has_ended)
+    log.close()
+    packets.close()
+
+
+def controller_named(name: str, env_id: str, env: NCSEnv, seed: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Returns a controller, estimate -> input: "push", or a policy of `policy_by_name` with the task's own entries.
+
+    Raises:
+        AgentError: If there is no agent for this environment.
+        ValueError: If the folder of a run holds several agents.
+    """
+    plant = env.plant
+    if name == "push":
+        count = 0
+
+        def push(estimate: np.ndarray) -> np.ndarray:
+            nonlocal count
+            count += 1
+            return plant.u_max * (1.0 if (count - 1) // PUSH % 2 == 0 else -1.0)
+
+        return push
+    policy, rng, task = policy_by_name(name, env_id, env, seed), np.random.default_rng([seed, 3]), env.task
+    goal = task.begin(rng, plant)
+    low, high = env.observation_space.low, env.observation_space.high  # pyright: ignore[reportAttributeAccessIssue]
+
+    def propose(estimate: np.ndarray) -> np.ndarray:
+        nonlocal goal
+        observation = np.clip(np.concatenate([estimate, task.observe(goal)]), low, high).astype(np.float32)
+        u = plant.u_max * np.asarray(policy(observation, {"estimate": estimate}), dtype=np.float64)
+        goal = task.advance(rng, plant, goal, u)
+        return u
+
+    return propose

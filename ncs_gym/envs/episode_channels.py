@@ -1,0 +1,195 @@
+"""Which channel each environment has in its present episode: its own, another one, or one that is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import VectorWrapper
+
+from ncs_gym.network.channel import Channel
+from ncs_gym.network.downlink import DownlinkProtocol, require_fitting_downlink
+from ncs_gym.validation import shown
+
+# A channel, or what draws one at the start of every episode.
+ChannelSource = Channel | Callable[[np.random.Generator], Channel]
+
+
+class EpisodeChannels:
+    """The channels of N environments in their present episodes, in one direction.
+
+    Args:
+        own: The channels that the environments were made with; None for an ideal one.
+        require_fitting: Raises ValueError for a channel that the environments cannot have.
+
+    Attributes:
+        now: Those of the present episodes.
+        is_plain: Whether all have the same one, and will have it in the next episode, too.
+    """
+
+    def __init__(self, own: Sequence[Channel | None], require_fitting: Callable[[Channel], None]) -> None:
+        self._own, self._require_fitting = list(own), require_fitting
+        for each in {channel for channel in own if channel is not None}:
+            require_fitting(each)
+        self._sources: list[Any] = self._own
+        self.now: list[Any] = list(own)
+        self._is_uniform = len(set(own)) == 1
+        self.is_plain = self._is_uniform
+
+    def read(self, option: Any, name: str) -> list[Any]:
+        """Returns the sources that an option of `reset` names, one for each environment.
+
+        Args:
+            option: None for the environments' own; a channel, or what draws one, for all; or N of these.
+            name: What the error message calls it.
+
+        Raises:
+            ValueError: If it is none of these, or a channel that the environments cannot have.
+        """
+        count = len(self._own)
+        if option is None:
+            return self._own
+        each = [option] * count if isinstance(option, Channel) or callable(option) else option
+        if not isinstance(each, (list, tuple)) or len(each) != count:
+            several = "" if count == 1 else f", or a list of {count} of these"
+            raise ValueError(f"{name} must be a Channel or a function (rng) -> Channel{several}, got {shown(option)}")
+        for channel in {id(channel): channel for channel in each if not callable(channel)}.values():
+            if channel is not None:
+                self._checked(channel, name)
+        return [own if given is None else given for given, own in zip(each, self._own, strict=True)]
+
+    def give(self, sources: list[Any], chosen: Sequence[int] | None = None) -> None:
+        """Takes what `read` returned for some environments, given by their indices; for all by default."""
+        if chosen is None or len(chosen) == len(self._own):
+            self._sources = sources
+            self.is_plain = self._is_uniform and sources is self._own
+            self.now = list(self._own)
+        elif sources is not self._own or not self.is_plain:
+            self._sources, self.is_plain = list(self._sources), False
+            for e in chosen:
+                self._sources[e] = sources[e]
+
+    def begin(self, rng: np.random.Generator, chosen: np.ndarray | None = None) -> list[Any] | None:
+        """Draws the channels of episodes that begin where a mask (N,) says so; all by default.
+
+        Returns:
+            Those of all environments; None if all have the same one, as before.
+
+        Raises:
+            ValueError: If what was drawn is no channel that the environments can have.
+        """
+        if self.is_plain:
+            return None
+        indices = range(len(self.now)) if chosen is None else np.flatnonzero(chosen).tolist()
+        for e in indices:
+            source = self._sources[e]
+            self.now[e] = self._checked(source(rng), "what was drawn") if callable(source) else source
+        return self.now
+
+    def _checked(self, channel: Any, name: str) -> Channel:
+        if not isinstance(channel, Channel):
+            raise ValueError(f"{name} must be a Channel, got {shown(channel)}")
+        self._require_fitting(channel)
+        return channel
+
+
+def uplinks(own: Sequence[Channel], declared: Channel) -> EpisodeChannels:
+    """Returns the channels between sensors and controllers, none of which may round more coarsely than declared."""
+    return EpisodeChannels(own, partial(_require_fine, declared.quantization_step))
+
+
+def downlinks(own: Sequence[Channel | None], protocol: DownlinkProtocol | None) -> EpisodeChannels:
+    """Returns the channels between controllers and actuators, which keep the c steps of a protocol."""
+    return EpisodeChannels(own, partial(require_fitting_downlink, protocol))
+
+
+def covering(channels: Sequence[Channel], declared: Channel) -> Channel:
+    """Returns a channel with the delays of all, and the quantization step that environments were made for."""
+    shortest = min(channel.delay for channel in channels)
+    longest = max(channel.longest_delay for channel in channels)
+    return Channel(quantization_step=declared.quantization_step, delay=shortest, jitter=longest - shortest)
+
+
+class RandomChannel(gym.Wrapper, RecordConstructorArgs):
+    """Draws a channel at the start of every episode (domain randomization over networks).
+
+    The draws come from the environment's own `np_random`, so that a seed determines them. A shield may stand inside or
+    outside. What the environment was made for bounds what may be drawn; see `NCSEnv.reset`.
+
+    Args:
+        env: An `NCSEnv`, possibly wrapped.
+        channel: A function (rng) -> Channel, or a list of channels of which each is equally likely; None for the
+            environment's own.
+        downlink: The same for the commands.
+
+    Raises:
+        ValueError: If neither is given, or it is none of these.
+    """
+
+    def __init__(self, env: gym.Env, channel: Any = None, downlink: Any = None) -> None:
+        RecordConstructorArgs.__init__(self, channel=channel, downlink=downlink)
+        gym.Wrapper.__init__(self, env)
+        self._drawn = _drawn(channel, downlink)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Starts an episode; a channel among the options takes the place of a drawn one."""
+        return self.env.reset(seed=seed, options=self._drawn | (options or {}))
+
+
+class VectorRandomChannel(VectorWrapper, RecordConstructorArgs):
+    """`RandomChannel` for an `NCSVectorEnv`: one is drawn for every episode of every one, in any autoreset mode.
+
+    Args:
+        env: An `NCSVectorEnv`, possibly wrapped.
+        channel: See `RandomChannel`.
+        downlink: See `RandomChannel`.
+
+    Raises:
+        ValueError: See `RandomChannel`.
+    """
+
+    def __init__(self, env: Any, channel: Any = None, downlink: Any = None) -> None:
+        RecordConstructorArgs.__init__(self, channel=channel, downlink=downlink)
+        VectorWrapper.__init__(self, env)
+        self._drawn = _drawn(channel, downlink)
+
+    def reset(
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Starts episodes; channels among the options take the place of drawn ones."""
+        # gymnasium's annotation leaves out the lists that its own vector environments take.
+        return self.env.reset(seed=seed, options=self._drawn | (options or {}))  # pyright: ignore[reportArgumentType]
+
+
+def _drawn(channel: Any, downlink: Any) -> dict[str, Callable[[np.random.Generator], Any]]:
+    """Returns the options of `reset` that draw channels."""
+    given = {name: each for name, each in {"channel": channel, "downlink": downlink}.items() if each is not None}
+    if not given:
+        raise ValueError("give channel or downlink: a function (rng) -> Channel, or a list of channels")
+    return {name: _draw(each, name) for name, each in given.items()}
+
+
+def _draw(source: Any, name: str) -> Callable[[np.random.Generator], Any]:
+    if callable(source):
+        return source
+    choices = tuple(source) if isinstance(source, (list, tuple)) else ()
+    if not choices or not all(isinstance(each, Channel) for each in choices):
+        raise ValueError(f"{name} must be a function (rng) -> Channel or a list of channels, got {shown(source)}")
+    return partial(_chosen, choices)
+
+
+def _chosen(choices: tuple[Channel, ...], rng: np.random.Generator) -> Channel:
+    return choices[int(rng.integers(len(choices)))]
+
+
+def _require_fine(coarsest: float, channel: Channel) -> None:
+    """Raises ValueError if a channel rounds more coarsely than an environment was made for."""
+    if channel.quantization_step > coarsest:
+        raise ValueError(
+            f"the channel rounds to {channel.quantization_step}, the environment was made for no more than "
+            f"{coarsest}: make it with the coarsest of its channels"
+        )

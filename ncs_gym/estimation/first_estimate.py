@@ -1,0 +1,78 @@
+"""A first estimate from samples alone, where nothing else is known of the state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ncs_gym.estimation.error_bound import ErrorSet
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.uncertainty.shape_matrices import outer_sum
+
+# Room for the rounding of sums of a few dozen terms; directions that samples tell apart less are not told apart.
+ROUNDING, LEAST_SHARE = 1e-9, 1e-9
+
+
+def first_estimate(
+    plant: LinearPlant,
+    error_set: ErrorSet,
+    samples: Mapping[int, np.ndarray],
+    inputs: Sequence[np.ndarray],
+    sensor_error: np.ndarray,
+) -> tuple[np.ndarray, int] | None:
+    """Returns x_hat now, shape (n,), and the age of the newest sample, if samples prove that its error is certified.
+
+    With z the state at the oldest sample, w steps ago, every sample is y_a = H x_a + v_a, and x_a = A^(w-a) z plus what
+    inputs and disturbances since then add. Weighted least squares give z, and the inputs x_hat. Its error is a sum of
+    independent terms M d of every disturbance and T v of every sample, so that it lies in an ellipsoid around the sum
+    of all E(M D M') and E(T N T') (theory.md section 1). Where that lies inside the certified set of its age, the
+    estimate is as good as one that was always followed. The fewest newest samples that prove it are taken.
+
+    Args:
+        plant: The plant, without a remainder: its bound would need to be known to hold for the states that are sought.
+        error_set: The certified sets.
+        samples: By age [steps], each of shape (p,).
+        inputs: What was applied one step ago, two steps ago and so on, at least as far back as the oldest sample, (m,).
+        sensor_error: N, shape (p, p).
+
+    Returns:
+        None if nothing is proved.
+    """
+    ages = sorted(samples)
+    certified = error_set.shape_at(ages[0]) if ages and plant.remainder is None else None
+    if certified is None:
+        return None
+    size = np.sqrt(np.diag(certified))
+    for count in range(1, len(ages) + 1):
+        estimate, shape = _least_squares(plant, {age: samples[age] for age in ages[:count]}, inputs, sensor_error)
+        rest = (certified - (1.0 + ROUNDING) * shape) / np.outer(size, size)
+        if np.isfinite(estimate).all() and np.isfinite(rest).all() and np.linalg.eigvalsh(rest)[0] > ROUNDING:
+            return estimate, ages[0]
+    return None
+
+
+def _least_squares(
+    plant: LinearPlant, samples: Mapping[int, np.ndarray], inputs: Sequence[np.ndarray], N: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns x_hat, (n,), and the shape (n, n) of an ellipsoid around its error; NaN where it is not observed."""
+    A, B, H, D, n, w = plant.A, plant.B, plant.H, plant.disturbance.shape_matrix, plant.n, max(samples)
+    powers, moved = [np.eye(n)], [np.zeros(n)]  # A^i, and what the inputs alone add in the first i steps
+    for age in range(w, 0, -1):
+        powers.append(A @ powers[-1])
+        moved.append(A @ moved[-1] + B @ inputs[age - 1])
+    outputs = np.sqrt(np.diag(H @ np.diag(plant.half_widths**2) @ H.T))
+    weights = 1.0 / np.maximum(np.sqrt(np.diag(N)), LEAST_SHARE * outputs)
+    regressors = np.vstack([weights[:, None] * (H @ powers[w - age]) for age in samples]) * plant.half_widths
+    if np.linalg.matrix_rank(regressors / np.abs(regressors).max(), LEAST_SHARE) < n:
+        return np.full(n, np.nan), np.full((n, n), np.nan)
+    parts = np.hsplit(powers[w] @ (plant.half_widths[:, None] * np.linalg.pinv(regressors)), len(samples))
+    gains = {age: part * weights for age, part in zip(samples, parts, strict=True)}
+    estimate, shape = moved[w], np.zeros((n, n))
+    for age, T in gains.items():
+        estimate = estimate + T @ (samples[age] - H @ moved[w - age])
+        shape = outer_sum(shape, T @ N @ T.T, plant.weight)
+    for left in range(w):  # steps that are left after the one in which a disturbance acted
+        M = sum((T @ H @ powers[left - age] for age, T in gains.items() if age <= left), -powers[left])
+        shape = outer_sum(shape, M @ D @ M.T, plant.weight)
+    return estimate, shape

@@ -1,0 +1,366 @@
+"""Sensor, actuator and controller of a control loop, each a node of its own that talks in datagrams.
+
+A node acts at its steps only: it takes what arrived since the last one, moves, and sends. What comes too late for a
+step is used at a later one or not at all, exactly as if the network had delayed or lost it (docs/network_loop.md).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from collections import Counter
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from ncs_gym import Actuator, Command, Echo, Packet
+from ncs_gym.network.wire import Kind, Message, Wire, WireError
+from shields.nodes.step_clock import StepClock
+from shields.nodes.transport import Datagram, Transport
+from shields.runtime.decisions import Decision
+from shields.runtime.safe_loop import SafeLoop
+
+# Steps without a message of its episode after which a node may be taken over by another one.
+PATIENCE = 10
+# Steps by which samples and echoes may be early; beyond it their stamps are not plausible.
+EARLIEST = 16
+# Steps that a controller makes up for at once after it was held up; more of them end the episode.
+MOST_SKIPPED = 1000
+NO_EPISODE = 0
+# Steps for which all nodes hear of an episode before it starts: stamps in datagrams are counted from their beginning.
+PRELUDE = 25
+# What begins within this part of a step begins now.
+EARLY = 0.1
+
+
+class _PlantNode:
+    """What sensor and actuator have in common: they join the episodes of a controller, and follow its clock.
+
+    A node that belongs to no episode says so at every step, with a challenge that it draws when it is made and whenever
+    it joins. It joins the episode of the message that answers this challenge, so that what was recorded in earlier
+    episodes moves nothing. It leaves an episode when it has heard nothing of it for `PATIENCE` steps.
+
+    Attributes:
+        episode: Number of the episode, drawn by the controller; 0 for none.
+        refused: How many datagrams were refused, by reason.
+    """
+
+    _hears: tuple[Kind, ...]
+
+    def __init__(self, wire: Wire, transport: Transport, clock: StepClock) -> None:
+        self.wire, self.transport, self.clock = wire, transport, clock
+        self.episode, self._challenge, self._heard_at = NO_EPISODE, _drawn(), 0.0
+        self.refused: Counter[str] = Counter()
+
+    def listen(self, now: float) -> None:
+        """Takes in what arrived since the last step."""
+        for time, data, _ in self.transport.received():
+            message = _decoded(self.wire, data, self._hears, self.refused)
+            if message is None:
+                continue
+            if message.episode != self.episode:
+                if self.episode != NO_EPISODE or message.challenge != self._challenge:
+                    self.refused["episode"] += 1
+                    continue
+                self._join(message, time)
+            self._heard_at = time
+            self.clock.follow(message.stamp - PRELUDE, time)
+            self._use(message)
+        if now - self._heard_at > PATIENCE * self.clock.dt:
+            self.episode = NO_EPISODE
+
+    def _join(self, message: Message, time: float) -> None:
+        """Begins to belong to an episode, at the step of the message."""
+        self.episode, self._challenge = message.episode, _drawn()
+        self.clock.join(message.episode, time, message.stamp - PRELUDE)
+
+    def _use(self, message: Message) -> None:
+        """Uses a message of the episode."""
+
+    def _send(self, kind: Kind, step: int, **fields: Any) -> None:
+        stamp = step + PRELUDE if self.episode != NO_EPISODE else 0
+        common = {"kind": kind, "episode": self.episode, "stamp": stamp, "challenge": self._challenge}
+        self.transport.send(self.wire.encode(Message(**common, **fields)))
+
+
+class SensorNode(_PlantNode):
+    """Samples the plant at every step and sends what it measures.
+
+    Args:
+        wire: Encodes and decodes.
+        transport: Leads to the controller.
+        clock: Its clock; an actuator on the same board may have the same one.
+    """
+
+    _hears = (Kind.BEACON,)
+
+    def send(self, step: int, measurement: np.ndarray) -> None:
+        """Sends the sample of a step, shape (p,), taken before the input of that step acts.
+
+        Steps before the start of the episode are below 0; samples of theirs say that the sensor is there.
+        """
+        self._send(Kind.SAMPLE, step, values=measurement)
+
+
+class ActuatorNode(_PlantNode):
+    """Applies what is committed for each step, zero if nothing is, and sends an echo of what it applied.
+
+    Args:
+        wire: Encodes and decodes.
+        transport: Leads to the controller.
+        clock: Its clock.
+        actuator: Holds what is committed; give it the limits of the inputs.
+    """
+
+    _hears = (Kind.COMMAND, Kind.BEACON)
+
+    def __init__(self, wire: Wire, transport: Transport, clock: StepClock, actuator: Actuator) -> None:
+        super().__init__(wire, transport, clock)
+        self.actuator = actuator
+
+    def apply(self, step: int) -> np.ndarray:
+        """Returns the input to apply from the beginning of a step until the next one, shape (m,): zero below step 0.
+
+        Steps that were left out since the last call were not applied: the echo says so.
+        """
+        idle = self.episode == NO_EPISODE or step < 0
+        u = np.zeros(self.actuator.inputs) if idle else self.actuator.apply(step)
+        steps, missing, digest, _ = self.actuator.echo
+        self._send(Kind.ECHO, steps, missing=missing, digest=digest)
+        return u
+
+    def _join(self, message: Message, time: float) -> None:
+        super()._join(message, time)
+        self.actuator.start()
+
+    def _use(self, message: Message) -> None:
+        if message.kind is Kind.COMMAND and message.values is not None:
+            self.actuator.receive([Command(message.stamp - PRELUDE, message.values)])
+
+
+class _Peer:
+    """What a controller knows of a sensor or an actuator."""
+
+    def __init__(self) -> None:
+        self.address: Any = None
+        self.challenge, self.newest, self.heard_at = 0, -1, 0.0
+
+
+class ControllerNode:
+    """Runs a `SafeLoop` behind a downlink at every step, and numbers the steps of all.
+
+    It waits until sensor and actuator are there and belong to no episode, draws a number, tells it to both for
+    `PRELUDE` steps, and then starts the loop at step 0. A
+    sensor or an actuator that is restarted joins the episode again: samples that are missing meanwhile are lost, inputs
+    that are missing end the guarantee, because echoes tell. A controller that is restarted begins another episode.
+
+    Args:
+        loop: With a downlink, and with `echo_age`.
+        wire: Encodes and decodes.
+        transport: Where sensor and actuator are heard.
+        clock: Its clock, which the others follow.
+        x_hat0: First estimate, shape (n,).
+        known: Whether its error is known to lie in `plant.initial_error`; after a restart it is not (`SafeLoop.start`).
+
+    Attributes:
+        episode: Number drawn for this episode; 0 while it waits.
+        skipped: How many steps of this episode were decided too late, by the certified fallback.
+        arrived: Stamps of the samples that were taken in at this step.
+        missing: How many inputs of this episode the actuator says were missing.
+        refused: How many datagrams were refused, by reason.
+        decision: The last one.
+
+    Raises:
+        ValueError: If the loop has no downlink or no echoes.
+    """
+
+    def __init__(
+        self, loop: SafeLoop, wire: Wire, transport: Transport, clock: StepClock, x_hat0: Any, *, known: bool
+    ) -> None:
+        if loop.lead == 0 or loop.echo_age is None:
+            raise ValueError("commands that go over a network need SafeLoop(..., downlink=Channel(...), echo_age=...)")
+        self.loop, self.wire, self.transport, self.clock = loop, wire, transport, clock
+        self.refused: Counter[str] = Counter()
+        self.decision: Decision
+        self.begin(x_hat0, known=known)
+
+    def begin(self, x_hat0: Any, *, known: bool) -> None:
+        """Ends the episode; the next one begins when the others have noticed, after `PATIENCE` steps of silence."""
+        self.episode, self._first = NO_EPISODE, (x_hat0, known)
+        self._peers = {Kind.SAMPLE: _Peer(), Kind.ECHO: _Peer()}
+        self._waiting: list[Packet | Echo] = []
+        self.arrived: list[int] = []
+        self.skipped, self.missing, self._is_started = 0, 0, False
+        self.step = -PRELUDE
+
+    def receive(self, now: float) -> np.ndarray | None:
+        """Returns the estimate at the step that begins now, shape (n,), or None while it waits for the others.
+
+        Steps that were left out are made up for by the certified fallback: it is too late for anything else.
+        """
+        for datagram in self.transport.received():
+            message = _decoded(self.wire, datagram.data, tuple(self._peers), self.refused)
+            if message is not None:
+                self._hear(message, datagram)
+        if self.episode == NO_EPISODE:
+            if not all(peer.challenge for peer in self._peers.values()):
+                return None
+            self.episode = _drawn()
+            self.clock.start(now, -PRELUDE)
+        step = self.clock.step_at(now + EARLY * self.clock.dt)
+        if step < 0:
+            for heard in self._peers:
+                self._answer(heard, Kind.BEACON, step)
+            self.step = step + 1
+            return None
+        if self.step <= 0 and not self._is_started:
+            x_hat0, known = self._first
+            self.loop.start(x_hat0, known=known)
+            self.step, self._is_started = 0, True
+        late = step - self.step
+        if late > MOST_SKIPPED:
+            self.begin(self.loop.estimate, known=False)
+            return None
+        for _ in range(late):
+            self.loop.step(None)
+            self.step += 1
+            self.skipped += 1
+        due = [each for each in self._waiting if _stamp(each) <= self.step]
+        self._waiting = [each for each in self._waiting if _stamp(each) > self.step]
+        packets = [each for each in due if isinstance(each, Packet)]
+        echoes = [each for each in due if isinstance(each, Echo)]
+        self.arrived = [packet.stamp for packet in packets]
+        self.missing = max([self.missing, *(echo.missing for echo in echoes)])
+        return self.loop.receive(packets, echoes=echoes)
+
+    def decide(self, proposed: Any) -> Decision:
+        """Decides at this step, whatever is proposed, and sends command and beacon."""
+        self.decision = self.loop.decide(proposed)
+        command = self.loop.command()
+        self._answer(Kind.ECHO, Kind.COMMAND, self.step, command.inputs)
+        self._answer(Kind.SAMPLE, Kind.BEACON, self.step)
+        self.step += 1
+        return self.decision
+
+    def _answer(self, heard: Kind, kind: Kind, step: int, values: np.ndarray | None = None) -> None:
+        peer = self._peers[heard]
+        fields = {"episode": self.episode, "stamp": step + PRELUDE, "challenge": peer.challenge, "values": values}
+        self.transport.send(self.wire.encode(Message(kind=kind, **fields)), peer.address)
+
+    def _hear(self, message: Message, datagram: Datagram) -> None:
+        """Takes in a message, and where its sender is."""
+        peer, time = self._peers[message.kind], datagram.time
+        if message.episode == NO_EPISODE:  # a node that waits, or was restarted
+            if self.episode == NO_EPISODE or time - peer.heard_at > PATIENCE * self.clock.dt:
+                peer.address, peer.challenge = datagram.sender, message.challenge
+            return
+        if message.episode != self.episode:
+            self.refused["episode"] += 1
+            if self.episode == NO_EPISODE:
+                peer.challenge = 0  # it still belongs to another one
+            return
+        step = message.stamp - PRELUDE
+        if step > self.step + EARLIEST:
+            self.refused["ahead"] += 1
+            return
+        if message.stamp > peer.newest:
+            peer.address, peer.challenge, peer.newest = datagram.sender, message.challenge, message.stamp
+            peer.heard_at = time
+        if step < 0:
+            return
+        if message.kind is Kind.SAMPLE:
+            assert message.values is not None
+            self._waiting.append(Packet(step, message.values, self.loop.episode))
+        else:
+            self._waiting.append(Echo(step, message.missing, message.digest, self.loop.episode))
+
+
+async def run_plant_side(
+    nodes: Sequence[_PlantNode], act: Callable[[int], Any], is_over: Callable[[], bool] = lambda: False
+) -> None:
+    """Runs a sensor, an actuator, or both on one board, in real time.
+
+    Args:
+        nodes: Nodes with a common clock.
+        act: Called at the beginning of every step with its number: reads the sensor, applies the input. Numbers begin
+            anew with each episode, below 0 before it starts, and steps that were missed are left out.
+        is_over: Asked after each step.
+    """
+    loop, clock = asyncio.get_running_loop(), nodes[0].clock
+    clock.start(loop.time())
+    episode, last = NO_EPISODE, 0  # without an episode it only counts
+    while not is_over():
+        await asyncio.sleep(max(clock.time_of(last + 1) - loop.time(), 0.0))
+        now = loop.time()
+        for node in nodes:
+            node.listen(now)
+        step = clock.step_at(now + EARLY * clock.dt)
+        if clock.episode != episode:  # in the middle of a step of another count
+            episode, last = clock.episode, step
+        elif step > last:
+            last = step
+            act(step)
+
+
+async def run_controller(
+    node: ControllerNode,
+    controller: Callable[[np.ndarray], Any],
+    on_step: Callable[[ControllerNode, Any], None] = lambda node, proposed: None,
+    is_over: Callable[[], bool] = lambda: False,
+    budget: float | None = None,
+) -> None:
+    """Runs a controller in real time.
+
+    The controller is called in a thread of its own. What it has not proposed within its budget is not waited for: the
+    certified fallback is applied, in time, and the next call comes when it has returned.
+
+    Args:
+        node: The node.
+        controller: Proposes an input given an estimate, shape (n,).
+        on_step: Called after each decision with the node and what was proposed, to write a log.
+        is_over: Asked after each step.
+        budget: How long the controller may take [s]; half a step by default.
+    """
+    loop, clock = asyncio.get_running_loop(), node.clock
+    budget = 0.5 * clock.dt if budget is None else budget
+    clock.start(loop.time())
+    running: asyncio.Future[Any] | None = None
+    thread = ThreadPoolExecutor(1, "controller")
+    while not is_over():
+        step = node.step if node.episode != NO_EPISODE else clock.step_at(loop.time()) + 1
+        await asyncio.sleep(max(clock.time_of(step) - loop.time(), 0.0))
+        estimate = node.receive(loop.time())
+        if estimate is None:
+            continue
+        proposed = None
+        if running is None or running.done():
+            running = loop.run_in_executor(thread, controller, estimate)
+            await asyncio.wait([running], timeout=budget)
+            proposed = running.result() if running.done() and running.exception() is None else None
+        node.decide(proposed)
+        on_step(node, proposed)
+    thread.shutdown(wait=False)
+
+
+def _decoded(wire: Wire, data: bytes, kinds: Sequence[Kind], refused: Counter[str]) -> Message | None:
+    """Returns a message of one of the kinds; None, counted by reason, for anything else."""
+    try:
+        message = wire.decode(data)
+    except WireError as error:
+        refused[error.reason] += 1
+        return None
+    if message.kind in kinds:
+        return message
+    refused["kind"] += 1
+    return None
+
+
+def _stamp(early: Packet | Echo) -> int:
+    return early.stamp if isinstance(early, Packet) else early.steps
+
+
+def _drawn() -> int:
+    """Returns a random number other than 0."""
+    return secrets.randbelow(2**63 - 1) + 1

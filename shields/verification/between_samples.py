@@ -1,0 +1,143 @@
+"""The box between sampling instants (docs/shield_proof.md, "Between the samples"), decided in rational arithmetic."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from fractions import Fraction
+
+import numpy as np
+
+from ncs_gym import LinearPlant
+from shields.certificate import Certificate
+from shields.verification.conditions import Condition, flag, scalar_condition
+from shields.verification.polytope_conditions import ACTION_ROUNDING, half_widths, reach, root_above
+from shields.verification.rational_matrix import Matrix, add, congruence, multiply, quadratic, rational, scale
+
+# A series ends where what is left of it is below this, next to what a row reaches; one that is longer is not summed.
+_SMALLEST_TAIL, _MOST_TERMS = Fraction(1, 2**100), 1000
+
+
+def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
+    """Checks the claim of a certificate about times between samples; nothing where neither it nor the plant has one.
+
+    (G): between the points of the plant's grid nothing is larger than at them by more than eta, which also covers that
+    the rows of the grid are rounded. (B) on S and (PB) on the polytope: with u = K x_hat, |c x| stays so far below 1 at
+    every point of the grid.
+    """
+    rows, model, points = plant.grid_rows, plant.continuous_model, plant.between_samples
+    if certificate.between_samples is None and points is None:
+        return
+    claimed = certificate.between_samples == points and rows is not None and model is not None
+    yield flag("between samples: the certificate has the plant's grid", claimed)
+    if rows is None or model is None or points is None or not claimed:
+        return
+    (k, n), m = plant.box_rows.shape, plant.m
+    fits = rows.state.shape == (points, k, n) and rows.input.shape == (points, k, m) and model.shape == (n, n + m)
+    fits = fits and rows.remainder.shape == (k,) and bool(np.isfinite(rows.remainder).all())
+    fits = fits and bool((rows.state[0] == plant.box_rows).all()) and not rows.input[0].any()
+    yield flag("between samples: the grid has all its points and begins with the safe box", fits)
+    widths = half_widths(rational(plant.box_rows))
+    yield flag("between samples: the box bounds every state", widths is not None)
+    if not fits or widths is None:
+        return
+    sizes = widths + [Fraction(float(limit)) for limit in plant.u_max]
+    G, eta = rational(np.concatenate([model, np.zeros((m, n + m))])), rational(rows.remainder)[0]
+    sampled = multiply(rational(plant.box_rows), rational(np.concatenate([plant.A, plant.B], axis=1)))
+    for j, box_row in enumerate(rational(plant.box_rows)):
+        grid = [*rational(np.concatenate([rows.state[:, j], rows.input[:, j]], axis=1)), sampled[j]]
+        least = _remainder(box_row + [Fraction(0)] * m, grid, G, sizes, Fraction(plant.dt))
+        left = Fraction(-1) if least is None else eta[j] - least
+        yield scalar_condition(f"(G) what is between grid points is at most eta of row {j + 1}", left)
+    yield from _closed_loop_conditions(certificate, plant, widths)
+
+
+def _closed_loop_conditions(
+    certificate: Certificate, plant: LinearPlant, widths: list[Fraction]
+) -> Iterator[Condition]:
+    """Checks (B), and (PB) if there is a polytope: with u = K x_hat every point of the grid is inside."""
+    rows, polytope, k = plant.grid_rows, certificate.polytope, len(plant.box_rows)
+    assert rows is not None
+    L, K, D = rational(certificate.L), rational(certificate.K), rational(certificate.disturbances()[0])
+    errors = [congruence(K, rational(proof.Sigma)) for proof in certificate.proofs]
+    limits, faces = [Fraction(float(limit)) for limit in plant.u_max], None if polytope is None else polytope.rows
+    G = None if faces is None else rational(faces)
+    for j, row in enumerate(rational(plant.box_rows)):
+        allowed = 1 - Fraction(float(rows.remainder[j])) - root_above(quadratic([row], D))
+        for i in range(len(rows.state)):
+            pushed = rational(rows.input[i, j])
+            image = add(rational(rows.state[i, j]), multiply(pushed, K))[0]
+            left = allowed - root_above(max(quadratic(pushed, error) for error in errors))
+            left -= ACTION_ROUNDING * sum((abs(b) * u for b, u in zip(pushed[0], limits, strict=True)), Fraction(0))
+            yield scalar_condition(
+                f"(B) |c x| + rho <= 1 - eta on S at tau_{i} of row {j + 1}", left - root_above(quadratic([image], L))
+            )
+            if polytope is not None and G is not None:
+                multipliers = polytope.multipliers[len(G) + plant.m + i * k + j]
+                left -= reach(image, multipliers, G, widths)
+                yield scalar_condition(f"(PB) |c x| + rho <= 1 - eta on the polytope at tau_{i} of row {j + 1}", left)
+
+
+def _remainder(row: list[Fraction], grid: Matrix, G: Matrix, sizes: list[Fraction], dt: Fraction) -> Fraction | None:
+    """Returns the least eta that is proved for a row [c, 0] and its rows on the grid; None if a series is too long.
+
+    That is the largest error of the rows and h^2/8 exp(h m) max_i |[c, 0] exp(G tau_i) G^2|, measured by what they can
+    reach for |z_j| <= W_j; m is the logarithmic norm of G.
+
+    Args:
+        row: [c, 0].
+        grid: What the plant has for [c, 0] exp(G tau_i), i = 0..N.
+        G: The generator.
+        sizes: W.
+        dt: Duration of a step.
+    """
+    points = len(grid) - 1
+    h, error, bend, square = dt / points, Fraction(0), Fraction(0), multiply(G, G)
+    norm = max(sum((abs(g) * w for g, w in zip(line, sizes, strict=True)), Fraction(0)) / sizes[i]
+               for i, line in enumerate(G))  # fmt: skip
+    drift = max(
+        sum((abs(g) * w for g, w in zip(line, sizes, strict=True)), Fraction(0)) / sizes[i] + line[i] - abs(line[i])
+        for i, line in enumerate(G)
+    )
+    growth = _moved([Fraction(1)], [[max(drift, Fraction(0))]], [Fraction(1)], h, max(drift, Fraction(0)))
+    if growth is None:
+        return None
+    for i, given in enumerate(grid):
+        moved = _moved(row, G, sizes, i * h, norm)
+        if moved is None:
+            return None
+        exact, tail = moved
+        error = max(error, _size([a - b for a, b in zip(exact, given, strict=True)], sizes) + tail)
+        if i < points:
+            bend = max(bend, _size(multiply([exact], square)[0], sizes) + tail * norm**2)
+    return error + h * h / 8 * (growth[0][0] + growth[1]) * bend
+
+
+def _moved(
+    row: list[Fraction], G: Matrix, sizes: list[Fraction], time: Fraction, norm: Fraction
+) -> tuple[list[Fraction], Fraction] | None:
+    """Returns row exp(G t) by its series, and a bound of what is left of that; None if it is too long.
+
+    After the term of power p that is at most |row| (t |G|)^(p+1) / (p+1)! / (1 - t |G| / (p+2)).
+
+    Args:
+        row: Shape (n + m,).
+        G: The generator.
+        sizes: W of the norm |q| = sum |q_j| W_j.
+        time: t.
+        norm: |G|.
+    """
+    term, total, step = row, row, scale(time, G)
+    left = size = _size(row, sizes)
+    for power in range(1, _MOST_TERMS):
+        left *= time * norm / power
+        term = [entry / power for entry in multiply([term], step)[0]]
+        total = [a + b for a, b in zip(total, term, strict=True)]
+        ratio = time * norm / (power + 2)
+        if 2 * ratio <= 1 and left <= _SMALLEST_TAIL * size:
+            return total, left * 2 * time * norm / (power + 1)
+    return None
+
+
+def _size(row: list[Fraction], sizes: list[Fraction]) -> Fraction:
+    """Returns |q| = sum |q_j| W_j."""
+    return sum((abs(entry) * size for entry, size in zip(row, sizes, strict=True)), Fraction(0))

@@ -1,0 +1,116 @@
+"""(G), (B) and (PB) of docs/shield_proof.md by the second engine: exponentials and roots as balls."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
+
+from ncs_gym import LinearPlant
+from shields.certificate import Certificate
+from shields.verification.conditions import Condition
+from shields.verification.flint.exact import form, is_so, mapped, matrix, number
+from shields.verification.flint.polytope import PRECISION, at_least_zero_ball, box_extents
+
+_FLOAT32 = fmpq(1, 2**24)
+
+
+def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
+    """Checks what a certificate claims of times between samples, without the code of the first engine."""
+    grid, points = plant.grid_rows, plant.between_samples
+    if points is None and certificate.between_samples is None:
+        return
+    is_claimed = points == certificate.between_samples and grid is not None
+    yield is_so("between samples: the certificate has the plant's grid", is_claimed)
+    if grid is None or plant.continuous_model is None or points is None or not is_claimed:
+        return
+    (k, n), m, polytope = plant.box_rows.shape, plant.m, certificate.polytope
+    kept = (grid.state.shape, grid.input.shape, grid.remainder.shape) == ((points, k, n), (points, k, m), (k,))
+    if kept:
+        first = np.concatenate([grid.state[0] - plant.box_rows, grid.input[0]], axis=1)
+        kept = bool(np.isfinite(grid.remainder).all()) and not np.count_nonzero(first)
+    yield is_so("between samples: the grid has all its points and begins with the safe box", kept)
+    widths = box_extents(matrix(plant.box_rows))
+    yield is_so("between samples: the box bounds every state", widths is not None)
+    if not kept or widths is None:
+        return
+    before = ctx.prec
+    ctx.prec = PRECISION
+    try:
+        for j, least in enumerate(_remainders(plant, widths + [number(limit) for limit in plant.u_max])):
+            name = f"(G) what is between grid points is at most eta of row {j + 1}"
+            yield at_least_zero_ball(name, arb(number(grid.remainder[j])) - least)
+        if polytope is None or len(polytope.multipliers) == len(polytope.rows) + m + k * points:
+            yield from _gain_conditions(certificate, plant, widths)
+    finally:
+        ctx.prec = before
+
+
+def _remainders(plant: LinearPlant, sizes: list[Any]) -> list[Any]:
+    """Returns balls around the least eta that is proved for each row of the box.
+
+    Args:
+        plant: With a model in continuous time and a grid.
+        sizes: Largest |x_i| in the box and |u_i|.
+    """
+    grid, model, points = plant.grid_rows, plant.continuous_model, plant.between_samples
+    assert grid is not None
+    assert model is not None
+    assert points is not None
+    (k, _), m, dt = plant.box_rows.shape, plant.m, number(plant.dt)
+    size = len(sizes)
+    G = matrix(np.vstack([model, np.zeros((m, size))]))
+    box = matrix(np.hstack([plant.box_rows, np.zeros((k, m))]))
+    rates = [
+        G[i, i] + sum((abs(G[i, j]) * sizes[j] for j in range(size) if j != i), fmpq(0)) / sizes[i] for i in range(size)
+    ]
+    growth = (arb(max(*rates, fmpq(0))) * arb(dt / points)).exp()
+    errors, bends = [arb(0)] * k, [arb(0)] * k
+    for i in range(points + 1):
+        true = arb_mat(box) * arb_mat(G * (dt * i / points)).exp()
+        if i == points:  # the sampled plant itself
+            rows = matrix(plant.box_rows) * matrix(np.hstack([plant.A, plant.B]))
+        else:
+            rows = matrix(np.hstack([grid.state[i], grid.input[i]]))
+        bend = true * arb_mat(G * G)
+        for row in range(k):
+            off = [abs(true[row, j] - arb(rows[row, j])) * arb(sizes[j]) for j in range(size)]
+            errors[row] = errors[row].max(sum(off, arb(0)))
+            if i < points:
+                turn = [abs(bend[row, j]) * arb(sizes[j]) for j in range(size)]
+                bends[row] = bends[row].max(sum(turn, arb(0)))
+    square = arb(dt * dt / (8 * points * points))
+    return [error + square * growth * bend for error, bend in zip(errors, bends, strict=True)]
+
+
+def _gain_conditions(certificate: Certificate, plant: LinearPlant, widths: list[Any]) -> Iterator[Condition]:
+    """Checks (B), and (PB) if there is a polytope."""
+    grid, polytope, (k, n) = plant.grid_rows, certificate.polytope, plant.box_rows.shape
+    assert grid is not None
+    L, K, D = matrix(certificate.L), matrix(certificate.K), matrix(certificate.disturbances()[0])
+    errors = [mapped(K, matrix(proof.Sigma)) for proof in certificate.proofs]
+    limits = [number(limit) for limit in plant.u_max]
+    G = None if polytope is None else matrix(polytope.rows)
+    for i, (state, pushed) in enumerate(zip(grid.state, grid.input, strict=True)):
+        for j in range(k):
+            push = matrix(pushed[j])
+            image = matrix(state[j]) + push * K
+            rest = 1 - number(grid.remainder[j])
+            rest -= _FLOAT32 * sum((abs(push[0, a]) * limits[a] for a in range(plant.m)), fmpq(0))
+            left = arb(rest) - arb(form(matrix(plant.box_rows[j]), D)).sqrt()
+            left -= arb(max(form(push, error) for error in errors)).sqrt()
+            where = f"tau_{i} of row {j + 1}"
+            yield at_least_zero_ball(f"(B) |c x| + rho <= 1 - eta on S at {where}", left - arb(form(image, L)).sqrt())
+            if polytope is not None and G is not None:
+                given = polytope.multipliers[len(polytope.rows) + plant.m + i * k + j]
+                used = [(int(index), number(given[index])) for index in np.flatnonzero(given)]
+                over = image - sum((value * _row(G, index) for index, value in used), fmpq_mat(1, n))
+                reach = sum((abs(value) for _, value in used), fmpq(0))
+                reach += sum((abs(over[0, a]) * widths[a] for a in range(n)), fmpq(0))
+                yield at_least_zero_ball(f"(PB) |c x| + rho <= 1 - eta on the polytope at {where}", left - arb(reach))
+
+
+def _row(rows: Any, index: int) -> Any:
+    return fmpq_mat([[rows[index, a] for a in range(rows.ncols())]])

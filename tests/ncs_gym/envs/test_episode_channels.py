@@ -1,0 +1,173 @@
+"""Channels of single episodes, and of each environment of a vector: equal, refused where they do not fit, and drawn."""
+
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from ncs_gym import (
+    Channel,
+    ChannelContract,
+    GilbertElliott,
+    NCSEnv,
+    NCSVectorEnv,
+    RandomChannel,
+    SpeedTracking,
+    UnstablePlantError,
+    VectorRandomChannel,
+    cart_pole,
+    truck_trailer,
+)
+from tests.ncs_gym.envs.same_draws import compare
+
+PLANT = truck_trailer(mass=4000.0)
+BURSTS = GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.3)
+# Each draws as many numbers per step, so that scalar environments can be fed with those of a vector.
+LATE = [Channel(loss=0.3, delay=delay, quantization_step=0.02, send_period=1 + delay % 2) for delay in (0, 3, 5)]
+JITTERY = [Channel(loss=BURSTS, delay=1, jitter=2), Channel(loss=BURSTS, jitter=5, max_consecutive_losses=2)]
+
+
+def both(steps=40, **settings):
+    """Estimates of an episode with the same action throughout."""
+    env = NCSEnv(PLANT, **settings)
+
+    def estimates(**options):
+        infos = [env.reset(seed=1, options=options)[1]] + [env.step([0.3])[4] for _ in range(steps)]
+        return np.array([info["estimate"] for info in infos])
+
+    return estimates
+
+
+def test_channel_of_an_episode_is_as_if_the_environment_were_made_with_it():
+    made, other = Channel(quantization_step=0.05), Channel(loss=0.4, quantization_step=0.05, delay=3, jitter=1)
+    of_made, of_other = both(channel=made), both(channel=other)
+    np.testing.assert_array_equal(of_made(channel=other), of_other())
+    np.testing.assert_array_equal(of_made(), of_other(channel=made))  # the next episode has the environment's own again
+    assert not np.array_equal(of_made(), of_other())
+
+
+def test_downlink_of_an_episode_is_as_if_the_environment_were_made_with_it():
+    late, contract = Channel(loss=0.5, delay=1, max_consecutive_losses=2), ChannelContract(3)
+    of_made = both(downlink=Channel(delay=3))
+    np.testing.assert_array_equal(of_made(downlink=late), both(downlink=late, downlink_contract=contract)())
+
+
+@pytest.mark.parametrize("channels", [LATE, JITTERY])
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_vector_with_a_channel_for_each_environment_equals_scalar_ones(channels, mode):
+    settings = {"terminate_on_violation": True, "autoreset_mode": mode, "max_episode_steps": 31}
+    env = NCSVectorEnv(len(channels), plant=PLANT, channel=channels, task=SpeedTracking(), **settings)
+    compare(env, 90)
+    assert env.episodes.min() > 1
+    assert env.episode_channels == tuple(channels)
+
+
+def test_channels_of_a_reset_equal_scalar_ones_and_are_kept_by_episodes_that_begin_by_themselves():
+    env = NCSVectorEnv(3, plant=PLANT, channel=Channel(quantization_step=0.02), max_episode_steps=31)
+    compare(env, 90, {"channel": LATE})
+    assert env.episode_channels == tuple(LATE)
+    env.reset(seed=0, options={"reset_mask": np.array([True, False, False])})
+    assert env.episode_channels == (Channel(quantization_step=0.02), *LATE[1:])
+    env.reset(seed=0)
+    assert set(env.episode_channels) == {env.channel}
+
+
+def test_downlinks_for_each_environment_equal_scalar_ones():
+    downlinks = [Channel(loss=0.5, delay=1, max_consecutive_losses=2), Channel(loss=0.2, max_consecutive_losses=1)]
+    env = NCSVectorEnv(2, plant=PLANT, channel=Channel(delay=1), downlink=downlinks, max_episode_steps=31)
+    assert env.downlink_protocol.lead == 3
+    compare(env, 90)
+
+
+def test_other_environments_go_on_when_a_longer_delay_joins_in_the_middle_of_their_episodes():
+    def estimates(delay):
+        env = NCSVectorEnv(2, plant=PLANT, channel=Channel(delay=1), disturbance="ball")
+        env.reset(seed=0)
+        found = []
+        for step in range(60):
+            if step == 20:
+                options = {"reset_mask": np.array([True, False]), "channel": Channel(loss=0.0, delay=delay)}
+                env.reset(options=options)
+            found.append(env.step(np.full((2, 1), 0.2))[4])
+        return [np.array([info[key][1] for info in found]) for key in ("estimate", "error_shape", "measurement_age")]
+
+    for short, long in zip(estimates(1), estimates(7), strict=True):
+        np.testing.assert_array_equal(short, long)
+
+
+def test_errors_stay_in_their_ellipsoids_whatever_channels_are_drawn():
+    def draw(rng):
+        loss = [0.0, 0.5, BURSTS][rng.integers(3)]
+        return Channel(loss, 0.05 * rng.random(), int(rng.integers(1, 4)), int(rng.integers(6)), int(rng.integers(4)))
+
+    coarse = Channel(quantization_step=0.05)
+    env = VectorRandomChannel(NCSVectorEnv(32, plant=PLANT, channel=coarse, max_episode_steps=13), draw)
+    _, info = env.reset(seed=2)
+    seen = set()
+    for _ in range(150):
+        e, shapes = info["estimation_error"], info["error_shape"]
+        assert np.einsum("ki,ki->k", e, np.linalg.solve(shapes, e[..., None])[..., 0]).max() <= 1.0 + 1e-9
+        assert not info["assumption_violated"].any()
+        seen |= set(env.unwrapped.episode_channels)
+        info = env.step(env.action_space.sample())[4]
+    assert len(seen) > 300
+
+
+def test_draws_follow_from_the_seed_and_pickled_wrappers_draw_the_same():
+    env = RandomChannel(gym.make("ncs_gym/TruckTrailer-v0"), LATE)
+    again = pickle.loads(pickle.dumps(env))
+    drawn = [[each.reset(seed=seed) and each.unwrapped.episode_channel for seed in range(9)] for each in (env, again)]
+    assert drawn[0] == drawn[1]
+    assert set(drawn[0]) == set(LATE)
+    env.reset(options={"channel": Channel(delay=9)})
+    assert env.unwrapped.episode_channel == Channel(delay=9)
+    check_env(env, skip_render_check=True)
+
+
+def test_space_and_contract_are_those_of_the_widest_channel():
+    channels = [Channel(), Channel(loss=0.3, delay=2, max_consecutive_losses=1), Channel(delay=1)]
+    env = NCSVectorEnv(3, plant=cart_pole(), channel=channels)
+    assert env.contract == ChannelContract(3)
+    widest = NCSVectorEnv(3, plant=cart_pole(), channel=channels[1])
+    assert env.single_observation_space == widest.single_observation_space
+    with pytest.raises(UnstablePlantError):
+        NCSVectorEnv(2, plant=cart_pole(), channel=[Channel(), Channel(loss=0.1)])
+
+
+def test_make_vec_takes_channels_as_json_values():
+    env = gym.make_vec("ncs_gym/TruckTrailer-v0", num_envs=2, channel=[{"delay": 1}, {"loss": 0.5}])
+    assert env.unwrapped.episode_channels == (Channel(delay=1), Channel(loss=0.5))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"channel": 0.3}, "channel must be a Channel or a function"),
+        ({"channel": Channel(quantization_step=0.1)}, "rounds to 0.1, the environment was made for no more than 0.05"),
+        ({"downlink": Channel()}, "ideal downlink, and commits no inputs ahead"),
+        ({"channel": [Channel()] * 3}, "channel must be a Channel or a function"),
+        ({"channels": Channel()}, "reset knows the options"),
+    ],
+)
+def test_channels_that_do_not_fit_are_refused_before_anything_moves(options, words):
+    for env in (gym.make("ncs_gym/TruckTrailer-v0"), gym.make_vec("ncs_gym/TruckTrailer-v0", num_envs=2)):
+        env.reset(seed=0)
+        state = env.unwrapped._state.copy()
+        with pytest.raises(ValueError, match=words):
+            env.reset(options=options)
+        np.testing.assert_array_equal(env.unwrapped._state, state)
+        env.step(env.action_space.sample())
+
+
+def test_downlinks_that_delay_by_more_than_what_is_committed_are_refused():
+    env = NCSEnv(PLANT, downlink=Channel(delay=2))
+    with pytest.raises(ValueError, match="delays commands by up to 3 steps"):
+        env.reset(options={"downlink": Channel(delay=3)})
+    with pytest.raises(ValueError, match="give channel or downlink"):
+        RandomChannel(env)
+    with pytest.raises(ValueError, match="or a list of channels"):
+        VectorRandomChannel(NCSVectorEnv(2, plant=PLANT), 0.3)
+    with pytest.raises(ValueError, match="what was drawn must be a Channel"):
+        RandomChannel(env, lambda rng: 0.3).reset()

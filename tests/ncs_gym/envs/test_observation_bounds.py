@@ -1,0 +1,112 @@
+"""What observations are clipped to, and that clipping is never silent where it hides something."""
+
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from ncs_gym import Channel, ClippedObservationWarning, LinearPlant, NCSEnv, NCSVectorEnv, Task, cart_pole
+
+PLANT = LinearPlant(A=[[0.5]], B=[[1.0]], box=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-4, sensor_bound=0, initial_bound=0)
+
+
+class Far(Task):
+    """Its entry grows by one per step; its bound is that of the horizon, or less."""
+
+    def __init__(self, share=1.0):
+        self.share = share
+
+    def begin(self, rng, plant):
+        return 0.0
+
+    def advance(self, rng, plant, task_state, u):
+        return task_state + 1.0
+
+    def observe(self, task_state):
+        return np.array([task_state])
+
+    def observation_bound(self, plant, horizon):
+        return np.array([self.share * horizon])
+
+    def reward(self, plant, task_state, state, u):
+        return 0.0
+
+
+class Boundless(Far):
+    observation_bound = Task.observation_bound
+
+
+class Wrong(Far):
+    def observation_bound(self, plant, horizon):
+        return np.ones(3)
+
+
+def play(env, steps):
+    env.reset(seed=0)
+    zero = np.zeros(env.action_space.shape, np.float32)
+    return [env.step(zero)[0] for _ in range(steps)]
+
+
+@pytest.mark.parametrize("make", [NCSEnv, lambda **settings: NCSVectorEnv(2, **settings)])
+def test_entries_beyond_their_bound_are_told_of_once(make):
+    env = make(plant=PLANT, task=Far(0.1), horizon=100)
+    with pytest.warns(ClippedObservationWarning, match="entry 0 of Far is beyond .* of 10.1") as caught:
+        play(env, 30)
+    assert len(caught) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", ClippedObservationWarning)
+        assert np.ravel(play(env, 30)[-1])[-1] == np.float32(10.1)
+        play(make(plant=PLANT, task=Far(), horizon=30), 30)
+
+
+def test_longer_vector_episodes_have_a_longer_horizon_and_longer_scalar_ones_a_warning():
+    gym.register("Test/Far-v0", entry_point="ncs_gym.registration:LINEAR_NCS", max_episode_steps=200)
+    try:
+        env = gym.make("Test/Far-v0", plant=PLANT, task=Far(), max_episode_steps=300)
+        with pytest.warns(ClippedObservationWarning, match="give horizon=... if episodes are longer"):
+            play(env, 300)
+        long = gym.make("Test/Far-v0", plant=PLANT, task=Far(), max_episode_steps=300, horizon=300)
+    finally:
+        del gym.registry["Test/Far-v0"]
+    many = NCSVectorEnv(2, plant=PLANT, task=Far(), max_episode_steps=300)
+    assert many.single_observation_space == long.observation_space
+    assert many.horizon == 300
+    assert NCSVectorEnv(2, plant=PLANT, task=Far(), max_episode_steps=20).horizon == 200
+
+
+def test_task_without_bounds_of_what_it_observes_is_refused_by_name():
+    with pytest.raises(ValueError, match="Boundless: observe is defined, observation_bound is not"):
+        NCSEnv(PLANT, task=Boundless())
+    with pytest.raises(ValueError, match="Wrong: observe returns 1 entries, observation_bound the bounds of 3"):
+        NCSEnv(PLANT, task=Wrong()).reset()
+
+
+@pytest.mark.parametrize("name", ["CartPole", "CartPoleTwoWay", "BatchReactor", "Pendulum", "CartPoleNonlinear"])
+def test_boxes_of_unstable_plants_are_of_the_size_of_the_safe_box_and_hold_what_one_step_out_of_it_can_reach(name):
+    env = gym.make_vec(f"ncs_gym/{name}-v0", num_envs=64, max_episode_steps=None).unwrapped
+    plant, high = env.plant, env.single_observation_space.high[: env.plant.n]
+    assert (high < 100.0 * plant.half_widths).all()
+    _, info = env.reset(seed=0)
+    ended = 0
+    for _ in range(300):  # the environments end with the first violation
+        estimates, inside = info["estimate"], info["cost"] == 0.0
+        assert (np.abs(estimates[inside]) <= high).all()
+        ended += np.count_nonzero(~inside)
+        info = env.step(env.action_space.sample())[4]
+    assert ended > 10
+
+
+def test_rescaled_observations_of_an_unstable_plant_say_something():
+    env = gym.wrappers.RescaleObservation(gym.make("ncs_gym/CartPole-v0"), -1.0, 1.0)
+    sizes = [np.abs(env.reset(seed=seed)[0][:4]).max() for seed in range(20)]
+    assert min(sizes) > 1e-3
+
+
+def test_runaway_states_are_clipped_in_observations_and_not_in_infos():
+    env = NCSEnv(cart_pole(), Channel())
+    env.reset(seed=0)
+    for _ in range(100):
+        observation, *_, info = env.step([1.0])
+    assert observation in env.observation_space
+    assert (np.abs(info["estimate"]) > env.observation_space.high).any()

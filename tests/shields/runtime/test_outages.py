@@ -1,0 +1,262 @@
+"""What goes wrong in real loops: outages of the plant, wild commands, controllers that start anew in the middle."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from ncs_gym import (
+    Actuator,
+    Channel,
+    ChannelContract,
+    Command,
+    Ellipsoid,
+    Packet,
+    cart_pole,
+    certified_error_set,
+    truck_trailer,
+)
+from ncs_gym.estimation.first_estimate import first_estimate
+from ncs_gym.processes import nonlinear_cart_pole
+from shields import SafeLoop
+from shields.runtime.guarantee import LATE_INPUT, NOT_CONFIRMED, OTHER_INPUT, UNKNOWN_START
+from tests import arrays
+from tests.certificates import certificate_of
+
+PLANT = cart_pole()
+UPLINK = Channel(loss=0.3, delay=1, max_consecutive_losses=1)
+DOWNLINK = Channel(loss=0.3, delay=1, max_consecutive_losses=1)  # c = 2
+
+
+def loop_with(echo_age=4, downlink=DOWNLINK, plant=PLANT, contract=4, **settings):
+    certificate = certificate_of(plant, None if contract is None else ChannelContract(contract))
+    return SafeLoop(certificate, plant, UPLINK, downlink=downlink, echo_age=echo_age, **settings)
+
+
+class World:
+    """A plant with its actuator, which can be switched off: then it stays where it is, and sends nothing."""
+
+    def __init__(self, loop, state=None, seed=0):
+        self.loop, self.plant, self.rng = loop, loop.filter.plant, np.random.default_rng(seed)
+        self.state = np.zeros(self.plant.n) if state is None else state
+        self.actuator = Actuator(loop.lead, self.plant.m, self.plant.u_max)
+        self.packets, self.echoes, self.step = [], [], 0
+
+    def start(self, **settings):
+        plant = self.plant
+        self.loop.start(self.state + plant.sample_initial_error(self.rng), **settings)
+        self.actuator.start(self.loop.episode)
+        self.packets, self.echoes, self.step = [], [], 0
+
+    def move(self, proposed=0.0, *, is_on=True, is_heard=True):
+        loop, plant = self.loop, self.plant
+        loop.receive(self.packets, echoes=self.echoes)
+        guaranteed = loop.guaranteed
+        loop.decide(proposed)
+        self.packets, self.echoes = [], []
+        if is_on:
+            if is_heard:
+                self.actuator.receive([loop.command()])
+            sample = plant.H @ self.state + plant.sample_sensor_noise(self.rng)
+            self.packets = [Packet(self.step, sample, loop.episode)]
+            u = self.actuator.apply(self.step)
+            self.echoes = [self.actuator.echo]
+            d = plant.nominal_disturbance.sample_boundary(self.rng)
+            self.state = plant.A @ self.state + plant.B @ u + d
+        self.step += 1
+        return guaranteed
+
+
+@pytest.mark.parametrize("length", [1, 2, 5, 10, 30])
+@pytest.mark.parametrize("downlink", [None, DOWNLINK])
+def test_outage_of_the_plant_ends_the_proof_for_the_episode(length, downlink):
+    loop = loop_with(downlink=downlink)
+    world = World(loop)
+    world.start()
+    before = [world.move() for _ in range(20)]
+    for _ in range(length):
+        world.move(is_on=False)
+    world.move()
+    after = [world.move() for _ in range(40)]
+    assert all(before)
+    assert not any(after)
+    assert loop.reason == (OTHER_INPUT if downlink is None else LATE_INPUT)
+    world.state = np.zeros(PLANT.n)
+    world.start()
+    assert world.move()
+
+
+def test_a_single_input_that_was_not_applied_is_found_out_although_later_echoes_are_lost():
+    loop = loop_with(echo_age=30)
+    world = World(loop)
+    world.start()
+    for step in range(60):
+        world.move(is_heard=not 20 <= step < 23)  # three commands in a row are lost: one input is missing
+        if 20 <= step < 40:
+            world.echoes = []
+        assert (loop.reason == LATE_INPUT) is (step > 40)
+
+
+def test_silent_actuator_is_not_trusted_for_longer_than_asked_for():
+    loop = loop_with(echo_age=4)
+    world = World(loop)
+    world.start()
+    reasons = []
+    for step in range(40):
+        world.move()
+        reasons.append(loop.reason)
+        if 10 <= step < 20:
+            world.echoes = []
+    assert {step for step, reason in enumerate(reasons) if reason} == set(range(15, 21))
+    assert set(reasons) == {"", NOT_CONFIRMED}
+
+
+def test_what_the_loop_says_is_conditional_where_nothing_is_echoed():
+    told, untold = loop_with(), loop_with(echo_age=None)
+    for loop in (told, untold):
+        loop.start(np.zeros(4))
+    condition = "if everything that is decided is applied"
+    assert (condition in str(told), condition in str(untold)) == (False, True)
+
+
+@pytest.mark.parametrize("echo", [None, 5, ("1", 0, b"", 0), (1, 0, "", 0), (1, 0)])
+def test_what_is_no_echo_is_refused(echo):
+    loop = loop_with()
+    loop.start(np.zeros(4))
+    with pytest.raises(ValueError, match=r"an echo is what Actuator.echo says"):
+        loop.receive(echoes=[echo])
+
+
+@pytest.mark.parametrize("lead", [0, 2, 5])
+def test_wild_stamps_and_inputs_do_not_stop_an_actuator(lead):
+    actuator = Actuator(lead, 1, 10.0)
+    inputs = np.ones((lead + 1, 1))
+    for step in range(100):
+        wild = [Command(stamp, -inputs) for stamp in (10**9, 2**62, step + lead + 2, -(10**9))]
+        wild += [Command(step, size * inputs) for size in (1e6, -10.001)]
+        actuator.receive([*wild, Command(step, inputs), *wild])
+        u = actuator.apply(step)
+        assert u.tolist() == [1.0 if step >= lead else 0.0]
+    assert actuator.echo.missing == 0
+    assert actuator.refused == 100 * 10
+    assert len(actuator._committed) <= 2 * lead + 3
+
+
+def test_command_that_comes_early_is_kept_for_its_step():
+    actuator = Actuator(1, 1)
+    actuator.receive([Command(0, np.array([[0.0], [1.0]])), Command(1, np.array([[1.0], [2.0]]))])
+    assert [actuator.apply(step).tolist() for step in range(4)] == [[0.0], [1.0], [2.0], [0.0]]
+    assert (actuator.missing, actuator.echo.missing) == (True, 1)
+
+
+@pytest.mark.parametrize("u_max", [-1.0, [1.0, 2.0], "10", np.nan])
+def test_limits_of_an_actuator_are_sizes(u_max):
+    with pytest.raises(ValueError, match="u_max must be a size"):
+        Actuator(1, 1, u_max)
+
+
+def far_out(plant, seed):
+    """A state in the middle of S."""
+    return 0.5 * certificate_of(plant, ChannelContract(4)).safe_set.sample_boundary(np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("downlink", [None, DOWNLINK])
+@pytest.mark.parametrize("seed", range(5))
+def test_controller_that_starts_in_the_middle_claims_nothing_until_samples_tell_where_the_state_is(downlink, seed):
+    loop = loop_with(downlink=downlink)
+    world = World(loop, far_out(PLANT, seed), seed)
+    wrong = np.zeros(4) if seed else np.full(4, 1e6)
+    world.start()
+    loop.start(wrong, known=False)
+    world.actuator.start(loop.episode)
+    assert loop.reason == UNKNOWN_START
+    proved = []
+    for _ in range(60):
+        x = world.state.copy()
+        proved.append(world.move())
+        if loop.reason != UNKNOWN_START and loop.lead == 0:
+            e = loop.estimate - x
+            assert e @ np.linalg.solve(loop.error_shape, e) <= 1.0
+    assert not proved[0]
+    assert proved[-1]
+    assert proved == sorted(proved)
+    assert np.abs(PLANT.box_rows @ world.state).max() <= 1.0
+
+
+def test_wrong_first_estimate_that_is_claimed_to_be_known_is_no_longer_the_only_way():
+    loop = loop_with(downlink=None)
+    loop.start(np.zeros(4))
+    assert loop.guaranteed  # a claim, which may be wrong
+    loop.start(np.zeros(4), known=False)
+    assert not loop.guaranteed
+    with pytest.raises(ValueError, match="initial_set says what is known"):
+        loop.start(np.zeros(4), np.zeros(4), known=False)
+    with pytest.raises(ValueError, match="known must be"):
+        loop.start(np.zeros(4), known="yes")
+
+
+@pytest.mark.parametrize("plant", [PLANT, cart_pole(full_state=False), truck_trailer()])
+def test_first_estimate_holds_what_it_claims_against_the_worst_disturbance_and_noise(plant):
+    """The claim is attacked by the extreme disturbances and noises of one direction of the error."""
+    noise, ages = plant.nominal_sensor_error, certified_error_set(plant, ChannelContract(5))
+    rng, found = np.random.default_rng(0), 0
+    for _ in range(60):
+        x, inputs, states = rng.uniform(-0.3, 0.3, plant.n) * plant.half_widths, [], []
+        for _ in range(int(rng.integers(0, 8))):
+            states.insert(0, x)
+            inputs.insert(0, rng.uniform(-1, 1, plant.m) * plant.u_max)
+            push = rng.standard_normal(plant.n)
+            x = plant.A @ x + plant.B @ inputs[0] + plant.nominal_disturbance.extreme_point(push)
+        states.insert(0, x)
+        samples = {
+            age: plant.H @ state + noise.extreme_point(rng.standard_normal(plant.p))
+            for age, state in enumerate(states)
+            if rng.random() < 0.5
+        }
+        known = first_estimate(plant, ages, samples, inputs, plant.sensor_error.shape_matrix)
+        if known is not None:
+            found += 1
+            assert known[1] == min(samples)
+            assert Ellipsoid(ages.shape_at(known[1])).gauge(known[0] - x) <= 1.0
+    assert 5 < found < 60
+
+
+def test_too_few_or_too_coarse_samples_are_no_first_estimate():
+    position, contract = cart_pole(full_state=False), ChannelContract(5)
+    N, ages = position.sensor_error.shape_matrix, certified_error_set(position, contract)
+    assert first_estimate(position, ages, {}, [], N) is None
+    assert first_estimate(position, ages, {0: np.zeros(2)}, [], N) is None  # two of four states are not seen
+    N, ages = PLANT.sensor_error.shape_matrix, certified_error_set(PLANT, contract)
+    assert first_estimate(PLANT, ages, {0: np.zeros(4)}, [], N) is not None
+    assert first_estimate(PLANT, ages, {0: np.zeros(4)}, [], 100.0 * N) is None
+    assert first_estimate(PLANT, ages, {0: np.full(4, np.inf)}, [], N) is None
+    assert first_estimate(PLANT, ages, {6: np.zeros(4)}, [np.zeros(1)] * 6, N) is None  # too old
+    local = nonlinear_cart_pole()
+    ages = certified_error_set(local, contract)
+    assert first_estimate(local, ages, {0: np.zeros(4)}, [], local.sensor_error.shape_matrix) is None
+
+
+@pytest.mark.parametrize("downlink", [None, DOWNLINK])
+@pytest.mark.parametrize("phase", ["received", "decided"])
+def test_pickled_loop_goes_on_where_it_was(downlink, phase):
+    loop = loop_with(downlink=downlink, mode="project")
+    world = World(loop)
+    world.start()
+    for _ in range(30):
+        world.move(5.0)
+    if phase == "received":
+        loop.receive(world.packets, echoes=world.echoes)
+        world.packets, world.echoes = [], []
+        loop.decide(1.0)
+        loop.receive()
+    other = pickle.loads(pickle.dumps(loop))
+    for each in (loop, other):
+        if phase == "decided":
+            each.receive(world.packets, echoes=world.echoes)
+    for step in range(20):
+        arrays.assert_equal(loop.estimate, other.estimate)
+        assert (loop.reason, loop.steps, loop.measurement_age) == (other.reason, other.steps, other.measurement_age)
+        packets = [Packet(loop.steps, np.zeros(4), loop.episode)] if step % 2 else []
+        arrays.assert_equal(loop.decide(3.0).input, other.decide(3.0).input)
+        for each in (loop, other):
+            each.receive(packets)

@@ -1,0 +1,123 @@
+"""Mistakes that used to pass in silence: each is refused with a sentence, or heard."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.monitor import Monitor
+
+from agents import LoopConfig, SafetyCallback
+from agents.loop import CostPenalty
+from ncs_gym import Channel, NCSEnv, NCSVectorEnv, Packet, UnusedPacketsWarning, cart_pole, truck_trailer
+from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
+from tests.certificates import certificate_of
+
+PLANT = truck_trailer(mass=4000.0)
+
+
+@pytest.fixture(scope="module")
+def certificate():
+    return certificate_of(PLANT)
+
+
+def test_stepping_after_the_end_of_an_episode_is_refused():
+    env = NCSEnv(PLANT, terminate_on_violation=True)
+    env.reset(options={"state": [1.9, 0.0]})
+    while not env.step([1.0])[2]:
+        pass
+    with pytest.raises(gym.error.ResetNeeded, match="the episode is over"):
+        env.step([1.0])
+    env.reset()
+    env.step([1.0])
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("estimate", "proposed", "words"),
+    [
+        (np.zeros((5, 2)), np.zeros((5, 1)), r"one estimate, numbers of shape \(2,\), got shape \(5, 2\).*decide_many"),
+        (np.zeros(2), np.zeros((5, 1)), r"one input, numbers of shape \(1,\), got shape \(5, 1\)"),
+        (np.zeros(2), torch.zeros(1, requires_grad=True), "one input, .* got a Tensor.*SafeLayer"),
+    ],
+)
+def test_batches_and_tensors_handed_to_a_filter_are_told_of(certificate, estimate, proposed, words):
+    shield = SafetyFilter(certificate, PLANT)
+    with pytest.warns(UserWarning, match=words):
+        decision = shield.decide(estimate, certificate.Sigma, proposed)
+    assert decision.reason == "invalid"
+
+
+def test_unknown_ids_are_refused_where_a_loop_is_described():
+    with pytest.raises(ValueError, match="'ncs_gym/Nothing-v0' is no registered environment"):
+        LoopConfig(env="ncs_gym/Nothing-v0")
+
+
+def test_infos_without_cost_are_named():
+    env = gym.make_vec("CartPole-v1", num_envs=2)
+    penalized = CostPenalty(env, 1.0)
+    penalized.reset(seed=0)
+    with pytest.raises(ValueError, match='needs environments with "cost" in their infos'):
+        penalized.step(env.action_space.sample())
+    with pytest.raises(ValueError, match='SafetyCallback counts "cost"'):
+        PPO("MlpPolicy", gym.make("CartPole-v1"), n_steps=8, batch_size=8).learn(8, callback=SafetyCallback())
+
+
+def test_rounding_too_coarse_for_any_update_is_named_once():
+    with pytest.warns(UnusedPacketsWarning, match="no packet is of use: with a quantization step of 9") as caught:
+        NCSEnv(PLANT, Channel(quantization_step=9.0))
+    assert len(caught) == 1
+
+
+@pytest.mark.filterwarnings("error")
+def test_channels_whose_packets_are_used_are_not_named():
+    for step in (0.0, 0.05):
+        NCSEnv(PLANT, Channel(quantization_step=step, delay=3))
+        NCSEnv(cart_pole(full_state=False), Channel(loss=0.2, max_consecutive_losses=2))
+
+
+def test_packets_that_come_too_late_for_a_loop_are_named_once(certificate):
+    loop = SafeLoop(certificate, PLANT, Channel(delay=1))
+    loop.start([0.0, 0.0])
+    [loop.step(0.0) for _ in range(4)]
+    with pytest.warns(UnusedPacketsWarning, match="later than the 1 steps"):
+        loop.step(0.0, [Packet(1, np.zeros(2))])
+    loop.step(0.0, [Packet(2, np.zeros(2))])
+    assert loop.discarded.too_late == 2
+
+
+class Alarming(gym.Wrapper):
+    """Raises the alarm of the environment after some steps."""
+
+    def step(self, action):
+        result = self.env.step(action)
+        if self.unwrapped.steps == 7:
+            self.unwrapped.estimator.alarm = True
+        return result
+
+
+def test_monitor_has_the_share_of_guaranteed_states(certificate):
+    env = Alarming(gym.make("ncs_gym/TruckTrailerCruise-v0", max_episode_steps=19))
+    shield = Monitor(SafetyShield(env, certificate, on_unproved="ignore"), info_keywords=("episode_guaranteed",))
+    shield.reset(seed=0)
+    while not (result := shield.step([0.1]))[3]:
+        pass
+    assert result[4]["episode"]["episode_guaranteed"] == 8 / 20
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_vector_has_the_same_share(certificate, mode):
+    env = NCSVectorEnv(3, plant=PLANT, max_episode_steps=19, autoreset_mode=mode)
+    shield = VectorSafetyShield(env, certificate, on_unproved="ignore")
+    shield.reset(seed=0)
+    for step in range(45):
+        if step == 7:
+            env._estimator.alarm[1] = True
+        *_, truncated, info = shield.step(np.full((3, 1), 0.1))
+        share = info["final_info"]["episode_guaranteed"] if "final_info" in info else info["episode_guaranteed"]
+        if truncated.any():
+            np.testing.assert_allclose(share, [1.0, 8 / 20 if step < 20 else 1.0, 1.0])
+        elif step == 10:
+            np.testing.assert_allclose(share, [1.0, 8 / 12, 1.0])
+    info = shield.reset(options={"reset_mask": np.array([True, False, False])})[1]
+    assert info["episode_guaranteed"].tolist() == [1.0, 1.0, 1.0]
