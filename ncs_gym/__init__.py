@@ -6,10 +6,11 @@ from ncs_gym.envs.spaces import ClippedObservationWarning
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlantError, certified_error_set
 from ncs_gym.estimation.estimator import Estimator
-from ncs_gym.network.channel import Channel, GilbertElliott, Packet
+from ncs_gym.network.channel import Channel, GilbertElliott, Packet, TraceChannel
 from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
 from ncs_gym.network.downlink import Actuator, Command, Echo
 from ncs_gym.network.escape_probability import escape_probability
+from ncs_gym.network.packet_log import PacketLog
 from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
@@ -56,6 +57,7 @@ __all__ = [
     "NCSVectorEnv",
     "NoNoiseWarning",
     "Packet",
+    "PacketLog",
     "Process",
     "RandomChannel",
     "Regulation",
@@ -65,6 +67,7 @@ __all__ = [
     "SpeedTracking",
     "SphereDisturbance",
     "Task",
+    "TraceChannel",
     "UnstablePlantError",
     "UnusedPacketsWarning",
     "VectorRandomChannel",

@@ -5,6 +5,7 @@ from experiments.settings.backend import BackendSettings
 from experiments.settings.certificates import (
     AttackSettings,
     AuditSettings,
+    ChannelSettings,
     ReproduceSettings,
     RequirementsSettings,
     SynthesizeSettings,
@@ -27,6 +28,7 @@ __all__ = [
     "AttackSettings",
     "AuditSettings",
     "BackendSettings",
+    "ChannelSettings",
     "CompareSettings",
     "EvaluateSettings",
     "LearningSettings",

@@ -258,3 +258,29 @@ class RequirementsSettings(BackendSettings):
         _refuse_both(self.env, self.plant)
         if not 0.0 < self.keep <= 100.0:
             raise ValueError(f"--keep must be a percentage above 0 and at most 100, got {self.keep:g}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChannelSettings:
+    """Reads recorded packets, and says what a channel contract they kept and how often closer ones would have broken.
+
+    Attributes:
+        file: A CSV file with a line per packet, when it was sent and when it was received in seconds, the second empty
+            for a lost packet; or the output of ping, whose delays are those of the whole way and back.
+        sampling_period: Duration of a control step [s]; by default the time between packets.
+        ping_period: Time between the packets of ping without stamps (ping -D prints them) [s]; 1 by default.
+        env: Id of an environment whose contract is compared with the record.
+        out: File for the numbers (JSON).
+        seed: Seed of the bootstrap, >= 0.
+    """
+
+    file: tyro.conf.Positional[Path]
+    sampling_period: float | None = None
+    ping_period: float | None = None
+    env: str | None = None
+    out: Path | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        require_least(self, seed=0)
