@@ -15,8 +15,8 @@ def broken_contracts(ages: np.ndarray, rng: np.random.Generator) -> list[dict[st
     """Returns, for every largest age up to the recorded one, in what fraction of steps it was exceeded.
 
     The interval is that of a circular block bootstrap of the steps (95 %), blocks being ten times as long as the
-    largest age. Where an age was never exceeded it ends at 3 / (number of blocks), what is excluded at that level if blocks are
-    independent. `halves` are the two halves of the record.
+    largest age. Where an age was never exceeded it ends at 3 / (number of blocks), what is excluded at that level if
+    blocks are independent. `halves` are the two halves of the record.
 
     Args:
         ages: Age of the newest sample at every step, shape (k,).

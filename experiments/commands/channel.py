@@ -71,6 +71,7 @@ def _text(log: PacketLog, dt: float, found: dict[str, Any]) -> str:
     runs = ", ".join(f"{count} of {length}" for length, count in found["runs_of_losses"].items()) or "none"
     median, ninety, ninety_nine, longest = (1000.0 * each for each in found["delay_quantiles"])
     first, second = found["kept_by_halves"]
+    together = "none" if found["promised"] is None else f"max_age = {found['promised']}"
     lines = [
         f"{found['packets']:,} packets in {log.sent[-1] - log.sent[0]:.4g} s, control steps of {1000.0 * dt:.4g} ms, a "
         f"packet every {found['send_period']} of them.",
@@ -78,7 +79,7 @@ def _text(log: PacketLog, dt: float, found: dict[str, Any]) -> str:
         f"Delays: median {median:.3g} ms, 90 % {ninety:.3g} ms, 99 % {ninety_nine:.3g} ms, longest {longest:.3g} ms: "
         f"{low} to {high} steps.",
         f"Contract kept: max_age = {found['kept']} (first half {first}, second half {second}); by the longest run of "
-        f"losses and the longest delay together: max_age = {found['promised']}.",
+        f"losses and the longest delay together: {together}.",
     ]
     header = [["max_age", "steps beyond", "[95 % CI]", "times", "first half", "second half"]]
     cells = [

@@ -124,13 +124,14 @@ def test_a_loss_beside_a_trace_is_refused():
 
 def test_record_is_replayed_in_an_environment_single_and_vectorized_within_its_contract():
     channel = TraceChannel(trace=(1, -1, 2, 1, -1, -1, 1), quantization_step=1e-4)
-    env = gym.make("ncs_gym/CartPole-v0", channel=channel, contract=ChannelContract(8, 1e-4))
+    settings = {"contract": ChannelContract(8, 1e-4), "terminate_on_violation": False}
+    env = gym.make("ncs_gym/CartPole-v0", channel=channel, **settings)
     promised = contract_of(channel)
     assert promised is not None
     env.reset(seed=0)
     ages = [env.step(np.zeros(1))[4]["measurement_age"] for _ in range(60)]
     assert max(ages) <= promised.max_age
-    vector = gym.make_vec("ncs_gym/CartPole-v0", num_envs=5, channel=channel, contract=ChannelContract(8, 1e-4))
+    vector = gym.make_vec("ncs_gym/CartPole-v0", num_envs=5, channel=channel, **settings)
     vector.reset(seed=0)
     ages = np.stack([vector.step(np.zeros((5, 1), np.float32))[4]["measurement_age"] for _ in range(60)])
     assert ages.max() <= promised.max_age
