@@ -29,19 +29,8 @@ def ncs(*arguments):
 
 
 def test_requirements_leave_table_figure_certificates_and_are_resumed(plant_file, tmp_path):
-    arguments = (
-        "requirements",
-        "--plant",
-        plant_file,
-        "--send-periods",
-        1,
-        2,
-        "--losses",
-        0,
-        20,
-        "--out",
-        tmp_path / "r",
-    )
+    asked = ("--send-periods", 1, 2, "--losses", 0, 20, "--out", tmp_path / "r")
+    arguments = ("requirements", "--plant", plant_file, *asked)
     first = ncs(*arguments)
     assert first.returncode == 0, first.stderr
     assert "no certificate was found" in first.stdout
