@@ -14,7 +14,10 @@ from ncs_gym.network.packet_log import PacketLog
 from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
+from ncs_gym.plants.convoy import convoy
+from ncs_gym.plants.lane_keeping import lane_keeping
 from ncs_gym.plants.linear_plant import LinearPlant, NoNoiseWarning
+from ncs_gym.plants.stirred_tank import stirred_tank
 from ncs_gym.plants.truck_trailer import truck_trailer
 from ncs_gym.processes import FunctionProcess, GymProcess, LinearProcess, Process, linear_model
 from ncs_gym.registration import register_all, register_plant
@@ -75,8 +78,11 @@ __all__ = [
     "cart_pole",
     "certified_error_set",
     "contract_of",
+    "convoy",
     "escape_probability",
+    "lane_keeping",
     "linear_model",
     "register_plant",
+    "stirred_tank",
     "truck_trailer",
 ]

@@ -15,12 +15,15 @@ from shields.runtime import Decision, SafeLoop, SafetyFilter, SafetyShield, Vect
 from shields.verification import Condition, Report, verify
 
 if TYPE_CHECKING:
+    from shields.nodes import ActuatorNode, ControllerNode, SensorNode
     from shields.synthesis import Network, Requirement, Requirements, certify, requirements, synthesize
 
 __all__ = [
+    "ActuatorNode",
     "Certificate",
     "CertificateError",
     "Condition",
+    "ControllerNode",
     "Decision",
     "GuaranteeLostError",
     "GuaranteeLostWarning",
@@ -35,6 +38,7 @@ __all__ = [
     "SafeLoop",
     "SafetyFilter",
     "SafetyShield",
+    "SensorNode",
     "Updates",
     "VectorSafetyShield",
     "certify",
@@ -44,8 +48,9 @@ __all__ = [
 ]
 
 
-# Imported at first use: these need the solver.
+# Imported at first use: these need the solver, or asyncio.
 _LAZY = dict.fromkeys(("Network", "Requirement", "Requirements", "certify", "requirements", "synthesize"), "synthesis")
+_LAZY |= dict.fromkeys(("ActuatorNode", "ControllerNode", "SensorNode"), "nodes")
 
 
 def __getattr__(name: str) -> Any:

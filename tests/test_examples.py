@@ -37,6 +37,10 @@ RUNS = {
         [],
         [r"monitor: outside the box in [1-9]\d* steps", r"project: outside the box in 0 steps, [1-9].* in 300 of 300"],
     ),
+    "mpc_over_udp.py": (  # what a busy machine does to it is the machine's affair
+        [],
+        [r"closest to the limit: \d+\.\d+ .* proved: \d+ of 120", r"inputs that did not arrive in time: \d+;"],
+    ),
     "own_plant.py": (
         ["--steps", "12800"],
         ["largest angle in the safe set: 0.500 rad", "without a violation: 64 of 64"],

@@ -36,6 +36,7 @@ LAYERS = {
         {"certificate"},
         {"verification", "paper", "synthesis"},
         {"runtime", "downlink"},
+        {"nodes"},
     ),
     "agents": (
         {"hyperparams", "results", "sb3_vec_env"},
@@ -45,11 +46,11 @@ LAYERS = {
         {"training"},
     ),
     "experiments": (
-        {"errors", "warning_sentences"},
+        {"errors", "warning_sentences", "json_values"},
         {"settings", "baselines"},
         {"runs"},
         {"backends", "analysis", "plots"},
-        {"report", "attack", "paper"},
+        {"report", "attack", "paper", "network_loop"},
         {"commands"},
         {"study"},
         {"__main__"},

@@ -1,13 +1,11 @@
-"""Confidence intervals, and tests of the differences between arms whose runs are paired by their seeds."""
+"""Confidence intervals."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from itertools import combinations
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.stats import binomtest, bootstrap, sem, t, trim_mean, ttest_rel
+from scipy.stats import binomtest, bootstrap, sem, t, trim_mean
 
 # A number per run or episode.
 Values = Sequence[float] | np.ndarray
@@ -16,8 +14,6 @@ CONFIDENCE = 0.95
 RESAMPLES = 10_000
 # Resamples of a single stratum held in memory at once: it may have thousands of episodes, where strata have runs.
 _BATCH = 1_000
-# Differences that differ by less than this fraction of the values are equal but for rounding.
-_ROUNDING = 1e-12
 
 
 def clopper_pearson(events: int, trials: int) -> list[float]:
@@ -77,61 +73,29 @@ def bootstrap_interval(*strata: Values, statistic: Callable[..., float] = np.mea
     return [float(found.low), float(found.high)]
 
 
-def paired_difference(first: Values, second: Values) -> dict[str, Any]:
-    """Returns mean, Student's 95 % interval and p-value of the differences first - second of paired runs.
+def hierarchical_interval(values: np.ndarray, confidence: float = CONFIDENCE) -> list[float] | None:
+    """Returns the percentile bootstrap's interval of the mean of what runs and their episodes gave.
 
-    The p-value is that of the two-sided paired t-test. Where all differences are equal the test does not apply: the
-    p-value is then 1 if they are zero, and else that of the sign-flip test, 2^(1 - runs). Interval and p-value are None
-    for fewer than two runs.
-
-    Args:
-        first: A number per run.
-        second: Numbers of the runs with the same seeds.
-
-    Raises:
-        ValueError: If there are not equally many numbers, or none.
-    """
-    if len(first) != len(second) or len(first) == 0:
-        raise ValueError(f"paired runs must be equally many, at least one, got {len(first)} and {len(second)}")
-    differences = np.subtract(first, second, dtype=np.float64)
-    if len(differences) < 2:
-        p_value = None
-    elif np.ptp(differences) <= _ROUNDING * max(np.abs(first).max(), np.abs(second).max()):
-        p_value = 1.0 if np.array_equal(first, second) else 2.0 ** (1 - len(differences))
-    else:
-        p_value = float(ttest_rel(first, second).pvalue)
-    return {"mean": float(differences.mean()), "ci95": mean_interval(differences), "p": p_value}
-
-
-def holm(p_values: Sequence[float]) -> list[float]:
-    """Returns p-values adjusted for their number, in the same order.
-
-    Rejecting what is adjusted to at most alpha keeps the probability of any false rejection below alpha, however the
-    tests depend on each other (Holm: "A simple sequentially rejective multiple test procedure", 1979).
+    Runs are resampled, then episodes within each resampled run, so that the interval covers what retraining changes
+    and what chance does in an evaluation. With a handful of runs it is too narrow, as every bootstrap is.
 
     Args:
-        p_values: Between 0 and 1.
-    """
-    p, order = np.asarray(p_values, np.float64), np.argsort(p_values)
-    adjusted = np.empty_like(p)
-    adjusted[order] = np.minimum(1.0, np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1)))
-    return adjusted.tolist()
-
-
-def all_pairs(values: Mapping[str, Values]) -> list[dict[str, Any]]:
-    """Returns the difference of every pair of arms, with the p-values that Holm's method adjusts over all pairs.
-
-    Args:
-        values: A number per run of each arm, paired by position.
+        values: Shape (runs, episodes).
+        confidence: Of the interval.
 
     Returns:
-        JSON values per pair: first, second, what `paired_difference` returns, and p_holm (None for single runs).
+        The interval; None for a single run.
     """
-    pairs: list[dict[str, Any]] = [
-        {"first": one, "second": other} | paired_difference(values[one], values[other]) | {"p_holm": None}
-        for one, other in combinations(values, 2)
-    ]
-    tested = [pair for pair in pairs if pair["p"] is not None]
-    for pair, adjusted in zip(tested, holm([pair["p"] for pair in tested]), strict=True):
-        pair["p_holm"] = adjusted
-    return pairs
+    runs, episodes = values.shape
+    if runs < 2:
+        return None
+    rng, means = np.random.default_rng(0), []
+    while len(means) * _BATCH < RESAMPLES:
+        chosen = rng.integers(runs, size=(_BATCH, runs))
+        if episodes == 1:
+            means.append(values[chosen, 0].mean(axis=1))
+        else:
+            within = rng.integers(episodes, size=(_BATCH, runs, episodes), dtype=np.int32)
+            means.append(values[chosen[..., None], within].mean(axis=(1, 2)))
+    tails = (0.5 - confidence / 2.0, 0.5 + confidence / 2.0)
+    return [float(end) for end in np.quantile(np.concatenate(means), tails)]

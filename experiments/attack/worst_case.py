@@ -8,7 +8,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ncs_gym import AdversarialDisturbance, Disturbance, Ellipsoid, LinearPlant, NCSVectorEnv
-from ncs_gym.processes.simulation import BlockSampler
 from shields import Certificate
 
 # Points on a boundary are pulled in by rounding.
@@ -44,18 +43,12 @@ class WorstCaseVectorEnv(NCSVectorEnv):
     ) -> None:
         push = AdversarialDisturbance() if pushes_to_box else _push_out_of(certificate)
         initial_set = start_set(certificate, settings.get("downlink"))
-        super().__init__(num_envs, disturbance=push, initial_set=initial_set, **settings)
-        self._process.sensor_noise = BlockSampler(self._extreme_noise, num_envs)
-
-    def _extreme_noise(self, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Returns sensor noise on the boundary of its bound, shape (p, count)."""
-        return INWARD * self.plant.nominal_sensor_error.sample_boundary(rng, count).T
+        super().__init__(num_envs, disturbance=push, initial_set=initial_set, noise="extreme", **settings)
 
     def _first(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns starts and first errors on the boundaries of their sets, shape (n, count) each."""
         states = self.single.initial_set.sample_boundary(self.np_random, count)
-        errors = self.plant.nominal_initial_error.sample_boundary(self.np_random, count)
-        return (1.0 - 1e-9) * states.T, INWARD * errors.T
+        return (1.0 - 1e-9) * states.T, self._process.first_error(self.np_random, count)
 
 
 class BoundedPush(Disturbance):

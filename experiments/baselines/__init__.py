@@ -3,7 +3,18 @@
 None of them comes with a proof under estimation errors, so none reports `shield_guaranteed`.
 """
 
-from experiments.baselines.controllers import CONTROLLERS, controller
+from experiments.baselines.controllers import CONTROLLERS, REGULATORS, RegulatorWeights, controller, tuned_weights
 from experiments.baselines.estimate_filter import FILTERS, EstimateFilter, EstimateFilterSettings
+from experiments.baselines.margins import MARGINS
 
-__all__ = ["CONTROLLERS", "FILTERS", "EstimateFilter", "EstimateFilterSettings", "controller"]
+__all__ = [
+    "CONTROLLERS",
+    "FILTERS",
+    "MARGINS",
+    "REGULATORS",
+    "EstimateFilter",
+    "EstimateFilterSettings",
+    "RegulatorWeights",
+    "controller",
+    "tuned_weights",
+]

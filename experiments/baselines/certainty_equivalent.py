@@ -22,6 +22,8 @@ class CertaintyEquivalentFilter:
         plant: The plant it was made for.
         mode: "project" or "lookahead"; see `SafetyFilter`.
         horizon: Longest plan of mode "lookahead" [steps]; None for that of `SafetyFilter`.
+        margin: Fraction of the safe set that is kept free after the next step: the next state is taken to be off by as
+            much, margin^2 L in the place of A Sigma_k A'.
 
     Raises:
         CertificateError: If the certificate does not verify for the plant.
@@ -29,10 +31,16 @@ class CertaintyEquivalentFilter:
     """
 
     def __init__(
-        self, certificate: Certificate, plant: LinearPlant, mode: str = "project", horizon: int | None = None
+        self,
+        certificate: Certificate,
+        plant: LinearPlant,
+        mode: str = "project",
+        horizon: int | None = None,
+        margin: float = 0.0,
     ) -> None:
         self._filter = SafetyFilter(certificate, plant, mode, horizon)
-        self._no_error = self._filter.errors_of_many(np.zeros((1, plant.n, plant.n)))
+        back = np.linalg.inv(plant.A) if margin else np.zeros_like(plant.A)
+        self._assumed = self._filter.errors_of_many((margin**2 * back @ certificate.L @ back.T)[None])
         self._plans = np.empty((0, plant.m, 0))
 
     def __call__(self, estimates: np.ndarray, proposed: np.ndarray, begun: np.ndarray) -> np.ndarray:
@@ -43,7 +51,7 @@ class CertaintyEquivalentFilter:
             proposed: Shape (N, m) [physical units].
             begun: Where an episode has just begun, shape (N,): earlier plans do not count.
         """
-        errors, plans = self._no_error.of(np.zeros(len(estimates), np.intp)), None
+        errors, plans = self._assumed.of(np.zeros(len(estimates), np.intp)), None
         if self._plans.shape[-1] == len(estimates):
             plans = np.where(begun, np.nan, self._plans)
         decided = self._filter.decide_many(estimates.T, errors, proposed.T, plans)

@@ -11,7 +11,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 
 from experiments.baselines.certainty_equivalent import CertaintyEquivalentFilter
-from experiments.baselines.predictive import PredictiveFilter
+from experiments.baselines.margins import MARGINS
+from experiments.baselines.predictive import TUBE_HORIZON, PredictiveFilter
 from ncs_gym import NCSVectorEnv
 from shields import Certificate
 
@@ -19,10 +20,16 @@ from shields import Certificate
 Rule = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 # How each filter is made from a certificate and its plant.
-FILTERS: dict[str, Callable[..., Rule]] = {
+_NOMINAL: dict[str, Callable[..., Rule]] = {
     "trusting": CertaintyEquivalentFilter,
     "trusting:lookahead": partial(CertaintyEquivalentFilter, mode="lookahead"),
     "psf": PredictiveFilter,
+}
+# Also with margins in percent of the safe set, as in "psf:10", and with a tube.
+FILTERS: dict[str, Callable[..., Rule]] = {
+    **_NOMINAL,
+    **{f"{name}:{each}": partial(make, margin=each / 100) for name, make in _NOMINAL.items() for each in MARGINS},
+    "psf:tube": partial(PredictiveFilter, horizon=TUBE_HORIZON, tube=True),
 }
 
 

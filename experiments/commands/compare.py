@@ -57,7 +57,7 @@ def compare(settings: CompareSettings) -> None:
         ClusterError: If a cluster cannot execute the runs.
     """
     settings = _with_full_names(short_version(settings, **_SMOKE))
-    loop = loop_config(settings.env, settings.channel, noise=settings.noise)
+    loop = loop_config(settings.env, settings.channel, noise="gaussian" if settings.noise == "gaussian" else None)
     require_trainable(settings, loop)
     certificate = certificate_of(loop, settings.certificate, settings.safe_set)
     with claim_folder("compare", settings.completed):

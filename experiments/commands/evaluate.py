@@ -15,8 +15,9 @@ from experiments.analysis.tables import summary_text
 from experiments.commands import short_version
 from experiments.runs import RunResult, certificate_of, require_place, versions
 from experiments.runs.environments import module_and_id, registered_env
+from experiments.runs.loops import with_channel
 from experiments.runs.policies import agent_folder, certificate_file
-from experiments.settings import EvaluateSettings, changed_channel
+from experiments.settings import EvaluateSettings
 from experiments.settings.steps import require_horizon
 from ncs_gym.envs.env import ncs_env
 from shields.atomic_write import write_atomically
@@ -42,9 +43,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     require_place(settings.out)
     folder = agent_folder(settings.model)
     agent = _agent(folder, settings.env)
-    loop = LoopConfig(env=agent.env, kwargs={"channel": agent.channel})
-    if (changed := changed_channel(ncs_env(loop.single()).channel, settings.channel)) is not None:
-        loop = loop.with_kwargs(channel=changed)
+    loop = with_channel(LoopConfig(env=agent.env, kwargs={"channel": agent.channel}), settings.channel)
     mode = _mode(settings, agent)
     horizon = (settings.horizon or agent.horizon) if mode == "lookahead" else None
     certificate = certificate_of(loop, settings.certificate or certificate_file(folder))

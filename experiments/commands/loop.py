@@ -48,7 +48,7 @@ def loop(settings: LoopSettings) -> None:
         Infeasible: If there is no certificate for the plant behind this network.
         CertificateError: If a given certificate is damaged or does not verify.
         OSError: If a file cannot be read or written, or an address is in use.
-        RuntimeError: If a process ended by itself.
+        ChildProcessError: If a process ended by itself.
     """
     settings = short_version(settings, **_SMOKE)
     env = registered_env(settings.env)
@@ -68,9 +68,10 @@ def loop(settings: LoopSettings) -> None:
                 time.sleep(_PERIOD / 4)
         else:
             with _view(settings, env) as show:
-                run_controller_node(network_loop, show=show)
+                known = not settings.restarted
+                run_controller_node(network_loop, known, show, lambda: not all(each.is_alive() for each in processes))
         if not all(process.is_alive() for process in processes):
-            raise RuntimeError("a process of the loop ended by itself; its message is above")
+            raise ChildProcessError("a process of the loop ended by itself; its message is above")
     finally:
         for process in processes:
             process.terminate()
@@ -78,7 +79,7 @@ def loop(settings: LoopSettings) -> None:
             process.join(_PATIENCE)
             if process.is_alive():
                 process.kill()
-    if settings.role == "all":
+    if settings.role != "plant":
         summary = summary_of(settings.out)
         write_atomically(settings.out / "summary.json", json.dumps(summary, indent=1) + "\n")
         print("\n".join(f"{name:>28}  {value}" for name, value in summary.items()))
@@ -88,7 +89,10 @@ def _in_process(run: Callable[[NetworkLoop], None], network_loop: NetworkLoop, e
     """Runs a process of the loop; the module that registers the environment is imported in each."""
     if module_and_id(env)[0]:
         import_module(module_and_id(env)[0])
-    run(network_loop)
+    try:
+        run(network_loop)
+    except OSError as error:
+        sys.exit(f"ncs: {error}")
 
 
 def _network_loop(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
@@ -214,7 +218,7 @@ def summary_of(folder: Path) -> dict[str, Any]:
         counts["outside, proved"] += row["outside"] == "1" and proved.get(key) == "1" and missing == 0
         counts["proved, missed"] += proved.get(key) == "1" and missing > 0
         counts["drift"] = step
-    summary = {
+    summary: dict[str, Any] = {
         "episodes": len({episode for episode, _ in proved}),
         "steps of the controller": counts["steps"],
         "steps of the plant": counts["plant"],

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, replace
 from itertools import product
+from typing import Any
 
 import pandas as pd
 
@@ -28,61 +29,23 @@ from experiments.runs import (
     run_of_arm,
     write_results,
 )
-from experiments.settings import Assignments, SweepSettings
+from experiments.settings import SweepSettings
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, verify
 
-# Budget of `--smoke`, and the sides of the grid of which it takes the first and the last value.
+# Budget of `--smoke`, which takes the first and the last value of each side of the grid.
 _SMOKE = {"steps": 1_024, "episodes": 4, "seeds": 1}
-_SIDES = ("losses", "delays", "quantization_steps", "burst_lengths", "mass_factors", "downlink_losses")
-
-
-@dataclass(frozen=True)
-class _GridPoint:
-    """One channel of the grid, and one mass.
-
-    Attributes:
-        loss: Probability that a packet is lost.
-        delay: Delay of every packet [steps].
-        quantization_step: Quantization step of the measurements; None for the environment's own.
-        burst_length: Mean number of packets lost in a row; 0 for independent losses.
-        mass_factor: Of the mass in the process; None for the environment's own.
-        downlink_loss: Probability that a command is lost; None for the environment's own downlink.
-    """
-
-    loss: float
-    delay: int
-    quantization_step: float | None
-    burst_length: float
-    mass_factor: float | None = None
-    downlink_loss: float | None = None
-
-    @property
-    def name(self) -> str:
-        """Name of the point in file names."""
-        quantization = "" if self.quantization_step is None else f"-q{self.quantization_step}"
-        mass = "" if self.mass_factor is None else f"-mass{self.mass_factor}"
-        downlink = "" if self.downlink_loss is None else f"-down{self.downlink_loss}"
-        return f"loss{self.loss}-delay{self.delay}{quantization}-burst{self.burst_length}{mass}{downlink}"
-
-    @property
-    def columns(self) -> dict[str, float]:
-        """What all rows of the table of episodes at this point have in common; NaN for the environment's own."""
-        return {name: float("nan" if value is None else value) for name, value in asdict(self).items()}
-
-    def channel(self, base: Assignments) -> Assignments:
-        """Returns the changes of the environment's channel that make this point's channel."""
-        changes = base | {"loss": self.loss, "delay": self.delay}
-        if self.quantization_step is not None:
-            changes["quantization_step"] = self.quantization_step
-        if self.burst_length != 0.0 and self.loss != 0.0:
-            changes["burst_length"] = self.burst_length
-        return changes
-
-    def loop(self, settings: SweepSettings) -> LoopConfig:
-        """Returns the control loop with the channels and the mass of this point."""
-        channel = self.channel(settings.channel)
-        return loop_config(settings.env, channel, mass_factor=self.mass_factor, downlink_loss=self.downlink_loss)
+# The sides of the grid: names of settings, and of the values at a point.
+_SIDES = {
+    "losses": "loss",
+    "delays": "delay",
+    "quantization_steps": "quantization_step",
+    "burst_lengths": "burst_length",
+    "mass_factors": "mass_factor",
+    "downlink_losses": "downlink_loss",
+}
+# Value of each side by its name; None for the environment's own.
+_GridPoint = dict[str, Any]
 
 
 def sweep(settings: SweepSettings) -> None:
@@ -106,7 +69,7 @@ def sweep(settings: SweepSettings) -> None:
             raise ValueError(f"--channel {name} is a side of the grid: give its values there")
     for name in settings.arms:
         Arm.of(name, settings.mode)
-    loops = [point.loop(settings) for point in points]
+    loops = [_loop(settings, point) for point in points]
     require_trainable(settings, loops[0])
     certificates = [certificate_of(loop, settings.certificate, settings.safe_set) for loop in loops]
     with claim_folder("sweep", settings.completed):
@@ -124,7 +87,7 @@ def _sweep_in_folder(
     print(wrapped(settings.agent_line), flush=True)
     settings = settings.completed
     runs = [
-        run_of_arm(settings, loop, certificate, name, index, grid_point=point.name)
+        run_of_arm(settings, loop, certificate, name, index, grid_point=_name(point))
         for point, loop, certificate in zip(points, loops, certificates, strict=True)
         for index in range(settings.seeds)
         for name in settings.arms
@@ -132,11 +95,15 @@ def _sweep_in_folder(
     results = results_of(runs, settings.out, settings)
     per_point = len(runs) // len(points)
     parts = [
-        episodes_table(results[i * per_point : (i + 1) * per_point], **point.columns) for i, point in enumerate(points)
+        episodes_table(
+            results[i * per_point : (i + 1) * per_point],
+            **{name: float("nan" if value is None else value) for name, value in point.items()},
+        )
+        for i, point in enumerate(points)
     ]
     arms = [arm_summaries(part, settings.mode) for part in parts]
     summary = {
-        "cells": [asdict(point) | {"arms": each} for point, each in zip(points, arms, strict=True)]
+        "cells": [point | {"arms": each} for point, each in zip(points, arms, strict=True)]
     } | experiment_provenance("sweep", settings, loops[0], certificates[0], runs)
     figures = sweep_figures(summary, settings.arms)
     certificates[0].save(settings.out / "certificate.json")
@@ -157,17 +124,35 @@ def _grid_points(settings: SweepSettings) -> list[_GridPoint]:
     Raises:
         ValueError: If a side of the grid is empty or names a value twice.
     """
-    sides = {
-        "losses": settings.losses,
-        "delays": settings.delays,
-        "quantization_steps": settings.quantization_steps or (None,),
-        "burst_lengths": settings.burst_lengths,
-        "mass_factors": settings.mass_factors or (None,),
-        "downlink_losses": settings.downlink_losses or (None,),
-        "arms": settings.arms,
-    }
-    for name, side in sides.items():
+    own_unless_given = ("quantization_steps", "mass_factors", "downlink_losses")
+    sides = {name: getattr(settings, name) or ((None,) if name in own_unless_given else ()) for name in _SIDES}
+    for name, side in (sides | {"arms": settings.arms}).items():
         if not side or len(set(side)) != len(side):
             raise ValueError(f"--{name.replace('_', '-')} must be different values, at least one")
-    del sides["arms"]
-    return [_GridPoint(*point) for point in product(*sides.values())]
+    return [dict(zip(_SIDES.values(), point, strict=True)) for point in product(*sides.values())]
+
+
+def _name(point: _GridPoint) -> str:
+    """Returns the name of a point in file names."""
+    short = {"quantization_step": "q", "burst_length": "burst", "mass_factor": "mass", "downlink_loss": "down"}
+    return "-".join(f"{short.get(name, name)}{value}" for name, value in point.items() if value is not None)
+
+
+def _loop(settings: SweepSettings, point: _GridPoint) -> LoopConfig:
+    """Returns the control loop with the channels and the mass of a point.
+
+    Raises:
+        ValueError: If the environment cannot have the channel or another mass, or has no downlink to change.
+    """
+    changes = {name: point[name] for name in ("loss", "delay", "quantization_step") if point[name] is not None}
+    if point["burst_length"] and point["loss"]:
+        changes["burst_length"] = point["burst_length"]
+    loop = loop_config(settings.env, settings.channel | changes)
+    env, kwargs = ncs_env(loop.single()), {}
+    if point["mass_factor"] is not None:
+        kwargs["process"] = asdict(env.process.with_mass(point["mass_factor"]))  # pyright: ignore
+    if point["downlink_loss"] is not None:
+        if env.downlink is None:
+            raise ValueError(f"{settings.env} has an ideal downlink, which loses nothing: choose one with a downlink")
+        kwargs["downlink"] = asdict(replace(env.downlink, loss=point["downlink_loss"]))
+    return loop.with_kwargs(**kwargs)

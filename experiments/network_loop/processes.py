@@ -138,10 +138,21 @@ def run_network(loop: NetworkLoop) -> None:
 
 
 def run_controller_node(
-    loop: NetworkLoop, known: bool = True, show: Callable[[dict[str, Any]], None] | None = None
+    loop: NetworkLoop,
+    known: bool = True,
+    show: Callable[[dict[str, Any]], None] | None = None,
+    is_alone: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Runs the controller in real time, until it has made its steps or the process is ended."""
-    asyncio.run(_controller(loop, known, show, _told_to_stop()))
+    """Runs the controller in real time, until it has made its steps, the process is ended or is left alone.
+
+    Args:
+        loop: The loop.
+        known: Whether the plant starts where the first estimate says.
+        show: Called with each row of the log.
+        is_alone: Whether processes that it needs have ended.
+    """
+    told = _told_to_stop()
+    asyncio.run(_controller(loop, known, show, lambda: told() or is_alone()))
 
 
 def _told_to_stop() -> Callable[[], bool]:

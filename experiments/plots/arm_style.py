@@ -30,6 +30,7 @@ ARM_COLORS_AND_MARKERS = {
 _CONTROLLER_MARKERS = {
     "proportional": "*",
     "lqr": "H",
+    "governor": "^",
     "random": "8",
     "K x_hat": "1",
     "zero input": "2",
@@ -77,7 +78,7 @@ class ArmStyle:
             return cls(color, _DOTTED, marker if arm.filters_training else "h", hollow=True, size=11.0)
         if not arm.is_trained:
             hollow = arm.mode == "trusting:lookahead"
-            return cls(color, _DASHED, _CONTROLLER_MARKERS[arm.policy], hollow, size=9.0)
+            return cls(color, _DASHED, _CONTROLLER_MARKERS[arm.policy.partition(":")[0]], hollow, size=9.0)
         if arm.violation_weight is not None:
             decades = np.log10(max(arm.violation_weight, 1e-9))
             dash = float(np.clip(_PRICE_DASH * 2.0**decades, 0.5, 50.0))

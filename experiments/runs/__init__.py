@@ -4,10 +4,10 @@ from experiments.runs.arms import Arm, by_arm
 from experiments.runs.experiment import (
     certificate_of,
     experiment_provenance,
-    loop_config,
     require_trainable,
     run_of_arm,
 )
+from experiments.runs.loops import loop_config
 from experiments.runs.output_folder import claim_folder, prepare_output, require_place, write_results
 from experiments.runs.provenance import versions
 from experiments.runs.run_store import RunStore

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 from agents.loop import LoopConfig, ShieldSettings
-from experiments.baselines import CONTROLLERS, FILTERS, EstimateFilterSettings
+from experiments.baselines import CONTROLLERS, FILTERS, REGULATORS, EstimateFilterSettings
 from experiments.runs.training_run import RunResult
 from experiments.settings import LearningSettings
 from ncs_gym.envs.env import ncs_env
@@ -15,14 +15,14 @@ from shields import Certificate
 from shields.runtime.safety_filter import MODES
 
 _SHIELD_MODES = tuple(mode for mode in MODES if mode != "monitor")
-# Modes whose filter plans ahead.
+# Modes whose filter plans ahead, with or without a margin behind.
 _PLANNING = ("lookahead", "trusting:lookahead")
 _PENALIZED, _RESIDUAL = "penalized", "+residual"
 _KNOWN_ARMS = (
     "unshielded, monitor, penalized, penalized:WEIGHT, lagrangian, FILTER, 'FILTER at test', FILTER+penalty, each also "
     "with +residual; CONTROLLER and CONTROLLER+FILTER, with FILTER one of shielded, shielded:MODE, "
     f"lookahead, {', '.join(FILTERS)} (modes: {', '.join(_SHIELD_MODES)}) and CONTROLLER one of untrained, "
-    f"{', '.join(CONTROLLERS)}"
+    f"{', '.join((*CONTROLLERS, *REGULATORS))}"
 )
 
 # Results of the training runs of each arm, in the order of their indices.
@@ -96,7 +96,7 @@ class Arm:
             certificate: Certificate of the shield or filter, which also gives the gain of residual agents.
             settings: Horizon and penalties.
         """
-        horizon = settings.horizon if self.mode in _PLANNING else None
+        horizon = settings.horizon if self.mode is not None and self.mode.startswith(_PLANNING) else None
 
         def filtered(penalty: float = 0.0) -> LoopConfig:
             if self.mode is None:
@@ -141,7 +141,7 @@ def _arms(mode: str) -> dict[str, Arm]:
     filters |= {name: name for name in ("lookahead", *FILTERS)}
     trained = list(_trained_arms(filters))
     arms = [*trained, *(replace(arm, name=arm.name + _RESIDUAL, is_residual=True) for arm in trained)]
-    for policy in (*CONTROLLERS, "untrained"):
+    for policy in (*CONTROLLERS, *REGULATORS, "untrained"):
         arms += [Arm(policy, policy=policy)]
         arms += [Arm(f"{policy}+{name}", own, policy) for name, own in filters.items()]
     return {arm.name.replace(" ", "-"): arm for arm in arms}

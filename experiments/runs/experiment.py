@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from agents.loop import LoopConfig
 from experiments.runs.arms import Arm
-from experiments.runs.environments import module_and_id, registered_env
+from experiments.runs.environments import module_and_id
 from experiments.runs.provenance import versions
 from experiments.runs.scenarios import other_scenarios
 from experiments.runs.synthesis_status import synthesis_status
 from experiments.runs.training_run import TrainingRun
-from experiments.settings import Assignments, BackendSettings, LearningSettings, changed_channel, settings_json
-from ncs_gym import Channel, NCSEnv
+from experiments.settings import BackendSettings, LearningSettings, settings_json
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, Report
 from shields.certificate_text import size_of
@@ -24,39 +22,6 @@ from shields.verification import require_valid
 
 # Settings that results do not depend on.
 INCIDENTAL_SETTINGS = ("out", *BackendSettings.__dataclass_fields__)
-
-
-def loop_config(
-    env_id: str,
-    channel: Assignments | None = None,
-    *,
-    noise: str = "truncated",
-    mass_factor: float | None = None,
-    downlink_loss: float | None = None,
-) -> LoopConfig:
-    """Returns the control loop of a registered environment with changes, whose keyword arguments are JSON values.
-
-    Args:
-        env_id: Id, or "module:id" if the user gave it.
-        channel: Changes of the environment's own channel by name; see `changed_channel`.
-        noise: "truncated", or "gaussian" for noise without a bound.
-        mass_factor: Of the mass in the process, the model being what it was; None keeps the mass.
-        downlink_loss: Loss probability of the environment's own downlink in place of its own; None keeps it.
-
-    Raises:
-        ValueError: If the environment is unknown or has no plant of its own, has no downlink although one is to be
-            changed, or cannot have the channel or another mass.
-    """
-    env, kwargs = registered_env(env_id), {}
-    if (changed := changed_channel(env.channel, channel or {})) is not None:
-        kwargs["channel"] = asdict(changed)
-    if noise != "truncated":
-        kwargs["noise"] = noise
-    if downlink_loss is not None:
-        kwargs["downlink"] = asdict(replace(_downlink_of(env, env_id), loss=downlink_loss))
-    if mass_factor is not None:
-        kwargs["process"] = asdict(env.process.with_mass(mass_factor))  # pyright: ignore
-    return LoopConfig(env=module_and_id(env_id)[1], kwargs=kwargs)
 
 
 def require_trainable(settings: LearningSettings, loop: LoopConfig) -> None:
@@ -164,14 +129,3 @@ def experiment_provenance(
         "certificate_file": certificate.document,
         "versions": versions(),
     }
-
-
-def _downlink_of(env: NCSEnv, env_id: str) -> Channel:
-    """Returns an environment's own downlink.
-
-    Raises:
-        ValueError: If it has none.
-    """
-    if env.downlink is None:
-        raise ValueError(f"{env_id} has an ideal downlink, which loses nothing: choose an environment with a downlink")
-    return env.downlink

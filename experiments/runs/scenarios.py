@@ -89,8 +89,26 @@ def _on_worse_channel(loop: LoopConfig) -> LoopConfig:
     return loop.with_kwargs(channel=asdict(worse_channel(env.channel, env.contract)))
 
 
+def bursts_at_their_longest(channel: Channel) -> Channel:
+    """Returns a channel that loses as many packets in a row as it may, each time; one without losses as it is."""
+    return channel if channel.most_consecutive_losses == 0 else replace(channel, loss=1.0)
+
+
+def _on_ideal_channel(loop: LoopConfig) -> LoopConfig:
+    return loop.with_kwargs(channel=asdict(Channel()))
+
+
+def _attacked(loop: LoopConfig) -> LoopConfig:
+    """Returns a loop with the disturbance that does the most harm, noise of full size, and bursts at their longest."""
+    worst = bursts_at_their_longest(ncs_env(loop.single()).channel)
+    return loop.with_kwargs(disturbance="adversarial", noise="extreme", channel=asdict(worst))
+
+
 _CHANGES: dict[str, Callable[[LoopConfig], LoopConfig]] = {
     "worst-case disturbance": lambda loop: loop.with_kwargs(disturbance="adversarial"),
     "worse channel": _on_worse_channel,
     "gaussian": lambda loop: loop.with_kwargs(noise="gaussian"),
+    "ideal channel": _on_ideal_channel,
+    "attacked": _attacked,
+    "attacked on an ideal channel": lambda loop: _on_ideal_channel(_attacked(loop)),
 }

@@ -19,7 +19,7 @@ from agents.hyperparams import rollout_steps
 from agents.loop import LoopConfig
 from agents.results import Episode, TrainingPoint, Trajectory
 from agents.sharing.agent_file import AGENT_FILES, write_files
-from experiments.baselines import controller
+from experiments.baselines import controller, tuned_weights
 from experiments.runs.environments import import_module, module_digest
 from experiments.runs.provenance import versions
 from experiments.runs.scenarios import AS_TRAINED, under
@@ -42,7 +42,7 @@ class TrainingRun:
     Attributes:
         arm: Name of the arm that the run belongs to.
         policy_kind: "trained" is a trained agent; "untrained" an agent with its initial weights; the others are
-            controllers (`experiments.baselines.CONTROLLERS`).
+            controllers (`experiments.baselines.CONTROLLERS` and `REGULATORS`).
         training_loop: Control loop that the policy is trained in, with its penalties.
         loop: Control loop that the policy is evaluated in.
         module: Module of the user's that registers the environment, imported where the run is executed; empty for none.
@@ -301,4 +301,5 @@ def _policy(run: TrainingRun, agent: Agent | None) -> Policy:
     """Returns what acts in the evaluation of a run: an agent, or for None the run's controller, which begins anew."""
     if agent is not None:
         return lambda observations, infos: agent.act(observations)
-    return controller(run.policy_kind, ncs_env(run.loop.single()), run.certificate.K, run.evaluation_seed)
+    weights = tuned_weights(run.loop.env, run.arm)
+    return controller(run.policy_kind, ncs_env(run.loop.single()), run.certificate.K, run.evaluation_seed, weights)

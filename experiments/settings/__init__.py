@@ -11,7 +11,6 @@ from experiments.settings.certificates import (
     SynthesizeSettings,
     VerifySettings,
 )
-from experiments.settings.channel import changed_channel
 from experiments.settings.learning import (
     CompareSettings,
     EvaluateSettings,
@@ -41,7 +40,6 @@ __all__ = [
     "SynthesizeSettings",
     "TrainSettings",
     "VerifySettings",
-    "changed_channel",
     "config_defaults",
     "save_settings",
     "settings_json",

@@ -158,13 +158,16 @@ class CompareSettings(BackendSettings, LearningSettings):
         arms: unshielded, monitor (unshielded, counts what the shield would have done), penalized (unshielded, with a
             penalty per violation), penalized:WEIGHT, lagrangian (PPO-Lagrangian adapts that penalty), shielded,
             shielded:MODE, lookahead, trusting and trusting:lookahead (certainty-equivalent: without an error set), psf
-            (a nominal predictive safety filter).
+            (a nominal predictive safety filter), these also with a margin in percent as in psf:20, psf:tube.
             shield-at-test, trusting-at-test and psf-at-test are trained unshielded; +penalty costs reward per
             intervention, +residual adds the agent's action to K x_hat. Controllers that are not trained: proportional,
-            lqr, random, K-x_hat, zero-input and untrained, alone or behind a filter as in proportional+shielded.
+            lqr, governor (lqr with a reference governor, governor:20 with a margin), random, K-x_hat, zero-input and
+            untrained, alone or behind a filter as in proportional+shielded.
         baselines: Arms that are listed below the others and not drawn.
         scenarios: What policies are evaluated under besides "as trained": worst-case-disturbance, worse-channel (more
-            loss, later packets, within the contract), gaussian (noise without a bound).
+            loss, later packets, within the contract), ideal-channel, attacked (the worst disturbance, noise of full
+            size, bursts of losses as long as the contract allows), attacked-on-an-ideal-channel, gaussian (noise
+            without a bound).
         noise: "gaussian" draws noise that the certificate's bounds do not hold for always, and prints next to the
             episodes that left the safe set the bound on their probability.
     """

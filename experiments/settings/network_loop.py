@@ -29,6 +29,7 @@ class LoopSettings:
         worst: Lose all the datagrams in a row that the channel's promise allows, whenever one is lost.
         seed: Of network, disturbance and controller.
         role: What runs here: "all", or "plant" (with the network) and "controller" on two machines.
+        restarted: The plant has moved already: the controller claims nothing until samples tell where it is.
         host: Name or address of the controller's machine.
         port: Its UDP port; the two after it are used by the network.
         key_file: File with the shared key, at least 16 bytes, needed on two machines; drawn anew otherwise.
@@ -49,6 +50,7 @@ class LoopSettings:
     worst: bool = False
     seed: int = 0
     role: Literal["all", "plant", "controller"] = "all"
+    restarted: bool = False
     host: str = "127.0.0.1"
     port: int = 47600
     key_file: Path | None = None

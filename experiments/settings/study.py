@@ -6,9 +6,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from experiments.baselines.margins import MARGINS
 from experiments.settings.backend import BackendSettings
 from experiments.settings.learning import Algorithm, Baselines, LearningSettings, Scenarios
 from experiments.settings.steps import StepCount, require_least
+
+# Environments in which the network decides.
+NETWORK_ENVS = ("ncs_gym/CSTR-v0", "ncs_gym/Convoy-v0", "ncs_gym/LaneKeeping-v0")
+# What the shield is compared with and needs no training, margins in percent: a regulator alone, with a governor of its
+# references, and behind every filter. The weights of each are tuned by themselves (benchmarks/tune_baselines.py).
+_MARGINS = ("", *(f":{margin}" for margin in MARGINS))
+REGULATED_ARMS = (
+    "lqr",
+    *(f"governor{margin}" for margin in _MARGINS),
+    *(f"lqr+{name}{margin}" for name in ("psf", "trusting", "trusting:lookahead") for margin in _MARGINS),
+    "lqr+psf:tube",
+    "lqr+shielded",
+    "lqr+lookahead",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,8 +74,8 @@ class StudySettings(BackendSettings):
     """Compares arms in several environments and under several scenarios, with the statistics to judge them by.
 
     Every environment is a comparison of its own (`ncs compare`) in a folder below the output folder, with the settings
-    of that command; then linear controllers and trained agents meet worse and better channels, behind filters with and
-    without the error set. Leaves report.html, the same as a page of Markdown (docs/results.md is one), figures,
+    of that command; then linear controllers and trained agents are attacked with every impairment of the channel on and
+    off. Leaves report.html, the same as a page of Markdown (docs/results.md is one), figures,
     summary.json and episodes.parquet. Started again with the same folder, finished runs are kept: a long study can be
     run in parts.
 
@@ -76,8 +91,9 @@ class StudySettings(BackendSettings):
         arms: Trained arms; see `ncs compare`.
         baselines: Arms in which nothing is trained.
         scenarios: What policies are evaluated under besides "as trained".
-        safe_set: What shields keep: the ellipsoid, as in the published study, or the polytope that other commands take.
-        channel_episodes: Episodes per point of the figure about channels; 0 leaves it out.
+        safe_set: What shields keep: the ellipsoid, which the filters beside them have too, or the polytope that other
+            commands take.
+        channel_episodes: Episodes per arm and combination of impairments; 0 leaves them out.
         page: Also write the page of Markdown to this file, its figures into the folder images beside it, and its
             numbers into the file with the ending .json.
         quote: Pages in which the marked tables are replaced by those of this study.
@@ -88,39 +104,15 @@ class StudySettings(BackendSettings):
 
     config: Path | None = None
     out: Path = Path("runs/study")
-    envs: tuple[str, ...] = ("ncs_gym/BatchReactor-v0", "ncs_gym/CartPole-v0", "ncs_gym/TruckTrailerCruise-v0")
+    envs: tuple[str, ...] = NETWORK_ENVS
     seed: int = 0
-    seeds: int = 10
+    seeds: int = 5
     budget: float = 1.0
     episodes: int = 100
     algo: Algorithm = "PPO"
-    arms: tuple[str, ...] = (
-        "unshielded",
-        "penalized:1",
-        "penalized:10",
-        "lagrangian",
-        "psf",
-        "psf at test",
-        "trusting",
-        "trusting:lookahead",
-        "shield at test",
-        "shielded",
-        "lookahead",
-    )
-    baselines: Baselines = (
-        "zero input",
-        "K x_hat",
-        "random+shielded",
-        "proportional",
-        "proportional+trusting",
-        "proportional+shielded",
-        "lqr",
-        "lqr+psf",
-        "lqr+trusting:lookahead",
-        "lqr+shielded",
-        "lqr+lookahead",
-    )
-    scenarios: Scenarios = ("worst-case-disturbance", "worse-channel", "gaussian")
+    arms: tuple[str, ...] = ("unshielded", "penalized:10", "lagrangian", "trusting:20", "shielded", "lookahead")
+    baselines: Baselines = REGULATED_ARMS
+    scenarios: Scenarios = ("ideal-channel", "worse-channel", "attacked", "attacked-on-an-ideal-channel")
     safe_set: Literal["polytope", "ellipsoid"] = "ellipsoid"
     channel_episodes: int = 100
     page: Path | None = None

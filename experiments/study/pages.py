@@ -10,13 +10,11 @@ from experiments.report.html import render_page
 from experiments.study.tables import (
     QUOTABLE,
     budget_text,
-    channels_table,
+    comparisons_table,
     evaluation_table,
-    overview_table,
-    pairs_table,
-    price_table,
-    scores_table,
-    simpler_table,
+    margins_table,
+    prices_table,
+    switches_table,
     training_table,
 )
 
@@ -28,7 +26,7 @@ def study_report(summary: dict[str, Any], figures: dict[str, tuple[str, bytes]])
     """Returns the HTML page; opens offline, but for its links to the comparisons beside it.
 
     Args:
-        summary: What `page_summary` returns, with the sweep of channels, settings and versions.
+        summary: What `study_summary` returns, with the sweep of channels, settings and versions.
         figures: Caption and PNG file by name.
     """
     return render_page("study.html.j2", figures, title="Safe learning: the study", **_context(summary))
@@ -52,14 +50,12 @@ def _context(summary: dict[str, Any]) -> dict[str, Any]:
     return {
         "summary": summary,
         "budget": budget_text(summary),
-        "overview": overview_table(summary),
+        "comparisons": comparisons_table(summary),
+        "prices": prices_table(summary),
+        "margins": margins_table(summary),
         "evaluation": {name: evaluation_table(env) for name, env in environments.items()},
         "training": {name: training_table(env) for name, env in environments.items()},
-        "pairs": {name: pairs_table(env) for name, env in environments.items()},
-        "channels": {name: channels_table(rows) for name, rows in summary["channels"].items()},
-        "price": price_table(summary),
-        "simpler": simpler_table(summary),
-        "scores": scores_table(summary),
+        "channels": {name: switches_table(rows) for name, rows in summary["channels"].items()},
     }
 
 

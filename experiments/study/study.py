@@ -17,10 +17,10 @@ from experiments.runs import claim_folder, prepare_output, versions, write_resul
 from experiments.runs.experiment import INCIDENTAL_SETTINGS
 from experiments.settings import BackendSettings, CompareSettings, StudySettings, settings_json
 from experiments.settings.study import short_name
-from experiments.study.channel_sweep import channel_sweep, trained_agents
+from experiments.study.channel_switches import channel_switches, trained_agents
 from experiments.study.figures import study_figures
 from experiments.study.pages import quoted, require_marks, results_page, study_report
-from experiments.study.summary import page_summary, study_summary
+from experiments.study.summary import study_summary
 from experiments.study.tables import tables_by_name
 from shields.atomic_write import write_atomically
 
@@ -59,15 +59,15 @@ def _study_in_folder(settings: StudySettings) -> None:
         comparisons[name] = json.loads((part.out / "summary.json").read_bytes())
         if settings.channel_episodes:
             sweep = replace(part, out=part.out / _CHANNELS, episodes=settings.channel_episodes)
-            channels[name] = channel_sweep(sweep, trained_agents(part))
+            channels[name] = channel_switches(sweep, trained_agents(part))
         print(flush=True)
     content = settings_json("study", settings)["settings"]
     provenance = {
         "settings": {key: value for key, value in content.items() if key not in _INCIDENTAL},
         "versions": versions(),
     }
-    summary = study_summary(comparisons) | {"channels": channels} | provenance
     episodes = {name: pd.read_parquet(part.out / "episodes.parquet") for name, part in parts.items()}
+    summary = study_summary(comparisons, episodes) | {"channels": channels} | provenance
     _write(settings, summary, pd.concat(episodes, names=["environment"]).reset_index("environment"))
     print(f"files: {settings.out}")
 
@@ -94,25 +94,24 @@ def _comparison_settings(settings: StudySettings, env_id: str) -> CompareSetting
 
 def _write(settings: StudySettings, summary: dict[str, Any], episodes: pd.DataFrame) -> None:
     """Writes every file."""
-    shown = page_summary(summary)
-    figures = study_figures(shown)
+    figures = study_figures(summary)
     if settings.page is not None:
-        _write_page(settings.page, shown, figures)
+        _write_page(settings.page, summary, figures)
     files = {
         "episodes.parquet": parquet(episodes, summary),
-        "report.html": study_report(shown, figures),
-        "results.md": results_page(shown, figures, "figures/"),
+        "report.html": study_report(summary, figures),
+        "results.md": results_page(summary, figures, "figures/"),
     }
     write_results(settings.out, summary, files, figures)
     for path in settings.quote:
-        write_atomically(path, quoted(path.read_text("utf-8"), tables_by_name(shown)))
+        write_atomically(path, quoted(path.read_text("utf-8"), tables_by_name(summary)))
 
 
-def _write_page(page: Path, shown: dict[str, Any], figures: dict[str, tuple[str, bytes]]) -> None:
+def _write_page(page: Path, summary: dict[str, Any], figures: dict[str, tuple[str, bytes]]) -> None:
     """Writes the page of the documentation, its figures, and the numbers that it shows."""
     images = page.parent / "images"
     images.mkdir(parents=True, exist_ok=True)
     for name, (_, png) in figures.items():
         write_atomically(images / f"{page.stem}-{name}.png", png)
-    write_atomically(page.with_suffix(".json"), json.dumps(shown, allow_nan=False) + "\n")
-    write_atomically(page, results_page(shown, figures, f"images/{page.stem}-"))
+    write_atomically(page.with_suffix(".json"), json.dumps(summary, allow_nan=False) + "\n")
+    write_atomically(page, results_page(summary, figures, f"images/{page.stem}-"))

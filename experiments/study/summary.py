@@ -1,66 +1,98 @@
-"""The summary of a study: what its comparisons found, differences between all pairs of arms, and scores."""
+"""The summary of a study: every arm in every scenario with intervals that cover retraining, and few comparisons."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
-from experiments.analysis.statistics import all_pairs, bootstrap_interval, interquartile_mean, paired_difference
+import numpy as np
+import pandas as pd
 
-# Arms with a proof, which a page compares all others with.
-SOUND_ARMS = ("shielded", "lookahead")
-# The policies behind the shield that have a score of 0 and of 1.
-SCORE_ZERO, SCORE_ONE = "random+shielded", "lqr+shielded"
-# Measures in which pairs of arms differ, with the key of their numbers per run.
-MEASURES = {"return": "eval_return_by_run", "violating episodes": "eval_violation_rate_by_run"}
-# What a page shows of an arm, and of its evaluation under a condition.
-_ARM = ("mode", "train_steps", "train_violation_steps", "train_violation_steps_by_run")
-_EVALUATION = (
-    "eval_episodes",
-    "eval_violating_episodes",
-    "eval_violation_rate",
-    "eval_violation_rate_ci95",
-    "eval_episodes_outside_set",
-    "eval_return_mean",
-    "eval_return_ci95",
-    "intervention_rate",
+from experiments.analysis.statistics import CONFIDENCE, clopper_pearson, hierarchical_interval
+from experiments.baselines import MARGINS
+from experiments.runs.arms import Arm
+from experiments.runs.scenarios import AS_TRAINED
+
+IDEAL, ATTACKED = "ideal channel", "attacked"
+# Arms with a proof: no scenario leaves the assumptions of the certificate.
+SOUND = "lookahead"
+
+
+class Comparison(NamedTuple):
+    """The difference first - second of a share of violating episodes, in one scenario.
+
+    Attributes:
+        first: Name of an arm.
+        second: Name of the arm that is subtracted.
+        scenario: Name of the scenario.
+    """
+
+    first: str
+    second: str
+    scenario: str
+
+
+# Declared before the study was run, the same in every environment. The first is the primary one; the others are judged
+# at a level that is divided by their number. Everything else on the page is exploratory.
+PRIMARY = Comparison("unshielded", SOUND, ATTACKED)
+SECONDARY = (
+    Comparison("trusting:20", SOUND, ATTACKED),
+    Comparison("penalized:10", SOUND, ATTACKED),
+    Comparison("lqr+psf:20", f"lqr+{SOUND}", ATTACKED),
 )
+# Families of arms that differ by the margin alone, with the arm that has the proof in their place.
+FAMILIES = {
+    "governor": f"lqr+{SOUND}",
+    "lqr+psf": f"lqr+{SOUND}",
+    "lqr+trusting": "lqr+shielded",
+    "lqr+trusting:lookahead": f"lqr+{SOUND}",
+}
 
 
-def study_summary(comparisons: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
-    """Returns JSON values: per environment its arms, pairs and prices of soundness, and scores over environments.
+def study_summary(comparisons: Mapping[str, dict[str, Any]], episodes: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
+    """Returns JSON values: of every environment its arms in every scenario, the declared comparisons and prices.
 
     Args:
         comparisons: Content of each comparison's summary.json by the environment's short name.
+        episodes: The table of its episodes (`experiments.analysis.episodes`), by the same name.
     """
-    environments = {name: _environment(comparison) for name, comparison in comparisons.items()}
-    arms = [each["arms"] for each in environments.values()]
-    return {"environments": environments, "scores": _scores(arms)}
+    return {"environments": {name: _environment(each, episodes[name]) for name, each in comparisons.items()}}
 
 
-def page_summary(summary: dict[str, Any]) -> dict[str, Any]:
-    """Returns the part of a study's summary that pages show: pairs with a sound arm, and no numbers of single runs."""
-    environments = {}
-    for name, env in summary["environments"].items():
-        pairs = {
-            measure: [pair for pair in found if {pair["first"], pair["second"]} & set(SOUND_ARMS)]
-            for measure, found in env["pairs"].items()
-        }
-        environments[name] = env | {"arms": {arm: _shown(each) for arm, each in env["arms"].items()}, "pairs": pairs}
-    return summary | {"environments": environments}
+def difference(
+    episodes: pd.DataFrame, compared: Comparison, column: str = "violating", confidence: float = CONFIDENCE
+) -> dict[str, Any] | None:
+    """Returns the mean difference of two arms and its interval over runs and episodes; None if an arm is missing.
 
+    Runs with the same number have the same seeds and episodes with the same index the same random numbers, so that
+    differences are taken episode by episode; runs are resampled, then episodes within each.
 
-def sound_counterpart(name: str) -> str | None:
-    """Returns the arm that differs from a trusting one only in that it has the error set; None for other arms."""
-    if "trusting" not in name:
+    Args:
+        episodes: The table of an environment's episodes.
+        compared: Arms and scenario.
+        column: "violating" or "episode_return".
+        confidence: Of the interval.
+    """
+    played = episodes[episodes["condition"] == compared.scenario]
+    values = [_by_run(played[played["arm"] == name], column) for name in (compared.first, compared.second)]
+    if not all(each.size for each in values):
         return None
-    named = name.replace("trusting:lookahead", "lookahead").replace("trusting", "shielded")
-    return named.replace("shielded at test", "shield at test")
+    differences = values[0] - values[1]
+    return {
+        **compared._asdict(),
+        "mean": float(differences.mean()),
+        "interval": hierarchical_interval(differences, confidence),
+        "confidence": confidence,
+        "by_run": differences.mean(axis=1).tolist(),
+    }
 
 
-def _environment(comparison: dict[str, Any]) -> dict[str, Any]:
-    """Returns what a study keeps of a comparison."""
-    arms, settings = comparison["arms"] | comparison["references"], comparison["settings"]
+def _environment(comparison: dict[str, Any], episodes: pd.DataFrame) -> dict[str, Any]:
+    """Returns what a study keeps of an environment."""
+    settings, known = comparison["settings"], comparison["arms"] | comparison["references"]
+    arms = {name: _arm(name, arm, episodes[episodes["arm"] == name]) for name, arm in known.items()}
+    level = 1.0 - (1.0 - CONFIDENCE) / len(SECONDARY)
+    declared = [difference(episodes, PRIMARY), *(difference(episodes, each, confidence=level) for each in SECONDARY)]
     return {
         "env": settings["env"],
         "seeds": settings["seeds"],
@@ -69,49 +101,85 @@ def _environment(comparison: dict[str, Any]) -> dict[str, Any]:
         "certificate": comparison["certificate"],
         "trained": list(comparison["arms"]),
         "arms": arms,
-        "pairs": {
-            measure: all_pairs({name: arm[key] for name, arm in arms.items()}) for measure, key in MEASURES.items()
-        },
-        "prices": _prices(arms),
+        "comparisons": [each for each in declared if each is not None],
+        "prices": _prices(arms, episodes),
     }
 
 
-def _prices(arms: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    """Returns, for each arm without the error set beside the same one with it, how much more the latter overrides."""
+def _arm(name: str, arm: dict[str, Any], episodes: pd.DataFrame) -> dict[str, Any]:
+    """Returns what pages show of an arm: its training, and its evaluation in every scenario."""
+    kept = ("mode", "train_steps", "train_violation_steps", "train_violation_steps_by_run")
+    is_fixed = Arm.of(name).policy not in ("trained", "untrained")
+    scenarios = {
+        scenario: _evaluated(played, is_fixed=is_fixed)
+        for scenario, played in episodes.groupby("condition", sort=False)
+    }
+    return {key: arm[key] for key in kept} | {"scenarios": scenarios}
+
+
+def _evaluated(played: pd.DataFrame, *, is_fixed: bool) -> dict[str, Any]:
+    """Returns rate and return of an arm in a scenario, with intervals over runs and episodes, and those of each run.
+
+    A fixed policy is the same in all runs, so that its episodes are as good as one run each. Where no episode violates
+    or every one does, resampling says nothing, and the interval is the exact one of a single proportion.
+
+    Args:
+        played: Rows of the arm in this scenario.
+        is_fixed: Whether the policy is the same in all runs.
+    """
+    violating, returns = _by_run(played, "violating"), _by_run(played, "episode_return")
+    if is_fixed:
+        violating, returns = violating.reshape(-1, 1), returns.reshape(-1, 1)
+    rate, count = float(violating.mean()), violating.size
+    exact = rate in (0.0, 1.0)
+    return {
+        "episodes": count,
+        "violating": int(violating.sum()),
+        "rate": rate,
+        "rate_ci95": clopper_pearson(int(violating.sum()), count) if exact else hierarchical_interval(violating),
+        "rate_by_run": _by_run(played, "violating").mean(axis=1).tolist(),
+        "return": float(returns.mean()),
+        "return_ci95": hierarchical_interval(returns),
+        "return_by_run": _by_run(played, "episode_return").mean(axis=1).tolist(),
+        "overridden": float(played["interventions"].sum() / played["steps"].sum()),
+    }
+
+
+def _by_run(played: pd.DataFrame, column: str) -> np.ndarray:
+    """Returns a column by run and episode, shape (runs, episodes)."""
+    return played.pivot(index="run", columns="index", values=column).to_numpy(np.float64)
+
+
+def _prices(arms: Mapping[str, dict[str, Any]], episodes: pd.DataFrame) -> list[dict[str, Any]]:
+    """Returns what the proof costs beside the best arm that violates anywhere, of trained arms and of regulators."""
     prices = []
-    for name, arm in arms.items():
-        sound = sound_counterpart(name)
-        if sound is not None and sound in arms:
-            measures = ("intervention_rate_by_run", MEASURES["return"])
-            overridden, returns = (paired_difference(arms[sound][key], arm[key]) for key in measures)
-            prices.append({"trusting": name, "sound": sound, "overridden": overridden, "return": returns})
+    for sound in (SOUND, f"lqr+{SOUND}"):
+        rivals = {
+            name: arm["scenarios"][AS_TRAINED]["return"]
+            for name, arm in arms.items()
+            if any(each["violating"] for each in arm["scenarios"].values())
+            and (arm["train_steps"] > 0) == (not sound.startswith("lqr"))
+        }
+        if sound in arms and rivals:
+            best = max(rivals, key=lambda name: rivals[name])
+            prices.append(difference(episodes, Comparison(sound, best, AS_TRAINED), "episode_return"))
     return prices
 
 
-def _scores(environments: Sequence[Mapping[str, dict[str, Any]]]) -> dict[str, Any]:
-    """Returns the interquartile mean over all runs of the score of each arm that every environment has.
+def margins_needed(env: Mapping[str, Any], family: str, scenario: str) -> str | None:
+    """Returns the arm of a family that violates in no episode of a scenario with the smallest margin; None for none.
 
-    The score of a run is 0 for the mean return of random actions behind the shield and 1 for that of the
-    linear-quadratic regulator behind it; its interval is from resampling the runs of each environment by themselves.
+    Args:
+        env: An environment of `study_summary`.
+        family: A name in `FAMILIES`.
+        scenario: Name of a scenario.
     """
-    shared = [name for name in environments[0] if all(name in arms for arms in environments)]
-    ends = [[arms[end]["eval_return_mean"] for end in (SCORE_ZERO, SCORE_ONE) if end in arms] for arms in environments]
-    if any(len(each) < 2 or each[0] == each[1] for each in ends):
-        return {}
-    scores = {}
-    for name in shared:
-        strata = [
-            [(value - zero) / (one - zero) for value in arms[name][MEASURES["return"]]]
-            for arms, (zero, one) in zip(environments, ends, strict=True)
-        ]
-        scores[name] = {
-            "iqm": float(interquartile_mean([score for stratum in strata for score in stratum])),
-            "ci95": bootstrap_interval(*strata, statistic=interquartile_mean),
-        }
-    return scores
+    return next(
+        (name for name in members(env, family) if env["arms"][name]["scenarios"][scenario]["violating"] == 0), None
+    )
 
 
-def _shown(arm: dict[str, Any]) -> dict[str, Any]:
-    """Returns what pages show of an arm."""
-    conditions = {name: {key: each[key] for key in _EVALUATION} for name, each in arm["conditions"].items()}
-    return {key: arm[key] for key in (*_ARM, *_EVALUATION)} | {"conditions": conditions}
+def members(env: Mapping[str, Any], family: str) -> Sequence[str]:
+    """Returns the arms of a family that an environment has, the smallest margin first."""
+    names = {0: family} | {margin: f"{family}:{margin}" for margin in MARGINS}
+    return [names[margin] for margin in sorted(names) if names[margin] in env["arms"]]

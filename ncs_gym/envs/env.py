@@ -112,8 +112,9 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         render_mode: "human" shows every step in a window, "rgb_array" makes `render` return an image; both need
             the extra `[render]` (docs/rendering.md).
         horizon: Steps the observation space is sized for; give it beside a longer `max_episode_steps`.
-        noise: "truncated", or "gaussian" for process noise, sensor noise and first errors without a bound: what is
-            proved then holds but for a probability that `escape_probability` bounds (docs/shield.md).
+        noise: "truncated"; "gaussian" for process noise, sensor noise and first errors without a bound: what is
+            proved then holds but for a probability that `escape_probability` bounds (docs/shield.md); or "extreme" for
+            sensor noise and first errors as large as assumed, in random directions.
         process: What really moves (docs/beyond_linear.md); the plant's own equations by default.
         downlink: The network between controller and actuator (docs/contracts.md); ideal by default.
         downlink_contract: What is assumed of the downlink, which may then break it; by default what the downlink's
@@ -203,11 +204,10 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._downlink_state = DownlinkState(self._protocol, plant.m)
         self._uplinks, self._downlinks = uplinks([self._channel], self._channel), downlinks([downlink], self._protocol)
         self._noise = as_noise(noise, plant)
-        truncated = self._noise == "truncated"
         self._process_given = LinearProcess() if process is None else expect(process, Process, "process")
         allowed = self._allow_assumption_violation
         self._process = PlantSimulation(
-            plant, self._disturbance, allowed, truncated=truncated, process=self._process_given
+            plant, self._disturbance, allowed, noise=self._noise, process=self._process_given
         )
         self._horizon = as_count(horizon, "horizon", low=1, high=LONGEST_HORIZON)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)

@@ -115,9 +115,9 @@ class NCSVectorEnv(VectorEnv):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         bounds = single.observation_space.low, single.observation_space.high
         self._low, self._high = (np.asarray(bound, dtype=np.float64)[:, None] for bound in bounds)
-        allowed, truncated = single.allow_assumption_violation, single.noise == "truncated"
+        allowed = single.allow_assumption_violation
         self._process = PlantSimulation(
-            self._plant, single.disturbance, allowed, self.num_envs, truncated=truncated, process=single.process
+            self._plant, single.disturbance, allowed, self.num_envs, noise=single.noise, process=single.process
         )
         self._downlink, self._protocol = single.downlink, single.downlink_protocol
         self._certificate_contract = single.certificate_contract

@@ -9,7 +9,7 @@ import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import LinearProcess, Process
-from ncs_gym.uncertainty.disturbance import Disturbance, checked, checked_many
+from ncs_gym.uncertainty.disturbance import ROUNDING, Disturbance, checked, checked_many
 from ncs_gym.uncertainty.disturbance_settings import stays_inside
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import read_only
@@ -55,7 +55,7 @@ class PlantSimulation:
         disturbance: What acts on it; process noise is added unless it replaces that.
         allow_assumption_violation: Let disturbances outside the certified bound pass instead of raising.
         size: Number of environments; None for one without that axis.
-        truncated: Whether process noise, sensor noise and first errors are truncated; False draws Gaussian ones.
+        noise: How process noise, sensor noise and first errors are drawn, one of `NOISES`.
         process: What moves; the plant's own equations by default.
 
     Attributes:
@@ -74,13 +74,14 @@ class PlantSimulation:
         allow_assumption_violation: bool,
         size: int | None = None,
         *,
-        truncated: bool = True,
+        noise: str = "truncated",
         process: Process | None = None,
     ) -> None:
         given = LinearProcess() if process is None else process
         self.process, self._is_linear = given.opened(plant, size), isinstance(given, LinearProcess)
         self.plant, self._model = plant if self._is_linear else plant.without_remainder, plant
-        self.disturbance, self.size, self._truncated = disturbance, size, truncated
+        self.disturbance, self.size = disturbance, size
+        self._truncated, self._is_extreme = noise != "gaussian", noise == "extreme"
         self._allow = allow_assumption_violation
         self._limit = plant.state_limit if np.isfinite(plant.state_limit).all() else None
         if size is not None and self._limit is not None:
@@ -150,10 +151,14 @@ class PlantSimulation:
 
     def _draw_sensor_noise(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Returns sensor noise, shape (p, count)."""
+        if self._is_extreme:
+            return (1.0 - ROUNDING) * self.plant.nominal_sensor_error.sample_boundary(rng, count).T
         return self.plant.sample_sensor_noise(rng, count, truncated=self._truncated).T
 
     def first_error(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
         """Returns the error of a first estimate, shape (n,), or of `count` of them, shape (n, count)."""
+        if self._is_extreme:
+            return (1.0 - ROUNDING) * self.plant.nominal_initial_error.sample_boundary(rng, count).T
         return self.plant.sample_initial_error(rng, count, truncated=self._truncated).T
 
     def forget(self) -> None:

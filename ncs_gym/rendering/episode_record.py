@@ -250,6 +250,6 @@ def _tracked_output(task: Task, plant: LinearPlant, task_state: Any, state: np.n
         used, name, unit = np.flatnonzero(task.output), "output", ""
         if len(used) == 1:
             name, unit = plant.state_names[int(used[0])], plant.state_units[int(used[0])]
-        value, target = float(task.output @ state), float(task_state)
+        value, target = float(task.output @ state), float(task.target(task_state))
         return TrackedOutput(name=name, unit=unit, value=value, target=target, low=-task.reach, high=task.reach)
     return None

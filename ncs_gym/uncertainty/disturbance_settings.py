@@ -19,8 +19,9 @@ BY_NAME: dict[str, type[Disturbance]] = {
     "sphere": SphereDisturbance,
     "adversarial": AdversarialDisturbance,
 }
-# How the noise of a plant may be drawn: inside the bounds that its covariances are truncated at, or without a bound.
-NOISES = ("truncated", "gaussian")
+# How the noise of a plant may be drawn: inside the bounds that its covariances are truncated at, without a bound, or
+# with sensor noise and first errors on their bounds.
+NOISES = ("truncated", "gaussian", "extreme")
 
 
 def stays_inside(source: Disturbance) -> bool:
@@ -52,11 +53,12 @@ def as_disturbance(value: Any, plant: LinearPlant, allow_assumption_violation: b
 
 
 def as_noise(value: Any, plant: LinearPlant) -> str:
-    """Returns "truncated" or "gaussian", checked.
+    """Returns "truncated", "gaussian" or "extreme", checked.
 
     "gaussian" draws what a covariance describes, which is process noise, sensor noise and first error, from the
     Gaussian itself. What is bounded by declaration (`gamma`, `disturbance_bound`, `sensor_bound`, `initial_bound`) has
-    no distribution beyond its bound and stays inside.
+    no distribution beyond its bound and stays inside. "extreme" draws sensor noise and first errors in random
+    directions on the boundary of what is assumed of them.
 
     Raises:
         ValueError: If it is another value, or "gaussian" for a plant without any covariance.

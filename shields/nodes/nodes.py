@@ -30,7 +30,7 @@ EARLIEST = 16
 MOST_SKIPPED = 1000
 NO_EPISODE = 0
 # Steps for which all nodes hear of an episode before it starts: stamps in datagrams are counted from their beginning.
-PRELUDE = 25
+PRELUDE = 40
 # What begins within this part of a step begins now.
 EARLY = 0.1
 
@@ -39,8 +39,9 @@ class _PlantNode:
     """What sensor and actuator have in common: they join the episodes of a controller, and follow its clock.
 
     A node that belongs to no episode says so at every step, with a challenge that it draws when it is made and whenever
-    it joins. It joins the episode of the message that answers this challenge, so that what was recorded in earlier
-    episodes moves nothing. It leaves an episode when it has heard nothing of it for `PATIENCE` steps.
+    it joins or leaves. It joins the episode of the message that answers this challenge, so that what was recorded in
+    earlier episodes moves nothing. It leaves an episode when it has heard nothing of it for `PATIENCE` steps, or when
+    the clock of the controller jumps.
 
     Attributes:
         episode: Number of the episode, drawn by the controller; 0 for none.
@@ -66,15 +67,22 @@ class _PlantNode:
                     continue
                 self._join(message, time)
             self._heard_at = time
-            self.clock.follow(message.stamp - PRELUDE, time)
-            self._use(message)
-        if now - self._heard_at > PATIENCE * self.clock.dt:
-            self.episode = NO_EPISODE
+            if self.clock.follow(message.stamp - PRELUDE, time):
+                self._use(message)
+            else:
+                self._leave()
+        is_silent = now - self._heard_at > PATIENCE * self.clock.dt
+        if self.episode != NO_EPISODE and (is_silent or self.clock.episode != self.episode):
+            self._leave()
 
     def _join(self, message: Message, time: float) -> None:
         """Begins to belong to an episode, at the step of the message."""
         self.episode, self._challenge = message.episode, _drawn()
         self.clock.join(message.episode, time, message.stamp - PRELUDE)
+
+    def _leave(self) -> None:
+        """Belongs to no episode any more; what was recorded answers an earlier challenge."""
+        self.episode, self._challenge = NO_EPISODE, _drawn()
 
     def _use(self, message: Message) -> None:
         """Uses a message of the episode."""
@@ -128,7 +136,7 @@ class ActuatorNode(_PlantNode):
         idle = self.episode == NO_EPISODE or step < 0
         u = np.zeros(self.actuator.inputs) if idle else self.actuator.apply(step)
         steps, missing, digest, _ = self.actuator.echo
-        self._send(Kind.ECHO, steps, missing=missing, digest=digest)
+        self._send(Kind.ECHO, min(step, 0) or steps, missing=missing, digest=digest)
         return u
 
     def _join(self, message: Message, time: float) -> None:
@@ -301,7 +309,8 @@ async def run_plant_side(
             episode, last = clock.episode, step
         elif step > last:
             last = step
-            act(step)
+            if clock.is_settled:
+                act(step)
 
 
 async def run_controller(

@@ -14,6 +14,7 @@ from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.estimation.set_membership import enlarged_by_rounding
 from ncs_gym.uncertainty.shape_matrices import outer_sum
 from shields.certificate import Certificate
+from shields.runtime.between_samples import grid_test
 from shields.runtime.guarantee import LoopObservation
 from shields.runtime.one_step import PredictedErrors
 from shields.runtime.safety_filter import MARGIN, SafetyFilter
@@ -63,11 +64,13 @@ def starts_inside(certificate: Certificate, initial: Ellipsoid | np.ndarray) -> 
 def starts_in_box(plant: LinearPlant, initial: Ellipsoid | np.ndarray) -> bool:
     """Returns whether all possible starts lie in the safe box, decided in exact arithmetic.
 
+    Where the box counts between samples, they have to lie in a smaller one, in which disturbances cannot leave it.
+
     Args:
         plant: Gives the rows c_i.
         initial: An ellipsoid E(P), in the box exactly if c_i P c_i' <= 1 for all rows; or a single state, shape (n,).
     """
-    return _between(plant.box_rows, initial)
+    return _between(grid_test(plant).at_samples, initial)
 
 
 def _between(bounds: np.ndarray, initial: Ellipsoid | np.ndarray) -> bool:

@@ -334,6 +334,8 @@ def _found_certificate(
         stage, design = reached
         best = design and _certificate(plant, problem, with_best_gain(problem, design), errors, slack)
         raise _interrupted(plant, stage, best) from interrupt
+    if tightened and not failure:  # there is a set in the plant's box
+        raise _leaves_between_samples(float(np.abs(tightened[-1]).max() / np.abs(plant.box_rows).max() - 1.0))
     raise failure or infeasibility(problem)
 
 
@@ -353,13 +355,18 @@ def _tightened_box(
     if over.max() <= 1.0 - 0.1 * _BETWEEN_RESERVE:
         return None
     if len(tightened) == _MOST_BOXES or grid.left.min() <= 0.0:
-        raise Infeasible(
-            "(B) the state leaves the box between two samples: a shorter dt, more grid points (between_samples=), or "
-            "less disturbance would help, and between_samples=None asks for the sampling instants alone",
-            "B",
-            float(over.max() - 1.0),
-        )
+        raise _leaves_between_samples(float(over.max() - 1.0))
     return (tightened[-1] if tightened else plant.box_rows) * np.maximum(over / (1.0 - _BETWEEN_RESERVE), 1.0)[:, None]
+
+
+def _leaves_between_samples(shortfall: float) -> Infeasible:
+    """Returns the exception for sets that hold at the sampling instants alone."""
+    return Infeasible(
+        "(B) the state leaves the box between two samples: a shorter dt, more grid points (between_samples=) or less "
+        "disturbance would help, and between_samples=None asks for the sampling instants alone",
+        "B",
+        shortfall,
+    )
 
 
 def _finished(problem: DesignProblem, found: CandidateDesign, slack: float) -> Iterator[CandidateDesign]:

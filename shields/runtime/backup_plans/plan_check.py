@@ -12,6 +12,7 @@ import numpy as np
 
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
 from ncs_gym.validation import read_only
+from shields.runtime.between_samples import GridTest, grid_test
 from shields.runtime.one_step import SMALLEST_RADIUS, OneStepTest, judged_shapes, predicted_errors
 from shields.runtime.polytope_step import PolytopeTest
 
@@ -114,6 +115,8 @@ class PlanTest:
         if not self.prediction.ends:
             kept &= np.all(within, axis=1)
         kept[1:] &= np.logical_and.accumulate(inside[:-1], axis=0)
+        if self.prediction.grid is not None:
+            kept &= self.prediction.grid.keeps(estimates, tightening.between, plans, self._margin)
         return kept.transpose(1, 2, 0) & self._within_limits(plans)
 
     def _within_limits(self, plans: np.ndarray) -> np.ndarray:
@@ -124,7 +127,7 @@ class PlanTest:
     @np.errstate(all="ignore")
     def knows_in_box(self, estimate: np.ndarray, error_shape: np.ndarray) -> bool:
         """Returns whether |c_i x_hat| + sqrt(c_i Sigma_k c_i') <= 1 for all rows, which proves that x is in the box."""
-        rows, extents = self.prediction.plant.box_rows, np.sqrt(np.diag(error_shape))
+        rows, extents = self.prediction.rows[: len(self.prediction.plant.box_rows)], np.sqrt(np.diag(error_shape))
         rounding = float(self.prediction.rounding[0])
         size = np.abs(rows) @ extents
         reach = np.sqrt(np.maximum(((rows @ error_shape) * rows).sum(axis=1), 0.0) + rounding * size**2)
@@ -146,7 +149,8 @@ class Prediction:
         plant: The plant.
         steps: N.
         rows: Rows whose values at the centers are judged, shape (r, n): the k rows of the box, and where plans end in P
-            its others.
+            its others. Those of the box are closer where it counts between samples, too (`GridTest`).
+        grid: What is asked between samples then; None where only these count.
         free: A^j, shape (N, n, n).
         forced: Block rows [A^{j-1} B, ..., B, 0, ...], shape (N, n, N m).
         size_free: |A|^j, shape (N, n, n).
@@ -158,8 +162,10 @@ class Prediction:
 
     def __init__(self, first: OneStepTest | PolytopeTest, steps: int) -> None:
         plant, n, m = first.plant, first.plant.n, first.plant.m
-        self.plant, self.steps = plant, steps
-        self.rows = first.root if isinstance(first, PolytopeTest) else plant.box_rows
+        self.plant, self.steps, test = plant, steps, grid_test(plant)
+        self.rows = test.at_samples
+        if isinstance(first, PolytopeTest):
+            self.rows = np.concatenate([self.rows, first.root[len(self.rows) :]])
         powers, sizes = [np.eye(n)], [np.eye(n)]
         for _ in range(steps):
             powers.append(plant.A @ powers[-1])
@@ -175,6 +181,7 @@ class Prediction:
         self.rounding = read_only(8.0 * (n + m) * (np.arange(1, steps + 1) + 2.0) * float(np.finfo(float).eps))
         ends = [] if isinstance(first, PolytopeTest) else [EndTest(first, self, j) for j in range(steps)]
         self.ends = tuple(ends)
+        self.grid = None if plant.grid_rows is None else PlanGrid(self, test)
         self._free = np.ascontiguousarray(self.free.reshape(steps * n, n))
         self._forced = np.ascontiguousarray(self.forced.reshape(steps * n, steps * m))
 
@@ -189,6 +196,64 @@ class Prediction:
         pushed = (self._forced @ plans.reshape(count * number, -1).T).reshape(-1, count, number)
         moved = (self._free @ estimates.T)[..., None] + pushed
         return moved.reshape(self.steps, self.plant.n, count, number)
+
+
+class PlanGrid:
+    """The rows of the grid in every step of a plan, i = 0..N-1: |row (A_tau c_i + B_tau u_i)| + rho_i <= 1.
+
+    Args:
+        prediction: Of the plant, without its grid.
+        test: Rows of one step.
+
+    Attributes:
+        free: Rows on x_hat, shape (N, g, n).
+        forced: Rows on a plan, shape (N, g, N m).
+    """
+
+    def __init__(self, prediction: Prediction, test: GridTest) -> None:
+        steps, m, n = prediction.steps, prediction.plant.m, prediction.plant.n
+        self._shape, self._rounding = prediction.plant.disturbance.shape_matrix, prediction.rounding
+        begun, size = np.eye(n)[None], np.abs(test.moved)
+        self.free = read_only(test.moved @ np.concatenate([begun, prediction.free[:-1]]))
+        self._size = read_only(size @ np.concatenate([begun, prediction.size_free[:-1]]))
+        forced = test.moved @ np.concatenate([np.zeros((1, n, steps * m)), prediction.forced[:-1]])
+        for i in range(steps):
+            forced[i, :, i * m : (i + 1) * m] += test.effect
+        self.forced = read_only(forced)
+        pushed = np.concatenate([np.zeros((1, n)), prediction.size_forced[:-1]]) @ size.T
+        self._pushed = read_only(pushed + np.abs(test.effect) @ prediction.plant.u_max)
+        own = _supports(self.free, self._size, self._shape[None], self._rounding[:, None])[0]
+        self._disturbed = read_only(np.concatenate([np.zeros_like(own[:1]), np.cumsum(own[:-1], axis=0)]))
+        self._arriving = test.disturbed
+
+    def room(self, shapes: np.ndarray) -> np.ndarray:
+        """Returns 1 - rho_i less the rounding that does not depend on the estimate, shape (E, N, g).
+
+        Args:
+            shapes: Symmetric Sigma_k, shape (E, n, n).
+        """
+        rounding = self._rounding[:, None]
+        reach = _supports(self.free, self._size, shapes, rounding) + self._disturbed + self._arriving
+        return 1.0 - reach * (1.0 + rounding) - rounding * self._pushed
+
+    def keeps(self, estimates: np.ndarray, room: np.ndarray, plans: np.ndarray, margin: float) -> np.ndarray:
+        """Returns whether the box is kept between the samples of the first i+1 steps of plans, shape (N, E, P).
+
+        Args:
+            estimates: x_hat, shape (E, n).
+            room: What `room` returns for the error shape of each.
+            plans: Inputs, shape (E, P, N, m) [physical units].
+            margin: By which it must be kept.
+        """
+        steps, g, n = self.free.shape
+        count, number = plans.shape[:2]
+        left = room - (np.abs(estimates) @ (self._rounding[:, None, None] * self._size).reshape(-1, n).T).reshape(
+            count, steps, g
+        )
+        values = (self.forced.reshape(steps * g, -1) @ plans.reshape(count * number, -1).T).reshape(-1, count, number)
+        values += (self.free.reshape(-1, n) @ estimates.T)[..., None]
+        inside = np.abs(values.reshape(steps, g, count, number)) <= left.transpose(1, 2, 0)[..., None] - margin
+        return np.logical_and.accumulate(inside.all(axis=1), axis=0)
 
 
 class EndTest(OneStepTest):
@@ -238,11 +303,13 @@ class Tightening(NamedTuple):
             |T G c_j| is at most the radius. Of shape (E, N, 0, n) where plans end in P.
         radius: 1 - h less the rounding that does not depend on the estimate, shape (E, N); 1 where plans end in P; NaN
             for an unusable shape.
+        between: `PlanGrid.room`, shape (E, N, g); g is 0 where the box counts at samples alone.
     """
 
     room: np.ndarray
     weighting: np.ndarray
     radius: np.ndarray
+    between: np.ndarray
 
 
 @np.errstate(all="ignore")  # what overflows leaves no room
@@ -264,16 +331,20 @@ def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
     symmetric = 0.5 * (shapes + shapes.swapaxes(1, 2))
     reach = (_supports(rows, sizes, symmetric, rounding) + disturbed) * (1.0 + rounding)
     pushed = rounding * (prediction.size_forced @ np.abs(prediction.rows).T)
+    grid = prediction.grid
+    between = np.empty((len(shapes), prediction.steps, 0)) if grid is None else grid.room(symmetric)
     nothing = np.empty((0, *shapes.shape[1:]))
     if not prediction.ends:
         usable = judged_shapes(shapes, nothing)[1] & np.isfinite(reach).all(axis=(1, 2))
         ones = np.where(usable, 1.0, np.nan)[:, None] * np.ones(prediction.steps)
-        return Tightening(ones[..., None] - reach - pushed, np.empty((len(shapes), prediction.steps, 0, plant.n)), ones)
+        none = np.empty((len(shapes), prediction.steps, 0, plant.n))
+        return Tightening(ones[..., None] - reach - pushed, none, ones, between)
     errors = [predicted_errors(end, shapes, nothing) for end in prediction.ends]
     radius = np.stack([each.radius for each in errors], axis=1)
     unusable = np.where(np.isnan(radius).any(axis=1), np.nan, 0.0)
     weightings = np.stack([each.weighting.transpose(2, 0, 1) for each in errors], axis=1) @ prediction.ends[0].root
-    return Tightening(1.0 - reach - pushed + unusable[:, None, None], weightings, radius)
+    between = np.empty((len(shapes), prediction.steps, 0)) if grid is None else grid.room(symmetric)
+    return Tightening(1.0 - reach - pushed + unusable[:, None, None], weightings, radius, between)
 
 
 def _supports(rows: np.ndarray, sizes: np.ndarray, shapes: np.ndarray, rounding: np.ndarray) -> np.ndarray:

@@ -171,7 +171,8 @@ class Planner:
         limits, (box, radius) = self._plant.u_max, self.test.room(estimates, tightening)
         tried = np.full((len(estimates), 2, self.horizon, self._plant.m), np.nan)
         for e, u in enumerate(proposed):
-            data = estimates[e], box[e], tightening.weighting[e, -1], float(radius[e, -1]), u
+            last = tightening.weighting[e, -1], float(radius[e, -1])
+            data = estimates[e], box[e], *last, tightening.between[e], u
             if (found := self._program.solve(*data)) is not None:
                 tried[e] = expressible(found, limits)
                 if (np.abs(found[0] - u) <= AS_PROPOSED * limits).all():

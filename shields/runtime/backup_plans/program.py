@@ -38,8 +38,12 @@ class PlanProgram:
         self._free = prediction.free
         self._end = read_only(prediction.forced[-1] * scale)
         forced = prediction.forced[:-1] * scale
-        self._C, self._G = plant.box_rows, prediction.rows[:0] if prediction.ends else prediction.rows
+        self._C = prediction.rows[: len(plant.box_rows)]
+        self._G, grid = prediction.rows[:0] if prediction.ends else prediction.rows, prediction.grid
         rows = np.concatenate([(self._C @ forced).reshape(-1, len(scale)), self._G @ self._end])
+        self._between = np.empty((0, plant.n)) if grid is None else grid.free.reshape(-1, plant.n)
+        if grid is not None:
+            rows = np.concatenate([rows, (grid.forced * scale).reshape(-1, len(scale))])
         self._rows = read_only(np.concatenate([rows, -rows]))
         self._reserve = SOLVER_RESERVE + float(ACTION_ROUNDING) * np.abs(rows).sum(axis=1)
         root = prediction.ends[-1].root if prediction.ends else np.empty((0, plant.n))
@@ -71,7 +75,13 @@ class PlanProgram:
         self._typical = numbered
 
     def solve(
-        self, estimate: np.ndarray, room: np.ndarray, weighting: np.ndarray, radius: float, proposed: np.ndarray
+        self,
+        estimate: np.ndarray,
+        room: np.ndarray,
+        weighting: np.ndarray,
+        radius: float,
+        between: np.ndarray,
+        proposed: np.ndarray,
     ) -> np.ndarray | None:
         """Returns a plan, shape (N, m) [physical units], of which nothing is known; None if the solver fails.
 
@@ -80,10 +90,11 @@ class PlanProgram:
             room: Largest |row c_j| for j = 1..N, shape (N, r).
             weighting: T G of the last step, shape (n, n), or (0, n) for an end in P.
             radius: Largest |T G c_j| of the last step.
+            between: Largest values of the rows of the grid in every step, shape (N, g).
             proposed: Shape (m,).
         """
         try:
-            A, b, q = self._data(estimate, room, weighting, radius, proposed)
+            A, b, q = self._data(estimate, room, weighting, radius, between, proposed)
             if not (np.isfinite(b).all() and np.isfinite(A).all() and np.isfinite(q).all()):
                 return None
             solver, self._solver = self._set_up() if self._solver is None else self._solver, None
@@ -98,12 +109,19 @@ class PlanProgram:
         return plan.reshape(self._length, self._m) * self._limits if usable else None
 
     def _data(
-        self, estimate: np.ndarray, room: np.ndarray, weighting: np.ndarray, radius: float, proposed: np.ndarray
+        self,
+        estimate: np.ndarray,
+        room: np.ndarray,
+        weighting: np.ndarray,
+        radius: float,
+        between: np.ndarray,
+        proposed: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns entries of the matrix, right-hand side and linear cost."""
         centers = self._free @ estimate
-        drift = np.concatenate([(centers[:-1] @ self._C.T).ravel(), self._G @ centers[-1]])
-        allowed = np.concatenate([room[:-1, : len(self._C)].ravel(), room[-1, : len(self._G)]]) - self._reserve
+        moved = [(centers[:-1] @ self._C.T).ravel(), self._G @ centers[-1], self._between @ estimate]
+        left = [room[:-1, : len(self._C)].ravel(), room[-1, : len(self._G)], between.ravel()]
+        drift, allowed = np.concatenate(moved), np.concatenate(left) - self._reserve
         ones = np.ones(2 * self._length * self._m)
         cone = np.concatenate([[radius - self._end_reserve], weighting @ centers[-1]])[: self._cone]
         b = np.concatenate([allowed - drift, allowed + drift, ones, cone])

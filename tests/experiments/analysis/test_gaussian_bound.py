@@ -11,7 +11,7 @@ from experiments.analysis.gaussian_bound import gaussian_sentences, gaussian_sum
 from experiments.analysis.statistics import clopper_pearson
 from experiments.analysis.summary import arm_summaries, arm_summary
 from experiments.commands.compare import _findings, _gaussian_noise
-from experiments.runs.experiment import certificate_of, loop_config, run_of_arm
+from experiments.runs import certificate_of, loop_config, run_of_arm
 from experiments.runs.training_run import RunResult
 from experiments.settings import CompareSettings
 from ncs_gym import Channel, LinearPlant, escape_probability, register_plant

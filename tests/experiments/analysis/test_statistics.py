@@ -1,15 +1,13 @@
 import numpy as np
 import pytest
-from scipy.stats import binom, norm, ttest_1samp
+from scipy.stats import binom, norm
 
 from experiments.analysis.statistics import (
-    all_pairs,
     bootstrap_interval,
     clopper_pearson,
-    holm,
+    hierarchical_interval,
     interquartile_mean,
     mean_interval,
-    paired_difference,
 )
 
 
@@ -77,56 +75,26 @@ def test_stratified_interval_needs_two_runs_in_every_stratum():
     assert bootstrap_interval() is None
 
 
-def test_paired_difference_is_the_one_sample_test_of_the_differences():
-    rng = np.random.default_rng(1)
-    first, second = rng.normal(1.0, 1.0, 8), rng.normal(0.0, 2.0, 8)
-    found, test = paired_difference(first, second), ttest_1samp(first - second, 0.0)
-    assert found["p"] == pytest.approx(test.pvalue)
-    assert found["ci95"] == pytest.approx(list(test.confidence_interval(0.95)))
-    assert found["mean"] == pytest.approx((first - second).mean())
+def test_hierarchical_interval_covers_what_retraining_changes_and_one_over_episodes_does_not():
+    rng, covered, too_narrow = np.random.default_rng(0), [], []
+    for _ in range(150):
+        runs = rng.normal(0.0, 1.0, (12, 1))
+        values = runs + rng.normal(0.0, 1.0, (12, 20))
+        low, high = hierarchical_interval(values)
+        covered.append(low <= 0.0 <= high)
+        low, high = bootstrap_interval(values.ravel())
+        too_narrow.append(low <= 0.0 <= high)
+    assert np.mean(covered) == pytest.approx(0.9, abs=0.06)  # of 12 runs, as for any bootstrap
+    assert np.mean(too_narrow) < 0.7
 
 
-def test_pairing_finds_what_independent_samples_would_hide():
-    noise = np.random.default_rng(0).normal(0.0, 100.0, 10)
-    shift = 1.0 + 0.01 * np.arange(10)
-    assert paired_difference(noise + shift, noise)["p"] < 1e-6
-    assert paired_difference(noise + shift, noise[::-1])["p"] > 0.5
+def test_hierarchical_interval_is_the_ordinary_bootstrap_where_a_run_has_one_episode():
+    values = np.random.default_rng(0).exponential(size=(60, 1))
+    assert hierarchical_interval(values) == pytest.approx(bootstrap_interval(values.ravel()), abs=0.02)
+    low, high = hierarchical_interval(values, 0.99)
+    assert low < hierarchical_interval(values)[0] < hierarchical_interval(values)[1] < high
 
 
-@pytest.mark.parametrize(("difference", "runs", "p"), [(0.0, 5, 1.0), (0.25, 5, 1 / 16), (-1.0, 3, 1 / 4)])
-def test_equal_differences_are_no_proof_beyond_the_sign_flip_test(difference, runs, p):
-    assert paired_difference([difference] * runs, [0.0] * runs)["p"] == p
-
-
-def test_a_single_run_has_neither_interval_nor_p_value():
-    assert paired_difference([2.0], [1.0]) == {"mean": 1.0, "ci95": None, "p": None}
-    assert all_pairs({"one": [2.0], "other": [1.0]})[0]["p_holm"] is None
-
-
-@pytest.mark.parametrize("second", [[], [1.0, 2.0]])
-def test_runs_that_are_not_paired_are_refused(second):
-    with pytest.raises(ValueError, match="equally many"):
-        paired_difference([1.0] if second else [], second)
-
-
-def test_holm_adjusts_as_in_the_textbook():
-    # alpha 0.05, p = 0.01, 0.04, 0.03, 0.005: the two smallest are rejected (Wikipedia, "Holm-Bonferroni method").
-    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
-    assert holm([]) == []
-    assert holm([0.7, 0.9]) == [1.0, 1.0]
-
-
-def test_holm_keeps_the_family_wise_error_where_single_tests_do_not():
-    p_values = np.random.default_rng(0).uniform(size=(2000, 20))
-    assert np.mean(p_values.min(axis=1) < 0.05) > 0.5
-    assert np.mean([min(holm(row.tolist())) < 0.05 for row in p_values]) == pytest.approx(0.05, abs=0.015)
-
-
-def test_all_pairs_are_there_once_and_adjusted_together():
-    rng = np.random.default_rng(0)
-    values = {name: rng.normal(mean, 0.1, 6).tolist() for name, mean in (("a", 0.0), ("b", 0.0), ("c", 9.0))}
-    pairs = all_pairs(values)
-    assert [(pair["first"], pair["second"]) for pair in pairs] == [("a", "b"), ("a", "c"), ("b", "c")]
-    assert [pair["p_holm"] for pair in pairs] == holm([pair["p"] for pair in pairs])
-    assert pairs[1]["mean"] == pytest.approx(-9.0, abs=0.3)
-    assert pairs[0]["p_holm"] > 0.05 > pairs[1]["p_holm"]
+def test_hierarchical_interval_needs_two_runs():
+    assert hierarchical_interval(np.ones((1, 50))) is None
+    assert hierarchical_interval(np.ones((2, 3))) == [1.0, 1.0]

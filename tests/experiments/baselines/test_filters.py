@@ -11,6 +11,7 @@ from agents.loop import LoopConfig, ShieldSettings
 from experiments.baselines import FILTERS, EstimateFilterSettings, controller
 from experiments.baselines.certainty_equivalent import CertaintyEquivalentFilter
 from experiments.baselines.predictive import PredictiveFilter
+from ncs_gym import Channel
 from ncs_gym.envs.env import ncs_env
 from shields import SafetyFilter
 from tests.certificates import certificate_of
@@ -52,19 +53,57 @@ def test_trusting_filter_is_caught_leaving_the_safe_set_and_the_shield_is_not(ce
     assert all(episode.guaranteed for episode in shielded)
 
 
+def tank(env_id="ncs_gym/CSTR-v0"):
+    loop = LoopConfig(env=env_id)
+    env = ncs_env(loop.single())
+    return loop, env, certificate_of(env.plant, env.contract)
+
+
+def violating(loop, certificate, name, episodes=40, **settings):
+    """Violating episodes of a regulator behind a filter."""
+    if name in FILTERS:
+        loop = replace(loop, filter=EstimateFilterSettings(name, certificate))
+    elif name:
+        loop = replace(loop, shield=ShieldSettings(certificate, name, 0.0, None, "ignore"))
+    policy = controller("lqr", ncs_env(loop.single()), certificate.K, 0)
+    return sum(
+        each.violation_steps > 0 for each in evaluate(loop.with_kwargs(**settings), policy, episodes, 7).episodes
+    )
+
+
 def test_trusting_lookahead_is_caught_leaving_the_box_and_lookahead_is_not():
-    reactor = LoopConfig(env="ncs_gym/BatchReactor-v0")
-    env = ncs_env(reactor.single())
-    certificate = certificate_of(env.plant, env.contract)
-    policy = controller("lqr", env, certificate.K, 0)
-    trusting = replace(reactor, filter=EstimateFilterSettings("trusting:lookahead", certificate))
-    lookahead = replace(reactor, shield=ShieldSettings(certificate, "lookahead"))
-    violating = [
-        sum(episode.violation_steps for episode in evaluate(loop, policy, 12, 7).episodes)
-        for loop in (trusting, lookahead)
+    loop, _, certificate = tank()
+    assert violating(loop, certificate, "trusting:lookahead") >= 3
+    assert violating(loop, certificate, "lookahead") == 0
+
+
+@pytest.mark.parametrize("name", ["psf", "trusting"])
+def test_margins_keep_the_box_on_an_ideal_channel_and_larger_ones_keep_it_longer_on_the_real_one(name):
+    loop, env, certificate = tank()
+    attack = {"noise": "extreme", "disturbance": "adversarial"}
+    bursts = replace(env.channel, loss=1.0)
+    assert violating(loop, certificate, f"{name}:10", channel=Channel(), **attack) == 0
+    small, large = (violating(loop, certificate, f"{name}:{each}", channel=bursts, **attack) for each in (10, 40))
+    assert large < small - 5
+
+
+def test_filter_with_the_tube_of_our_error_sets_keeps_the_box_under_attack():
+    loop, env, certificate = tank()
+    attack = {"noise": "extreme", "disturbance": "adversarial", "channel": replace(env.channel, loss=1.0)}
+    assert violating(loop, certificate, "psf:tube", **attack) == 0
+    assert violating(loop, certificate, "psf", **attack) > 10
+
+
+def test_margin_moves_the_estimate_away_from_the_edge_of_the_safe_set():
+    _, env, certificate = tank()
+    estimate = 0.8 * certificate.safe_set.extreme_point(np.array([0.0, 1.0]))
+    pushed = [
+        np.linalg.norm(np.linalg.cholesky(certificate.M).T @ (env.plant.A @ estimate + env.plant.B @ u))
+        for name in ("trusting", "trusting:20", "psf:20")
+        for u in FILTERS[name](certificate, env.plant)(estimate[None], env.plant.u_max[None], NEVER)
     ]
-    assert violating[0] >= 3  # an episode ends at its first violation
-    assert violating[1] == 0
+    assert pushed[0] > 0.9
+    assert pushed[1] <= 0.8
 
 
 @pytest.mark.parametrize("name", FILTERS)

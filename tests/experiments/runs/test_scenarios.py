@@ -18,6 +18,7 @@ from ncs_gym import AdversarialDisturbance, Channel, ChannelContract, GilbertEll
 from ncs_gym.envs.env import ncs_env
 
 CRUISE, CART_POLE, REACTOR = (f"ncs_gym/{name}-v0" for name in ("TruckTrailerCruise", "CartPole", "BatchReactor"))
+ATTACKS = ("attacked", "attacked on an ideal channel")
 ALL = ("worst-case disturbance", "worse channel", "gaussian")
 
 
@@ -142,3 +143,16 @@ def test_summary_and_table_have_a_block_per_scenario(results):
     assert f" {pushed['eval_violation_steps']:,} " in text
     for printed in (text, summary_text(arms, {})):
         assert max(map(len, printed.splitlines())) <= 100
+
+
+def test_attack_is_as_strong_as_the_contract_allows_and_on_an_ideal_channel_the_network_alone_is_missing():
+    loop = LoopConfig(env="ncs_gym/CSTR-v0")
+    own, attacked, without = (ncs_env(each.single()) for each in (loop, *(under(name, loop) for name in ATTACKS)))
+    assert attacked.channel == replace(own.channel, loss=1.0)
+    assert attacked.contract.is_kept_by(attacked.channel)
+    assert without.channel == Channel()
+    for env in (attacked, without):
+        assert isinstance(env.disturbance, AdversarialDisturbance)
+        assert (env.noise, env.contract) == ("extreme", own.contract)
+    ideal = ncs_env(under("ideal channel", loop).single())
+    assert (ideal.channel, ideal.noise, type(ideal.disturbance)) == (Channel(), own.noise, type(own.disturbance))

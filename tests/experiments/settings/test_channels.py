@@ -3,9 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.commands.sweep import _grid_points
-from experiments.runs import certificate_of, loop_config, run_of_arm
-from experiments.settings.channel import _bursts, changed_channel
+from experiments.commands.sweep import _grid_points, _loop, _name
+from experiments.runs import certificate_of, run_of_arm
+from experiments.runs.loops import _bursts, changed_channel
 from experiments.settings.study import SweepSettings
 from ncs_gym import Channel, ChannelContract, GilbertElliott
 from ncs_gym.envs.env import ncs_env
@@ -71,25 +71,26 @@ def test_bursts_need_a_loss_probability():
 def test_grid_is_the_product_of_its_sides():
     settings = SweepSettings(losses=(0.0, 0.5), delays=(1,), quantization_steps=(0.1, 0.2), burst_lengths=(0.0, 3.0))
     points = _grid_points(settings)
-    assert len(points) == len({point.name for point in points}) == 8
+    assert len(points) == len({_name(point) for point in points}) == 8
     lossless, *_, last = points
-    assert lossless.channel({"jitter": 1}) == {"loss": 0.0, "delay": 1, "quantization_step": 0.1, "jitter": 1}
-    assert last.channel({}) == {"loss": 0.5, "delay": 1, "quantization_step": 0.2, "burst_length": 3.0}
+    own = replace(settings, channel={"jitter": 1})
+    assert _loop(own, lossless).channel == Channel(0.0, 0.1, send_period=2, delay=1, jitter=1)
+    assert _loop(settings, last).channel == Channel(_bursts(0.5, 3.0, 2), 0.2, send_period=2, delay=1)
 
 
 def test_masses_are_a_side_of_the_grid():
     settings = SweepSettings(losses=(0.3,), delays=(0,), mass_factors=(0.9, 1.0, 1.1))
     points = _grid_points(settings)
-    assert [point.mass_factor for point in points] == [0.9, 1.0, 1.1]
-    assert len({point.name for point in points}) == 3
-    loop = points[0].loop(replace(settings, env="ncs_gym/Pendulum-v0"))
+    assert [point["mass_factor"] for point in points] == [0.9, 1.0, 1.1]
+    assert len({_name(point) for point in points}) == 3
+    loop = _loop(replace(settings, env="ncs_gym/Pendulum-v0"), points[0])
     run = run_of_arm(settings.completed, loop, certificate_of(loop), "shielded", 0)
     assert ncs_env(run.loop.single()).process == PendulumProcess(mass=0.9)
     assert (
         run.certificate.checksum == certificate_for(ncs_env(loop.single()).plant, ChannelContract(2)).checksum
     )  # the model's
     with pytest.raises(ValueError, match="a LinearProcess has no mass to change"):
-        loop_config("ncs_gym/TruckTrailer-v0", mass_factor=0.9)
+        _loop(replace(settings, env="ncs_gym/TruckTrailer-v0"), points[0])
 
 
 @pytest.mark.parametrize("change", [{"losses": ()}, {"delays": (1, 1)}, {"arms": ("shielded", "shielded")}])
@@ -100,4 +101,4 @@ def test_empty_and_repeated_sides_are_refused(change):
 
 def test_points_that_print_alike_have_names_of_their_own():
     points = _grid_points(SweepSettings(losses=(0.9, 0.90000001), delays=(0,)))
-    assert len({point.name for point in points}) == 2
+    assert len({_name(point) for point in points}) == 2

@@ -9,8 +9,8 @@ from experiments.study.study import study
 from tests.workers import no_worker_processes
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
-ONE_CHANNEL = {"_LOSSES": (0.9,), "_DELAYS": (), "_QUANTIZATION": ()}
-MARKED = "# A page\n\n<!-- ncs study: lead -->\n<!-- end -->\n"
+FEW = {"SWITCHES": ("loss",), "SWITCHED_REGULATORS": ("lqr+lookahead",)}
+MARKED = "# A page\n\n<!-- ncs study: margins -->\n<!-- end -->\n"
 
 
 @pytest.fixture(scope="module")
@@ -27,11 +27,11 @@ def finished(tmp_path_factory):
         episodes=2,
         channel_episodes=2,
         jobs=1,
-        arms=("unshielded", "shielded"),
-        baselines=("random+shielded", "lqr+trusting", "lqr+shielded"),
-        scenarios=("worst-case-disturbance",),
+        arms=("unshielded", "lookahead"),
+        baselines=("lqr", "lqr+trusting", "lqr+shielded"),
+        scenarios=("ideal-channel", "attacked"),
     )
-    with no_worker_processes(), mock.patch.multiple("experiments.study.channel_sweep", **ONE_CHANNEL):
+    with no_worker_processes(), mock.patch.multiple("experiments.study.channel_switches", **FEW):
         study(settings)
         yield settings
 
@@ -42,28 +42,27 @@ def test_study_leaves_its_files(finished):
     summary = json.loads((finished.out / "summary.json").read_text())
     env = summary["environments"]["TruckTrailerCruise-v0"]
     assert env["steps"] == 1500  # one per cent of the steps tuned for the cruise
-    assert len(env["pairs"]["return"]) == 10
-    assert env["prices"][0]["sound"] == "lqr+shielded"
-    assert summary["scores"]["lqr+shielded"]["ci95"] is not None
+    assert [each["first"] for each in env["comparisons"]] == ["unshielded"]
+    assert len(env["arms"]["unshielded"]["scenarios"]["attacked"]["rate_by_run"]) == 2
+    assert {tuple(row["on"]) for row in summary["channels"]["TruckTrailerCruise-v0"]} == {(), ("loss",)}
     assert "Report of this comparison" in (finished.out / "report.html").read_text()
 
 
 def test_table_has_every_episode_of_every_environment_arm_condition_and_run(finished):
     rows = pq.read_table(finished.out / "episodes.parquet").to_pylist()
-    assert len({(row["environment"], row["arm"], row["condition"], row["run"]) for row in rows}) == 5 * 2 * 2
-    assert len(rows) == 5 * 2 * 2 * 2
-    assert {row["condition"] for row in rows} == {"as trained", "worst-case disturbance"}
-    shielded = [row for row in rows if row["arm"].endswith("shielded")]
-    assert not any(row["violating"] or row["outside_set"] for row in shielded)
+    assert len({(row["environment"], row["arm"], row["condition"], row["run"]) for row in rows}) == 5 * 3 * 2
+    assert len(rows) == 5 * 3 * 2 * 2
+    assert {row["condition"] for row in rows} == {"as trained", "ideal channel", "attacked"}
+    shielded = [row for row in rows if row["arm"].endswith(("+shielded", "lookahead"))]
+    assert not any(row["violating"] for row in shielded)
 
 
 def test_page_quotes_and_figures_are_written_where_they_were_asked_for(finished):
     page = finished.page.read_text()
-    of_channels = [f"results-trusting-{kind}TruckTrailerCruise-v0.png" for kind in ("", "agents-")]
-    for link in ("results-return.png", "results-training.png", *of_channels):
+    for link in ("results-return.png", "results-training.png", "results-runs.png"):
         assert f"images/{link}" in page
         assert (finished.page.parent / "images" / link).is_file()
-    assert "lqr+shielded" in finished.quote[0].read_text()
+    assert "TruckTrailerCruise-v0 lqr+trusting" in finished.quote[0].read_text()
     assert json.loads(finished.page.with_suffix(".json").read_text())["environments"]
 
 
@@ -72,7 +71,7 @@ def test_finished_runs_are_kept_and_give_the_same_summary(finished, capsys):
     study(finished)
     messages = capsys.readouterr().err
     assert "10 of 10 runs were finished before" in messages
-    assert "6 of 6 runs were finished before" in messages  # of the sweep: the regulator's and those of two agents
+    assert "10 of 10 runs were finished before" in messages
     assert (finished.out / "summary.json").read_bytes() == before
 
 

@@ -109,8 +109,8 @@ class ScriptedEnv(NCSEnv):
 def scalar_versions(many: NCSVectorEnv, kind: type[ScriptedEnv] = ScriptedEnv) -> list[Any]:
     """Scalar environments that follow each environment of a vector, which is made to record."""
     single = many.single
-    allowed, truncated = single.allow_assumption_violation, single.noise == "truncated"
-    many._process = RecordedProcess(many.plant, single.disturbance, allowed, many.num_envs, truncated=truncated)
+    allowed = single.allow_assumption_violation
+    many._process = RecordedProcess(many.plant, single.disturbance, allowed, many.num_envs, noise=single.noise)
     many._process.noise_now = np.zeros((many.plant.p, many.num_envs))
     many.np_random = rng = RecordingGenerator(many.np_random)
     begin = many._begin

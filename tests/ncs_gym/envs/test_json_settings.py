@@ -16,7 +16,7 @@ def settings(plant, channel):
     return {
         "channel": {"loss": 0.1, "quantization_step": step, "max_consecutive_losses": 2},
         "contract": {"max_age": 4, "quantization_step": step},
-        "task": {"output": [1.0] + [0.0] * (plant.n - 1), "reach": 1.0, "width": 1.0, "change_probability": 0.1},
+        "task": {"output": [1.0] + [0.0] * (plant.n - 1), "reach": 0.8, "width": 1.0, "change_probability": 0.1},
         "disturbance": "sphere",
         "initial_set": {"shape": (1e-4 * np.eye(plant.n)).tolist()},
         "terminate_on_violation": True,

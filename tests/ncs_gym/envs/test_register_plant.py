@@ -96,7 +96,7 @@ def test_spec_of_a_plant_s_file_is_json(register, tmp_path):
         {"channel": Channel(max_consecutive_losses=1), "contract": ChannelContract(max_age=5)},
         {"contract": {"max_age": 5}, "channel": {}},
         {"task": SpeedTracking(fastest=10.0)},
-        {"task": {"output": [1.0, 0.0], "reach": 1.0, "width": 0.5}},
+        {"task": {"output": [1.0, 0.0], "reach": 0.8, "width": 0.5}},
         {"task": Regulation()},
         {"disturbance": "sphere"},
         {"disturbance": {"half_widths": [0.01, 0.01]}},

@@ -242,7 +242,7 @@ def test_what_a_users_subclass_changes_counts():
         if step % 4:
             np.testing.assert_allclose(reward, [42.0 + speed for speed, _ in env._task_state])
             np.testing.assert_allclose(info["state"], before @ plant.A.T + 1e-3)
-    env = NCSVectorEnv(3, plant=plant, task=Odd(output=(1.0, 0.0), reach=1.0, width=2.0, change_probability=0.0))
+    env = NCSVectorEnv(3, plant=plant, task=Odd(output=(1.0, 0.0), reach=0.8, width=2.0, change_probability=0.0))
     observation, _ = env.reset(seed=0)
     np.testing.assert_array_equal(observation[:, -1], 0.25)
 

@@ -82,7 +82,7 @@ def test_episodes_that_begin_anew_equal_scalar_ones(channel, mode):
 
 @pytest.mark.parametrize("disturbance", ["adversarial", "sinusoid", "sphere", "box"])
 def test_disturbances_and_set_points_equal_scalar_ones(disturbance):
-    task = SetpointTracking(output=(1.0, 0.5), reach=1.0, width=0.3, change_probability=0.3)
+    task = SetpointTracking(output=(1.0, 0.5), reach=0.8, width=0.3, change_probability=0.3)
     settings = {"plant": truck_trailer(), "channel": CHANNELS["bursts"], "task": task, "disturbance": disturbance}
     compare(NCSVectorEnv(3, **settings), 100)
 

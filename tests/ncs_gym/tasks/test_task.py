@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from ncs_gym import Regulation, SpeedTracking, truck_trailer
+from ncs_gym import LinearPlant, Regulation, SetpointTracking, SpeedTracking, truck_trailer
+from ncs_gym.tasks.setpoint_tracking import farthest_equilibrium
 
 
 def test_regulation_costs_about_one_at_the_edge_of_the_box(plant):
@@ -68,3 +69,58 @@ def test_bad_tasks_are_refused(make, word):
 def test_tasks_that_do_not_fit_the_plant_say_so(plant):
     assert "input_index" in SpeedTracking(input_index=1).check(plant)
     assert "state_cost" in Regulation(state_cost=np.eye(3)).check(plant)
+
+
+def setpoints(**changes):
+    return SetpointTracking(**({"output": [1.0, 0.0], "reach": 0.8, "width": 2.0} | changes))
+
+
+def test_targets_known_ahead_are_those_that_come(plant):
+    task, rng = setpoints(preview=4, change_probability=0.3), np.random.default_rng(0)
+    task_state, announced, came = task.begin(rng, plant), [], []
+    for _ in range(300):
+        observed = task.observe(task_state)
+        assert observed.shape == (5,)
+        assert observed[0] == task.target(task_state)
+        announced.append(observed[4])
+        came.append(observed[0])
+        task_state = task.advance(rng, plant, task_state, np.zeros(1))
+    assert announced[:-4] == came[4:]
+    assert len(set(came)) > 50
+    assert 0.7 < np.abs(came).max() <= 0.8
+
+
+def test_change_of_the_input_has_its_price_and_the_last_input_is_observed(plant):
+    task, rng = setpoints(change_price=0.5), np.random.default_rng(0)
+    task_state = task.begin(rng, plant)
+    first = task.advance(rng, plant, task_state, np.array([3.0]))
+    np.testing.assert_array_equal(task.observe(first), [task.target(first), 3.0])
+    state = np.array([task.target(first), 0.0])
+    assert task.reward(plant, first, state, np.array([3.0])) == pytest.approx(1.0 - 0.5 * 3.0 / 4.0)
+    second = task.advance(rng, plant, first, np.array([-1.0]))
+    assert task.reward(plant, second, state, np.array([-1.0])) == pytest.approx(
+        1.0 - abs(state[0] - task.target(second)) / 2.0 - 0.5 * 4.0 / 4.0
+    )
+
+
+def test_targets_beyond_every_equilibrium_are_refused():
+    plant = truck_trailer()
+    farthest = farthest_equilibrium(plant, np.array([1.0, 0.0]))
+    assert farthest == pytest.approx(1000.0 * 4.0 / 4500.0)  # the coupling's pull at full throttle
+    assert setpoints(reach=farthest).check(plant) == ""
+    assert "farthest equilibrium" in setpoints(reach=1.01 * farthest).check(plant)
+    assert farthest_equilibrium(plant, np.array([0.0, 1.0])) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_farthest_equilibrium_is_that_of_a_search_over_all_inputs():
+    rng = np.random.default_rng(3)
+    for _ in range(10):
+        A, B = 0.5 * rng.standard_normal((3, 3)), rng.standard_normal((3, 2))
+        known = {"gamma": 1e-6, "sensor_bound": 0, "initial_bound": 0}
+        plant = LinearPlant(A=A, B=B, box=rng.uniform(0.5, 2.0, 3), u_max=[1.0, 2.0], dt=1.0, **known)
+        to_state, output = np.linalg.solve(np.eye(3) - A, B), rng.standard_normal(3)
+        angles = np.linspace(0.0, 2.0 * np.pi, 20_001)
+        inputs = np.stack([np.cos(angles), np.sin(angles)])
+        states = to_state @ inputs
+        used = np.maximum(np.abs(plant.box_rows @ states).max(axis=0), np.abs(inputs.T / plant.u_max).max(axis=1))
+        assert farthest_equilibrium(plant, output) == pytest.approx((output @ states / used).max(), rel=1e-3)

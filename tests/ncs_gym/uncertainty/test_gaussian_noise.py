@@ -207,3 +207,12 @@ def test_environments_with_the_same_seed_are_the_same(plant, channel):
         infos = [env.reset(seed=3)[1]] + [env.step(np.zeros(plant.m, np.float32))[4] for _ in range(50)]
         runs.append(np.array([info["state"] for info in infos]))
     np.testing.assert_array_equal(*runs)
+
+
+def test_extreme_noise_lies_on_the_bounds_in_scalar_and_vector_environments():
+    plant = LinearPlant(**CALM, gamma=1e-6, sensor_bound=0.1, initial_bound=0.2)
+    for env in both(plant, noise="extreme"):
+        _, info = env.reset(seed=3)
+        np.testing.assert_allclose(np.abs(info["estimation_error"]), 0.2, rtol=1e-9)
+        measured = env.unwrapped._process.measure(env.unwrapped.np_random, 0.0 * np.atleast_1d(info["state"]).T)
+        np.testing.assert_allclose(np.abs(measured), 0.1, rtol=1e-9)

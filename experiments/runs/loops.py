@@ -1,12 +1,36 @@
-"""Changes of an environment's own channel, given by name."""
+"""The control loop that a command's settings ask for: a registered environment, with changes of its channel by name."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from typing import Any
 
+from agents.loop import LoopConfig
+from experiments.runs.environments import module_and_id, registered_env
 from ncs_gym import Channel, GilbertElliott
+from ncs_gym.envs.env import ncs_env
+
+
+def loop_config(env_id: str, channel: Mapping[str, Any] | None = None, **kwargs: Any) -> LoopConfig:
+    """Returns the bare control loop of a registered environment.
+
+    Args:
+        env_id: Id, or "module:id" if the user gave it.
+        channel: Changes of the environment's own channel by name; see `changed_channel`.
+        **kwargs: Keyword arguments of the environment; None keeps its own.
+
+    Raises:
+        ValueError: If the environment is unknown or has no plant of its own, or cannot have the channel.
+    """
+    registered_env(env_id)
+    return with_channel(LoopConfig(env=module_and_id(env_id)[1], kwargs=kwargs), channel or {})
+
+
+def with_channel(loop: LoopConfig, changes: Mapping[str, Any]) -> LoopConfig:
+    """Returns a control loop with changes of its channel; for arguments and errors see `changed_channel`."""
+    changed = changed_channel(ncs_env(loop.single()).channel, changes)
+    return loop if changed is None else loop.with_kwargs(channel=asdict(changed))
 
 
 def changed_channel(own: Channel, changes: Mapping[str, Any]) -> Channel | None:

@@ -1,0 +1,126 @@
+"""What it costs that the box counts between samples, too, for registered environments with a model in continuous time.
+
+    python benchmarks/between_samples.py [--ids TruckTrailerCruise BatchReactor] [--points 4] [--steps 4000]
+
+Each id has two lines: at sampling instants alone, and at all times. "S" and "P" are the shares of the safe box's volume
+that ellipsoid and polytope fill, "rows" those of P and "s" the time of its search and proof. "overridden" and "reward"
+(per step) are those of an LQR behind the shield with P in mode "project", in the same episodes. "left" is the largest
+|c x| between two samples inside the box, without a shield, under random inputs of full size. "decision", "step" and
+"step x 64" are times, least of many in turns, next to those of the first line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+import ncs_gym  # noqa: F401  (registers the environments)
+from experiments.baselines import controller
+from ncs_gym import LinearPlant
+from shields import Certificate, SafetyFilter, VectorSafetyShield, synthesize
+from shields.synthesis.certification import with_polytope
+
+IDS = {"TruckTrailer": 8, "TruckTrailerCruise": 8, "CartPole": 4, "BatchReactor": 4}
+BLOCKS, REPEATS = 40, 50
+
+
+def behind(name: str, plant: LinearPlant, certificate: Certificate, steps: int) -> tuple[float, float]:
+    """Returns the share of overridden steps and the reward per step of an LQR behind a shield in mode "project"."""
+    envs = VectorSafetyShield(gym.make_vec(f"ncs_gym/{name}-v0", num_envs=20, plant=plant), certificate)
+    policy = controller("lqr", gym.make(f"ncs_gym/{name}-v0").unwrapped, certificate.K, 0)
+    observations, info = envs.reset(seed=0)
+    overridden = total = 0.0
+    for _ in range(steps // 20):
+        observations, reward, *_, info = envs.step(policy(observations, info).astype(np.float32))
+        overridden += float(info["shield_intervened"].sum())
+        total += float(reward.sum())
+    return overridden / (steps // 20 * 20), total / (steps // 20 * 20)
+
+
+def left(name: str, plant: LinearPlant, steps: int) -> float:
+    """Returns the largest |c x| between two samples inside the box, under random inputs of full size."""
+    settings: dict[str, Any] = {"plant": plant, "terminate_on_violation": True, "max_episode_steps": 200}
+    envs, most = gym.make_vec(f"ncs_gym/{name}-v0", num_envs=100, **settings), 0.0
+    rng, u = np.random.default_rng(0), np.ones((100, plant.m))
+    _, info = envs.reset(seed=0)
+    for _ in range(steps // 100):
+        before, u = info["constraint_values"], np.where(rng.random(u.shape) < 0.2, -u, u)
+        *_, info = envs.step(u.astype(np.float32))
+        inside = np.maximum(before, info["constraint_values"]).max(axis=1) <= 0.0
+        most = max(most, 1.0 + float(info["worst_constraint_values"][inside].max(initial=-1.0)))
+    return most
+
+
+def ratios(works: list[Callable[[], object]]) -> list[float]:
+    """Returns the least times of works, in turns, in units of the first's."""
+    least = [np.inf] * len(works)
+    for _ in range(BLOCKS):
+        for k, work in enumerate(works):
+            begin = time.perf_counter()
+            for _ in range(REPEATS):
+                work()
+            least[k] = min(least[k], time.perf_counter() - begin)
+    return [each / least[0] for each in least]
+
+
+def stepping(name: str, plant: LinearPlant, number: int) -> Callable[[], object]:
+    """Returns a step of an environment, or of many."""
+    settings = {"plant": plant, "terminate_on_violation": False}
+    path = f"ncs_gym/{name}-v0"
+    env = gym.make(path, **settings).unwrapped if number == 1 else gym.make_vec(path, num_envs=number, **settings)
+    action = 0.0 * env.action_space.sample()
+    env.reset(seed=0)
+    return lambda: env.step(action)
+
+
+def deciding(plant: LinearPlant, certificate: Certificate, inside: Certificate) -> Callable[[], object]:
+    """Returns decisions about 64 estimates in the polytope of a certificate, and random inputs."""
+    rng, shield, safe = np.random.default_rng(0), SafetyFilter(certificate, plant), inside.safe_set
+    estimates = (safe.sample_boundary(rng, 64) * rng.uniform(0.2, 0.9, (64, 1))).T.copy()
+    proposals = rng.uniform(-1.0, 1.0, (plant.m, 64)) * plant.u_max[:, None]
+    errors = shield.errors_of(0.5 * certificate.error_shapes[0]).batch().of(np.zeros(64, np.int64))
+    return lambda: shield.decide_many(estimates, errors, proposals)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--ids", nargs="*", default=list(IDS))
+    parser.add_argument("--points", type=int, default=0)
+    parser.add_argument("--steps", type=int, default=8000)
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    print("id                   N      S      P  rows     s  overridden   reward   left  decision   step  step x 64")
+    for name in options.ids:
+        env = gym.make(f"ncs_gym/{name}-v0").unwrapped
+        plants = [env.plant, replace(env.plant, between_samples=options.points or IDS.get(name, 8))]
+        found, seconds = [], []
+        for plant in plants:
+            plain = synthesize(plant, contract=env.certificate_contract, safe_set="ellipsoid")
+            begin = time.perf_counter()
+            found.append(with_polytope(plain, plant))
+            seconds.append(time.perf_counter() - begin)
+        works = [[deciding(p, c, found[1]) for p, c in zip(plants, found, strict=True)]]
+        works += [[stepping(name, plant, number) for plant in plants] for number in (1, 64)]
+        times = [ratios(pair) for pair in works]
+        for k, (plant, certificate) in enumerate(zip(plants, found, strict=True)):
+            recorded, polytope = certificate.provenance, certificate.polytope
+            overridden, reward = behind(name, plant, certificate, options.steps)
+            print(
+                f"{name:<20} {plant.between_samples or 1:>2} {recorded['share_of_box']:>6.1%}"
+                f" {recorded.get('polytope_share_of_box', np.nan):>6.1%}"
+                f" {0 if polytope is None else len(polytope.rows):>5}"
+                f" {seconds[k]:>5.1f} {overridden:>11.1%} {reward:>8.4f} {left(name, plant, options.steps):>6.3f}"
+                f" {times[0][k]:>9.2f} {times[1][k]:>6.2f} {times[2][k]:>10.2f}",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,42 @@
+"""An exothermic stirred-tank reactor, linearized at its unstable operating point."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.plants.statespace import zero_order_hold
+
+
+def stirred_tank(dt: float = 3.0, **bounds: Any) -> LinearPlant:
+    """Returns the continuous stirred-tank reactor of Seborg et al. at its unstable point, by exact zero-order hold.
+
+    x = (concentration [0.01 mol/L], temperature [K]) and u the temperature of the coolant [K], |u| <= 20, all in
+    deviations from the operating point. An exothermic reaction heats what it is sped up by: left alone, deviations grow
+    by a factor of 2.7 in 21 s (a pole at +2.83/min). Safe box 10 and 5 K. What comes in is up to 2 K/min too warm or
+    too cold; both states are measured to within 0.02 of their units.
+
+    Seborg, Edgar, Mellichamp and Doyle: "Process Dynamics and Control", the reactor of chapter 2.
+
+    Args:
+        dt: Step [s].
+        bounds: Other arguments of `LinearPlant`, in the place of these.
+    """
+    per_minute = np.array([[-2.0, -3.57], [2.092, 4.38]])
+    coolant_and_feed = np.array([[0.0, 0.0], [2.092, 1.0]])
+    A, both = zero_order_hold(per_minute / 60.0, coolant_and_feed / 60.0, dt)
+    defaults = {
+        "box": [10.0, 5.0],
+        "u_max": 20.0,
+        "disturbance_bound": (both[:, 1:], 2.0),
+        "sensor_bound": 0.02,
+        "initial_bound": 0.1,
+        "error_gain": ((-0.6, -3.0),),
+        "state_names": ("concentration", "temperature"),
+        "state_units": ("0.01 mol/L", "K"),
+        "input_names": ("coolant temperature",),
+        "input_units": ("K",),
+    }
+    return LinearPlant(**({"A": A, "B": both[:, :1], "dt": dt} | defaults | bounds))

@@ -1,0 +1,139 @@
+"""A control loop over UDP in processes of its own: what the logs say holds at any speed of the machine."""
+
+import csv
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pandas as pd
+import pytest
+
+from experiments.commands.loop import summary_of
+from experiments.network_loop.log import StepLog, rows_of
+from tests.certificates import certificate_of
+from tests.command import environment, ncs, ncs_process
+
+CRUISE = "ncs_gym/TruckTrailerCruise-v0"
+
+
+def free_port():
+    """One of three in a row, as a rule."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as each:
+        each.bind(("127.0.0.1", 0))
+        return min(each.getsockname()[1], 65533)
+
+
+def check(folder):
+    """What the logs of plant and controller have to agree on, however late processes and packets were."""
+    summary = summary_of(folder)
+    assert summary["outside although proved"] == 0
+    plant = pd.concat(pd.read_csv(file) for file in sorted(folder.glob("plant-*.csv")))
+    controller = pd.concat(pd.read_csv(file) for file in sorted(folder.glob("controller-*.csv")))
+    both = controller.merge(plant, on=["episode", "step"], suffixes=("", "_applied"))
+    assert len(both) > 0
+    missed = plant[plant["missing"] > 0].groupby("episode")["step"].min()
+    for episode, own in plant.groupby("episode"):
+        kept = own[own["step"] < missed.get(episode, 2**62)]
+        if (controller["episode"] == episode).any() and not own["outside"].iloc[0]:
+            assert not kept["outside"].any()  # while every input arrived
+    assert (controller["missing"].groupby(controller["episode"]).diff().fillna(0) >= 0).all()
+    heard = controller[controller["missing"] > 0]
+    assert not heard["guaranteed"].any()  # a miss that was heard of ends the proof
+    return summary, controller
+
+
+def test_ten_seconds_over_udp_with_everything_that_a_network_does(tmp_path):
+    out = tmp_path / "loop"
+    done = ncs_process(
+        *("loop", "--env", CRUISE, "--speed", 5, "--steps", 100, "--room", 4, "--worst", "--mischief", 0.3),
+        *("--port", free_port(), "--out", out, "--live", "yes"),
+    )
+    assert done.returncode == 0, done.stderr
+    summary, controller = check(out)
+    assert summary["steps of the controller"] == len(controller) == 100
+    assert summary["datagrams refused"] > 0
+    assert controller["guaranteed"].iloc[0] == 1
+    assert "outside although proved" in done.stdout
+    assert "step 0: proved" in done.stdout
+    packets = pd.read_csv(out / "packets-000.csv")
+    assert (packets["received"] >= packets["sent"]).all()
+
+
+@pytest.mark.slow
+def test_controller_that_is_killed_is_restarted_beside_the_running_plant(tmp_path):
+    key, certificate = tmp_path / "key", tmp_path / "c.json"
+    key.write_bytes(os.urandom(32))
+    from ncs_gym.registration import loaded_truck_trailer
+
+    certificate_of(loaded_truck_trailer()).save(certificate)
+    common = ["loop", "--env", CRUISE, "--speed", "5", "--room", "4", "--port", str(free_port())]
+    common += ["--key-file", str(key), "--certificate", str(certificate), "--live", "yes"]
+
+    def started(role, *more):
+        command = [sys.executable, "-m", "experiments", *common, "--role", role, "--out", str(tmp_path / role), *more]
+        return subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+    plant = started("plant")
+    try:
+        first = started("controller", "--steps", "100000")
+        log = tmp_path / "controller" / "controller-000.csv"
+        deadline = time.monotonic() + 120
+        while not (log.exists() and log.stat().st_size > 4000) and time.monotonic() < deadline:
+            time.sleep(0.2)
+        first.kill()
+        first.wait()
+        episode = next(rows_of(tmp_path / "controller", "controller"))["episode"]
+        second = started("controller", "--steps", "60", "--restarted")
+        text, _ = second.communicate(timeout=240)
+        assert second.returncode == 0, text
+        rows = list(rows_of(tmp_path / "controller", "controller"))
+        assert len(rows) == 60
+        assert episode not in {row["episode"] for row in rows}
+        assert rows[0]["reason"] == "the samples do not yet tell where the state is"
+        assert any(row["guaranteed"] == "1" for row in rows)
+    finally:
+        plant.send_signal(signal.SIGINT)
+        plant.communicate(timeout=60)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--speed", 0], "--speed must be positive"),
+        (["--mischief", 2], "--mischief must be a probability"),
+        (["--port", 70000], "--port must be between 1 and 65533"),
+        (["--room", -1], "--room must be between 0 and 100 steps"),
+        (["--role", "plant"], "give both the same --key-file"),
+        (["--env", "ncs_gym/Nothing-v0"], "ncs_gym/Nothing-v0"),
+        (["--key-file", "/dev/null", "--role", "plant"], "must hold at least 16 bytes"),
+    ],
+)
+def test_wrong_settings_are_refused(arguments, words, tmp_path):
+    done = ncs("loop", "--env", CRUISE, *arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert words in " ".join(done.stderr.replace("│", " ").split())
+    assert "Traceback" not in done.stderr
+
+
+def test_port_that_is_in_use_ends_the_command(tmp_path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as used:
+        used.bind(("127.0.0.1", 0))
+        port = used.getsockname()[1]
+        done = ncs_process("loop", "--env", CRUISE, "--smoke", "--port", port - 1, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "ended by itself" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_log_is_rotated_and_read_in_order_without_a_row_that_was_cut_off(tmp_path):
+    log = StepLog(tmp_path, "steps", ["step", "text"], rows_per_file=3)
+    for step in range(8):
+        log.write([step, "a, b"])
+    log.close()
+    assert [file.name for file in sorted(tmp_path.iterdir())] == [f"steps-00{i}.csv" for i in range(3)]
+    with open(tmp_path / "steps-002.csv", "a", newline="") as file:
+        csv.writer(file).writerow([8])
+    assert [row["step"] for row in rows_of(tmp_path, "steps")] == [str(step) for step in range(8)]

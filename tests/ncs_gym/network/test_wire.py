@@ -1,0 +1,127 @@
+"""Datagrams: what is encoded is decoded, and nothing else is understood, whatever the bytes."""
+
+import pickle
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ncs_gym import batch_reactor, cart_pole
+from ncs_gym.network.wire import MAGIC, TAG_SIZE, Kind, Message, Wire, WireError
+from tests.fuzz import examples
+
+PLANT, KEY = batch_reactor(), b"sixteen bytes or more"
+WIRE = Wire(PLANT, 3, KEY)
+NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
+COUNTS = st.integers(0, 2**62 - 1)
+FIELDS = {"episode": st.integers(0, 2**64 - 1), "stamp": COUNTS, "challenge": st.integers(0, 2**64 - 1)}
+
+
+def values(count):
+    return st.lists(NUMBERS, min_size=count, max_size=count)
+
+
+MESSAGES = st.one_of(
+    st.builds(Message, kind=st.just(Kind.SAMPLE), values=values(2).map(np.array), **FIELDS),
+    st.builds(Message, kind=st.just(Kind.COMMAND), values=values(8).map(lambda v: np.reshape(v, (4, 2))), **FIELDS),
+    st.builds(Message, kind=st.just(Kind.ECHO), missing=COUNTS, digest=st.binary(min_size=16, max_size=16), **FIELDS),
+    st.builds(Message, kind=st.just(Kind.BEACON), **FIELDS),
+)
+
+
+def shown(message):
+    fields = vars(message).copy()
+    given = fields.pop("values")
+    return fields, [] if given is None else np.asarray(given).tolist()
+
+
+def reason_of(data, wire=WIRE):
+    with pytest.raises(WireError) as refused:
+        wire.decode(data)
+    return refused.value.reason
+
+
+@examples(100)
+@given(MESSAGES)
+def test_what_is_encoded_is_decoded(message):
+    assert shown(WIRE.decode(WIRE.encode(message))) == shown(message)
+
+
+@given(MESSAGES, st.data())
+@examples(300)
+def test_one_bit_more_or_less_or_another_is_refused(message, data):
+    sent = WIRE.encode(message)
+    changed = bytearray(sent)
+    changed[data.draw(st.integers(0, len(sent) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    assert reason_of(bytes(changed)) in {"format", "length", "tag"}
+    assert reason_of(sent[: data.draw(st.integers(0, len(sent) - 1))]) in {"format", "length", "tag"}
+    assert reason_of(sent + b"\0") == "length"
+
+
+@given(st.binary(max_size=300))
+@examples(500)
+def test_noise_is_refused(noise):
+    assert reason_of(noise) in {"format", "length", "tag"}
+    assert reason_of(MAGIC + b"\1\1\0\0" + noise) in {"length", "tag"}
+
+
+def tagged(wire, head):
+    return head + wire._tag(head)
+
+
+def test_what_has_the_key_and_another_plant_version_or_size_is_refused():
+    sample = Message(kind=Kind.SAMPLE, episode=1, stamp=2, values=np.zeros(2))
+    data = WIRE.encode(sample)
+    other = Wire(cart_pole(), 3, KEY).encode(Message(kind=Kind.BEACON, episode=1, stamp=2))
+    assert reason_of(other) == "plant"
+    assert reason_of(Wire(PLANT, 3, KEY + b"!").encode(sample)) == "tag"
+    for place, value, reason in [(4, 2, "format"), (5, 0, "format"), (5, 5, "format"), (6, 1, "format")]:
+        head = bytearray(data[:-TAG_SIZE])
+        head[place] = value
+        assert reason_of(tagged(WIRE, bytes(head))) == reason
+    command = Wire(PLANT, 4, KEY).encode(Message(kind=Kind.COMMAND, episode=1, stamp=2, values=np.zeros((5, 2))))
+    assert reason_of(command) == "length"
+    for place, text in (
+        (24, struct.pack("<Q", 2**62)),
+        (40, struct.pack("<d", np.nan)),
+        (40, struct.pack("<d", np.inf)),
+    ):
+        head = bytearray(
+            WIRE.encode(Message(kind=Kind.COMMAND, episode=1, stamp=2, values=np.zeros((4, 2))))[:-TAG_SIZE]
+        )
+        head[place : place + 8] = text
+        assert reason_of(tagged(WIRE, bytes(head))) == "value"
+
+
+def test_layout_is_the_documented_one():
+    """Written down by hand: another language has to come to the same bytes."""
+    import hashlib
+    import hmac
+
+    data = WIRE.encode(Message(kind=Kind.SAMPLE, episode=7, stamp=9, challenge=11, values=np.array([1.5, -2.0])))
+    head = (
+        b"NCSW"
+        + bytes([1, 1, 0, 0])
+        + bytes.fromhex(PLANT.fingerprint)[:8]
+        + struct.pack("<QQQdd", 7, 9, 11, 1.5, -2.0)
+    )
+    assert data == head + hmac.new(KEY, head, hashlib.sha256).digest()[:16]
+
+
+@pytest.mark.parametrize("key", ["a string of sixteen letters", b"short", None])
+def test_key_is_long_enough(key):
+    with pytest.raises(ValueError, match="at least 16 bytes"):
+        Wire(PLANT, 3, key)
+
+
+def test_what_does_not_fit_the_plant_or_a_datagram_is_not_encoded():
+    with pytest.raises(ValueError, match="shape"):
+        WIRE.encode(Message(kind=Kind.SAMPLE, episode=1, stamp=2, values=np.zeros(3)))
+    with pytest.raises(ValueError, match="more than 1400 bytes"):
+        Wire(PLANT, 100, KEY)
+
+
+def test_nothing_is_unpickled():
+    assert reason_of(pickle.dumps(Message(kind=Kind.BEACON, episode=1, stamp=2))) == "format"

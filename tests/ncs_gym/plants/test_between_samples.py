@@ -1,0 +1,207 @@
+"""Times between samples: rows of a grid, the bound of what is between its points, and what environments report."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from ncs_gym import FunctionProcess, LinearPlant, batch_reactor, cart_pole, truck_trailer
+from ncs_gym.plants.between_samples import GridRows
+
+CRUISE = "ncs_gym/TruckTrailerCruise-v0"
+PLANTS = {
+    "truck-trailer": lambda: truck_trailer(mass=4000.0),
+    "cart-pole": cart_pole,
+    "reactor": batch_reactor,
+}
+
+
+def exponentials(plant, times):
+    """[A_tau, B_tau] by scipy, shape (len(times), n, n + m)."""
+    n, m = plant.n, plant.m
+    G = np.concatenate([plant.continuous_model, np.zeros((m, n + m))])
+    return np.array([expm(G * time)[:n] for time in times])
+
+
+def random_model(seed, n, m, k):
+    """A plant of a random model in continuous time, with k oblique rows of the box besides the axes."""
+    rng = np.random.default_rng(seed)
+    rows = np.concatenate([np.eye(n) * rng.uniform(0.3, 3.0, n), rng.standard_normal((k, n))])
+    model = (2.0 * rng.standard_normal((n, n)), rng.standard_normal((n, m)), np.eye(n), np.zeros((n, m)))
+    bounds = {"disturbance_bound": 1e-3, "sensor_bound": 1e-3, "initial_bound": 1e-3}
+    return LinearPlant.from_statespace(
+        model, 0.2, box=rows, u_max=rng.uniform(0.2, 5.0, m), between_samples=5, **bounds
+    )
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_grid_is_that_of_the_model_and_begins_with_the_box(name):
+    plant = replace(PLANTS[name](), between_samples=6)
+    grid = plant.grid_rows
+    np.testing.assert_array_equal(grid.state[0], plant.box_rows)
+    assert not grid.input[0].any()
+    true = plant.box_rows @ exponentials(plant, plant.dt * np.arange(6) / 6)
+    np.testing.assert_allclose(np.concatenate([grid.state, grid.input], axis=2), true, rtol=1e-11, atol=1e-13)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000), st.integers(1, 4), st.integers(1, 2), st.integers(0, 3))
+def test_nothing_between_grid_points_is_larger_than_at_them_by_more_than_the_bound(seed, n, m, k):
+    plant = random_model(seed, n, m, k)
+    rng, points, fine = np.random.default_rng(seed), 5, 20
+    x = rng.standard_normal((400, n))
+    x /= np.abs(x @ plant.box_rows.T).max(axis=1)[:, None]
+    joint = np.concatenate([x, rng.choice([-1.0, 1.0], (400, m)) * plant.u_max], axis=1)
+    moved = exponentials(plant, plant.dt * np.arange(points * fine + 1) / (points * fine))
+    values = np.abs(plant.box_rows @ moved @ joint.T)
+    ends = np.repeat(np.maximum(values[:-fine:fine], values[fine::fine]), fine, axis=0)
+    excess = (values[:-1] - ends).max(axis=(0, 2))
+    assert (excess <= plant.grid_rows.remainder).all()
+
+
+def test_bound_is_no_larger_than_it_needs_to_be():
+    plant = replace(truck_trailer(mass=4000.0), between_samples=8)
+    # The worst second derivative at the beginning of a step, by hand: x2' of the first row, x2'' of the second.
+    stretch = (4.5 / 4.0 * 2.0 + 4.6 / 4.0 * 2.0 + 4.0) / 2.0
+    h = 0.5 / 8
+    assert h**2 / 8 * stretch <= plant.grid_rows.remainder[0] <= 1.2 * h**2 / 8 * stretch
+    finer = replace(plant, between_samples=32).grid_rows.remainder
+    assert (finer < plant.grid_rows.remainder / 12.0).all()
+
+
+def fine_values(plant, x, u, x_next):
+    """Values of the rows at the grid points after the first, of a step from x to x_next, by scipy, (N, k)."""
+    points = plant.between_samples
+    shares = np.arange(1, points + 1) / points
+    d = x_next - plant.A @ x - plant.B @ u
+    states = exponentials(plant, plant.dt * shares) @ np.concatenate([x, u]) + shares[:, None] * d
+    return np.abs(states @ plant.box_rows.T) - 1.0
+
+
+def test_environment_reports_the_worst_value_of_a_step_and_counts_it():
+    plant = replace(truck_trailer(mass=4000.0), between_samples=8)
+    env = gym.make(CRUISE, plant=plant, disturbance="sphere")
+    rng, between_alone, total = np.random.default_rng(0), 0, 0.0
+    for episode in range(6):
+        _, info = env.reset(seed=episode)
+        np.testing.assert_array_equal(info["worst_constraint_values"], info["constraint_values"])
+        for k in range(60):
+            before, total = info, info["episode_violations"]
+            *_, info = env.step(np.float32(rng.choice([-1.0, 1.0], 1)) if k % 3 == 0 else env.action_space.sample())
+            worst = fine_values(plant, before["state"], info["input"], info["state"]).max(axis=0)
+            np.testing.assert_allclose(info["worst_constraint_values"], worst, atol=1e-11)
+            assert (info["worst_constraint_values"] >= info["constraint_values"]).all()
+            assert info["cost"] == float(info["worst_constraint_values"].max() > 0.0)
+            assert info["episode_violations"] == total + info["cost"]
+            inside = max(before["constraint_values"].max(), info["constraint_values"].max()) <= 0.0
+            between_alone += inside and info["cost"] == 1.0
+    assert between_alone  # the box was left between two samples that are inside
+
+
+def test_violation_between_samples_ends_an_episode_if_violations_do():
+    plant = replace(truck_trailer(mass=4000.0), between_samples=8)
+    env = gym.make(CRUISE, plant=plant, terminate_on_violation=True)
+    for seed in range(5):
+        env.reset(seed=seed)
+        terminated = False
+        for k in range(100):
+            *_, terminated, _, info = env.step(np.array([(-1.0) ** (k // 3)], np.float32))
+            assert terminated == (info["cost"] > 0.0)
+            if terminated:
+                break
+        assert terminated
+
+
+def test_many_environments_report_what_single_ones_do():
+    plant = replace(truck_trailer(mass=4000.0), between_samples=8)
+    envs = gym.make_vec(CRUISE, num_envs=7, plant=plant, max_episode_steps=12)
+    _, info = envs.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for k in range(40):
+        before, restarted = info, envs.unwrapped.steps == 12
+        *_, info = envs.step(rng.choice([-1.0, 1.0], (7, 1)).astype(np.float32))
+        for e in range(7):
+            u = info["input"][e]
+            worst = fine_values(plant, before["state"][e], u, info["state"][e]).max(axis=0)
+            expected = info["constraint_values"][e] if restarted[e] else worst
+            np.testing.assert_allclose(info["worst_constraint_values"][e], expected, atol=1e-11, err_msg=str((k, e)))
+            assert info["cost"][e] == float(expected.max() > 0.0)
+    same = gym.make_vec(CRUISE, num_envs=3, plant=plant, max_episode_steps=4, autoreset_mode="SameStep")
+    same.reset(seed=0)
+    for _ in range(4):
+        *_, info = same.step(np.ones((3, 1), np.float32))
+    np.testing.assert_array_equal(info["worst_constraint_values"], info["constraint_values"])
+    assert (info["final_info"]["worst_constraint_values"] >= info["final_info"]["constraint_values"]).all()
+
+
+def test_without_the_setting_only_samples_count_and_everything_is_as_before():
+    plant = truck_trailer(mass=4000.0)
+    assert plant.between_samples is None
+    assert plant.grid_rows is None
+    assert plant.fingerprint == replace(plant, continuous_model=None).fingerprint
+    assert plant.fingerprint != replace(plant, between_samples=8).fingerprint
+    assert replace(plant, between_samples=8).fingerprint != replace(plant, between_samples=9).fingerprint
+    env = gym.make(CRUISE)
+    env.reset(seed=0)
+    for _ in range(50):
+        *_, info = env.step(env.action_space.sample())
+        np.testing.assert_array_equal(info["worst_constraint_values"], info["constraint_values"])
+    env.reset(seed=0)
+
+
+def test_file_of_a_plant_keeps_the_setting(tmp_path):
+    plant = replace(batch_reactor(), between_samples=4)
+    plant.save(tmp_path / "plant.json")
+    again = LinearPlant.load(tmp_path / "plant.json")
+    assert again.fingerprint == plant.fingerprint
+    np.testing.assert_array_equal(again.grid_rows.state, plant.grid_rows.state)
+    assert "at all times: at 4 of each step" in str(plant)
+    assert "at all times" not in str(batch_reactor())
+
+
+@pytest.mark.parametrize("wrong", [1, 0, -3, 65, 2.5, True, "8", [8]])
+def test_numbers_that_are_no_grid_are_refused(wrong):
+    with pytest.raises(ValueError, match="between_samples must be"):
+        replace(truck_trailer(), between_samples=wrong)
+
+
+def test_plants_whose_times_between_samples_nobody_knows_are_refused():
+    plant = truck_trailer()
+    with pytest.raises(ValueError, match="needs a model in continuous time"):
+        replace(plant, continuous_model=None, between_samples=8)
+    with pytest.raises(ValueError, match="is another one"):
+        replace(plant, A=1.001 * plant.A, between_samples=8)
+    with pytest.raises(ValueError, match="bounds every state"):
+        truck_trailer(box=[2.0, np.inf], between_samples=8)
+    model = (plant.continuous_model[:, :2], plant.continuous_model[:, 2:], np.eye(2), np.zeros((2, 1)))
+    given_bounds = {"disturbance_bound": 1e-3, "sensor_bound": 1e-3, "initial_bound": 1e-3}
+    with pytest.raises(ValueError, match="without input_delay"):
+        LinearPlant.from_statespace(
+            model, 0.5, box=[2.0, 2.0], u_max=4.0, input_delay=1, between_samples=8, **given_bounds
+        )
+    discrete = (plant.A, plant.B, np.eye(2), np.zeros((2, 1)), 0.5)
+    with pytest.raises(ValueError, match="needs a model in continuous time"):
+        LinearPlant.from_statespace(discrete, box=[2.0, 2.0], u_max=4.0, between_samples=8, **given_bounds)
+    pendulum = gym.make("ncs_gym/CartPoleNonlinear-v0").unwrapped.plant
+    with pytest.raises(ValueError, match="without a remainder"):
+        replace(pendulum, continuous_model=cart_pole().continuous_model, between_samples=8)
+
+
+def test_other_processes_are_refused_where_times_between_samples_count():
+    plant = replace(truck_trailer(mass=4000.0), between_samples=8)
+    process = FunctionProcess(lambda x, u: plant.A @ x + plant.B @ u)
+    with pytest.raises(ValueError, match="the plant's own equations"):
+        gym.make(CRUISE, plant=plant, process=process)
+    gym.make(CRUISE, process=process)
+
+
+def test_rows_of_a_grid_are_read_only():
+    grid = replace(truck_trailer(), between_samples=3).grid_rows
+    assert isinstance(grid, GridRows)
+    assert not any(array.flags.writeable for array in grid)

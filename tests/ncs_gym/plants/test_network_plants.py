@@ -1,0 +1,57 @@
+"""The three plants at which the network decides: their equations, and certificates that are nearly used up."""
+
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from ncs_gym import ChannelContract, Ellipsoid, contract_of
+from ncs_gym.envs.env import ncs_env
+from ncs_gym.plants.convoy import convoy
+from ncs_gym.plants.lane_keeping import lane_keeping
+from ncs_gym.plants.stirred_tank import stirred_tank
+from shields import Infeasible, synthesize, verify
+from shields.runtime.wrapper import certificate_for
+
+IDS = ("CSTR", "Convoy", "LaneKeeping")
+
+
+def test_tank_runs_away_at_the_rate_of_its_unstable_pole():
+    growth = max(abs(np.linalg.eigvals(stirred_tank().A)))
+    assert np.log(growth) * 60.0 / 3.0 == pytest.approx(2.83, abs=0.01)  # per minute, of a step of 3 s
+
+
+def test_follower_falls_back_by_what_the_leader_gains():
+    plant, v = convoy(), np.array([0.0, 1.0])
+    away = expm(np.array([[0.0, -1.0], [0.0, -1.0 / 0.3]]) * 0.1) @ v
+    np.testing.assert_allclose(plant.A @ v, away, rtol=1e-12)
+    assert np.sqrt(plant.disturbance_bound.shape_matrix[0, 0]) == pytest.approx(0.45 * 0.1)
+
+
+def test_car_moves_sideways_with_its_heading():
+    plant = lane_keeping()
+    np.testing.assert_allclose(plant.A, [[1.0, 20.0 * 0.05], [0.0, 1.0]], rtol=1e-12)
+    np.testing.assert_allclose(plant.B, [[20.0 * 0.05**2 / 2.0], [0.05]], rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_certificate_exists_for_the_contract_and_not_for_four_tenths_more_uncertainty(name):
+    env = ncs_env(gym.make(f"ncs_gym/{name}-v0"))
+    assert env.contract == contract_of(env.channel)
+    certificate = certificate_for(env.plant, env.contract)
+    assert verify(certificate, env.plant).valid
+
+    def grown(bound):
+        return Ellipsoid(1.4**2 * bound.shape_matrix)
+
+    plant = env.plant
+    more = replace(
+        plant,
+        disturbance_bound=grown(plant.disturbance_bound),
+        sensor_bound=grown(plant.sensor_bound),
+        initial_bound=grown(plant.initial_bound),
+    )
+    with pytest.raises(Infeasible):
+        synthesize(more, contract=ChannelContract(env.contract.max_age, 1.4 * env.contract.quantization_step))

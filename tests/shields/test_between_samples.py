@@ -1,0 +1,316 @@
+"""Shields whose box counts between samples, too: proved by both engines, attacked on a fine grid by another route."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from shields import Certificate, CertificateError, Infeasible, SafetyFilter, SafetyShield, synthesize, verify
+from shields.runtime.backup_plans import PlanTest, Prediction
+from shields.runtime.between_samples import grid_test
+from shields.runtime.one_step import OneStepTest
+from shields.runtime.starts import starts_known
+from shields.synthesis.certification import with_polytope
+from tests.certificates import certificate_of
+
+IDS = {"TruckTrailerCruise": 8, "BatchReactor": 4}
+FINE = 200
+
+
+def both(certificate, plant):
+    """Verdict of either engine; they have to agree."""
+    verdicts = {verify(certificate, plant, engine=engine).valid for engine in ("rational", "flint")}
+    assert len(verdicts) == 1
+    return verdicts.pop()
+
+
+@cache
+def found(name, points=None):
+    """Plant and certificates, with ellipsoid and with polytope, of a registered environment."""
+    env = gym.make(f"ncs_gym/{name}-v0").unwrapped
+    plant = replace(env.plant, between_samples=points)
+    plain = replace(certificate_of(plant, env.certificate_contract), polytope=None)
+    return plant, plain, with_polytope(plain, plant)
+
+
+@cache
+def fine_rows(name):
+    """Rows of the box on x and u at FINE + 1 times of a step, by scipy, shape (FINE + 1, k, n + m)."""
+    plant = found(name)[0]
+    n, m = plant.n, plant.m
+    G = np.concatenate([plant.continuous_model, np.zeros((m, n + m))])
+    return plant.box_rows @ np.array([expm(G * (plant.dt * i / FINE))[:n] for i in range(FINE + 1)])
+
+
+def worst_between(name, x, u):
+    """The largest |c x(tau)| on a fine grid of a step, for the disturbance that is worst at each time; x is (n, N)."""
+    plant = found(name)[0]
+    reach = np.array([plant.nominal_disturbance.support(row) for row in plant.box_rows])
+    return (np.abs(fine_rows(name) @ np.concatenate([x, u])) + reach[:, None]).max()
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_both_engines_prove_ellipsoid_and_polytope(name):
+    plant, plain, wide = found(name, IDS[name])
+    assert wide.polytope is not None
+    assert plain.between_samples == wide.between_samples == IDS[name]
+    assert both(plain, plant)
+    assert both(wide, plant)
+    for engine in ("rational", "flint"):
+        names = [condition.name for condition in verify(wide, plant, engine=engine).conditions]
+        assert sum(each.startswith("(G)") for each in names) == len(plant.box_rows)
+        for kind in ("(B)", "(PB)"):
+            assert sum(each.startswith(kind) for each in names) == len(plant.box_rows) * IDS[name]
+    assert plain.provenance["share_of_box"] < found(name)[1].provenance["share_of_box"]
+    assert wide.provenance["polytope_share_of_box"] < found(name)[2].provenance["polytope_share_of_box"]
+
+
+@pytest.mark.parametrize("name", IDS)
+@pytest.mark.parametrize("kind", [1, 2])
+@pytest.mark.parametrize("mode", ["project", "switch"])
+def test_no_state_between_samples_is_outside_and_without_it_some_are(name, kind, mode):
+    rng, worst = np.random.default_rng(1), {}
+    for points in (None, IDS[name]):
+        loop = found(name, points)
+        plant, certificate = loop[0], loop[kind]
+        shield, most = SafetyFilter(certificate, plant, mode=mode), 0.0
+        for shape in certificate.error_shapes[[0, -1]]:
+            x = certificate.safe_set.sample_boundary(rng, 3000).T * rng.choice([1.0, 1.0, 0.9], 3000)
+            e = rng.standard_normal((plant.n, 3000))
+            e = np.linalg.cholesky(shape) @ (e / np.linalg.norm(e, axis=0))
+            proposed = plant.u_max[:, None] * rng.choice([-1.0, 1.0, 0.3], (plant.m, 3000))
+            errors = shield.errors_of_many(shape[None]).of(np.zeros(3000, np.int64))
+            decided = shield.decide_many(x + e, errors, proposed)
+            assert len(np.unique(decided.reason)) == {"project": 3, "switch": 2}[mode]
+            most = max(most, worst_between(name, x, decided.input))
+        worst[points] = most
+    assert worst[IDS[name]] <= 1.0
+    assert worst[None] > 1.0
+
+
+@pytest.mark.parametrize("kind", [1, 2])
+@pytest.mark.parametrize("mode", ["project", "lookahead"])
+def test_single_decisions_are_those_of_many(mode, kind):
+    loop = found("TruckTrailerCruise", 8)
+    plant, certificate = loop[0], loop[kind]
+    shield, rng = SafetyFilter(certificate, plant, mode=mode), np.random.default_rng(0)
+    shape = certificate.error_shapes[0]
+    x = rng.uniform(-2.0, 2.0, (2, 300))
+    u = rng.uniform(-4.0, 4.0, (1, 300))
+    many = shield.decide_many(x, shield.errors_of_many(shape[None]).of(np.zeros(300, np.int64)), u)
+    for k in range(300):
+        one = shield.decide(x[:, k].copy(), shape, u[:, k].copy())
+        np.testing.assert_allclose(one.input, many.input[:, k], atol=1e-6)
+        assert (one.passed, one.intervened) == (many.passed[k], many.intervened[k])
+
+
+@pytest.mark.parametrize("name", [*IDS, "TruckTrailerCruiseTwoWay"])
+@pytest.mark.parametrize("mode", ["project", "lookahead"])
+def test_shielded_episodes_stay_inside_at_all_times(name, mode):
+    points = IDS.get(name, 8)
+    plant, plain, wide = found(name, points)
+    rng = np.random.default_rng(0)
+    for certificate in (plain, wide):
+        settings = {"plant": plant, "disturbance": "adversarial", "terminate_on_violation": False}
+        env = SafetyShield(gym.make(f"ncs_gym/{name}-v0", **settings), certificate, mode)
+        contract = env.unwrapped.certificate_contract
+        assert contract == certificate.contract or contract is None
+        interventions = 0
+        for episode in range(3):
+            _, info = env.reset(seed=episode)
+            sign = np.ones(plant.m)
+            for _ in range(100):
+                before = info
+                sign = np.where(rng.random(plant.m) < 0.2, -sign, sign)
+                *_, info = env.step(sign.astype(np.float32))
+                assert info["shield_guaranteed"], info["shield_reason"]
+                assert info["cost"] == 0.0
+                assert worst_between(name, before["state"][:, None], info["input"][:, None]) <= 1.0
+                interventions += info["shield_intervened"]
+        assert interventions > 10
+
+
+def test_unshielded_cruise_leaves_its_box_between_two_samples_inside_it():
+    # The largest value between two samples in the box is about a tenth beyond it.
+    rng = np.random.default_rng(0)
+    x = np.concatenate([rng.uniform(-2.0, 2.0, (2, 200_000)), rng.choice([-4.0, 4.0], (1, 200_000))])
+    rows = fine_rows("TruckTrailerCruise")
+    inside = (np.abs(rows[-1] @ x) <= 1.0).all(axis=0)
+    assert 1.07 < np.abs(rows[::10] @ x[:, inside]).max() < 1.12
+
+
+def changed_grid(plant, **fields):
+    """The plant as it would be if it had computed other rows."""
+    other = replace(plant)
+    other.__dict__["grid_rows"] = plant.grid_rows._replace(**fields)
+    return other
+
+
+def one_entry(array, where, factor):
+    changed = array.copy()
+    changed[where] *= factor
+    return changed
+
+
+PLANT_MUTANTS = {
+    "c A_tau changed": lambda p, g: changed_grid(p, state=one_entry(g.state, (2, 0, 0), 0.98)),
+    "c B_tau changed": lambda p, g: changed_grid(p, input=one_entry(g.input, (3, 1, 0), 0.9)),
+    "the box changed": lambda p, g: changed_grid(p, state=one_entry(g.state, (0, 0, 0), 1.0 - 1e-9)),
+    "eta too small": lambda p, g: changed_grid(p, remainder=0.95 * g.remainder),
+    "eta not a number": lambda p, g: changed_grid(p, remainder=np.nan * g.remainder),
+    "a time left out": lambda p, g: changed_grid(p, state=g.state[:-1], input=g.input[:-1]),
+    "a time given twice": lambda p, g: changed_grid(
+        p, state=np.concatenate([g.state[:2], g.state[1:-1]]), input=np.concatenate([g.input[:2], g.input[1:-1]])
+    ),
+    "a row left out": lambda p, g: changed_grid(
+        p, state=g.state[:, 1:], input=g.input[:, 1:], remainder=g.remainder[1:]
+    ),
+    "rows of another input": lambda p, g: changed_grid(p, input=-g.input),
+}
+
+
+@pytest.mark.parametrize("mutant", PLANT_MUTANTS)
+@pytest.mark.parametrize("name", IDS)
+def test_grids_that_are_not_the_models_are_refused_by_both_engines(name, mutant):
+    plant, plain, wide = found(name, IDS[name])
+    broken = PLANT_MUTANTS[mutant](plant, plant.grid_rows)
+    assert not both(plain, broken)
+    assert not both(wide, broken)
+    with pytest.raises(CertificateError, match="does not verify"):
+        SafetyFilter(wide, broken)
+
+
+def with_multipliers(certificate, multipliers):
+    return replace(certificate, polytope=replace(certificate.polytope, multipliers=multipliers))
+
+
+def grown(certificate, factor):
+    return replace(certificate, L=factor * certificate.L, polytope=None)
+
+
+CERTIFICATE_MUTANTS = {
+    "claims samples alone": lambda c: replace(c, between_samples=None),
+    "claims another grid": lambda c: replace(c, between_samples=c.between_samples + 1),
+    "multipliers of a time left out": lambda c: with_multipliers(c, c.polytope.multipliers[: -len(c.L)]),
+    "multipliers of a row left out": lambda c: with_multipliers(c, c.polytope.multipliers[:-1]),
+    "no multipliers on the grid": lambda c: with_multipliers(
+        c, np.where(np.arange(len(c.polytope.multipliers))[:, None] < len(c.polytope.rows) + len(c.K),
+                    c.polytope.multipliers, 0.0)
+    ),
+    "multipliers of other times": lambda c: with_multipliers(
+        c, np.concatenate([c.polytope.multipliers[: len(c.polytope.rows) + len(c.K)],
+                           np.flip(c.polytope.multipliers[len(c.polytope.rows) + len(c.K) :], axis=0)])
+    ),
+    "a larger ellipsoid": lambda c: grown(c, 1.01),
+    "another gain": lambda c: replace(c, K=1.02 * c.K),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mutant", CERTIFICATE_MUTANTS)
+@pytest.mark.parametrize("name", IDS)
+def test_changed_certificates_are_refused_by_both_engines(name, mutant):
+    plant, _, wide = found(name, IDS[name])
+    assert not both(CERTIFICATE_MUTANTS[mutant](wide), plant)
+
+
+def test_certificate_of_a_plant_that_counts_otherwise_is_refused():
+    plant, _, wide = found("TruckTrailerCruise", 8)
+    without, plain, _ = found("TruckTrailerCruise")
+    assert not both(wide, without)
+    assert not both(plain, plant)
+    claimed = replace(plain, between_samples=8, fingerprint=plant.fingerprint)
+    broken = [condition.name for condition in verify(claimed, plant).conditions if not condition.holds]
+    assert broken
+    assert all(name.startswith("(B)") for name in broken)
+
+
+def test_polytope_of_samples_alone_is_refused_at_times_between_them():
+    plant = found("TruckTrailerCruise", 8)[0]
+    without = found("TruckTrailerCruise")[2]
+    rows, m = without.polytope.rows, plant.m
+    multipliers = np.concatenate([without.polytope.multipliers, np.zeros((8 * len(plant.box_rows), len(rows)))])
+    closed = plant.grid_rows.state + plant.grid_rows.input @ without.K
+    multipliers[len(rows) + m :] = np.linalg.lstsq(rows.T, closed.reshape(-1, plant.n).T, rcond=None)[0].T
+    claimed = replace(with_multipliers(without, multipliers), between_samples=8, fingerprint=plant.fingerprint)
+    broken = {condition.name[:4] for condition in verify(claimed, plant).conditions if not condition.holds}
+    assert "(PB)" in broken
+
+
+def test_certificate_says_when_its_claim_holds_and_its_file_keeps_it(tmp_path):
+    _, plain, wide = found("TruckTrailerCruise", 8)
+    _, without, _ = found("TruckTrailerCruise")
+    assert "in the safe box at all times" in str(plain)
+    assert "at the sampling instants" in str(without)
+    assert "between_samples" not in without.document["certificate"]
+    wide.save(tmp_path / "wide.json")
+    assert Certificate.load(tmp_path / "wide.json") == wide
+    with pytest.raises(CertificateError, match="between_samples must be"):
+        replace(plain, between_samples="8")
+
+
+def test_plant_whose_disturbances_alone_fill_the_box_between_samples_has_no_certificate():
+    env = gym.make("ncs_gym/TruckTrailer-v0").unwrapped
+    plant = replace(env.plant, gamma=0.43)
+    synthesize(plant)
+    with pytest.raises(Infeasible, match="between"):
+        synthesize(replace(plant, between_samples=2))
+
+
+@pytest.mark.parametrize("horizon", [1, 4])
+def test_plans_are_certified_only_if_every_time_between_samples_is_inside(horizon):
+    plant, plain, _ = found("TruckTrailerCruise", 8)
+    prediction = Prediction(OneStepTest(plain.L, plant), horizon)
+    without = Prediction(OneStepTest(plain.L, found("TruckTrailerCruise")[0]), horizon)
+    rng, shape = np.random.default_rng(0), 0.5 * plain.error_shapes[0]
+    estimates = rng.uniform(-2.0, 2.0, (2000, 2))
+    plans = rng.uniform(-4.0, 4.0, (2000, 1, horizon, 1))
+    verdicts = []
+    for each in (prediction, without):
+        test = PlanTest(each, 1e-9)
+        verdicts.append(test.certified(estimates, test.tightenings_of(np.tile(shape, (2000, 1, 1))), plans)[:, 0])
+    assert (verdicts[0] <= verdicts[1]).all()
+    assert verdicts[0].sum() < verdicts[1].sum()
+    reach = np.array([plant.disturbance.support(row) for row in plant.box_rows])
+    for length in range(1, horizon + 1):
+        center, A, disturbed, worst = estimates.T, np.eye(2), np.zeros((FINE + 1, 2)), np.zeros(2000)
+        for i in range(length):
+            u = plans[:, 0, i].T
+            rows = fine_rows("TruckTrailerCruise")[..., :2]
+            error = np.sqrt(np.einsum("tkn,nm,tkm->tk", rows @ A, shape, rows @ A))
+            values = np.abs(fine_rows("TruckTrailerCruise") @ np.concatenate([center, u]))
+            # At the first sampling instant the state is what it is.
+            part = slice(FINE // 8 if i == 0 else 0, FINE + 1)
+            worst = np.maximum(worst, (values + (error + disturbed + reach)[..., None])[part].max(axis=(0, 1)))
+            disturbed = disturbed @ np.eye(2) + np.sqrt(
+                np.einsum("tkn,nm,tkm->tk", rows @ A, plant.disturbance.shape_matrix, rows @ A)
+            )
+            center, A = plant.A @ center + plant.B @ u, A @ plant.A
+        assert worst[verdicts[0][:, length - 1]].max() <= 1.0
+
+
+def test_before_the_first_decision_behind_a_downlink_times_between_samples_count():
+    plant, _, wide = found("BatchReactor", 4)
+    shield, zero = SafetyFilter(wide, plant), np.zeros((2, 1))
+    assert all(known.in_safe_set for known in starts_known(shield, np.zeros(4), 1))
+    counts = {True: 0, False: 0}
+    for x in 0.9999 * wide.polytope.sample_boundary(np.random.default_rng(0), 300):
+        assert starts_known(shield, x, 0)[0].in_safe_set  # the first input is decided
+        first, second = starts_known(shield, x, 1)
+        # From the last point of the grid on it is the next sample that has to be inside.
+        known = first.in_safe_set and second.in_safe_set
+        counts[first.in_safe_set] += 1
+        if known:
+            assert worst_between("BatchReactor", x[:, None], zero) <= 1.0
+    assert min(counts.values()) > 10
+
+
+def test_plants_without_a_grid_have_no_rows_of_one():
+    plant = found("TruckTrailerCruise")[0]
+    test = grid_test(plant)
+    assert not len(test.moved)
+    assert test.at_samples is plant.box_rows
