@@ -35,6 +35,8 @@ COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
     "loop": ("LoopSettings", "experiments.commands.loop:loop", {}),
     "synthesize": ("SynthesizeSettings", "experiments.commands.synthesize:synthesize", {}),
     "verify": ("VerifySettings", "experiments.commands.verify:verify", {}),
+    "channel": ("ChannelSettings", "experiments.commands.channel:channel", {}),
+    "requirements": ("RequirementsSettings", "experiments.commands.requirements:requirements", {}),
     "attack": ("AttackSettings", "experiments.commands.attack:attack", {}),
     "audit": ("AuditSettings", "experiments.commands.audit:audit", {}),
     "reproduce": ("ReproduceSettings", "experiments.commands.reproduce:reproduce", {}),

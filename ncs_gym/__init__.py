@@ -6,11 +6,12 @@ from ncs_gym.envs.spaces import ClippedObservationWarning
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlantError, certified_error_set
 from ncs_gym.estimation.estimator import Estimator
-from ncs_gym.network.channel import Channel, GilbertElliott, Packet
+from ncs_gym.network.channel import Channel, GilbertElliott, Packet, TraceChannel
 from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
 from ncs_gym.network.downlink import Actuator, Command, Echo
 from ncs_gym.network.gaussian_bound import bound_violation_probability
 from ncs_gym.network.gaussian_bound import bound_violation_probability as escape_probability  # noqa: F401  its former name
+from ncs_gym.network.packet_log import PacketLog
 from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.cart_pole import cart_pole
@@ -60,6 +61,7 @@ __all__ = [
     "NCSVectorEnv",
     "NoNoiseWarning",
     "Packet",
+    "PacketLog",
     "Process",
     "RandomChannel",
     "Regulation",
@@ -69,6 +71,7 @@ __all__ = [
     "SpeedTracking",
     "SphereDisturbance",
     "Task",
+    "TraceChannel",
     "UnstablePlantError",
     "UnusedPacketsWarning",
     "VectorRandomChannel",

@@ -16,7 +16,7 @@ from shields.verification import Condition, Report, verify
 
 if TYPE_CHECKING:
     from shields.nodes import ActuatorNode, ControllerNode, SensorNode
-    from shields.synthesis import certify, synthesize
+    from shields.synthesis import Network, Requirement, Requirements, certify, requirements, synthesize
 
 __all__ = [
     "ActuatorNode",
@@ -29,9 +29,12 @@ __all__ = [
     "GuaranteeLostWarning",
     "Infeasible",
     "Multipliers",
+    "Network",
     "Polytope",
     "Proof",
     "Report",
+    "Requirement",
+    "Requirements",
     "SafeLoop",
     "SafetyFilter",
     "SafetyShield",
@@ -39,13 +42,14 @@ __all__ = [
     "Updates",
     "VectorSafetyShield",
     "certify",
+    "requirements",
     "synthesize",
     "verify",
 ]
 
 
 # Imported at first use: these need the solver, or asyncio.
-_LAZY = {"certify": "synthesis", "synthesize": "synthesis"}
+_LAZY = dict.fromkeys(("Network", "Requirement", "Requirements", "certify", "requirements", "synthesize"), "synthesis")
 _LAZY |= dict.fromkeys(("ActuatorNode", "ControllerNode", "SensorNode"), "nodes")
 
 

@@ -47,9 +47,11 @@ class Infeasible(ValueError):
         details: Further figures by name. Method "certified": `share_of_radii`, the fraction of the given radii for
             which a design is found; the largest feasible value of each bound that the plant declares, changed alone:
             `largest_gamma`, and as a fraction of the given one `disturbance_bound_factor`, `process_noise_cov_factor`
-            and so on; under a channel contract also `max_age`. Method "paper": `ratio`, the largest
-            lambda_min(L)/alpha with its `kappa` and `rho`, and `largest_gamma`, `largest_noise_scale` and
-            `largest_scale`, the largest uncertainty for which OP is feasible.
+            and so on; the smallest feasible factors on the box, on each of its sides and on each input limit,
+            changed alone: `box_factor`, `box_row_1_factor`, `u_max_1_factor`; where no change alone is enough,
+            `pair_factor`, that of the two changes in the message; under a channel contract also `max_age`. Method
+            "paper": `ratio`, the largest lambda_min(L)/alpha with its `kappa` and `rho`, and `largest_gamma`,
+            `largest_noise_scale` and `largest_scale`, the largest uncertainty for which OP is feasible.
     """
 
     def __init__(self, message: str, binding: str, shortfall: float, details: dict[str, float] | None = None) -> None:

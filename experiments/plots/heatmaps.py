@@ -133,7 +133,7 @@ def _heatmap(cells: Sequence[dict[str, Any]], arms: Sequence[str], quantity: _Qu
             if not panel.get_visible():
                 continue
             arm, other = arms[arm_at], others[row // block]
-            _draw(panel, fields[arm, other], quantity.colors, norm)
+            draw_field(panel, fields[arm, other], quantity.colors, norm)
             panel.set_title(_title(arm, other, len(others) > 1))
             below = row + 1 < rows and (row % block + 1 == block or arm_at + columns < len(arms))
             _name_axes(panel, losses, values, _SIDE_LABELS[side] if column == 0 else "", lowest=not below)
@@ -176,7 +176,7 @@ def _norm(fields: Sequence[np.ndarray], quantity: _Quantity) -> Normalize:
     return Normalize(low, high if high > low else low + 1.0)
 
 
-def _draw(axis: Axes, values: np.ndarray, colors: str, norm: Normalize) -> None:
+def draw_field(axis: Axes, values: np.ndarray, colors: str, norm: Normalize) -> None:
     """Draws a panel and writes the numbers into its fields, light on dark."""
     axis.imshow(values, cmap=colors, norm=norm, origin="lower", aspect="auto")
     digits = 1 if max(abs(norm.vmin or 0.0), abs(norm.vmax or 0.0)) >= 1.0 else 2

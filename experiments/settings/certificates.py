@@ -207,3 +207,84 @@ class ReproduceSettings:
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
         require_least(self, starts=1, steps=1, seed=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RequirementsSettings(BackendSettings):
+    """Finds which networks leave a plant certifiable: how slow, late, lossy and coarse the network may be.
+
+    Every combination of the values below is a network. Prints what share of the safe box a certificate keeps, - where
+    none was found (which does not prove that there is none), and the cheapest network that keeps enough; leaves
+    summary.json with every network's packets and bits per second, the certificates, and a figure. Started again with
+    the same folder, finished searches are kept.
+
+    Attributes:
+        env: Id of an environment with a plant of its own, or module:id, which first imports the module. By default
+            ncs_gym/CartPole-v0.
+        plant: File of a plant that `LinearPlant.save` wrote, in place of an environment's.
+        out: Output folder; created if it does not exist.
+        sampling_periods: Durations of a control step [s]; others than the plant's for one with a model in continuous
+            time.
+        send_periods: Steps between samples.
+        losses: Most packets lost in a row; "any" for no limit, which only stable plants can bear.
+        delays: Fixed delays of a sample [steps].
+        jitters: Largest further delays [steps].
+        input_delays: Steps from a decision until its input takes effect, as behind a network to the actuator.
+        quantization_steps: Steps of the quantizer, in the units of the measurements; 0 for none.
+        disturbances: Factors on the radii of the disturbances.
+        noises: Factors on the radii of sensor noise and first errors.
+        tolerance: Also seek the factor by which all radii may grow in each network.
+        keep: Percentage of the largest share that the cheapest network is to keep.
+        force: Replace finished results of other settings in the output folder, which otherwise is refused.
+        seed: Accepted by every command; the search is deterministic and does not use it.
+    """
+
+    env: str | None = None
+    plant: Path | None = None
+    out: Path = Path("runs/requirements")
+    sampling_periods: tuple[float, ...] = ()
+    send_periods: tuple[int, ...] = ()
+    losses: tuple[int | Literal["any"], ...] = ()
+    delays: tuple[int, ...] = ()
+    jitters: tuple[int, ...] = ()
+    input_delays: tuple[int, ...] = ()
+    quantization_steps: tuple[float, ...] = ()
+    disturbances: tuple[float, ...] = (1.0,)
+    noises: tuple[float, ...] = (1.0,)
+    tolerance: bool = False
+    keep: float = 90.0
+    force: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a setting is out of range or contradicts another."""
+        BackendSettings.__post_init__(self)
+        _refuse_both(self.env, self.plant)
+        if not 0.0 < self.keep <= 100.0:
+            raise ValueError(f"--keep must be a percentage above 0 and at most 100, got {self.keep:g}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChannelSettings:
+    """Reads recorded packets, and says what a channel contract they kept and how often closer ones would have broken.
+
+    Attributes:
+        file: A CSV file with a line per packet, when it was sent and when it was received in seconds, the second empty
+            for a lost packet; or the output of ping, whose delays are those of the whole way and back.
+        sampling_period: Duration of a control step [s]; by default the time between packets.
+        ping_period: Time between the packets of ping without stamps (ping -D prints them) [s]; 1 by default.
+        env: Id of an environment whose contract is compared with the record.
+        out: File for the numbers (JSON).
+        seed: Seed of the bootstrap, >= 0.
+    """
+
+    file: tyro.conf.Positional[Path]
+    sampling_period: float | None = None
+    ping_period: float | None = None
+    env: str | None = None
+    out: Path | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        require_least(self, seed=0)

@@ -3,11 +3,11 @@
 `channel` has the settings (packet loss, quantization, transmission period, delay and jitter), `packet_transmission`
 what happens to packets during an episode, `contract` what a channel guarantees about the age of samples,
 `packet_reception` which packets a receiver can use, and `gaussian_bound` says how likely Gaussian noise is to leave its
-bounds, given how many samples a channel takes. `downlink` is the way of the commands, with the inputs that are
-committed ahead.
+bounds, given how many samples a channel takes. `packet_log` reads recorded packets, which a `TraceChannel` replays.
+`downlink` is the way of the commands, with the inputs that are committed ahead.
 """
 
-from ncs_gym.network.channel import Channel, GilbertElliott, Packet
+from ncs_gym.network.channel import Channel, GilbertElliott, Packet, TraceChannel
 from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
 from ncs_gym.network.downlink import (
     Actuator,
@@ -19,6 +19,7 @@ from ncs_gym.network.downlink import (
     downlink_protocol,
 )
 from ncs_gym.network.gaussian_bound import bound_violation_probability
+from ncs_gym.network.packet_log import PacketLog
 from ncs_gym.network.packet_reception import DiscardedPackets, UnusedPacketsWarning
 from ncs_gym.network.packet_transmission import ChannelState
 
@@ -36,6 +37,8 @@ __all__ = [
     "Echo",
     "GilbertElliott",
     "Packet",
+    "PacketLog",
+    "TraceChannel",
     "UnusedPacketsWarning",
     "bound_violation_probability",
     "contract_of",

@@ -172,3 +172,54 @@ def _bursts(loss: dict[str, Any]) -> GilbertElliott:
         raise ValueError(
             f"loss must be a probability or the fields of GilbertElliott ({names}), got {shown(loss)}"
         ) from None
+
+
+@dataclass(frozen=True)
+class TraceChannel(Channel):
+    """A channel that replays what happened to recorded packets, from a random one on and around again (`PacketLog`).
+
+    Its losses and delays are those of the trace, so that the contract of the recording is the contract of the channel.
+
+    Attributes:
+        trace: After how many steps each packet arrived, one after the other; -1 for a lost one.
+
+    Raises:
+        ValueError: If the trace is empty or has other entries, or a loss or delay is given that is not the trace's.
+    """
+
+    trace: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        if isinstance(self.trace, str) or len(self.trace) == 0:
+            raise ValueError(
+                f"trace must be the delays of recorded packets, -1 for a lost one, got {shown(self.trace)}"
+            )
+        trace = tuple(as_count(each, "a delay of the trace", low=-1, high=LONGEST_DELAY) for each in self.trace)
+        arrived = [each for each in trace if each >= 0] or [0]
+        own = {
+            "trace": trace,
+            "loss": trace.count(-1) / len(trace),
+            "delay": min(arrived),
+            "jitter": max(arrived) - min(arrived),
+            "max_consecutive_losses": None if max(trace) < 0 else _longest_run(trace),
+        }
+        defaults = {entry.name: entry.default for entry in fields(self)}
+        for name, value in own.items():
+            if name != "trace" and getattr(self, name) not in (value, defaults[name]):
+                raise ValueError(f"{name} of a TraceChannel is that of its trace, {value}: leave it out")
+            object.__setattr__(self, name, value)
+        super().__post_init__()
+
+    @property
+    def description(self) -> str:
+        """What the channel does to samples, in sentences."""
+        return f"{super().description} It replays a record of {len(self.trace)} packets from a random one on."
+
+
+def _longest_run(trace: tuple[int, ...]) -> int:
+    """Returns the longest run of lost packets in a trace that begins again at its end."""
+    longest = run = 0
+    for delay in trace + trace:
+        run = run + 1 if delay < 0 else 0
+        longest = max(longest, run)
+    return longest

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ncs_gym.network.channel import Channel, GilbertElliott, Packet
+from ncs_gym.network.channel import Channel, GilbertElliott, Packet, TraceChannel
 
 # More losses in a row than any episode has steps.
 UNLIMITED = 2**31 - 1
@@ -17,7 +17,7 @@ class LossState(NamedTuple):
     """The loss process of one channel (numbers) or of N (arrays of shape (N,)).
 
     Attributes:
-        bad: Whether the Gilbert-Elliott chain is in its bad state.
+        bad: Whether the Gilbert-Elliott chain is in its bad state; of a `TraceChannel` the number of the next packet.
         consecutive: Number of packets that were lost in a row so far.
     """
 
@@ -43,6 +43,9 @@ class StackedChannels:
     """
 
     def __init__(self, channels: Sequence[Channel]) -> None:
+        if any(isinstance(each, TraceChannel) for each in channels):
+            raise ValueError("a TraceChannel stands beside equal ones alone, since each replays its own record")
+
         def stacked(*names: str) -> list[np.ndarray]:
             return [np.array([getattr(each, name) for each in channels]) for name in names]
 
@@ -77,6 +80,8 @@ def first_loss_state(
 ) -> LossState:
     """Returns the loss process at the start of an episode; a chain starts in its stationary distribution."""
     bad = False if size is None else np.zeros(size, np.bool_)
+    if isinstance(channel, TraceChannel):
+        bad = rng.integers(len(channel.trace), size=size)
     if isinstance(channel.loss, (GilbertElliott, StackedBursts)):
         bad = rng.random(size) < channel.loss.stationary_bad
     return LossState(bad, 0 if size is None else np.zeros(size, np.int64))
@@ -98,6 +103,10 @@ def transmit(
     """
     size = sends.shape if isinstance(sends, np.ndarray) else None
     bad, consecutive = state
+    if isinstance(channel, TraceChannel):
+        delay = np.where(sends, np.take(channel.trace, bad), -1)
+        following = (bad + sends) % len(channel.trace)
+        return LossState(following, consecutive), int(delay) if size is None else delay
     loss: Any = channel.loss
     if isinstance(loss, (GilbertElliott, StackedBursts)):
         bad = bad != (rng.random(size) < loss.p_good_to_bad + (loss.p_bad_to_good - loss.p_good_to_bad) * bad)

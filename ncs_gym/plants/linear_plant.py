@@ -66,6 +66,8 @@ FARTHEST = 1e30
 # bound the safe set: closer ones would forbid inputs near their limit, farther ones enlarge the set by little.
 STORED_INPUT_REACH = 4.0
 LONGEST_INPUT_DELAY = 100
+# Disturbances of a step of a model whose response to a constant is worse conditioned are not traced back to its cause.
+LARGEST_CONDITION = 1e9
 _FORMAT = "ncs-gym plant 1"
 # The kinds of uncertainty: what a plant without it assumes, and the arguments that declare it.
 _KINDS = {
@@ -366,6 +368,43 @@ class LinearPlant(ReadOnlyArrays):
             raise ValueError(f"{given.pop()} is given alone: give state_limits and input_limits, or box and u_max")
         plant = cls.around(**arguments) if given else cls(**arguments)
         return plant if input_delay == 0 else plant._delayed(input_delay)
+
+    def resampled(self, dt: float) -> LinearPlant:
+        """Returns the plant with another duration of a step, which its continuous model knows; itself for the same one.
+
+        Whatever disturbs it is taken to act in continuous time and to be constant during a step: with
+        G(dt) = int_0^dt exp(Ac s) ds, the disturbances of a step become G(dt') G(dt)^-1 d. What is declared of sensors
+        and of the first estimate stays as it is. Where that is not what disturbs your plant, make the plant anew.
+
+        Raises:
+            ValueError: If dt is out of range, the plant has no continuous model, or a remainder, which belongs to its
+                step.
+        """
+        dt = as_number(dt, "dt", low=0.0, low_open=True)
+        if abs(dt - self.dt) <= statespace.SAME_STEP * self.dt:
+            return self
+        if self.continuous_model is None or self.remainder is not None:
+            raise ValueError(
+                f"only a plant that was sampled from a model in continuous time, without a remainder, can be sampled "
+                f"every {dt:g} s: make it by LinearPlant.from_statespace"
+            )
+        Ac, Bc = self.continuous_model[:, : self.n], self.continuous_model[:, self.n :]
+        A, B = statespace.zero_order_hold(Ac, Bc, dt)
+        of_constant = [statespace.zero_order_hold(Ac, np.eye(self.n), step)[1] for step in (dt, self.dt)]
+        if np.linalg.cond(of_constant[1]) > LARGEST_CONDITION:
+            raise ValueError(f"a step of {self.dt:g} s hides how disturbances act in continuous time: shorten dt")
+        G = exact.product(of_constant[0], exact.inverse(of_constant[1]))
+        ball = Ellipsoid(self.gamma * np.eye(self.n))
+        bound = _ellipsoid_around_sum(ball, self.disturbance_bound, self.relative_weight)
+        return replace(
+            self,
+            A=A,
+            B=B,
+            dt=dt,
+            gamma=0.0,
+            disturbance_bound=Ellipsoid(_symmetric_product(G, bound.shape_matrix)),
+            process_noise_cov=_symmetric_product(G, self.process_noise_cov),
+        )
 
     def _delayed(self, input_delay: int) -> Self:
         """Returns the plant whose inputs take effect some steps later.
@@ -767,6 +806,12 @@ def _ellipsoid_around_sum(first: Ellipsoid, second: Ellipsoid | None, weight: np
     return (
         Ellipsoid(outer_sum(first.shape_matrix, second.shape_matrix, weight)) if np.any(first.shape_matrix) else second
     )
+
+
+def _symmetric_product(G: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Returns G P G'."""
+    product = exact.product(G, shape, G.T)
+    return 0.5 * (product + product.T)
 
 
 def _padded(bound: Ellipsoid | None, zeros: int) -> Ellipsoid | None:

@@ -2,10 +2,11 @@
 
 `synthesize` looks for the largest certified set: the design problem is scaled, an initial design is found for fixed
 multipliers or from a gain of largest margin, alternation between the linear matrix inequalities and the multipliers
-enlarges the set, and the result is verified exactly. `certify` proves a given set and gain. Importing this package
-imports the solver.
+enlarges the set, and the result is verified exactly. `certify` proves a given set and gain, and `requirements` says
+which networks leave a plant certifiable. Importing this package imports the solver.
 """
 
 from shields.synthesis.certification import certify, synthesize
+from shields.synthesis.network_requirements import Network, Requirement, Requirements, requirements
 
-__all__ = ["certify", "synthesize"]
+__all__ = ["Network", "Requirement", "Requirements", "certify", "requirements", "synthesize"]

@@ -24,24 +24,33 @@ _SMALLEST_GAIN = 1e-4
 _FIRST_STEP, _SMALLEST_STEP = 0.3, 0.03
 
 
-def largest_set(problem: DesignProblem, slack: float, report: ProgressCallback) -> CandidateDesign | None:
+def largest_set(
+    problem: DesignProblem,
+    slack: float,
+    report: ProgressCallback,
+    start: CandidateDesign | None = None,
+    alternations: int = _ALTERNATIONS,
+) -> CandidateDesign | None:
     """Returns the design of largest volume that alternation finds; None if no initial design is found.
 
     Args:
         problem: The scaled design problem.
         slack: Relative tightening of the conditions.
         report: Called with the stage and the best design so far, per initial design and per alternation.
+        start: Design of a similar problem, which alternation begins near if it can; None for none.
+        alternations: Largest number of them.
     """
     program = InvariantSetProgram(problem, slack)
-    best = initial_design(problem, program, report)
+    best = None if start is None else program.solve(start.multipliers, start.inputs, start.L)
+    best = best or initial_design(problem, program, report)
     if best is None:
         return None
     step = _FIRST_STEP
-    for turn in range(_ALTERNATIONS):
+    for turn in range(alternations):
         if -best.log_det < VOLUME_TOLERANCE:
             break
         better = _alternate(problem, program, best, step)
-        report(f"alternation {turn + 1} of at most {_ALTERNATIONS}", better)
+        report(f"alternation {turn + 1} of at most {alternations}", better)
         if better.log_det - best.log_det < _SMALLEST_GAIN:
             step /= 3.0
             if step < _SMALLEST_STEP:

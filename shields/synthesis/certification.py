@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
@@ -19,7 +19,7 @@ from shields.certificate_text import size_of
 from shields.errors import CertificateError, Infeasible, SynthesisInterrupted
 from shields.synthesis.alternating_optimization import largest_set, with_best_gain
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem, design_problem
-from shields.synthesis.diagnosis import infeasibility, with_feasible_bounds
+from shields.synthesis.diagnosis import infeasibility, is_feasible, with_feasible_bounds
 from shields.synthesis.invariant_polytope import grid_in_closed_loop, invariant_polytope, share_in_polytope
 from shields.synthesis.max_margin_gain import max_margin_gain
 from shields.synthesis.multipliers import best_input_multipliers, best_multipliers, with_best_multipliers
@@ -38,6 +38,10 @@ _BETWEEN_RESERVE, _MOST_BOXES = 1e-3, 8
 _DIGITS, _SHOWN_DIGITS = 12, 6
 # Called with a line of text: the stage, and the volume reached so far.
 Progress = Callable[[str], object]
+# Alternations of a search that begins near the design of a similar problem.
+_FEW_ALTERNATIONS = 4
+# Where no certificate is found, these fractions of the input limits are tried: wide limits can mislead the search.
+_LIMIT_FRACTIONS = (0.5, 0.25, 0.1)
 # Multipliers from which those of a given set and gain are sought.
 _INITIAL_MULTIPLIERS = (0.9, 0.03, 0.07)
 
@@ -52,6 +56,7 @@ def synthesize(
     dkappa: float = 0.02,
     drho: float = 0.05,
     search: str = "first",
+    candidates: Sequence[Certificate] = (),
 ) -> Certificate:
     """Returns a verified certificate.
 
@@ -70,6 +75,9 @@ def synthesize(
         dkappa: Grid step of kappa ("paper").
         drho: Grid step of rho ("paper").
         search: "first" feasible grid point, as printed, or "largest" volume over the grid ("paper").
+        candidates: Certificates of tighter problems (closer limits, larger bounds, an older age, a coarser
+            quantization). The search is local; no set that one of them proves here is larger than the result's, so that
+            more room is never less ("certified").
 
     Raises:
         Infeasible: If no certificate is found; it names the binding condition and the shortfall.
@@ -82,6 +90,8 @@ def synthesize(
         raise ValueError(f"method must be 'certified' or 'paper', got {shown(method)}")
     if not (safe_set is None or (isinstance(safe_set, str) and safe_set in ("ellipsoid", "polytope"))):
         raise ValueError(f"safe_set must be 'polytope', 'ellipsoid' or None, got {shown(safe_set)}")
+    if not all(isinstance(each, Certificate) and each.method == "certified" for each in candidates):
+        raise ValueError("candidates must be certificates of method 'certified'")
     if method == "paper" and safe_set == "polytope":
         raise ValueError("method 'paper' has an ellipsoid: safe_set='polytope' is for method 'certified'")
     if method == "paper":
@@ -98,7 +108,8 @@ def synthesize(
             f"None, got {shown(contract)}"
         )
     report = progress or (lambda line: None)
-    certificate = _largest_certificate(plant, contract, report)
+    known = [each for given in candidates if (each := carried_over(given, plant, contract)) is not None]
+    certificate = _largest_certificate(plant, contract, report, known)
     return certificate if safe_set == "ellipsoid" else with_polytope(certificate, plant, report)
 
 
@@ -136,24 +147,113 @@ def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progre
     return replace(certificate, provenance=certificate.provenance | {"no_polytope": reason})
 
 
-def certify(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> Certificate | None:
+def certify(
+    plant: LinearPlant, L: np.ndarray, K: np.ndarray, contract: ChannelContract | None = None
+) -> Certificate | None:
     """Returns a verified certificate for a given set and gain; None if no multipliers that prove it are found.
 
     Args:
         plant: The plant with its bounds.
         L: Shape of the safe set, (n, n).
         K: Gain, shape (m, n) [input per state].
+        contract: Channel contract; with one, the error sets depend on the age of the newest sample.
 
     Raises:
         Infeasible: If the plant has no error set or its safe box is unbounded.
     """
-    problem, errors = design_problem(plant)
-    scaled_L, scaled_K = problem.to_scaled(L, K)
-    multipliers, _ = best_multipliers(problem, problem.error_shapes, scaled_L, scaled_K, _INITIAL_MULTIPLIERS)
-    inputs = best_input_multipliers(problem.error_shapes, scaled_L, scaled_K)
-    design = CandidateDesign(scaled_L, scaled_K, multipliers, inputs, float(np.linalg.slogdet(scaled_L)[1]))
+    problem, errors = design_problem(plant, contract)
+    design = _design_at(problem, L, K, _INITIAL_MULTIPLIERS)
     certificate = replace(_certificate(plant, problem, design, errors, 0.0), L=L, K=K)
     return certificate if verify(certificate, plant).valid else None
+
+
+def carried_over(certificate: Certificate, plant: LinearPlant, contract: ChannelContract | None) -> Certificate | None:
+    """Returns a certificate of a tighter problem as one of this problem; None if it does not verify here.
+
+    A problem is tighter with larger bounds, closer limits, an older largest age or a coarser quantization. A
+    certificate of the same plant is returned as it is: channels that keep this contract keep its own. For another plant
+    its set and gain are proved anew, with this plant's error sets.
+
+    Args:
+        certificate: A verified one of method "certified".
+        plant: The plant.
+        contract: What the channel promises; None for nothing.
+    """
+    promised = certificate.contract
+    if plant.has_fingerprint(certificate.fingerprint):
+        covered = promised is None or (
+            contract is not None
+            and contract.max_age <= promised.max_age
+            and contract.quantization_step <= promised.quantization_step
+        )
+        return certificate if covered and verify(certificate, plant).valid else None
+    if certificate.L.shape != (plant.n, plant.n) or certificate.K.shape != (plant.m, plant.n):
+        return None
+    try:
+        return certify(plant, certificate.L, certificate.K, contract)
+    except Infeasible:
+        return None
+
+
+def nearby_certificate(
+    plant: LinearPlant,
+    contract: ChannelContract | None,
+    start: Certificate | None = None,
+    alternations: int = _FEW_ALTERNATIONS,
+) -> Certificate | None:
+    """Returns a verified certificate, found faster and with a slightly smaller set than `synthesize`; None if none is.
+
+    Args:
+        plant: The plant with its bounds.
+        contract: Channel contract; None for none.
+        start: Certificate of a similar problem with as many states and inputs, which the search begins near.
+        alternations: How often the set is enlarged at most.
+    """
+    try:
+        certificate = _nearby(plant, contract, start, alternations)
+    except Infeasible:
+        certificate = None
+    return certificate or (None if start is None else carried_over(start, plant, contract))
+
+
+def _nearby(
+    plant: LinearPlant,
+    contract: ChannelContract | None,
+    start: Certificate | None,
+    alternations: int,
+    tightened: tuple[np.ndarray, ...] = (),
+) -> Certificate | None:
+    """Returns what `nearby_certificate` searches, in the boxes of `_found_certificate`.
+
+    Raises:
+        Infeasible: If the plant has no error set, or the state leaves every box between two samples.
+    """
+    problem, errors = design_problem(plant, contract, tightened[-1] if tightened else None)
+    near = None
+    if start is not None:
+        lx, le, ld = start.proofs[-1].shares.tolist()
+        near = _design_at(problem, start.L, start.K, (lx, le, ld))
+    for slack in _SLACKS:
+        found = largest_set(problem, slack, lambda stage, design: None, near, alternations)
+        if found is None:
+            return None
+        certificate = _certificate(plant, problem, with_best_gain(problem, found), errors, slack)
+        box_rows = _tightened_box(certificate, plant, tightened)
+        if box_rows is not None:
+            return _nearby(plant, contract, start, alternations, (*tightened, box_rows))
+        if verify(certificate, plant).valid:
+            return certificate
+    return None
+
+
+def _design_at(
+    problem: DesignProblem, L: np.ndarray, K: np.ndarray, multipliers: tuple[float, float, float]
+) -> CandidateDesign:
+    """Returns a set and gain in physical units as a design, with the best multipliers near given ones."""
+    scaled_L, scaled_K = problem.to_scaled(L, K)
+    best, _ = best_multipliers(problem, problem.error_shapes, scaled_L, scaled_K, multipliers)
+    inputs = best_input_multipliers(problem.error_shapes, scaled_L, scaled_K)
+    return CandidateDesign(scaled_L, scaled_K, best, inputs, float(np.linalg.slogdet(scaled_L)[1]))
 
 
 def _is_certifiable(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> bool:
@@ -165,6 +265,38 @@ def _is_certifiable(plant: LinearPlant, L: np.ndarray, K: np.ndarray) -> bool:
 
 
 def _largest_certificate(
+    plant: LinearPlant, contract: ChannelContract | None, progress: Progress, known: Sequence[Certificate]
+) -> Certificate:
+    """Returns the verified certificate of the largest set found, or the largest of known ones."""
+
+    def volume(certificate: Certificate) -> float:
+        return float(np.linalg.slogdet(certificate.L)[1])
+
+    try:
+        return max([*known, _found_certificate(plant, contract, progress)], key=volume)
+    except Infeasible as infeasible:
+        if known:
+            return max(known, key=volume)
+        was_sought = "share_of_radii" in infeasible.details
+        if was_sought and (certificate := _with_closer_limits(plant, contract)) is not None:
+            return certificate
+        if was_sought or infeasible.binding == "E1":
+            raise _with_hints(infeasible, plant, contract, progress) from infeasible
+        raise
+
+
+def _with_closer_limits(plant: LinearPlant, contract: ChannelContract | None) -> Certificate | None:
+    """Returns a certificate that is found with closer input limits and holds for the plant's own; None if none is."""
+    for fraction in _LIMIT_FRACTIONS if plant.remainder is None else ():
+        closer = replace(plant, u_max=fraction * plant.u_max)
+        found = nearby_certificate(closer, contract) if is_feasible(closer, contract) else None
+        certificate = found and carried_over(found, plant, contract)
+        if certificate is not None:
+            return certificate
+    return None
+
+
+def _found_certificate(
     plant: LinearPlant, contract: ChannelContract | None, progress: Progress, tightened: tuple[np.ndarray, ...] = ()
 ) -> Certificate:
     """Returns the verified certificate of the largest set found.
@@ -176,10 +308,7 @@ def _largest_certificate(
         tightened: The boxes that sets were sought in so far, rows (k, n), and one more; empty for the plant's own.
     """
     progress("error set")
-    try:
-        problem, errors = design_problem(plant, contract, tightened[-1] if tightened else None)
-    except Infeasible as infeasible:
-        raise _with_hints(infeasible, plant, contract, progress) from infeasible
+    problem, errors = design_problem(plant, contract, tightened[-1] if tightened else None)
     failure, slack = None, 0.0
     reached: tuple[str, CandidateDesign | None] = "start", None
 
@@ -198,7 +327,7 @@ def _largest_certificate(
                 certificate = _certificate(plant, problem, design, errors, slack)
                 box_rows = _tightened_box(certificate, plant, tightened)
                 if box_rows is not None:
-                    return _largest_certificate(plant, contract, progress, (*tightened, box_rows))
+                    return _found_certificate(plant, contract, progress, (*tightened, box_rows))
                 verification = verify(certificate, plant)
                 if verification.valid:
                     return _with_tolerated_scale(certificate, problem)
@@ -209,7 +338,7 @@ def _largest_certificate(
         raise _interrupted(plant, stage, best) from interrupt
     if tightened and not failure:  # there is a set in the plant's box
         raise _leaves_between_samples(float(np.abs(tightened[-1]).max() / np.abs(plant.box_rows).max() - 1.0))
-    raise failure or _with_hints(infeasibility(problem), plant, contract, progress)
+    raise failure or infeasibility(problem)
 
 
 def _tightened_box(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -27,6 +28,8 @@ _BOUNDS = (
     "remainder",
 )
 _SMALLEST_FACTOR, _FACTOR_PRECISION = 1e-6, 1.02
+# Limits are widened by at most this factor.
+_WIDEST = 100.0
 
 
 def infeasibility(problem: DesignProblem) -> Infeasible:
@@ -65,7 +68,7 @@ def with_feasible_bounds(
     without_contract = contract is None and infeasible.binding == "E1"
     if without_contract or infeasible.binding == "S" or infeasible.details.get("share_of_radii") == 0.0:
         return infeasible
-    hints, useless, details = [], [], dict(infeasible.details)
+    hints, useless, useless_limits, details = [], [], [], dict(infeasible.details)
     if contract is not None and contract.max_age > 0:
         progress("no certificate: searching for a max_age that has one")
         age = _largest_age(plant, contract)
@@ -83,9 +86,26 @@ def with_feasible_bounds(
             else:
                 hints.append(_hint(plant, name, factor))
                 details |= _figure(plant, name, factor)
+    for change in _widenings(plant):
+        progress(f"no certificate: searching for {change.what} that has one")
+        factor = _smallest_factor(plant, (change,), contract)
+        if factor is None:
+            useless_limits.append(change.what)
+        else:
+            hints.append(f"{factor:.3g} times {change.what} is the smallest that works")
+            details[f"{change.name}_factor"] = factor
     if useless:
         hints.append(f"a smaller {' or '.join(useless)} is not enough")
-    changed = f"; each changed alone: {'; '.join(hints)}" if hints else ""
+    if useless_limits:
+        hints.append(f"a larger one of {', '.join(useless_limits)} is not enough")
+    together = ""
+    if len(details) == len(infeasible.details):
+        progress("no certificate: searching for two changes that have one")
+        if (pair := _smallest_pair(plant, contract)) is not None:
+            (first, second), factor = pair
+            together = f"; the smallest pair of changes: {first.what} and {second.what}, {factor:.3g} times each"
+            details |= {"pair_factor": factor}
+    changed = f"; each changed alone: {'; '.join(hints)}{together}" if hints else together
     asked = "" if contract is None else f" (asked: max_age = {contract.max_age})"
     text = f"{infeasible}{_limits_exceeded(plant)}{changed}{asked}"
     return Infeasible(text, infeasible.binding, infeasible.shortfall, details)
@@ -122,6 +142,91 @@ def _figure(plant: LinearPlant, name: str, factor: float) -> dict[str, float]:
     return {"largest_gamma": factor * plant.gamma} if name == "gamma" else {f"{name}_factor": factor}
 
 
+@dataclass(frozen=True)
+class _Change:
+    """Something about a plant that could be made easier.
+
+    Attributes:
+        name: Its name in the details of the exception.
+        what: Its name in a sentence, after "2 times", or "a smaller ...".
+        of: Returns the plant in which it is easier by a factor >= 1.
+    """
+
+    name: str
+    what: str
+    of: Callable[[LinearPlant, float], LinearPlant]
+
+
+def _widenings(plant: LinearPlant) -> list[_Change]:
+    """Returns the limits that could be wider: the box as a whole, each of its sides, each input.
+
+    None of a plant with a remainder, which belongs to its box and input limits.
+    """
+    if plant.remainder is not None or plant.between_samples is not None:
+        return []
+
+    def rows(chosen: slice) -> Callable[[LinearPlant, float], LinearPlant]:
+        def wider(plant: LinearPlant, factor: float) -> LinearPlant:
+            box = plant.box_rows.copy()
+            box[chosen] /= factor
+            return replace(plant, box=box)
+
+        return wider
+
+    def input_limit(i: int) -> Callable[[LinearPlant, float], LinearPlant]:
+        return lambda plant, factor: replace(plant, u_max=plant.u_max * np.where(np.arange(plant.m) == i, factor, 1.0))
+
+    changes = [
+        _Change(f"u_max_{i + 1}", f"the limit of {plant.input_names[i]}", input_limit(i)) for i in range(plant.m)
+    ]
+    changes.append(_Change("box", "the safe box", rows(slice(None))))
+    if len(plant.box_rows) > 1:
+        changes += [
+            _Change(f"box_row_{j + 1}", f"the limit {row_limit(plant, row)}", rows(slice(j, j + 1)))
+            for j, row in enumerate(plant.box_rows)
+        ]
+    return changes
+
+
+def _smallest_pair(
+    plant: LinearPlant, contract: ChannelContract | None
+) -> tuple[tuple[_Change, _Change], float] | None:
+    """Returns the two changes that certify together with the smallest factor, the same for both; None for none."""
+
+    def smaller(name: str) -> Callable[[LinearPlant, float], LinearPlant]:
+        return lambda plant, factor: _with_scaled(plant, name, 1.0 / factor)
+
+    shrinkings = [_Change(name, f"a smaller {name}", smaller(name)) for name in _BOUNDS if _is_declared(plant, name)]
+    changes = [*shrinkings, *(each for each in _widenings(plant) if not each.name.startswith("box_row"))]
+    best: tuple[tuple[_Change, _Change], float] | None = None
+    for pair in combinations(changes, 2):
+        factor = _smallest_factor(plant, pair, contract, _WIDEST if best is None else best[1] / _FACTOR_PRECISION)
+        if factor is not None:
+            best = pair, factor
+    return best
+
+
+def _smallest_factor(
+    plant: LinearPlant, changes: Sequence[_Change], contract: ChannelContract | None, widest: float = _WIDEST
+) -> float | None:
+    """Returns nearly the smallest factor, at most `widest`, with which all changes together certify; None for none."""
+
+    def certifies(factor: float) -> bool:
+        changed = plant
+        for change in changes:
+            changed = change.of(changed, factor)
+        return is_feasible(changed, contract)
+
+    low = 1.0
+    high = next((factor for factor in (2.0, 10.0, widest) if factor <= widest and certifies(factor)), None)
+    if high is None:
+        return None
+    while high > _FACTOR_PRECISION * low:
+        middle = (low * high) ** 0.5
+        low, high = (low, middle) if certifies(middle) else (middle, high)
+    return high
+
+
 def _with_scaled(plant: LinearPlant, name: str, factor: float) -> LinearPlant:
     """Returns the plant with one of its bounds multiplied: lengths of an ellipsoid, entries of anything else."""
     value = getattr(plant, name)
@@ -132,7 +237,7 @@ def _with_scaled(plant: LinearPlant, name: str, factor: float) -> LinearPlant:
     return replace(plant, **{name: scaled})
 
 
-def _is_feasible(plant: LinearPlant, contract: ChannelContract | None) -> bool:
+def is_feasible(plant: LinearPlant, contract: ChannelContract | None) -> bool:
     """Returns whether a gain is found that tolerates the plant's radii."""
     try:
         problem, _ = design_problem(plant, contract)
@@ -146,18 +251,18 @@ def _largest_age(plant: LinearPlant, contract: ChannelContract) -> int | None:
     low, high = -1, contract.max_age
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (middle, high) if _is_feasible(plant, replace(contract, max_age=middle)) else (low, middle)
+        low, high = (middle, high) if is_feasible(plant, replace(contract, max_age=middle)) else (low, middle)
     return low if low >= 0 else None
 
 
 def _largest_factor(plant: LinearPlant, name: str, contract: ChannelContract | None) -> float | None:
     """Returns nearly the largest feasible fraction of a bound; None if there is none above a millionth."""
     low, high = _SMALLEST_FACTOR, 1.0
-    if not _is_feasible(_with_scaled(plant, name, low), contract):
+    if not is_feasible(_with_scaled(plant, name, low), contract):
         return None
     while high > _FACTOR_PRECISION * low:
         middle = (low * high) ** 0.5
-        low, high = (middle, high) if _is_feasible(_with_scaled(plant, name, middle), contract) else (low, middle)
+        low, high = (middle, high) if is_feasible(_with_scaled(plant, name, middle), contract) else (low, middle)
     return low
 
 

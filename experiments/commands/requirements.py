@@ -1,0 +1,377 @@
+"""`ncs requirements`: which networks leave a plant certifiable, and the cheapest of them."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import product
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+import shields
+from experiments.analysis.terminal_text import text_table, wrapped
+from experiments.backends.execution import execute, executor_of
+from experiments.errors import ResultsError
+from experiments.plots.requirements_map import requirements_map
+from experiments.runs import claim_folder, prepare_output, write_results
+from experiments.runs.environments import registered_env
+from experiments.runs.provenance import versions
+from experiments.settings import RequirementsSettings
+from ncs_gym import LinearPlant
+from shields import Certificate, Network, Requirement, Requirements
+from shields.atomic_write import write_atomically
+from shields.json_documents import digest
+from shields.synthesis.network_requirements import Answer, LargestAge, Search
+
+_DEFAULT_ENV = "ncs_gym/CartPole-v0"
+# Steps between samples, and losses in a row, that are asked about by default.
+_SEND_PERIODS, _LOSSES = (1, 2, 3, 4, 6, 8), (0, 1, 2, 3, 4, 5)
+# What a network consists of: the setting, the field of `Network`, and its name in tables and figures.
+_AXES = {
+    "sampling_periods": ("sampling_period", "sampling period [s]"),
+    "send_periods": ("send_period", "steps between samples"),
+    "losses": ("losses", "losses in a row"),
+    "delays": ("delay", "delay [steps]"),
+    "jitters": ("jitter", "jitter [steps]"),
+    "input_delays": ("input_delay", "input delay [steps]"),
+    "quantization_steps": ("quantization_step", "quantization step"),
+    "disturbances": ("disturbance", "size of disturbances"),
+    "noises": ("noise", "size of noise"),
+}
+# Progress is counted in these parts of an age that is searched: workers report a thousand at a time.
+_PARTS = 1000
+_MOST_PANELS = 9
+
+
+def requirements(settings: RequirementsSettings) -> None:
+    """Runs `ncs requirements`.
+
+    Raises:
+        ValueError: If the environment is unknown, the plant's file cannot be read, or a setting is out of range.
+        FolderInUseError: If another command is writing to the output folder.
+        OtherResultsError: If the output folder holds finished results of other settings.
+        OSError: If the output folder cannot be written.
+        RunError: If a search fails.
+        ClusterError: If a cluster cannot execute the searches.
+    """
+    plant, today = _plant_and_network(settings)
+    asked = _values(settings, plant, today)
+    with claim_folder("requirements", settings):
+        prepare_output(settings.out)
+        store = _Store(settings.out)
+        found = shields.requirements(
+            plant, **asked, tolerance=settings.tolerance, execute=lambda searches: _answers(searches, settings, store)
+        )
+        tables = [_Table.of(found, asked, "share of the box [%]")]
+        if settings.tolerance:
+            tables.append(_Table.of(found, asked, "factor on all radii"))
+        figures = {}
+        for name, table in zip(("share", "tolerance"), tables, strict=False):
+            figure = table.figure(today)
+            figures[name] = (figure.caption, figure.png)
+        for point in found.points:
+            if point.certificate is not None:
+                point.certificate.save(store.place_of(point.certificate.checksum))
+        cheapest = found.cheapest(settings.keep / 100.0)
+        summary = found.document | {
+            "command": "requirements",
+            "plant_fingerprint": plant.fingerprint,
+            "today": None if today is None else _index_of(found, today),
+            "cheapest": None if cheapest is None else found.points.index(cheapest),
+            "keep": settings.keep,
+            "versions": versions(),
+        }
+        write_results(settings.out, summary, figures=figures)
+    for table in tables:
+        print(table.text, end="\n\n")
+    sentences = [*map(_boundary_text, found.largest_ages), _today_text(found, today)]
+    sentences += [_cheapest_text(found, settings.keep, None), _cheapest_text(found, settings.keep, today)]
+    for sentence in sentences:
+        if sentence:
+            print(wrapped(sentence))
+    print(f"files: {settings.out}")
+
+
+def _plant_and_network(settings: RequirementsSettings) -> tuple[LinearPlant, Network | None]:
+    """Returns the plant, and the network that it has today; None for the plant of a file."""
+    if settings.plant is not None:
+        return LinearPlant.load(settings.plant), None
+    env = registered_env(settings.env or _DEFAULT_ENV)
+    plant, channel = env.plant, env.channel
+    network = Network(
+        sampling_period=plant.dt,
+        send_period=channel.send_period,
+        losses=channel.most_consecutive_losses,
+        delay=channel.delay,
+        jitter=channel.jitter,
+        input_delay=0 if env.downlink_protocol is None else env.downlink_protocol.lead,
+        quantization_step=channel.quantization_step,
+    )
+    return plant, network
+
+
+def _values(settings: RequirementsSettings, plant: LinearPlant, today: Network | None) -> dict[str, Sequence[Any]]:
+    """Returns the values of every axis: those given, else today's, and of losses and periods the usual ones, too."""
+    default = today or Network(sampling_period=plant.dt)
+    values = {}
+    for name, (entry, _) in _AXES.items():
+        given = tuple(None if value == "any" else value for value in getattr(settings, name))
+        values[name] = given or (getattr(default, entry),)
+    if not settings.send_periods:
+        values["send_periods"] = tuple(sorted({*_SEND_PERIODS, default.send_period}))
+    if not settings.losses:
+        limited = {*_LOSSES, *(() if default.losses is None else (default.losses,))}
+        values["losses"] = (*sorted(limited), *((None,) if plant.spectral_radius < 1.0 else ()))
+    return values
+
+
+@dataclass(frozen=True)
+class _Store:
+    """The answers of finished searches in an output folder, and certificates by their checksums."""
+
+    folder: Path
+
+    def place_of(self, checksum: str) -> Path:
+        place = self.folder / "certificates"
+        place.mkdir(exist_ok=True)
+        return place / f"{checksum[:16]}.json"
+
+    def save(self, search: Search, answers: dict[float, Answer]) -> None:
+        entries = []
+        for age, answer in answers.items():
+            checksum = answer.certificate and answer.certificate.checksum
+            if answer.certificate is not None:
+                answer.certificate.save(self.place_of(answer.certificate.checksum))
+            numbers = {"age": None if age == inf else age, "searched": answer.searched, "tolerance": answer.tolerance}
+            entries.append(numbers | {"certificate": checksum})
+        write_atomically(self._file(search), json.dumps({"key": _key(search), "answers": entries}, indent=1) + "\n")
+
+    def load(self, search: Search) -> dict[float, Answer] | None:
+        """Returns the answers of a search; None if there are none.
+
+        Raises:
+            ResultsError: If the file is damaged, or a certificate does not verify.
+        """
+        file = self._file(search)
+        if not file.exists():
+            return None
+        try:
+            document = json.loads(file.read_bytes())
+            if document["key"] != _key(search):
+                return None
+            answers = {}
+            for entry in document["answers"]:
+                age = inf if entry["age"] is None else int(entry["age"])
+                checksum = entry["certificate"]
+                certificate = None if checksum is None else Certificate.load(self.place_of(checksum))
+                answers[age] = Answer(certificate, bool(entry["searched"]), entry["tolerance"])
+            _SearchRun(search).require(answers)
+            return answers
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
+            raise ResultsError(f"{file} is damaged; delete it to repeat its search") from error
+
+    def _file(self, search: Search) -> Path:
+        place = self.folder / "searches"
+        place.mkdir(exist_ok=True)
+        return place / f"{search.name}.json"
+
+
+def _key(search: Search) -> str:
+    """Returns what the answers of a search depend on."""
+    ages = [None if age == inf else age for age in search.ages]
+    known = [search.plant.fingerprint, search.quantization_step, ages, search.tolerance, versions()]
+    return digest(known)
+
+
+def _answers(searches: Sequence[Search], settings: RequirementsSettings, store: _Store) -> list[dict[float, Answer]]:
+    """Returns the answers of all searches, in their order; each is stored when it is finished."""
+    answers = {search.name: known for search in searches if (known := store.load(search)) is not None}
+    missing = {search.name: search for search in searches if search.name not in answers}
+    if answers:
+        print(f"{len(answers)} of {len(searches)} searches were finished before", file=sys.stderr)
+
+    def keep(run: _SearchRun, result: dict[float, Answer]) -> None:
+        store.save(run.search, result)
+        answers[run.name] = result
+        largest = max((age for age, answer in result.items() if answer.certificate is not None), default=None)
+        outcome = "none found" if largest is None else f"certified up to age {largest:g}"
+        tqdm.write(f"{run.name}: {outcome}", file=sys.stderr)
+
+    if missing:
+        executor = executor_of(settings, len(missing), store.folder / "tensorboard")
+        execute([_SearchRun(search) for search in missing.values()], executor, keep)
+    return [answers[search.name] for search in searches]
+
+
+@dataclass(frozen=True)
+class _SearchRun:
+    """A search as a `Run`, whose steps are thousandths of an age."""
+
+    search: Search
+    parts: tuple[str, ...] = ("certificates, in thousandths",)
+    result_type: type = dict
+    leaves: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        return self.search.name
+
+    @property
+    def key(self) -> str:
+        return _key(self.search)
+
+    @property
+    def total_steps(self) -> int:
+        return _PARTS * len(self.search.ages)
+
+    def execute(self, on_progress: Callable[[int], None], log_folder: Path | None = None) -> dict[float, Answer]:
+        return self.search(lambda count: on_progress(_PARTS * count))
+
+    def require(self, result: Any) -> None:
+        """Raises ValueError unless every certificate verifies."""
+        for answer in result.values():
+            if answer.certificate is not None and not shields.verify(answer.certificate, self.search.plant).valid:
+                raise ValueError("certificate")
+
+
+@dataclass(frozen=True)
+class _Table:
+    """A quantity of every network: a block per combination of what rows and columns do not show.
+
+    Attributes:
+        quantity: What the numbers are.
+        rows: Name and values of the rows.
+        columns: Name and values of the columns.
+        blocks: Numbers by title, shape (rows, columns); NaN where no certificate was found.
+        fixed: What the networks of a block have in common, by title.
+        entries: Fields of `Network` that rows and columns show.
+    """
+
+    quantity: str
+    rows: tuple[str, Sequence[Any]]
+    columns: tuple[str, Sequence[Any]]
+    blocks: dict[str, np.ndarray]
+    fixed: dict[str, dict[str, Any]]
+    entries: tuple[str, str]
+
+    @classmethod
+    def of(cls, found: Requirements, asked: dict[str, Sequence[Any]], quantity: str) -> _Table:
+        several = [name for name in _AXES if len(asked[name]) > 1]
+        shown = (several + [name for name in ("send_periods", "losses") if name not in several])[:2]
+        others = [name for name in several if name not in shown]
+        (down, down_name), (across, across_name) = (_AXES[name] for name in shown)
+        blocks, fixed = {}, {}
+        for values in product(*(asked[name] for name in others)):
+            common = {_AXES[name][0]: value for name, value in zip(others, values, strict=True)}
+            title = ", ".join(f"{_AXES[name][1]} {_shown(value)}" for name, value in zip(others, values, strict=True))
+            block = np.full((len(asked[shown[0]]), len(asked[shown[1]])), np.nan)
+            for point in found.points:
+                if all(getattr(point.network, entry) == value for entry, value in common.items()):
+                    i = asked[shown[0]].index(getattr(point.network, down))
+                    j = asked[shown[1]].index(getattr(point.network, across))
+                    block[i, j] = _number(point, quantity)
+            blocks[title], fixed[title] = block, common
+        return cls(
+            quantity, (down_name, asked[shown[0]]), (across_name, asked[shown[1]]), blocks, fixed, (down, across)
+        )
+
+    @property
+    def text(self) -> str:
+        """The table for a terminal."""
+        parts = []
+        for title, block in self.blocks.items():
+            header = [f"{self.rows[0]} \\ {self.columns[0]}", *map(_shown, self.columns[1])]
+            cells = [
+                [_shown(value), *("-" if np.isnan(number) else f"{number:.3g}" for number in line)]
+                for value, line in zip(self.rows[1], block, strict=True)
+            ]
+            parts.append(f"{self.quantity}{', ' if title else ''}{title}\n{text_table([header, *cells])}")
+        return "\n\n".join(parts)
+
+    def figure(self, today: Network | None) -> Any:
+        """The heatmap, with the first panels where there are too many."""
+        marked = None
+        for title, common in self.fixed.items():
+            if today is None or any(getattr(today, entry) != value for entry, value in common.items()):
+                continue
+            at = [getattr(today, entry) for entry in self.entries]
+            if at[0] in self.rows[1] and at[1] in self.columns[1]:
+                marked = title, list(self.rows[1]).index(at[0]), list(self.columns[1]).index(at[1])
+        panels = dict(list(self.blocks.items())[:_MOST_PANELS])
+        return requirements_map(panels, self.rows, self.columns, marked, self.quantity)
+
+
+def _number(point: Requirement, quantity: str) -> float:
+    if point.certificate is None:
+        return float("nan")
+    return 100.0 * point.share if quantity.startswith("share") else point.tolerance or float("nan")
+
+
+def _index_of(found: Requirements, network: Network) -> int | None:
+    return next((i for i, point in enumerate(found.points) if point.network == network), None)
+
+
+def _boundary_text(largest: LargestAge) -> str:
+    network = largest.network
+    where = f"Sampled every {network.sampling_period:g} s"
+    if network.quantization_step:
+        where += f", rounded to {network.quantization_step:g}"
+    if network.disturbance != 1.0:
+        where += f", disturbances times {network.disturbance:g}"
+    if network.noise != 1.0:
+        where += f", noise times {network.noise:g}"
+    if largest.certified is None:
+        return f"{where}: no certificate was found for any age of the newest sample that was asked."
+    if largest.certified == inf:
+        return f"{where}: a certificate needs no samples at all."
+    period = 1000.0 * network.sampling_period
+    text = f"{where}: the newest sample may be {largest.certified:g} steps ({largest.certified * period:g} ms) old"
+    beyond = "" if largest.none_found is None else f"; for {_shown_age(largest.none_found)} no certificate was found"
+    return f"{text}{beyond}."
+
+
+def _shown_age(age: float) -> str:
+    return "any age" if age == inf else f"{age:g}"
+
+
+def _today_text(found: Requirements, today: Network | None) -> str:
+    index = None if today is None else _index_of(found, today)
+    return "" if index is None else f"Today: {_description(found.points[index])}."
+
+
+def _cheapest_text(found: Requirements, keep: float, bearing: Network | None) -> str:
+    cheapest = found.cheapest(keep / 100.0, bearing)
+    if cheapest is None:
+        return "" if bearing else "No certificate was found for any of these networks."
+    what = "Cheapest" if bearing is None else "Cheapest that bears the losses and delays of today"
+    return f"{what}, with at least {keep:g} % of the largest share: {_description(cheapest)}."
+
+
+def _description(point: Requirement) -> str:
+    network = point.network
+    parts = [f"a step of {network.sampling_period:g} s", f"a sample every {_steps(network.send_period)}"]
+    parts.append("any losses" if network.losses is None else f"at most {network.losses} lost in a row")
+    if network.delay or network.jitter:
+        latest = network.delay + network.jitter
+        parts.append(f"at most {_steps(latest)} late")
+    if network.input_delay:
+        parts.append(f"inputs {_steps(network.input_delay)} late")
+    if network.quantization_step:
+        parts.append(f"rounded to {network.quantization_step:g}")
+    parts.append(f"{network.packets_per_second:.4g} packets/s and {point.bits_per_second:.4g} bits/s")
+    share = "no certificate was found" if point.certificate is None else f"{100.0 * point.share:.3g} % of the box"
+    return f"{', '.join(parts)}: {share}"
+
+
+def _steps(number: int) -> str:
+    return "1 step" if number == 1 else f"{number} steps"
+
+
+def _shown(value: Any) -> str:
+    return "any" if value is None else f"{value:g}"
