@@ -88,7 +88,7 @@ def deciding(plant: LinearPlant, certificate: Certificate, inside: Certificate) 
     estimates = (safe.sample_boundary(rng, 64) * rng.uniform(0.2, 0.9, (64, 1))).T.copy()
     proposals = rng.uniform(-1.0, 1.0, (plant.m, 64)) * plant.u_max[:, None]
     errors = shield.errors_of(0.5 * certificate.error_shapes[0]).batch().of(np.zeros(64, np.int64))
-    return lambda: shield.decide_many(estimates, errors, proposals)
+    return lambda: shield.decide_columns(estimates, errors, proposals)
 
 
 def main() -> None:

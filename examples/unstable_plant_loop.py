@@ -35,5 +35,5 @@ for step in range(5000):
     state = plant.A @ state + plant.B @ decision.input + disturbance
     worst = max(worst, float(np.abs(plant.box_rows @ state).max()))
 print(f"oldest sample in use: {oldest} steps, allowed: {loop.contract.max_age}")
-print(f"overridden: {overridden} of 5000, closest to the limit: {worst:.3f} (violated above 1)")
+print(f"overridden: {overridden} of 5000, closest to the limit: {worst:.5f} (violated above 1)")
 print(f"proved: {proved} of 5000 steps")

@@ -52,6 +52,13 @@ RUNS = {
         [rf"trained on the {name}, worst network: return {NUMBER}, violating steps: 0" for name in ("best", "range")],
     ),
     "recurrent_ppo.py": (["--steps", "1024"], [rf"mean return of the last 4 episodes: {NUMBER}", "violating steps: 0"]),
+    "servo_requirements.py": (
+        [],
+        [
+            r"a sample every 0.005 s, 3 lost in a row: 0\.\d+ of the box",
+            "a sample every 0.02 s, 10 lost in a row: none",
+        ],
+    ),
     "sb3_ten_lines.py": (
         ["--steps", "210"],
         [rf"{name}: last return {NUMBER}; 0 violating steps, [1-9]\d* actions" for name in ("PPO", "SAC", "TD3")],

@@ -45,8 +45,8 @@ _BOX_COLUMNS: _Columns = {
 _SET_LEGEND = f"""\
 outside: steps with a true state outside S or the box; failed: episodes that left S or the box;
 p <: upper end of the exact 95 % interval of their probability;
-margin: smallest 1 - level from step {SETTLING_STEPS} on, the level in S being max |g x| over the rows g of a polytope,
-sqrt(x'Mx) in an ellipsoid (episodes start on the boundary);
+margin: smallest 1 - level from step {SETTLING_STEPS} on (episodes start on the boundary); the level in S is
+max |g x| over the rows g of a polytope, sqrt(x'Mx) in an ellipsoid;
 overridden: steps that the shield changed or, unshielded, would have changed"""
 _BOX_LEGEND = f"""\
 began outside: episodes that began outside S with a certified plan;

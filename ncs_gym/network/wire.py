@@ -46,8 +46,11 @@ class WireError(ValueError):
     """
 
     def __init__(self, reason: str) -> None:
-        super().__init__(f"a datagram was refused: {reason}")
+        super().__init__(reason)
         self.reason = reason
+
+    def __str__(self) -> str:
+        return f"a datagram was refused: {self.reason}"
 
 
 class Kind(IntEnum):

@@ -85,7 +85,7 @@ def test_no_state_between_samples_is_outside_and_without_it_some_are(name, kind,
             e = np.linalg.cholesky(shape) @ (e / np.linalg.norm(e, axis=0))
             proposed = plant.u_max[:, None] * rng.choice([-1.0, 1.0, 0.3], (plant.m, 3000))
             errors = shield.errors_of_many(shape[None]).of(np.zeros(3000, np.int64))
-            decided = shield.decide_many(x + e, errors, proposed)
+            decided = shield.decide_columns(x + e, errors, proposed)
             assert len(np.unique(decided.reason)) == {"project": 3, "switch": 2}[mode]
             most = max(most, worst_between(name, x, decided.input))
         worst[points] = most
@@ -102,7 +102,7 @@ def test_single_decisions_are_those_of_many(mode, kind):
     shape = certificate.error_shapes[0]
     x = rng.uniform(-2.0, 2.0, (2, 300))
     u = rng.uniform(-4.0, 4.0, (1, 300))
-    many = shield.decide_many(x, shield.errors_of_many(shape[None]).of(np.zeros(300, np.int64)), u)
+    many = shield.decide_columns(x, shield.errors_of_many(shape[None]).of(np.zeros(300, np.int64)), u)
     for k in range(300):
         one = shield.decide(x[:, k].copy(), shape, u[:, k].copy())
         np.testing.assert_allclose(one.input, many.input[:, k], atol=1e-6)

@@ -60,7 +60,7 @@ def test_printed_bound_is_no_smaller_than_the_bound(bound, text):
 @pytest.fixture(scope="module")
 def setup():
     loop = loop_config("Tests/Tight-v0", noise="gaussian")
-    return loop, certificate_of(loop)
+    return loop, certificate_of(loop, safe_set="ellipsoid")
 
 
 def test_comparison_under_gaussian_noise_plays_it_and_states_the_bound(setup):

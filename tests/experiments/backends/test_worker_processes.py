@@ -43,7 +43,7 @@ def test_a_run_told_to_stop_gives_up_at_its_next_report(endless):
 
 
 def test_the_first_failure_stops_the_others_and_is_the_one_reported(endless):
-    broken = replace(endless, arm="broken", loop=LoopConfig(env="ncs_gym/Nowhere-v0"))
+    broken = replace(endless, arm="broken", policy_kind="Nowhere")
     begin, kept = time.monotonic(), []
     with pytest.raises(Exception, match="Nowhere") as caught:
         execute([endless, broken], local_workers(2), lambda run, result: kept.append(run))

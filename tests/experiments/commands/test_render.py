@@ -12,8 +12,9 @@ from agents.training import untrained
 from experiments.commands.render import render
 from experiments.runs.policies import _greedy_action, policy_by_name
 from experiments.settings import RenderSettings
+from ncs_gym import truck_trailer
 from ncs_gym.rendering import theme
-from shields import SafetyShield
+from shields import SafetyShield, synthesize
 from tests.command import assert_one_sentence, ncs
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -76,8 +77,10 @@ def test_pictures_are_twice_as_dense_as_animations_unless_asked_otherwise(tmp_pa
 
 
 def test_lookahead_is_drawn_with_its_plan(tmp_path):
+    file = tmp_path / "certificate.json"
+    synthesize(truck_trailer(mass=4000.0), safe_set="ellipsoid").save(file)  # in a polytope hardly a plan is needed
     for shield in ("project", "lookahead"):
-        render(settings(shield=shield, steps=12, out=tmp_path / f"{shield}.png", scale=1))
+        render(settings(shield=shield, steps=12, certificate=file, out=tmp_path / f"{shield}.png", scale=1))
     with Image.open(tmp_path / "project.png") as one, Image.open(tmp_path / "lookahead.png") as other:
         plans = [(np.asarray(each.convert("RGB")) == theme.PLAN).all(axis=2) for each in (one, other)]
     plane = slice(int(theme.PLANE.y), int(theme.PLANE.bottom)), slice(int(theme.PLANE.x), int(theme.PLANE.right))

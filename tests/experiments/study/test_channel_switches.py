@@ -10,7 +10,8 @@ import pytest
 from experiments.backends.execution import results_of
 from experiments.errors import ResultsError
 from experiments.runs import certificate_of, loop_config, run_of_arm
-from experiments.settings import CompareSettings, changed_channel
+from experiments.runs.loops import changed_channel
+from experiments.settings import CompareSettings
 from experiments.settings.study import NETWORK_ENVS
 from experiments.study.channel_switches import SWITCHES, channel_switches, switched, trained_agents
 from ncs_gym.envs.env import ncs_env

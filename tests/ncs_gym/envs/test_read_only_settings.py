@@ -98,8 +98,8 @@ def test_what_estimators_share_cannot_be_written_to():
     many = gym.make_vec("ncs_gym/CartPole-v0", num_envs=3).unwrapped
     for each in (env, many):
         each.reset(seed=0)
-        for _ in range(20):
-            each.step(each.action_space.sample())
+        for _ in range(8):
+            each.step(0.0 * each.action_space.sample())
     estimator = env.estimator
     for array in (estimator.shape, estimator.mean, many.error_shapes[0].shapes):
         with pytest.raises(ValueError, match="read-only"):

@@ -172,9 +172,11 @@ def test_registered_channels_keep_their_contracts(env_id):
     _, info = env.reset(seed=0)
     ages = []
     for _ in range(300):
-        info = env.step(np.zeros(env.plant.m))[4]
+        *_, terminated, _, info = env.step(np.zeros(env.plant.m))
         ages.append(info["measurement_age"])
         assert not info["contract_broken"]
+        if terminated:
+            env.reset()
     assert max(ages) == env.contract.max_age
 
 

@@ -145,7 +145,7 @@ def test_inner_end_of_an_episode_is_that_of_the_loop():
     env.reset(seed=0, options={"state": [0.0, 0.0]})
     ends = [env.step(np.zeros(1))[2:4] for _ in range(10)]
     assert ends == [(False, False)] * 9 + [(False, True)]
-    with pytest.raises(gym.error.ResetNeeded, match="the process inside has ended"):
+    with pytest.raises(gym.error.ResetNeeded, match="the episode is over"):
         env.step(np.zeros(1))
     env.reset(options={"state": [0.9, 0.9]})
     assert env.step(np.zeros(1))[2:4] == (True, False)

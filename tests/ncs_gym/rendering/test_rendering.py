@@ -21,7 +21,7 @@ from ncs_gym.registration import ENVIRONMENTS, needing_extras
 from ncs_gym.rendering import PacketRecord, theme
 from ncs_gym.rendering.episode_record import RECENT_STEPS
 from ncs_gym.rendering.renderer import _Picture
-from shields import SafetyShield
+from shields import SafetyShield, synthesize
 from tests.plants import random_plant
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -263,7 +263,8 @@ def test_stored_plan_is_drawn_from_the_estimate_and_named_in_the_legend(picture,
 
 
 def test_shield_tells_the_picture_what_it_has_in_store(loaded):
-    env = SafetyShield(make(), mode="lookahead", horizon=3)
+    certificate = synthesize(loaded, safe_set="ellipsoid")  # in a polytope hardly a plan is needed
+    env = SafetyShield(make(), certificate, mode="lookahead", horizon=3)
     env.reset(seed=0)
     assert env.unwrapped.renderer.frame_record().annotation.plan.shape[0] == 0
     lengths = set()

@@ -34,7 +34,8 @@ def test_no_state_that_is_guaranteed_leaves_the_box(name, channel, episodes):
     env = extremal_env(name, channel)
     counts = [attack(env, policy, seed, episodes, 60) for seed, policy in enumerate(POLICIES)]
     assert total(counts)["guaranteed"] > 0
-    assert total(counts)["planned"] > 0 or name == "n=3 m=2"  # there every input that matters passes today's test
+    # In these every input that matters passes the one-step test, of the ellipsoid or of the polytope.
+    assert total(counts)["planned"] > 0 or name in ("n=3 m=2", "n=6 m=2, polytope")
 
 
 @pytest.mark.parametrize("name", [*MOST_TRIED, "cart-pole, polytope", "batch reactor, polytope"])

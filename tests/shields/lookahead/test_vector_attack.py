@@ -72,7 +72,8 @@ def test_no_environment_leaves_its_box_while_guaranteed(name, channel, autoreset
 
 def test_final_info_says_what_the_last_decision_stored():
     env = gym.make_vec("ncs_gym/BatchReactor-v0", num_envs=8, max_episode_steps=5, autoreset_mode="SameStep")
-    shield, lengths = VectorSafetyShield(env, mode="lookahead"), []
+    certificate = certificate_of(env.unwrapped.plant, env.unwrapped.certificate_contract, safe_set="ellipsoid")
+    shield, lengths = VectorSafetyShield(env, certificate, mode="lookahead"), []
     shield.reset(seed=0)
     for step in range(40):
         *_, truncated, info = shield.step(np.ones((8, 2), np.float32))

@@ -312,7 +312,7 @@ def test_solver_that_panics_is_a_solver_without_an_answer(monkeypatch, panic):
             raise panic
 
     monkeypatch.setattr(program, "_solver", Panicking())
-    data = np.zeros(2), np.ones((4, len(PLANT.box_rows))), np.eye(2), 1.0, np.zeros(1)
+    data = np.zeros(2), np.ones((4, len(PLANT.box_rows))), np.eye(2), 1.0, np.empty((4, 0)), np.zeros(1)
     assert program.solve(*data) is None
     assert program._solver is None
     assert program.solve(*data) is not None
@@ -327,7 +327,7 @@ def test_interrupted_solver_is_not_asked_again(monkeypatch):
 
     monkeypatch.setattr(program, "_solver", Interrupted())
     with pytest.raises(KeyboardInterrupt):
-        program.solve(np.zeros(2), np.ones((4, len(PLANT.box_rows))), np.eye(2), 1.0, np.zeros(1))
+        program.solve(np.zeros(2), np.ones((4, len(PLANT.box_rows))), np.eye(2), 1.0, np.empty((4, 0)), np.zeros(1))
     assert program._solver is None
 
 

@@ -406,7 +406,7 @@ def test_wrong_uses_are_refused():
     with pytest.raises(ValueError, match="penalty"):
         VectorSafetyShield(env, penalty=-1.0)
     with pytest.raises(ValueError, match="certificate must be"):
-        VectorSafetyShield(env, certificate="file")
+        VectorSafetyShield(env, certificate=7)
     with pytest.raises(CertificateError):
         VectorSafetyShield(env, certificate_of(truck_trailer()))
     with pytest.raises(gym.error.ResetNeeded):

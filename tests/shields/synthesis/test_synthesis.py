@@ -84,7 +84,7 @@ def test_state_that_no_output_shows_is_named():
 def test_closed_loop_stays_inside_for_the_worst_state_error_and_disturbance():
     # By another route than the condition: projected ascent over (x, e, d) on x+' M x+.
     plant = random_plant(3, 2, 1)
-    certificate = synthesize(plant)
+    certificate = synthesize(plant, safe_set="ellipsoid")
     M, closed, gain = certificate.M, plant.A + plant.B @ certificate.K, plant.B @ certificate.K
     rng = np.random.default_rng(0)
     worst = 0.0
