@@ -43,7 +43,7 @@ LAYERS = {
         {"former_settings", "loop", "replay"},
         {"algorithms", "callbacks", "evaluation", "sharing"},
         {"agent"},
-        {"training"},
+        {"sb3_zip", "training"},
     ),
     "experiments": (
         {"errors", "warning_sentences", "json_values"},

@@ -88,7 +88,7 @@ def _agent(folder: Path, env_id: str | None) -> Agent:
         ValueError: If the environment is unknown, or not the one that the agent was trained in.
     """
     from agents.agent import Agent  # imports torch
-    from agents.sharing.sb3_zip import is_sb3_zip, load_sb3_zip
+    from agents.sb3_zip import is_sb3_zip, load_sb3_zip
 
     if env_id is not None:
         registered_env(env_id)
