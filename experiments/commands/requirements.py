@@ -92,7 +92,7 @@ def requirements(settings: RequirementsSettings) -> None:
         print(table.text, end="\n\n")
     sentences = [*map(_boundary_text, found.largest_ages), _today_text(found, today)]
     sentences += [_cheapest_text(found, settings.keep, None), _cheapest_text(found, settings.keep, today)]
-    for sentence in sentences:
+    for sentence in dict.fromkeys(sentences):
         if sentence:
             print(wrapped(sentence))
     print(f"files: {settings.out}")

@@ -266,7 +266,7 @@ class RequirementsSettings(BackendSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelSettings:
-    """Reads recorded packets, and says what a channel contract they kept and how often closer ones would have broken.
+    """Reads recorded packets, and says which channel contract they kept and how often closer ones would have broken.
 
     Attributes:
         file: A CSV file with a line per packet, when it was sent and when it was received in seconds, the second empty

@@ -61,6 +61,8 @@ class LoopSettings:
     def __post_init__(self) -> None:
         """Raises ValueError if a setting is out of range."""
         require_horizon(self.horizon, self.shield)
+        if self.steps < 1:
+            raise ValueError(f"--steps must be at least 1, got {self.steps}")
         if not 0.0 < self.speed < float("inf"):
             raise ValueError(f"--speed must be positive, got {self.speed}")
         if not 0 <= self.room <= 100:

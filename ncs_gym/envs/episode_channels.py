@@ -133,6 +133,8 @@ class RandomChannel(gym.Wrapper, RecordConstructorArgs):
     def __init__(self, env: gym.Env, channel: Any = None, downlink: Any = None) -> None:
         RecordConstructorArgs.__init__(self, channel=channel, downlink=downlink)
         gym.Wrapper.__init__(self, env)
+        if not hasattr(env.unwrapped, "episode_channel"):
+            raise ValueError(f"RandomChannel is for an NCSEnv, got {env.unwrapped}")
         self._drawn = _drawn(channel, downlink)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

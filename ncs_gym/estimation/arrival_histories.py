@@ -111,8 +111,12 @@ class ErrorTable:
         return frozen(self._shapes[number])
 
     def statistics(self, number: int) -> ErrorStatistics:
-        """Returns statistics by their number, read-only."""
-        return ErrorStatistics(frozen(self._covariances[number]), self.shape(number), self._ages.item(number))
+        """Returns statistics by their number, read-only.
+
+        They are copies: on some processors the last bit of a sum depends on where in memory its terms lie.
+        """
+        covariance, shape = self._covariances[number].copy(), self._shapes[number].copy()
+        return ErrorStatistics(frozen(covariance), frozen(shape), self._ages.item(number))
 
     def age_matters(self, age: int) -> bool:
         """Returns whether an age is told apart from all larger ones."""

@@ -241,6 +241,8 @@ class Actuator:
                 missing, digest = missing + left_out, digest_of_inputs(digest, None)
             self.echo = Echo(step + 1, missing + self.missing, digest_of_inputs(digest, u), episode)
             self._committed = {ahead: each for ahead, each in self._committed.items() if ahead >= step}
+        elif step < steps - 1:  # a clock that went back: what is applied now is none of the inputs that were decided
+            self.echo = Echo(steps, missing + 1, digest_of_inputs(digest, None), episode)
         return u
 
 

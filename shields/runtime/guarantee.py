@@ -45,7 +45,8 @@ class MonitorState(NamedTuple):
             inputs stored are what is left of a certified plan.
         certified: Whether the error ellipsoid lies inside a certified one.
         wait: Behind a downlink, number of steps until x in S is proved now, if `inside` stays true: that is about the
-            time at which the next input takes effect. 0 without one.
+            time at which the next input takes effect. Where the box counts between samples, too, also after a step
+            that nothing proved, wherever it led. 0 otherwise.
     """
 
     broken: Any
@@ -96,6 +97,7 @@ class GuaranteeMonitor:
 
     def __init__(self, safety_filter: SafetyFilter, downlink: DownlinkProtocol | None = None) -> None:
         self._lead = 0 if downlink is None else downlink.lead
+        self._on_grid = safety_filter.plant.grid_rows is not None
         self._is_promised = downlink is None or downlink.contract is not None
         self._test = safety_filter.test
         # The present estimate, which is not observed then, is near where what was predicted of it is nearer still.
@@ -133,7 +135,8 @@ class GuaranteeMonitor:
         broken, wait = state.broken, state.wait
         for ahead, (inside, report) in enumerate(earlier):
             seen = self._observe(self._within_limits(broken, report), inside, report, 0)
-            broken, wait = seen.broken, np.maximum(wait, _not(seen.inside) * (ahead + 1))
+            proved = inside & seen.inside if self._on_grid else seen.inside
+            broken, wait = seen.broken, np.maximum(wait, _not(proved) * (ahead + 1))
         return state._replace(broken=broken, wait=wait)
 
     def advance(
@@ -163,7 +166,7 @@ class GuaranteeMonitor:
         if not _all(inside):
             # A stored plan was certified for every error that it can meet: it needs no certified error set on its way.
             inside = inside | state.inside & (state.certified & decision.fallback | decision.stored)
-        return self._observe(broken, inside, report, state.wait)
+        return self._observe(broken, inside, report, state.wait, inside)
 
     def reasons(self, state: MonitorState, age: Any = 0) -> Any:
         """Returns why the proof does not hold now, as indices of `EXPLANATIONS`: 0 while it does.
@@ -178,7 +181,7 @@ class GuaranteeMonitor:
         if not self._is_promised:
             reason = _first(reason, True, NO_DOWNLINK_CONTRACT)
         reason = _first(reason, _not(state.inside), NOT_KNOWN_INSIDE)
-        if self._lead:
+        if self._lead or self._on_grid:
             reason = _first(reason, state.wait > 0, NOT_KNOWN_INSIDE)
         if _all(state.certified):
             return reason
@@ -194,8 +197,10 @@ class GuaranteeMonitor:
         limits = self._limits if sizes.ndim == 1 else self._limits[:, None]
         return _first(broken, _not(_rows_all(sizes <= limits)), LEFT_MODEL)
 
-    def _observe(self, broken: Any, inside: Any, report: LoopObservation, wait: Any) -> MonitorState:
-        """Takes in the alarm, the running ellipsoid, and what the estimate alone proves."""
+    def _observe(
+        self, broken: Any, inside: Any, report: LoopObservation, wait: Any, on_the_way: Any = True
+    ) -> MonitorState:
+        """Takes in the alarm, the running ellipsoid, and what the estimate alone proves: not what was on the way."""
         estimate, errors, alarm, _ = report
         size = np.abs(estimate)
         reach = self._reach if estimate.ndim == 1 else self._reach[:, None]
@@ -209,8 +214,9 @@ class GuaranteeMonitor:
             inside = inside | self._test.knows_inside(estimate, errors, MARGIN)
             if self._is_local:
                 broken = _first(broken, _not(inside), LEFT_MODEL)
-        if self._lead:
-            wait = (inside & (wait > 1)) * (wait - 1) + _not(inside) * (self._lead + 1)
+        if self._lead or self._on_grid:
+            proved = inside & on_the_way if self._on_grid else inside
+            wait = (proved & (wait > 1)) * (wait - 1) + _not(proved) * (self._lead + 1)
         return MonitorState(broken, inside, errors.certified, wait)
 
 

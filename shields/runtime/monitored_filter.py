@@ -76,8 +76,11 @@ class MonitoredFilter:
             self._schedule.start()
             self._schedule.pending = pending or self._schedule.pending
             reports = [self.reported(mean.copy(), shape, alarm=False) for mean, shape in beliefs]
-            pairs = zip(known[:-1], reports, strict=True)
-            inside = [known_inside(self.filter, start, each.estimate, each.errors) for start, each in pairs]
+            acting = pending or (None,) * len(reports)
+            inside = [
+                known_inside(self.filter, start, each.estimate, each.errors, u)
+                for start, each, u in zip(known[:-1], reports, acting, strict=True)
+            ]
             self._state = self._monitor.cover(self._state, zip(inside, reports, strict=True))
 
     def decide(self, proposed: np.ndarray) -> Decision:

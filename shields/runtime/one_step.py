@@ -119,7 +119,9 @@ class OneStepTest:
         level = norms(self.root.dot(estimates)) + errors.largest
         return level <= 1.0 - margin - self.rounding * self.own_columns.dot(np.abs(estimates))
 
-    def keeps_between(self, estimate: np.ndarray, errors: PredictedErrors, margin: float) -> bool:
+    def keeps_between(
+        self, estimate: np.ndarray, errors: PredictedErrors, margin: float, u: np.ndarray | None = None
+    ) -> bool:
         """Returns whether the box is kept until the next sample, where that counts (`EllipsoidOnGrid`); here not."""
         return True
 

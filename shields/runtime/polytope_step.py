@@ -135,17 +135,20 @@ class PolytopeTest:
         return level <= 1.0 - margin - self.rounding * self.own_columns.dot(np.abs(estimates))
 
     @np.errstate(all="ignore")
-    def keeps_between(self, estimate: np.ndarray, errors: Any, margin: float) -> bool:
-        """Returns whether the box is kept between this sample and the next one under no input, if that counts.
+    def keeps_between(self, estimate: np.ndarray, errors: Any, margin: float, u: np.ndarray | None = None) -> bool:
+        """Returns whether the box is kept between this sample and the next one, if that counts.
 
         Args:
             estimate: x_hat, shape (n,).
             errors: What is known of its Sigma_k.
             margin: In units of the box.
+            u: The input until then, within the limits, shape (m,); none by default.
         """
         first = len(self.root)
         rounding = self.rounding * float(self.columns.dot(np.abs(estimate)))
-        return bool((np.abs(self.moved[first:].dot(estimate)) <= errors.room[first:] - rounding - margin).all())
+        values = self.moved[first:].dot(estimate)
+        values = values if u is None else values + self.effect[first:].dot(u)
+        return bool((np.abs(values) <= errors.room[first:] - rounding - margin).all())
 
 
 class PolytopeErrors(NamedTuple):
@@ -263,9 +266,9 @@ class EllipsoidOnGrid(OneStepTest):
         first, grid = super().reachable_alone(estimate, errors), self.grid.reachable_alone(estimate, errors)
         return None if first is None or grid is None else SetOnGrid(first, grid)
 
-    def keeps_between(self, estimate: np.ndarray, errors: Any, margin: float) -> bool:
+    def keeps_between(self, estimate: np.ndarray, errors: Any, margin: float, u: np.ndarray | None = None) -> bool:
         """Returns what `PolytopeTest.keeps_between` does."""
-        return self.grid.keeps_between(estimate, errors, margin)
+        return self.grid.keeps_between(estimate, errors, margin, u)
 
 
 class GridErrors(NamedTuple):

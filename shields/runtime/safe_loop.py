@@ -269,6 +269,8 @@ class SafeLoop:
             if self._unknown is not None:
                 samples, inputs = self._unknown
                 self._unknown = samples, (taken, *inputs[: self._filter.plant.n + self._estimator.buffer])
+                if told is None:  # samples of before tell nothing of a state that an unknown input moved
+                    self._unknown = {}, ()
         self._applied.compare(heard, self.steps, self.episode)
         if self._unknown is not None:
             self._find(arrived)

@@ -134,7 +134,13 @@ def starts_known(
     return tuple(known)
 
 
-def known_inside(safety_filter: SafetyFilter, known: StartKnown, estimate: np.ndarray, errors: PredictedErrors) -> bool:
+def known_inside(
+    safety_filter: SafetyFilter,
+    known: StartKnown,
+    estimate: np.ndarray,
+    errors: PredictedErrors,
+    u: np.ndarray | None = None,
+) -> bool:
     """Returns whether one of the states x_0 .. x_{c-1} is known to be in the safe set; in mode "lookahead" in the box.
 
     Args:
@@ -142,10 +148,11 @@ def known_inside(safety_filter: SafetyFilter, known: StartKnown, estimate: np.nd
         known: What is known of it from where starts are possible.
         estimate: Its estimate, shape (n,).
         errors: What is known of the error shape of that.
+        u: The input that acts then, decided before, shape (m,); none at the start of an episode.
     """
     if known.in_safe_set or (known.in_box and safety_filter.lookahead is not None):
         return True
-    if not safety_filter.test.keeps_between(estimate, errors, MARGIN):
+    if not safety_filter.test.keeps_between(estimate, errors, MARGIN, u):
         return False
     return bool(safety_filter.test.knows_inside(estimate, errors, MARGIN)) or _in_box(safety_filter, estimate, errors)
 

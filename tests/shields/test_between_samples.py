@@ -10,9 +10,13 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from shields import Certificate, CertificateError, Infeasible, SafetyFilter, SafetyShield, synthesize, verify
+from ncs_gym import Channel, LinearPlant, Packet
+from ncs_gym.network import downlink_protocol
+from shields import Certificate, CertificateError, Infeasible, SafeLoop, SafetyFilter, SafetyShield, synthesize, verify
 from shields.runtime.backup_plans import PlanTest, Prediction
 from shields.runtime.between_samples import grid_test
+from shields.runtime.decisions import Decision
+from shields.runtime.guarantee import GuaranteeMonitor, LoopObservation
 from shields.runtime.one_step import OneStepTest
 from shields.runtime.starts import starts_known
 from shields.synthesis.certification import with_polytope
@@ -314,3 +318,52 @@ def test_plants_without_a_grid_have_no_rows_of_one():
     test = grid_test(plant)
     assert not len(test.moved)
     assert test.at_samples is plant.box_rows
+
+
+@cache
+def oscillator(damping, limits, u_max):
+    """A plant whose input pushes it far out and back between two samples, and its certificate."""
+    w = 2.0 * np.pi
+    model = [[0.0, 1.0], [-w * w, -2.0 * damping * w]], [[0.0], [w * w]], np.eye(2), np.zeros((2, 1))
+    plant = LinearPlant.from_statespace(
+        model, dt=1.0, box=limits, u_max=u_max, gamma=1e-6, initial_bound=1e-3, sensor_bound=1e-4, between_samples=32
+    )
+    return plant, synthesize(plant)
+
+
+@pytest.mark.parametrize("mode", ["project", "lookahead"])
+def test_inputs_on_their_way_at_a_start_in_the_middle_count_between_samples(mode):
+    plant, certificate = oscillator(0.3, (1.0, 8.0), 0.9)
+    times = [expm(np.pad(plant.continuous_model, ((0, 1), (0, 0))) * tau)[:2] for tau in np.linspace(0.0, 1.0, 201)]
+    seen = 0
+    for guess in np.linspace(0.0, 0.9, 10):
+        loop = SafeLoop(certificate, plant, Channel(), mode, downlink=Channel(delay=1), on_unproved="ignore")
+        x, pending = np.zeros(2), [np.zeros(1)]
+        loop.start(np.array([guess, 0.0]), known=False)
+        for step in range(4):
+            loop.receive([Packet(step, x.copy(), loop.episode)] if step else [])
+            guaranteed = loop.guaranteed
+            pending.append(loop.decide(plant.u_max if step == 0 else np.zeros(1)).input)
+            both = np.concatenate([x, pending.pop(0)])
+            worst = max(np.abs(plant.box_rows @ (each @ both)).max() for each in times)
+            seen += worst > 1.0
+            assert worst <= 1.0 or not guaranteed
+            x = plant.A @ x + plant.B @ both[2:]
+    assert seen > 0
+
+
+def test_a_step_that_nothing_proved_is_not_proved_by_where_it_led():
+    plant, certificate = oscillator(0.4, (1.0, 8.0), 0.95)
+    safety_filter = SafetyFilter(certificate, plant, "switch")
+    monitor = GuaranteeMonitor(safety_filter, downlink_protocol(Channel(delay=1), None))
+    small = safety_filter.errors_of(plant.initial_error.shape_matrix)
+    large = safety_filter.errors_of(np.diag([0.16, 9.0]))
+    seen = LoopObservation(np.zeros(2), small, False)
+    passed = Decision(np.zeros(1), False, True, False, 1.0, "", np.empty((0, 1)))
+    fallback = passed._replace(passed=False, fallback=True)
+    state = monitor.cover(monitor.start(True, True, seen), [(True, seen)])
+    held = []
+    for decision, errors in ((passed, large), (fallback, small), (passed, small), (passed, small), (passed, small)):
+        held.append(not monitor.reasons(state))
+        state = monitor.advance(state, decision, True, True, seen._replace(errors=errors))
+    assert held == [True, False, False, False, True]

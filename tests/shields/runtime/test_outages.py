@@ -260,3 +260,32 @@ def test_pickled_loop_goes_on_where_it_was(downlink, phase):
         arrays.assert_equal(loop.decide(3.0).input, other.decide(3.0).input)
         for each in (loop, other):
             each.receive(packets)
+
+
+def test_samples_of_before_an_unknown_input_tell_nothing_of_where_the_state_is():
+    plant = truck_trailer(mass=4000.0)
+    loop = SafeLoop(certificate_of(plant), plant, Channel(jitter=5), on_unproved="ignore")
+    x, unknown = np.zeros(2), None
+    loop.start(np.zeros(2), known=False)
+    for step in range(6):  # the only sample is of step 0, and nobody knows what acted since then
+        loop.receive([Packet(0, np.zeros(2), loop.episode)] if step == 5 else [], applied=unknown)
+        assert not loop.guaranteed
+        loop.decide(np.zeros(1))
+        x, unknown = plant.A @ x + plant.B @ (0.3 * plant.u_max), np.full(1, np.nan)
+    loop.receive([Packet(6, x, loop.episode)])
+    assert loop.guaranteed
+    error = loop.estimate - x
+    assert error @ np.linalg.solve(loop.error_shape, error) <= 1.0
+
+
+def test_actuator_whose_clock_goes_back_says_that_it_applied_something_else():
+    actuator = Actuator(0, 1)
+    actuator.receive([Command(step, np.full((1, 1), 1.0 + step)) for step in range(2)])
+    for step in range(3):
+        actuator.apply(step)
+    echo = actuator.echo
+    actuator.apply(2)  # once more
+    assert actuator.echo == echo
+    actuator.apply(1)
+    assert actuator.echo.missing == echo.missing + 1
+    assert actuator.echo.digest != echo.digest
