@@ -20,28 +20,15 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from polytope import behind
 
 import ncs_gym  # noqa: F401  (registers the environments)
-from experiments.baselines import controller
 from ncs_gym import LinearPlant
-from shields import Certificate, SafetyFilter, VectorSafetyShield, synthesize
+from shields import Certificate, SafetyFilter, synthesize
 from shields.synthesis.certification import with_polytope
 
 IDS = {"TruckTrailer": 8, "TruckTrailerCruise": 8, "CartPole": 4, "BatchReactor": 4}
 BLOCKS, REPEATS = 200, 10
-
-
-def behind(name: str, plant: LinearPlant, certificate: Certificate, steps: int) -> tuple[float, float]:
-    """Returns the share of overridden steps and the reward per step of an LQR behind a shield in mode "project"."""
-    envs = VectorSafetyShield(gym.make_vec(f"ncs_gym/{name}-v0", num_envs=20, plant=plant), certificate)
-    policy = controller("lqr", gym.make(f"ncs_gym/{name}-v0").unwrapped, certificate.K, 0)
-    observations, info = envs.reset(seed=0)
-    overridden = total = 0.0
-    for _ in range(steps // 20):
-        observations, reward, *_, info = envs.step(policy(observations, info).astype(np.float32))
-        overridden += float(info["shield_intervened"].sum())
-        total += float(reward.sum())
-    return overridden / (steps // 20 * 20), total / (steps // 20 * 20)
 
 
 def left(name: str, plant: LinearPlant, steps: int) -> float:
@@ -116,7 +103,7 @@ def main() -> None:
                 certificate.provenance,
                 0 if certificate.polytope is None else len(certificate.polytope.rows),
             )
-            overridden, reward = behind(name, plant, certificate, options.steps)
+            overridden, reward = behind(name, certificate, options.steps, plant=plant)
             print(
                 f"{name:<20} {plant.between_samples or 1:>2} {recorded['share_of_box']:>6.1%}"
                 f" {recorded.get('polytope_share_of_box', np.nan):>6.1%} {rows:>5}"

@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import time
 import warnings
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -50,9 +51,9 @@ def per_decision(shields: list[SafetyFilter], count: int) -> list[float]:
     return least
 
 
-def behind(name: str, certificate: Certificate, steps: int) -> tuple[float, float]:
-    """Returns the share of overridden steps and the return of an LQR behind a shield in mode "project"."""
-    envs = VectorSafetyShield(gym.make_vec(f"ncs_gym/{name}-v0", num_envs=20), certificate)
+def behind(name: str, certificate: Certificate, steps: int, **settings: Any) -> tuple[float, float]:
+    """Returns the share of overridden steps and the reward per step of an LQR behind a shield in mode "project"."""
+    envs = VectorSafetyShield(gym.make_vec(f"ncs_gym/{name}-v0", num_envs=20, **settings), certificate)
     policy = controller("lqr", gym.make(f"ncs_gym/{name}-v0").unwrapped, certificate.K, 0)
     observations, info = envs.reset(seed=0)
     overridden = total = 0.0
