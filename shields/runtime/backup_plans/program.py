@@ -74,6 +74,7 @@ class PlanProgram:
         numbered.data = self._entries[self._order]
         self._typical = numbered
 
+    @np.errstate(all="ignore")  # what is not finite has no plan
     def solve(
         self,
         estimate: np.ndarray,
@@ -92,32 +93,10 @@ class PlanProgram:
             radius: Largest |T G c_j| of the last step.
             between: Largest values of the rows of the grid in every step, shape (N, g).
             proposed: Shape (m,).
-        """
-        try:
-            A, b, q = self._data(estimate, room, weighting, radius, between, proposed)
-            if not (np.isfinite(b).all() and np.isfinite(A).all() and np.isfinite(q).all()):
-                return None
-            solver, self._solver = self._set_up() if self._solver is None else self._solver, None
-            solver.update(A=A, b=b, q=q)
-            plan = np.array(solver.solve().x, dtype=np.float64)
-            self._solver = solver  # what did not come to its end is not used again
-        except (KeyboardInterrupt, SystemExit):
-            raise
-        except BaseException:  # whatever a solver does wrong (its panics are no Exceptions): another plan, or none
-            return None
-        usable = plan.shape == (self._length * self._m,) and np.isfinite(plan).all()
-        return plan.reshape(self._length, self._m) * self._limits if usable else None
 
-    def _data(
-        self,
-        estimate: np.ndarray,
-        room: np.ndarray,
-        weighting: np.ndarray,
-        radius: float,
-        between: np.ndarray,
-        proposed: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns entries of the matrix, right-hand side and linear cost."""
+        Raises:
+            ValueError: If an argument has another shape: that is no failure of the solver.
+        """
         centers = self._free @ estimate
         moved = [(centers[:-1] @ self._C.T).ravel(), self._G @ centers[-1], self._between @ estimate]
         left = [room[:-1, : len(self._C)].ravel(), room[-1, : len(self._G)], between.ravel()]
@@ -128,7 +107,20 @@ class PlanProgram:
         q = np.zeros(self._length * self._m)
         q[: self._m] = -2.0 * self._weights * proposed / self._limits
         self._entries[self._in_cone] = -(weighting @ self._end).ravel()
-        return self._entries[self._order], b, q
+        A = self._entries[self._order]
+        if not (np.isfinite(b).all() and np.isfinite(A).all() and np.isfinite(q).all()):
+            return None
+        try:
+            solver, self._solver = self._set_up() if self._solver is None else self._solver, None
+            solver.update(A=A, b=b, q=q)
+            plan = np.array(solver.solve().x, dtype=np.float64)
+            self._solver = solver  # what did not come to its end is not used again
+        except (KeyboardInterrupt, SystemExit):
+            raise
+        except BaseException:  # whatever a solver does wrong (its panics are no Exceptions): another plan, or none
+            return None
+        usable = plan.shape == (self._length * self._m,) and np.isfinite(plan).all()
+        return plan.reshape(self._length, self._m) * self._limits if usable else None
 
     def _set_up(self) -> Any:
         """Returns a solver with the pattern of the problem."""

@@ -318,6 +318,12 @@ def test_solver_that_panics_is_a_solver_without_an_answer(monkeypatch, panic):
     assert program.solve(*data) is not None
 
 
+def test_arguments_that_do_not_fit_are_no_failure_of_the_solver():
+    program = loop_case("lookahead", "ideal").filter.lookahead.planner._program
+    with pytest.raises(ValueError, match="shape"):
+        program.solve(np.zeros(2), np.ones((3, len(PLANT.box_rows))), np.eye(2), 1.0, np.empty((4, 0)), np.zeros(1))
+
+
 def test_interrupted_solver_is_not_asked_again(monkeypatch):
     program = loop_case("lookahead", "ideal").filter.lookahead.planner._program
 
