@@ -29,7 +29,7 @@ from experiments.settings import LoopSettings
 from ncs_gym import NCSEnv
 from ncs_gym.network import contract_of, downlink_protocol
 from ncs_gym.network.wire import SHORTEST_KEY
-from shields import Certificate
+from shields import Certificate, Infeasible
 from shields.atomic_write import write_atomically
 from shields.runtime.wrapper import certificate_for
 from shields.verification import require_valid
@@ -44,8 +44,7 @@ def loop(settings: LoopSettings) -> None:
     """Runs `ncs loop`.
 
     Raises:
-        ValueError: If a setting is wrong, or the key too short.
-        Infeasible: If there is no certificate for the plant behind this network.
+        ValueError: If a setting is wrong, the key too short, or there is no certificate for the plant behind this network.
         CertificateError: If a given certificate is damaged or does not verify.
         OSError: If a file cannot be read or written, or an address is in use.
         ChildProcessError: If a process ended by itself.
@@ -104,8 +103,18 @@ def _network_loop(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
     assert protocol is not None
     contract = None if env.contract is None else protocol.behind(contract_of(uplink))
     if settings.certificate is None:
-        with synthesis_status() as show:
-            certificate = certificate_for(env.plant, contract, show)
+        try:
+            with synthesis_status() as show:
+                certificate = certificate_for(env.plant, contract, show)
+        except Infeasible as error:
+            ages = [
+                f"{way.most_consecutive_losses} + {way.delay} + {way.jitter} + {settings.room}"
+                for way in (given.uplink, given.downlink)
+            ]
+            raise ValueError(
+                f"{error}. There and back, what the network promises adds up to max_age: max_consecutive_losses + delay "
+                f"+ jitter + --room, now {ages[0]} by --channel NAME=VALUE ... and {ages[1]} by --downlink NAME=VALUE ..."
+            ) from error
     else:
         certificate = Certificate.load(settings.certificate)
         require_valid(certificate, env.plant)
@@ -114,7 +123,7 @@ def _network_loop(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
 
 
 def _given(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
-    uplink, downlink = network_channels(env)
+    uplink, downlink = network_channels(env, settings.channel, settings.downlink)
     key = os.urandom(32) if settings.key_file is None else settings.key_file.read_bytes()
     if len(key) < SHORTEST_KEY:
         raise ValueError(f"{settings.key_file} must hold at least {SHORTEST_KEY} bytes")

@@ -6,7 +6,7 @@ import asyncio
 import gc
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import numpy as np
 from experiments.network_loop.impairment import Impairment, open_line
 from experiments.network_loop.log import StepLog
 from experiments.runs.environments import registered_env
+from experiments.runs.loops import changed_channel
 from experiments.runs.policies import policy_by_name
 from ncs_gym import Actuator, AdversarialDisturbance, Channel, NCSEnv
 from ncs_gym.network import downlink_protocol
@@ -110,10 +111,20 @@ class NetworkLoop:
         return SafeLoop(certificate, env.plant, uplink, self.mode, self.horizon, **settings)
 
 
-def network_channels(env: NCSEnv) -> tuple[Channel, Channel]:
+def network_channels(
+    env: NCSEnv, up_changes: Mapping[str, Any], down_changes: Mapping[str, Any]
+) -> tuple[Channel, Channel]:
     """Returns uplink and downlink of an environment as a real network has them: what is sent now arrives a step later.
 
     Without a downlink of its own it has one like its uplink.
+
+    Args:
+        env: The environment.
+        up_changes: Changes of the uplink by name; see `changed_channel`.
+        down_changes: Those of the downlink.
+
+    Raises:
+        ValueError: If a change is wrong, or is none that a real network can have.
     """
     up = env.channel
     down = env.downlink or Channel(loss=up.loss, jitter=up.jitter, max_consecutive_losses=up.max_consecutive_losses)
@@ -124,7 +135,15 @@ def network_channels(env: NCSEnv) -> tuple[Channel, Channel]:
         settings = {name: getattr(channel, name) for name in ("loss", "quantization_step", "jitter")}
         return Channel(**settings, delay=max(channel.delay, 1), max_consecutive_losses=channel.max_consecutive_losses)
 
-    return late(up), late(down)
+    def changed(own: Channel, changes: Mapping[str, Any], flag: str) -> Channel:
+        channel = changed_channel(own, changes, flag) or own
+        if channel.delay < 1 or channel.send_period != 1:
+            raise ValueError(
+                f"{flag}: what is sent at each step arrives at the next at best: delay >= 1, send_period 1"
+            )
+        return channel
+
+    return changed(late(up), up_changes, "--channel"), changed(late(down), down_changes, "--downlink")
 
 
 def run_plant(loop: NetworkLoop) -> None:
