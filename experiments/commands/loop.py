@@ -44,7 +44,8 @@ def loop(settings: LoopSettings) -> None:
     """Runs `ncs loop`.
 
     Raises:
-        ValueError: If a setting is wrong, the key too short, or there is no certificate for the plant behind this network.
+        ValueError: If a setting is wrong or the key too short, or there is no certificate for the plant behind this
+            network.
         CertificateError: If a given certificate is damaged or does not verify.
         OSError: If a file cannot be read or written, or an address is in use.
         ChildProcessError: If a process ended by itself.
@@ -112,8 +113,9 @@ def _network_loop(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
                 for way in (given.uplink, given.downlink)
             ]
             raise ValueError(
-                f"{error}. There and back, what the network promises adds up to max_age: max_consecutive_losses + delay "
-                f"+ jitter + --room, now {ages[0]} by --channel NAME=VALUE ... and {ages[1]} by --downlink NAME=VALUE ..."
+                f"{error}. There and back, what the network promises adds up to max_age: max_consecutive_losses + "
+                f"delay + jitter + --room, now {ages[0]} by --channel NAME=VALUE ... and {ages[1]} by --downlink "
+                "NAME=VALUE ..."
             ) from error
     else:
         certificate = Certificate.load(settings.certificate)
