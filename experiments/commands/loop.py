@@ -9,6 +9,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -64,14 +65,17 @@ def loop(settings: LoopSettings) -> None:
     try:
         if settings.role == "plant":
             print(f"the plant waits for a controller at {settings.host}, port {settings.port}; end it with Ctrl-C")
-            while all(process.is_alive() for process in processes):
-                time.sleep(_PERIOD / 4)
+            with suppress(KeyboardInterrupt):  # which ends both processes, too
+                while all(process.is_alive() for process in processes):
+                    time.sleep(_PERIOD / 4)
+                raise ChildProcessError("a process of the loop ended by itself; its message is above")
         else:
             with _view(settings, env) as show:
                 known = not settings.restarted
-                run_controller_node(network_loop, known, show, lambda: not all(each.is_alive() for each in processes))
-        if not all(process.is_alive() for process in processes):
-            raise ChildProcessError("a process of the loop ended by itself; its message is above")
+                alone = lambda: not all(each.is_alive() for each in processes)  # noqa: E731
+                was_told = run_controller_node(network_loop, known, show, alone)
+            if not was_told and alone():
+                raise ChildProcessError("a process of the loop ended by itself; its message is above")
     finally:
         for process in processes:
             process.terminate()
@@ -79,11 +83,10 @@ def loop(settings: LoopSettings) -> None:
             process.join(_PATIENCE)
             if process.is_alive():
                 process.kill()
-    if settings.role != "plant":
-        summary = summary_of(settings.out)
-        write_atomically(settings.out / "summary.json", json.dumps(summary, indent=1) + "\n")
-        width = max(map(len, summary))
-        print("\n".join(f"{name:>{width}}  {value}" for name, value in summary.items()))
+    summary = summary_of(settings.out)
+    write_atomically(settings.out / "summary.json", json.dumps(summary, indent=1) + "\n")
+    width = max(map(len, summary))
+    print("\n".join(f"{name:>{width}}  {value}" for name, value in summary.items()))
 
 
 def _in_process(run: Callable[[NetworkLoop], None], network_loop: NetworkLoop, env: str) -> None:
@@ -136,7 +139,7 @@ def _given(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
         uplink=uplink,
         downlink=downlink,
         room=settings.room,
-        key=key,
+        secret=key,
         seed=settings.seed,
         speed=settings.speed,
         policy=settings.policy,
@@ -229,26 +232,26 @@ def summary_of(folder: Path) -> dict[str, Any]:
         counts["outside"] += row["outside"] == "1"
         counts["outside, proved"] += row["outside"] == "1" and proved.get(key) == "1" and missing == 0
         counts["proved, missed"] += proved.get(key) == "1" and missing > 0
-    summary: dict[str, Any] = {
-        "episodes": len({episode for episode, _ in proved}),
-        "steps of the controller": counts["steps"],
-        "steps of the plant": counts["plant"],
-        "proved": counts["proved"],
-        "outside the box": counts["outside"],
-        "outside although proved": counts["outside, proved"],
-        "overridden": counts["overridden"],
-        "inputs missing": sum(last_of.values()),
-        "proved, a miss not yet heard": counts["proved, missed"],
-        "decided too late": int(last["skipped"]) if counts["steps"] else 0,
-        "datagrams refused": int(last["refused"]) if counts["steps"] else 0,
-        "oldest sample in use": max(ages, default=0),
-    }
-    if times:
+    summary: dict[str, Any] = {"episodes": len(last_of.keys() | {episode for episode, _ in proved})}
+    if proved:  # else the controller's log is on the other machine
+        summary |= {
+            "steps of the controller": counts["steps"],
+            "proved": counts["proved"],
+            "overridden": counts["overridden"],
+            "decided too late": int(last["skipped"]),
+            "datagrams refused": int(last["refused"]),
+            "oldest sample in use": max(ages),
+        }
         q = np.quantile(times, [0.5, 0.999, 1.0]).round().astype(int).tolist()
         summary["ms into the step, 50/99.9/100 %"] = " / ".join(f"{each / 1000:.2f}" for each in q)
-    if not counts["plant"]:  # its log is on the other machine
-        for name in ("steps of the plant", "outside the box", "outside although proved", "inputs missing"):
-            del summary[name]
-        del summary["proved, a miss not yet heard"]
+    if last_of:  # else the plant's is
+        summary |= {
+            "steps of the plant": counts["plant"],
+            "outside the box": counts["outside"],
+            "inputs missing": sum(last_of.values()),
+        }
+    if proved and last_of:
+        summary["outside although proved"] = counts["outside, proved"]
+        summary["proved, a miss not yet heard"] = counts["proved, missed"]
     reasons = {name.removeprefix("reason: "): count for name, count in counts.items() if name.startswith("reason: ")}
     return summary | {f"not proved, {name}": count for name, count in reasons.items() if count}
