@@ -16,7 +16,6 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.algorithms import build_model
-from agents.former_settings import from_former
 from agents.hyperparams import ALGORITHMS, complete_hyperparams
 from agents.loop import LoopConfig, ShieldSettings, with_gain
 from agents.results import Evaluation
@@ -210,8 +209,7 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         raise AgentError(f"the agent was trained on another plant than that of {env_id}: their fingerprints differ")
     if algorithm not in ALGORITHMS:
         raise AgentError(f"the agent is of an unknown algorithm, {algorithm!r}")
-    given = content["hyperparams"] if "hyperparams" in content else from_former(algorithm, content["settings"])
-    hyperparams = complete_hyperparams(algorithm, given)
+    hyperparams = complete_hyperparams(algorithm, content["hyperparams"])
     loop = LoopConfig(env=env_id, kwargs={"channel": content["channel"]})
     shield_mode, horizon = shield_from_json(content.get("shield"))
     model = build_model(algorithm, SB3VecEnv(loop.vector(2)), hyperparams, seed=0)  # as in `untrained`

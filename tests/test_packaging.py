@@ -40,7 +40,7 @@ LAYERS = {
     ),
     "agents": (
         {"hyperparams", "results", "sb3_vec_env"},
-        {"former_settings", "loop", "replay"},
+        {"loop", "replay"},
         {"algorithms", "callbacks", "evaluation", "sharing"},
         {"agent"},
         {"sb3_zip", "training"},

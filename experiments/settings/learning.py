@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Any, Literal, Self
 
 import tyro
 
@@ -18,9 +18,6 @@ from ncs_gym.validation import shown
 # Training steps where none belong to tuned hyperparameters.
 _DEFAULT_STEPS = 150_000
 Algorithm = Literal["PPO", "A2C", "SAC", "TD3", "TRPO", "TQC", "CrossQ"]
-# Settings with the flags that they had before.
-Baselines = Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--references"])]
-Scenarios = Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--conditions"])]
 Mode = Literal["project", "lookahead", "switch", "boundary"]
 
 
@@ -175,7 +172,7 @@ class CompareSettings(BackendSettings, LearningSettings):
     out: Path = Path("runs/compare")
     seeds: int = 3
     arms: tuple[str, ...] = ("unshielded", "penalized", "trusting", "shielded")
-    baselines: Baselines = (
+    baselines: tuple[str, ...] = (
         "zero input",
         "K x_hat",
         "untrained",
@@ -183,7 +180,7 @@ class CompareSettings(BackendSettings, LearningSettings):
         "proportional+trusting",
         "proportional+shielded",
     )
-    scenarios: Scenarios = ("as trained",)
+    scenarios: tuple[str, ...] = ("as trained",)
     noise: Literal["truncated", "gaussian"] = "truncated"
 
     @property

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
-
-import tyro
+from typing import Literal
 
 from experiments.settings.steps import StepCount, require_horizon
 
@@ -35,7 +33,7 @@ class RenderSettings:
     """
 
     env: str = "ncs_gym/TruckTrailerCruise-v0"
-    out: Annotated[Path, tyro.conf.arg(aliases=["--gif"])] = Path("episode.gif")
+    out: Path = Path("episode.gif")
     policy: str = "greedy"
     shield: Literal["project", "lookahead", "switch", "boundary", "monitor", "none"] = "project"
     horizon: int | None = None

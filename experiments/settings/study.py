@@ -8,7 +8,7 @@ from typing import Literal
 
 from experiments.baselines.margins import MARGINS
 from experiments.settings.backend import BackendSettings
-from experiments.settings.learning import Algorithm, Baselines, LearningSettings, Scenarios
+from experiments.settings.learning import Algorithm, LearningSettings
 from experiments.settings.steps import StepCount, require_least
 
 # Environments in which the network decides.
@@ -111,8 +111,8 @@ class StudySettings(BackendSettings):
     episodes: int = 100
     algo: Algorithm = "PPO"
     arms: tuple[str, ...] = ("unshielded", "penalized:10", "lagrangian", "trusting:20", "shielded", "lookahead")
-    baselines: Baselines = REGULATED_ARMS
-    scenarios: Scenarios = ("ideal-channel", "worse-channel", "attacked", "attacked-on-an-ideal-channel")
+    baselines: tuple[str, ...] = REGULATED_ARMS
+    scenarios: tuple[str, ...] = ("ideal-channel", "worse-channel", "attacked", "attacked-on-an-ideal-channel")
     safe_set: Literal["polytope", "ellipsoid"] = "ellipsoid"
     channel_episodes: int = 100
     page: Path | None = None
