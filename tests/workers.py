@@ -15,6 +15,7 @@ from typing import Any
 from unittest import mock
 
 from experiments.attack import monte_carlo_batch
+from experiments.commands import attack
 
 
 class _Executor(Executor):
@@ -59,3 +60,11 @@ def no_worker_processes() -> Iterator[None]:
         mock.patch("experiments.backends.worker_processes.SyncManager", _Manager),
     ):
         yield
+
+
+def replace_cases(monkeypatch: Any, cases: dict[str, Any]) -> None:
+    """Has `ncs attack` attack these cases instead of its own."""
+    for module in (monte_carlo_batch, attack):
+        monkeypatch.setattr(
+            module, "cases_of", lambda settings: {name: case.with_delta(settings.delta) for name, case in cases.items()}
+        )
