@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from agents.agent import Agent
+    from agents.algorithms import AppliedActionBuffer
     from agents.callbacks import DualAscentCallback, EvaluationCallback, SafetyCallback
     from agents.evaluation import evaluate
     from agents.hyperparams import read_hyperparams, tuned_hyperparams, tuned_steps
     from agents.loop import LagrangianSettings, LoopConfig, ShieldSettings
-    from agents.replay import AppliedActionBuffer
     from agents.results import Episode, Evaluation, TrainingPoint, Trajectory
     from agents.sb3_vec_env import SB3VecEnv
     from agents.sharing.agent_file import AgentError

@@ -15,11 +15,10 @@ from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.agent import Agent, Normalization
-from agents.algorithms import build_model, normalized_env
+from agents.algorithms import APPLIED, build_model, normalized_env
 from agents.callbacks import CheckpointCallback, DualAscentCallback, EvaluationCallback, SafetyCallback
 from agents.hyperparams import ON_POLICY, complete_hyperparams
 from agents.loop import CostPenalty, LoopConfig
-from agents.replay import APPLIED
 from agents.results import TrainingPoint
 from agents.sb3_vec_env import SB3VecEnv
 

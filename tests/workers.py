@@ -56,8 +56,8 @@ class _Manager:
 def no_worker_processes() -> Iterator[None]:
     """Commands execute their training runs and batches in this process."""
     with (
-        mock.patch("experiments.backends.worker_processes.ProcessPoolExecutor", _Executor),
-        mock.patch("experiments.backends.worker_processes.SyncManager", _Manager),
+        mock.patch("experiments.backends.execution.ProcessPoolExecutor", _Executor),
+        mock.patch("experiments.backends.execution.SyncManager", _Manager),
     ):
         yield
 

@@ -9,10 +9,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar
 
-from experiments.analysis.gaussian_bound import rounded_up
-from experiments.analysis.statistics import clopper_pearson
-from experiments.analysis.terminal_text import text_table
+from experiments.analysis.statistics import clopper_pearson, rounded_up
 from experiments.errors import SafetyBroken
+from experiments.terminal import text_table
 
 # Episodes start on the boundary of S; the largest level is taken from this step on.
 SETTLING_STEPS = 20

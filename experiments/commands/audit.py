@@ -8,11 +8,11 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 
-from experiments.analysis.terminal_text import terminal_width, wrapped
 from experiments.paper.audit import Claim, Verdict, audited_claims, defects
 from experiments.paper.paper_example import PaperExample
 from experiments.runs import require_place
 from experiments.settings import AuditSettings
+from experiments.terminal import terminal_width, wrapped
 from shields.atomic_write import write_atomically
 
 _INDENT = 16

@@ -10,11 +10,16 @@ import gymnasium as gym
 import pandas as pd
 
 from agents.loop import LoopConfig
-from experiments.analysis.episodes import episodes_table, parquet, training_table
-from experiments.analysis.gaussian_bound import gaussian_sentences, gaussian_summary
-from experiments.analysis.summary import arm_summaries, covered_fraction, paired_differences
+from experiments.analysis.episodes import (
+    arm_summaries,
+    covered_fraction,
+    episodes_table,
+    paired_differences,
+    parquet,
+    training_table,
+)
+from experiments.analysis.statistics import gaussian_sentences, gaussian_summary
 from experiments.analysis.tables import decimals_of, scenario_text, summary_text
-from experiments.analysis.terminal_text import wrapped
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.plots.comparison_figures import comparison_figures
@@ -34,6 +39,7 @@ from experiments.runs import (
 )
 from experiments.runs.experiment import certificate_line
 from experiments.settings import CompareSettings
+from experiments.terminal import wrapped
 from ncs_gym import bound_violation_probability
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, SafetyFilter, verify

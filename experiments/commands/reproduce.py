@@ -7,11 +7,10 @@ from dataclasses import asdict
 
 from tqdm import tqdm
 
-from experiments.analysis.terminal_text import text_table
-from experiments.paper.reproduction import Outcome, designs, simulate
-from experiments.paper.reproduction_figures import reproduction_figures
+from experiments.paper.reproduction import Outcome, designs, reproduction_figures, simulate
 from experiments.runs import claim_folder, prepare_output
 from experiments.settings import ReproduceSettings
+from experiments.terminal import text_table
 from shields.atomic_write import write_atomically
 
 

@@ -10,10 +10,8 @@ from typing import Any
 import pandas as pd
 
 from agents.loop import LoopConfig
-from experiments.analysis.episodes import episodes_table, parquet
-from experiments.analysis.summary import arm_summaries
+from experiments.analysis.episodes import arm_summaries, episodes_table, parquet
 from experiments.analysis.tables import sweep_table
-from experiments.analysis.terminal_text import wrapped
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.plots.heatmaps import sweep_figures
@@ -30,6 +28,7 @@ from experiments.runs import (
     write_results,
 )
 from experiments.settings import SweepSettings
+from experiments.terminal import wrapped
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, verify
 

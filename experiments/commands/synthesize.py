@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import shields
 from experiments.runs import require_place
-from experiments.runs.environments import registered_env
-from experiments.runs.synthesis_status import synthesis_status
+from experiments.runs.loops import registered_env
 from experiments.settings import SynthesizeSettings
 from experiments.settings.certificates import changed_contract
+from experiments.terminal import synthesis_status
 from ncs_gym import ChannelContract, LinearPlant
 from shields.certificate_text import size_of
 from shields.errors import SynthesisInterrupted

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from agents.loop import LoopConfig
-from experiments.analysis.episodes import episodes_table
-from experiments.analysis.summary import arm_summary
+from experiments.analysis.episodes import arm_summary, episodes_table
 from experiments.analysis.tables import summary_text
-from experiments.analysis.terminal_text import wrapped
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.runs import (
@@ -22,6 +20,7 @@ from experiments.runs import (
     write_results,
 )
 from experiments.settings import BackendSettings, TrainSettings
+from experiments.terminal import wrapped
 from shields import Certificate
 
 # Budget of `--smoke`.

@@ -7,7 +7,7 @@ from dataclasses import asdict
 
 import shields
 from experiments.runs import require_place
-from experiments.runs.environments import registered_env
+from experiments.runs.loops import registered_env
 from experiments.settings import VerifySettings
 from ncs_gym import LinearPlant
 from ncs_gym.registration import registered_ids

@@ -11,8 +11,7 @@ from matplotlib.axes import Axes
 from scipy.linalg import null_space, orth
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
-from experiments.plots.arm_style import ArmStyle
-from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below, with_unit
+from experiments.plots.figure_style import STYLE, ArmStyle, CaptionedFigure, label, legend_below, with_unit
 from experiments.runs.arms import ResultsByArm
 from ncs_gym import LinearPlant
 from shields import Certificate

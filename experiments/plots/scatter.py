@@ -10,8 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from experiments.plots.arm_style import ArmStyle
-from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below, thousands
+from experiments.plots.figure_style import STYLE, ArmStyle, CaptionedFigure, label, legend_below, thousands
 from experiments.runs.arms import ResultsByArm
 
 # Marker sizes of the first and of the last arm [points]: where arms coincide, the lower ones are visible.

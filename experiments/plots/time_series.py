@@ -12,8 +12,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 
 from agents.results import Trajectory
-from experiments.plots.arm_style import ArmStyle
-from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below, with_unit
+from experiments.plots.figure_style import STYLE, ArmStyle, CaptionedFigure, label, legend_below, with_unit
 from experiments.runs.arms import Arm, ResultsByArm
 from ncs_gym import LinearPlant
 

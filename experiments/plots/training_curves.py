@@ -12,8 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from experiments.plots.arm_style import ArmStyle
-from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below, thousands
+from experiments.plots.figure_style import STYLE, ArmStyle, CaptionedFigure, label, legend_below, thousands
 from experiments.runs.arms import Arm, ResultsByArm
 from experiments.runs.training_run import RunResult
 

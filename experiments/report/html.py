@@ -10,7 +10,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from experiments.analysis.statistics import CONFIDENCE, RESAMPLES
 from experiments.json_values import flat
-from experiments.plots.arm_style import ArmStyle
+from experiments.plots.figure_style import ArmStyle
 from experiments.runs.arms import Arm
 from shields import Report
 

@@ -12,7 +12,7 @@ from experiments.analysis.statistics import clopper_pearson
 from experiments.backends.execution import results_of
 from experiments.errors import ResultsError
 from experiments.runs import Arm, RunStore, TrainingRun, certificate_of, loop_config, run_of_arm
-from experiments.runs.environments import registered_env
+from experiments.runs.loops import registered_env
 from experiments.settings import Assignments, CompareSettings
 from experiments.study.summary import ATTACKED
 from ncs_gym import Channel, ChannelContract

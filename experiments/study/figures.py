@@ -8,9 +8,8 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 
-from experiments.plots.arm_style import ArmStyle
-from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below, thousands
-from experiments.runs.scenarios import AS_TRAINED
+from experiments.plots.figure_style import STYLE, ArmStyle, CaptionedFigure, label, legend_below, thousands
+from experiments.runs.loops import AS_TRAINED
 from experiments.study.summary import ATTACKED
 
 

@@ -11,7 +11,7 @@ import pandas as pd
 from experiments.analysis.statistics import CONFIDENCE, clopper_pearson, hierarchical_interval
 from experiments.baselines import MARGINS
 from experiments.runs.arms import Arm
-from experiments.runs.scenarios import AS_TRAINED
+from experiments.runs.loops import AS_TRAINED
 
 IDEAL, ATTACKED = "ideal channel", "attacked"
 # Arms with a proof: no scenario leaves the assumptions of the certificate.

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from agents.loop import LoopConfig, ShieldSettings
 from agents.sharing.agent_file import AgentError
-from experiments.analysis.episodes import episodes_table, parquet, training_table
-from experiments.analysis.summary import arm_summary
+from experiments.analysis.episodes import arm_summary, episodes_table, parquet, training_table
 from experiments.analysis.tables import summary_text
 from experiments.attack.monte_carlo_batch import MonteCarloBatch
 from experiments.attack.safety_counts import SafetyCounts, counts_table

@@ -358,7 +358,7 @@ def assert_verdict_first(printed, last):
     assert lines[-1] == last
 
 
-@pytest.mark.parametrize("module", ["experiments.warning_sentences", "tyro", "numpy", "shields"])
+@pytest.mark.parametrize("module", ["experiments.terminal", "tyro", "numpy", "shields"])
 def test_interrupt_while_the_command_starts_is_one_line(module):
     code = f"""
 import sys

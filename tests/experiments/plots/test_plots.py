@@ -8,9 +8,8 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex, to_rgb
 from scipy.optimize import linprog
 
-from experiments.plots.arm_style import ARM_COLORS_AND_MARKERS, ArmStyle
 from experiments.plots.comparison_figures import comparison_figures
-from experiments.plots.figure_style import thousands
+from experiments.plots.figure_style import ARM_COLORS_AND_MARKERS, ArmStyle, thousands
 from experiments.plots.phase_plane import _plane, phase_figure, projected_box, projected_ellipsoid
 from experiments.plots.scatter import scatter_figure
 from experiments.plots.time_series import _shown_arms, episode_figure
