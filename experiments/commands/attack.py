@@ -31,65 +31,44 @@ from shields.runtime.safety_filter import DEFAULT_HORIZON
 
 
 def attack(settings: AttackSettings) -> None:
-    """Runs `ncs attack`.
-
-    Raises:
-        SafetyBroken: If a shielded state left S or its box (in mode "lookahead": its box), or a proof did not hold,
-            although the channels kept their contracts; with Gaussian noise, if more episodes did so than the bound on
-            their probability allows.
-        ResultsError: If a stored result is damaged.
-        FolderInUseError: If another command is writing to the output folder.
-        OtherResultsError: If the output folder holds finished results of other settings.
-        ValueError: If there is no environment of the given id, the plant's file cannot be read, or nothing is
-            claimed of an environment because its downlink promises nothing.
-        Infeasible: If there is no certificate for the plant.
-        CertificateError: If a certificate in the folder is damaged.
-        RunError: If a batch fails.
-        ClusterError: If a cluster cannot execute the batches.
-        OSError: If the folder cannot be written.
-    """
-    horizon = (settings.horizon or DEFAULT_HORIZON) if settings.mode == "lookahead" else None
-    plant = settings.plant and settings.plant.resolve()  # workers may have another working folder
+    """Runs `ncs attack`."""
     cases, kinds = cases_of(settings), len(kinds_of_batches(settings))
-    # Smaller batches, so that each kind of each case comes in once within the budget.
-    each = int(settings.steps / (len(cases) * kinds * EPISODE_STEPS))
-    attacked = replace(settings, horizon=horizon, plant=plant, envs=min(settings.envs, max(each, FEWEST_ENVS)))
     if not settings.unshielded:
         _require_claims(cases)
     with claim_folder("certify", settings):  # the name of the command in files
-        _attack_in_folder(attacked, cases, kinds)
-
-
-def _attack_in_folder(settings: AttackSettings, cases: dict[str, AttackCase], kinds: int) -> None:
-    """Executes the batches that are missing, prints the table and writes the counts; raises as `attack` says."""
-    certificates = _certificates(cases, settings.out / "certificates")
-    numbers = _numbers_of_batches(len(cases), int(settings.steps // (settings.envs * EPISODE_STEPS)), kinds)
-    batches = [
-        MonteCarloBatch(settings, case, index, certificate)
-        for (case, certificate), number in zip(certificates.items(), numbers, strict=True)
-        for index in range(number)
-    ]
-    counts = {case: SafetyCounts() for case, number in zip(cases, numbers, strict=True) if number}
-    for batch, counted in zip(batches, results_of(batches, settings.out, settings), strict=True):
-        counts[batch.case] += counted
-    total, looks_ahead = sum(counts.values(), SafetyCounts()), settings.mode == "lookahead"
-    print(counts_table(counts, looks_ahead=looks_ahead))
-    if left_out := len(cases) - len(counts):
-        print(f"{left_out} of {len(cases)} cases are not attacked within {settings.steps:,.0f} steps")
-    limits = {name: cases[name].escape_probability() for name in counts} if settings.noise == "gaussian" else {}
-    if limits:
-        print("", gaussian_table(counts, limits), GAUSSIAN_LEGEND, sep="\n")
-    given = settings_json("certify", settings)["settings"]
-    document = {"settings": {name: value for name, value in given.items() if name not in INCIDENTAL_SETTINGS}}
-    document |= {"versions": versions(), "total": total.document()}
-    document["cases"] = {case: each.document() for case, each in counts.items()}
-    if limits:
-        document["escape_probability"] = limits
-    write_atomically(settings.out / "certify.json", json.dumps(document, indent=1) + "\n")
-    if limits and not settings.unshielded:
-        require_within(counts, limits)
-    elif not settings.unshielded:
-        require_safe(total, looks_ahead=looks_ahead)
+        horizon = (settings.horizon or DEFAULT_HORIZON) if settings.mode == "lookahead" else None
+        plant = settings.plant and settings.plant.resolve()  # workers may have another working folder
+        # Smaller batches, so that each kind of each case comes in once within the budget.
+        each = int(settings.steps / (len(cases) * kinds * EPISODE_STEPS))
+        settings = replace(settings, horizon=horizon, plant=plant, envs=min(settings.envs, max(each, FEWEST_ENVS)))
+        certificates = _certificates(cases, settings.out / "certificates")
+        numbers = _numbers_of_batches(len(cases), int(settings.steps // (settings.envs * EPISODE_STEPS)), kinds)
+        batches = [
+            MonteCarloBatch(settings, case, index, certificate)
+            for (case, certificate), number in zip(certificates.items(), numbers, strict=True)
+            for index in range(number)
+        ]
+        counts = {case: SafetyCounts() for case, number in zip(cases, numbers, strict=True) if number}
+        for batch, counted in zip(batches, results_of(batches, settings.out, settings), strict=True):
+            counts[batch.case] += counted
+        total, looks_ahead = sum(counts.values(), SafetyCounts()), settings.mode == "lookahead"
+        print(counts_table(counts, looks_ahead=looks_ahead))
+        if left_out := len(cases) - len(counts):
+            print(f"{left_out} of {len(cases)} cases are not attacked within {settings.steps:,.0f} steps")
+        limits = {name: cases[name].escape_probability() for name in counts} if settings.noise == "gaussian" else {}
+        if limits:
+            print("", gaussian_table(counts, limits), GAUSSIAN_LEGEND, sep="\n")
+        given = settings_json("certify", settings)["settings"]
+        document = {"settings": {name: value for name, value in given.items() if name not in INCIDENTAL_SETTINGS}}
+        document |= {"versions": versions(), "total": total.document()}
+        document["cases"] = {case: each.document() for case, each in counts.items()}
+        if limits:
+            document["escape_probability"] = limits
+        write_atomically(settings.out / "certify.json", json.dumps(document, indent=1) + "\n")
+        if limits and not settings.unshielded:
+            require_within(counts, limits)
+        elif not settings.unshielded:
+            require_safe(total, looks_ahead=looks_ahead)
 
 
 def _require_claims(cases: dict[str, AttackCase]) -> None:

@@ -20,11 +20,7 @@ _RELATIONS = re.compile(r" (=|<=|>=|<|>) ")
 
 
 def audit(settings: AuditSettings) -> None:
-    """Runs `ncs audit`.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
+    """Runs `ncs audit`."""
     require_place(settings.out)
     claims = list(audited_claims(PaperExample()))
     document = json.dumps([asdict(claim) for claim in claims], indent=1)

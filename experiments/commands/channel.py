@@ -20,12 +20,7 @@ _MOST_ROWS = 12
 
 
 def channel(settings: ChannelSettings) -> None:
-    """Runs `ncs channel`.
-
-    Raises:
-        ValueError: If the file cannot be read, holds no packets, or the environment is unknown.
-        OSError: If the file of numbers cannot be written.
-    """
+    """Runs `ncs channel`."""
     require_place(settings.out)
     log = PacketLog.load(settings.file, settings.ping_period)
     env = None if settings.env is None else registered_env(settings.env)

@@ -28,15 +28,7 @@ _SMOKE = {"episodes": 5}
 
 
 def evaluate(settings: EvaluateSettings) -> None:
-    """Runs `ncs evaluate`.
-
-    Raises:
-        AgentError: If the agent's files are missing, damaged or of another environment.
-        ValueError: If a setting is out of range, or the agent is of another environment.
-        CertificateError: If a given certificate does not verify.
-        Infeasible: If no certificate is found.
-        OSError: If the summary cannot be written.
-    """
+    """Runs `ncs evaluate`."""
     settings = short_version(settings, **_SMOKE)
     require_place(settings.out)
     folder = agent_folder(settings.model)

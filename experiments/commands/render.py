@@ -28,13 +28,7 @@ _GRAY = 120
 
 
 def render(settings: RenderSettings) -> None:
-    """Runs `ncs render`.
-
-    Raises:
-        ValueError: If a setting is wrong.
-        OSError: If a file cannot be read or written.
-        Infeasible: If a shield is asked for and no certificate is found.
-    """
+    """Runs `ncs render`."""
     settings = short_version(settings, **_SMOKE)
     _check(settings)
     if settings.policy not in UNTRAINED_POLICIES:

@@ -16,14 +16,7 @@ _DEFAULT_ENV = "ncs_gym/TruckTrailerCruise-v0"
 
 
 def synthesize(settings: SynthesizeSettings) -> None:
-    """Runs `ncs synthesize`.
-
-    Raises:
-        ValueError: If the environment is unknown, the plant's file cannot be read, or a setting is out of range.
-        Infeasible: If no certificate is found.
-        SynthesisInterrupted: If it is interrupted; the best certificate so far is saved.
-        OSError: If the file cannot be written.
-    """
+    """Runs `ncs synthesize`."""
     require_place(settings.out)
     plant, contract = _plant_and_contract(settings)
     try:

@@ -43,45 +43,30 @@ _CHANNELS, _INCIDENTAL = "channels", (*INCIDENTAL_SETTINGS, "smoke")
 
 
 def study(settings: StudySettings) -> None:
-    """Runs `ncs study`: prints the table of every environment and writes the files.
-
-    Raises:
-        ValueError: If a setting is out of range, a page quotes no table, or a stored result is damaged.
-        FolderInUseError: If another command is writing to the output folder.
-        OtherResultsError: If the output folder holds finished results of other settings.
-        OSError: If a file cannot be read or written.
-        Infeasible: If no certificate is found.
-        RunError: If a run fails.
-        ClusterError: If a cluster cannot execute the runs.
-    """
+    """Runs `ncs study`: prints the table of every environment and writes the files."""
     settings = short_version(settings, **_SMOKE)
     for path in settings.quote:
         require_marks(path.read_text("utf-8"))
     with claim_folder("study", settings):
-        _study_in_folder(settings)
-
-
-def _study_in_folder(settings: StudySettings) -> None:
-    """Executes what is missing, prints the tables and writes the files."""
-    prepare_output(settings.out)
-    parts = {short_name(env): _comparison_settings(settings, env) for env in settings.envs}
-    comparisons, channels = {}, {}
-    for name, part in parts.items():
-        compare(part)
-        comparisons[name] = json.loads((part.out / "summary.json").read_bytes())
-        if settings.channel_episodes:
-            sweep = replace(part, out=part.out / _CHANNELS, episodes=settings.channel_episodes)
-            channels[name] = channel_switches(sweep, trained_agents(part))
-        print(flush=True)
-    content = settings_json("study", settings)["settings"]
-    provenance = {
-        "settings": {key: value for key, value in content.items() if key not in _INCIDENTAL},
-        "versions": versions(),
-    }
-    episodes = {name: pd.read_parquet(part.out / "episodes.parquet") for name, part in parts.items()}
-    summary = study_summary(comparisons, episodes) | {"channels": channels} | provenance
-    _write(settings, summary, pd.concat(episodes, names=["environment"]).reset_index("environment"))
-    print(f"files: {settings.out}")
+        prepare_output(settings.out)
+        parts = {short_name(env): _comparison_settings(settings, env) for env in settings.envs}
+        comparisons, channels = {}, {}
+        for name, part in parts.items():
+            compare(part)
+            comparisons[name] = json.loads((part.out / "summary.json").read_bytes())
+            if settings.channel_episodes:
+                sweep = replace(part, out=part.out / _CHANNELS, episodes=settings.channel_episodes)
+                channels[name] = channel_switches(sweep, trained_agents(part))
+            print(flush=True)
+        content = settings_json("study", settings)["settings"]
+        provenance = {
+            "settings": {key: value for key, value in content.items() if key not in _INCIDENTAL},
+            "versions": versions(),
+        }
+        episodes = {name: pd.read_parquet(part.out / "episodes.parquet") for name, part in parts.items()}
+        summary = study_summary(comparisons, episodes) | {"channels": channels} | provenance
+        _write(settings, summary, pd.concat(episodes, names=["environment"]).reset_index("environment"))
+        print(f"files: {settings.out}")
 
 
 def _comparison_settings(settings: StudySettings, env_id: str) -> CompareSettings:
