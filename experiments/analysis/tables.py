@@ -57,7 +57,6 @@ def scenario_text(scenario: str, arms: dict[str, dict[str, Any]], baselines: dic
 
 
 def _without_training(rows: list[list[str]]) -> list[list[str]]:
-    """Returns the rows without the columns about the training."""
     return [[row[0], *row[1 + _TRAINING_COLUMNS :]] for row in rows]
 
 
@@ -76,7 +75,6 @@ def _rows(arms: dict[str, dict[str, Any]]) -> list[list[str]]:
 
 
 def _cells(arm: dict[str, Any]) -> list[str]:
-    """Returns the numbers of an arm as text."""
     low, high = arm["eval_violation_rate_ci95"]
     trained = arm["train_steps"] > 0
     return [

@@ -128,7 +128,6 @@ def execute(
 
 
 def _progress_bar(runs: Sequence[Run]) -> tqdm:
-    """Returns a bar of the steps of all runs."""
     return tqdm(
         total=sum(run.total_steps for run in runs),
         desc=" and ".join(dict.fromkeys(part for run in runs for part in run.parts)),

@@ -30,7 +30,6 @@ def audit(settings: AuditSettings) -> None:
 
 
 def _text(claims: Sequence[Claim], width: int) -> str:
-    """Returns the table and the summary for a terminal of that many columns."""
     blocks = []
     for number, claim in enumerate(claims, 1):
         lines = [_wrapped(f"{number:2d}.", f"{claim.verdict.upper()}: {claim.claim}", width, indent=4)]

@@ -34,7 +34,6 @@ def channel(settings: ChannelSettings) -> None:
 
 
 def _numbers(log: PacketLog, dt: float, seed: int) -> dict[str, Any]:
-    """Returns what the record says, as JSON values."""
     replayed, trace = log.channel(dt), np.array(log.trace(dt))
     lost, arrived = trace < 0, log.delays[np.isfinite(log.delays)]
     ages = log.ages(dt)
@@ -60,7 +59,6 @@ def _numbers(log: PacketLog, dt: float, seed: int) -> dict[str, Any]:
 
 
 def _text(log: PacketLog, dt: float, found: dict[str, Any]) -> str:
-    """Returns it for a terminal."""
     low, high = found["delays"]
     runs = ", ".join(f"{count} of {length}" for length, count in found["runs_of_losses"].items()) or "none"
     median, ninety, ninety_nine, longest = (1000.0 * each for each in found["delay_quantiles"])
@@ -90,7 +88,6 @@ def _text(log: PacketLog, dt: float, found: dict[str, Any]) -> str:
 
 
 def _compared(contract: Any, found: dict[str, Any]) -> str:
-    """Returns whether the record kept an environment's contract."""
     if contract is None:
         return "The environment's certificate needs no contract."
     row = next((row for row in found["contracts"] if row["max_age"] == contract.max_age), None)

@@ -101,7 +101,6 @@ def _with_full_names(settings: CompareSettings) -> CompareSettings:
 
 
 def _tables(summary: dict[str, Any]) -> str:
-    """Returns the tables for a terminal: training and evaluation, then one per other scenario."""
     arms, baselines = summary["arms"], summary["references"]
     scenarios = next(iter(arms.values()))["conditions"]
     others = [scenario_text(scenario, arms, baselines) for scenario in scenarios]
@@ -122,7 +121,6 @@ def _summary(
     runs: Sequence[TrainingRun],
     episodes: pd.DataFrame,
 ) -> dict[str, Any]:
-    """Returns the content of summary.json."""
     arms = arm_summaries(episodes, settings.mode)
     gaussian = {}
     if settings.noise == "gaussian":

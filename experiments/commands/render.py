@@ -109,7 +109,6 @@ def _frames(renderers: list[_EpisodeRenderer], steps: int) -> Iterator[list[np.n
 
 
 def _side_by_side(frames: list[np.ndarray]) -> np.ndarray:
-    """Returns frames side by side with a line between them."""
     gap = np.full((len(frames[0]), _GAP, 3), 255, np.uint8)
     gap[:, _GAP // 2 - 1 : _GAP // 2 + 1] = _GRAY
     parts = [part for frame in frames for part in (gap, frame)][1:]

@@ -30,7 +30,6 @@ def reproduce(settings: ReproduceSettings) -> None:
 
 
 def _table(outcomes: dict[str, Outcome]) -> str:
-    """Returns the table for a terminal, a column per design."""
     rows = [
         ("steps outside the safe set", lambda o: f"{o.outside_set:,} of {o.steps:,}"),
         ("steps outside the safe box", lambda o: f"{o.outside_box:,} of {o.steps:,}"),

@@ -110,7 +110,6 @@ def _grid_points(settings: SweepSettings) -> list[_GridPoint]:
 
 
 def _name(point: _GridPoint) -> str:
-    """Returns the name of a point in file names."""
     short = {"quantization_step": "q", "burst_length": "burst", "mass_factor": "mass", "downlink_loss": "down"}
     return "-".join(f"{short.get(name, name)}{value}" for name, value in point.items() if value is not None)
 

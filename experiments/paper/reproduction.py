@@ -186,7 +186,6 @@ def _panels(simulations: Sequence[Simulation], draw: Callable[[Axes, Simulation]
 
 
 def _draw_states(axis: Axes, simulation: Simulation) -> None:
-    """Draws the trajectories, the safe set and the safe box."""
     design = simulation.design
     angle = np.linspace(0.0, 2.0 * np.pi, 361)
     circle = np.stack([np.cos(angle), np.sin(angle)])

@@ -75,7 +75,6 @@ def scatter_figure(summary: dict[str, dict[str, Any]], arms: ResultsByArm) -> Ca
 
 
 def _scatter_caption(arms: ResultsByArm) -> str:
-    """Returns the caption: what points and bars are."""
     runs = max(len(results) for results in arms.values())
     text = "Cost and return in evaluation, better to the upper left."
     if runs > 1:
@@ -162,7 +161,6 @@ def training_figure(arms: ResultsByArm) -> CaptionedFigure:
 
 
 def _training_caption(arms: ResultsByArm) -> str:
-    """Returns the caption: what the lines and bands are."""
     runs = max(len(results) for results in arms.values())
     band = (
         f"Lines are means over {runs} runs per arm, bands reach from the lowest to the highest run."
@@ -214,7 +212,6 @@ def _on(steps: np.ndarray, results: Sequence[RunResult], name: str) -> np.ndarra
 
 
 def _draw_curve(axis: Axes, steps: np.ndarray, values: np.ndarray, style: ArmStyle) -> None:
-    """Draws the mean of the runs, shape (runs, points), and a band from the lowest to the highest."""
     if len(values) > 1:
         low, high = values.min(axis=0), values.max(axis=0)
         if len(steps) < _FEW_POINTS:
@@ -285,7 +282,6 @@ def episode_figure(plant: LinearPlant, arms: ResultsByArm) -> CaptionedFigure:
 
 
 def _episode_caption(arms: ResultsByArm) -> str:
-    """Returns the caption: which episode is shown, and what is marked."""
     names = _shown_arms(list(arms))
     paths = [arms[name][0].trajectory for name in names]
     text = f"Time series: the first evaluation episode of the first run, {' and '.join(names)}"
@@ -310,9 +306,7 @@ def _draw_states(axis: Axes, paths: dict[str, Trajectory], plant: LinearPlant) -
         time = plant.dt * np.arange(len(path.states))
         true, estimated = (np.abs(x @ plant.box_rows.T).max(axis=1) for x in (path.states, path.estimates))
         (handles[name],) = axis.plot(time, true, color=color, lw=width)
-        (handles[f"{name}, estimate"],) = axis.plot(
-            time, estimated, color=darker, lw=1.1, ls=":", zorder=3
-        )
+        (handles[f"{name}, estimate"],) = axis.plot(time, estimated, color=darker, lw=1.1, ls=":", zorder=3)
         if (true > 1.0).any():
             crosses = axis.plot(time[true > 1.0], true[true > 1.0], "x", color=_INK, ms=4.5, mew=1.0, zorder=4)
     handles["limit"] = axis.axhline(1.0, **_LIMIT)
@@ -366,7 +360,6 @@ def _events(paths: dict[str, Trajectory], plant: LinearPlant) -> dict[str, tuple
 
 
 def _draw_events(axis: Axes, events: dict[str, tuple[np.ndarray, str]]) -> None:
-    """Draws a row of ticks per kind of event."""
     for row, (times, color) in enumerate(events.values()):
         axis.vlines(times, row - 0.36, row + 0.36, color=color, lw=1.2)
     axis.set_yticks(range(len(events)), [f"{name} ({len(times):,})" for name, (times, _) in events.items()])
@@ -408,7 +401,6 @@ def phase_figure(plant: LinearPlant, certificate: Certificate, arms: ResultsByAr
 
 
 def _phase_caption(plant: LinearPlant, certificate: Certificate, arms: ResultsByArm, plane: tuple[int, int]) -> str:
-    """Returns what is shown, and what is left out."""
     text = "Phase plane: true states of the first evaluation episode of each run, for every arm."
     if plant.n > 2:
         first, second = (plant.state_names[i] for i in plane)
@@ -434,7 +426,6 @@ def _plane(certificate: Certificate, arms: ResultsByArm) -> tuple[int, int]:
 def _draw_path(
     axis: Axes, plant: LinearPlant, states: np.ndarray, plane: tuple[int, int], color: str, alpha: float
 ) -> dict[str, Artist]:
-    """Draws one trajectory, its start and its violating states."""
     x, y = states[:, plane].T
     axis.plot(x, y, color=color, lw=0.9, alpha=alpha)
     (start,) = axis.plot(x[:1], y[:1], "o", ls="none", ms=5, mfc="white", mec=_INK, mew=1.0)
@@ -447,7 +438,6 @@ def _draw_path(
 
 
 def _draw_sets(axis: Axes, plant: LinearPlant, certificate: Certificate, plane: tuple[int, int]) -> dict[str, Artist]:
-    """Draws safe set and safe box, or their projections."""
     prefix = "" if plant.n == 2 else "projection of the "
     (outline,) = axis.plot(*_projected(certificate, plane).T, color=_INK, lw=1.3)
     handles: dict[str, Artist] = {f"{prefix}safe set": outline}

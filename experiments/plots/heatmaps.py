@@ -104,7 +104,6 @@ def sweep_figures(summary: dict[str, Any], arms: Sequence[str]) -> dict[str, tup
 
 
 def _caption(quantity: _Quantity, cells: Sequence[dict[str, Any]], arms: Sequence[str]) -> str:
-    """Returns the caption."""
     runs = max(cell["arms"][arm]["runs"] for cell in cells for arm in arms)
     text = f"{quantity.caption} {runs} {'run' if runs == 1 else 'runs'} per field."
     if quantity.of_shields and "monitor" in arms:
@@ -168,7 +167,6 @@ def _field(
 
 
 def _norm(fields: Sequence[np.ndarray], quantity: _Quantity) -> Normalize:
-    """Returns one color scale for all panels."""
     low = np.nanmin(fields) if quantity.low is None else quantity.low
     high = np.nanmax(fields) if quantity.high is None else max(quantity.high, np.nanmax(fields))
     if quantity.low is None and (missing := _SMALLEST_SPAN * max(abs(low), abs(high)) - (high - low)) > 0.0:
@@ -189,7 +187,6 @@ def draw_field(axis: Axes, values: np.ndarray, colors: str, norm: Normalize) -> 
 
 
 def _name_axes(axis: Axes, losses: list[float], values: list[float], left: str, lowest: bool) -> None:
-    """Labels the outer axes of the panels."""
     axis.set_xticks(range(len(losses)), [f"{loss:g}" for loss in losses])
     axis.set_yticks(range(len(values)), [f"{value:g}" for value in values])
     axis.tick_params(length=0, labelbottom=lowest, labelleft=bool(left))
@@ -264,7 +261,6 @@ def requirements_map(
 
 
 def _draw_boundary(axis: Axes, possible: np.ndarray) -> None:
-    """Draws a line between fields with and without a certificate."""
     down, across = possible.shape
     for i in range(down):
         for j in range(across):

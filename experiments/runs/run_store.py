@@ -138,7 +138,6 @@ class RunStore:
             raise ResultsError(f"{path} is no result of its run ({reason}): delete it to repeat the run") from error
 
     def _files(self, run: Run, digests: dict[str, str]) -> dict[str, bytes]:
-        """Returns the contents of the agent's files; ValueError if one is missing or is not the one stored."""
         files = {}
         for name, checksum in digests.items():
             path = self._folder / "models" / run.name / name

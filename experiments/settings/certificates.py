@@ -94,7 +94,6 @@ def changed_contract(
 
 
 def _refuse_both(env: str | None, plant: Path | None) -> None:
-    """Raises ValueError if both an environment and the file of a plant are given."""
     if env is not None and plant is not None:
         raise ValueError("give either --env or --plant, not both")
 

@@ -123,7 +123,6 @@ def channel_switches(settings: CompareSettings, agents: Mapping[str, AgentFiles]
 
 
 def _files(store: RunStore, run: TrainingRun) -> dict[str, bytes]:
-    """Returns the files of the agent that a run left."""
     result = store.load(run)
     if result is None:
         raise ResultsError(f"there is no result of the training {run.name}: run the comparison again")

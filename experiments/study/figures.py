@@ -110,12 +110,10 @@ def _by_run_figure(summary: dict[str, Any], caption: str, quantity: str, draw: A
 
 
 def _trained(env: dict[str, Any]) -> list[str]:
-    """Returns the arms of an environment in which agents were trained."""
     return [name for name in env["trained"] if env["arms"][name]["train_steps"]]
 
 
 def _draw_runs(axis: Axes, style: ArmStyle, values: list[float], height: int) -> None:
-    """Draws a number per run, and their mean."""
     axis.plot(values, [height] * len(values), "o", ms=4.0, mfc=style.color, mec="white", mew=0.5)
     axis.plot(np.mean(values), height, ls="none", **style.points)
 

@@ -70,7 +70,6 @@ def study(settings: StudySettings) -> None:
 
 
 def _comparison_settings(settings: StudySettings, env_id: str) -> CompareSettings:
-    """Returns the settings of the comparison in an environment."""
     backend = {name: getattr(settings, name) for name in BackendSettings.__dataclass_fields__}
     part = CompareSettings(
         env=env_id,
@@ -90,7 +89,6 @@ def _comparison_settings(settings: StudySettings, env_id: str) -> CompareSetting
 
 
 def _write(settings: StudySettings, summary: dict[str, Any], episodes: pd.DataFrame) -> None:
-    """Writes every file."""
     figures = study_figures(summary)
     if settings.page is not None:
         _write_page(settings.page, summary, figures)
@@ -105,7 +103,6 @@ def _write(settings: StudySettings, summary: dict[str, Any], episodes: pd.DataFr
 
 
 def _write_page(page: Path, summary: dict[str, Any], figures: dict[str, tuple[str, bytes]]) -> None:
-    """Writes the page of the documentation, its figures, and the numbers that it shows."""
     images = page.parent / "images"
     images.mkdir(parents=True, exist_ok=True)
     for name, (_, png) in figures.items():
@@ -141,7 +138,6 @@ def results_page(summary: dict[str, Any], figures: dict[str, tuple[str, bytes]],
 
 
 def _context(summary: dict[str, Any]) -> dict[str, Any]:
-    """Returns the variables of both templates."""
     environments = summary["environments"]
     return {
         "summary": summary,

@@ -88,7 +88,6 @@ def difference(
 
 
 def _environment(comparison: dict[str, Any], episodes: pd.DataFrame) -> dict[str, Any]:
-    """Returns what a study keeps of an environment."""
     settings, known = comparison["settings"], comparison["arms"] | comparison["references"]
     arms = {name: _arm(name, arm, episodes[episodes["arm"] == name]) for name, arm in known.items()}
     level = 1.0 - (1.0 - CONFIDENCE) / len(SECONDARY)

@@ -175,7 +175,6 @@ def tables_by_name(summary: dict[str, Any]) -> dict[str, str]:
 
 
 def _margin(name: str, family: str) -> str:
-    """Returns the margin of an arm of a family, in words."""
     return f"{name.removeprefix(family).removeprefix(':') or '0'} %"
 
 
