@@ -11,31 +11,26 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from agents.agent import Agent
+    from agents.algorithms import AppliedActionBuffer
     from agents.callbacks import DualAscentCallback, EvaluationCallback, SafetyCallback
     from agents.evaluation import evaluate
-    from agents.former_settings import A2CSettings, OffPolicySettings, PPOSettings, tuned_settings
     from agents.hyperparams import read_hyperparams, tuned_hyperparams, tuned_steps
-    from agents.loop import ControlLoop, LagrangianSettings, LoopConfig, ShieldSettings
-    from agents.replay import AppliedActionBuffer
+    from agents.loop import LagrangianSettings, LoopConfig, ShieldSettings
     from agents.results import Episode, Evaluation, TrainingPoint, Trajectory
     from agents.sb3_vec_env import SB3VecEnv
     from agents.sharing.agent_file import AgentError
     from agents.training import TrainingResult, train
 
 __all__ = [
-    "A2CSettings",
     "Agent",
     "AgentError",
     "AppliedActionBuffer",
-    "ControlLoop",
     "DualAscentCallback",
     "Episode",
     "Evaluation",
     "EvaluationCallback",
     "LagrangianSettings",
     "LoopConfig",
-    "OffPolicySettings",
-    "PPOSettings",
     "SB3VecEnv",
     "SafetyCallback",
     "ShieldSettings",
@@ -46,16 +41,14 @@ __all__ = [
     "read_hyperparams",
     "train",
     "tuned_hyperparams",
-    "tuned_settings",
     "tuned_steps",
 ]
 
 _MODULES = {
     "agent": ("Agent",),
     "callbacks": ("DualAscentCallback", "EvaluationCallback", "SafetyCallback"),
-    "loop": ("ControlLoop", "LagrangianSettings", "LoopConfig", "ShieldSettings"),
+    "loop": ("LagrangianSettings", "LoopConfig", "ShieldSettings"),
     "evaluation": ("evaluate",),
-    "former_settings": ("A2CSettings", "OffPolicySettings", "PPOSettings", "tuned_settings"),
     "hyperparams": ("read_hyperparams", "tuned_hyperparams", "tuned_steps"),
     "replay": ("AppliedActionBuffer",),
     "results": ("Episode", "Evaluation", "TrainingPoint", "Trajectory"),

@@ -21,7 +21,7 @@ import numpy as np
 from agents import evaluate
 from agents.loop import LoopConfig, ShieldSettings
 from experiments.baselines import FILTERS, EstimateFilterSettings, RegulatorWeights, controller
-from experiments.settings.study import NETWORK_ENVS, REGULATED_ARMS
+from experiments.settings.learning import NETWORK_ENVS, REGULATED_ARMS
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate
 from shields.runtime.wrapper import certificate_for

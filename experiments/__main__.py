@@ -54,7 +54,7 @@ def main() -> None:
         import signal
         from contextlib import nullcontext
 
-        from experiments.warning_sentences import warnings_as_sentences
+        from experiments.terminal import warnings_as_sentences
 
         signal.signal(signal.SIGTERM, _interrupt)
         # Matrices are small: more threads only wait for each other. Read when numpy is imported, here and in workers.
@@ -79,12 +79,10 @@ def _parse(arguments: list[str]) -> object:
     import tyro
 
     from experiments import settings
-    from experiments.settings.assignments import beside_those_of_file, with_assignments
+    from experiments.settings.arguments import beside_those_of_file
 
     arguments = [_ALIASES.get(each, each) if at == 0 else each for at, each in enumerate(arguments)]
-    arguments = ["--help" if each == "--help-all" else each for each in arguments]  # its former name
     kinds = {name: getattr(settings, kind) for name, (kind, _, _) in COMMANDS.items()}
-    arguments = with_assignments(arguments)
     command, rest = "".join(arguments[:1]), arguments[1:]
     if hasattr(kinds.get(command), "config"):
         defaults, others = settings.config_defaults(rest, command, kinds[command])

@@ -40,13 +40,13 @@ LAYERS = {
     ),
     "agents": (
         {"hyperparams", "results", "sb3_vec_env"},
-        {"former_settings", "loop", "replay"},
+        {"loop"},
         {"algorithms", "callbacks", "evaluation", "sharing"},
         {"agent"},
-        {"sb3_zip", "training"},
+        {"training"},
     ),
     "experiments": (
-        {"errors", "warning_sentences", "json_values"},
+        {"errors", "json_values", "terminal"},
         {"settings", "baselines"},
         {"runs"},
         {"backends", "analysis", "plots"},

@@ -1,4 +1,8 @@
-"""The commands of `ncs`, one module each: a function of its settings that runs an experiment and writes its files."""
+"""The commands of `ncs`, one module each: a function of its settings that runs an experiment and writes its files.
+
+What they raise is a sentence for the user: ValueError for settings that cannot be, the errors of `experiments.errors`,
+`shields.Infeasible` and `CertificateError`, `agents.AgentError`, and OSError.
+"""
 
 from __future__ import annotations
 

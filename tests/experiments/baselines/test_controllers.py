@@ -6,7 +6,7 @@ import pytest
 
 from experiments.baselines import CONTROLLERS, RegulatorWeights, controller, tuned_weights
 from experiments.baselines.regulators import equilibrium
-from experiments.settings.study import NETWORK_ENVS, REGULATED_ARMS
+from experiments.settings.learning import NETWORK_ENVS, REGULATED_ARMS
 from ncs_gym.envs.env import ncs_env
 
 SETPOINTS = ("ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0")
