@@ -122,6 +122,13 @@ def test_every_example_says_how_long_it_takes():
         assert re.search(r"^Takes about .* (seconds?) on one core", text, re.MULTILINE), name
 
 
+def test_examples_that_train_compute_with_one_thread():
+    """Those that take their environments from `agents` do so by that; where others train, a line says it."""
+    for name in TRAINING | {"single_file_ppo.py"}:
+        text = (ROOT / "examples" / name).read_text()
+        assert ("from agents import" in text) != ("torch.set_num_threads(1)" in text), name
+
+
 def test_versions_of_foreign_packages_are_those_that_the_page_names():
     page = (ROOT / "docs" / "integrations.md").read_text()
     for name, packages in FOREIGN.items():
