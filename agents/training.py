@@ -64,7 +64,7 @@ def train(
 ) -> TrainingResult:
     """Returns a trained agent and what happened on the way; the same seed gives the same result on one machine.
 
-    torch computes with one thread once `agents.SB3VecEnv` is imported; `torch.set_num_threads` changes that and results.
+    torch has one thread once `agents.SB3VecEnv` is imported; `torch.set_num_threads` changes both that and results.
 
     Args:
         loop: The control loop the agent is trained in.
