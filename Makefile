@@ -15,7 +15,7 @@ AUDIT_INSTALLED := $(VENV)/.installed-audit
 ZOO_INSTALLED := $(VENV)/.installed-rl-zoo
 RAY_INSTALLED := $(VENV)/.installed-ray
 
-.PHONY: compare study test test-other-processor coverage coverage-report test-slow lint types benchmark docs audit clean
+.PHONY: compare study test test-other-processor coverage coverage-report test-slow lint types benchmark example-times docs audit clean
 
 compare: $(INSTALLED)
 	$(BIN)/ncs compare --out $(OUT)
@@ -67,6 +67,10 @@ benchmark: $(INSTALLED) $(RAY_INSTALLED)
 	$(BIN)/python benchmarks/rendering.py
 	$(BIN)/python benchmarks/ppo_settings.py
 	$(BIN)/python benchmarks/ray_overhead.py
+
+# How long each example takes beside the time that it states; `make example-times EXAMPLES="quick_start.py"` for some.
+example-times: $(INSTALLED)
+	$(BIN)/python benchmarks/example_times.py $(EXAMPLES)
 
 # Fails on a broken link, anchor, reference or formula; makes a page per registered environment. Look at it: python -m http.server -d site (from a file the search is missing).
 docs: $(DOCS_INSTALLED)

@@ -11,7 +11,6 @@ from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
 import numpy as np
-import torch
 from gymnasium.spaces import flatdim
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -72,7 +71,6 @@ def build_model(name: str, env: VecEnv, hyperparams: Mapping[str, Any], seed: in
         ModuleNotFoundError: If the algorithm's package is not installed.
     """
     cls = algorithm_class(name)
-    torch.set_num_threads(1)  # more threads only pay off at batches of 16384 and make results depend on their number
     try:
         return cls(env=env, seed=seed, device="cpu", **_arguments(name, cls, env, hyperparams, steps))
     except Exception as error:  # the library checks by many kinds of errors
