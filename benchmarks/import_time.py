@@ -1,4 +1,4 @@
-"""CPU time of what a user waits for first, each in a process of its own and each after one that imports gymnasium alone.
+"""CPU time of what a user waits for first, in processes of their own, each after one that imports gymnasium alone.
 
 The time is the best of seven, the ratio to the process before it is the median: what else the machine does slows both.
 
