@@ -19,6 +19,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from agents.hyperparams import ALGORITHMS, ON_POLICY, rollout_steps
+from ncs_gym.installation import install_command
 from ncs_gym.validation import shown
 
 # Arguments of the library that are no hyperparameters: they are given here.
@@ -36,7 +37,7 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
     if importlib.util.find_spec(package) is None:
         extra = "contrib" if package == "sb3_contrib" else "train"
         distribution = package.replace("_", "-")
-        raise ModuleNotFoundError(f"{name} needs {distribution}: in a clone of ncs-gym, pip install -e '.[{extra}]'")
+        raise ModuleNotFoundError(f"{name} needs {distribution}: {install_command(extra)}")
     return getattr(importlib.import_module(package), name)
 
 
