@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from experiments.settings.assignments import Assignments
-from experiments.settings.steps import StepCount, require_horizon
+from experiments.settings.arguments import Assignments, StepCount, require_horizon
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,8 +16,8 @@ import tyro
 from experiments.commands.loop import summary_of
 from experiments.network_loop.log import StepLog, rows_of
 from experiments.network_loop.processes import NetworkLoop, network_channels, waiting_text
-from experiments.runs.environments import registered_env
-from experiments.settings.network_loop import LoopSettings
+from experiments.runs.loops import registered_env
+from experiments.settings import LoopSettings
 from ncs_gym import Channel
 from tests.certificates import certificate_of
 from tests.command import environment, ncs, ncs_process
