@@ -120,16 +120,17 @@ class SetMembership:
         """Returns a shape rounded up to multiples of a step where the certified set of age 0 is the unit ball.
 
         Rounding moves an entry by half a step, hence no direction by more than n halves of one, which is added before.
-        Where steps are coarse, the whole steps that are missing are added afterwards, which is about a third of that.
+        Where steps are coarse, that of the usual step stays added, and of the coarse ones as many as are missing are
+        added afterwards, about a third of what they could take.
         """
         inward, outward, size = self._to_ball, self._ball, len(shape)
         extent = np.sqrt(np.abs(shape.diagonal()))
         inner = enlarged_by_rounding(inward.dot(shape).dot(inward.T), self._abs_to_ball.dot(extent))
-        if self.shape_step <= SHAPE_STEP:
-            inner.flat[:: size + 1] += size * self.shape_step
+        is_coarse = self.shape_step > SHAPE_STEP
+        inner.flat[:: size + 1] += size * (0.5 * SHAPE_STEP if is_coarse else self.shape_step)
         given = inner / self.shape_step
         steps = np.rint(given)
-        if self.shape_step > SHAPE_STEP:
+        if is_coarse:
             missing = EIGENVALUE_ROOM - np.linalg.eigvalsh(steps - given)[0]
             steps.flat[:: size + 1] += max(np.ceil(missing), 0.0)
         inner = self.shape_step * steps

@@ -77,6 +77,8 @@ def test_rounded_shape_holds_the_shape_and_is_not_much_larger(step):
         rounded = sets.rounded_up(shape)
         assert is_inside(shape, rounded)
         inner = np.linalg.solve(ball, np.linalg.solve(ball, rounded).T)
+        room = np.linalg.eigvalsh(inner - factor @ factor.T)[0]
+        assert room >= (3.0 - 1e-6) * 2.0**-14  # what the rounding of updated estimates is covered with
         assert np.allclose(inner / step, np.rint(inner / step), atol=1e-6)
         added.append(np.trace(inner - factor @ factor.T) / (3.0 * step))
     assert np.mean(added) < (3.1 if step == SHAPE_STEP else 1.5)
