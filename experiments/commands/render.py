@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from experiments.commands import require_extra, short_version
 from experiments.plots.animation import FORMATS, save_animation
+from experiments.plots.loop_log import loop_log_figure
 from experiments.runs import require_place
 from experiments.runs.loops import module_and_id, registered_env
 from experiments.runs.policies import UNTRAINED_POLICIES, policy_by_name
@@ -31,6 +32,11 @@ def render(settings: RenderSettings) -> None:
     """Runs `ncs render`."""
     settings = short_version(settings, **_SMOKE)
     _check(settings)
+    if settings.log is not None:
+        figure = loop_log_figure(settings.log, registered_env(settings.env).plant, settings.steps)
+        settings.out.write_bytes(figure.png)
+        print(f"saved to {settings.out}")
+        return
     if settings.policy not in UNTRAINED_POLICIES:
         require_extra("train", "stable_baselines3", "torch")
     if settings.out.suffix == ".mp4":
@@ -125,6 +131,8 @@ def _check(settings: RenderSettings) -> None:
     registered_env(settings.env)
     if settings.out.suffix not in FORMATS:
         raise ValueError(f"--out must end in one of {', '.join(FORMATS)}, got {settings.out}")
+    if settings.log is not None and settings.out.suffix != ".png":
+        raise ValueError(f"--log draws a figure: --out must end in .png, got {settings.out}")
     limits_of = {"seed": (0, None), "steps": (1, None), "fps": (1, _MAX_FPS), "scale": (1, _MAX_SCALE)}
     for name, (low, high) in (limits_of | {"width": (_MIN_WIDTH, None)}).items():
         value = getattr(settings, name)

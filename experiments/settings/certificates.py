@@ -297,6 +297,8 @@ class RenderSettings:
         env: Id of an environment with a plant of its own; module:id first imports the module, which registers one of
             your own (`ncs_gym.register_plant`).
         out: File to write: .gif, .mp4, or .png for the last frame alone.
+        log: Folder of the logs of `ncs loop`: draws the last steps of its newest episode, of the plant that `--env`
+            names, into a .png.
         policy: "greedy" (toward the task's goal as hard as it can), "zero", "random", or the folder of a
             trained agent.
         shield: Mode of the shield; "none" for no shield.
@@ -314,6 +316,7 @@ class RenderSettings:
 
     env: str = "ncs_gym/TruckTrailerCruise-v0"
     out: Path = Path("episode.gif")
+    log: Path | None = None
     policy: str = "greedy"
     shield: Literal["project", "lookahead", "switch", "boundary", "monitor", "none"] = "project"
     horizon: int | None = None

@@ -12,6 +12,7 @@ from dataclasses import fields
 import pandas as pd
 import pytest
 import tyro
+from PIL import Image
 
 from experiments.commands.loop import summary_of
 from experiments.network_loop.log import StepLog, rows_of
@@ -65,6 +66,11 @@ def test_ten_seconds_over_udp_with_everything_that_a_network_does(tmp_path):
     assert "outside although proved" in done.stdout
     assert "overridden" in done.stdout
     assert "newest sample" in done.stdout  # a line or, with rich, the title of the table
+    drawn = ncs_process("render", "--env", CRUISE, "--log", out, "--out", tmp_path / "loop.png")
+    assert drawn.returncode == 0, drawn.stderr
+    assert Image.open(tmp_path / "loop.png").size[0] > 1000
+    other = ncs_process("render", "--env", "ncs_gym/CSTR-v0", "--log", out, "--out", tmp_path / "other.png")
+    assert "are of another plant, without concentration, temperature" in other.stderr
     packets = pd.read_csv(out / "packets-000.csv")
     assert (packets["received"] >= packets["sent"]).all()
 

@@ -1,0 +1,56 @@
+"""The log of a loop over a network as a figure: states against their box, inputs, and what is not proved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+import pandas as pd
+
+from experiments.network_loop.log import rows_of
+from experiments.plots.figure_style import STYLE, CaptionedFigure, label, with_unit
+from ncs_gym import LinearPlant
+
+
+def loop_log_figure(folder: Path, plant: LinearPlant, steps: int) -> CaptionedFigure:
+    """Returns the last steps of the newest episode in the logs of `ncs loop`: its plant's, its controller's, or both.
+
+    Args:
+        folder: Folder of the logs.
+        plant: The plant they are of.
+        steps: How many of them.
+
+    Raises:
+        ValueError: If there are no rows, or they are of another plant.
+    """
+    logs = {name: pd.DataFrame(rows_of(folder, name)) for name in ("plant", "controller")}
+    logs = {name: log.tail(steps) for name, log in logs.items() if len(log)}
+    if not logs:
+        raise ValueError(f"no logs of ncs loop in {folder}: plant-000.csv or controller-000.csv")
+    columns = {"plant": "x_", "controller": "x_hat_"}
+    for name, log in logs.items():
+        if missing := [each for each in plant.state_names if columns[name] + each not in log]:
+            raise ValueError(f"the logs in {folder} are of another plant, without {', '.join(missing)}: give its --env")
+    logs = {name: log[log["episode"] == log["episode"].iloc[-1]] for name, log in logs.items()}
+    names, units = plant.state_names + plant.input_names, plant.state_units + plant.input_units
+    widths = [*plant.half_widths, *plant.u_max]
+    with matplotlib.rc_context(STYLE):
+        figure = CaptionedFigure(
+            (11.0, 1.0 + 1.4 * len(names)), f"{folder.name}: the dashed lines are the box and the input limits."
+        )
+        axes = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+        for i, (axis, name, unit, width) in enumerate(zip(axes, names, units, widths, strict=True)):
+            for log, rows in logs.items():
+                column = columns[log] + name if i < plant.n else f"u_{name}"
+                style = {"plant": "-", "controller": ":"}[log]
+                axis.plot(rows["step"].astype(int), rows[column].astype(float), style, lw=1.2, label=log)
+            for side in (-width, width):
+                axis.axhline(side, color="#222222", lw=1.0, ls=(0, (6.0, 3.0)))
+            if "controller" in logs:
+                unproved = logs["controller"][logs["controller"]["guaranteed"] == "0"]["step"].astype(int)
+                axis.vlines(unproved, -width, width, color="#cc3311", alpha=0.2, label="not proved")
+            label(axis, "", with_unit(name, unit).replace(" [", "\n["))
+        axes[-1].set_xlabel("step")
+        axes[0].set_title("what the controller estimates and decides at a step is about that at which it takes effect")
+        axes[0].legend(loc="upper right", ncols=3)
+        return figure
