@@ -15,7 +15,7 @@ AUDIT_INSTALLED := $(VENV)/.installed-audit
 ZOO_INSTALLED := $(VENV)/.installed-rl-zoo
 RAY_INSTALLED := $(VENV)/.installed-ray
 
-.PHONY: compare study test test-other-processor coverage coverage-report test-slow lint types benchmark docs audit clean
+.PHONY: compare study test test-other-processor coverage coverage-report test-slow lint types benchmark docs words audit clean
 
 compare: $(INSTALLED)
 	$(BIN)/ncs compare --out $(OUT)
@@ -71,6 +71,10 @@ benchmark: $(INSTALLED) $(RAY_INSTALLED)
 # Fails on a broken link, anchor, reference or formula; makes a page per registered environment. Look at it: python -m http.server -d site (from a file the search is missing).
 docs: $(DOCS_INSTALLED)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
+# Words of README and of every page (of those that the code makes, as they are).
+words:
+	@wc -w README.md docs/*.md
 
 # Known vulnerabilities of what constraints.txt names, by OSV: any index of packages will do, a network is needed.
 audit: $(AUDIT_INSTALLED)

@@ -1,4 +1,4 @@
-"""The pages of `ncs study`: one in HTML with its figures inside, one in Markdown, and others that quote its tables."""
+"""The pages of `ncs study`: in HTML with its figures inside, in Markdown, as tables alone, and others that quote it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 from experiments.report.html import render_page
 from experiments.study.tables import (
     QUOTABLE,
+    agents_of,
     budget_text,
     comparisons_table,
     evaluation_table,
@@ -32,16 +33,34 @@ def study_report(summary: dict[str, Any], figures: dict[str, tuple[str, bytes]])
     return render_page("study.html.j2", figures, title="Safe learning: the study", **_context(summary))
 
 
-def results_page(summary: dict[str, Any], figures: dict[str, tuple[str, bytes]], prefix: str) -> str:
+def results_page(
+    summary: dict[str, Any], figures: dict[str, tuple[str, bytes]], prefix: str, tables: str = "results.txt"
+) -> str:
     """Returns the Markdown page.
 
     Args:
         summary: As for `study_report`.
         figures: As for `study_report`.
         prefix: What stands before a figure's name in its link.
+        tables: Link to the file of all tables (`results_tables`).
     """
     links = {name: f"{prefix}{name}.png" for name in figures}
-    return render_page("results.md.j2", figures, links=links, **_context(summary))
+    return render_page("results.md.j2", figures, links=links, tables=tables, **_context(summary))
+
+
+def results_tables(summary: dict[str, Any]) -> str:
+    """Returns all tables as plain text: every arm and every combination of impairments.
+
+    Args:
+        summary: As for `study_report`.
+    """
+    known = _context(summary)
+    parts = [known["budget"], known["comparisons"], known["prices"], known["margins"]]
+    for name in summary["environments"]:
+        parts.append(f"{name}\n{known['evaluation'][name]}")
+        if name in known["channels"]:
+            parts.append(f"{name}\n{known['channels'][name]}")
+    return "\n\n\n".join([*parts, known["training"]]) + "\n"
 
 
 def _context(summary: dict[str, Any]) -> dict[str, Any]:
@@ -54,8 +73,10 @@ def _context(summary: dict[str, Any]) -> dict[str, Any]:
         "prices": prices_table(summary),
         "margins": margins_table(summary),
         "evaluation": {name: evaluation_table(env) for name, env in environments.items()},
-        "training": {name: training_table(env) for name, env in environments.items()},
+        "agents": {name: agents_of(env) for name, env in environments.items()},
+        "training": training_table(summary),
         "channels": {name: switches_table(rows) for name, rows in summary["channels"].items()},
+        "switches": {name: switches_table(rows, combined=False) for name, rows in summary["channels"].items()},
     }
 
 

@@ -19,7 +19,7 @@ from experiments.settings import BackendSettings, CompareSettings, StudySettings
 from experiments.settings.study import short_name
 from experiments.study.channel_switches import channel_switches, trained_agents
 from experiments.study.figures import study_figures
-from experiments.study.pages import quoted, require_marks, results_page, study_report
+from experiments.study.pages import quoted, require_marks, results_page, results_tables, study_report
 from experiments.study.summary import study_summary
 from experiments.study.tables import tables_by_name
 from shields.atomic_write import write_atomically
@@ -101,6 +101,7 @@ def _write(settings: StudySettings, summary: dict[str, Any], episodes: pd.DataFr
         "episodes.parquet": parquet(episodes, summary),
         "report.html": study_report(summary, figures),
         "results.md": results_page(summary, figures, "figures/"),
+        "results.txt": results_tables(summary),
     }
     write_results(settings.out, summary, files, figures)
     for path in settings.quote:
@@ -108,10 +109,12 @@ def _write(settings: StudySettings, summary: dict[str, Any], episodes: pd.DataFr
 
 
 def _write_page(page: Path, summary: dict[str, Any], figures: dict[str, tuple[str, bytes]]) -> None:
-    """Writes the page of the documentation, its figures, and the numbers that it shows."""
+    """Writes the page of the documentation, its figures, all tables, and the numbers that they show."""
     images = page.parent / "images"
     images.mkdir(parents=True, exist_ok=True)
     for name, (_, png) in figures.items():
         write_atomically(images / f"{page.stem}-{name}.png", png)
     write_atomically(page.with_suffix(".json"), json.dumps(summary, allow_nan=False) + "\n")
-    write_atomically(page, results_page(summary, figures, f"images/{page.stem}-"))
+    tables = page.with_suffix(".txt")
+    write_atomically(tables, results_tables(summary))
+    write_atomically(page, results_page(summary, figures, f"images/{page.stem}-", tables.name))
