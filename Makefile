@@ -31,7 +31,7 @@ compare: $(INSTALLED) ## agents with and without a shield, compared (OUT=runs/co
 
 # The pages of results: runs that runs/study has already are kept, so that it can be done in parts. STUDY: more options of ncs study.
 study: $(INSTALLED) ## the whole study, and the pages of results
-	$(BIN)/ncs study --page docs/results.md --quote README.md docs/when_not.md $(STUDY)
+	$(BIN)/ncs study --page docs/results.md --quote README.md docs/index.md docs/when_not.md $(STUDY)
 
 test: $(INSTALLED) ## the tests
 	$(BIN)/python -m pytest -n auto --dist worksteal $(TEST_FLAGS)

@@ -20,7 +20,7 @@ def stored():
     return json.loads(STORED.read_text())
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/when_not.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/index.md", "docs/when_not.md"])
 def test_quoted_tables_are_those_of_the_stored_study(page, stored):
     text = (ROOT / page).read_text()
     assert quoted(text, tables_by_name(stored)) == text
