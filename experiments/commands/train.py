@@ -18,7 +18,7 @@ from experiments.runs import (
     run_of_arm,
     write_results,
 )
-from experiments.settings import BackendSettings, TrainSettings
+from experiments.settings import TrainSettings
 from experiments.terminal import wrapped
 
 # Budget of `--smoke`.
@@ -37,7 +37,7 @@ def train(settings: TrainSettings) -> None:
         print(wrapped(settings.agent_line), flush=True)
         settings = settings.completed
         run = run_of_arm(settings, loop, certificate, settings.arm, 0)
-        results = results_of([run], settings.out, BackendSettings(jobs=1))
+        results = results_of([run], settings.out, settings)
         mode = Arm.of(settings.arm, settings.mode).mode
         arms = {settings.arm: arm_summary(episodes_table(results), mode, fixed_policy=True)}
         certificate.save(settings.out / "certificate.json")
