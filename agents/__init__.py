@@ -46,11 +46,11 @@ __all__ = [
 
 _MODULES = {
     "agent": ("Agent",),
+    "algorithms": ("AppliedActionBuffer",),
     "callbacks": ("DualAscentCallback", "EvaluationCallback", "SafetyCallback"),
     "loop": ("LagrangianSettings", "LoopConfig", "ShieldSettings"),
     "evaluation": ("evaluate",),
     "hyperparams": ("read_hyperparams", "tuned_hyperparams", "tuned_steps"),
-    "replay": ("AppliedActionBuffer",),
     "results": ("Episode", "Evaluation", "TrainingPoint", "Trajectory"),
     "sb3_vec_env": ("SB3VecEnv",),
     "sharing.agent_file": ("AgentError",),
