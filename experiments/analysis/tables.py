@@ -114,11 +114,7 @@ def decimals_of(*numbers: float) -> int:
 
 
 def sweep_table(cells: list[dict[str, Any]]) -> str:
-    """Returns a row per point of the grid and arm, below a line that says what all points have in common.
-
-    Args:
-        cells: The points with the summaries of their arms, as in summary.json.
-    """
+    """Returns a row per point of the grid and arm, below a line that says what all points have in common."""
     swept = [side for side in _SIDES if len({cell[side] for cell in cells}) > 1]
     fixed = [side for side in _SIDES if side not in swept and (side != "downlink_loss" or cells[0][side] is not None)]
     common = ", ".join(f"{_name(side)} {_side_text(side, cells[0][side])}" for side in fixed)

@@ -91,10 +91,6 @@ class MonteCarloBatch:
     def execute(self, on_progress: Callable[[int], None], log_folder: Path | None = None) -> SafetyCounts:
         """Returns the counts, the same in any process and after any other batch.
 
-        Args:
-            on_progress: Called with the number of steps taken since its last call.
-            log_folder: Not used.
-
         Raises:
             CertificateError: If the certificate does not verify for the case's plant.
         """

@@ -33,9 +33,6 @@ _SOURCE_FOLDER = Path(__file__).resolve().parents[2]
 def joined_cluster(settings: BackendSettings) -> Iterator[RayCluster]:
     """Yields a cluster, an `execution.Executor`.
 
-    Args:
-        settings: Address of the cluster and resources of a run.
-
     Raises:
         ClusterError: If the cluster cannot be reached, is too small, or has other versions.
     """

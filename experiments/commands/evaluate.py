@@ -69,10 +69,6 @@ def evaluate(settings: EvaluateSettings) -> None:
 def _agent(folder: Path, env_id: str | None) -> Agent:
     """Returns the agent in a folder.
 
-    Args:
-        folder: The agent's folder, or a zip of stable-baselines3.
-        env_id: Id that the user gave, which may name a module to import; None for the agent's own.
-
     Raises:
         AgentError: If the agent's files are missing or damaged.
         ValueError: If the environment is unknown, or not the one that the agent was trained in.

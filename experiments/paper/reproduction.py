@@ -46,33 +46,6 @@ class StateFeedback:
     epsilon: float | None
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What the simulation of a design showed.
-
-    Attributes:
-        steps: Number of simulated steps of all initial states.
-        outside_set: Number of steps with the true state outside the safe set.
-        outside_box: Number of steps with the true state outside the safe box.
-        input_asked_beyond: Number of steps with |K x_hat| beyond the input limit (the plant applied the limit).
-        largest_level: Largest x'Mx.
-        largest_error: Largest e'e, e = B K e_up.
-        largest_estimation_error: Largest e_up'e_up.
-        largest_input: Largest |K x_hat|.
-        epsilon: The bound on e'e that the design claims; None if it claims none.
-    """
-
-    steps: int
-    outside_set: int
-    outside_box: int
-    input_asked_beyond: int
-    largest_level: float
-    largest_error: float
-    largest_estimation_error: float
-    largest_input: float
-    epsilon: float | None
-
-
 @dataclass(frozen=True, eq=False)
 class Simulation:
     """Simulated trajectories of a design.
@@ -90,23 +63,23 @@ class Simulation:
     errors: np.ndarray
 
     @property
-    def outcome(self) -> Outcome:
-        """Counts and largest values of the simulation."""
+    def outcome(self) -> dict[str, float | None]:
+        """Counts of steps and largest values, by name; e = B K e_up, and `epsilon` is the design's own claim."""
         design = self.design
         levels = np.einsum("ski,ij,skj->sk", self.states, np.linalg.inv(design.L), self.states)
         boxes = np.abs(self.states @ design.plant.box_rows.T).max(axis=2)
         gain = design.plant.B @ design.K
-        return Outcome(
-            steps=self.inputs.size,
-            outside_set=int((levels[:, 1:] > 1.0).sum()),
-            outside_box=int((boxes[:, 1:] > 1.0).sum()),
-            input_asked_beyond=int((np.abs(self.inputs) > design.plant.u_max[0]).sum()),
-            largest_level=float(levels.max()),
-            largest_error=float(np.square(self.errors @ gain.T).sum(axis=2).max()),
-            largest_estimation_error=float(np.square(self.errors).sum(axis=2).max()),
-            largest_input=float(np.abs(self.inputs).max()),
-            epsilon=design.epsilon,
-        )
+        return {
+            "steps": self.inputs.size,
+            "outside_set": int((levels[:, 1:] > 1.0).sum()),
+            "outside_box": int((boxes[:, 1:] > 1.0).sum()),
+            "input_asked_beyond": int((np.abs(self.inputs) > design.plant.u_max[0]).sum()),
+            "largest_level": float(levels.max()),
+            "largest_error": float(np.square(self.errors @ gain.T).sum(axis=2).max()),
+            "largest_estimation_error": float(np.square(self.errors).sum(axis=2).max()),
+            "largest_input": float(np.abs(self.inputs).max()),
+            "epsilon": design.epsilon,
+        }
 
 
 def designs() -> list[StateFeedback]:

@@ -52,14 +52,7 @@ _FLAT = 1e-9
 def comparison_figures(
     plant: LinearPlant, certificate: Certificate, summary: dict[str, Any], results: ResultsByArm
 ) -> dict[str, tuple[str, bytes]]:
-    """Returns caption and PNG file of every figure by name, what the findings are about first.
-
-    Args:
-        plant: Plant of the environment.
-        certificate: Certificate of the safe set.
-        summary: Content of summary.json; its arms are shown in its order.
-        results: Results of the runs of every arm.
-    """
+    """Returns caption and PNG file of every figure by name, what the findings are about first."""
     arms = {name: results[name] for name in summary["arms"]}
     trained = {name: runs for name, runs in arms.items() if runs[0].history}
     figures = {"scatter": scatter_figure(summary["arms"])}

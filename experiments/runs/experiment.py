@@ -69,14 +69,6 @@ def run_of_arm(
 ) -> TrainingRun:
     """Returns one training run of an arm, or the run of an arm in which nothing is trained.
 
-    Args:
-        settings: Settings of the command.
-        loop: The bare control loop.
-        certificate: Certificate for its plant.
-        arm_name: Name of the arm.
-        index: Number of the run within its arm.
-        grid_point: Name of the point of a sweep's grid.
-
     Raises:
         ValueError: If the arm or a scenario is unknown.
     """

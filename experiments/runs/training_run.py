@@ -136,13 +136,7 @@ class TrainingRun:
         return -(-self.steps // rollout) * rollout + evaluation
 
     def execute(self, on_progress: Callable[[int], None], log_folder: Path | None = None) -> RunResult:
-        """Returns the result; only TensorBoard's events are written.
-
-        Args:
-            on_progress: Called with the number of training and evaluation steps taken since its last call.
-            log_folder: Folder of TensorBoard's events, those of each run in a folder of its name; earlier ones of this
-                run are removed.
-        """
+        """Returns the result; only TensorBoard's events are written."""
         if self.module:
             import_module(self.module)
         trained = None

@@ -46,10 +46,6 @@ def beside_those_of_file(settings: Any, of_file: Any) -> Any:
     """Returns a command's settings in which the assignments of a settings file hold where none are given.
 
     Hyperparameters of the file are for its algorithm alone, and give way to a file of hyperparameters.
-
-    Args:
-        settings: Settings of the command line; those of the file are their defaults.
-        of_file: Settings of the file.
     """
     merged = {
         name: with_changes(getattr(of_file, name), getattr(settings, name))

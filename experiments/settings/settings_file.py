@@ -48,11 +48,6 @@ def save_settings(path: Path, command: str, settings: Any) -> None:
 def config_defaults(arguments: list[str], command: str, kind: type) -> tuple[Any, list[str]]:
     """Returns the settings in the file given by `--config`, or None, and the other arguments.
 
-    Args:
-        arguments: Arguments of the command.
-        command: Name of the command.
-        kind: Dataclass of the command's settings; fields that the file does not give have their defaults.
-
     Raises:
         SettingsError: If the flag is given more than once or without a file, or the file is missing, damaged or another
             command's, or holds a wrong value.
@@ -71,14 +66,7 @@ def config_defaults(arguments: list[str], command: str, kind: type) -> tuple[Any
 
 
 def _load(path: Path, command: str, kind: type, names_folder: bool) -> Any:
-    """Returns the settings in a file; raises SettingsError as `config_defaults` says.
-
-    Args:
-        path: The file.
-        command: Name of the command.
-        kind: Dataclass of the command's settings.
-        names_folder: Whether the user names the output folder; otherwise it is that of the file.
-    """
+    """Returns the settings in a file; raises SettingsError as `config_defaults` says."""
     try:
         document = json.loads(path.read_bytes())
     except OSError as error:

@@ -116,12 +116,7 @@ _MARKED = re.compile(r"(<!-- ncs study: (\S+) -->\n).*?(<!-- end -->)", re.DOTAL
 
 
 def study_report(summary: dict[str, Any], figures: dict[str, tuple[str, bytes]]) -> str:
-    """Returns the HTML page; opens offline, but for its links to the comparisons beside it.
-
-    Args:
-        summary: What `study_summary` returns, with the sweep of channels, settings and versions.
-        figures: Caption and PNG file by name.
-    """
+    """Returns the HTML page; opens offline, but for its links to the comparisons beside it."""
     return render_page("study.html.j2", figures, title="Safe learning: the study", **_context(summary))
 
 
@@ -155,10 +150,6 @@ def quoted(page: str, tables: Mapping[str, str]) -> str:
     """Returns a page with the tables between its marks replaced.
 
     A mark is `<!-- ncs study: NAME -->` on a line of its own, and `<!-- end -->` after the table.
-
-    Args:
-        page: Text of the page.
-        tables: What `tables_by_name` returns.
 
     Raises:
         ValueError: If the page has no mark, or one of a table that there is not.

@@ -23,11 +23,7 @@ _SCENARIOS = {
 
 
 def evaluation_table(env: dict[str, Any]) -> str:
-    """Returns violating episodes [%] in every scenario, the interval of the attacked ones, overridden steps, returns.
-
-    Args:
-        env: An environment of `study_summary`.
-    """
+    """Returns violating episodes [%] in every scenario, the interval under attack, overridden steps and returns."""
     known = next(iter(env["arms"].values()))["scenarios"]
     scenarios = [name for name in _SCENARIOS if name in known]
     interval_of = ATTACKED if ATTACKED in known else AS_TRAINED
@@ -129,11 +125,7 @@ def training_table(env: dict[str, Any]) -> str:
 
 
 def switches_table(rows: Sequence[dict[str, Any]]) -> str:
-    """Returns violating episodes under attack [%] with each impairment of the channel on or off.
-
-    Args:
-        rows: What `channel_switches` returns.
-    """
+    """Returns violating episodes under attack [%] with each impairment of the channel on or off."""
     arms = list(dict.fromkeys(row["arm"] for row in rows))
     points = list(dict.fromkeys(tuple(row["on"]) for row in rows))
     table = [["attacked, violating [%]", *arms]]
@@ -166,11 +158,7 @@ QUOTABLE: dict[str, Callable[[dict[str, Any]], str]] = {
 
 
 def tables_by_name(summary: dict[str, Any]) -> dict[str, str]:
-    """Returns the tables that pages quote: regulators (of the first environment), agents, comparisons, prices, ...
-
-    Args:
-        summary: What `study_summary` returns, with the switches of the channels.
-    """
+    """Returns the tables that pages quote: regulators (of the first environment), agents, comparisons, prices, ..."""
     return {name: table(summary) for name, table in QUOTABLE.items()}
 
 
