@@ -19,8 +19,7 @@ from tqdm import tqdm
 
 from experiments.backends.worker_init import initialize_worker
 from experiments.errors import RunError, RunStopped
-from experiments.runs import RunStore
-from experiments.runs.run_store import Run
+from experiments.runs.run_store import Run, RunStore
 from experiments.settings import BackendSettings
 from experiments.terminal import warnings_sent
 

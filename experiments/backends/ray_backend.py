@@ -19,7 +19,7 @@ from ray.exceptions import LocalRayletDiedError, RayTaskError  # pyright: ignore
 
 from experiments.backends.ray_cluster import portable_task, require_answer
 from experiments.errors import ClusterError, RunError
-from experiments.runs import versions
+from experiments.runs.provenance import versions
 from experiments.runs.run_store import Run
 from experiments.settings import BackendSettings
 from experiments.settings.learning import OWN_CLUSTER

@@ -19,8 +19,9 @@ from experiments.attack.safety_counts import (
     require_within,
 )
 from experiments.backends.execution import results_of
-from experiments.runs import claim_folder, versions
 from experiments.runs.experiment import INCIDENTAL_SETTINGS
+from experiments.runs.output_folder import claim_folder
+from experiments.runs.provenance import versions
 from experiments.settings import AttackSettings, settings_json
 from experiments.settings.certificates import FEWEST_ENVS
 from ncs_gym.network import downlink_protocol

@@ -12,9 +12,12 @@ from agents.loop import LoopConfig, ShieldSettings
 from experiments.analysis.episodes import arm_summary, episodes_table
 from experiments.analysis.tables import summary_text
 from experiments.commands import short_version
-from experiments.runs import RunResult, certificate_of, require_place, versions
+from experiments.runs.experiment import certificate_of
 from experiments.runs.loops import module_and_id, registered_env, with_channel
+from experiments.runs.output_folder import require_place
 from experiments.runs.policies import agent_folder, certificate_file
+from experiments.runs.provenance import versions
+from experiments.runs.training_run import RunResult
 from experiments.settings import EvaluateSettings
 from experiments.settings.arguments import require_horizon
 from ncs_gym.envs.env import ncs_env

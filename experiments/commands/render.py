@@ -10,8 +10,8 @@ from tqdm import tqdm
 
 from experiments.commands import require_extra, short_version
 from experiments.plots.animation import FORMATS, save_animation
-from experiments.runs import require_place
 from experiments.runs.loops import module_and_id, registered_env
+from experiments.runs.output_folder import require_place
 from experiments.runs.policies import UNTRAINED_POLICIES, policy_by_name
 from experiments.settings import RenderSettings
 from ncs_gym.envs.env import ncs_env

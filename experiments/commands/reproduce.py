@@ -7,7 +7,7 @@ import json
 from tqdm import tqdm
 
 from experiments.paper.reproduction import designs, reproduction_figures, simulate
-from experiments.runs import claim_folder, prepare_output
+from experiments.runs.output_folder import claim_folder, prepare_output
 from experiments.settings import ReproduceSettings
 from experiments.terminal import text_table
 from shields.atomic_write import write_atomically

@@ -15,17 +15,10 @@ from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.plots.heatmaps import sweep_figures
 from experiments.report.html import sweep_report
-from experiments.runs import (
-    Arm,
-    certificate_of,
-    claim_folder,
-    experiment_provenance,
-    loop_config,
-    prepare_output,
-    require_trainable,
-    run_of_arm,
-    write_results,
-)
+from experiments.runs.arms import Arm
+from experiments.runs.experiment import certificate_of, experiment_provenance, require_trainable, run_of_arm
+from experiments.runs.loops import loop_config
+from experiments.runs.output_folder import claim_folder, prepare_output, write_results
 from experiments.settings import SweepSettings
 from experiments.terminal import wrapped
 from ncs_gym.envs.env import ncs_env

@@ -6,18 +6,11 @@ from experiments.analysis.episodes import arm_summary, episodes_table
 from experiments.analysis.tables import summary_text
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
-from experiments.runs import (
-    Arm,
-    RunResult,
-    certificate_of,
-    claim_folder,
-    experiment_provenance,
-    loop_config,
-    prepare_output,
-    require_trainable,
-    run_of_arm,
-    write_results,
-)
+from experiments.runs.arms import Arm
+from experiments.runs.experiment import certificate_of, experiment_provenance, require_trainable, run_of_arm
+from experiments.runs.loops import loop_config
+from experiments.runs.output_folder import claim_folder, prepare_output, write_results
+from experiments.runs.training_run import RunResult
 from experiments.settings import TrainSettings
 from experiments.terminal import wrapped
 

@@ -88,7 +88,7 @@ def run_of_arm(
         episodes=settings.episodes,
         certificate=certificate,
         certificate_basis=origin if settings.certificate is None else "",
-        scenarios=other_scenarios(settings.evaluated_under),
+        scenarios=other_scenarios(getattr(settings, "scenarios", ())),
         algorithm=settings.algo,
         settings=settings.all_hyperparams,
         grid_point=grid_point,

@@ -114,11 +114,6 @@ class LearningSettings(BackendSettings):
     force: bool = False
 
     @property
-    def evaluated_under(self) -> tuple[str, ...]:
-        """Scenarios that policies are evaluated in, besides that of the training."""
-        return ()
-
-    @property
     def all_hyperparams(self) -> dict[str, Any]:
         """All hyperparameters of the algorithm: those given, those of the file, those tuned, the defaults.
 
@@ -223,11 +218,6 @@ class CompareSettings(LearningSettings):
     )
     scenarios: tuple[str, ...] = ("as trained",)
     noise: Literal["truncated", "gaussian"] = "truncated"
-
-    @property
-    def evaluated_under(self) -> tuple[str, ...]:
-        """Scenarios that policies are evaluated in, besides that of the training."""
-        return self.scenarios
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -86,7 +86,9 @@ def _load(path: Path, command: str, kind: type, names_folder: bool) -> Any:
                 "alone, and give --env module:id if you trust the module"
             )
     try:
-        settings = _read(values, kind)
+        for name in values.keys() & set(_OF_THE_CALL):
+            raise TypeError(f"{name} = {json.dumps(values[name])}")
+        settings = from_json(values, kind)
         if not names_folder and not _is_near(settings.out, path):
             raise ValueError(f"out = {shown(str(settings.out))} lies neither here nor beside the file: give --out")
         return settings
@@ -99,10 +101,3 @@ def _is_near(folder: Path, path: Path) -> bool:
     """Returns whether an output folder lies in the working folder, or is the one that the file of settings lies in."""
     place = folder.resolve()
     return place.is_relative_to(Path.cwd().resolve()) or place == path.parent.resolve()
-
-
-def _read(values: dict[str, Any], kind: type) -> Any:
-    """Returns the settings that a file gives; raises as `from_json` does, also if one is of the call alone."""
-    for name in values.keys() & set(_OF_THE_CALL):
-        raise TypeError(f"{name} = {json.dumps(values[name])}")
-    return from_json(values, kind)

@@ -11,8 +11,11 @@ from experiments.analysis.episodes import episodes_table
 from experiments.analysis.statistics import clopper_pearson
 from experiments.backends.execution import results_of
 from experiments.errors import ResultsError
-from experiments.runs import Arm, RunStore, TrainingRun, certificate_of, loop_config, run_of_arm
-from experiments.runs.loops import registered_env
+from experiments.runs.arms import Arm
+from experiments.runs.experiment import certificate_of, run_of_arm
+from experiments.runs.loops import loop_config, registered_env
+from experiments.runs.run_store import RunStore
+from experiments.runs.training_run import TrainingRun
 from experiments.settings import Assignments, CompareSettings
 from experiments.study.summary import ATTACKED
 from ncs_gym import Channel, ChannelContract

@@ -16,8 +16,9 @@ from experiments.analysis.episodes import parquet
 from experiments.commands import short_version
 from experiments.commands.compare import compare
 from experiments.report.html import render_page
-from experiments.runs import claim_folder, prepare_output, versions, write_results
 from experiments.runs.experiment import INCIDENTAL_SETTINGS
+from experiments.runs.output_folder import claim_folder, prepare_output, write_results
+from experiments.runs.provenance import versions
 from experiments.settings import BackendSettings, CompareSettings, StudySettings, settings_json
 from experiments.settings.learning import short_name
 from experiments.study.channel_switches import channel_switches, trained_agents
