@@ -9,6 +9,8 @@ first asked for.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from ncs_gym.installation import require_own_packages
+
 if TYPE_CHECKING:
     from agents.agent import Agent
     from agents.algorithms import AppliedActionBuffer
@@ -20,6 +22,8 @@ if TYPE_CHECKING:
     from agents.sb3_vec_env import SB3VecEnv
     from agents.sharing.agent_file import AgentError
     from agents.training import TrainingResult, train
+
+__distribution__ = "ncs-gym"
 
 __all__ = [
     "Agent",
@@ -63,4 +67,5 @@ def __getattr__(name: str) -> Any:
     """Imports the module of a public name when the name is first asked for."""
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    require_own_packages("shields")
     return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)

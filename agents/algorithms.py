@@ -11,7 +11,6 @@ from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
 import numpy as np
-import torch
 from gymnasium.spaces import flatdim
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -20,6 +19,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from agents.hyperparams import ALGORITHMS, ON_POLICY, rollout_steps
+from ncs_gym.installation import install_command
 from ncs_gym.validation import shown
 
 # Arguments of the library that are no hyperparameters: they are given here.
@@ -37,7 +37,7 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
     if importlib.util.find_spec(package) is None:
         extra = "contrib" if package == "sb3_contrib" else "train"
         distribution = package.replace("_", "-")
-        raise ModuleNotFoundError(f"{name} needs {distribution}: in a clone of ncs-gym, pip install -e '.[{extra}]'")
+        raise ModuleNotFoundError(f"{name} needs {distribution}: {install_command(extra)}")
     return getattr(importlib.import_module(package), name)
 
 
@@ -72,7 +72,6 @@ def build_model(name: str, env: VecEnv, hyperparams: Mapping[str, Any], seed: in
         ModuleNotFoundError: If the algorithm's package is not installed.
     """
     cls = algorithm_class(name)
-    torch.set_num_threads(1)  # more threads only pay off at batches of 16384 and make results depend on their number
     try:
         return cls(env=env, seed=seed, device="cpu", **_arguments(name, cls, env, hyperparams, steps))
     except Exception as error:  # the library checks by many kinds of errors

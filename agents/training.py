@@ -60,6 +60,8 @@ def train(
 ) -> TrainingResult:
     """Returns a trained agent and what happened on the way; the same seed gives the same result on one machine.
 
+    torch has one thread once `agents.SB3VecEnv` is imported; `torch.set_num_threads` changes both that and results.
+
     Args:
         loop: The control loop the agent is trained in.
         steps: Environment steps to train for, rounded up to whole rollouts.

@@ -10,6 +10,8 @@ import importlib.util
 from dataclasses import replace
 from typing import Any
 
+from ncs_gym.installation import install_command
+
 
 def require_extra(extra: str, *packages: str) -> None:
     """Returns if all packages of an optional dependency are installed.
@@ -19,9 +21,7 @@ def require_extra(extra: str, *packages: str) -> None:
     """
     missing = [name for name in packages if importlib.util.find_spec(name) is None]
     if missing:
-        raise ModuleNotFoundError(
-            f"this command needs {', '.join(missing)}: in a clone of ncs-gym, pip install -e '.[{extra}]'"
-        )
+        raise ModuleNotFoundError(f"this command needs {', '.join(missing)}: {install_command(extra)}")
 
 
 def short_version(settings: Any, **budget: Any) -> Any:

@@ -273,11 +273,13 @@ class EvaluateSettings:
 # Environments in which the network decides.
 NETWORK_ENVS = ("ncs_gym/CSTR-v0", "ncs_gym/Convoy-v0", "ncs_gym/LaneKeeping-v0")
 # What the shield is compared with and needs no training, margins in percent: a regulator alone, with a governor of its
-# references, and behind every filter. The weights of each are tuned by themselves (benchmarks/tune_baselines.py).
+# references, or behind a filter, and model predictive control. The weights of each are tuned by themselves
+# (benchmarks/tune_baselines.py).
 _MARGINS = ("", *(f":{margin}" for margin in MARGINS))
 REGULATED_ARMS = (
     "lqr",
     *(f"governor{margin}" for margin in _MARGINS),
+    *(f"mpc{margin}" for margin in ("", ":20", ":40")),
     *(f"lqr+{name}{margin}" for name in ("psf", "trusting", "trusting:lookahead") for margin in _MARGINS),
     "lqr+psf:tube",
     "lqr+shielded",

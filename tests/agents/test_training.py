@@ -142,7 +142,7 @@ def test_missing_package_is_one_sentence(monkeypatch):
     import importlib.util
 
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ModuleNotFoundError, match=r"TQC needs sb3-contrib: in a clone .* '\.\[contrib\]'$"):
+    with pytest.raises(ModuleNotFoundError, match=r"TQC needs sb3-contrib: in .*, pip install -e '\.\[contrib\]'$"):
         train(CRUISE, 64, 0, "TQC", TINY_REPLAY)
 
 
