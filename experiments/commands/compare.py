@@ -83,11 +83,7 @@ def compare(settings: CompareSettings) -> None:
 
 
 def _with_full_names(settings: CompareSettings) -> CompareSettings:
-    """Returns the settings with the full names of arms, each of which is listed once.
-
-    Raises:
-        ValueError: If an arm is unknown or is given twice, or there is none.
-    """
+    """Returns the settings with the full names of arms, each of which is listed once."""
     arms, baselines = (
         tuple(Arm.of(name, settings.mode).name for name in names) for names in (settings.arms, settings.baselines)
     )

@@ -70,12 +70,7 @@ def evaluate(settings: EvaluateSettings) -> None:
 
 
 def _agent(folder: Path, env_id: str | None) -> Agent:
-    """Returns the agent in a folder.
-
-    Raises:
-        AgentError: If the agent's files are missing or damaged.
-        ValueError: If the environment is unknown, or not the one that the agent was trained in.
-    """
+    """Returns the agent in a folder."""
     from agents.agent import (
         Agent,  # imports torch
         is_sb3_zip,
@@ -97,11 +92,7 @@ def _agent(folder: Path, env_id: str | None) -> Agent:
 
 
 def _mode(settings: EvaluateSettings, agent: Agent) -> str | None:
-    """Returns the mode of the shield, None for no shield; by default that of the agent's training.
-
-    Raises:
-        ValueError: If a horizon is given and the shield plans nothing.
-    """
+    """Returns the mode of the shield, None for no shield; by default that of the agent's training."""
     chosen = agent.shield_mode if settings.shield == "as-trained" else settings.shield
     mode = None if chosen == "none" else chosen
     require_horizon(settings.horizon, mode)

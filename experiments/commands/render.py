@@ -116,12 +116,7 @@ def _side_by_side(frames: list[np.ndarray]) -> np.ndarray:
 
 
 def _check(settings: RenderSettings) -> None:
-    """Checks the settings.
-
-    Raises:
-        ValueError: If a setting is wrong.
-        OSError: If the file cannot be written.
-    """
+    """Checks the settings."""
     registered_env(settings.env)
     if settings.out.suffix not in FORMATS:
         raise ValueError(f"--out must end in one of {', '.join(FORMATS)}, got {settings.out}")
