@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.sharing.agent_file import AgentError
+from agents.agent_file import AgentError
 from ncs_gym import NCSEnv, SetpointTracking, SpeedTracking
 
 UNTRAINED_POLICIES = ("greedy", "zero", "random")

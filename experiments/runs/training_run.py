@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
+from agents.agent_file import AGENT_FILES, write_files
 from agents.evaluation import Policy, evaluate
 from agents.hyperparams import rollout_steps
 from agents.loop import LoopConfig
 from agents.results import Episode, TrainingPoint, Trajectory
-from agents.sharing.agent_file import AGENT_FILES, write_files
 from experiments.baselines import controller, tuned_weights
 from experiments.runs.loops import AS_TRAINED, import_module, module_digest, under
 from experiments.runs.provenance import versions

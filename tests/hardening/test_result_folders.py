@@ -9,8 +9,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from agents.agent_file import AgentError
 from agents.loop import LoopConfig, ShieldSettings
-from agents.sharing.agent_file import AgentError
 from experiments.analysis.episodes import arm_summary, episodes_table, parquet, training_table
 from experiments.analysis.tables import summary_text
 from experiments.attack.monte_carlo_batch import MonteCarloBatch
