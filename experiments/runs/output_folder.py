@@ -41,7 +41,7 @@ _LOCK = ".lock"
 # What the operating system says where there are no locks.
 _NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
 # What stands for a finished experiment, and what is drawn and listed of it: patterns where names depend on settings.
-_TABLES = ("episodes.parquet", "training.parquet", "sweep.parquet", "study.parquet")
+_TABLES = ("episodes.parquet", "training.parquet")
 _FIGURES = ("scatter", "training", "episode", "phase", "violations", "return", "interventions", "states", "inputs")
 _MADE_OF_RESULTS = (
     "summary.json",

@@ -7,7 +7,6 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -90,12 +89,17 @@ def _comparison_settings(settings: StudySettings, env_id: str) -> CompareSetting
 
 
 def _write(settings: StudySettings, summary: dict[str, Any], episodes: pd.DataFrame) -> None:
+    """Writes every file: those of the study, and those that the documentation asks for."""
     figures = study_figures(summary)
-    if settings.page is not None:
-        _write_page(settings.page, summary, figures)
+    if (page := settings.page) is not None:
+        (page.parent / "images").mkdir(parents=True, exist_ok=True)
+        for name, (_, png) in figures.items():
+            write_atomically(page.parent / "images" / f"{page.stem}-{name}.png", png)
+        write_atomically(page.with_suffix(".json"), json.dumps(summary, allow_nan=False) + "\n")
+        write_atomically(page, results_page(summary, figures, f"images/{page.stem}-"))
     files = {
         "episodes.parquet": parquet(episodes, summary),
-        "report.html": study_report(summary, figures),
+        "report.html": render_page("study.html.j2", figures, title="Safe learning: the study", **_context(summary)),
         "results.md": results_page(summary, figures, "figures/"),
     }
     write_results(settings.out, summary, files, figures)
@@ -103,32 +107,12 @@ def _write(settings: StudySettings, summary: dict[str, Any], episodes: pd.DataFr
         write_atomically(path, quoted(path.read_text("utf-8"), tables_by_name(summary)))
 
 
-def _write_page(page: Path, summary: dict[str, Any], figures: dict[str, tuple[str, bytes]]) -> None:
-    images = page.parent / "images"
-    images.mkdir(parents=True, exist_ok=True)
-    for name, (_, png) in figures.items():
-        write_atomically(images / f"{page.stem}-{name}.png", png)
-    write_atomically(page.with_suffix(".json"), json.dumps(summary, allow_nan=False) + "\n")
-    write_atomically(page, results_page(summary, figures, f"images/{page.stem}-"))
-
-
 # A mark names a table; what stands between it and the end is replaced.
 _MARKED = re.compile(r"(<!-- ncs study: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
-def study_report(summary: dict[str, Any], figures: dict[str, tuple[str, bytes]]) -> str:
-    """Returns the HTML page; opens offline, but for its links to the comparisons beside it."""
-    return render_page("study.html.j2", figures, title="Safe learning: the study", **_context(summary))
-
-
 def results_page(summary: dict[str, Any], figures: dict[str, tuple[str, bytes]], prefix: str) -> str:
-    """Returns the Markdown page.
-
-    Args:
-        summary: As for `study_report`.
-        figures: As for `study_report`.
-        prefix: What stands before a figure's name in its link.
-    """
+    """Returns the Markdown page; links to figures are their names behind a prefix."""
     links = {name: f"{prefix}{name}.png" for name in figures}
     return render_page("results.md.j2", figures, links=links, **_context(summary))
 
