@@ -25,6 +25,7 @@ from experiments.study.figures import study_figures
 from experiments.study.summary import study_summary
 from experiments.study.tables import (
     QUOTABLE,
+    agents_of,
     budget_text,
     comparisons_table,
     evaluation_table,
@@ -96,11 +97,14 @@ def _write(settings: StudySettings, summary: dict[str, Any], episodes: pd.DataFr
         for name, (_, png) in figures.items():
             write_atomically(page.parent / "images" / f"{page.stem}-{name}.png", png)
         write_atomically(page.with_suffix(".json"), json.dumps(summary, allow_nan=False) + "\n")
-        write_atomically(page, results_page(summary, figures, f"images/{page.stem}-"))
+        tables = page.with_suffix(".txt")
+        write_atomically(tables, results_tables(summary))
+        write_atomically(page, results_page(summary, figures, f"images/{page.stem}-", tables.name))
     files = {
         "episodes.parquet": parquet(episodes, summary),
         "report.html": render_page("study.html.j2", figures, title="Safe learning: the study", **_context(summary)),
         "results.md": results_page(summary, figures, "figures/"),
+        "results.txt": results_tables(summary),
     }
     write_results(settings.out, summary, files, figures)
     for path in settings.quote:
@@ -111,10 +115,23 @@ def _write(settings: StudySettings, summary: dict[str, Any], episodes: pd.DataFr
 _MARKED = re.compile(r"(<!-- ncs study: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
-def results_page(summary: dict[str, Any], figures: dict[str, tuple[str, bytes]], prefix: str) -> str:
-    """Returns the Markdown page; links to figures are their names behind a prefix."""
+def results_page(
+    summary: dict[str, Any], figures: dict[str, tuple[str, bytes]], prefix: str, tables: str = "results.txt"
+) -> str:
+    """Returns the Markdown page; figures are linked by their names behind a prefix, `results_tables` by a file."""
     links = {name: f"{prefix}{name}.png" for name in figures}
-    return render_page("results.md.j2", figures, links=links, **_context(summary))
+    return render_page("results.md.j2", figures, links=links, tables=tables, **_context(summary))
+
+
+def results_tables(summary: dict[str, Any]) -> str:
+    """Returns all tables as plain text: every arm and every combination of impairments."""
+    known = _context(summary)
+    parts = [known["budget"], known["comparisons"], known["prices"], known["margins"]]
+    for name in summary["environments"]:
+        parts.append(f"{name}\n{known['evaluation'][name]}")
+        if name in known["channels"]:
+            parts.append(f"{name}\n{known['channels'][name]}")
+    return "\n\n\n".join([*parts, known["training"]]) + "\n"
 
 
 def _context(summary: dict[str, Any]) -> dict[str, Any]:
@@ -126,8 +143,10 @@ def _context(summary: dict[str, Any]) -> dict[str, Any]:
         "prices": prices_table(summary),
         "margins": margins_table(summary),
         "evaluation": {name: evaluation_table(env) for name, env in environments.items()},
-        "training": {name: training_table(env) for name, env in environments.items()},
+        "agents": {name: agents_of(env) for name, env in environments.items()},
+        "training": training_table(summary),
         "channels": {name: switches_table(rows) for name, rows in summary["channels"].items()},
+        "switches": {name: switches_table(rows, combined=False) for name, rows in summary["channels"].items()},
     }
 
 
