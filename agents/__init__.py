@@ -13,6 +13,7 @@ from ncs_gym.installation import require_own_packages
 
 if TYPE_CHECKING:
     from agents.agent import Agent
+    from agents.agent_file import AgentError
     from agents.algorithms import AppliedActionBuffer
     from agents.callbacks import DualAscentCallback, EvaluationCallback, SafetyCallback
     from agents.evaluation import evaluate
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from agents.loop import LagrangianSettings, LoopConfig, ShieldSettings
     from agents.results import Episode, Evaluation, TrainingPoint, Trajectory
     from agents.sb3_vec_env import SB3VecEnv
-    from agents.sharing.agent_file import AgentError
     from agents.training import TrainingResult, train
 
 __distribution__ = "ncs-gym"
@@ -57,7 +57,7 @@ _MODULES = {
     "hyperparams": ("read_hyperparams", "tuned_hyperparams", "tuned_steps"),
     "results": ("Episode", "Evaluation", "TrainingPoint", "Trajectory"),
     "sb3_vec_env": ("SB3VecEnv",),
-    "sharing.agent_file": ("AgentError",),
+    "agent_file": ("AgentError",),
     "training": ("TrainingResult", "train"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

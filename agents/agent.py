@@ -17,13 +17,12 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 
+from agents.agent_file import AGENT_FILES, AgentError, card_text, document_of, read_files, shield_from_json
 from agents.algorithms import algorithm_class, build_model
 from agents.hyperparams import ALGORITHMS, complete_hyperparams
 from agents.loop import LoopConfig, ShieldSettings, with_gain
 from agents.results import Evaluation
 from agents.sb3_vec_env import SB3VecEnv
-from agents.sharing.agent_file import AGENT_FILES, AgentError, document_of, read_files, shield_from_json
-from agents.sharing.model_card import card_text
 from ncs_gym import Channel, LinearPlant
 from shields.atomic_write import write_atomically
 

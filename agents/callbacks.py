@@ -130,31 +130,32 @@ class DualAscentCallback(BaseCallback):
         self.logger.record("safety/multiplier", self._priced.penalty)
 
 
-class CheckpointCallback(BaseCallback):
-    """Saves what is learned so far about ten times while an agent is trained, between rollouts.
+class RegularCallback(BaseCallback):
+    """Does something about ten times while an agent is trained, between rollouts.
 
     Args:
-        save: Saves it.
+        act: Does it.
+        at_start: Whether the first time is before anything is learned.
     """
 
-    def __init__(self, save: Callable[[], None]) -> None:
+    def __init__(self, act: Callable[[], None], *, at_start: bool = False) -> None:
         super().__init__()
-        self._save, self._due = save, 0.0
+        self._act, self._at_start = act, at_start
 
     def _on_training_start(self) -> None:
         self._interval = self.locals["total_timesteps"] / _EVALUATIONS
-        self._due = self._interval
+        self._due = 0.0 if self._at_start else self._interval
 
     def _on_rollout_start(self) -> None:
         if self.num_timesteps >= self._due:
-            self._save()
+            self._act()
             self._due = self.num_timesteps + self._interval
 
     def _on_step(self) -> bool:
         return True
 
 
-class EvaluationCallback(BaseCallback):
+class EvaluationCallback(RegularCallback):
     """Evaluates the policy about every tenth part of the training, and once more at its end, and logs the results.
 
     TensorBoard gets `eval/mean_reward` (mean return, without penalties), `eval/success_rate` (episodes without a
@@ -169,26 +170,14 @@ class EvaluationCallback(BaseCallback):
     """
 
     def __init__(self, loop: LoopConfig, seed: int, episodes: int = 20) -> None:
-        super().__init__()
+        super().__init__(self._evaluate, at_start=True)
         self._loop, self._seed, self._episodes = loop, seed, episodes
-        self._due = 0
-
-    def _on_training_start(self) -> None:
-        self._interval = self.locals["total_timesteps"] / _EVALUATIONS
-
-    def _on_rollout_start(self) -> None:
-        if self.num_timesteps >= self._due:
-            self._evaluate()
-            self._due = self.num_timesteps + self._interval
-
-    def _on_step(self) -> bool:
-        return True
 
     def _on_training_end(self) -> None:
         self._evaluate()
 
     def _evaluate(self) -> None:
-        episodes = evaluate(self._loop, lambda seen, _: self._act(seen), self._episodes, self._seed).episodes
+        episodes = evaluate(self._loop, lambda seen, _: self._actions(seen), self._episodes, self._seed).episodes
         steps = sum(episode.steps for episode in episodes)
         safe = [episode.violation_steps == 0 for episode in episodes]
         self.logger.record("eval/mean_reward", float(np.mean([episode.episode_return for episode in episodes])))
@@ -196,7 +185,7 @@ class EvaluationCallback(BaseCallback):
         self.logger.record("eval/intervention_rate", sum(episode.interventions for episode in episodes) / steps)
         self.logger.dump(self.num_timesteps)
 
-    def _act(self, observations: np.ndarray) -> np.ndarray:
+    def _actions(self, observations: np.ndarray) -> np.ndarray:
         """Returns deterministic actions, shape (N, m), for raw observations, shape (N, entries)."""
         env, gain, seen = self.model.get_env(), self._loop.residual_gain, observations
         if isinstance(env, VecNormalize):

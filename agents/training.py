@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.agent import Agent, Normalization
 from agents.algorithms import APPLIED, build_model, normalized_env
-from agents.callbacks import CheckpointCallback, DualAscentCallback, EvaluationCallback, SafetyCallback
+from agents.callbacks import DualAscentCallback, EvaluationCallback, RegularCallback, SafetyCallback
 from agents.hyperparams import ON_POLICY, complete_hyperparams
 from agents.loop import CostPenalty, LoopConfig
 from agents.results import TrainingPoint
@@ -96,7 +96,7 @@ def train(
         _go_on(start, loop, algorithm, model, env)
     current = partial(_agent, loop, algorithm, hyperparams, model, env)
     if checkpoints is not None:
-        beside.append(CheckpointCallback(lambda: current().save(checkpoints, loop.shield)))
+        beside.append(RegularCallback(lambda: current().save(checkpoints, loop.shield)))
     try:
         model.learn(steps, callback=[*beside, *callbacks])
     except KeyboardInterrupt:

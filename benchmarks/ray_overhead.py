@@ -23,7 +23,8 @@ import gymnasium as gym
 from agents.loop import LoopConfig, ShieldSettings
 from experiments.backends import ray_backend
 from experiments.backends.execution import execute
-from experiments.runs import RunStore, TrainingRun
+from experiments.runs.run_store import RunStore
+from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings, SweepSettings
 from ncs_gym.envs.env import ncs_env
 from shields import synthesize

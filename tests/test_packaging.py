@@ -47,7 +47,7 @@ LAYERS = {
     "agents": (
         {"hyperparams", "results", "sb3_vec_env"},
         {"loop"},
-        {"algorithms", "callbacks", "evaluation", "sharing"},
+        {"algorithms", "callbacks", "evaluation", "agent_file"},
         {"agent"},
         {"training"},
     ),

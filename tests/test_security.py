@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from agents.agent import Agent
+from agents.agent_file import AgentError
 from agents.loop import LoopConfig
-from agents.sharing.agent_file import AgentError
 from agents.training import untrained
 from experiments.__main__ import _parse
 from experiments.settings import CompareSettings, StudySettings, config_defaults, save_settings, settings_json

@@ -77,12 +77,7 @@ _AVERAGED = ["episode_return", "violating", "outside_set"]
 
 
 def arm_summaries(episodes: pd.DataFrame, mode: str) -> dict[str, dict[str, Any]]:
-    """Returns what `arm_summary` says of every arm, by its name and in the order of the rows.
-
-    Args:
-        episodes: What `episodes_table` returns.
-        mode: Mode of the shield of arms that name none.
-    """
+    """Returns what `arm_summary` says of every arm, by its name and in the order of the rows."""
     arms = {str(name): (Arm.of(str(name), mode), rows) for name, rows in episodes.groupby("arm", sort=False)}
     return {
         name: arm_summary(rows, arm.mode, fixed_policy=arm.policy not in ("trained", "untrained"))
@@ -164,10 +159,6 @@ def paired_differences(episodes: pd.DataFrame, baseline: str) -> dict[str, Any]:
 
     They are the differences of the mean returns, with Student's and the bootstrap's interval over the runs, and of the
     numbers of violating episodes.
-
-    Args:
-        episodes: Rows of the arms in what `episodes_table` returns.
-        baseline: Name of the arm that is subtracted.
     """
     as_trained = episodes[episodes["condition"] == AS_TRAINED]
     runs = as_trained.groupby(["run", "arm"]).agg(mean=("episode_return", "mean"), violating=("violating", "sum"))

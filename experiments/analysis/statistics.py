@@ -108,13 +108,7 @@ def rounded_up(bound: float) -> str:
 
 
 def gaussian_summary(bound: float, steps: int, arms: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
-    """Returns JSON values: the bound for an episode, and what the evaluation episodes of each shielded arm did.
-
-    Args:
-        bound: `ncs_gym.escape_probability` of an episode.
-        steps: Number of steps of an episode.
-        arms: What `arm_summary` returns of each arm whose claim is the safe set, in which its episodes start.
-    """
+    """Returns JSON values: the bound for an episode, and what the evaluation episodes of each shielded arm did."""
     counts = {name: (arm["eval_episodes"], arm["eval_episodes_outside_set"]) for name, arm in arms.items()}
     return {
         "escape_probability": bound,

@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from math import floor, log10
 from typing import Any
 
 from experiments.terminal import text_table
 
-_HEADERS = (
-    ("", "training:", "", "evaluation:", "", "", "", ""),
-    ("", "violating", "over-", "violating", "violating", "left", "over-", "return"),
-    ("", "steps", "ridden", "episodes", "steps", "S", "ridden", "[95 % CI]"),
-)
-# Number of columns after the first that are about the training.
-_TRAINING_COLUMNS = 2
 _MOST_DECIMALS = 4
 # Two lines of the header of what a point of a sweep fixes, by its key.
 _SIDES = {
@@ -34,7 +27,10 @@ _OUTCOMES = (
 )
 
 
-def summary_text(arms: dict[str, dict[str, Any]], baselines: dict[str, dict[str, Any]]) -> str:
+_Arms = dict[str, dict[str, Any]]
+
+
+def summary_text(arms: _Arms, baselines: _Arms) -> str:
     """Returns the table for a terminal; baselines stand below a rule.
 
     Violating episodes have their exact interval, the return has Student's (`experiments.analysis.episodes`). "Left S"
@@ -42,67 +38,65 @@ def summary_text(arms: dict[str, dict[str, Any]], baselines: dict[str, dict[str,
     decision the shield of mode "lookahead" had inputs of a certified plan in store. The columns about the training are
     left out where nothing was trained.
     """
-    rows = _rows(arms | baselines)
-    if not any(arm["train_steps"] for arm in (arms | baselines).values()):
-        rows = _without_training(rows)
-    return text_table(rows, rules=(len(_HEADERS), len(_HEADERS) + len(arms)))
+    trained = any(arm["train_steps"] for arm in (arms | baselines).values())
+    return _text(arms | baselines, len(arms), [*(_TRAINING if trained else []), *_EVALUATION])
 
 
-def scenario_text(scenario: str, arms: dict[str, dict[str, Any]], baselines: dict[str, dict[str, Any]]) -> str:
+def scenario_text(scenario: str, arms: _Arms, baselines: _Arms) -> str:
     """Returns the table of the evaluation in a scenario, with its name in the corner."""
-    rows = _rows({name: arm | arm["conditions"][scenario] for name, arm in (arms | baselines).items()})
-    rows = _without_training(rows)
-    rows[0] = [f"{scenario}:", *[""] * (len(rows[0]) - 1)]
-    return text_table(rows, rules=(len(_HEADERS), len(_HEADERS) + len(arms)))
+    played = {name: arm | arm["conditions"][scenario] for name, arm in (arms | baselines).items()}
+    return _text(played, len(arms), _EVALUATION, f"{scenario}:")
 
 
-def _without_training(rows: list[list[str]]) -> list[list[str]]:
-    return [[row[0], *row[1 + _TRAINING_COLUMNS :]] for row in rows]
+def _text(arms: _Arms, above: int, columns: list[_Column], corner: str = "") -> str:
+    """Returns a table, with a rule below so many arms, and a column of plans if an arm looks ahead."""
+    if any(arm["mode"] == "lookahead" for arm in arms.values()):
+        columns = [*columns[:-1], _PLANNED, columns[-1]]
+    titles = list(zip(*(header for header, _ in columns), strict=True))
+    first = ["" for _ in columns] if corner else titles[0]
+    rows = [[corner, *first], *(["", *line] for line in titles[1:])]
+    rows += [[name, *(show(arm) for _, show in columns)] for name, arm in arms.items()]
+    return text_table(rows, rules=(len(titles), len(titles) + above))
 
 
-def _with_plans(rows: list[list[str]], arms: Mapping[str, dict[str, Any]]) -> list[list[str]]:
-    """Returns the rows with a column of the steps that live from a plan before the last one, if an arm looks ahead."""
-    if not any(arm["mode"] == "lookahead" for arm in arms.values()):
-        return rows
-    shares = [f"{100 * arm['plan_rate']:.1f} %" if arm["mode"] == "lookahead" else "-" for arm in arms.values()]
-    cells = ["", "from a", "plan", *shares]
-    return [[*row[:-1], cell, row[-1]] for row, cell in zip(rows, cells, strict=True)]
-
-
-def _rows(arms: dict[str, dict[str, Any]]) -> list[list[str]]:
-    """Returns the header's rows, then one row of text per summary of an arm."""
-    return _with_plans([*map(list, _HEADERS), *([name, *_cells(arm)] for name, arm in arms.items())], arms)
-
-
-def _cells(arm: dict[str, Any]) -> list[str]:
-    low, high = arm["eval_violation_rate_ci95"]
-    trained = arm["train_steps"] > 0
-    return [
-        f"{arm['train_violation_steps']:,}" if trained else "-",
-        _overridden(arm, "train_intervention_rate") if trained else "-",
-        f"{arm['eval_violating_episodes']:,} [{100 * low:.1f}, {100 * high:.1f} %]",
-        f"{arm['eval_violation_steps']:,}",
-        f"{arm['eval_episodes_outside_set']:,}",
-        _overridden(arm, "intervention_rate"),
-        _return_text(arm),
-    ]
-
-
-def _overridden(arm: dict[str, Any], key: str) -> str:
+def _overridden(arm: dict[str, Any], key: str = "intervention_rate") -> str:
     """Returns a rate of interventions; in brackets what a monitor would have done."""
     text = f"{100 * arm[key]:.1f} %"
     return {"monitor": f"({text})", None: "-"}.get(arm["mode"], text)
 
 
+def _violating(arm: dict[str, Any]) -> str:
+    low, high = arm["eval_violation_rate_ci95"]
+    return f"{arm['eval_violating_episodes']:,} [{100 * low:.1f}, {100 * high:.1f} %]"
+
+
 def _return_text(arm: dict[str, Any]) -> str:
     """Returns mean and half-width of Student's interval, which is symmetric."""
-    interval = arm["eval_return_ci95"]
-    mean = arm["eval_return_mean"]
+    interval, mean = arm["eval_return_ci95"], arm["eval_return_mean"]
     if interval is None:
         return f"{mean:z.{decimals_of(mean)}f} [n/a]"
     half = 0.5 * (interval[1] - interval[0])
     decimals = decimals_of(mean, half)
     return f"{mean:z.{decimals}f} +-{half:.{decimals}f}"
+
+
+# Three lines of the header of a column, and its text of the summary of an arm.
+_Column = tuple[tuple[str, str, str], Callable[[dict[str, Any]], str]]
+_TRAINING: list[_Column] = [
+    (("training:", "violating", "steps"), lambda a: f"{a['train_violation_steps']:,}" if a["train_steps"] else "-"),
+    (("", "over-", "ridden"), lambda a: _overridden(a, "train_intervention_rate") if a["train_steps"] else "-"),
+]
+_EVALUATION: list[_Column] = [
+    (("evaluation:", "violating", "episodes"), _violating),
+    (("", "violating", "steps"), lambda arm: f"{arm['eval_violation_steps']:,}"),
+    (("", "left", "S"), lambda arm: f"{arm['eval_episodes_outside_set']:,}"),
+    (("", "over-", "ridden"), _overridden),
+    (("", "return", "[95 % CI]"), _return_text),
+]
+_PLANNED: _Column = (
+    ("", "from a", "plan"),
+    lambda arm: f"{100 * arm['plan_rate']:.1f} %" if arm["mode"] == "lookahead" else "-",
+)
 
 
 def decimals_of(*numbers: float) -> int:
@@ -114,11 +108,7 @@ def decimals_of(*numbers: float) -> int:
 
 
 def sweep_table(cells: list[dict[str, Any]]) -> str:
-    """Returns a row per point of the grid and arm, below a line that says what all points have in common.
-
-    Args:
-        cells: The points with the summaries of their arms, as in summary.json.
-    """
+    """Returns a row per point of the grid and arm, below a line that says what all points have in common."""
     swept = [side for side in _SIDES if len({cell[side] for cell in cells}) > 1]
     fixed = [side for side in _SIDES if side not in swept and (side != "downlink_loss" or cells[0][side] is not None)]
     common = ", ".join(f"{_name(side)} {_side_text(side, cells[0][side])}" for side in fixed)

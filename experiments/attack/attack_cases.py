@@ -86,11 +86,6 @@ class AttackCase:
 def attack_cases(seed: int, random_plants: int, env_id: str | None = None) -> dict[str, AttackCase]:
     """Returns the cases by name: registered environments, and all kinds of channels for some and random plants.
 
-    Args:
-        seed: Seed of the random plants.
-        random_plants: Number of random plants.
-        env_id: Id, or "module:id", of the only environment to attack; None for all of these.
-
     Raises:
         ValueError: If there is no environment of that id.
     """

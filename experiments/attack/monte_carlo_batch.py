@@ -91,10 +91,6 @@ class MonteCarloBatch:
     def execute(self, on_progress: Callable[[int], None], log_folder: Path | None = None) -> SafetyCounts:
         """Returns the counts, the same in any process and after any other batch.
 
-        Args:
-            on_progress: Called with the number of steps taken since its last call.
-            log_folder: Not used.
-
         Raises:
             CertificateError: If the certificate does not verify for the case's plant.
         """
@@ -192,11 +188,7 @@ def _begin(settings: AttackSettings, shield: VectorSafetyShield, seed: int, rng:
 
 @lru_cache(maxsize=1)  # a shield's tables may take a hundred megabytes
 def _shields(settings: AttackSettings, case: str, certificate: Certificate) -> dict[str, VectorSafetyShield]:
-    """Returns the shields of all kinds of batches, around the same environments where nature is the same.
-
-    Raises:
-        CertificateError: If the certificate does not verify for the case's plant.
-    """
+    """Returns the shields of all kinds of batches, around the same environments where nature is the same."""
     attacked = vars(cases_of(settings)[case])
     is_gaussian, kinds = settings.noise == "gaussian", kinds_of_batches(settings)
     env = (GaussianVectorEnv if is_gaussian else WorstCaseVectorEnv)(settings.envs, certificate, **attacked)

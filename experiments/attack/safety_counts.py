@@ -209,10 +209,6 @@ def require_within(counts: Mapping[str, SafetyCounts], limits: Mapping[str, floa
 def require_safe(total: SafetyCounts, *, looks_ahead: bool) -> None:
     """Returns if the shield kept what it claims in every step.
 
-    Args:
-        total: Counts of all cases.
-        looks_ahead: Whether the shield was that of mode "lookahead", which does not claim to stay in S.
-
     Raises:
         SafetyBroken: If it did not.
     """

@@ -19,8 +19,7 @@ from tqdm import tqdm
 
 from experiments.backends.worker_init import initialize_worker
 from experiments.errors import RunError, RunStopped
-from experiments.runs import RunStore
-from experiments.runs.run_store import Run
+from experiments.runs.run_store import Run, RunStore
 from experiments.settings import BackendSettings
 from experiments.terminal import warnings_sent
 
@@ -51,11 +50,6 @@ class Executor(Protocol):
 
 def results_of(runs: Sequence[Run], folder: Path, settings: BackendSettings) -> list[Any]:
     """Returns the results of all runs, in their order, without the agents' files; each is stored when it is finished.
-
-    Args:
-        runs: Runs with different names.
-        folder: Output folder with the results of finished runs.
-        settings: Where the other runs are executed.
 
     Raises:
         ResultsError: If a stored result is damaged.
@@ -95,11 +89,6 @@ def execute(
     runs: Sequence[Run], where: AbstractContextManager[Executor], on_result: Callable[[Any, Any], object]
 ) -> None:
     """Executes runs, with a progress bar on stderr.
-
-    Args:
-        runs: The runs, which begin in this order.
-        where: What executes them.
-        on_result: Called here with each run and its result when it is finished.
 
     Raises:
         RunError: If a run fails: the first failure stops the others, and what finished beside it is kept.
@@ -161,12 +150,7 @@ _REPORTED_STEPS = 1000
 
 @contextmanager
 def local_workers(workers: int, log_folder: Path | None = None) -> Iterator[LocalWorkers]:
-    """Yields worker processes, an `execution.Executor`.
-
-    Args:
-        workers: Largest number of worker processes.
-        log_folder: Folder of TensorBoard's events; None for none.
-    """
+    """Yields worker processes, an `execution.Executor`."""
     context = multiprocessing.get_context("spawn")
     manager = SyncManager(ctx=context)
     manager.start(initialize_worker)

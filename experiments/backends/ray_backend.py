@@ -19,7 +19,7 @@ from ray.exceptions import LocalRayletDiedError, RayTaskError  # pyright: ignore
 
 from experiments.backends.ray_cluster import portable_task, require_answer
 from experiments.errors import ClusterError, RunError
-from experiments.runs import versions
+from experiments.runs.provenance import versions
 from experiments.runs.run_store import Run
 from experiments.settings import BackendSettings
 from experiments.settings.learning import OWN_CLUSTER
@@ -32,9 +32,6 @@ _SOURCE_FOLDER = Path(__file__).resolve().parents[2]
 @contextmanager
 def joined_cluster(settings: BackendSettings) -> Iterator[RayCluster]:
     """Yields a cluster, an `execution.Executor`.
-
-    Args:
-        settings: Address of the cluster and resources of a run.
 
     Raises:
         ClusterError: If the cluster cannot be reached, is too small, or has other versions.

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from experiments.errors import ClusterError
-from experiments.runs import versions
+from experiments.runs.provenance import versions
 
 # Time that a machine has to accept a connection, and a cluster to be joined; Ray itself tries for minutes [s].
 CONNECT_TIMEOUT, JOIN_TIMEOUT = 10.0, 30.0

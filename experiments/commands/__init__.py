@@ -25,12 +25,7 @@ def require_extra(extra: str, *packages: str) -> None:
 
 
 def short_version(settings: Any, **budget: Any) -> Any:
-    """Returns the settings of a command's short version if `--smoke` is given, otherwise the same settings.
-
-    Args:
-        settings: Settings of a command, with the fields `smoke` and `out`.
-        **budget: Settings that the short version changes.
-    """
+    """Returns the settings of a command's short version if `--smoke` is given, otherwise the same settings."""
     if not settings.smoke:
         return settings
     default = type(settings).out

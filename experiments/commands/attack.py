@@ -19,8 +19,9 @@ from experiments.attack.safety_counts import (
     require_within,
 )
 from experiments.backends.execution import results_of
-from experiments.runs import claim_folder, versions
 from experiments.runs.experiment import INCIDENTAL_SETTINGS
+from experiments.runs.output_folder import claim_folder
+from experiments.runs.provenance import versions
 from experiments.settings import AttackSettings, settings_json
 from experiments.settings.certificates import FEWEST_ENVS
 from ncs_gym.network import downlink_protocol
@@ -72,11 +73,7 @@ def attack(settings: AttackSettings) -> None:
 
 
 def _require_claims(cases: dict[str, AttackCase]) -> None:
-    """Returns if something is claimed of every case.
-
-    Raises:
-        ValueError: If a downlink promises nothing, so that there is nothing to attack.
-    """
+    """Returns if something is claimed of every case."""
     for name, case in cases.items():
         protocol = downlink_protocol(case.downlink, case.downlink_contract)
         if protocol is not None and protocol.contract is None:

@@ -10,7 +10,7 @@ from dataclasses import asdict
 
 from experiments.paper.audit import Claim, Verdict, audited_claims, defects
 from experiments.paper.paper_example import PaperExample
-from experiments.runs import require_place
+from experiments.runs.output_folder import require_place
 from experiments.settings import AuditSettings
 from experiments.terminal import terminal_width, wrapped
 from shields.atomic_write import write_atomically

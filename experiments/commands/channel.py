@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.runs import require_place
 from experiments.runs.loops import registered_env
+from experiments.runs.output_folder import require_place
 from experiments.settings import ChannelSettings
 from experiments.terminal import text_table, wrapped
 from ncs_gym import PacketLog, contract_of

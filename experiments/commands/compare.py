@@ -24,20 +24,17 @@ from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.plots.comparison_figures import comparison_figures
 from experiments.report.html import comparison_report
-from experiments.runs import (
-    Arm,
-    TrainingRun,
-    by_arm,
+from experiments.runs.arms import Arm, by_arm
+from experiments.runs.experiment import (
+    certificate_line,
     certificate_of,
-    claim_folder,
     experiment_provenance,
-    loop_config,
-    prepare_output,
     require_trainable,
     run_of_arm,
-    write_results,
 )
-from experiments.runs.experiment import certificate_line
+from experiments.runs.loops import loop_config
+from experiments.runs.output_folder import claim_folder, prepare_output, write_results
+from experiments.runs.training_run import TrainingRun
 from experiments.settings import CompareSettings
 from experiments.terminal import wrapped
 from ncs_gym import bound_violation_probability
@@ -86,11 +83,7 @@ def compare(settings: CompareSettings) -> None:
 
 
 def _with_full_names(settings: CompareSettings) -> CompareSettings:
-    """Returns the settings with the full names of arms, each of which is listed once.
-
-    Raises:
-        ValueError: If an arm is unknown or is given twice, or there is none.
-    """
+    """Returns the settings with the full names of arms, each of which is listed once."""
     arms, baselines = (
         tuple(Arm.of(name, settings.mode).name for name in names) for names in (settings.arms, settings.baselines)
     )

@@ -12,9 +12,12 @@ from agents.loop import LoopConfig, ShieldSettings
 from experiments.analysis.episodes import arm_summary, episodes_table
 from experiments.analysis.tables import summary_text
 from experiments.commands import short_version
-from experiments.runs import RunResult, certificate_of, require_place, versions
+from experiments.runs.experiment import certificate_of
 from experiments.runs.loops import module_and_id, registered_env, with_channel
+from experiments.runs.output_folder import require_place
 from experiments.runs.policies import agent_folder, certificate_file
+from experiments.runs.provenance import versions
+from experiments.runs.training_run import RunResult
 from experiments.settings import EvaluateSettings
 from experiments.settings.arguments import require_horizon
 from ncs_gym.envs.env import ncs_env
@@ -67,16 +70,7 @@ def evaluate(settings: EvaluateSettings) -> None:
 
 
 def _agent(folder: Path, env_id: str | None) -> Agent:
-    """Returns the agent in a folder.
-
-    Args:
-        folder: The agent's folder, or a zip of stable-baselines3.
-        env_id: Id that the user gave, which may name a module to import; None for the agent's own.
-
-    Raises:
-        AgentError: If the agent's files are missing or damaged.
-        ValueError: If the environment is unknown, or not the one that the agent was trained in.
-    """
+    """Returns the agent in a folder."""
     from agents.agent import (
         Agent,  # imports torch
         is_sb3_zip,
@@ -98,11 +92,7 @@ def _agent(folder: Path, env_id: str | None) -> Agent:
 
 
 def _mode(settings: EvaluateSettings, agent: Agent) -> str | None:
-    """Returns the mode of the shield, None for no shield; by default that of the agent's training.
-
-    Raises:
-        ValueError: If a horizon is given and the shield plans nothing.
-    """
+    """Returns the mode of the shield, None for no shield; by default that of the agent's training."""
     chosen = agent.shield_mode if settings.shield == "as-trained" else settings.shield
     mode = None if chosen == "none" else chosen
     require_horizon(settings.horizon, mode)

@@ -11,8 +11,8 @@ from tqdm import tqdm
 from experiments.commands import require_extra, short_version
 from experiments.plots.animation import FORMATS, save_animation
 from experiments.plots.loop_log import loop_log_figure
-from experiments.runs import require_place
 from experiments.runs.loops import module_and_id, registered_env
+from experiments.runs.output_folder import require_place
 from experiments.runs.policies import UNTRAINED_POLICIES, policy_by_name
 from experiments.settings import RenderSettings
 from ncs_gym.envs.env import ncs_env
@@ -122,12 +122,7 @@ def _side_by_side(frames: list[np.ndarray]) -> np.ndarray:
 
 
 def _check(settings: RenderSettings) -> None:
-    """Checks the settings.
-
-    Raises:
-        ValueError: If a setting is wrong.
-        OSError: If the file cannot be written.
-    """
+    """Checks the settings."""
     registered_env(settings.env)
     if settings.out.suffix not in FORMATS:
         raise ValueError(f"--out must end in one of {', '.join(FORMATS)}, got {settings.out}")

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 
 from tqdm import tqdm
 
-from experiments.paper.reproduction import Outcome, designs, reproduction_figures, simulate
-from experiments.runs import claim_folder, prepare_output
+from experiments.paper.reproduction import designs, reproduction_figures, simulate
+from experiments.runs.output_folder import claim_folder, prepare_output
 from experiments.settings import ReproduceSettings
 from experiments.terminal import text_table
 from shields.atomic_write import write_atomically
@@ -23,22 +22,25 @@ def reproduce(settings: ReproduceSettings) -> None:
         for name, png in reproduction_figures(simulations).items():
             write_atomically(settings.out / "figures" / f"{name}.png", png)
         outcomes = {simulation.design.name: simulation.outcome for simulation in simulations}
-        summary = {name: asdict(outcome) for name, outcome in outcomes.items()}
-        write_atomically(settings.out / "summary.json", json.dumps(summary, indent=1) + "\n")
+        write_atomically(settings.out / "summary.json", json.dumps(outcomes, indent=1) + "\n")
         print(_table(outcomes))
         print(f"files: {settings.out}")
 
 
-def _table(outcomes: dict[str, Outcome]) -> str:
+def _table(outcomes: dict[str, dict[str, float | None]]) -> str:
     rows = [
-        ("steps outside the safe set", lambda o: f"{o.outside_set:,} of {o.steps:,}"),
-        ("steps outside the safe box", lambda o: f"{o.outside_box:,} of {o.steps:,}"),
-        ("inputs asked beyond the limit", lambda o: f"{o.input_asked_beyond:,} of {o.steps:,}"),
-        ("largest x'Mx", lambda o: f"{o.largest_level:.4f}"),
-        ("largest |K x_hat| [m/s^2]", lambda o: f"{o.largest_input:.3f}"),
-        ("largest e'e", lambda o: f"{o.largest_error:.5f}"),
-        ("claimed epsilon", lambda o: "-" if o.epsilon is None else f"{o.epsilon:.5f}"),
-        ("largest e_up'e_up", lambda o: f"{o.largest_estimation_error:.5f}"),
+        ("steps outside the safe set", "{outside_set:,} of {steps:,}"),
+        ("steps outside the safe box", "{outside_box:,} of {steps:,}"),
+        ("inputs asked beyond the limit", "{input_asked_beyond:,} of {steps:,}"),
+        ("largest x'Mx", "{largest_level:.4f}"),
+        ("largest |K x_hat| [m/s^2]", "{largest_input:.3f}"),
+        ("largest e'e", "{largest_error:.5f}"),
+        ("claimed epsilon", "{epsilon:.5f}"),
+        ("largest e_up'e_up", "{largest_estimation_error:.5f}"),
     ]
-    cells = [[name, *map(show, outcomes.values())] for name, show in rows]
+    cells = [[name, *(_shown(text, outcome) for outcome in outcomes.values())] for name, text in rows]
     return text_table([["", *outcomes], *cells])
+
+
+def _shown(text: str, outcome: dict[str, float | None]) -> str:
+    return "-" if outcome["epsilon"] is None and "epsilon" in text else text.format(**outcome)

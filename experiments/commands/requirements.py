@@ -18,8 +18,8 @@ import shields
 from experiments.backends.execution import execute, executor_of
 from experiments.errors import ResultsError
 from experiments.plots.heatmaps import requirements_map
-from experiments.runs import claim_folder, prepare_output, write_results
 from experiments.runs.loops import registered_env
+from experiments.runs.output_folder import claim_folder, prepare_output, write_results
 from experiments.runs.provenance import versions
 from experiments.settings import RequirementsSettings
 from experiments.terminal import text_table, wrapped

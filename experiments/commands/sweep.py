@@ -15,17 +15,10 @@ from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.plots.heatmaps import sweep_figures
 from experiments.report.html import sweep_report
-from experiments.runs import (
-    Arm,
-    certificate_of,
-    claim_folder,
-    experiment_provenance,
-    loop_config,
-    prepare_output,
-    require_trainable,
-    run_of_arm,
-    write_results,
-)
+from experiments.runs.arms import Arm
+from experiments.runs.experiment import certificate_of, experiment_provenance, require_trainable, run_of_arm
+from experiments.runs.loops import loop_config
+from experiments.runs.output_folder import claim_folder, prepare_output, write_results
 from experiments.settings import SweepSettings
 from experiments.terminal import wrapped
 from ncs_gym.envs.env import ncs_env
@@ -96,11 +89,7 @@ def sweep(settings: SweepSettings) -> None:
 
 
 def _grid_points(settings: SweepSettings) -> list[_GridPoint]:
-    """Returns the points of the grid.
-
-    Raises:
-        ValueError: If a side of the grid is empty or names a value twice.
-    """
+    """Returns the points of the grid."""
     own_unless_given = ("quantization_steps", "mass_factors", "downlink_losses")
     sides = {name: getattr(settings, name) or ((None,) if name in own_unless_given else ()) for name in _SIDES}
     for name, side in (sides | {"arms": settings.arms}).items():
@@ -115,11 +104,7 @@ def _name(point: _GridPoint) -> str:
 
 
 def _loop(settings: SweepSettings, point: _GridPoint) -> LoopConfig:
-    """Returns the control loop with the channels and the mass of a point.
-
-    Raises:
-        ValueError: If the environment cannot have the channel or another mass, or has no downlink to change.
-    """
+    """Returns the control loop with the channels and the mass of a point."""
     changes = {name: point[name] for name in ("loss", "delay", "quantization_step") if point[name] is not None}
     if point["burst_length"] and point["loss"]:
         changes["burst_length"] = point["burst_length"]

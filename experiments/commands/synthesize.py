@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import shields
-from experiments.runs import require_place
 from experiments.runs.loops import registered_env
+from experiments.runs.output_folder import require_place
 from experiments.settings import SynthesizeSettings
 from experiments.settings.certificates import changed_contract
 from experiments.terminal import synthesis_status

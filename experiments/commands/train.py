@@ -6,19 +6,12 @@ from experiments.analysis.episodes import arm_summary, episodes_table
 from experiments.analysis.tables import summary_text
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
-from experiments.runs import (
-    Arm,
-    RunResult,
-    certificate_of,
-    claim_folder,
-    experiment_provenance,
-    loop_config,
-    prepare_output,
-    require_trainable,
-    run_of_arm,
-    write_results,
-)
-from experiments.settings import BackendSettings, TrainSettings
+from experiments.runs.arms import Arm
+from experiments.runs.experiment import certificate_of, experiment_provenance, require_trainable, run_of_arm
+from experiments.runs.loops import loop_config
+from experiments.runs.output_folder import claim_folder, prepare_output, write_results
+from experiments.runs.training_run import RunResult
+from experiments.settings import TrainSettings
 from experiments.terminal import wrapped
 
 # Budget of `--smoke`.
@@ -37,7 +30,7 @@ def train(settings: TrainSettings) -> None:
         print(wrapped(settings.agent_line), flush=True)
         settings = settings.completed
         run = run_of_arm(settings, loop, certificate, settings.arm, 0)
-        results = results_of([run], settings.out, BackendSettings(jobs=1))
+        results = results_of([run], settings.out, settings)
         mode = Arm.of(settings.arm, settings.mode).mode
         arms = {settings.arm: arm_summary(episodes_table(results), mode, fixed_policy=True)}
         certificate.save(settings.out / "certificate.json")

@@ -6,8 +6,8 @@ import json
 from dataclasses import asdict
 
 import shields
-from experiments.runs import require_place
 from experiments.runs.loops import registered_env
+from experiments.runs.output_folder import require_place
 from experiments.settings import VerifySettings
 from ncs_gym import LinearPlant
 from ncs_gym.registration import registered_ids

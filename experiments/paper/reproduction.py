@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from tqdm import tqdm
 
 from experiments.paper.paper_example import PaperExample
+from experiments.plots.comparison_figures import projected_box, projected_ellipsoid
 from experiments.plots.figure_style import STYLE, CaptionedFigure, with_unit
 from experiments.settings.certificates import ReproduceSettings
 from ncs_gym import BoxDisturbance, Ellipsoid, LinearPlant
@@ -46,33 +47,6 @@ class StateFeedback:
     epsilon: float | None
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What the simulation of a design showed.
-
-    Attributes:
-        steps: Number of simulated steps of all initial states.
-        outside_set: Number of steps with the true state outside the safe set.
-        outside_box: Number of steps with the true state outside the safe box.
-        input_asked_beyond: Number of steps with |K x_hat| beyond the input limit (the plant applied the limit).
-        largest_level: Largest x'Mx.
-        largest_error: Largest e'e, e = B K e_up.
-        largest_estimation_error: Largest e_up'e_up.
-        largest_input: Largest |K x_hat|.
-        epsilon: The bound on e'e that the design claims; None if it claims none.
-    """
-
-    steps: int
-    outside_set: int
-    outside_box: int
-    input_asked_beyond: int
-    largest_level: float
-    largest_error: float
-    largest_estimation_error: float
-    largest_input: float
-    epsilon: float | None
-
-
 @dataclass(frozen=True, eq=False)
 class Simulation:
     """Simulated trajectories of a design.
@@ -90,23 +64,23 @@ class Simulation:
     errors: np.ndarray
 
     @property
-    def outcome(self) -> Outcome:
-        """Counts and largest values of the simulation."""
+    def outcome(self) -> dict[str, float | None]:
+        """Counts of steps and largest values, by name; e = B K e_up, and `epsilon` is the design's own claim."""
         design = self.design
         levels = np.einsum("ski,ij,skj->sk", self.states, np.linalg.inv(design.L), self.states)
         boxes = np.abs(self.states @ design.plant.box_rows.T).max(axis=2)
         gain = design.plant.B @ design.K
-        return Outcome(
-            steps=self.inputs.size,
-            outside_set=int((levels[:, 1:] > 1.0).sum()),
-            outside_box=int((boxes[:, 1:] > 1.0).sum()),
-            input_asked_beyond=int((np.abs(self.inputs) > design.plant.u_max[0]).sum()),
-            largest_level=float(levels.max()),
-            largest_error=float(np.square(self.errors @ gain.T).sum(axis=2).max()),
-            largest_estimation_error=float(np.square(self.errors).sum(axis=2).max()),
-            largest_input=float(np.abs(self.inputs).max()),
-            epsilon=design.epsilon,
-        )
+        return {
+            "steps": self.inputs.size,
+            "outside_set": int((levels[:, 1:] > 1.0).sum()),
+            "outside_box": int((boxes[:, 1:] > 1.0).sum()),
+            "input_asked_beyond": int((np.abs(self.inputs) > design.plant.u_max[0]).sum()),
+            "largest_level": float(levels.max()),
+            "largest_error": float(np.square(self.errors @ gain.T).sum(axis=2).max()),
+            "largest_estimation_error": float(np.square(self.errors).sum(axis=2).max()),
+            "largest_input": float(np.abs(self.inputs).max()),
+            "epsilon": design.epsilon,
+        }
 
 
 def designs() -> list[StateFeedback]:
@@ -187,14 +161,13 @@ def _panels(simulations: Sequence[Simulation], draw: Callable[[Axes, Simulation]
 
 def _draw_states(axis: Axes, simulation: Simulation) -> None:
     design = simulation.design
-    angle = np.linspace(0.0, 2.0 * np.pi, 361)
-    circle = np.stack([np.cos(angle), np.sin(angle)])
     for i, path in enumerate(simulation.states):
         label = None if i else "true state"
         axis.plot(path[:, 0], path[:, 1], color=_COLOR, lw=0.6, alpha=0.5, label=label)
-    axis.plot(*(np.linalg.cholesky(design.L) @ circle), color="black", lw=1.4, label="safe set")
-    corners = np.linalg.solve(design.plant.box_rows, np.array([[1, 1, -1, -1, 1], [1, -1, -1, 1, 1]], dtype=float))
-    axis.plot(*corners, color="black", lw=1.0, ls="--", label="safe box")
+    axis.plot(*projected_ellipsoid(design.L, (0, 1)).T, color="black", lw=1.4, label="safe set")
+    box = projected_box(design.plant.box_rows, (0, 1))
+    assert box is not None
+    axis.plot(*box.T, color="black", lw=1.0, ls="--", label="safe box")
     axis.set_xlabel("coupling stretch [m]")
     axis.set_ylabel("stretch rate [m/s]")
     axis.set_aspect("equal")

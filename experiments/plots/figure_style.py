@@ -117,10 +117,8 @@ _CONTROLLER_MARKERS = {
 # Filters that share the color of another one.
 _HOLLOW = ("trusting:lookahead", "psf:tube")
 _SOLID, _DOTTED, _DASHED = "-", (0, (1.0, 1.3)), (0, (4.5, 1.6))
-# Length of a dash that stands for a price of 1 per violating step, in line widths; it doubles with every factor of ten.
-_PRICE_DASH = 6.0
-# Size of the marker of that price [points], and what every factor of ten adds.
-_PRICE_SIZE, _PRICE_GROWTH = 7.0, 3.0
+# Dashes, and size of the marker [points], of an arm with a price of its own per violating step.
+_PRICED, _PRICED_SIZE = (0, (12.0, 1.6)), 13.0
 
 
 @dataclass(frozen=True)
@@ -146,8 +144,8 @@ class ArmStyle:
         """Returns the style of an arm: the color stands for the shield, dashed lines and hollow markers for a penalty.
 
         Dotted lines and hollow markers stand for what acts in evaluation alone; so they do for the monitor, whose agent
-        is the unshielded one and whose curves lie on that arm's. The higher a price, the longer the dashes and the
-        larger the marker. Of fixed policies that share a color, the one behind a trusting lookahead is hollow.
+        is the unshielded one and whose curves lie on that arm's. A price of one's own has long dashes and
+        a large marker. Of fixed policies that share a color, the one behind a trusting lookahead is hollow.
 
         Raises:
             ValueError: If the arm is unknown.
@@ -160,10 +158,7 @@ class ArmStyle:
             hollow = str(arm.mode).startswith(_HOLLOW)
             return cls(color, _DASHED, _CONTROLLER_MARKERS[arm.policy.partition(":")[0]], hollow, size=9.0)
         if arm.violation_weight is not None:
-            decades = np.log10(max(arm.violation_weight, 1e-9))
-            dash = float(np.clip(_PRICE_DASH * 2.0**decades, 0.5, 50.0))
-            size = float(np.clip(_PRICE_SIZE + _PRICE_GROWTH * decades, 3.0, 14.0))
-            return cls(color, (0, (dash, 1.6)), marker, hollow=True, size=size)
+            return cls(color, _PRICED, marker, hollow=True, size=_PRICED_SIZE)
         changed = arm.penalizes_interventions or arm.is_residual or str(arm.mode).startswith(_HOLLOW)
         return cls(color, _DASHED if changed else _SOLID, marker, hollow=changed, size=10.0 if changed else 7.0)
 
@@ -197,10 +192,18 @@ def _look_of(arm: Arm) -> str:
         return "lagrangian" if arm.adapts_penalty else "penalized"
     if arm.mode is None:
         return "unshielded"
+    if not arm.is_shielded:
+        return arm.mode.partition(":")[0]
     named = f"shielded:{arm.mode}"
-    return named if arm.is_shielded and (named in arm.name or arm.mode == "lookahead") else _default(arm)
+    return named if named in arm.name or arm.mode == "lookahead" else "shielded"
 
 
-def _default(arm: Arm) -> str:
-    """Returns the key of an arm behind a filter that does not name a mode of the shield."""
-    return "shielded" if arm.is_shielded else str(arm.mode).partition(":")[0]
+def draw_estimate(
+    axis: Axes, style: ArmStyle, rate: float, rates: list[float] | None, mean: float, means: list[float] | None
+) -> None:
+    """Draws a mean return against a rate [%], and their intervals where there are any."""
+    if means is not None:
+        axis.plot([100.0 * rate] * 2, means, "-_", color=style.color, lw=1.3, ms=9.0, mew=1.3)
+    if rates is not None:
+        axis.plot([100.0 * end for end in rates], [mean] * 2, "-|", color=style.color, lw=1.3, ms=9.0, mew=1.3)
+    axis.plot(100.0 * rate, mean, ls="none", **style.points, zorder=3)

@@ -24,27 +24,14 @@ _PNG_WIDTH = slice(16, 20)
 def comparison_report(
     summary: dict[str, Any], verification: Report, figures: dict[str, bytes], findings: list[str]
 ) -> str:
-    """Returns the page of `ncs compare`: tables, findings, figures, certificate and settings; opens offline.
-
-    Args:
-        summary: Content of summary.json.
-        verification: Exact verification of the certificate.
-        figures: PNG files by caption.
-        findings: Sentences to print under the first table.
-    """
+    """Returns the page of `ncs compare`: tables, findings, figures, certificate and settings; opens offline."""
     runs, title = max(arm["runs"] for arm in summary["arms"].values()), f"Safe learning on {summary['settings']['env']}"
     context = _origin("compare", summary, verification)
     return render_page("comparison.html.j2", _named(figures), title=title, runs=runs, findings=findings, **context)
 
 
 def sweep_report(summary: dict[str, Any], verification: Report, figures: dict[str, bytes]) -> str:
-    """Returns the page of `ncs sweep`: figures, a table of every channel and arm, certificate and settings.
-
-    Args:
-        summary: Content of summary.json.
-        verification: Exact verification of the certificate.
-        figures: PNG files by caption.
-    """
+    """Returns the page of `ncs sweep`: figures, a table of every channel and arm, certificate and settings."""
     title, context = f"Channels of {summary['settings']['env']}", _origin("sweep", summary, verification)
     return render_page("sweep.html.j2", _named(figures), title=title, **context)
 

@@ -59,10 +59,6 @@ class Arm:
     def of(cls, name: str, mode: str = "project") -> Arm:
         """Returns the arm of a name, whose spaces may be given as hyphens.
 
-        Args:
-            name: Name of the arm on the command line.
-            mode: Mode of the shield of arms that name none.
-
         Raises:
             ValueError: If the name is unknown.
         """
@@ -132,11 +128,7 @@ def by_arm(results: Sequence[RunResult]) -> ResultsByArm:
 
 @cache
 def _arms(mode: str) -> dict[str, Arm]:
-    """Returns all arms, but for the weights of "penalized", by their names with hyphens.
-
-    Args:
-        mode: Mode of the shield of arms that name none.
-    """
+    """Returns all arms, but for the weights of "penalized", by their names with hyphens."""
     filters = {"shielded": mode} | {f"shielded:{each}": each for each in _SHIELD_MODES}
     filters |= {name: name for name in ("lookahead", *FILTERS)}
     trained = list(_trained_arms(filters))

@@ -69,14 +69,6 @@ def run_of_arm(
 ) -> TrainingRun:
     """Returns one training run of an arm, or the run of an arm in which nothing is trained.
 
-    Args:
-        settings: Settings of the command.
-        loop: The bare control loop.
-        certificate: Certificate for its plant.
-        arm_name: Name of the arm.
-        index: Number of the run within its arm.
-        grid_point: Name of the point of a sweep's grid.
-
     Raises:
         ValueError: If the arm or a scenario is unknown.
     """
@@ -96,7 +88,7 @@ def run_of_arm(
         episodes=settings.episodes,
         certificate=certificate,
         certificate_basis=origin if settings.certificate is None else "",
-        scenarios=other_scenarios(settings.evaluated_under),
+        scenarios=other_scenarios(getattr(settings, "scenarios", ())),
         algorithm=settings.algo,
         settings=settings.all_hyperparams,
         grid_point=grid_point,

@@ -174,10 +174,6 @@ def other_scenarios(names: Sequence[str]) -> tuple[str, ...]:
 def under(scenario: str, loop: LoopConfig) -> LoopConfig:
     """Returns a control loop under a scenario; everything else stays the same.
 
-    Args:
-        scenario: A name that `scenario_named` returns.
-        loop: The control loop as it was in training.
-
     Raises:
         ValueError: If the scenario is unknown, or the channel cannot be worse within the contract.
     """

@@ -41,7 +41,7 @@ _LOCK = ".lock"
 # What the operating system says where there are no locks.
 _NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
 # What stands for a finished experiment, and what is drawn and listed of it: patterns where names depend on settings.
-_TABLES = ("episodes.parquet", "training.parquet", "sweep.parquet", "study.parquet")
+_TABLES = ("episodes.parquet", "training.parquet")
 _FIGURES = ("scatter", "training", "episode", "phase", "violations", "return", "interventions", "states", "inputs")
 _MADE_OF_RESULTS = (
     "summary.json",
@@ -108,12 +108,6 @@ def write_results(
 ) -> None:
     """Writes what a command leaves; summary.json comes last, so that it stands for complete results.
 
-    Args:
-        folder: The output folder.
-        summary: Content of summary.json, JSON values.
-        files: Contents of other files by name.
-        figures: Caption and PNG file of every figure by name.
-
     Raises:
         OSError: If a file cannot be written.
     """
@@ -164,9 +158,6 @@ def _require_own_entries(folder: Path) -> None:
 
 def require_place(path: Path | None) -> None:
     """Returns if a command can write a file, which it finds out before it computes what it would lose.
-
-    Args:
-        path: Of the file; None for none.
 
     Raises:
         OSError: If there is a folder in its place, or no folder to write it in.

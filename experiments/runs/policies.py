@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.sharing.agent_file import AgentError
+from agents.agent_file import AgentError
 from ncs_gym import NCSEnv, SetpointTracking, SpeedTracking
 
 UNTRAINED_POLICIES = ("greedy", "zero", "random")
@@ -71,11 +71,7 @@ def agent_folder(folder: Path) -> Path:
 
 
 def certificate_file(agent: Path) -> Path | None:
-    """Returns the certificate beside an agent, or of the run that left it in its models; None if there is none.
-
-    Args:
-        agent: Folder of the agent.
-    """
+    """Returns the certificate beside an agent, or of the run that left it in its models; None if there is none."""
     agent = agent.resolve()
     folders = [agent, agent.parent.parent] if agent.parent.name == "models" else [agent]
     return next((file for folder in folders if (file := folder / "certificate.json").is_file()), None)

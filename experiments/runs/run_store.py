@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from agents.sharing.agent_file import require_names, write_files
+from agents.agent_file import require_names, write_files
 from experiments.errors import ResultsError
 from experiments.json_values import from_json, to_json
 from ncs_gym.validation import MAX_QUOTED_LENGTH

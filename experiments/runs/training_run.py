@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
+from agents.agent_file import AGENT_FILES, write_files
 from agents.evaluation import Policy, evaluate
 from agents.hyperparams import rollout_steps
 from agents.loop import LoopConfig
 from agents.results import Episode, TrainingPoint, Trajectory
-from agents.sharing.agent_file import AGENT_FILES, write_files
 from experiments.baselines import controller, tuned_weights
 from experiments.runs.loops import AS_TRAINED, import_module, module_digest, under
 from experiments.runs.provenance import versions
@@ -136,13 +136,7 @@ class TrainingRun:
         return -(-self.steps // rollout) * rollout + evaluation
 
     def execute(self, on_progress: Callable[[int], None], log_folder: Path | None = None) -> RunResult:
-        """Returns the result; only TensorBoard's events are written.
-
-        Args:
-            on_progress: Called with the number of training and evaluation steps taken since its last call.
-            log_folder: Folder of TensorBoard's events, those of each run in a folder of its name; earlier ones of this
-                run are removed.
-        """
+        """Returns the result; only TensorBoard's events are written."""
         if self.module:
             import_module(self.module)
         trained = None

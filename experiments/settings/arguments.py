@@ -14,11 +14,7 @@ from shields.runtime.safety_filter import LONGEST_HORIZON
 
 
 def _assignments(texts: list[str]) -> dict[str, Any]:
-    """Returns the values by name: Python's numbers, lists, dictionaries, True, False and None; otherwise the text.
-
-    Raises:
-        ValueError: If a text is no NAME=VALUE, or a name is given twice.
-    """
+    """Returns the values by name: Python's numbers, lists, dictionaries, True, False and None; otherwise the text."""
     found: dict[str, Any] = {}
     for text in texts:
         name, equals, value = text.partition("=")
@@ -46,10 +42,6 @@ def beside_those_of_file(settings: Any, of_file: Any) -> Any:
     """Returns a command's settings in which the assignments of a settings file hold where none are given.
 
     Hyperparameters of the file are for its algorithm alone, and give way to a file of hyperparameters.
-
-    Args:
-        settings: Settings of the command line; those of the file are their defaults.
-        of_file: Settings of the file.
     """
     merged = {
         name: with_changes(getattr(of_file, name), getattr(settings, name))
@@ -66,11 +58,7 @@ _LIMIT = Decimal("1e15")
 
 
 def _step_count(texts: list[str]) -> int:
-    """Returns the whole number that the only text stands for exactly.
-
-    Raises:
-        ValueError: If it stands for none, or for one out of range.
-    """
+    """Returns the whole number that the only text stands for exactly."""
     try:
         number = Decimal(texts[0])
     except InvalidOperation:

@@ -62,7 +62,7 @@ Mode = Literal["project", "lookahead", "switch", "boundary"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearningSettings:
+class LearningSettings(BackendSettings):
     """Settings that the commands that train share.
 
     Attributes:
@@ -112,11 +112,6 @@ class LearningSettings:
     lagrangian: LagrangianSettings = field(default_factory=LagrangianSettings)
     smoke: bool = False
     force: bool = False
-
-    @property
-    def evaluated_under(self) -> tuple[str, ...]:
-        """Scenarios that policies are evaluated in, besides that of the training."""
-        return ()
 
     @property
     def all_hyperparams(self) -> dict[str, Any]:
@@ -175,13 +170,14 @@ class LearningSettings:
 
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
+        BackendSettings.__post_init__(self)
         require_least(self, seeds=1, steps=1, episodes=1, seed=0, intervention_penalty=0, violation_penalty=0)
         arms = getattr(self, "arm", ""), *getattr(self, "arms", ()), *getattr(self, "baselines", ())
         require_horizon(self.horizon, self.mode, *arms)
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareSettings(BackendSettings, LearningSettings):
+class CompareSettings(LearningSettings):
     """Trains agents with and without the shield and compares violations, return and interventions.
 
     Synthesizes and exactly verifies a certificate, trains paired runs (equal seeds), evaluates each on the same
@@ -222,16 +218,6 @@ class CompareSettings(BackendSettings, LearningSettings):
     )
     scenarios: tuple[str, ...] = ("as trained",)
     noise: Literal["truncated", "gaussian"] = "truncated"
-
-    @property
-    def evaluated_under(self) -> tuple[str, ...]:
-        """Scenarios that policies are evaluated in, besides that of the training."""
-        return self.scenarios
-
-    def __post_init__(self) -> None:
-        """Raises ValueError if a value is out of range."""
-        LearningSettings.__post_init__(self)
-        BackendSettings.__post_init__(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -302,7 +288,7 @@ REGULATED_ARMS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepSettings(BackendSettings, LearningSettings):
+class SweepSettings(LearningSettings):
     """Compares arms over a grid of channels: how safety, return and interventions depend on the channel.
 
     Every point of the grid is a comparison of its own with the same seeds. Leaves episodes.parquet, summary.json,
@@ -337,11 +323,6 @@ class SweepSettings(BackendSettings, LearningSettings):
     burst_lengths: tuple[float, ...] = (0.0,)
     mass_factors: tuple[float, ...] = ()
     downlink_losses: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        """Raises ValueError if a value is out of range."""
-        LearningSettings.__post_init__(self)
-        BackendSettings.__post_init__(self)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -48,11 +48,6 @@ def save_settings(path: Path, command: str, settings: Any) -> None:
 def config_defaults(arguments: list[str], command: str, kind: type) -> tuple[Any, list[str]]:
     """Returns the settings in the file given by `--config`, or None, and the other arguments.
 
-    Args:
-        arguments: Arguments of the command.
-        command: Name of the command.
-        kind: Dataclass of the command's settings; fields that the file does not give have their defaults.
-
     Raises:
         SettingsError: If the flag is given more than once or without a file, or the file is missing, damaged or another
             command's, or holds a wrong value.
@@ -71,14 +66,7 @@ def config_defaults(arguments: list[str], command: str, kind: type) -> tuple[Any
 
 
 def _load(path: Path, command: str, kind: type, names_folder: bool) -> Any:
-    """Returns the settings in a file; raises SettingsError as `config_defaults` says.
-
-    Args:
-        path: The file.
-        command: Name of the command.
-        kind: Dataclass of the command's settings.
-        names_folder: Whether the user names the output folder; otherwise it is that of the file.
-    """
+    """Returns the settings in a file; raises SettingsError as `config_defaults` says."""
     try:
         document = json.loads(path.read_bytes())
     except OSError as error:
@@ -98,7 +86,9 @@ def _load(path: Path, command: str, kind: type, names_folder: bool) -> Any:
                 "alone, and give --env module:id if you trust the module"
             )
     try:
-        settings = _read(values, kind)
+        for name in values.keys() & set(_OF_THE_CALL):
+            raise TypeError(f"{name} = {json.dumps(values[name])}")
+        settings = from_json(values, kind)
         if not names_folder and not _is_near(settings.out, path):
             raise ValueError(f"out = {shown(str(settings.out))} lies neither here nor beside the file: give --out")
         return settings
@@ -111,10 +101,3 @@ def _is_near(folder: Path, path: Path) -> bool:
     """Returns whether an output folder lies in the working folder, or is the one that the file of settings lies in."""
     place = folder.resolve()
     return place.is_relative_to(Path.cwd().resolve()) or place == path.parent.resolve()
-
-
-def _read(values: dict[str, Any], kind: type) -> Any:
-    """Returns the settings that a file gives; raises as `from_json` does, also if one is of the call alone."""
-    for name in values.keys() & set(_OF_THE_CALL):
-        raise TypeError(f"{name} = {json.dumps(values[name])}")
-    return from_json(values, kind)

@@ -11,8 +11,11 @@ from experiments.analysis.episodes import episodes_table
 from experiments.analysis.statistics import clopper_pearson
 from experiments.backends.execution import results_of
 from experiments.errors import ResultsError
-from experiments.runs import Arm, RunStore, TrainingRun, certificate_of, loop_config, run_of_arm
-from experiments.runs.loops import registered_env
+from experiments.runs.arms import Arm
+from experiments.runs.experiment import certificate_of, run_of_arm
+from experiments.runs.loops import loop_config, registered_env
+from experiments.runs.run_store import RunStore
+from experiments.runs.training_run import TrainingRun
 from experiments.settings import Assignments, CompareSettings
 from experiments.study.summary import ATTACKED
 from ncs_gym import Channel, ChannelContract
@@ -59,9 +62,6 @@ def trained_agents(settings: CompareSettings) -> dict[str, AgentFiles]:
 
     They are those of the first runs, at most `MOST_AGENTS`.
 
-    Args:
-        settings: Settings of the comparison; arms that it has not are left out.
-
     Raises:
         ValueError: If the environment is unknown.
         Infeasible: If no certificate is found.
@@ -84,10 +84,6 @@ def channel_switches(settings: CompareSettings, agents: Mapping[str, AgentFiles]
     The attack is that of the scenario "attacked": the strongest disturbance, noise of full size, and bursts as long as
     the contract allows. The policies are the same at every combination; those of the agents were trained with all of
     the environment's own impairments.
-
-    Args:
-        settings: Environment, seed, episodes of each combination, output folder and backend.
-        agents: Files of the agents by the name of their arm.
 
     Returns:
         Rows of JSON values: `on`, the impairments that are on, `arm`, `policies`, `episodes`, `violating` and its exact

@@ -8,17 +8,21 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 
-from experiments.plots.figure_style import STYLE, ArmStyle, CaptionedFigure, label, legend_below, thousands
+from experiments.plots.figure_style import (
+    STYLE,
+    ArmStyle,
+    CaptionedFigure,
+    draw_estimate,
+    label,
+    legend_below,
+    thousands,
+)
 from experiments.runs.loops import AS_TRAINED
 from experiments.study.summary import ATTACKED
 
 
 def study_figures(summary: dict[str, Any]) -> dict[str, tuple[str, bytes]]:
-    """Returns caption and PNG file of every figure by name.
-
-    Args:
-        summary: What `study_summary` returns.
-    """
+    """Returns caption and PNG file of every figure by name, of what `study_summary` returns."""
     figures = {"return": return_figure(summary)}
     if any(_trained(env) for env in summary["environments"].values()):
         figures |= {"runs": runs_figure(summary), "training": training_figure(summary)}
@@ -26,11 +30,7 @@ def study_figures(summary: dict[str, Any]) -> dict[str, tuple[str, bytes]]:
 
 
 def return_figure(summary: dict[str, Any]) -> CaptionedFigure:
-    """Returns the mean return as trained against violating episodes under attack, a panel per environment.
-
-    Args:
-        summary: What `study_summary` returns.
-    """
+    """Returns the mean return as trained against violating episodes under attack, a panel per environment."""
     environments = summary["environments"]
     with matplotlib.rc_context(STYLE):
         caption = (
@@ -55,11 +55,7 @@ def return_figure(summary: dict[str, Any]) -> CaptionedFigure:
 
 
 def runs_figure(summary: dict[str, Any]) -> CaptionedFigure:
-    """Returns the violating episodes of every trained run under attack, a panel per environment.
-
-    Args:
-        summary: What `study_summary` returns.
-    """
+    """Returns the violating episodes of every trained run under attack, a panel per environment."""
     caption = (
         "Violating episodes under attack, by training run. Small dots are runs, markers their mean, bars 95 % "
         "intervals over runs and episodes."
@@ -76,11 +72,7 @@ def runs_figure(summary: dict[str, Any]) -> CaptionedFigure:
 
 
 def training_figure(summary: dict[str, Any]) -> CaptionedFigure:
-    """Returns the violating steps of every training run, a panel per environment.
-
-    Args:
-        summary: What `study_summary` returns.
-    """
+    """Returns the violating steps of every training run, a panel per environment."""
     caption = (
         "Violating steps while the agents learned, on a scale that is linear up to 1 and logarithmic beyond. Small "
         "dots are runs, markers their mean. These violations do not appear in the evaluation."
@@ -121,11 +113,7 @@ def _draw_runs(axis: Axes, style: ArmStyle, values: list[float], height: int) ->
 def _draw_point(axis: Axes, style: ArmStyle, scenarios: dict[str, Any], margin: str) -> None:
     """Draws the return of an arm as trained against its violating episodes under attack, with both intervals."""
     own, attacked = scenarios[AS_TRAINED], scenarios.get(ATTACKED, scenarios[AS_TRAINED])
-    rate, mean = 100.0 * attacked["rate"], own["return"]
-    if attacked["rate_ci95"] is not None:
-        axis.plot([100.0 * end for end in attacked["rate_ci95"]], [mean] * 2, "-", color=style.color, lw=1.0)
-    if own["return_ci95"] is not None:
-        axis.plot([rate] * 2, own["return_ci95"], "-", color=style.color, lw=1.0)
-    axis.plot(rate, mean, ls="none", **style.points)
+    draw_estimate(axis, style, attacked["rate"], attacked["rate_ci95"], own["return"], own["return_ci95"])
     if margin:
-        axis.annotate(margin, (rate, mean), (4.0, 4.0), textcoords="offset points", size=6.5)
+        point = (100.0 * attacked["rate"], own["return"])
+        axis.annotate(margin, point, (4.0, 4.0), textcoords="offset points", size=6.5)

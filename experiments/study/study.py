@@ -7,7 +7,6 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -16,8 +15,9 @@ from experiments.analysis.episodes import parquet
 from experiments.commands import short_version
 from experiments.commands.compare import compare
 from experiments.report.html import render_page
-from experiments.runs import claim_folder, prepare_output, versions, write_results
 from experiments.runs.experiment import INCIDENTAL_SETTINGS
+from experiments.runs.output_folder import claim_folder, prepare_output, write_results
+from experiments.runs.provenance import versions
 from experiments.settings import BackendSettings, CompareSettings, StudySettings, settings_json
 from experiments.settings.learning import short_name
 from experiments.study.channel_switches import channel_switches, trained_agents
@@ -90,12 +90,19 @@ def _comparison_settings(settings: StudySettings, env_id: str) -> CompareSetting
 
 
 def _write(settings: StudySettings, summary: dict[str, Any], episodes: pd.DataFrame) -> None:
+    """Writes every file: those of the study, and those that the documentation asks for."""
     figures = study_figures(summary)
-    if settings.page is not None:
-        _write_page(settings.page, summary, figures)
+    if (page := settings.page) is not None:
+        (page.parent / "images").mkdir(parents=True, exist_ok=True)
+        for name, (_, png) in figures.items():
+            write_atomically(page.parent / "images" / f"{page.stem}-{name}.png", png)
+        write_atomically(page.with_suffix(".json"), json.dumps(summary, allow_nan=False) + "\n")
+        tables = page.with_suffix(".txt")
+        write_atomically(tables, results_tables(summary))
+        write_atomically(page, results_page(summary, figures, f"images/{page.stem}-", tables.name))
     files = {
         "episodes.parquet": parquet(episodes, summary),
-        "report.html": study_report(summary, figures),
+        "report.html": render_page("study.html.j2", figures, title="Safe learning: the study", **_context(summary)),
         "results.md": results_page(summary, figures, "figures/"),
         "results.txt": results_tables(summary),
     }
@@ -104,52 +111,20 @@ def _write(settings: StudySettings, summary: dict[str, Any], episodes: pd.DataFr
         write_atomically(path, quoted(path.read_text("utf-8"), tables_by_name(summary)))
 
 
-def _write_page(page: Path, summary: dict[str, Any], figures: dict[str, tuple[str, bytes]]) -> None:
-    images = page.parent / "images"
-    images.mkdir(parents=True, exist_ok=True)
-    for name, (_, png) in figures.items():
-        write_atomically(images / f"{page.stem}-{name}.png", png)
-    write_atomically(page.with_suffix(".json"), json.dumps(summary, allow_nan=False) + "\n")
-    tables = page.with_suffix(".txt")
-    write_atomically(tables, results_tables(summary))
-    write_atomically(page, results_page(summary, figures, f"images/{page.stem}-", tables.name))
-
-
 # A mark names a table; what stands between it and the end is replaced.
 _MARKED = re.compile(r"(<!-- ncs study: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
-
-
-def study_report(summary: dict[str, Any], figures: dict[str, tuple[str, bytes]]) -> str:
-    """Returns the HTML page; opens offline, but for its links to the comparisons beside it.
-
-    Args:
-        summary: What `study_summary` returns, with the sweep of channels, settings and versions.
-        figures: Caption and PNG file by name.
-    """
-    return render_page("study.html.j2", figures, title="Safe learning: the study", **_context(summary))
 
 
 def results_page(
     summary: dict[str, Any], figures: dict[str, tuple[str, bytes]], prefix: str, tables: str = "results.txt"
 ) -> str:
-    """Returns the Markdown page.
-
-    Args:
-        summary: As for `study_report`.
-        figures: As for `study_report`.
-        prefix: What stands before a figure's name in its link.
-        tables: Link to the file of all tables (`results_tables`).
-    """
+    """Returns the Markdown page; figures are linked by their names behind a prefix, `results_tables` by a file."""
     links = {name: f"{prefix}{name}.png" for name in figures}
     return render_page("results.md.j2", figures, links=links, tables=tables, **_context(summary))
 
 
 def results_tables(summary: dict[str, Any]) -> str:
-    """Returns all tables as plain text: every arm and every combination of impairments.
-
-    Args:
-        summary: As for `study_report`.
-    """
+    """Returns all tables as plain text: every arm and every combination of impairments."""
     known = _context(summary)
     parts = [known["budget"], known["comparisons"], known["prices"], known["margins"]]
     for name in summary["environments"]:
@@ -179,10 +154,6 @@ def quoted(page: str, tables: Mapping[str, str]) -> str:
     """Returns a page with the tables between its marks replaced.
 
     A mark is `<!-- ncs study: NAME -->` on a line of its own, and `<!-- end -->` after the table.
-
-    Args:
-        page: Text of the page.
-        tables: What `tables_by_name` returns.
 
     Raises:
         ValueError: If the page has no mark, or one of a table that there is not.

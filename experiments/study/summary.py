@@ -50,12 +50,7 @@ FAMILIES = {
 
 
 def study_summary(comparisons: Mapping[str, dict[str, Any]], episodes: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
-    """Returns JSON values: of every environment its arms in every scenario, the declared comparisons and prices.
-
-    Args:
-        comparisons: Content of each comparison's summary.json by the environment's short name.
-        episodes: The table of its episodes (`experiments.analysis.episodes`), by the same name.
-    """
+    """Returns JSON values: of every environment its arms in every scenario, the declared comparisons and prices."""
     return {"environments": {name: _environment(each, episodes[name]) for name, each in comparisons.items()}}
 
 
@@ -121,10 +116,6 @@ def _evaluated(played: pd.DataFrame, *, is_fixed: bool) -> dict[str, Any]:
 
     A fixed policy is the same in all runs, so that its episodes are as good as one run each. Where no episode violates
     or every one does, resampling says nothing, and the interval is the exact one of a single proportion.
-
-    Args:
-        played: Rows of the arm in this scenario.
-        is_fixed: Whether the policy is the same in all runs.
     """
     violating, returns = _by_run(played, "violating"), _by_run(played, "episode_return")
     if is_fixed:
@@ -166,13 +157,7 @@ def _prices(arms: Mapping[str, dict[str, Any]], episodes: pd.DataFrame) -> list[
 
 
 def margins_needed(env: Mapping[str, Any], family: str, scenario: str) -> str | None:
-    """Returns the arm of a family that violates in no episode of a scenario with the smallest margin; None for none.
-
-    Args:
-        env: An environment of `study_summary`.
-        family: A name in `FAMILIES`.
-        scenario: Name of a scenario.
-    """
+    """Returns the arm of a family that violates in no episode of a scenario with the smallest margin; None for none."""
     return next(
         (name for name in members(env, family) if env["arms"][name]["scenarios"][scenario]["violating"] == 0), None
     )

@@ -32,11 +32,7 @@ _SCENARIOS = {
 
 
 def evaluation_table(env: dict[str, Any]) -> str:
-    """Returns violating episodes [%] in every scenario, the interval of the attacked ones, overridden steps, returns.
-
-    Args:
-        env: An environment of `study_summary`.
-    """
+    """Returns violating episodes [%] in every scenario, the interval under attack, overridden steps and returns."""
     known = next(iter(env["arms"].values()))["scenarios"]
     scenarios = [name for name in _SCENARIOS if name in known]
     interval_of = ATTACKED if ATTACKED in known else AS_TRAINED

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from agents.agent import Agent, Normalization
+from agents.agent_file import AgentError
 from agents.evaluation import evaluate
 from agents.hyperparams import with_changes
 from agents.loop import LoopConfig, ShieldSettings
-from agents.sharing.agent_file import AgentError
 from agents.training import train
 from ncs_gym import Channel, GilbertElliott, truck_trailer
 from shields import Certificate

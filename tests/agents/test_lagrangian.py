@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from agents.agent import Agent
+from agents.agent_file import AgentError
 from agents.callbacks import DualAscentCallback
 from agents.loop import CostPenalty, LagrangianSettings, LoopConfig, ResidualActions
-from agents.sharing.agent_file import AgentError
 from agents.training import train
 
 CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")

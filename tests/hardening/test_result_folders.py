@@ -9,14 +9,14 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from agents.agent_file import AgentError
 from agents.loop import LoopConfig, ShieldSettings
-from agents.sharing.agent_file import AgentError
 from experiments.analysis.episodes import arm_summary, episodes_table, parquet, training_table
 from experiments.analysis.tables import summary_text
 from experiments.attack.monte_carlo_batch import MonteCarloBatch
 from experiments.attack.safety_counts import SafetyCounts, counts_table
 from experiments.errors import ResultsError
-from experiments.runs import claim_folder, prepare_output
+from experiments.runs.output_folder import claim_folder, prepare_output
 from experiments.runs.run_store import RunStore
 from experiments.runs.training_run import TrainingRun, _agent_of
 from experiments.settings import AttackSettings, CompareSettings

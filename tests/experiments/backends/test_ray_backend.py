@@ -20,7 +20,7 @@ ray = pytest.importorskip("ray", reason="Ray is not installed: pip install -e '.
 from experiments.backends import ray_backend, ray_cluster  # noqa: E402
 from experiments.backends.ray_cluster import portable_task, require_answer  # noqa: E402
 from experiments.errors import ClusterError, RunError  # noqa: E402
-from experiments.runs import versions  # noqa: E402
+from experiments.runs.provenance import versions  # noqa: E402
 from experiments.settings import BackendSettings  # noqa: E402
 from tests.command import ROOT  # noqa: E402
 

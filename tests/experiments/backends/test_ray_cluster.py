@@ -14,7 +14,8 @@ from experiments.backends import execution
 from experiments.backends.execution import execute, results_of
 from experiments.backends.ray_cluster import _execute_on_node, portable_task, require_answer
 from experiments.errors import ClusterError, RunError
-from experiments.runs import TrainingRun, versions
+from experiments.runs.provenance import versions
+from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings
 
 

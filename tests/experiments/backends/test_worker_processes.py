@@ -8,7 +8,7 @@ from queue import Queue
 import pytest
 
 from agents.loop import LoopConfig
-from experiments.backends.execution import _execute, execute, local_workers, results_of
+from experiments.backends.execution import _execute_here, execute, local_workers, results_of
 from experiments.errors import RunStopped
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings
@@ -37,7 +37,7 @@ def test_a_run_told_to_stop_gives_up_at_its_next_report(endless):
     reports, stop = Queue(), threading.Event()
     stop.set()
     with pytest.raises(RunStopped, match="zero-input-0"):
-        _execute(endless, reports, stop, None)
+        _execute_here(endless, reports, stop, None)
     assert reports.empty()
 
 

@@ -14,7 +14,7 @@ from experiments.attack.safety_counts import SafetyCounts, gaussian_table, requi
 from experiments.commands import attack as command
 from experiments.commands.attack import attack
 from experiments.errors import OtherResultsError, ResultsError, RunError, SafetyBroken
-from experiments.runs import RunStore
+from experiments.runs.run_store import RunStore
 from experiments.settings.certificates import AttackSettings
 from ncs_gym import truck_trailer
 from ncs_gym.network.contract import contract_of

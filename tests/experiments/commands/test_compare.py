@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,7 @@ from agents.hyperparams import complete_hyperparams
 from agents.loop import LoopConfig
 from agents.results import Episode
 from experiments.analysis.episodes import arm_summary, covered_fraction, episodes_table, paired_differences
-from experiments.analysis.tables import _rows
+from experiments.analysis.tables import summary_text
 from experiments.commands.compare import _findings, _training_runs
 from experiments.runs.arms import Arm, by_arm
 from experiments.runs.output_folder import prepare_output
@@ -107,8 +108,16 @@ def test_steps_that_live_from_a_plan_have_a_column_where_an_arm_looks_ahead():
     summary = arm_summary(episodes_table([one]), "lookahead", fixed_policy=True)
     assert summary["plan_rate"] == 0.05
     arms = {"shielded": summary | {"mode": "project"}, "lookahead": summary}
-    assert [row[-2] for row in _rows(arms)] == ["", "from a", "plan", "-", "5.0 %"]
-    assert "from a" not in _rows({"shielded": arms["shielded"]})[1]
+    cells = cells_of(arms)
+    assert [cells[name][-2] for name in arms] == ["-", "5.0 %"]
+    assert "from a" in summary_text(arms, {})
+    assert "from a" not in summary_text({"shielded": arms["shielded"]}, {})
+
+
+def cells_of(arms):
+    """The cells of the printed table behind each name."""
+    rows = [re.split(" {2,}", line) for line in summary_text(arms, {}).splitlines()]
+    return {row[0]: row[1:] for row in rows}
 
 
 @pytest.mark.parametrize("name", ["", "shield", "shielded:", "shielded:hope", "monitor+penalty", "shielded:monitor"])
@@ -214,9 +223,7 @@ def test_paired_differences_are_those_of_runs_with_equal_index():
 
 def test_no_violation_is_printed_with_its_upper_bound():
     summary = arm_summary(episodes_table([result([1.0] * 10, [0] * 10)]), "monitor", fixed_policy=True)
-    row = _rows({"monitor": summary})[-1]
-    assert row[3] == "0 [0.0, 30.8 %]"
-    assert row[2] == "(20.0 %)"
+    assert cells_of({"monitor": summary})["monitor"][1:3] == ["(20.0 %)", "0 [0.0, 30.8 %]"]
 
 
 def test_results_are_grouped_by_arm_in_the_order_of_runs():

@@ -15,11 +15,16 @@ def test_outcome_counts_what_left_the_set_the_box_and_the_limit():
     states = np.array([[[0.0, 0.0], [1.9, 1.9], [2.1, 0.0]]])
     errors = np.array([[[0.1, 0.0], [0.0, 0.0]]])
     outcome = Simulation(design, states, np.array([[4.5, -1.0]]), errors).outcome
-    assert (outcome.steps, outcome.outside_set, outcome.outside_box, outcome.input_asked_beyond) == (2, 2, 1, 1)
-    assert outcome.largest_level == pytest.approx(2 * 1.9**2 / 4)
+    assert (outcome["steps"], outcome["outside_set"], outcome["outside_box"], outcome["input_asked_beyond"]) == (
+        2,
+        2,
+        1,
+        1,
+    )
+    assert outcome["largest_level"] == pytest.approx(2 * 1.9**2 / 4)
     expected = np.square(case.plant.B @ case.K @ [0.1, 0.0]).sum()
-    assert outcome.largest_error == pytest.approx(expected)
-    assert outcome.largest_estimation_error == pytest.approx(0.01)
+    assert outcome["largest_error"] == pytest.approx(expected)
+    assert outcome["largest_estimation_error"] == pytest.approx(0.01)
 
 
 def test_command_leaves_figures_and_summary(tmp_path):

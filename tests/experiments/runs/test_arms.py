@@ -5,7 +5,9 @@ import pytest
 
 from agents.loop import CostPenalty, LagrangianSettings, LoopConfig, ResidualActions
 from experiments.baselines import EstimateFilter
-from experiments.runs import Arm, certificate_of, loop_config, run_of_arm
+from experiments.runs.arms import Arm
+from experiments.runs.experiment import certificate_of, run_of_arm
+from experiments.runs.loops import loop_config
 from experiments.settings import CompareSettings
 from shields import VectorSafetyShield
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from experiments.errors import FolderInUseError, OtherResultsError
-from experiments.runs import claim_folder as folder_of
+from experiments.runs.output_folder import claim_folder as folder_of
 from experiments.settings import (
     AttackSettings,
     CompareSettings,

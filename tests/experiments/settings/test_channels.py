@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from experiments.commands.sweep import _grid_points, _loop, _name
-from experiments.runs import certificate_of, run_of_arm
+from experiments.runs.experiment import certificate_of, run_of_arm
 from experiments.runs.loops import _bursts, changed_channel
 from experiments.settings.learning import SweepSettings
 from ncs_gym import Channel, ChannelContract, GilbertElliott

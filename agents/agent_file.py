@@ -1,8 +1,14 @@
-"""The card of a shared agent: where it was trained, behind which shield, and what it did in an evaluation."""
+"""The files of an agent, checked, and its card: where it was trained, behind which shield, and what it did.
+
+`agent.json` has numbers and names and the checksum of `model.zip`, the weights.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -11,6 +17,92 @@ import numpy as np
 from agents.loop import ShieldSettings
 from agents.results import Evaluation
 from ncs_gym import Channel
+from ncs_gym.validation import shown
+from shields.atomic_write import write_atomically
+from shields.json_documents import digest
+from shields.runtime.safety_filter import LONGEST_HORIZON, MODES
+
+# Files of an agent: no other name is read or written for one, whoever made the list of names.
+AGENT_FILES = ("model.zip", "agent.json")
+_FORMAT = "ncs-gym agent 2"
+
+
+class AgentError(ValueError):
+    """A folder holds no agent, a damaged or altered one, or one of another environment."""
+
+
+def document_of(content: dict[str, Any]) -> bytes:
+    """Returns the `agent.json` of some content."""
+    document = {"format": _FORMAT, "sha256": digest(content), "agent": content}
+    return (json.dumps(document, indent=1) + "\n").encode()
+
+
+def require_names(names: Iterable[str]) -> None:
+    """Returns if files of these names may belong to an agent.
+
+    Raises:
+        AgentError: If a name is none of `AGENT_FILES`; it may lead out of the agent's folder.
+    """
+    for name in names:
+        if name not in AGENT_FILES:
+            raise AgentError(f"an agent has no file of the name {shown(name)}, only {' and '.join(AGENT_FILES)}")
+
+
+def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Writes the files of an agent in a folder that exists.
+
+    Args:
+        folder: The folder.
+        files: Contents by name.
+
+    Raises:
+        AgentError: If a name is none of `AGENT_FILES`; nothing is written then.
+        OSError: If a file cannot be written.
+    """
+    require_names(files)
+    for name, content in files.items():
+        write_atomically(folder / name, content)
+
+
+def read_files(folder: str | Path) -> tuple[Path, dict[str, Any], bytes]:
+    """Returns the folder of an agent, the content of its `agent.json` and its `model.zip`, whose checksums are right.
+
+    Args:
+        folder: The folder, or one of the two files in it.
+
+    Raises:
+        AgentError: If a file is missing, damaged or of another format.
+    """
+    folder = Path(folder)
+    folder = folder.parent if folder.name in AGENT_FILES else folder
+    try:
+        document, weights = json.loads((folder / "agent.json").read_bytes()), (folder / "model.zip").read_bytes()
+    except OSError as error:
+        raise AgentError(
+            f"no agent in {folder}: cannot read {Path(error.filename).name} ({error.strerror}); `ncs compare` leaves "
+            "agents in OUT/models"
+        ) from error
+    except (ValueError, RecursionError) as error:
+        raise AgentError(f"{folder / 'agent.json'} is damaged: it is not valid JSON") from error
+    if not isinstance(document, dict) or document.get("format") != _FORMAT:
+        raise AgentError(f"{folder / 'agent.json'} is not of format {_FORMAT!r}")
+    content = document.get("agent")
+    if not isinstance(content, dict) or document.get("sha256") != digest(content):
+        raise AgentError(f"{folder / 'agent.json'} was altered: its checksum does not match")
+    if hashlib.sha256(weights).hexdigest() != content.get("sha256_of_model"):
+        raise AgentError(f"{folder / 'model.zip'} was altered: its checksum does not match")
+    return folder, content, weights
+
+
+def shield_from_json(content: dict[str, Any] | None) -> tuple[str | None, int | None]:
+    """Returns mode and horizon of the shield that an agent was trained behind; None each for no shield."""
+    if content is None:
+        return None, None
+    mode, horizon = content["mode"], content["horizon"]
+    if mode not in MODES or not (horizon is None or (type(horizon) is int and 1 <= horizon <= LONGEST_HORIZON)):
+        raise AgentError("the agent is damaged: there is no shield of that mode and horizon")
+    return mode, horizon
+
 
 _USE = """## Use
 
