@@ -95,11 +95,10 @@ dist: $(INSTALLED) ## sdist and wheel, in dist/
 address: $(INSTALLED) ## writes the public address everywhere (ADDRESS=https://...)
 	@$(BIN)/python .ci/address.py '$(ADDRESS)'
 
-$(INSTALLED): pyproject.toml constraints.txt tests/requirements.txt
+$(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[train,contrib,render,zmq,live,dev]'
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r tests/requirements.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[train,contrib,render,video,zmq,live,dev]'
 	touch $@
 
 $(DOCS_INSTALLED): $(INSTALLED)
