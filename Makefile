@@ -82,7 +82,7 @@ example-times: $(INSTALLED) ## how long each example takes, and what it says (EX
 
 # Fails on a broken link, anchor, reference or formula; makes a page per registered environment. Look at it: python -m http.server -d site (from a file the search is missing).
 docs: $(DOCS_INSTALLED) ## the site, in site/
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	$(BIN)/python docs/hooks/build_site.py
 
 # Known vulnerabilities of what constraints.txt names, by OSV: any index of packages will do, a network is needed.
 audit: $(AUDIT_INSTALLED) ## known vulnerabilities of the dependencies (asks a database on the internet)
