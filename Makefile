@@ -82,7 +82,7 @@ example-times: $(INSTALLED) ## how long each example takes, and what it says (EX
 
 # Fails on a broken link, anchor, reference or formula; makes a page per registered environment. Look at it: python -m http.server -d site (from a file the search is missing).
 docs: $(DOCS_INSTALLED) ## the site, in site/
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	$(BIN)/python docs/hooks/build_site.py
 
 words: ## words of README and of every page
 	@wc -w README.md docs/*.md
@@ -98,11 +98,10 @@ dist: $(INSTALLED) ## sdist and wheel, in dist/
 address: $(INSTALLED) ## writes the public address everywhere (ADDRESS=https://...)
 	@$(BIN)/python .ci/address.py '$(ADDRESS)'
 
-$(INSTALLED): pyproject.toml constraints.txt tests/requirements.txt
+$(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[train,contrib,render,zmq,live,dev]'
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r tests/requirements.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[train,contrib,render,video,zmq,live,dev]'
 	touch $@
 
 $(DOCS_INSTALLED): $(INSTALLED)

@@ -1,6 +1,6 @@
 """Shows a control loop of your own without Gymnasium: the estimate, your controller, and the input that is safe.
 
-Takes about two seconds on one core.
+Takes about three seconds on one core.
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 """Shows the smallest shielded episode: the policy is random, and still the coupling never exceeds its limits.
 
-Takes about two seconds on one core.
+Takes about three seconds on one core.
 """
 
 import gymnasium as gym

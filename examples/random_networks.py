@@ -1,6 +1,6 @@
 """Shows domain randomization over networks: agents train on the best channel or on a range, and meet the worst of it.
 
-Takes about 40 seconds on one core. The environment is the cruise behind a shield.
+Takes about 50 seconds on one core. The environment is the cruise behind a shield.
 """
 
 import argparse

@@ -2,7 +2,7 @@
 
 The observation does not say how old the estimate is, which a recurrent policy can find out from earlier observations.
 
-Takes about 40 seconds on one core.
+Takes about 60 seconds on one core.
 """
 
 import argparse

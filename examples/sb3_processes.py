@@ -1,6 +1,6 @@
 """Shows stable-baselines3's SubprocVecEnv: shielded environments in processes of their own, for slow plants.
 
-Takes about ten seconds on one core. `agents.SB3VecEnv` is faster for the environments of this package.
+Takes about eight seconds on one core. `agents.SB3VecEnv` is faster for the environments of this package.
 """
 
 import torch

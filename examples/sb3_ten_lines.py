@@ -1,6 +1,6 @@
 """Shows stable-baselines3's PPO, SAC and TD3 without any adapter: the shield is a wrapper like any other.
 
-Takes about 35 seconds on one core.
+Takes about 50 seconds on one core.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """What network does a position servo need? Saves the plant for `ncs requirements`, and asks a first question here.
 
-Takes about ten seconds on one core.
+Takes about nine seconds on one core.
 """
 
 import shields

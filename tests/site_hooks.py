@@ -1,4 +1,4 @@
-"""The modules in docs/hooks, which the site loads by their files: they are part of no package."""
+"""The modules in docs/hooks, which the site loads by their folder: they are part of no package."""
 
 from __future__ import annotations
 

@@ -3,12 +3,10 @@
 import contextlib
 import io
 import tempfile
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from environment_page import environment_page
-from mkdocs.structure.files import File
 
 from experiments.commands.render import render
 from experiments.settings import RenderSettings
@@ -20,35 +18,42 @@ STEPS = 12
 MARK = "<!-- a page per environment -->"
 
 
-def on_config(config: Any) -> Any:
-    """Adds the pages to the navigation, below the page of all environments."""
-    for section in config.nav:
-        for entries in section.values():
-            places = [index for index, entry in enumerate(entries) if entry == {"Environments": "ncs_gym.md"}]
-            for index in places:
-                pages = [{name: f"environments/{name}.md"} for name in _ids_by_name()]
-                entries[index] = {"Environments": ["ncs_gym.md", *pages]}
-    return config
+def add_pages(docs: Path, nav: list[Any]) -> None:
+    """Writes the pages and their pictures, and adds them to the navigation below the page of all environments.
 
-
-def on_files(files: Any, config: Any) -> Any:
-    """Adds the pages and their pictures to the files of the site."""
-    for name, env_id in _ids_by_name().items():
+    Args:
+        docs: Folder of the site's pages.
+        nav: The navigation, which is changed.
+    """
+    names = _ids_by_name()
+    (docs / "environments").mkdir()
+    for name, env_id in names.items():
         text, picture = _made(name, env_id)
-        files.append(File.generated(config, f"environments/{name}.md", content=text))
-        files.append(File.generated(config, f"environments/{name}.png", content=picture))
-    return files
+        (docs / "environments" / f"{name}.md").write_text(text)
+        (docs / "environments" / f"{name}.png").write_bytes(picture)
+    _enter(nav, [{name: f"environments/{name}.md"} for name in names])
+    page = docs / "ncs_gym.md"
+    page.write_text(page.read_text().replace(MARK, _list_of(names)))
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Puts a list of the pages on the page of all environments."""
-    pages = [f"[{name}](environments/{name}.md)" for name in _ids_by_name()]
+def _enter(nav: list[Any], pages: list[Any]) -> None:
+    """Puts the pages below the page of all environments, wherever that is."""
+    for index, entry in enumerate(nav):
+        ((title, target),) = entry.items() if isinstance(entry, dict) else ((None, entry),)
+        if target == "ncs_gym.md":
+            nav[index] = {title: [target, *pages]}
+        elif isinstance(target, list):
+            _enter(target, pages)
+
+
+def _list_of(names: dict[str, str]) -> str:
+    """Returns the sentence with links to the pages."""
+    pages = [f"[{name}](environments/{name}.md)" for name in names]
     absent = ", ".join(f"`{env_id}`" for env_id in needing_extras())
     missing = f" (not {absent}: its extra was not installed when this site was built)" if absent else ""
-    return markdown.replace(MARK, f"Each that has a plant of its own has a page: {', '.join(pages)}{missing}.")
+    return f"Each that has a plant of its own has a page: {', '.join(pages)}{missing}."
 
 
-@lru_cache
 def _made(name: str, env_id: str) -> tuple[str, bytes]:
     """Returns the page of an environment, and its picture."""
     with tempfile.TemporaryDirectory() as folder:
