@@ -114,8 +114,13 @@ def network_channels(env: NCSEnv) -> tuple[Channel, Channel]:
     """Returns uplink and downlink of an environment as a real network has them: what is sent now arrives a step later.
 
     Without a downlink of its own it has one like its uplink.
+
+    Raises:
+        ValueError: If its samples are on request.
     """
     up = env.channel
+    if up.on_request:
+        raise ValueError("datagrams carry no requests for samples yet: give an environment without on_request")
     down = env.downlink or Channel(loss=up.loss, jitter=up.jitter, max_consecutive_losses=up.max_consecutive_losses)
     if down.most_consecutive_losses is None:  # nothing can be committed ahead without a promise
         down = Channel(loss=down.loss, delay=down.delay, jitter=down.jitter, max_consecutive_losses=2)
