@@ -31,6 +31,7 @@ class Campaign:
         contract: Channel contract of the plant of the file; None for none.
         mode: Only mode of the shield; None for `SHIELD_MODES`.
         horizon: Longest plan of mode "lookahead" [steps]; None in other modes.
+        channel: Only kind of channel to attack; None for all.
     """
 
     seed: int
@@ -44,6 +45,7 @@ class Campaign:
     contract: ChannelContract | None = None
     mode: str | None = None
     horizon: int | None = None
+    channel: str | None = None
 
     @property
     def looks_ahead(self) -> bool:
@@ -72,10 +74,16 @@ class Campaign:
         """Returns what is attacked, by name.
 
         Raises:
-            ValueError: If there is no environment of the id, or the plant's file cannot be read.
+            ValueError: If there is no environment of the id, no such kind of channel, or the plant's file cannot be
+                read.
         """
         if self.plant is None:
             found = attack_cases(self.seed, self.random_plants, self.env)
         else:
             found = plant_cases(Path(self.plant), self.contract)
+        kinds = {name: name.rpartition(", ")[2] for name in found}
+        if self.channel is not None:
+            if self.channel not in kinds.values():
+                raise ValueError(f"channel must be one of {sorted(set(kinds.values()))}, got {self.channel!r}")
+            found = {name: case for name, case in found.items() if kinds[name] == self.channel}
         return {name: case.with_delta(self.delta) for name, case in found.items()}

@@ -15,7 +15,13 @@ import numpy as np
 
 from experiments.attack.campaign import SHIELD_MODES, Campaign
 from experiments.attack.safety_counts import SafetyCounts
-from experiments.attack.worst_case import GaussianVectorEnv, HostileAgents, WorstCaseVectorEnv, starts_in_box
+from experiments.attack.worst_case import (
+    GaussianVectorEnv,
+    HostileAgents,
+    HostileRequests,
+    WorstCaseVectorEnv,
+    starts_in_box,
+)
 from ncs_gym import NCSVectorEnv
 from ncs_gym.registration import EPISODE_STEPS
 from shields import Certificate, VectorSafetyShield
@@ -81,6 +87,9 @@ class MonteCarloBatch:
         rng = np.random.default_rng(policy_seed)
         info = _begin(campaign, shield, seed >> 1, rng)
         agents = HostileAgents(campaign.envs, plant, shield.certificate, rng)
+        attacked, env = campaign.cases()[self.case], shield.env.unwrapped
+        assert isinstance(env, NCSVectorEnv)
+        requests = HostileRequests(campaign.envs, shield.certificate, rng) if attacked.channel.on_request else None
         counts = SafetyCounts(
             steps=campaign.batch_steps,
             episodes=campaign.envs,
@@ -89,18 +98,22 @@ class MonteCarloBatch:
         )
         kept, broken = np.ones(campaign.envs, np.bool_), np.zeros(campaign.envs, np.bool_)
         for step in range(EPISODE_STEPS):
+            if requests is not None:
+                env.request(requests.ask(info))
             *_, info = shield.step(agents.act(info["estimate"]))
             claimed, kept = _claimed_and_kept(info, kept)
             if not campaign.shielded:  # nothing is claimed, and everything counted
                 claimed[:] = True
             outside, reached = _outside_and_reached(campaign, info, safe_set.gauge(info["state"]))
             counts += _step_counts(info, outside, claimed, kept)
+            if attacked.keeps_contract:
+                counts += SafetyCounts(overdue=int(np.count_nonzero(info["contract_broken"])))
             broken |= claimed & (outside.box | (outside.safe_set & (not campaign.looks_ahead)))
             if step >= SETTLING_STEPS:
                 level = float(np.nan_to_num(reached, nan=np.inf).max(initial=0.0, where=claimed))
                 counts += SafetyCounts(level=level)
             on_progress(campaign.envs)
-        return counts + SafetyCounts(broken_episodes=int(broken.sum()))
+        return counts + SafetyCounts(broken_episodes=int(broken.sum()), packets=int(info["packets"].sum()))
 
     def require(self, result: SafetyCounts) -> None:
         """Returns if counts can be this batch's.
@@ -153,6 +166,7 @@ def _step_counts(info: dict[str, Any], outside: _Outside, claimed: np.ndarray, k
         interventions=int(np.count_nonzero(info["shield_intervened"])),
         unproved=int(np.count_nonzero(kept & ~info["shield_guaranteed"])),
         planned=int(np.count_nonzero(info.get("shield_plan_length", 0))),
+        forced=int(np.count_nonzero(info["request_forced"])),
         lapsed=int(np.count_nonzero(~claimed)),
         lapsed_violations=int(np.count_nonzero(~claimed & outside.box)),
     )

@@ -29,6 +29,9 @@ class SafetyCounts:
         outside_starts: Number of episodes that began outside S, with a certified plan.
         lapsed: Number of lapsed steps.
         lapsed_violations: Number of lapsed steps whose true state lay outside the safe box.
+        packets: Number of samples sent.
+        forced: Number of steps in which the contract forced a request.
+        overdue: Number of steps at which the newest sample was older than a contract allows that the channel keeps.
     """
 
     files: ClassVar[dict[str, bytes]] = {}  # a batch leaves none
@@ -44,6 +47,9 @@ class SafetyCounts:
     outside_starts: int = 0
     lapsed: int = 0
     lapsed_violations: int = 0
+    packets: int = 0
+    forced: int = 0
+    overdue: int = 0
 
     def __add__(self, other: SafetyCounts) -> SafetyCounts:
         """Returns the counts of both."""

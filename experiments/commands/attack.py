@@ -94,6 +94,7 @@ def _campaign(settings: AttackSettings) -> Campaign:
         plant=settings.plant and str(settings.plant.resolve()),  # workers may have another working folder
         contract=changed_contract(None, settings.max_age, settings.quantization_step),
         mode=settings.mode,
+        channel=settings.channel,
         horizon=(settings.horizon or DEFAULT_HORIZON) if settings.mode == "lookahead" else None,
     )
 

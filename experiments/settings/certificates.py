@@ -132,6 +132,7 @@ class AttackSettings(BackendSettings):
             up, or every kind of channel without one.
         max_age: Largest measurement age of the contract of --plant [steps]; no contract by default.
         quantization_step: Coarsest quantization that the contract of --plant allows.
+        channel: Only kind of channel to attack, by its name in the table: "on request", say; all by default.
         force: Replace the finished results of another campaign in the output folder, which otherwise is refused.
         seed: Seed of the campaign, >= 0.
     """
@@ -149,6 +150,7 @@ class AttackSettings(BackendSettings):
     plant: Path | None = None
     max_age: int | None = None
     quantization_step: float | None = None
+    channel: str | None = None
     force: bool = False
     seed: int = 0
 
