@@ -50,7 +50,7 @@ def counts_of(campaign, certificate, case, index=0):
 
 def test_every_kind_of_plant_and_channel_is_attacked():
     found = attack_cases(3, 5)
-    assert len(found) == 3 * 1 + 7 * 4 + (2 + 5) * 4
+    assert len(found) == 3 * 1 + 9 * 4 + (2 + 5) * 4
     assert {case.contract is None for case in found.values()} == {True, False}
     assert (
         attack_cases(3, 5)["random plant 4, perfect"].plant.fingerprint
