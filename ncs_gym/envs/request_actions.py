@@ -141,7 +141,8 @@ def _bounds(env: NCSEnv) -> np.ndarray:
 
 def _wider(space: Any, low: Any, high: Any) -> Box:
     """Returns a space with more entries, within bounds."""
-    return Box(np.concatenate([space.low, low]), np.concatenate([space.high, high]), dtype=np.float32)
+    bounds = [np.concatenate(pair).astype(np.float32) for pair in ((space.low, low), (space.high, high))]
+    return Box(*bounds, dtype=np.float32)
 
 
 def _parted(actions: Any, shape: Any) -> tuple[np.ndarray, np.ndarray]:
