@@ -23,7 +23,6 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents import SB3VecEnv
 from agents.evaluation import Policy
-from experiments.analysis.terminal_text import text_table
 from experiments.baselines.controllers import controller, tuned_weights
 from experiments.baselines.requests import (
     Asking,
@@ -37,6 +36,7 @@ from experiments.baselines.requests import (
     slack,
     with_rule,
 )
+from experiments.terminal import text_table
 from ncs_gym import NCSEnv, VectorRequestActions
 from shields import Certificate, SafetyShield, VectorSafetyShield
 
