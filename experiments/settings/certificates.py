@@ -272,7 +272,7 @@ class ChannelSettings:
     Attributes:
         file: A CSV file with a line per packet, when it was sent and when it was received in seconds, the second empty
             for a lost packet; or the output of ping, whose delays are those of the whole way and back.
-        sampling_period: Duration of a control step [s]; by default the time between packets.
+        sampling_period: Duration of a control step [s]; by default that of --env, or the time between packets.
         ping_period: Time between the packets of ping without stamps (ping -D prints them) [s]; 1 by default.
         env: Id of an environment whose contract is compared with the record.
         out: File for the numbers (JSON).

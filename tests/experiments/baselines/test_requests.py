@@ -131,7 +131,16 @@ def test_policies_behind_a_downlink_are_refused():
 
 
 def test_command_prints_a_table_and_draws_a_figure(tmp_path):
-    command = [sys.executable, "benchmarks/requests.py", "--episodes", "3", "--steps", "0", "--out", "figure.png"]
+    command = [
+        sys.executable,
+        "benchmarks/request_policies.py",
+        "--episodes",
+        "3",
+        "--steps",
+        "0",
+        "--out",
+        "figure.png",
+    ]
     command[1] = str(ROOT / command[1])
     run = subprocess.run(
         command, cwd=tmp_path, capture_output=True, text=True, check=True, env={"PYTHONPATH": str(ROOT)}

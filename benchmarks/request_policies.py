@@ -1,6 +1,6 @@
 """Compares policies that ask for samples: return, overridden share and violations against packets per step.
 
-    python benchmarks/requests.py [--env ncs_gym/LaneKeepingOnRequest-v0] [--steps 100000] [--seeds 2]
+    python benchmarks/request_policies.py [--env ncs_gym/LaneKeepingOnRequest-v0] [--steps 100000] [--seeds 2]
 
 A linear-quadratic regulator behind the shield proposes the inputs, and a policy asks: in every step, every few steps,
 at random, when the newest sample is old and the last request could have arrived, when the proposed input has little
@@ -23,7 +23,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents import SB3VecEnv
 from agents.evaluation import Policy
-from experiments.baselines.controllers import controller, tuned_weights
+from experiments.baselines.controllers import controller
+from experiments.baselines.regulators import tuned_weights
 from experiments.baselines.requests import (
     Asking,
     RequestResult,
