@@ -220,7 +220,7 @@ LANE_REQUESTS = replace(LANE_CHANNEL, max_consecutive_losses=2, on_request=True)
 
 
 def loaded_truck_trailer() -> LinearPlant:
-    """Returns the truck with a trailer of 4000 kg: full throttle overstretches its coupling (theory.md section 5)."""
+    """Returns the truck with a trailer of 4000 kg: full throttle overstretches its coupling."""
     return truck_trailer(mass=4000.0)
 
 

@@ -18,7 +18,7 @@ MULTIPLIERS = np.linspace(0.01, 0.99, 99)[:, None]
 
 
 class SetMembership:
-    """Moves the shape Sigma_k of the running ellipsoid: the error x_hat - x lies in E(Sigma_k) (theory.md section 3).
+    """Moves the shape Sigma_k of the running ellipsoid: the error x_hat - x lies in E(Sigma_k) (docs/shield_proof.md).
 
     Args:
         plant: The plant with its bounds.
@@ -96,7 +96,7 @@ class SetMembership:
     def gain(self, shape: np.ndarray) -> np.ndarray:
         """Returns T_mu = S H'/mu (H S H'/mu + N/(1-mu))^-1, shape (n, p), S = Sigma_k, with the trace-optimal mu.
 
-        Its updated shape is (mu S^-1 + (1-mu) H' N^-1 H)^-1 (theory.md section 3); with S = G G' and
+        Its updated shape is (mu S^-1 + (1-mu) H' N^-1 H)^-1 (docs/shield_proof.md); with S = G G' and
         G'H'N^-1HG = V diag(j) V' the weighted trace is a sum of w_i / (mu + (1-mu) j_i).
         """
         H = self.plant.H
