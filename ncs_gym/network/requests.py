@@ -53,8 +53,8 @@ class Requests:
     """The requests of one control loop, or of N: asked for, or forced so that the contract holds for every policy.
 
     At step k the request of sample k + c + 1 is decided. It is forced if of the samples that are newer than the newest
-    that arrived `spare_samples` were left out: n <= age + c + L + delta - h (theory.md section 13, docs/requests.md). A
-    contract that is broken although the samples were requested forces one in every step, until one arrives.
+    that arrived `spare_samples` were left out: n <= age + c + L + delta - h (docs/requests.md, "The rule"). A contract
+    that is broken although the samples were requested forces one in every step, until one arrives.
 
     Args:
         channel: The channel.
