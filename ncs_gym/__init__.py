@@ -2,6 +2,7 @@
 
 from ncs_gym.envs.env import NCSEnv
 from ncs_gym.envs.episode_channels import RandomChannel, VectorRandomChannel
+from ncs_gym.envs.request_actions import RequestActions, VectorRequestActions
 from ncs_gym.envs.spaces import ClippedObservationWarning
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlantError, certified_error_set
@@ -70,6 +71,7 @@ __all__ = [
     "RandomChannel",
     "Regulation",
     "Remainder",
+    "RequestActions",
     "SetpointTracking",
     "SinusoidDisturbance",
     "SpeedTracking",
@@ -79,6 +81,7 @@ __all__ = [
     "UnstablePlantError",
     "UnusedPacketsWarning",
     "VectorRandomChannel",
+    "VectorRequestActions",
     "batch_reactor",
     "bound_violation_probability",
     "cart_pole",

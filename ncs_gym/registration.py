@@ -64,7 +64,7 @@ class Factory:
 
     Attributes:
         plant: Makes the default plant; None if the user has to give one.
-        channel: Default channel, whose contract is that of the default plant.
+        channel: Default channel.
         task: Default task.
         disturbance: Default disturbance where it suits the plant; "ball" elsewhere.
         terminates: Whether a violation ends the episode by default: an unstable plant does not come back.
@@ -72,6 +72,7 @@ class Factory:
         process: What really moves, whose fields a dictionary may hold; None for the plant's own equations.
         extra: Extra that installs the module of this name, which the process needs; empty for none.
         downlink: Default downlink; None for an ideal one.
+        contract: Contract of the default plant; None for that of the default channel.
         is_vector: Whether it makes vector environments.
     """
 
@@ -84,6 +85,7 @@ class Factory:
     process: Process | None = None
     extra: str = ""
     downlink: Channel | None = None
+    contract: ChannelContract | None = None
     is_vector: bool = False
 
     def __call__(self, **settings: Any) -> NCSEnv | NCSVectorEnv:
@@ -123,7 +125,7 @@ class Factory:
                 raise ValueError(
                     "this environment has no plant of its own: give plant=LinearPlant(...), or register_plant it"
                 )
-            plant, own["contract"] = self.plant(), contract_of(self.channel)
+            plant, own["contract"] = self.plant(), self.contract or contract_of(self.channel)
         own |= {"plant": plant, "disturbance": self._disturbance(plant)}
         if self.start is not None and getattr(plant, "n", 0) == 2:
             own["initial_set"] = Ellipsoid(self.start**2 * np.eye(2))
@@ -211,6 +213,10 @@ CSTR_CHANNEL = Channel(loss=0.4, delay=1, max_consecutive_losses=5, quantization
 CONVOY_CHANNEL = Channel(loss=0.4, delay=1, max_consecutive_losses=7, quantization_step=0.05)
 LANE_CHANNEL = replace(CONVOY_CHANNEL, quantization_step=0.002)
 PERSISTENT = SinusoidDisturbance(period=100.0)
+# The same contracts on request: at most two packets are lost in a row, so that five of the eight samples that may be
+# missing are the controller's to leave out (docs/requests.md).
+CONVOY_REQUESTS = replace(CONVOY_CHANNEL, max_consecutive_losses=2, on_request=True)
+LANE_REQUESTS = replace(LANE_CHANNEL, max_consecutive_losses=2, on_request=True)
 
 
 def loaded_truck_trailer() -> LinearPlant:
@@ -222,6 +228,20 @@ def loaded_truck_trailer() -> LinearPlant:
 # 0.2 of rest of the coupling.
 _CRUISE = Factory(
     plant=loaded_truck_trailer, channel=CASE_STUDY_CHANNEL, task=SpeedTracking(), disturbance=CASE_STUDY_BOX, start=0.2
+)
+_CONVOY = Factory(
+    plant=convoy,
+    channel=CONVOY_CHANNEL,
+    task=SetpointTracking(output=np.array([1.0, 0.0]), reach=0.9, width=0.9, preview=10, change_price=0.5),
+    disturbance=PERSISTENT,
+    terminates=True,
+)
+_LANE_KEEPING = Factory(
+    plant=lane_keeping,
+    channel=LANE_CHANNEL,
+    task=SetpointTracking(output=np.array([1.0, 0.0]), reach=0.45, width=0.45, preview=10),
+    disturbance=PERSISTENT,
+    terminates=True,
 )
 _CART_POLE = Factory(plant=cart_pole, channel=CART_POLE_CHANNEL, task=CART_POLE_TASK, terminates=True)
 
@@ -252,19 +272,12 @@ ENVIRONMENTS = {
         disturbance=PERSISTENT,
         terminates=True,
     ),
-    "ncs_gym/Convoy-v0": Factory(
-        plant=convoy,
-        channel=CONVOY_CHANNEL,
-        task=SetpointTracking(output=np.array([1.0, 0.0]), reach=0.9, width=0.9, preview=10, change_price=0.5),
-        disturbance=PERSISTENT,
-        terminates=True,
-    ),
-    "ncs_gym/LaneKeeping-v0": Factory(
-        plant=lane_keeping,
-        channel=LANE_CHANNEL,
-        task=SetpointTracking(output=np.array([1.0, 0.0]), reach=0.45, width=0.45, preview=10),
-        disturbance=PERSISTENT,
-        terminates=True,
+    "ncs_gym/Convoy-v0": _CONVOY,
+    "ncs_gym/LaneKeeping-v0": _LANE_KEEPING,
+    # The same vehicles, which ask for samples.
+    "ncs_gym/ConvoyOnRequest-v0": replace(_CONVOY, channel=CONVOY_REQUESTS, contract=contract_of(CONVOY_CHANNEL)),
+    "ncs_gym/LaneKeepingOnRequest-v0": replace(
+        _LANE_KEEPING, channel=LANE_REQUESTS, contract=contract_of(LANE_CHANNEL)
     ),
     # Gymnasium's `Pendulum-v1` inside.
     "ncs_gym/Pendulum-v0": Factory(

@@ -35,6 +35,7 @@ QUICK_PAGES = (
 SLOW_PAGES = (
     *QUICK_PAGES,
     "docs/contracts.md",
+    "docs/requests.md",
     "docs/own_plant.md",
     "docs/deployment.md",
     "docs/lookahead.md",

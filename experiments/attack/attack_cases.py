@@ -77,6 +77,11 @@ class AttackCase:
         return self.contract if protocol is None else protocol.behind(self.contract)
 
     @property
+    def keeps_contract(self) -> bool:
+        """Whether there is a contract that the channel can never break."""
+        return self.contract is not None and self.contract.is_kept_by(self.channel)
+
+    @property
     def certificate(self) -> Certificate:
         """A certificate for the plant under the contract, synthesized once per process."""
         return certificate_for(self.plant, self.certificate_contract)
@@ -126,10 +131,12 @@ def _env_cases(name: str, env: NCSEnv, *, all_channels: bool = False) -> dict[st
 
 
 def _extremes(contract: ChannelContract) -> dict[str, Channel]:
-    """Returns channels that reach the limits of a contract: the oldest sample each time, the longest gap each time."""
+    """Returns channels that reach the limits of a contract: by delays, by losses, by samples left out."""
     age, step = contract.max_age, contract.quantization_step
     longest_gap = Channel(loss=1.0, max_consecutive_losses=age, quantization_step=step)
-    return {"late": Channel(delay=age, quantization_step=step), "rare": longest_gap}
+    third = {"max_consecutive_losses": age // 3, "delay": age // 3}  # the rest are samples that nobody asks for
+    on_request = Channel(loss=1.0, **third, quantization_step=step, on_request=True)
+    return {"late": Channel(delay=age, quantization_step=step), "rare": longest_gap, "on request": on_request}
 
 
 def _random_plant(seed: int, index: int) -> LinearPlant:

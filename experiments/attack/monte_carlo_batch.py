@@ -15,7 +15,13 @@ import numpy as np
 
 from experiments.attack.attack_cases import AttackCase, attack_cases, plant_cases
 from experiments.attack.safety_counts import SETTLING_STEPS, SafetyCounts
-from experiments.attack.worst_case import GaussianVectorEnv, HostileAgents, WorstCaseVectorEnv, starts_in_box
+from experiments.attack.worst_case import (
+    GaussianVectorEnv,
+    HostileAgents,
+    HostileRequests,
+    WorstCaseVectorEnv,
+    starts_in_box,
+)
 from experiments.runs.provenance import versions
 from experiments.settings import AttackSettings, BackendSettings
 from experiments.settings.certificates import changed_contract
@@ -34,12 +40,18 @@ def cases_of(settings: AttackSettings) -> dict[str, AttackCase]:
     """Returns what is attacked, by name.
 
     Raises:
-        ValueError: If there is no environment of the id, or the plant's file cannot be read.
+        ValueError: If there is no environment of the id, no such kind of channel, or the plant's file cannot be
+            read.
     """
     if settings.plant is None:
         found = attack_cases(settings.seed, settings.random_plants, settings.env)
     else:
         found = plant_cases(settings.plant, changed_contract(None, settings.max_age, settings.quantization_step))
+    kinds = {name: name.rpartition(", ")[2] for name in found}
+    if settings.channel is not None:
+        if settings.channel not in kinds.values():
+            raise ValueError(f"channel must be one of {sorted(set(kinds.values()))}, got {settings.channel!r}")
+        found = {name: case for name, case in found.items() if kinds[name] == settings.channel}
     return {name: case.with_delta(settings.delta) for name, case in found.items()}
 
 
@@ -103,6 +115,9 @@ class MonteCarloBatch:
         rng = np.random.default_rng(policy_seed)
         info = _begin(settings, shield, seed >> 1, rng)
         agents = HostileAgents(envs, plant, shield.certificate, rng)
+        attacked, env = cases_of(settings)[self.case], shield.env.unwrapped
+        assert isinstance(env, NCSVectorEnv)
+        requests = HostileRequests(envs, shield.certificate, rng) if attacked.channel.on_request else None
         counts = SafetyCounts(
             steps=self.total_steps,
             episodes=envs,
@@ -111,6 +126,8 @@ class MonteCarloBatch:
         )
         kept, broken = np.ones(envs, np.bool_), np.zeros(envs, np.bool_)
         for step in range(EPISODE_STEPS):
+            if requests is not None:
+                env.request(requests.ask(info))
             *_, info = shield.step(agents.act(info["estimate"]))
             claimed, kept = _claimed_and_kept(info, kept)
             if settings.unshielded:  # nothing is claimed, and everything counted
@@ -124,6 +141,8 @@ class MonteCarloBatch:
                 interventions=int(np.count_nonzero(info["shield_intervened"])),
                 unproved=int(np.count_nonzero(kept & ~info["shield_guaranteed"])),
                 planned=int(np.count_nonzero(info.get("shield_plan_length", 0))),
+                forced=int(np.count_nonzero(info["request_forced"])),
+                overdue=int(attacked.keeps_contract * np.count_nonzero(info["contract_broken"])),
                 lapsed=int(np.count_nonzero(~claimed)),
                 lapsed_violations=int(np.count_nonzero(~claimed & outside_box)),
             )
@@ -132,7 +151,7 @@ class MonteCarloBatch:
                 level = float(np.nan_to_num(reached, nan=np.inf).max(initial=0.0, where=claimed))
                 counts += SafetyCounts(level=level)
             on_progress(envs)
-        return counts + SafetyCounts(broken_episodes=int(broken.sum()))
+        return counts + SafetyCounts(broken_episodes=int(broken.sum()), packets=int(info["packets"].sum()))
 
     def require(self, result: SafetyCounts) -> None:
         """Returns if counts can be this batch's.

@@ -38,6 +38,9 @@ class SafetyCounts:
         outside_starts: Number of episodes that began outside S, with a certified plan.
         lapsed: Number of lapsed steps.
         lapsed_violations: Number of lapsed steps whose true state lay outside the safe box.
+        packets: Number of samples sent.
+        forced: Number of steps in which the contract forced a request.
+        overdue: Number of steps at which the newest sample was older than a contract allows that the channel keeps.
     """
 
     files: ClassVar[dict[str, bytes]] = {}  # a batch leaves none
@@ -53,6 +56,9 @@ class SafetyCounts:
     outside_starts: int = 0
     lapsed: int = 0
     lapsed_violations: int = 0
+    packets: int = 0
+    forced: int = 0
+    overdue: int = 0
 
     def __add__(self, other: SafetyCounts) -> SafetyCounts:
         """Returns the counts of both."""
@@ -104,6 +110,11 @@ _LAPSED: _Columns = {
     ("no", "claim"): lambda counts: f"{counts.lapsed / counts.steps:.1%}",
     ("outside", "then"): lambda counts: f"{counts.lapsed_violations:,}",
 }
+_REQUESTS: _Columns = {
+    ("packets", "per step"): lambda counts: f"{counts.packets / counts.steps:.2f}",
+    ("", "forced"): lambda counts: f"{counts.forced / counts.steps:.1%}" if counts.forced else "-",
+    ("age", "> h"): lambda counts: f"{counts.overdue:,}",
+}
 _SET_COLUMNS: _Columns = {
     **_EPISODES,
     ("outside", "S"): lambda counts: f"{counts.exits:,}",
@@ -142,6 +153,7 @@ _CHANNELS = {
     "its channel": "the environment's own",
     "late": "the oldest sample that the contract allows, at every step",
     "rare": "the longest gap that it allows, every time",
+    "on request": "samples where hostile policies ask, seeing the true state, or the contract forces one",
     "perfect": "loses and delays nothing",
     "blackout": "no packet at all",
     "bursts": "losses in a row",
@@ -150,6 +162,9 @@ _CHANNELS = {
 _LAPSED_LEGEND = """
 no claim: steps from a broken contract on, until the proof holds again, which no failure counts;
 outside then: such steps outside the box"""
+_REQUESTS_LEGEND = """
+forced: steps in which the contract forced a request that nobody made;
+age > h: steps with a sample older than the contract allows, of channels that keep it"""
 
 
 def counts_table(counts: Mapping[str, SafetyCounts], *, looks_ahead: bool) -> str:
@@ -163,6 +178,8 @@ def counts_table(counts: Mapping[str, SafetyCounts], *, looks_ahead: bool) -> st
     total = sum(counts.values(), SafetyCounts())
     if total.lapsed:
         columns, legend = columns | _LAPSED, legend + _LAPSED_LEGEND
+    if total.forced:
+        columns, legend = columns | _REQUESTS, legend + _REQUESTS_LEGEND
     rows = [list(line) for line in zip(("", "case"), *columns, strict=True)]
     plants = {name: name.rpartition(", ")[0] for name in counts}
     for plant in dict.fromkeys(plants.values()):
@@ -213,6 +230,8 @@ def require_safe(total: SafetyCounts, *, looks_ahead: bool) -> None:
         SafetyBroken: If it did not.
     """
     exits = 0 if looks_ahead else total.exits
+    if total.overdue:
+        raise SafetyBroken(f"at {total.overdue:,} steps the newest sample was older than a contract that was kept")
     if exits or total.violations or total.unproved:
         outside_set = "" if looks_ahead else f"{exits:,} steps outside S, "
         raise SafetyBroken(f"{outside_set}{total.violations:,} outside the box, {total.unproved:,} without a proof")

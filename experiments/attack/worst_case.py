@@ -131,3 +131,28 @@ class HostileAgents:
         actions[self._back] = np.clip(estimates[self._back] @ self._turned, -1.0, 1.0)
         actions[self._bang] = self._signs
         return actions
+
+
+class HostileRequests:
+    """Requests for N environments, by turns: never, at random, and where they are of little use, as the truth says.
+
+    The last two ask where the true error is smaller than in half of the environments, and where the true state is far
+    inside S.
+
+    Args:
+        num_envs: N.
+        certificate: Of S.
+        rng: Source of randomness.
+    """
+
+    def __init__(self, num_envs: int, certificate: Certificate, rng: np.random.Generator) -> None:
+        self._rng, self._M = rng, certificate.M
+        self._kinds = np.arange(num_envs) % 4
+
+    def ask(self, info: dict[str, Any]) -> np.ndarray:
+        """Returns where samples are asked for, shape (N,), after a step or reset that returned an info."""
+        errors, levels = (
+            np.einsum("ki,ij,kj->k", info[name], self._M, info[name]) for name in ("estimation_error", "state")
+        )
+        never, sometimes = np.zeros(len(levels), np.bool_), self._rng.random(len(levels)) < 0.3
+        return np.choose(self._kinds, [never, sometimes, errors < np.median(errors), levels < 0.5])

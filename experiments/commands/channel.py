@@ -22,8 +22,9 @@ _MOST_ROWS = 12
 def channel(settings: ChannelSettings) -> None:
     """Runs `ncs channel`."""
     require_place(settings.out)
-    log = PacketLog.load(settings.file, settings.ping_period)
     env = None if settings.env is None else registered_env(settings.env)
+    step = settings.sampling_period or (1.0 if env is None else env.plant.dt)
+    log = PacketLog.load(settings.file, settings.ping_period, step)
     dt = settings.sampling_period or (log.period if env is None else env.plant.dt)
     found = _numbers(log, dt, settings.seed)
     print(_text(log, dt, found))
@@ -63,13 +64,14 @@ def _text(log: PacketLog, dt: float, found: dict[str, Any]) -> str:
     runs = ", ".join(f"{count} of {length}" for length, count in found["runs_of_losses"].items()) or "none"
     median, ninety, ninety_nine, longest = (1000.0 * each for each in found["delay_quantiles"])
     first, second = found["kept_by_halves"]
+    late = f"{low} to {high} steps" if low < high else "1 step" if low == 1 else f"{low} steps"
     together = "none" if found["promised"] is None else f"max_age = {found['promised']}"
     lines = [
         f"{found['packets']:,} packets in {log.sent[-1] - log.sent[0]:.4g} s, control steps of {1000.0 * dt:.4g} ms, a "
-        f"packet every {found['send_period']} of them.",
+        f"packet every {'step' if found['send_period'] == 1 else str(found['send_period']) + ' steps'}.",
         f"Lost: {found['lost']:,} ({100.0 * found['lost'] / found['packets']:.3g} %); runs of losses: {runs}.",
         f"Delays: median {median:.3g} ms, 90 % {ninety:.3g} ms, 99 % {ninety_nine:.3g} ms, longest {longest:.3g} ms: "
-        f"{low} to {high} steps.",
+        f"{late}.",
         f"Contract kept: max_age = {found['kept']} (first half {first}, second half {second}); by the longest run of "
         f"losses and the longest delay together: {together}.",
     ]

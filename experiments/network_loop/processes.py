@@ -133,9 +133,11 @@ def network_channels(
         down_changes: Those of the downlink.
 
     Raises:
-        ValueError: If a change is wrong, or is none that a real network can have.
+        ValueError: If a change is wrong, or is none that a real network can have, or samples are on request.
     """
     up = env.channel
+    if up.on_request:
+        raise ValueError("datagrams carry no requests for samples yet: give an environment without on_request")
     down = env.downlink or Channel(loss=up.loss, jitter=up.jitter, max_consecutive_losses=up.max_consecutive_losses)
     if down.most_consecutive_losses is None:  # nothing can be committed ahead without a promise
         down = Channel(loss=down.loss, delay=down.delay, jitter=down.jitter, max_consecutive_losses=2)

@@ -131,6 +131,7 @@ class AttackSettings(BackendSettings):
             up, or every kind of channel without one.
         max_age: Largest measurement age of the contract of --plant [steps]; no contract by default.
         quantization_step: Coarsest quantization that the contract of --plant allows.
+        channel: Only kind of channel to attack, by its name in the table: "on request", say; all by default.
         force: Replace the finished results of another campaign in the output folder, which otherwise is refused.
         seed: Seed of the campaign, >= 0.
     """
@@ -148,6 +149,7 @@ class AttackSettings(BackendSettings):
     plant: Path | None = None
     max_age: int | None = None
     quantization_step: float | None = None
+    channel: str | None = None
     force: bool = False
     seed: int = 0
 
@@ -270,7 +272,7 @@ class ChannelSettings:
     Attributes:
         file: A CSV file with a line per packet, when it was sent and when it was received in seconds, the second empty
             for a lost packet; or the output of ping, whose delays are those of the whole way and back.
-        sampling_period: Duration of a control step [s]; by default the time between packets.
+        sampling_period: Duration of a control step [s]; by default that of --env, or the time between packets.
         ping_period: Time between the packets of ping without stamps (ping -D prints them) [s]; 1 by default.
         env: Id of an environment whose contract is compared with the record.
         out: File for the numbers (JSON).

@@ -30,6 +30,7 @@ from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.downlink import DownlinkProtocol, DownlinkState, Inputs, no_inputs
 from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from ncs_gym.network.packet_transmission import ChannelState
+from ncs_gym.network.requests import Requested, Requests, require_on_request
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import LinearProcess, Process
 from ncs_gym.processes.simulation import PlantSimulation
@@ -106,6 +107,9 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     | `is_success` | float | - | 1.0 while `episode_violations` is zero, else 0.0 |
     | `contract_broken` | bool | - | whether the newest sample used is older now than the channel's contract allows |
     | `downlink_broken` | bool | - | whether zero was applied in this step because the input committed had not arrived |
+    | `requested` | bool | - | whether a sample was requested in this step; False where samples are not on request |
+    | `request_forced` | bool | - | whether that was so because the contract needs it though nobody asked |
+    | `packets` | int | packets | samples sent in this episode |
 
     Args:
         plant: The plant with its bounds.
@@ -216,6 +220,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._estimator = Estimator(plant, self._channel, histories=histories)
         self._downlink_state = DownlinkState(self._protocol, plant.m)
         self._uplinks, self._downlinks = uplinks([self._channel], self._channel), downlinks([downlink], self._protocol)
+        on_request, lead = self._channel.on_request, len(self._pending)
+        self._requests = Requests(self._channel, self._contract, lead) if on_request else None
         self._noise = as_noise(noise, plant)
         self._process_given = LinearProcess() if process is None else expect(process, Process, "process")
         allowed = self._allow_assumption_violation
@@ -225,7 +231,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._horizon = as_count(horizon, "horizon", low=1, high=LONGEST_HORIZON)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)
         steps = self._horizon + len(self._pending)
-        self._observe, lead = read_observed(observe), len(self._pending)
+        self._observe = read_observed(observe)
         sets = self._error_set, self._initial_set
         self.observation_space = observation_space(plant, self._task, *sets, steps, lead, self._observe)
         self._low, self._high = self.observation_space.low, self.observation_space.high
@@ -264,7 +270,9 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             links.give(sources)
             links.begin(rng)
         channel = self.episode_channel
-        self._channel_state = ChannelState(channel, rng)
+        self._channel_state, self._packets = ChannelState(channel, rng), 0
+        if self._requests is not None:
+            self._requests.begin()
         if (channel.delay, channel.jitter) != (self._estimator.channel.delay, self._estimator.channel.jitter):
             self._estimator = self._estimator_for(covering([channel], self._channel))
         self._estimator.reset(self._state + self._process.first_error(rng))
@@ -295,12 +303,17 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         rng = self.np_random
         inputs = self._downlink_state.exchange(rng, self.steps, decided)
         u, before = inputs.applied, self._state
+        if self._requests is not None:
+            self._requests.decide(self._estimator.age)
+            # A sensor that has not heard whether a sample is requested takes it.
+            self._channel_state.requested = bool(self._requests.decided[0] or inputs.missing)
         self._state = self._process.advance(rng, before, u, self.steps, self._disturbance_memory)
         self._task_state = self._task.advance(rng, self._plant, self._task_state, u)
         self.steps += 1
         sends = self._channel_state.sends_at(self.steps)
         sample = self._process.measure(rng, self._state) if sends else None
         packets = self._channel_state.exchange(rng, self.steps, sample, self._estimator.episode)
+        self._packets += sends
         self._estimator.advance(u, packets)
         reward = float(self._task.reward(self._plant, self._task_state, self._state, u))
         worst = self._plant.worst_constraint_values(before, u, self._state)
@@ -311,6 +324,27 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             sent = sent_at(self.steps, self._channel_state, packets)
             self.renderer.record(info, self._task_state, sent)
         return self._observation(), reward, terminated, self._process.truncated, info
+
+    def request(self, asked: bool = True) -> None:
+        """Asks for a sample in the next step, where the channel takes samples on request (docs/requests.md).
+
+        The request is decided together with the next action: without a downlink it is about the sample that the next
+        step ends with, behind one about that of c steps later. Where nobody asks, samples are requested only if the
+        contract needs them.
+
+        Raises:
+            ValueError: If the channel does not take samples on request, or what is given is no bool.
+        """
+        require_on_request(self._requests).ask(asked)
+
+    @property
+    def outstanding(self) -> int:
+        """Number of samples requested that are newer than the newest one used (docs/requests.md).
+
+        Raises:
+            ValueError: If the channel does not take samples on request.
+        """
+        return int(require_on_request(self._requests).outstanding(self._estimator.age))
 
     def render(self) -> np.ndarray | None:
         """Returns an image, shape (height, width, 3), uint8; None in mode "human", which shows every step by itself.
@@ -395,7 +429,11 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._belief = self._predicted_estimate()
         known, alarm = self._estimator, bool(self._estimator.alarm or self._process.alarm)
         self._known = Known(*self._belief, known.age, alarm, inputs.applied.copy(), inputs.committed.copy())
-        return loop_info(known, self._belief, self._contract, self._state, inputs, arrived, constraints, alarm)
+        sampled = Requested(False, False, self._packets)
+        if self._requests is not None:
+            sampled = Requested(self._requests.requested, self._requests.forced, self._packets)
+        loop = known, self._belief, self._contract, self._state, inputs, arrived, constraints, alarm
+        return loop_info(*loop, sampled)
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:

@@ -98,8 +98,11 @@ class EpisodeChannels:
 
 
 def uplinks(own: Sequence[Channel], declared: Channel) -> EpisodeChannels:
-    """Returns the channels between sensors and controllers, none of which may round more coarsely than declared."""
-    return EpisodeChannels(own, partial(_require_fine, declared.quantization_step))
+    """Returns the channels between sensors and controllers.
+
+    None may round more coarsely than declared, or send samples on request if the declared one does not, or otherwise.
+    """
+    return EpisodeChannels(own, partial(_require_like, declared))
 
 
 def downlinks(own: Sequence[Channel | None], protocol: DownlinkProtocol | None) -> EpisodeChannels:
@@ -188,10 +191,17 @@ def _chosen(choices: tuple[Channel, ...], rng: np.random.Generator) -> Channel:
     return choices[int(rng.integers(len(choices)))]
 
 
-def _require_fine(coarsest: float, channel: Channel) -> None:
-    """Raises ValueError if a channel rounds more coarsely than an environment was made for."""
+def _require_like(declared: Channel, channel: Channel) -> None:
+    """Raises ValueError if an environment made for one channel cannot have another one."""
+    coarsest = declared.quantization_step
     if channel.quantization_step > coarsest:
         raise ValueError(
             f"the channel rounds to {channel.quantization_step}, the environment was made for no more than "
             f"{coarsest}: make it with the coarsest of its channels"
+        )
+    if channel.on_request != declared.on_request:
+        kind = "on request" if declared.on_request else "by itself"
+        raise ValueError(
+            f"the environment was made for a channel that sends samples {kind}: give one with "
+            f"on_request={declared.on_request}"
         )

@@ -10,6 +10,7 @@ from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.downlink import Inputs
+from ncs_gym.network.requests import Requested
 
 
 class Known(NamedTuple):
@@ -59,6 +60,7 @@ def loop_info(
     arrived: Any,
     constraints: Constraints,
     alarm: Any,
+    sampled: Requested,
 ) -> dict[str, Any]:
     """Returns `info`, every array a fresh copy; the environment is the first axis of what it holds for many.
 
@@ -72,6 +74,7 @@ def loop_info(
         arrived: Whether a packet arrived at this step, a bool or a fresh array of shape (N,).
         constraints: How the safe box is kept.
         alarm: Whether an assumption was seen to be violated, a bool or a fresh array of shape (N,).
+        sampled: What was requested in the step.
     """
     values, worst, cost, violations = constraints
     age: Any = estimator.age
@@ -96,4 +99,7 @@ def loop_info(
         "is_success": (violations == 0.0) * 1.0,
         "contract_broken": broken,
         "downlink_broken": np.array(missing) if many else missing,
+        "requested": np.array(sampled.requested) if many else sampled.requested,
+        "request_forced": np.array(sampled.forced) if many else sampled.forced,
+        "packets": np.array(sampled.packets) if many else sampled.packets,
     }

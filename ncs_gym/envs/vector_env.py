@@ -22,6 +22,7 @@ from ncs_gym.network.channel import Channel, widest
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.downlink import DownlinkProtocol, Inputs, VectorDownlinkState, no_inputs
 from ncs_gym.network.packet_transmission import VectorChannelState
+from ncs_gym.network.requests import Requested, Requests, require_on_request
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import Process
 from ncs_gym.processes.simulation import PlantSimulation
@@ -129,6 +130,11 @@ class NCSVectorEnv(VectorEnv):
         histories = arrival_histories(self._plant, self._channel, self._certificate_contract)
         self._estimator = VectorEstimator(self._plant, histories, self.num_envs)
         self._downlink_state = VectorDownlinkState(self._protocol, self._plant.m, self.num_envs)
+        self._requests = None
+        if self._channel.on_request:
+            lead = 0 if self._protocol is None else self._protocol.lead
+            self._requests = Requests(self._channel, self._contract, lead, self.num_envs)
+        self._packets, self._nothing = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, np.bool_)
         self._belief = self._predicted_estimates()
         self._state = np.zeros((self._plant.n, self.num_envs))
         self._worst = self._plant.constraint_values(self._state)
@@ -227,7 +233,7 @@ class NCSVectorEnv(VectorEnv):
         self._consistent, self._ended = False, None
         inputs = self._downlink_state.exchange(self.np_random, self.steps, u)
         applied, committed, missing = inputs
-        arrived = self._advance(applied)
+        arrived = self._advance(applied, self._requested(missing))
         reward = self._task.reward_many(self._plant, self._task_state, self._state, applied)
         restarted = self._done.copy() if some_done else None
         if restarted is not None:  # NEXT_STEP: the last step ended these episodes
@@ -246,6 +252,23 @@ class NCSVectorEnv(VectorEnv):
         self._consistent = True
         self._draw(info, begins=restarted)
         return observation, reward, terminated, truncated, info
+
+    def request(self, asked: Any = True) -> None:
+        """Asks for samples in the next step, in all environments or where a mask (N,) says so; see `NCSEnv.request`.
+
+        Raises:
+            ValueError: If the channel does not take samples on request, or what is given is no bool.
+        """
+        require_on_request(self._requests).ask(asked)
+
+    @property
+    def outstanding(self) -> np.ndarray:
+        """What `NCSEnv.outstanding` is, shape (N,).
+
+        Raises:
+            ValueError: If the channel does not take samples on request.
+        """
+        return require_on_request(self._requests).outstanding(self._estimator.age)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Returns the picture of `rendered_env` for each environment (`RecordVideo(record_first_only=True)`).
@@ -290,15 +313,31 @@ class NCSVectorEnv(VectorEnv):
         """
         return read_actions(self._plant, actions, self.num_envs)[1]
 
-    def _advance(self, u: np.ndarray) -> np.ndarray:
-        """Moves everything one step on with inputs (m, N), and returns where packets arrived, shape (N,)."""
+    def _requested(self, missing: Any) -> np.ndarray | None:
+        """Decides the requests; returns where a sample is requested now, (N,), or None if samples are not on request.
+
+        A sensor that has not heard whether a sample is requested, where commands are missing (N,), takes it.
+        """
+        if self._requests is None:
+            return None
+        self._requests.decide(self._estimator.age)
+        return self._requests.decided[0] | missing
+
+    def _advance(self, u: np.ndarray, requested: np.ndarray | None) -> np.ndarray:
+        """Moves everything one step on; returns where packets arrived, shape (N,).
+
+        Args:
+            u: Inputs, shape (m, N).
+            requested: Where samples are requested, (N,); None if samples are not on request.
+        """
         rng, estimator, before = self.np_random, self._estimator, self._state
         self._state = self._process.advance(rng, before, u, self.steps, self._disturbance_memory)
         self._worst = self._plant.worst_constraint_values(before, u, self._state)
         self._task_state = self._task.advance_many(rng, self._plant, self._task_state, u)
         self.steps += 1
         self.ticks += 1
-        sends, samples = self._channel_state.send(rng, self.steps), None
+        sends, samples = self._channel_state.send(rng, self.steps, requested), None
+        self._packets = self._packets + sends
         if sends.any():
             samples = self._channel_state.channel.quantize(self._process.measure(rng, self._state))
             if not np.isfinite(samples.sum()):  # no sensor within the assumptions sends this
@@ -344,6 +383,9 @@ class NCSVectorEnv(VectorEnv):
         self._state[:, mask] = states
         self._estimator.begin(mask, states + first_errors)
         self._downlink_state.begin(rng, mask, downlinks)
+        if self._requests is not None:
+            self._requests.begin(mask)
+        self._packets = np.where(mask, 0, self._packets)
         self.steps[mask], self._violations[mask], self._done[mask] = 0, 0.0, False
         self.episodes[mask] += 1
         self.starts[mask] = known
@@ -407,7 +449,11 @@ class NCSVectorEnv(VectorEnv):
         constraints = Constraints(values, self._worst, cost, self._violations.copy())
         alarm = self._estimator.alarm | self._process.alarm
         self._known = Known(*belief, self._estimator.age.copy(), alarm.copy(), *(each.copy() for each in inputs[:2]))
-        return loop_info(self._estimator, belief, self._contract, self._state, inputs, arrived, constraints, alarm)
+        requested = (self._nothing,) * 2
+        if self._requests is not None:
+            requested = self._requests.requested, self._requests.forced
+        loop = self._estimator, belief, self._contract, self._state, inputs, arrived, constraints, alarm
+        return loop_info(*loop, Requested(*requested, self._packets))
 
     def _restarted(self, observation: np.ndarray, info: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
         """Returns the first of new episodes where old ones ended, whose last go to final_obs and final_info."""

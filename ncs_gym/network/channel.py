@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ncs_gym.validation import as_count, as_number, shown
+from ncs_gym.validation import as_count, as_flag, as_number, shown
 
 # Packets in flight are kept in memory, for every environment [steps].
 LONGEST_DELAY = 1000
@@ -75,6 +75,8 @@ class Channel:
         delay: Fixed delay [steps].
         jitter: Largest extra random delay [steps].
         max_consecutive_losses: Never lose more packets in a row than this; None promises nothing.
+        on_request: Whether a sample is taken only where the controller asks for it, or the contract needs it, instead
+            of every `send_period` steps (docs/requests.md).
 
     Raises:
         ValueError: If a value is out of range.
@@ -86,6 +88,7 @@ class Channel:
     delay: int = 0
     jitter: int = 0
     max_consecutive_losses: int | None = None
+    on_request: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(self.loss, dict):
@@ -105,6 +108,10 @@ class Channel:
         if self.max_consecutive_losses is not None:
             most = as_count(self.max_consecutive_losses, "max_consecutive_losses", low=0)
             object.__setattr__(self, "max_consecutive_losses", most)
+        if as_flag(self.on_request, "on_request") and self.send_period != 1:
+            raise ValueError(
+                f"on request every step may have a sample: leave out send_period, which is {self.send_period}"
+            )
 
     @property
     def most_consecutive_losses(self) -> int | None:
@@ -123,6 +130,7 @@ class Channel:
     def description(self) -> str:
         """What the channel does to samples, in sentences."""
         every = "every step" if self.send_period == 1 else f"every {_steps(self.send_period)}"
+        every = "on request" if self.on_request else every
         rounded = f"quantized with step {self.quantization_step:g}" if self.quantization_step else "not quantized"
         if isinstance(self.loss, GilbertElliott):
             lost = f"Losses come in bursts ({self.loss})"

@@ -17,7 +17,7 @@ import numpy as np
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import MAX_AGE, ChannelContract, contract_of
 from ncs_gym.network.packet_transmission import ChannelState, VectorChannelState
-from ncs_gym.validation import as_count, as_numbers, read_only, shown
+from ncs_gym.validation import as_count, as_flag, as_numbers, read_only, shown
 
 # Stamp of the newest command where none has arrived.
 NEVER = -(2**31)
@@ -87,6 +87,8 @@ def downlink_protocol(downlink: Channel | None, contract: ChannelContract | None
         raise ValueError(
             f"a downlink sends a command at every step: leave out send_period, which is {downlink.send_period}"
         )
+    if downlink.on_request:
+        raise ValueError("a downlink sends a command at every step: on_request is for the channel of the samples")
     if contract is None:
         contract = contract_of(downlink)
     elif not isinstance(contract, ChannelContract):
@@ -121,11 +123,13 @@ class Command(NamedTuple):
         stamp: Step k at which it was sent, counted from the start of its episode.
         inputs: The committed inputs of steps k .. k + c, shape (c+1, m) [physical units].
         episode: Number of that episode.
+        requests: Whether the samples of steps k + 1 .. k + c + 1 are requested; empty where they are not on request.
     """
 
     stamp: int
     inputs: np.ndarray
     episode: int = 0
+    requests: tuple[bool, ...] = ()
 
 
 class Echo(NamedTuple):
@@ -170,6 +174,8 @@ class Actuator:
     Attributes:
         lead, inputs: c and m.
         missing: Whether the input applied last was zero because the committed one had not arrived.
+        requested: After `apply`, whether a sensor beside the actuator takes the sample of the next step, where samples
+            are on request: not if a command said so, and always where none has arrived.
         refused: How many commands of this episode were refused.
         echo: What was applied since the start of the episode, for `SafeLoop.receive(echoes=...)`.
 
@@ -197,7 +203,8 @@ class Actuator:
         """
         self.echo = Echo(0, 0, NO_INPUTS, as_count(episode, "episode", low=0))
         self._committed: dict[int, np.ndarray] = {}
-        self.missing, self.refused = False, 0
+        self._requested: dict[int, bool] = {}
+        self.missing, self.requested, self.refused = False, True, 0
 
     def receive(self, commands: Iterable[Command]) -> None:
         """Takes in what arrived, in any order.
@@ -219,6 +226,9 @@ class Actuator:
             for ahead, u in enumerate(command.inputs, command.stamp):
                 if ahead >= now:
                     self._committed.setdefault(ahead, u)
+            for ahead, requested in enumerate(command.requests, command.stamp):
+                if ahead >= now:
+                    self._requested.setdefault(ahead, requested)
 
     def apply(self, step: int) -> np.ndarray:
         """Returns the input to apply at a step, shape (m,) [physical units], as a new array.
@@ -231,6 +241,7 @@ class Actuator:
         step = as_count(step, "step", low=0)
         committed = self._committed.get(step) if step >= self.lead else self._nothing
         self.missing = committed is None
+        self.requested = self._requested.get(step, True)
         u = (self._nothing if committed is None else committed).copy()
         steps, missing, digest, episode = self.echo
         if step >= steps:
@@ -241,6 +252,7 @@ class Actuator:
                 missing, digest = missing + left_out, digest_of_inputs(digest, None)
             self.echo = Echo(step + 1, missing + self.missing, digest_of_inputs(digest, u), episode)
             self._committed = {ahead: each for ahead, each in self._committed.items() if ahead >= step}
+            self._requested = {ahead: each for ahead, each in self._requested.items() if ahead >= step}
         elif step < steps - 1:  # a clock that went back: what is applied now is none of the inputs that were decided
             self.echo = Echo(steps, missing + 1, digest_of_inputs(digest, None), episode)
         return u
@@ -250,20 +262,24 @@ def _as_command(value: Any, shape: tuple[int, int]) -> Command:
     """Returns a command whose inputs have a shape, (c+1, m).
 
     Raises:
-        ValueError: If stamp or episode is no whole number, or the inputs are not finite numbers of that shape.
+        ValueError: If stamp or episode is no whole number, the inputs are not finite numbers of that shape, or the
+            requests are no bools of c+1 samples.
     """
     stamp = episode = 0
+    requests: tuple[bool, ...] = ()
     try:
-        stamp, inputs, episode = value if isinstance(value, Command) else Command(*value)
+        stamp, inputs, episode, requests = value if isinstance(value, Command) else Command(*value)
         stamp, episode, numbers = index(stamp), index(episode), as_numbers(inputs)
+        requests = tuple(as_flag(each, "a request") for each in requests)
     except (TypeError, ValueError):
         numbers = None
-    if numbers is None or numbers.shape != shape or not np.isfinite(numbers).all():
+    complete = len(requests) in (0, shape[0])
+    if numbers is None or numbers.shape != shape or not np.isfinite(numbers).all() or not complete:
         raise ValueError(
             "a command is Command(stamp, inputs) or Command(stamp, inputs, episode) with whole numbers and finite "
-            f"inputs of shape {shape}, got {shown(value)}"
+            f"inputs of shape {shape}, and as many requests or none, got {shown(value)}"
         )
-    return Command(stamp, np.array(numbers), episode)
+    return Command(stamp, np.array(numbers), episode, requests)
 
 
 def as_echo(value: Any) -> Echo:
@@ -314,9 +330,9 @@ class CommittedInputs:
         """Adds the input decided now."""
         self.pending = (*self.pending, np.array(u, dtype=np.float64))
 
-    def command(self, step: int, episode: int) -> Command:
-        """Returns the command to send at a step, after the commitment of that step."""
-        return Command(step, np.array(self.pending), episode)
+    def command(self, step: int, episode: int, requests: tuple[bool, ...] = ()) -> Command:
+        """Returns the command to send at a step, after the commitment of that step, with requests if there are any."""
+        return Command(step, np.array(self.pending), episode, requests)
 
     def pop(self) -> np.ndarray:
         """Removes and returns the input whose step has come."""

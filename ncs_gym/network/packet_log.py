@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import re
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,16 +52,19 @@ class PacketLog(ReadOnlyArrays):
         self._make_arrays_read_only()
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], period: float | None = None) -> Self:
+    def load(cls, path: str | os.PathLike[str], period: float | None = None, step: float = 1.0) -> Self:
         """Returns the packets in a file.
 
         A CSV file has a line per packet: when it was sent and when it was received, in seconds, the second empty for a
-        lost packet; a first line of names is skipped. Of the output of ping the delay is that of the whole way and
-        back, and numbers without an answer are lost packets.
+        lost packet. A first line of names that has "sent" and "received" among them says where they are; another one is
+        skipped. With "episode" besides it is a log of `ncs loop`, whose numbers are those of steps: episodes count as
+        one after the other, and steps without a packet as lost packets. Of the output of ping the delay is that of the
+        whole way and back, and numbers without an answer are lost packets.
 
         Args:
             path: The file.
             period: Time between the packets of ping without stamps (`ping -D` prints them) [s]; 1 by default.
+            step: Duration of the steps of `ncs loop` [s].
 
         Raises:
             ValueError: If the file cannot be read or holds neither.
@@ -71,18 +75,52 @@ class PacketLog(ReadOnlyArrays):
             raise ValueError(f"cannot read packets from {shown(path)}: {error}") from error
         if any("icmp_seq=" in line for line in lines):
             return cls._of_ping(lines, 1.0 if period is None else as_number(period, "period", low=0.0, low_open=True))
-        return cls._of_csv(lines, path)
+        names = [name.strip() for name in lines[0].split(",")] if lines else []
+        named = {"sent", "received"} <= {*names}
+        columns = [names.index(name) for name in ("sent", "received")] if named else [0, 1]
+        if named and "episode" in names:
+            dt = as_number(step, "step", low=0.0, low_open=True)
+            return cls._of_steps(lines[1:], names.index("episode"), columns, path, dt)
+        log = cls._of_csv(lines, columns, path)
+        if log.period >= 1.0 and np.nanmedian(np.append(log.delays, -np.inf)) >= 1.0:
+            warnings.warn(
+                f"the times in {shown(path)} look like milliseconds, but are taken for seconds: packets every "
+                f"{log.period:g} s, most of which take more than a second",
+                UserWarning,
+                stacklevel=2,
+            )
+        return log
 
     @classmethod
-    def _of_csv(cls, lines: Iterable[str], path: str | os.PathLike[str]) -> Self:
+    def _of_steps(
+        cls, lines: Iterable[str], episode: int, columns: list[int], path: str | os.PathLike[str], dt: float
+    ) -> Self:
+        """Returns the packets of a log of `ncs loop`: the steps at which those that arrived were sent and received."""
+        arrivals: dict[str, dict[int, int]] = {}
+        for number, row in enumerate(csv.reader(lines), 2):
+            try:
+                sent, received = (int(row[column]) for column in columns)
+                arrived = arrivals.setdefault(row[episode], {})
+            except (ValueError, IndexError):
+                raise ValueError(
+                    f"line {number} of {shown(path)} is not an episode, a step sent and one received"
+                ) from None
+            arrived[sent] = min(received, arrived.get(sent, received))  # a second one is a duplicate
+        delays = [
+            arrived.get(step, np.nan) - step for arrived in arrivals.values() for step in range(1, max(arrived) + 1)
+        ]
+        return cls(dt * np.arange(len(delays)), dt * np.array(delays))
+
+    @classmethod
+    def _of_csv(cls, lines: Iterable[str], columns: list[int], path: str | os.PathLike[str]) -> Self:
         packets = []
         for number, row in enumerate(csv.reader(lines), 1):
             cells = [cell.strip() for cell in row]
             if not any(cells):
                 continue
             try:
-                sent = float(cells[0])
-                received = float(cells[1]) if len(cells) > 1 and cells[1] else np.nan
+                sent, received = (cells[column] if column < len(cells) else "" for column in columns)
+                sent, received = float(sent), float(received) if received else np.nan
             except ValueError:
                 if packets or number > 1:
                     raise ValueError(f"line {number} of {shown(path)} is not a time sent and a time received") from None

@@ -45,6 +45,7 @@ class StackedChannels:
     def __init__(self, channels: Sequence[Channel]) -> None:
         if any(isinstance(each, TraceChannel) for each in channels):
             raise ValueError("a TraceChannel stands beside equal ones alone, since each replays its own record")
+        self.on_request = channels[0].on_request  # of all, as environments require
 
         def stacked(*names: str) -> list[np.ndarray]:
             return [np.array([getattr(each, name) for each in channels]) for name in names]
@@ -132,16 +133,17 @@ class ChannelState:
 
     Attributes:
         in_flight: The packets on their way, by the step at which they arrive.
+        requested: Whether the next sample is requested, of a channel that takes samples on request.
     """
 
     def __init__(self, channel: Channel, rng: np.random.Generator) -> None:
-        self.channel = channel
+        self.channel, self.requested = channel, False
         self.in_flight: dict[int, list[Any]] = {}
         self._loss_state = first_loss_state(channel, rng)
 
     def sends_at(self, step: int) -> bool:
         """Returns whether the sensor sends at this step."""
-        return step % self.channel.send_period == 0
+        return self.requested if self.channel.on_request else step % self.channel.send_period == 0
 
     def exchange(
         self, rng: np.random.Generator, step: int, measurement: np.ndarray | None, episode: int = 0
@@ -185,7 +187,7 @@ class VectorChannelState:
 
     def __init__(self, channel: Channel | Sequence[Channel], rng: np.random.Generator, size: int) -> None:
         self.channel = channel if isinstance(channel, Channel) else side_by_side(channel)
-        self._size = size
+        self._size, self._sends = size, np.zeros(size, np.bool_)
         self._loss_state = first_loss_state(self.channel, rng, size)
         # For the samples of each age, after how many steps they arrive.
         self._delays = [np.full(size, -1) for _ in range(self.channel.longest_delay + 1)]
@@ -209,18 +211,22 @@ class VectorChannelState:
         for delays in self._delays:
             delays[chosen] = -1
 
-    def send(self, rng: np.random.Generator, steps: np.ndarray) -> np.ndarray:
-        """Sends samples where it is time, at steps (N,) of the episodes; returns which environments send, (N,)."""
-        sends = steps % self.channel.send_period == 0
+    def send(self, rng: np.random.Generator, steps: np.ndarray, requested: np.ndarray | None = None) -> np.ndarray:
+        """Sends samples where it is time, at steps (N,) of the episodes; returns which environments send, (N,).
+
+        Args:
+            rng: Source of randomness.
+            steps: The steps.
+            requested: Where a sample is requested, shape (N,), of channels that take samples on request.
+        """
+        sends = steps % self.channel.send_period == 0 if requested is None else requested
         self._loss_state, delays = transmit(self.channel, rng, self._loss_state, sends)
-        self._delays = [delays, *self._delays[:-1]]
+        self._delays, self._sends = [delays, *self._delays[:-1]], sends
         return sends
 
     def arrival_of(self, e: int, step: int) -> tuple[bool, int | None]:
         """Returns whether environment e sent at its present step, and at which step that arrives; None if never."""
-        period = self.channel.send_period
-        sends = step % int(period if isinstance(period, int) else period[e]) == 0
-        delay = int(self._delays[0][e])
+        sends, delay = bool(self._sends[e]), int(self._delays[0][e])
         return sends, step + delay if sends and delay >= 0 else None
 
     def discard(self, chosen: Any) -> None:

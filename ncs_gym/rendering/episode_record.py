@@ -108,6 +108,7 @@ class FrameRecord:
         path: The recent states, oldest first, shape (T, n).
         interventions: Whether the shield replaced the input that led to each of these states, shape (T,).
         packets: The recent packets, oldest first.
+        forced: Whether the contract forced a request in the step that led to each of these states, shape (T,).
         annotation: What the shield knows about the step that led here; None without a shield.
         tracked: What the task tracks; None if it does not track a single quantity.
         distance: Distance driven in this episode, if the task knows a speed [m].
@@ -128,6 +129,7 @@ class FrameRecord:
     path: np.ndarray
     interventions: np.ndarray
     packets: tuple[PacketRecord, ...]
+    forced: np.ndarray
     annotation: Annotation | None
     tracked: TrackedOutput | None
     distance: float
@@ -172,6 +174,7 @@ class EpisodeRecord:
         self._path: deque[np.ndarray] = deque(maxlen=RECENT_STEPS)
         self._interventions = deque([False], maxlen=RECENT_STEPS)
         self._packets: deque[PacketRecord] = deque(maxlen=RECENT_STEPS)
+        self._forced: deque[bool] = deque(maxlen=RECENT_STEPS)
         self._input: np.ndarray | None = None
         self._committed: np.ndarray | None = None
         note = self._next_annotation
@@ -215,6 +218,7 @@ class EpisodeRecord:
             path=np.array(self._path),
             interventions=np.array(self._interventions),
             packets=tuple(self._packets),
+            forced=np.array(self._forced),
             annotation=self._annotation,
             tracked=_tracked_output(self._task, self._plant, self._task_state, state),
             distance=self._distance,
@@ -228,6 +232,7 @@ class EpisodeRecord:
         self._violations, self._violated = int(info["episode_violations"]), bool(info["cost"] > 0.0)
         self._measurement_age = int(info["measurement_age"])
         self._input_missing = bool(info["downlink_broken"])
+        self._forced.append(bool(info["request_forced"]))
         self._missing_inputs += self._input_missing
         self._task_state = task_state
 

@@ -184,11 +184,18 @@ def _draw_tracked_output(canvas: Canvas, frame: FrameRecord, y: float) -> None:
 
 
 def _draw_packets(canvas: Canvas, frame: FrameRecord, y: float) -> None:
-    """Draws what became of the packets sent in the recent steps, the newest at the right."""
+    """Draws what became of the packets sent in the recent steps, the newest at the right.
+
+    A tick below marks a step in which nobody asked for a sample, but the contract needed one.
+    """
     age = frame.measurement_age
     text = "newest used: now" if age == 0 else f"newest used: {age} step{'s' if age > 1 else ''} old"
     bar = _draw_row(canvas, y, "packets sent", text, theme.LATE_TEXT if age else theme.ESTIMATE)
     spacing = (bar.w - 14) / (RECENT_STEPS - 1)
+    for back, forced in enumerate(frame.forced[::-1].tolist()):
+        if forced:
+            x = bar.right - 7 - spacing * back
+            canvas.line([(x, bar.bottom - 2), (x, bar.bottom + 4)], theme.SHIELD, 2.5)
     for packet in frame.packets:
         back = frame.step - packet.stamp
         if back >= RECENT_STEPS:

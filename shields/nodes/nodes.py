@@ -181,7 +181,7 @@ class ControllerNode:
         decision: The last one.
 
     Raises:
-        ValueError: If the loop has no downlink or no echoes.
+        ValueError: If the loop has no downlink or no echoes, or its channel takes samples on request.
     """
 
     def __init__(
@@ -189,6 +189,8 @@ class ControllerNode:
     ) -> None:
         if loop.lead == 0 or loop.echo_age is None:
             raise ValueError("commands that go over a network need SafeLoop(..., downlink=Channel(...), echo_age=...)")
+        if loop.channel.on_request:
+            raise ValueError("datagrams carry no requests for samples yet: leave out on_request of the loop's channel")
         self.loop, self.wire, self.transport, self.clock = loop, wire, transport, clock
         self.refused: Counter[str] = Counter()
         self.decision: Decision

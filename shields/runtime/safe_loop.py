@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from enum import Enum, auto
 from functools import wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar
@@ -17,6 +18,7 @@ from ncs_gym.network import AppliedInputs, Command, CommittedInputs, Echo, downl
 from ncs_gym.network.contract import MAX_AGE, warn_of_broken_contract
 from ncs_gym.network.downlink import as_echo
 from ncs_gym.network.packet_reception import DiscardedPackets, as_packet
+from ncs_gym.network.requests import Requests, require_on_request
 from ncs_gym.validation import as_count, as_flag, as_numbers, as_vector, setting, shown
 from shields.certificate import Certificate
 from shields.certificate_text import contract_text, counted, size_of, table
@@ -54,6 +56,7 @@ def _transaction(method: Callable[Concatenate[SafeLoop, P], T]) -> Callable[Conc
     def call(loop: SafeLoop, /, *args: P.args, **kwargs: P.kwargs) -> T:
         phase, discarded, unknown = loop._phase, loop._discarded, loop._unknown
         parts = (loop._estimator, loop._monitored, loop._inputs, loop._applied, loop._lost)
+        parts = parts if loop._requests is None else (*parts, loop._requests)
         before = [(part, part.saved()) for part in parts]
         try:
             return method(loop, *args, **kwargs)
@@ -96,6 +99,9 @@ class SafeLoop:
     Behind a downlink that is late or loses commands, send `command` after each `decide` instead, and let an
     `ncs_gym.Actuator` apply what it holds (docs/contracts.md, "Both directions"). What is decided takes effect `lead`
     steps later; estimate and error shape belong to that time.
+
+    Where the channel takes samples on request (docs/requests.md), `request` says after each `decide` whether the sample
+    of the next step is to be taken; behind a downlink commands say it, and the actuator's `requested`.
 
     Args:
         certificate: Verified exactly here.
@@ -157,6 +163,10 @@ class SafeLoop:
         self._lead = self._monitored.lead
         warn_of_broken_contract(self._contract, channel, self._lead, counts_losses=True)
         self._inputs = CommittedInputs(self._lead, plant.m)
+        self._requests = None
+        if channel.on_request:
+            assumed = self._contract and replace(self._contract, max_age=max(self._contract.max_age - self._lead, 0))
+            self._requests = Requests(channel, assumed, self._lead)
         self._echo_age = None if echo_age is None else as_count(echo_age, "echo_age", low=0, high=MAX_AGE)
         self._applied = AppliedInputs(self._echo_age)
         # Samples by stamp and inputs, the newest first, from which the state is to be found; None once it is known.
@@ -218,6 +228,8 @@ class SafeLoop:
         self._discarded = DiscardedPackets()
         self._inputs.start()
         self._applied.start()
+        if self._requests is not None:
+            self._requests.begin()
         self._unknown = None if known else ({}, ())
         self._begin(inside)
         self._phase = _Phase.STARTED
@@ -291,21 +303,28 @@ class SafeLoop:
         return estimate
 
     @_transaction
-    def decide(self, proposed: Any) -> Decision:
+    def decide(self, proposed: Any, *, ask: bool = False) -> Decision:
         """Returns what to apply from now until the next step, and why.
 
         Args:
             proposed: Your controller's input, shape (m,) or a number if m = 1 [physical units]; clipped to the limits.
                 What is no finite input (None, say, if the controller failed) is replaced by u = K x_hat.
+            ask: Whether your controller asks for a sample, where samples are on request: that of the next step, behind
+                a downlink that of c steps later. See `request`.
 
         Raises:
             RuntimeError: If `start` was not called, or this step was decided already.
+            ValueError: If a sample is asked for of a channel that does not take samples on request.
         """
         if self._require_started() is _Phase.DECIDED:
             raise RuntimeError("decide was called twice in a step: call receive in between, with the packets that came")
         self._phase = _Phase.STOPPED
         decision = self._monitored.decide(self._clipped(proposed))
         self._inputs.commit(decision.input)
+        if self._requests is not None or ask:
+            requests = require_on_request(self._requests)
+            requests.ask(as_flag(ask, "ask") or self._unknown is not None)  # a state that is not known is to be found
+            requests.decide(self._estimator.age)
         self._phase = _Phase.DECIDED
         return decision
 
@@ -317,10 +336,17 @@ class SafeLoop:
         """
         if self._phase is not _Phase.DECIDED:
             raise RuntimeError("call decide before command: it sends what was decided at this step")
-        return self._inputs.command(self.steps, self.episode)
+        requests = () if self._requests is None else tuple(self._requests.decided.tolist())
+        return self._inputs.command(self.steps, self.episode, requests)
 
     def step(
-        self, proposed: Any, packets: Iterable[Packet] = (), applied: Any = None, echoes: Iterable[Echo] = ()
+        self,
+        proposed: Any,
+        packets: Iterable[Packet] = (),
+        applied: Any = None,
+        echoes: Iterable[Echo] = (),
+        *,
+        ask: bool = False,
     ) -> Decision:
         """Returns the decision at this control step: `receive`, then `decide`, which is left if that is interrupted.
 
@@ -328,7 +354,20 @@ class SafeLoop:
             GuaranteeLostError: As from `receive`; `decide` is left then.
         """
         self.receive(packets, applied, echoes)
-        return self.decide(proposed)
+        return self.decide(proposed, ask=ask)
+
+    @property
+    def request(self) -> bool:
+        """Whether the sample of the next step is to be taken, after a decision: asked for, or needed by the contract.
+
+        Raises:
+            RuntimeError: If nothing was decided at this step.
+            ValueError: If the channel does not take samples on request.
+        """
+        requests = require_on_request(self._requests)
+        if self._phase is not _Phase.DECIDED:
+            raise RuntimeError("call decide before request: it says what was decided at this step")
+        return bool(requests.decided[0])
 
     @property
     def guaranteed(self) -> bool:

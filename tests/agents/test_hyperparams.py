@@ -7,7 +7,9 @@ from agents.hyperparams import DEFAULTS, _tuned, complete_hyperparams, literal, 
 from ncs_gym.registration import ENVIRONMENTS, needing_extras, registered_ids
 
 # Those of the three have the defaults: none were sought.
-DEFAULT = {"ncs_gym/CSTR-v0", "ncs_gym/Convoy-v0", "ncs_gym/LaneKeeping-v0"}
+DEFAULT = {
+    f"ncs_gym/{name}-v0" for name in ("CSTR", "Convoy", "ConvoyOnRequest", "LaneKeeping", "LaneKeepingOnRequest")
+}
 OWN = [env_id for env_id in ENVIRONMENTS if env_id in {*registered_ids(), *needing_extras()} - DEFAULT]
 
 

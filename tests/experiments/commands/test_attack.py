@@ -3,21 +3,25 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from experiments.attack import monte_carlo_batch
 from experiments.attack.attack_cases import AttackCase, attack_cases
-from experiments.attack.monte_carlo_batch import MonteCarloBatch
-from experiments.attack.safety_counts import SafetyCounts, gaussian_table, require_within
+from experiments.attack.monte_carlo_batch import MonteCarloBatch, cases_of
+from experiments.attack.safety_counts import SafetyCounts, gaussian_table, require_safe, require_within
+from experiments.attack.worst_case import HostileRequests
 from experiments.commands import attack as command
 from experiments.commands.attack import attack
 from experiments.errors import OtherResultsError, ResultsError, RunError, SafetyBroken
 from experiments.runs.run_store import RunStore
 from experiments.settings.certificates import AttackSettings
 from ncs_gym import truck_trailer
+from ncs_gym.network import requests
 from ncs_gym.network.contract import contract_of
+from ncs_gym.network.requests import spare_samples
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from shields import Certificate
 from shields import certify as smaller_set
@@ -45,7 +49,7 @@ def counts_of(campaign, certificate, case, index=0):
 
 def test_every_kind_of_plant_and_channel_is_attacked():
     found = attack_cases(3, 5)
-    assert len(found) == 3 * 1 + 7 * 3 + (2 + 5) * 4
+    assert len(found) == 3 * 1 + 9 * 4 + (2 + 5) * 4
     assert {case.contract is None for case in found.values()} == {True, False}
     assert (
         attack_cases(3, 5)["random plant 4, perfect"].plant.fingerprint
@@ -74,6 +78,44 @@ def test_batch_has_the_same_counts_after_any_other(certificates):
     assert (total.exits, total.violations, total.broken_episodes, total.unproved) == (0, 0, 0, 0)
     assert 0 < total.interventions < total.steps
     assert 0.99 < total.level <= 1.0
+
+
+ON_REQUEST = "CartPole-v0, on request"
+
+
+def test_hostile_requests_keep_the_contract_and_the_safe_set(certificates):
+    counts = counts_of(CAMPAIGN, certificates[ON_REQUEST], ON_REQUEST)
+    assert 0 < counts.forced < counts.packets < counts.steps
+    assert (counts.overdue, counts.lapsed, counts.exits, counts.violations, counts.unproved) == (0, 0, 0, 0, 0)
+    require_safe(counts, looks_ahead=False)
+
+
+def test_requests_that_are_forced_too_late_are_counted(certificates, monkeypatch):
+    monkeypatch.setattr(requests, "spare_samples", lambda *given: 1 + spare_samples(*given))
+    monte_carlo_batch._shields.cache_clear()
+    counts = counts_of(CAMPAIGN, certificates[ON_REQUEST], ON_REQUEST)
+    monte_carlo_batch._shields.cache_clear()
+    assert counts.overdue > 100
+    with pytest.raises(SafetyBroken, match="older than a contract"):
+        require_safe(counts, looks_ahead=False)
+
+
+def test_hostile_requests_follow_the_truth():
+    M = truck_trailer().weight
+    policy = HostileRequests(8, SimpleNamespace(M=M), np.random.default_rng(0))
+    sizes = np.repeat([[1e-3], [1.0]], 4, axis=0) * np.ones(2)  # small in the first four environments
+    asked = policy.ask({"estimation_error": sizes, "state": 10.0 * sizes})
+    assert asked[[0, 4]].tolist() == [False, False]
+    assert asked[[2, 6]].tolist() == asked[[3, 7]].tolist() == [True, False]
+
+
+def test_one_kind_of_channel_alone_is_attacked():
+    found = cases_of(replace(CAMPAIGN, channel="on request"))
+    assert ON_REQUEST in found
+    assert all(case.channel.on_request for case in found.values())
+    assert all(contract_of(case.channel).max_age <= case.contract.max_age for case in found.values())
+    with pytest.raises(ValueError, match="channel must be one of"):
+        cases_of(replace(CAMPAIGN, channel="nowhere"))
 
 
 def test_without_the_shield_the_attack_breaks_out_and_is_counted(certificates):

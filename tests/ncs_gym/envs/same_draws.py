@@ -92,18 +92,18 @@ class ScriptedEnv(NCSEnv):
 
     def replay(self, action: np.ndarray) -> tuple:
         """Steps with what the vector drew at its last step."""
-        sends = self.hear()
+        self.hear()
         result = self.step(action)
+        sends = self._channel_state.sends_at(self.steps)
         assert not (sends and self.np_random.numbers)  # where nothing is sent, less is drawn
         return result
 
-    def hear(self) -> bool:
-        """Takes over what the vector drew at its last step; returns whether the sensor sends at the next one here."""
+    def hear(self) -> None:
+        """Takes over what the vector drew at its last step."""
         process, rng = self.many._process, self.many.np_random
         self._process.disturbance_now = process.disturbance_now[:, self.index]
         self._process.noise_now = process.noise_now[:, self.index]
         self.np_random.numbers = [drawn[..., self.index] for drawn in rng.drawn]
-        return self._channel_state.sends_at(self.steps + 1)
 
 
 def scalar_versions(many: NCSVectorEnv, kind: type[ScriptedEnv] = ScriptedEnv) -> list[Any]:
@@ -160,6 +160,11 @@ def compare(many: NCSVectorEnv, steps: int, options: dict[str, Any] | None = Non
         actions = rng.uniform(-width, width, many.action_space.shape) + estimates @ gain.T
         actions, episodes = actions.astype(np.float32), many.episodes.copy()
         many.np_random.drawn = []
+        if many.channel.on_request:
+            asked = rng.random(many.num_envs) < 0.2
+            many.request(asked)
+            for single, asks in zip(singles, asked, strict=True):
+                single.request(bool(asks))
         observations, rewards, terminated, _, infos = many.step(actions)
         for index, single in enumerate(singles):
             begun, last = many.episodes[index] != episodes[index], (observations, infos)

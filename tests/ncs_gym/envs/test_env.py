@@ -34,6 +34,9 @@ KEYS = {
     "is_success": float,
     "contract_broken": bool,
     "downlink_broken": bool,
+    "requested": bool,
+    "request_forced": bool,
+    "packets": int,
 }
 
 

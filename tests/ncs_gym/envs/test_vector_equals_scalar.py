@@ -53,6 +53,18 @@ def test_equals_the_scalar_environment_for_every_channel(channel):
     compare(NCSVectorEnv(3, plant=truck_trailer(mass=4000.0), channel=CHANNELS[channel], task=task), 100)
 
 
+@pytest.mark.parametrize("downlink", [None, Channel(loss=0.5, delay=1, max_consecutive_losses=1)])
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_samples_on_request_equal_those_of_the_scalar_environment(mode, downlink):
+    channel = Channel(loss=0.6, delay=1, jitter=1, max_consecutive_losses=2, on_request=True)
+    contract = None if downlink is None else ChannelContract(9)
+    settings = {"plant": truck_trailer(mass=4000.0), "task": SpeedTracking(), "terminate_on_violation": True}
+    settings |= {"autoreset_mode": mode, "max_episode_steps": 23, "downlink": downlink, "contract": contract}
+    env = NCSVectorEnv(4, channel=channel, **settings)
+    compare(env, 110)
+    assert env.episodes.min() >= 4
+
+
 @pytest.mark.parametrize("name", IDS)
 def test_registered_environments_equal_their_scalar_versions(name):
     compare(make(name, 3, max_episode_steps=None, terminate_on_violation=False).unwrapped, 100)

@@ -32,6 +32,30 @@ def test_csv_is_read_with_losses_and_any_order(tmp_path):
     assert log.send_period(0.01) == 2
 
 
+def test_columns_are_found_by_their_names(tmp_path):
+    file = tmp_path / "packets.csv"
+    file.write_text("size,received,sent\n60,0.011,0.00\n60,,0.02\n60,0.09,0.04\n")
+    assert PacketLog.load(file).trace(0.02) == (1, -1, 3)
+
+
+def test_log_of_a_loop_is_read_in_steps_with_the_packets_that_are_missing(tmp_path):
+    file = tmp_path / "packets-000.csv"
+    file.write_text("episode,sent,received\n77,1,2\n77,4,5\n77,3,5\n77,3,6\n12,2,3\n")
+    log = PacketLog.load(file, step=0.05)
+    assert log.trace(0.05) == (1, -1, 2, 1, -1, 1)
+    assert log.period == pytest.approx(0.05)
+    file.write_text("episode,sent,received\n77,1,\n")
+    with pytest.raises(ValueError, match=r"line 2 of .* is not an episode"):
+        PacketLog.load(file)
+
+
+def test_times_that_look_like_milliseconds_are_warned_of(tmp_path):
+    file = tmp_path / "packets.csv"
+    file.write_text("sent,received\n0,15\n20,\n40,61\n60,71\n")
+    with pytest.warns(UserWarning, match="look like milliseconds"):
+        PacketLog.load(file)
+
+
 def test_ping_is_read_with_missing_numbers_and_duplicates(tmp_path):
     file = tmp_path / "ping.txt"
     file.write_text(PING)

@@ -188,6 +188,15 @@ def test_packets_show_whether_they_are_on_time_late_or_lost(picture):
     assert seen["late"][2] == seen["lost"][1] == 0
 
 
+def test_requests_that_the_contract_forces_are_marked(picture):
+    forced = np.arange(30) == 20
+    marks = [
+        count(pixels_of(picture, record(forced=each)), theme.SHIELD, theme.PANEL) for each in (forced & False, forced)
+    ]
+    assert marks[0] == 0
+    assert marks[1] > 5
+
+
 def test_packets_travel(picture):
     line = theme.Rect(0, theme.PACKET_LINE - 3, theme.WIDTH, 6)
     places = []
@@ -207,6 +216,7 @@ def test_packets_are_lost_and_late_as_the_channel_says():
             env.step(np.zeros(1, np.float32))
         return list(env.renderer.frame_record().packets)
 
+    assert packets(Channel(on_request=True)) == []
     assert packets(Channel(send_period=3)) == [PacketRecord(k, k) for k in (3, 6, 9, 12)]
     assert packets(Channel(delay=2)) == [PacketRecord(k, k + 2) for k in range(1, 13)]
     assert packets(Channel(loss=1.0)) == [PacketRecord(k, None) for k in range(1, 13)]

@@ -1,0 +1,158 @@
+"""Communication as an action: wrappers whose actions have one entry more, which asks for a sample."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import AutoresetMode, VectorWrapper
+from gymnasium.vector.utils import batch_space
+
+from ncs_gym.envs.env import NCSEnv
+from ncs_gym.envs.vector_env import NCSVectorEnv
+from ncs_gym.validation import as_number, as_numbers, shown
+
+
+class RequestActions(gym.Wrapper, RecordConstructorArgs):
+    """Lets an agent decide when samples are taken, at a price (docs/requests.md).
+
+    The action has one entry more, in [-1, 1]: a sample is asked for where it is positive. The observation has two
+    entries more: the age of the newest sample used, and how many samples are requested that are newer than it [steps,
+    samples], both clipped to what the contract allows. From the reward the cost of every packet sent is subtracted,
+    also of those that the contract forces. Wrap it around the shield, whose actions stay as they are.
+
+    Args:
+        env: An `NCSEnv` whose channel takes samples on request, possibly wrapped.
+        cost: Of a packet, in units of the reward, >= 0.
+
+    Raises:
+        ValueError: If the environment is another one, or the cost is negative.
+    """
+
+    def __init__(self, env: gym.Env, cost: float = 0.0) -> None:
+        RecordConstructorArgs.__init__(self, cost=cost)
+        gym.Wrapper.__init__(self, env)
+        self._inner = _on_request(env, NCSEnv)
+        self.cost = as_number(cost, "cost", low=0.0)
+        self._most = _bounds(self._inner)
+        self.action_space = _wider(env.action_space, [-1.0], [1.0])
+        self.observation_space = _wider(env.observation_space, np.zeros(2), self._most)
+        self._packets = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Starts an episode; see `NCSEnv.reset`."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._packets = 0
+        return self._seen(observation), info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Asks for a sample if the last entry of the action is positive, and applies the others.
+
+        Raises:
+            ValueError: If the action is not finite or wrongly shaped; nothing has moved then.
+        """
+        inputs, asked = _parted(action, self.action_space.shape)
+        self._inner.request(bool(asked))
+        observation, reward, terminated, truncated, info = self.env.step(inputs)
+        sent, self._packets = info["packets"] - self._packets, info["packets"]
+        return self._seen(observation), float(reward) - self.cost * sent, terminated, truncated, info
+
+    def _seen(self, observation: np.ndarray) -> np.ndarray:
+        more = np.minimum([self._inner.known.age, self._inner.outstanding], self._most)
+        return np.concatenate([observation, more.astype(np.float32)])
+
+
+class VectorRequestActions(VectorWrapper, RecordConstructorArgs):
+    """`RequestActions` for an `NCSVectorEnv`, possibly behind a shield.
+
+    Args:
+        env: An `NCSVectorEnv` whose channel takes samples on request, possibly wrapped; not with SAME_STEP autoreset.
+        cost: See `RequestActions`.
+
+    Raises:
+        ValueError: If the environment is another one, or the cost is negative.
+    """
+
+    def __init__(self, env: Any, cost: float = 0.0) -> None:
+        RecordConstructorArgs.__init__(self, cost=cost)
+        VectorWrapper.__init__(self, env)
+        self._inner = _on_request(env, NCSVectorEnv)
+        if self._inner.autoreset_mode is AutoresetMode.SAME_STEP:
+            raise ValueError("with SAME_STEP autoreset the age at an episode's end is not known: use NEXT_STEP")
+        self.cost = as_number(cost, "cost", low=0.0)
+        self._most = _bounds(self._inner.single)
+        self.single_action_space = _wider(env.single_action_space, [-1.0], [1.0])
+        self.single_observation_space = _wider(env.single_observation_space, np.zeros(2), self._most)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self._packets = np.zeros(self.num_envs, np.int64)
+
+    def reset(
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Starts episodes; see `NCSVectorEnv.reset`."""
+        # gymnasium's annotation leaves out the lists that its own vector environments take.
+        observations, info = self.env.reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
+        self._packets = info["packets"]
+        return self._seen(observations), info
+
+    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Asks for samples where the last entries of the actions, (N, m+1), are positive, and applies the others.
+
+        Raises:
+            ValueError: If an action is not finite or the shape is wrong; nothing has moved then.
+        """
+        inputs, asked = _parted(actions, self.action_space.shape)
+        self._inner.request(asked)
+        observations, rewards, terminated, truncated, info = self.env.step(inputs)
+        sent = np.maximum(info["packets"] - self._packets, 0)  # nothing in a step that only begins an episode
+        self._packets = info["packets"]
+        return self._seen(observations), rewards - self.cost * sent, terminated, truncated, info
+
+    def _seen(self, observations: np.ndarray) -> np.ndarray:
+        more = np.minimum(np.stack([self._inner.known.age, self._inner.outstanding], axis=1), self._most)
+        return np.concatenate([observations, more.astype(np.float32)], axis=1)
+
+
+def _on_request(env: Any, kind: type) -> Any:
+    """Returns the environment inside all wrappers.
+
+    Raises:
+        ValueError: If it is of another kind, or sends samples by itself.
+    """
+    inner = env.unwrapped
+    if not isinstance(inner, kind):
+        raise ValueError(f"expected an {kind.__name__} inside, got {type(inner).__name__}")
+    if not inner.channel.on_request:
+        raise ValueError("the channel sends samples by itself: make it with Channel(..., on_request=True)")
+    return inner
+
+
+def _bounds(env: NCSEnv) -> np.ndarray:
+    """Returns the largest age and the largest number of outstanding samples that are told apart, shape (2,)."""
+    lead = 0 if env.downlink_protocol is None else env.downlink_protocol.lead
+    if env.contract is None:
+        return np.array([env.horizon, max(env.channel.longest_delay + lead, 1)], dtype=np.float64)
+    return np.array([env.contract.max_age, env.contract.max_age + lead], dtype=np.float64).clip(min=1.0)
+
+
+def _wider(space: Any, low: Any, high: Any) -> Box:
+    """Returns a space with more entries, within bounds."""
+    bounds = [np.concatenate(pair).astype(np.float32) for pair in ((space.low, low), (space.high, high))]
+    return Box(*bounds, dtype=np.float32)
+
+
+def _parted(actions: Any, shape: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the entries of actions that are inputs, and whether a sample is asked for.
+
+    Raises:
+        ValueError: If the actions are not finite or wrongly shaped.
+    """
+    numbers = as_numbers(actions)
+    if numbers is None or numbers.shape != shape or not np.isfinite(numbers).all():
+        raise ValueError(f"actions must be finite with shape {shape}, got {shown(actions)}")
+    given = np.asarray(actions)
+    return given[..., :-1].copy(), np.asarray(numbers[..., -1] > 0.0)

@@ -1,0 +1,158 @@
+"""Samples that are asked for, and those that a contract needs although nobody asked (docs/requests.md)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ncs_gym.network.channel import Channel
+from ncs_gym.network.contract import ChannelContract
+from ncs_gym.validation import shown
+
+
+class Requested(NamedTuple):
+    """What was requested in a step; of N environments, arrays of shape (N,).
+
+    Attributes:
+        requested: Whether a sample is requested, asked for or forced.
+        forced: Whether it is requested only because the contract needs it.
+        packets: Number of samples sent in the episode so far.
+    """
+
+    requested: Any
+    forced: Any
+    packets: Any
+
+
+def spare_samples(channel: Channel, contract: ChannelContract | None) -> int | None:
+    """Returns how many of the samples newer than the newest that arrived may be left out; None for any number.
+
+    It is h - L - delta, with L the longest run of losses and delta the longest delay. Where the channel keeps no such
+    contract it is zero: then every sample is requested.
+
+    Args:
+        channel: The channel.
+        contract: What is to be kept; None for nothing.
+
+    Raises:
+        ValueError: If a contract is to be kept by a channel that may lose any number of packets in a row.
+    """
+    if contract is None:
+        return None
+    losses = channel.most_consecutive_losses
+    if losses is None:
+        raise ValueError(
+            "samples on request need a channel that promises something: if any number of packets may be lost in a row, "
+            f"no rule of requests keeps max_age = {contract.max_age}; give it max_consecutive_losses"
+        )
+    return max(contract.max_age - losses - channel.longest_delay, 0)
+
+
+class Requests:
+    """The requests of one control loop, or of N: asked for, or forced so that the contract holds for every policy.
+
+    At step k the request of sample k + c + 1 is decided. It is forced if of the samples that are newer than the newest
+    that arrived `spare_samples` were left out: n <= age + c + L + delta - h (docs/requests.md, "The rule"). A contract
+    that is broken although the samples were requested forces one in every step, until one arrives.
+
+    Args:
+        channel: The channel.
+        contract: What is to be kept; None if nothing is promised and nothing is forced.
+        lead: c, the number of steps from a decision to its effect. The samples of the first c steps are requested by
+            agreement.
+        size: N; None for one control loop, whose values are no arrays but numbers.
+
+    Attributes:
+        requested: Whether the last decision requests a sample, a bool or shape (N,); False at the start of an episode.
+        forced: Whether it does so only because the contract needs it, likewise.
+
+    Raises:
+        ValueError: If a contract is to be kept by a channel that may lose any number of packets in a row.
+    """
+
+    def __init__(
+        self, channel: Channel, contract: ChannelContract | None, lead: int = 0, size: int | None = None
+    ) -> None:
+        self._spare, self._lead = spare_samples(channel, contract), lead
+        self._shape = () if size is None else (size,)
+        # Without a contract it is enough to know which packets may still arrive.
+        self._oldest = channel.longest_delay if contract is None else contract.max_age
+        self._back = np.arange(lead + self._oldest + 1).reshape(-1, *[1] * len(self._shape))
+        self.begin()
+
+    def begin(self, chosen: np.ndarray | None = None) -> None:
+        """Starts episodes, in all environments or in those of a mask (N,)."""
+        # Whether the samples of k + c, k + c - 1, ... were requested.
+        first = np.zeros((len(self._back), *self._shape), np.bool_)
+        first[: self._lead] = True
+        nothing: Any = np.zeros(self._shape, np.bool_) if self._shape else False
+        if chosen is None or chosen.all():
+            self._flags, self.requested, self.forced, self._asked = first, nothing, nothing, nothing
+        else:
+            self._flags = np.where(chosen, first, self._flags)
+            self.requested, self.forced, self._asked = (
+                each & ~chosen for each in (self.requested, self.forced, self._asked)
+            )
+
+    def saved(self) -> dict[str, Any]:
+        """Returns all that changes, as attributes to be put back; arrays are replaced, never written into."""
+        return vars(self).copy()
+
+    def ask(self, asked: Any) -> None:
+        """Asks for the sample that is decided next, or does not: the last call before `decide` counts.
+
+        Args:
+            asked: A bool, or for N environments shape (N,) as well.
+
+        Raises:
+            ValueError: If it is neither.
+        """
+        flags = np.asarray(asked)
+        if flags.dtype != np.bool_ or flags.shape not in ((), self._shape):
+            wanted = "True or False" + (f", or bool of shape {self._shape}" if self._shape else "")
+            raise ValueError(f"a request is {wanted}, got {shown(asked)}")
+        self._asked = np.broadcast_to(flags, self._shape).copy() if self._shape else bool(flags)
+
+    def outstanding(self, age: Any) -> Any:
+        """Returns n, the number of samples requested that are newer than the newest that arrived, or shape (N,).
+
+        Without a contract those that cannot arrive any more do not count.
+
+        Args:
+            age: Steps since the newest sample that arrived was taken, or shape (N,).
+        """
+        return np.count_nonzero(self._flags & (self._back < age + self._lead), axis=0)
+
+    def decide(self, age: Any) -> None:
+        """Decides the request of sample k + c + 1.
+
+        Args:
+            age: Steps since the newest sample that arrived was taken, or shape (N,).
+        """
+        asked, needed = self._asked, self._asked & False
+        if self._spare is not None:
+            needed = (self.outstanding(age) + self._spare <= age + self._lead) | (age > self._oldest)
+        self.requested = asked | needed if self._shape else bool(asked | needed)
+        self.forced = self.requested != asked
+        self._flags = np.concatenate([np.asarray(self.requested)[None], self._flags[:-1]])
+        self._asked = asked & False
+
+    @property
+    def decided(self) -> np.ndarray:
+        """Which of the samples k + 1 .. k + c + 1 are requested, after the decision of step k.
+
+        Shape (c+1,) or (c+1, N); the first is the one that is due.
+        """
+        return self._flags[self._lead :: -1]
+
+
+def require_on_request(requests: Requests | None) -> Requests:
+    """Returns the requests of a channel that takes samples on request.
+
+    Raises:
+        ValueError: If there are none: then samples are sent periodically.
+    """
+    if requests is None:
+        raise ValueError("the channel sends samples by itself: make it with Channel(..., on_request=True)")
+    return requests

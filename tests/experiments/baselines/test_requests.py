@@ -1,0 +1,150 @@
+"""Policies that ask for samples: what they ask for, what the contract adds, and what is counted."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from experiments.baselines.requests import (
+    Asking,
+    RequestsOnly,
+    acknowledged,
+    at_random,
+    best_period,
+    every,
+    played,
+    slack,
+    with_rule,
+)
+from ncs_gym import Channel, ChannelContract, VectorRequestActions
+from shields import VectorSafetyShield
+from tests.certificates import certificate_of
+
+ID, COUNT, STEPS = "ncs_gym/LaneKeepingOnRequest-v0", 16, 60
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def environments(cost=0.1, **settings):
+    envs = gym.make_vec(ID, num_envs=COUNT, max_episode_steps=STEPS, **settings)
+    inner = envs.unwrapped
+    shield = VectorSafetyShield(envs, certificate_of(inner.plant, inner.certificate_contract))
+    return VectorRequestActions(shield, cost)
+
+
+def weakly_pushing(observations, infos):
+    return np.full((len(observations), 1), 0.3)
+
+
+def result_of(rule, **settings):
+    env = environments(**settings)
+    return played(env, with_rule(Asking(env, weakly_pushing), rule), seed=0)
+
+
+def test_best_period_keeps_the_contract_and_the_next_one_does_not():
+    for losses, delay, age in [(2, 1, 8), (0, 0, 0), (1, 3, 12), (2, 0, 4)]:
+        channel, contract = Channel(0.5, delay=delay, max_consecutive_losses=losses), ChannelContract(age)
+        period = best_period(channel, contract)
+        kept = [
+            contract.is_kept_by(Channel(0.5, delay=delay, max_consecutive_losses=losses, send_period=each))
+            for each in (period, period + 1)
+        ]
+        assert kept == [True, False]
+    with pytest.raises(ValueError, match="any number of packets"):
+        best_period(Channel(0.5), ChannelContract(3))
+
+
+@pytest.mark.parametrize(
+    ("rule", "low", "high"),
+    [
+        (every(1), 1.0, 1.0),
+        (every(2), 0.5, 0.5),
+        (at_random(0.0), 0.3, 0.36),
+        (acknowledged(2), 0.3, 0.45),
+        (slack(np.inf), 0.5, 0.5),
+    ],
+)
+def test_policies_send_what_they_say_and_the_contract_holds(rule, low, high):
+    result = result_of(rule)
+    assert low <= result.packets <= high
+    assert result.oldest <= 8
+    assert (result.violations, result.unproved) == (0, 0)
+
+
+def test_contract_forces_nothing_on_the_best_period_and_everything_on_who_never_asks():
+    assert result_of(every(2)).forced == 0.0
+    never = result_of(at_random(0.0))
+    assert never.forced == never.packets > 0.0
+
+
+def test_returns_are_without_the_price_of_packets():
+    free, paid = (result_of(every(2), cost=cost) for cost in (0.0, 10.0))
+    np.testing.assert_allclose(free.returns, paid.returns, atol=1e-9)
+
+
+def test_acknowledged_policy_waits_for_the_last_request():
+    env = environments()
+    asking = Asking(env, weakly_pushing)
+    policy = with_rule(asking, acknowledged(1))
+    observations, info = env.reset(seed=0)
+    requested = []
+    for _ in range(12):
+        observations, *_, info = env.step(policy(observations, info))
+        requested.append(info["requested"])
+    assert not (np.array(requested[1:]) & np.array(requested[:-1])).any()  # a packet is one step late
+
+
+def test_margin_is_that_of_the_decision_where_the_proposal_passes():
+    env = environments()
+    asking = Asking(env, weakly_pushing)
+    observations, info = env.reset(seed=0)
+    passed = 0
+    for _ in range(20):
+        margin = asking.see(observations, info).margin
+        action = np.column_stack([asking.proposed, np.ones(COUNT)])
+        observations, *_, info = env.step(action)
+        through = ~info["shield_intervened"]
+        np.testing.assert_allclose(info["shield_margin"][through], margin[through], atol=1e-9)
+        assert (margin[~through] < 1e-6).all()
+        passed += through.sum()
+    assert 0 < passed < 20 * COUNT
+
+
+def test_agent_that_only_asks_sees_the_margin_and_leaves_the_inputs_to_the_controller():
+    env = environments()
+    only = RequestsOnly(Asking(env, weakly_pushing), env)
+    observations, _ = only.reset(seed=0)
+    assert only.observation_space.contains(observations)
+    assert only.action_space.shape == (COUNT, 1)
+    for _ in range(10):
+        observations, *_, info = only.step(np.full((COUNT, 1), -1.0))
+        assert only.observation_space.contains(observations)
+        assert info["input_proposed"] == pytest.approx(0.3 * env.unwrapped.plant.u_max.item())
+    assert info["requested"].sum() == info["request_forced"].sum()
+
+
+def test_policies_behind_a_downlink_are_refused():
+    with pytest.raises(ValueError, match="leave out the downlink"):
+        Asking(environments(downlink=Channel(delay=1), contract=ChannelContract(7, 0.002)), weakly_pushing)
+
+
+def test_command_prints_a_table_and_draws_a_figure(tmp_path):
+    command = [
+        sys.executable,
+        "benchmarks/request_policies.py",
+        "--episodes",
+        "3",
+        "--steps",
+        "0",
+        "--out",
+        "figure.png",
+    ]
+    command[1] = str(ROOT / command[1])
+    run = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, check=True, env={"PYTHONPATH": str(ROOT)}
+    )
+    assert "At this price the winner is " in run.stdout
+    assert "period 2, the best" in run.stdout
+    assert (tmp_path / "figure.png").stat().st_size > 10_000

@@ -1,0 +1,218 @@
+"""The rule of forced requests keeps the contract whatever is asked for, lost and late; one step later breaks it."""
+
+from itertools import product
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from ncs_gym import Channel, ChannelContract, NCSEnv, NCSVectorEnv, TraceChannel, cart_pole, truck_trailer
+from ncs_gym.network.requests import Requests, spare_samples
+
+# Longest runs of losses, shortest and longest delays, steps that a contract allows beyond what they need, and leads.
+SETTINGS = [
+    (losses, shortest, longest, beyond, lead)
+    for losses, shortest, longest, beyond, lead in product((0, 1, 2), (0, 1, 2), (0, 1, 2), (0, 1, 2, 3), (0, 1, 2))
+    if shortest <= longest and losses + longest + beyond + lead <= 7
+]
+
+
+class LaterRequests(Requests):
+    """Forces requests one step later than it has to."""
+
+    def __init__(self, *settings, **more):
+        super().__init__(*settings, **more)
+        self._spare += 1
+
+
+def oldest_age(kind, losses, shortest, longest, beyond, lead):
+    """The largest age over all requests, losses and delays, and how many states were seen; ends beyond the contract.
+
+    A state is the age, what was requested of the samples up to k + c, the packets on their way (how old their samples
+    are, and in how many steps they arrive), and how many were lost in a row.
+    """
+    h = losses + longest + beyond
+    channel = Channel(0.5, delay=shortest, jitter=longest - shortest, max_consecutive_losses=losses, on_request=True)
+    first = tuple(kind(channel, ChannelContract(h), lead, 1)._flags[:, 0].tolist())
+    seen = frontier = {(0, first, frozenset(), 0)}
+    oldest = 0
+    while frontier:
+        # Each state twice: nobody asks, somebody does.
+        states = [state for state in frontier for _ in range(2)]
+        requests = kind(channel, ChannelContract(h), lead, len(states))
+        requests._flags = np.array([flags for _, flags, _, _ in states]).T
+        requests.ask(np.arange(len(states)) % 2 == 1)
+        requests.decide(np.array([age for age, _, _, _ in states]))
+        sent, following = requests.decided[0].tolist(), set()
+        for (age, _, flying, lost), flags, sends in zip(states, requests._flags.T.tolist(), sent, strict=True):
+            flying = {(old + 1, left - 1) for old, left in flying}
+            outcomes = [(flying, lost)]
+            if sends:
+                outcomes = [(flying | {(0, delay)}, 0) for delay in range(shortest, longest + 1)]
+                outcomes += [(flying, lost + 1)] if lost < losses else []
+            for packets, in_a_row in outcomes:
+                now = min([age + 1, *(old for old, left in packets if left == 0)])
+                oldest = max(oldest, now)
+                newer = frozenset((old, left) for old, left in packets if left > 0 and old < now)
+                following.add((now, tuple(flags), newer, in_a_row))
+        if oldest > h:
+            break
+        frontier = following - seen
+        seen = seen | frontier
+    return oldest, len(seen)
+
+
+@pytest.mark.parametrize("lead", [0, 1, 2])
+def test_no_requests_losses_and_delays_make_a_sample_older_than_the_contract_allows(lead):
+    count = 0
+    for setting in (each for each in SETTINGS if each[-1] == lead):
+        losses, _, longest, beyond, _ = setting
+        oldest, states = oldest_age(Requests, *setting)
+        assert oldest == losses + longest + beyond, setting  # and no less: the rule forces no sooner than it has to
+        count += states
+    print(f"lead {lead}: {count:,} states")
+
+
+@pytest.mark.parametrize("lead", [0, 1, 2])
+def test_requests_forced_one_step_later_break_every_contract(lead):
+    for setting in (each for each in SETTINGS if each[-1] == lead):
+        losses, _, longest, beyond, _ = setting
+        assert oldest_age(LaterRequests, *setting)[0] > losses + longest + beyond, setting
+
+
+def cart_pole_loop(kind, *count, **settings):
+    """The cart-pole with samples on request, of which five steps' worth may be left out."""
+    channel = Channel(0.5, delay=1, jitter=1, max_consecutive_losses=2, quantization_step=1e-4, on_request=True)
+    return kind(*count, plant=cart_pole(), channel=channel, contract=ChannelContract(9, 1e-4), **settings)
+
+
+def test_samples_are_taken_only_where_asked_or_forced():
+    env = cart_pole_loop(NCSEnv)
+    _, info = env.reset(seed=0)
+    assert (info["requested"], info["request_forced"], info["packets"]) == (False, False, 0)
+    ages, packets = [], 0
+    for step in range(120):
+        asks = step % 17 == 3
+        env.request(asks)
+        info = env.step(np.zeros(1, np.float32))[-1]
+        assert info["requested"] == (asks or info["request_forced"])
+        packets += info["requested"]
+        assert info["packets"] == packets
+        ages.append(info["measurement_age"])
+        assert not info["contract_broken"]
+    assert max(ages) > 6
+    assert packets < 60
+
+
+def test_first_sample_that_is_needed_is_that_after_the_spare_ones():
+    env = cart_pole_loop(NCSEnv)
+    env.reset(seed=0)
+    forced = [env.step(np.zeros(1, np.float32))[-1]["request_forced"] for _ in range(6)]
+    assert forced == [False] * 5 + [True]
+    assert spare_samples(env.channel, env.contract) == 5
+
+
+def test_outstanding_samples_are_those_requested_and_newer_than_the_newest():
+    env = cart_pole_loop(NCSEnv)
+    env.reset(seed=0)
+    stamps = []
+    for step in range(1, 200):
+        if step % 3:
+            env.request()
+        info = env.step(np.zeros(1, np.float32))[-1]
+        stamps += [step] * info["requested"]
+        assert env.outstanding == sum(stamp > step - info["measurement_age"] for stamp in stamps)
+
+
+def test_stable_plant_without_a_contract_is_never_forced_to_a_sample():
+    env = NCSVectorEnv(3, plant=truck_trailer(), channel=Channel(0.3, delay=2, on_request=True))
+    env.reset(seed=0)
+    for _ in range(60):
+        *_, info = env.step(np.zeros((3, 1), np.float32))
+    assert info["packets"].tolist() == [0, 0, 0]
+    assert info["measurement_age"].tolist() == [60, 60, 60]
+    env.request(np.array([True, False, True]))
+    *_, info = env.step(np.zeros((3, 1), np.float32))
+    assert info["packets"].tolist() == [1, 0, 1]
+    *_, info = env.step(np.zeros((3, 1), np.float32))  # a request is about one sample
+    assert info["packets"].tolist() == [1, 0, 1]
+
+
+def test_broken_contract_forces_a_request_in_every_step():
+    env = cart_pole_loop(NCSEnv)
+    dead = Channel(1.0, delay=1, jitter=1, quantization_step=1e-4, on_request=True)
+    env.reset(seed=0, options={"channel": dead})
+    infos = [env.step(np.zeros(1, np.float32))[-1] for _ in range(40)]
+    assert all(info["request_forced"] for info in infos if info["measurement_age"] > 10)
+    assert infos[-1]["contract_broken"]
+
+
+def test_contract_of_the_plant_alone_has_no_sample_to_spare():
+    channel = Channel(0.5, delay=1, max_consecutive_losses=2, on_request=True)
+    env = NCSEnv(plant=cart_pole(), channel=channel)
+    env.reset(seed=0)
+    assert all(env.step(np.zeros(1, np.float32))[-1]["request_forced"] for _ in range(9))
+
+
+def test_samples_are_sent_where_the_downlink_broke_its_contract():
+    downlink = Channel(loss=1.0, delay=1)
+    env = cart_pole_loop(NCSEnv, downlink=downlink, downlink_contract=ChannelContract(2))
+    env.reset(seed=0)
+    infos = [env.step(np.zeros(1, np.float32))[-1] for _ in range(8)]
+    assert [info["downlink_broken"] for info in infos] == [False] * 2 + [True] * 6
+    assert [info["packets"] for info in infos] == list(range(1, 9))
+
+
+def test_requests_behind_a_downlink_take_effect_when_the_input_does():
+    env = cart_pole_loop(NCSEnv, downlink=Channel(delay=3))
+    env.reset(seed=0)
+    env.request()
+    packets = [env.step(np.zeros(1, np.float32))[-1]["packets"] for _ in range(5)]
+    assert packets == [1, 2, 3, 4, 4]  # three by agreement, and the one asked for
+
+
+def test_trace_on_request_keeps_the_contract():
+    channel = TraceChannel(trace=(1, -1, 2, -1, -1, 2), on_request=True, quantization_step=1e-4)
+    settings = {"plant": cart_pole(), "channel": channel, "contract": ChannelContract(8, 1e-4)}
+    env, rng = NCSVectorEnv(50, **settings), np.random.default_rng(0)
+    env.reset(seed=0)
+    ages = []
+    for _ in range(300):
+        env.request(rng.random(50) < 0.1)
+        *_, info = env.step(np.zeros((50, 1), np.float32))
+        ages.append(info["measurement_age"].max())
+    assert max(ages) == 8
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: Channel(on_request=True, send_period=2), "leave out send_period"),
+        (lambda: Channel(on_request=1), "on_request must be True or False"),
+        (
+            lambda: cart_pole_loop(NCSEnv, downlink=Channel(on_request=True)),
+            "for the channel of the samples",
+        ),
+        (
+            lambda: NCSEnv(cart_pole(), Channel(0.1, on_request=True), contract=ChannelContract(9)),
+            "give it max_consecutive_losses",
+        ),
+        (lambda: NCSEnv(cart_pole(), Channel()).request(), r"make it with Channel\(..., on_request=True\)"),
+        (lambda: cart_pole_loop(NCSEnv).request("yes"), "a request is True or False"),
+        (lambda: cart_pole_loop(NCSVectorEnv, 3).request([True]), r"bool of shape \(3,\)"),
+        (lambda: cart_pole_loop(NCSEnv).reset(options={"channel": Channel()}), "give one with on_request=True"),
+        (lambda: NCSEnv(truck_trailer()).reset(options={"channel": Channel(on_request=True)}), "on_request=False"),
+        (lambda: NCSVectorEnv(2, plant=truck_trailer(), channel=[Channel(), Channel(on_request=True)]), "on_request="),
+    ],
+)
+def test_what_makes_no_sense_is_refused(make, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        make()
+
+
+def test_spec_with_samples_on_request_is_json():
+    channel = {"loss": 0.2, "max_consecutive_losses": 1, "on_request": True}
+    env = gym.make("ncs_gym/CartPole-v0", channel=channel, contract={"max_age": 6})
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json())).unwrapped
+    assert again.channel == env.unwrapped.channel
+    assert again.channel.on_request
