@@ -76,10 +76,13 @@ class AttackCase:
         protocol = downlink_protocol(self.downlink, self.downlink_contract)
         return self.contract if protocol is None else protocol.behind(self.contract)
 
-    @property
-    def certificate(self) -> Certificate:
-        """A certificate for the plant under the contract, synthesized once per process."""
-        return certificate_for(self.plant, self.certificate_contract)
+    def certificate(self, safe_set: str | None = None) -> Certificate:
+        """Returns a certificate for the plant under the contract, synthesized once per process.
+
+        Args:
+            safe_set: "polytope", "ellipsoid" or None; see `shields.synthesize`.
+        """
+        return certificate_for(self.plant, self.certificate_contract, safe_set=safe_set)
 
 
 @cache

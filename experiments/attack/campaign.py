@@ -30,6 +30,7 @@ class Campaign:
         plant: File of the only plant to attack, in place of environments; None for none.
         contract: Channel contract of the plant of the file; None for none.
         mode: Only mode of the shield; None for `SHIELD_MODES`.
+        safe_set: Kind of safe set of the certificates; see `shields.synthesize`.
         horizon: Longest plan of mode "lookahead" [steps]; None in other modes.
     """
 
@@ -43,6 +44,7 @@ class Campaign:
     plant: str | None = None
     contract: ChannelContract | None = None
     mode: str | None = None
+    safe_set: str | None = None
     horizon: int | None = None
 
     @property

@@ -54,7 +54,7 @@ def attack(settings: AttackSettings) -> None:
 
 def _attack_in_folder(settings: AttackSettings, campaign: Campaign, cases: dict[str, AttackCase]) -> None:
     """Executes the batches that are missing, prints the table and writes the counts; raises as `attack` says."""
-    certificates = _certificates(cases, settings.out / "certificates")
+    certificates = _certificates(cases, settings.out / "certificates", campaign.safe_set)
     numbers = _numbers_of_batches(len(cases), int(settings.steps // campaign.batch_steps), campaign.kinds_of_batches)
     batches = [
         MonteCarloBatch(campaign, case, index, certificate)
@@ -94,6 +94,7 @@ def _campaign(settings: AttackSettings) -> Campaign:
         plant=settings.plant and str(settings.plant.resolve()),  # workers may have another working folder
         contract=changed_contract(None, settings.max_age, settings.quantization_step),
         mode=settings.mode,
+        safe_set=settings.safe_set,
         horizon=(settings.horizon or DEFAULT_HORIZON) if settings.mode == "lookahead" else None,
     )
 
@@ -113,16 +114,17 @@ def _require_claims(cases: dict[str, AttackCase]) -> None:
             )
 
 
-def _certificates(cases: dict[str, AttackCase], folder: Path) -> dict[str, Certificate]:
+def _certificates(cases: dict[str, AttackCase], folder: Path, safe_set: str | None = None) -> dict[str, Certificate]:
     """Returns the certificate of each case; those that the folder lacks are synthesized and written there."""
     folder.mkdir(parents=True, exist_ok=True)
     found = {}
     for name, case in tqdm(cases.items(), desc="certificates", leave=False, disable=None):
         contract = case.certificate_contract
         suffix = "" if contract is None else f"-{contract.max_age}-{contract.quantization_step:g}"
+        suffix += f"-{safe_set}" if safe_set else ""
         file = folder / f"{case.plant.fingerprint[:16]}{suffix}.json"
         if not file.exists():
-            case.certificate.save(file)
+            case.certificate(safe_set).save(file)
         found[name] = Certificate.load(file)
     return found
 
