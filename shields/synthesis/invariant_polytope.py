@@ -71,6 +71,10 @@ def invariant_rows(
     Raises:
         Infeasible: If there are none within `MOST_ROWS` rows and `LONGEST_SEARCH` seconds, or `predecessor` raises it.
     """
+    if kept > MOST_ROWS:
+        raise _none(
+            f"the safe box alone has {kept} rows, and it would need {MOST_ROWS} at most: leave out implied ones"
+        )
     rows, _ = _without_implied(rows, kept)
     deadline, following = time.monotonic() + LONGEST_SEARCH, 0
     while following < len(rows):
