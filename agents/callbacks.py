@@ -71,7 +71,6 @@ class SafetyCallback(BaseCallback):
             self._add_point()
 
     def _add_point(self) -> None:
-        """Adds the present totals to the history and to TensorBoard's next event."""
         last = self.history[-1] if self.history else TrainingPoint(0, float("nan"), 0, 0)
         taken = max(self.num_timesteps - last.steps, 1)
         self.logger.record("safety/violation_rate", (self.violation_steps - last.violation_steps) / taken)
@@ -190,7 +189,6 @@ class EvaluationCallback(BaseCallback):
         self._evaluate()
 
     def _evaluate(self) -> None:
-        """Plays the episodes and writes their results to TensorBoard."""
         episodes = evaluate(self._loop, lambda seen, _: self._act(seen), self._episodes, self._seed).episodes
         steps = sum(episode.steps for episode in episodes)
         safe = [episode.violation_steps == 0 for episode in episodes]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
@@ -156,19 +155,6 @@ class LoopConfig:
         if self.lagrangian is not None:
             return CostPenalty(envs, self.lagrangian.multiplier)
         return CostPenalty(envs, self.violation_penalty) if self.violation_penalty else envs
-
-
-def ControlLoop(*, env: str, **settings: Any) -> LoopConfig:
-    """Returns a `LoopConfig`, by its former name: some keyword arguments of the environment stand beside its fields.
-
-    Args:
-        env: A registered environment id.
-        settings: Fields of `LoopConfig`, or channel, downlink, noise, disturbance and process of the environment.
-    """
-    warnings.warn("ControlLoop is now LoopConfig(env=..., kwargs={...})", DeprecationWarning, stacklevel=2)
-    of_env = ("channel", "downlink", "noise", "disturbance", "process")
-    kwargs = {name: settings.pop(name) for name in of_env if name in settings}
-    return LoopConfig(env=env, kwargs=kwargs, **settings)
 
 
 class CostPenalty(VectorWrapper):

@@ -171,14 +171,15 @@ def test_programs_of_a_page_that_train_nothing_print_what_follows_them(page):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", SLOW_PAGES)
-def test_programs_of_a_page_print_what_follows_them_in_a_process_of_their_own(page):
+def test_programs_of_a_page_print_what_follows_them_in_a_process_of_their_own(page, tmp_path):
     programs = PROGRAM.findall((ROOT / page).read_text())
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     run = subprocess.run(
         [sys.executable, "-c", in_one(programs)],
         capture_output=True,
         text=True,
-        env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
+        env=os.environ | {"PYTHONPATH": path},
+        cwd=tmp_path,
         timeout=600,
     )
     assert run.returncode == 0, run.stderr

@@ -77,7 +77,6 @@ def _channel(env: str, channel: Channel | None) -> str:
 
 
 def _figures(evaluation: Evaluation) -> list[str]:
-    """Returns what happened in the episodes, one line per figure."""
     episodes = evaluation.episodes
     steps = sum(episode.steps for episode in episodes)
     violating = sum(episode.violation_steps > 0 for episode in episodes)
@@ -93,7 +92,6 @@ def _figures(evaluation: Evaluation) -> list[str]:
 
 
 def _shield_text(shield: ShieldSettings | None) -> str:
-    """Returns mode, horizon and penalty of a shield in words."""
     if shield is None:
         return "none"
     horizon = "" if shield.horizon is None else f", plans of at most {shield.horizon} steps"

@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, overload
 
 import numpy as np
-from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov
-from scipy.optimize import minimize_scalar
 
 from ncs_gym import exact
 from ncs_gym.estimation.error_bounds_by_age import ErrorSetsByAge, congruence_sum, error_sets_by_age
@@ -192,6 +190,8 @@ def _unconditional_set(plant: LinearPlant) -> ErrorSet:
         UnstablePlantError: If the spectral radius of A is 1 or more.
         ErrorSetError: If the plant is so ill-conditioned that the result fails (E0) or (E1).
     """
+    from scipy.optimize import minimize_scalar  # takes long to import
+
     radius = plant.spectral_radius
     if not radius < 1.0:
         raise UnstablePlantError(
@@ -253,6 +253,8 @@ def _smallest_solution(A: np.ndarray, D: np.ndarray, first: np.ndarray, rate: fl
 
 def _lyapunov(A: np.ndarray, source: np.ndarray) -> np.ndarray:
     """Returns X = A X A' + source by the direct method (the other fails silently)."""
+    from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov  # takes long to import
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LinAlgWarning)
         return solve_discrete_lyapunov(A, source, method="direct")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.plants.linear_plant import FLAT_INFLATION, INFLATION, LinearPlant
@@ -34,6 +33,8 @@ class SetMembership:
     def __init__(
         self, plant: LinearPlant, quantization_step: float, error_set: ErrorSet, shape_step: float = SHAPE_STEP
     ) -> None:
+        from scipy.linalg import solve_triangular  # takes long to import
+
         self.plant, self.error_set, self._step = plant, error_set, shape_step
         Sigma = error_set.Sigma
         self._ball = np.linalg.cholesky(error_set.shape_at(0))

@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, outer_sum
 from ncs_gym.validation import ReadOnlyArrays, as_covariance, read_only
@@ -221,6 +220,8 @@ def sum_gauge(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> float
         return Ellipsoid(first).gauge(point)
     if not np.any(first):
         return Ellipsoid(second).gauge(point)
+    from scipy.optimize import minimize_scalar  # takes long to import
+
     best: Any = minimize_scalar(
         lambda nu: -gauge(nu),
         bounds=(SMALLEST_MULTIPLIER, 1.0 - SMALLEST_MULTIPLIER),

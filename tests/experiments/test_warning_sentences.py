@@ -8,7 +8,7 @@ from queue import Queue
 import pytest
 from tqdm import tqdm
 
-from experiments.warning_sentences import warnings_as_sentences, warnings_sent
+from experiments.terminal import warnings_as_sentences, warnings_sent
 from tests.command import ncs
 
 # Samples may become older than the contract allows from a delay of 5 steps on.
