@@ -101,11 +101,10 @@ class DualAscentCallback(BaseCallback):
     for episodes to end, which those of many environments do in the same step, and an episode that a violation ends does
     not count as a cheap one.
 
-    This is Ray, Achiam and Amodei's constrained baseline ("Benchmarking Safe Exploration in Deep Reinforcement
-    Learning", 2019) with a plain gradient step in place of Adam, and Stooke, Achiam and Abbeel's PID controller
-    ("Responsive Safety in Reinforcement Learning by PID Lagrangian Methods", 2020) with the integral term alone. The
-    cost is part of the reward, so one value function estimates both, where theirs have one each. With a limit of zero
-    the multiplier never falls. TensorBoard gets `safety/multiplier`.
+    This is the constrained baseline of Ray et al. 2019 with a plain gradient step in place of Adam, and the PID
+    controller of Stooke et al. 2020 with the integral term alone (docs/bibliography.md). The cost is part of
+    the reward, so one value function estimates both, where theirs have one each. With a limit of zero the multiplier
+    never falls. TensorBoard gets `safety/multiplier`.
 
     Args:
         settings: Limit and learning rate.

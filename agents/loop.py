@@ -57,7 +57,7 @@ class ShieldSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class LagrangianSettings:
-    """Settings of PPO-Lagrangian: how the price of a violating step is adapted (Ray et al. 2019).
+    """Settings of PPO-Lagrangian: how the price of a violating step is adapted (Ray et al. 2019, docs/bibliography.md).
 
     Attributes:
         cost_limit: Largest cost of an episode of full length (violating steps) that the agent is trained for.
@@ -181,7 +181,7 @@ class CostPenalty(VectorWrapper):
 
 
 class ResidualActions(VectorWrapper):
-    """Applies u = gain x_hat plus the agent's part, clipped to the limits (residual policies, Silver et al. 2018).
+    """Applies u = gain x_hat plus the agent's part, clipped to the limits (Silver et al. 2018).
 
     Args:
         env: A vector environment whose observations begin with the estimate.

@@ -47,8 +47,7 @@ def bootstrap_interval(*strata: Values, statistic: Callable[..., float] = np.mea
     """Returns the percentile bootstrap's 95 % interval of a statistic of all values, each stratum resampled by itself.
 
     With a handful of values it is too narrow: it cannot reach beyond the smallest and the largest of them. To resample
-    the runs within each environment is what Agarwal et al. do, "Deep reinforcement learning at the edge of the
-    statistical precipice" (2021).
+    the runs within each environment is what Agarwal et al. 2021 do (docs/bibliography.md).
 
     Args:
         *strata: Independent values of each stratum; a single one is the ordinary bootstrap.

@@ -164,8 +164,8 @@ def governor(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0) -> Inp
 
     Targets are moved as little as possible so that the regulator's own loop, from the estimate taken for the state and
     without disturbance, with a constant target keeps the limits of box and inputs less a margin for the next
-    `GOVERNED_STEPS` steps. Where no target does, the middle of what the limits ask for is used. (Garone, Di Cairano
-    and Kolmanovsky: "Reference and command governors for systems with constraints", Automatica 2017.)
+    `GOVERNED_STEPS` steps. Where no target does, the middle of what the limits ask for is used (Garone et al. 2017,
+    docs/bibliography.md).
 
     Args:
         env: The environment; tasks other than `SetpointTracking` are not governed.

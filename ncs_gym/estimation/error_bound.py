@@ -15,7 +15,7 @@ from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.shape_matrices import rounded_up
 from ncs_gym.validation import ReadOnlyArrays
 
-# Growth c of the optimal set: gives (E1) slack that an exact check can see, and updates room (theory.md section 3).
+# Growth c of the optimal set: gives (E1) slack that an exact check can see, and updates room (docs/shield_proof.md).
 GROWTH = 1.1
 # Digits of a set relative to its extents, and of 1 - rate: what differs between processors beyond them is cut off.
 DIGITS, RATE_DIGITS = 11, 4
@@ -176,7 +176,7 @@ def _holds(outer: np.ndarray, inner: np.ndarray, size: np.ndarray) -> bool:
 
 
 def _unconditional_set(plant: LinearPlant) -> ErrorSet:
-    """Returns the error set of a stable plant in closed form (theory.md section 3, (E0) and (E1)).
+    """Returns the error set of a stable plant in closed form (docs/shield_proof.md, (E0) and (E1)).
 
     For a fixed rate the smallest solution of (E1) is a Lyapunov series; where it does not cover the first
     estimate, the missing part is added as a source to the same series. The rate minimizes tr(W Sigma), W the

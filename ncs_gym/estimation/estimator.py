@@ -44,7 +44,7 @@ class Estimator:
 
     The packets of a step are applied at the steps their samples were taken at, and everything after is replayed. Next
     to mean and covariance runs a hard ellipsoid E(Sigma_k) that holds the error at every step and never leaves the
-    certified E(Sigma) (theory.md section 3): predictions and updates are accepted only inside it. What depends only on
+    certified E(Sigma) (docs/shield_proof.md): predictions and updates are accepted only inside it. What depends only on
     when packets arrive is looked up (`ArrivalHistories`).
 
     Args:
@@ -121,7 +121,8 @@ class Estimator:
         shape = self._error_set.shape_at(age)
         assert shape is not None
         first = ErrorStatistics(self._plant.kalman_covariances[2].copy(), shape.copy(), age)
-        self._histories = histories_of(self._plant, self._channel, self._error_set, first=first)
+        coarsens = self._usual.coarsens
+        self._histories = histories_of(self._plant, self._channel, self._error_set, coarsens, first=first)
         self._begin(mean, self.step, age)
 
     def _begin(self, mean: np.ndarray, step: int = 0, age: int = 0) -> None:

@@ -200,7 +200,7 @@ def sum_gauge(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> float
     """Returns sqrt(max over nu of r'(P1/nu + P2/(1-nu))^-1 r): at most 1 exactly if r is in E(P1) + E(P2).
 
     The intersection of all E(P1/nu + P2/(1-nu)) is the Minkowski sum, and the form is concave in nu
-    (theory.md section 1). A result above 1 proves that the point lies outside.
+    (docs/shield_proof.md, "Sums"). A result above 1 proves that the point lies outside.
 
     Args:
         point: r, shape (n,).
