@@ -1,11 +1,14 @@
 """What mode "lookahead" admits and what it costs, against mode "project" and the same program in cvxpy.
 
-    python benchmarks/lookahead.py [--sections beliefs loop training] [--safe-set ellipsoid] [--beliefs 2000]
+    python benchmarks/lookahead.py [--sections beliefs loop ends training] [--safe-set ellipsoid] [--beliefs 2000]
 
 Plans end in the safe set of the certificate: the polytope or, with `--safe-set ellipsoid`, the ellipsoid in it.
 
 Section "loop" runs 64 environments in both modes with random actions and with actions pushed towards the upper limits,
-and says how often and how far inputs were changed and how long a frame takes. Section "training" trains PPO on the
+and says how often and how far inputs were changed and how long a frame takes. Section "ends" compares plans that end in
+either set on the batch reactor under random actions: in a loop of each, and for the same beliefs, taken from either
+loop, with nothing stored. "with the solver" asks it for plans that end in P, too, wherever nothing is stored; "outside"
+is the share of states outside the ellipsoid S. Section "training" trains PPO on the
 batch reactor behind both modes and runs every agent behind both. Times are CPU times; what follows is about section
 "beliefs".
 
@@ -36,6 +39,8 @@ from agents.algorithms import build_model
 from agents.hyperparams import complete_hyperparams
 from ncs_gym import Ellipsoid, LinearPlant
 from shields import Certificate, SafetyFilter, VectorSafetyShield, synthesize
+from shields.runtime.backup_plans.plan_check import Tightening
+from shields.runtime.backup_plans.planner import Planner
 
 # Environment, horizon; where plans end in the ellipsoid more steps pay on the cart-pole.
 CASES = {
@@ -45,7 +50,7 @@ CASES = {
 EPISODES, STEPS = 5, 60
 # So many beliefs are given to cvxpy.
 CVXPY = 60
-SECTIONS = ("beliefs", "loop", "training")
+SECTIONS = ("beliefs", "loop", "ends", "training")
 MODES = ("project", "lookahead")
 # Steps of 64 environments that are measured, and before that.
 ENVS, MEASURED, WARM = 64, 150, 50
@@ -232,6 +237,56 @@ def loop(safe_set: str) -> None:
             )
 
 
+class AskingPlanner(Planner):
+    """Asks the solver for plans that end in P as `Planner` does for those that end in S."""
+
+    def find(self, estimates, shapes, proposed, projected, stored):
+        plans = super().find(estimates, shapes, proposed, projected, stored)
+        tightening = self.test.tightenings_of(shapes)
+        left = np.flatnonzero(np.isnan(stored[:, 0, 0]) & (plans.distances > 0.0))
+        if left.size:
+            known = Tightening(*(part[left] for part in tightening))
+            plans.improve(left, self._solved(estimates[left], known, proposed[left]))
+        return plans
+
+
+def asking(shield: SafetyFilter) -> SafetyFilter:
+    shield.lookahead.planner.__class__ = AskingPlanner
+    return shield
+
+
+def ends() -> None:
+    name, horizon = CASES["polytope"][-1]
+    S, plant = certified(name, "ellipsoid").ellipsoid, gym.make(f"ncs_gym/{name}-v0").unwrapped.plant
+    kinds = {"S": "ellipsoid", "P": "polytope", "P, with the solver": "polytope"}
+    print(f"{name}, plans end in   {'overridden':>12s}{'correction':>12s}{'outside':>9s}")
+    beliefs = {}
+    for end, safe_set in kinds.items():
+        env, rng, sums = shielded(name, safe_set, "lookahead", horizon), np.random.default_rng(SEED), np.zeros(3)
+        if "solver" in end:
+            asking(env.filter)
+        _, info = env.reset(seed=SEED)
+        taken = beliefs[end] = []
+        for step in range(WARM + MEASURED):
+            action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+            if step >= WARM and step % 25 == 0:
+                taken += zip(info["estimate"].copy(), info["error_shape"].copy(), action * plant.u_max, strict=True)
+            info = env.step(action)[4]
+            if step >= WARM:
+                outside = np.mean(S.gauge(info["state"]) > 1.0)
+                sums += info["shield_intervened"].mean(), info["shield_correction"].mean(), outside
+        overridden, correction, outside = sums / MEASURED
+        print(f"in a loop: {end:20s}{overridden:11.1%}{correction:12.3f}{outside:9.1%}", flush=True)
+    filters = {end: SafetyFilter(certified(name, kind), plant, "lookahead", horizon) for end, kind in kinds.items()}
+    asking(filters["P, with the solver"])
+    for loop_of in ("S", "P"):
+        for end, shield in filters.items():
+            found = [shield.decide(*each) for each in beliefs[loop_of]]
+            far = [np.linalg.norm(one.input - each[2]) for one, each in zip(found, beliefs[loop_of], strict=True)]
+            share = np.mean([one.intervened for one in found])
+            print(f"beliefs of loop {loop_of}: {end:20s}{share:6.1%}{np.mean(far):12.3f}", flush=True)
+
+
 def training(safe_set: str, steps: int) -> None:
     name, horizon = CASES[safe_set][-1]
     hyperparams, agents, rates = complete_hyperparams("PPO", {"n_envs": ENVS}), {}, {}
@@ -277,6 +332,8 @@ def main() -> None:
             print(report(name, options.safe_set, horizon, options.beliefs), flush=True)
     if "loop" in options.sections:
         loop(options.safe_set)
+    if "ends" in options.sections:
+        ends()
     if "training" in options.sections:
         training(options.safe_set, options.steps)
 

@@ -71,12 +71,13 @@ class Viability:
         equal = sparse.vstack([start.tocsr(), self._moves])
         cost = np.zeros(equal.shape[1])
         cost[0] = -1.0
-        found = linprog(
-            cost, A_ub=self._box, b_ub=np.ones(self._box.shape[0]), A_eq=equal, b_eq=np.zeros(equal.shape[0]),
-            bounds=self._bounds,
-        )  # fmt: skip
-        assert found.status == 0, found.message
-        return float(found.x[0])
+        problem = {"A_ub": self._box, "b_ub": np.ones(self._box.shape[0]), "bounds": self._bounds}
+        problem |= {"A_eq": equal, "b_eq": np.zeros(equal.shape[0])}
+        for method in ("highs-ds", "highs-ipm"):  # either gives up now and then, on different problems
+            found = linprog(cost, **problem, method=method)
+            if found.status == 0:
+                return float(found.x[0])
+        raise RuntimeError(f"the solver does not say how far a direction reaches: {found.message}")
 
 
 def reaches(certificate: Certificate, viability: Viability) -> dict[str, Callable[[np.ndarray], float]]:

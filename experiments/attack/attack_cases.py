@@ -81,10 +81,13 @@ class AttackCase:
         """Whether there is a contract that the channel can never break."""
         return self.contract is not None and self.contract.is_kept_by(self.channel)
 
-    @property
-    def certificate(self) -> Certificate:
-        """A certificate for the plant under the contract, synthesized once per process."""
-        return certificate_for(self.plant, self.certificate_contract)
+    def certificate(self, safe_set: str | None = None) -> Certificate:
+        """Returns a certificate for the plant under the contract, synthesized once per process.
+
+        Args:
+            safe_set: "polytope", "ellipsoid" or None; see `shields.synthesize`.
+        """
+        return certificate_for(self.plant, self.certificate_contract, safe_set=safe_set)
 
 
 @cache

@@ -42,7 +42,7 @@ def attack(settings: AttackSettings) -> None:
         # Smaller batches, so that each kind of each case comes in once within the budget.
         each = int(settings.steps / (len(cases) * kinds * EPISODE_STEPS))
         settings = replace(settings, horizon=horizon, plant=plant, envs=min(settings.envs, max(each, FEWEST_ENVS)))
-        certificates = _certificates(cases, settings.out / "certificates")
+        certificates = _certificates(cases, settings.out / "certificates", settings.safe_set)
         numbers = _numbers_of_batches(len(cases), int(settings.steps // (settings.envs * EPISODE_STEPS)), kinds)
         batches = [
             MonteCarloBatch(settings, case, index, certificate)
@@ -83,16 +83,17 @@ def _require_claims(cases: dict[str, AttackCase]) -> None:
             )
 
 
-def _certificates(cases: dict[str, AttackCase], folder: Path) -> dict[str, Certificate]:
+def _certificates(cases: dict[str, AttackCase], folder: Path, safe_set: str | None = None) -> dict[str, Certificate]:
     """Returns the certificate of each case; those that the folder lacks are synthesized and written there."""
     folder.mkdir(parents=True, exist_ok=True)
     found = {}
     for name, case in tqdm(cases.items(), desc="certificates", leave=False, disable=None):
         contract = case.certificate_contract
         suffix = "" if contract is None else f"-{contract.max_age}-{contract.quantization_step:g}"
+        suffix += f"-{safe_set}" if safe_set else ""
         file = folder / f"{case.plant.fingerprint[:16]}{suffix}.json"
         if not file.exists():
-            case.certificate.save(file)
+            case.certificate(safe_set).save(file)
         found[name] = Certificate.load(file)
     return found
 

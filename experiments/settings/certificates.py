@@ -119,6 +119,7 @@ class AttackSettings(BackendSettings):
         envs: Number of episodes in a batch, simulated side by side.
         mode: Mode of the shield; by default project, switch and boundary in turn. The claim of lookahead is the box:
             states may leave S, and half of the episodes are drawn from all of the box.
+        safe_set: What the shields keep; see `ncs synthesize`. By default the polytope, where there is one.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
         unshielded: Let the shield only watch, to see what happens without it.
         noise: "truncated" is the worst noise within the bounds; "gaussian" noise has none: it is drawn, next to
@@ -141,6 +142,7 @@ class AttackSettings(BackendSettings):
     random_plants: int = 4
     envs: int = 4096
     mode: Literal["project", "lookahead", "switch", "boundary"] | None = None
+    safe_set: Literal["polytope", "ellipsoid"] | None = None
     horizon: int | None = None
     unshielded: bool = False
     noise: Literal["truncated", "gaussian"] = "truncated"

@@ -153,7 +153,7 @@ def require_error_set(error_set: ErrorSet, plant: LinearPlant) -> None:
         needs = ages.needs(plant)
     for name, triples in needs.items():
         if not all(_holds(*triple) for triple in triples):
-            raise ErrorSetError(f"no error set found: the plant is too ill-conditioned for {name} to hold in float64")
+            raise _too_ill_conditioned(name)
 
 
 def _holds(outer: np.ndarray, inner: np.ndarray, size: np.ndarray) -> bool:
@@ -232,7 +232,7 @@ def _check(Sigma: np.ndarray, A: np.ndarray, D: np.ndarray, first: np.ndarray, r
         finite = np.isfinite(Sigma).all() and np.isfinite(need).all()
         rounding = ROUNDINGS * len(A) * np.finfo(float).eps * np.abs(Sigma).max()
         if not (finite and np.linalg.eigvalsh(Sigma - need)[0] > rounding):
-            raise ErrorSetError(f"no error set found: the plant is too ill-conditioned for {name} to hold in float64")
+            raise _too_ill_conditioned(name)
 
 
 def _smallest_solution(A: np.ndarray, D: np.ndarray, first: np.ndarray, rate: float) -> np.ndarray:
@@ -258,3 +258,10 @@ def _lyapunov(A: np.ndarray, source: np.ndarray) -> np.ndarray:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LinAlgWarning)
         return solve_discrete_lyapunov(A, source, method="direct")
+
+
+def _too_ill_conditioned(name: str) -> ErrorSetError:
+    return ErrorSetError(
+        f"no error set found: the plant is too ill-conditioned for {name} to hold in float64; give states units in "
+        "which the half-widths of the box are of similar size"
+    )

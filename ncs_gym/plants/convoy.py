@@ -29,6 +29,7 @@ def convoy(dt: float = 0.1, lag: float = 0.3, **bounds: Any) -> LinearPlant:
     defaults = {
         "box": [1.0, 2.0],
         "u_max": 2.0,
+        "continuous_model": np.concatenate([motion, drive_and_leader[:, :1]], axis=1),
         "disturbance_bound": (both[:, 1:], 0.45),
         "sensor_bound": 1e-3,
         "initial_bound": 0.02,

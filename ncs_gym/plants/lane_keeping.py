@@ -23,10 +23,12 @@ def lane_keeping(dt: float = 0.05, speed: float = 20.0, **bounds: Any) -> Linear
         bounds: Other arguments of `LinearPlant`, in the place of these.
     """
     motion = np.array([[0.0, speed], [0.0, 0.0]])
-    A, both = zero_order_hold(motion, np.array([[0.0, 1.0], [1.0, 0.0]]), dt)
+    turn_and_push = np.array([[0.0, 1.0], [1.0, 0.0]])
+    A, both = zero_order_hold(motion, turn_and_push, dt)
     defaults = {
         "box": [0.5, 0.1],
         "u_max": 0.4,
+        "continuous_model": np.concatenate([motion, turn_and_push[:, :1]], axis=1),
         "disturbance_bound": (both[:, 1:], 0.4),
         "sensor_bound": [1e-3, 2e-4],
         "initial_bound": [1e-2, 2e-3],

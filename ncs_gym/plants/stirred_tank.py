@@ -30,6 +30,7 @@ def stirred_tank(dt: float = 3.0, **bounds: Any) -> LinearPlant:
     defaults = {
         "box": [10.0, 5.0],
         "u_max": 20.0,
+        "continuous_model": np.concatenate([per_minute, coolant_and_feed[:, :1]], axis=1) / 60.0,
         "disturbance_bound": (both[:, 1:], 2.0),
         "sensor_bound": 0.02,
         "initial_bound": 0.1,

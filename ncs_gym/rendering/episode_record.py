@@ -101,7 +101,8 @@ class FrameRecord:
         input: The input applied in the step that led here, shape (m,); None at reset.
         committed: The input decided in that step, shape (m,); behind a downlink it is applied later. None at reset.
         violations: Number of steps of this episode with a violation.
-        violated: Whether the true state violates the safe box now.
+        violated: Whether the true state violated the safe box in the step that led here.
+        worst: Largest |c_j x| of that step: now, and between samples where they count (`between_samples`).
         measurement_age: Steps since the newest measurement used was taken.
         missing_inputs: Number of steps of this episode in which the downlink broke and zero was applied.
         input_missing: Whether that was so in the step that led here.
@@ -123,6 +124,7 @@ class FrameRecord:
     committed: np.ndarray | None
     violations: int
     violated: bool
+    worst: float
     measurement_age: int
     missing_inputs: int
     input_missing: bool
@@ -139,6 +141,11 @@ class FrameRecord:
         """Whether a shield that protects replaced the input that led here."""
         annotation = self.annotation
         return annotation is not None and annotation.intervened and annotation.protects
+
+    @property
+    def violated_between_samples(self) -> bool:
+        """Whether the true state violated the safe box in the step that led here, and is inside it again."""
+        return self.violated and bool((self.plant.constraint_values(self.state) <= 0.0).all())
 
     @property
     def planned_states(self) -> np.ndarray:
@@ -212,6 +219,7 @@ class EpisodeRecord:
             committed=self._committed,
             violations=self._violations,
             violated=self._violated,
+            worst=self._worst,
             measurement_age=self._measurement_age,
             missing_inputs=self._missing_inputs,
             input_missing=self._input_missing,
@@ -230,6 +238,7 @@ class EpisodeRecord:
         self._path.append(info["state"].copy())
         self._estimate, self._error_shape = info["estimate"].copy(), info["error_shape"].copy()
         self._violations, self._violated = int(info["episode_violations"]), bool(info["cost"] > 0.0)
+        self._worst = 1.0 + float(info["worst_constraint_values"].max())
         self._measurement_age = int(info["measurement_age"])
         self._input_missing = bool(info["downlink_broken"])
         self._forced.append(bool(info["request_forced"]))

@@ -231,9 +231,7 @@ class PolytopeSets(NamedTuple):
         rows = np.concatenate([self.test.effect, np.eye(len(limits))])
         offset = np.concatenate([self.test.moved @ self.estimates, np.zeros(inputs.shape)])
         room = np.concatenate([self.room - self.rounding - margin, np.repeat(limits[:, None], count, axis=1)])
-        if len(limits) == 1:
-            return closest_between(inputs, offset, rows[..., None], room)
-        return closest_between(inputs, offset, np.repeat(rows[..., None], count, axis=-1), room)
+        return closest_between(inputs, offset, rows[..., None], room)
 
 
 class EllipsoidOnGrid(OneStepTest):

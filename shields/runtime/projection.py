@@ -184,7 +184,7 @@ def closest_between(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, 
     Args:
         wanted: Shape (m, N).
         offset: Shape (r, N).
-        effect: Shape (r, m, N), with a single input also (r, 1, 1); every direction has some row.
+        effect: Shape (r, m, N), or (r, m, 1) for the same in all; every direction has some row.
         room: Shape (r, N); nothing is admissible where one is negative or NaN.
 
     Returns:
@@ -200,13 +200,14 @@ def closest_between(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, 
             high = np.where(flat, np.inf, high)
         low, high = low.max(axis=0), high.min(axis=0)
         return np.where(low <= high, np.minimum(np.maximum(wanted, low), high), np.nan)
-    values = offset + (effect * wanted).sum(axis=1)
+    values = offset + _changes(effect, wanted)
     beyond = ~(np.abs(values) <= room)
     closest = np.where(beyond.any(axis=0), np.nan, wanted)
     row, problem = np.nonzero(beyond & (room >= 0.0))
     if not row.size:
         return closest
-    normals, start = effect[row, :, problem].T, wanted[:, problem]
+    shared = effect.shape[2] == 1
+    normals, start = effect[row, :, 0 if shared else problem].T, wanted[:, problem]
     face = np.sign(values[row, problem]) * room[row, problem]
     foot = start + normals * ((face - values[row, problem]) / (normals * normals).sum(axis=0))
     usable = np.isfinite(foot).all(axis=0)
@@ -218,16 +219,19 @@ def closest_between(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, 
         normals[:, usable],
     )
     # Directions in the plane of the face, shape (m, m - 1, F).
-    plane = np.linalg.svd(normals.T[:, None])[2][:, 1:].transpose(2, 1, 0)
+    if len(normals) == 2:
+        plane = (np.stack([-normals[1], normals[0]]) / np.hypot(*normals))[:, None]
+    else:
+        plane = np.linalg.svd(normals.T[:, None])[2][:, 1:].transpose(2, 1, 0)
     left = room[:, problem]
     left[row, np.arange(len(row))] = np.inf  # the face itself
-    here = effect[:, :, problem]
-    within = (here[:, :, None] * plane).sum(axis=1)
+    here = effect if shared else effect[:, :, problem]
+    within = np.stack([_changes(here, direction) for direction in plane.swapaxes(0, 1)], axis=1)
     # A row that is parallel to the face does not change in its plane: rounding must not decide whether it holds there.
     parallel = (within * within).sum(axis=1) <= PARALLEL**2 * (here * here).sum(axis=1)
     within = np.where(parallel[:, None], 0.0, within)
     left = np.where(parallel, left * (1.0 + PARALLEL) + PARALLEL * np.abs(offset[:, problem]), left)
-    moves = closest_between(np.zeros(plane.shape[1:]), offset[:, problem] + (here * foot).sum(axis=1), within, left)
+    moves = closest_between(np.zeros(plane.shape[1:]), offset[:, problem] + _changes(here, foot), within, left)
     found = foot + (plane * moves).sum(axis=1)
     distance = np.sqrt(((found - start) ** 2).sum(axis=0))
     least = np.full(wanted.shape[1], np.inf)
@@ -235,3 +239,8 @@ def closest_between(wanted: np.ndarray, offset: np.ndarray, effect: np.ndarray, 
     best = distance == least[problem]
     closest[:, problem[best]] = found[:, best]
     return closest
+
+
+def _changes(effect: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+    """Returns effect u row by row, shape (r, N), of inputs (m, N); effect as in `closest_between`."""
+    return effect[..., 0] @ inputs if effect.shape[2] == 1 else (effect * inputs).sum(axis=1)

@@ -36,6 +36,11 @@ _BETWEEN_RESERVE, _MOST_BOXES = 1e-3, 8
 # Significant digits of the numbers of a certificate: what differs between processors beyond them is cut off. Sizes
 # that are for people have fewer.
 _DIGITS, _SHOWN_DIGITS = 12, 6
+# What helps where float64 has too few digits.
+_MORE_DIGITS = (
+    "give states units in which the half-widths of the box are of similar size, and leave out rows of the box that are "
+    "nearly the same as others"
+)
 # Called with a line of text: the stage, and the volume reached so far.
 Progress = Callable[[str], object]
 # Alternations of a search that begins near the design of a similar problem.
@@ -136,11 +141,11 @@ def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progre
             size = {} if share is None else {"polytope_share_of_box": float(exact.rounded(share, 3))}
             return replace(found, provenance=certificate.provenance | size)
         failed = next(condition for condition in report.conditions if not condition.holds)
-        reason = f"in exact arithmetic {failed.name} fails by {-failed.margin:.3g}"
+        reason = f"in exact arithmetic {failed.name} fails by {-failed.margin:.3g}: {_MORE_DIGITS}"
     except Infeasible as none:
         reason = str(none)
     except (ArithmeticError, ValueError, CertificateError) as error:  # numbers that a linear program cannot hold
-        reason = f"its numbers are out of reach of float64 ({error})"
+        reason = f"its numbers are out of reach of float64 ({error}): {_MORE_DIGITS}"
     except KeyboardInterrupt as interrupt:
         message = "interrupted while a polytope was sought; the certificate has the ellipsoid"
         raise SynthesisInterrupted(message, certificate) from interrupt
@@ -424,7 +429,7 @@ def _failed_verification(report: Report) -> Infeasible:
     """Returns the exception for a candidate that does not verify."""
     failed = next(condition for condition in report.conditions if not condition.holds)
     return Infeasible(
-        f"a candidate was found, but in exact arithmetic {failed.name} fails by {-failed.margin:.3g}",
+        f"a candidate was found, but in exact arithmetic {failed.name} fails by {-failed.margin:.3g}: {_MORE_DIGITS}",
         failed.name.split()[0].strip("():"),
         -failed.margin,
     )

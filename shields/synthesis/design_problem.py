@@ -27,6 +27,8 @@ INFLATION = 1.0 + 1e-9
 # Axes of an error set are lengthened to at least this fraction of its longest one in the semidefinite programs; exact
 # verification uses the error set itself.
 _SMALLEST_AXIS_RATIO = 0.01
+# A box that is longer in one direction than in another by more, each state in units of its own limit, is refused.
+_FLATTEST = 1e7
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -132,6 +134,14 @@ def design_problem(
             f"the safe box leaves {free} of {plant.n} directions unbounded: add rows to box with generous limits",
             "S",
             free,
+        )
+    flatness = float(np.linalg.cond(plant.box_rows * plant.half_widths))
+    if flatness > _FLATTEST:
+        raise Infeasible(
+            f"the safe box is flat, {flatness:.0e} times longer in one direction than in another that is no axis: add "
+            "rows to box that limit the long one, or leave out those that limit the short one",
+            "S",
+            flatness,
         )
     try:
         errors = _inflated(certified_error_set(plant, contract))

@@ -124,7 +124,7 @@ class Planner:
 
         Candidates are the projected input and then the regulator, what is stored, and either gain from the start. The
         solver is asked where none of them is certified; where plans end in S also if nothing is stored. Plans that end
-        in P hardly come closer by it than the projected input does, for three times the time.
+        in P would begin closer by it in a single step, but not in a loop (docs/lookahead.md), for three times the time.
 
         Args:
             estimates: x_hat, shape (E, n).

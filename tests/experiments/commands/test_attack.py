@@ -462,7 +462,23 @@ def test_settings_that_contradict_each_other_are_refused(changes, words, tmp_pat
 
 def test_the_certificate_of_a_case_fits_its_plant_and_contract():
     case = AttackCase(truck_trailer(), attack_cases(0, 1)[CRUISE].channel)
-    assert case.certificate.fingerprint == truck_trailer().fingerprint
+    assert case.certificate().fingerprint == truck_trailer().fingerprint
+
+
+def test_either_kind_of_safe_set_is_attacked_and_neither_takes_the_certificates_of_the_other(
+    tmp_path, small, without_workers
+):
+    for kind in ("polytope", "ellipsoid", None):
+        attack(settings(tmp_path, safe_set=kind, force=True))
+        files = sorted((tmp_path / "certificates").glob("*.json"))
+        chosen = [file for file in files if file.stem.endswith(kind or "")]
+        if kind is None:
+            chosen = [file for file in files if not file.stem.endswith(("polytope", "ellipsoid"))]
+        assert chosen
+        assert {Certificate.load(file).polytope is None for file in chosen} == {kind == "ellipsoid"}
+        document = json.loads((tmp_path / "certify.json").read_text())
+        assert document["settings"]["safe_set"] == kind
+        assert (document["total"]["exits"], document["total"]["broken_episodes"]) == (0, 0)
 
 
 def test_earlier_name_of_the_command_is_the_same_command(tmp_path, small, without_workers):

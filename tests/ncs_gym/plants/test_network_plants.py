@@ -36,6 +36,26 @@ def test_car_moves_sideways_with_its_heading():
     np.testing.assert_allclose(plant.B, [[20.0 * 0.05**2 / 2.0], [0.05]], rtol=1e-12)
 
 
+@pytest.mark.parametrize("plant", [stirred_tank, convoy, lane_keeping])
+def test_their_model_in_continuous_time_is_the_one_that_was_sampled(plant):
+    found, longer = plant(), 1.5 * plant().dt
+    assert replace(found, between_samples=4).grid_rows.state.shape == (4, 2, 2)
+    other = plant(dt=longer)
+    np.testing.assert_allclose(found.resampled(longer).A, other.A, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(found.resampled(longer).B, other.B, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", IDS)
+def test_certificate_at_all_times_exists_for_the_contract(name):
+    env = ncs_env(gym.make(f"ncs_gym/{name}-v0"))
+    plant = replace(env.plant, between_samples=4)
+    certificate = synthesize(plant, contract=env.contract)
+    assert certificate.polytope is not None
+    assert "in the safe box at all times" in str(certificate)
+    assert all(verify(certificate, plant, engine=engine).valid for engine in ("rational", "flint"))
+
+
 @pytest.mark.parametrize("name", IDS)
 def test_certificate_exists_for_the_contract_and_not_for_four_tenths_more_uncertainty(name):
     env = ncs_env(gym.make(f"ncs_gym/{name}-v0"))

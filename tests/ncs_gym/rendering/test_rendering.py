@@ -433,3 +433,27 @@ def test_drawn_environments_can_be_copied_and_pickled():
     frame = env.render()
     for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
         np.testing.assert_array_equal(twin.render(), frame)
+
+
+@pytest.mark.parametrize("points", [8, None])
+def test_picture_says_that_the_box_was_left_between_two_samples_where_that_counts(loaded, points):
+    plant = replace(loaded, between_samples=points)
+    env = make(plant=plant, terminate_on_violation=False).unwrapped
+    env.reset(seed=0, options={"state": np.array([-1.99, -1.45])})
+    *_, info = env.step(np.array([1.0], np.float32))
+    inside = (info["constraint_values"] <= 0.0).all()
+    frame, picture = env.renderer.frame_record(), env.render()
+    row, begin = int(theme.HEADER.h) + 13, theme.WIDTH // 2
+    shown = count(picture, theme.DANGER, (begin, row - 8, theme.WIDTH // 2 - 10, 16))
+    assert inside
+    if points is None:
+        assert (frame.violated, shown) == (False, 0)
+        assert frame.worst <= 1.0
+    else:
+        assert frame.violated
+        assert frame.worst == 1.0 + info["worst_constraint_values"].max() > 1.0
+        assert shown > 20
+        env.renderer._picture.draw(replace(frame, worst=frame.worst + 1.0))
+        assert (env.renderer._picture._canvas.pixels() != picture)[row - 8 : row + 8, begin:].any()
+        env.step(np.array([0.0], np.float32))
+        assert not env.renderer.frame_record().violated_between_samples

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from dataclasses import replace
 from fractions import Fraction
 from functools import cache
@@ -14,7 +15,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from ncs_gym import LinearPlant, cart_pole
-from ncs_gym.network.contract import contract_of
+from ncs_gym.network.contract import ChannelContract, contract_of
+from ncs_gym.plants.statespace import zero_order_hold
 from ncs_gym.registration import CART_POLE_CHANNEL
 from shields import Certificate, CertificateError, SafetyFilter, synthesize, verify
 from shields.errors import Infeasible, SynthesisInterrupted
@@ -226,6 +228,86 @@ def test_without_a_polytope_within_the_limits_the_certificate_says_why(monkeypat
     monkeypatch.setattr(search, "MOST_ROWS", 400)
     monkeypatch.setattr(search, "LONGEST_SEARCH", -1.0)
     assert "longer than" in with_polytope(certificate, plant).provenance["no_polytope"]
+
+
+def small_plant(**changes):
+    """Two states, of which the second is pushed; in the unit box."""
+    given = {"A": [[0.9, 0.2], [0.0, 0.8]], "B": [[0.0], [0.3]], "box": np.eye(2), "u_max": 1.0, "dt": 0.1}
+    noise = {"gamma": 1e-4, "measurement_noise_cov": 1e-5 * np.eye(2), "initial_cov": 1e-5 * np.eye(2)}
+    return LinearPlant(**(given | noise | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"box": [1.0, np.inf]}, "leaves 1 of 2 directions unbounded: add rows to box with generous limits"),
+        (
+            {"box": np.array([[1.0, 1.0], [1.0, 1.0 + 1e-8]])},
+            r"the safe box is flat, \de\+\d+ times longer in one direction .*: add rows to box that limit the long one",
+        ),
+        (
+            {"box": [1.0, 1e7]},
+            "too ill-conditioned for .* give states units in which the half-widths of the box are of similar size",
+        ),
+    ],
+)
+def test_boxes_that_leave_no_set_say_in_a_sentence_what_helps(changes, words):
+    with pytest.raises(Infeasible, match=words) as caught:
+        synthesize(small_plant(**changes))
+    assert "\n" not in str(caught.value)
+
+
+def test_box_with_nearly_the_same_row_twice_keeps_the_ellipsoid_and_says_what_helps():
+    certificate = synthesize(small_plant(box=np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1e-9]])))
+    assert certificate.polytope is None
+    assert "leave out rows of the box that are nearly the same as others" in " ".join(str(certificate).split())
+    assert synthesize(small_plant()).polytope is not None
+
+
+def test_box_of_more_rows_than_a_polytope_has_says_so():
+    angles = np.arange(401) * np.pi / 401
+    rows = np.column_stack([np.cos(angles), np.sin(angles)])
+    with pytest.raises(Infeasible, match="the safe box alone has 401 rows, and it would need 400 at most"):
+        search.invariant_rows(rows, lambda row: 0.5 * row, len(rows))
+    assert len(search.invariant_rows(rows[:400:50], lambda row: 0.5 * row, 8)) == 8
+
+
+def chain(masses, dt):
+    """Masses of 1 kg between two walls, on springs of 1 N/m; two forces act between the first and the last pair."""
+    stiffness = 2.0 * np.eye(masses) - np.eye(masses, k=1) - np.eye(masses, k=-1)
+    still, moving = np.zeros((masses, masses)), np.eye(masses)
+    model = np.block([[still, moving], [-stiffness, still]])
+    forces = np.zeros((2 * masses, 2))
+    forces[[masses, masses + 1, 2 * masses - 2, 2 * masses - 1], [0, 0, 1, 1]] = 1.0, -1.0, 1.0, -1.0
+    pushes = zero_order_hold(model, np.concatenate([still, moving]), dt)[1]
+    return LinearPlant.from_statespace(
+        (model, forces, np.eye(2 * masses), np.zeros((2 * masses, 2))),
+        dt,
+        box=4.0 * np.ones(2 * masses),
+        u_max=0.5,
+        disturbance_bound=(pushes, 0.05),
+        sensor_bound=0.01,
+        initial_bound=0.05,
+    )
+
+
+@pytest.mark.slow
+def test_chain_of_three_masses_with_two_forces_certifies_within_a_minute():
+    plant, begin = chain(3, 0.5), time.process_time()
+    wide = synthesize(plant, contract=ChannelContract(1))
+    assert time.process_time() - begin < 60.0
+    assert (plant.n, plant.m) == (6, 2)
+    assert wide.provenance["polytope_share_of_box"] > 0.12 > 2.5 * wide.provenance["share_of_box"]
+    assert both(wide, plant)
+
+
+@pytest.mark.slow
+def test_chain_that_needs_too_many_rows_says_so_within_a_minute_and_keeps_the_ellipsoid():
+    begin = time.process_time()
+    narrow = synthesize(chain(4, 0.5), contract=ChannelContract(1))
+    assert time.process_time() - begin < 60.0
+    assert "more than 400 rows, fewer with longer steps or less disturbance" in narrow.provenance["no_polytope"]
+    assert narrow.safe_set is narrow.ellipsoid
 
 
 def test_errors_that_leave_a_face_alone_leave_no_polytope():
