@@ -20,7 +20,12 @@ def warnings_as_sentences() -> Iterator[None]:
             shown.add(text)
             from tqdm import tqdm  # only where there is something to say: `ncs --help` starts sooner
 
-            tqdm.write(f"ncs: warning: {text}", file=sys.stderr)
+            line = f"ncs: warning: {text}"
+            if sys.stderr.isatty():
+                from experiments.analysis.terminal_text import wrapped
+
+                line = wrapped(line, indent=5)
+            tqdm.write(line, file=sys.stderr)
 
     with _shown_by(show):
         yield

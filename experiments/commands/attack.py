@@ -8,6 +8,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from experiments.analysis.terminal_text import wrapped
 from experiments.attack import MonteCarloBatch, SafetyCounts
 from experiments.attack.attack_cases import AttackCase
 from experiments.attack.campaign import Campaign
@@ -21,6 +22,9 @@ from ncs_gym.registration import EPISODE_STEPS
 from shields import Certificate
 from shields.atomic_write import write_atomically
 from shields.runtime.safety_filter import DEFAULT_HORIZON
+
+# Cases that a line names.
+_MOST_LISTED = 6
 
 
 def attack(settings: AttackSettings) -> None:
@@ -66,8 +70,10 @@ def _attack_in_folder(settings: AttackSettings, campaign: Campaign, cases: dict[
         counts[batch.case] += counted
     total = sum(counts.values(), SafetyCounts())
     print(counts_table(counts, looks_ahead=campaign.looks_ahead))
-    if left_out := len(cases) - len(counts):
-        print(f"{left_out} of {len(cases)} cases are not attacked within {settings.steps:,.0f} steps")
+    if left_out := [name for name in cases if name not in counts]:
+        listed = "; ".join([*left_out[:_MOST_LISTED], *["..."] * (len(left_out) > _MOST_LISTED)])
+        budget = f"within {settings.steps:,.0f} steps"
+        print(wrapped(f"{len(left_out)} of {len(cases)} cases are not attacked {budget}: {listed}"))
     limits = {name: cases[name].escape_probability() for name in counts} if campaign.gaussian else {}
     if limits:
         print("", gaussian_table(counts, limits), GAUSSIAN_LEGEND, sep="\n")
