@@ -15,7 +15,7 @@ AUDIT_INSTALLED := $(VENV)/.installed-audit
 ZOO_INSTALLED := $(VENV)/.installed-rl-zoo
 RAY_INSTALLED := $(VENV)/.installed-ray
 
-.PHONY: compare study test test-other-processor coverage coverage-report test-slow lint types benchmark docs audit clean
+.PHONY: compare study pretrained test test-other-processor coverage coverage-report test-slow lint types benchmark docs audit clean
 
 compare: $(INSTALLED)
 	$(BIN)/ncs compare --out $(OUT)
@@ -26,6 +26,10 @@ study: $(INSTALLED)
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest -n auto --dist worksteal $(TEST_FLAGS)
+
+# The small agents of the package, in agents/trained. The extra [mujoco] adds ncs_gym/InvertedPendulum-v0.
+pretrained: $(INSTALLED)
+	$(BIN)/python benchmarks/pretrained_agents.py
 
 # What proves, verifies and decides, once more with other kernels of linear algebra and without wide instructions (x86).
 test-other-processor: $(INSTALLED)

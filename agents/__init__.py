@@ -10,16 +10,16 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from agents.agent import Agent
+    from agents.agent import Agent, pretrained
     from agents.callbacks import DualAscentCallback, EvaluationCallback, SafetyCallback
     from agents.evaluation import evaluate
     from agents.former_settings import A2CSettings, OffPolicySettings, PPOSettings, tuned_settings
     from agents.hyperparams import read_hyperparams, tuned_hyperparams, tuned_steps
     from agents.loop import ControlLoop, LagrangianSettings, LoopConfig, ShieldSettings
     from agents.replay import AppliedActionBuffer
-    from agents.results import Episode, Evaluation, TrainingPoint, Trajectory
+    from agents.results import Episode, Evaluation, TrainingPoint, TrainingStopped, Trajectory
     from agents.sb3_vec_env import SB3VecEnv
-    from agents.sharing.agent_file import AgentError
+    from agents.sharing.agent_file import AgentError, pretrained_folder
     from agents.training import TrainingResult, train
 
 __all__ = [
@@ -41,8 +41,11 @@ __all__ = [
     "ShieldSettings",
     "TrainingPoint",
     "TrainingResult",
+    "TrainingStopped",
     "Trajectory",
     "evaluate",
+    "pretrained",
+    "pretrained_folder",
     "read_hyperparams",
     "train",
     "tuned_hyperparams",
@@ -51,16 +54,16 @@ __all__ = [
 ]
 
 _MODULES = {
-    "agent": ("Agent",),
+    "agent": ("Agent", "pretrained"),
     "callbacks": ("DualAscentCallback", "EvaluationCallback", "SafetyCallback"),
     "loop": ("ControlLoop", "LagrangianSettings", "LoopConfig", "ShieldSettings"),
     "evaluation": ("evaluate",),
     "former_settings": ("A2CSettings", "OffPolicySettings", "PPOSettings", "tuned_settings"),
     "hyperparams": ("read_hyperparams", "tuned_hyperparams", "tuned_steps"),
     "replay": ("AppliedActionBuffer",),
-    "results": ("Episode", "Evaluation", "TrainingPoint", "Trajectory"),
+    "results": ("Episode", "Evaluation", "TrainingPoint", "TrainingStopped", "Trajectory"),
     "sb3_vec_env": ("SB3VecEnv",),
-    "sharing.agent_file": ("AgentError",),
+    "sharing.agent_file": ("AgentError", "pretrained_folder"),
     "training": ("TrainingResult", "train"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +86,22 @@ def read_files(folder: str | Path) -> tuple[Path, dict[str, Any], bytes]:
     if hashlib.sha256(weights).hexdigest() != content.get("sha256_of_model"):
         raise AgentError(f"{folder / 'model.zip'} was altered: its checksum does not match")
     return folder, content, weights
+
+
+def pretrained_folder(env_id: str) -> Path:
+    """Returns the folder of the small agent that comes with the package, with its card and its certificate.
+
+    Args:
+        env_id: Id of an environment of this package.
+
+    Raises:
+        AgentError: If the package has none for it; the message names those that it has.
+    """
+    root = Path(str(resources.files("agents"))) / "trained"
+    found = {f"ncs_gym/{file.parent.name}": file.parent for file in sorted(root.glob("*/agent.json"))}
+    if env_id not in found:
+        raise AgentError(f"there is no pretrained agent of {shown(env_id)}, only of {', '.join(found)}")
+    return found[env_id]
 
 
 def shield_from_json(content: dict[str, Any] | None) -> tuple[str | None, int | None]:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Mapping
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import gymnasium as gym
@@ -12,6 +15,7 @@ from agents.loop import ShieldSettings
 from agents.results import Evaluation
 from ncs_gym import Channel
 
+_PACKAGES = ("ncs-gym", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "mujoco", "numpy")
 _USE = """## Use
 
 The weights are in `model.zip`, everything else in `agent.json`. Nothing is unpickled. Checksums find damage, not
@@ -55,6 +59,7 @@ def card_text(
         "shield": _shield_text(shield),
         "hyperparameters": ", ".join(f"{name}={value!r}" for name, value in hyperparams.items()),
         "SHA-256 of the weights": f"`{checksum}`",
+        "saved with": _versions(),
     }
     table = [f"| {name} | {value} |" for name, value in rows.items()]
     parts = [f"# {algorithm} in {env}\n", "| | |", "|---|---|", *table, ""]
@@ -74,6 +79,15 @@ def _channel(env: str, channel: Channel | None) -> str:
     """Returns the channel in words of Python; that of the id where the agent has none of its own."""
     own: Any = channel or getattr(gym.make(env).unwrapped, "channel", None)
     return f"`{own}`" + ("" if channel else ", that of the id")
+
+
+def _versions() -> str:
+    """Returns the versions of Python and of the packages that an agent is made of."""
+    found = [f"Python {platform.python_version()}"]
+    for name in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            found.append(f"{name} {version(name)}")
+    return ", ".join(found)
 
 
 def _figures(evaluation: Evaluation) -> list[str]:

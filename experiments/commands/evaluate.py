@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from agents import evaluation
 from agents.loop import LoopConfig, ShieldSettings
+from agents.sharing.agent_file import pretrained_folder
 from experiments.analysis.episodes import episodes_table
 from experiments.analysis.summary import arm_summary
 from experiments.analysis.tables import summary_text
@@ -16,7 +17,7 @@ from experiments.commands import short_version
 from experiments.runs import RunResult, certificate_of, require_place, versions
 from experiments.runs.environments import module_and_id, registered_env
 from experiments.runs.loops import with_channel
-from experiments.runs.policies import agent_folder, certificate_file
+from experiments.runs.policies import PRETRAINED, agent_folder, certificate_file
 from experiments.settings import EvaluateSettings
 from experiments.settings.steps import require_horizon
 from ncs_gym.envs.env import ncs_env
@@ -41,7 +42,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     """
     settings = short_version(settings, **_SMOKE)
     require_place(settings.out)
-    folder = agent_folder(settings.model)
+    folder = _folder(settings)
     agent = _agent(folder, settings.env)
     loop = with_channel(LoopConfig(env=agent.env, kwargs={"channel": agent.channel}), settings.channel)
     mode = _mode(settings, agent)
@@ -74,6 +75,15 @@ def evaluate(settings: EvaluateSettings) -> None:
             "versions": versions(),
         }
         write_atomically(settings.out, json.dumps(content, indent=1) + "\n")
+
+
+def _folder(settings: EvaluateSettings) -> Path:
+    """Returns the folder of the agent that is asked for."""
+    if str(settings.model) != PRETRAINED:
+        return agent_folder(settings.model)
+    if settings.env is None:
+        raise ValueError(f"{PRETRAINED} agents are of an environment each: give --env")
+    return pretrained_folder(module_and_id(settings.env)[1])
 
 
 def _agent(folder: Path, env_id: str | None) -> Agent:

@@ -15,6 +15,8 @@ from experiments.runs import (
     certificate_of,
     claim_folder,
     experiment_provenance,
+    forget_checkpoint,
+    going_on,
     loop_config,
     prepare_output,
     require_trainable,
@@ -55,11 +57,17 @@ def _train_in_folder(settings: TrainSettings, loop: LoopConfig, certificate: Cer
     print(wrapped(settings.agent_line), flush=True)
     settings = settings.completed
     run = run_of_arm(settings, loop, certificate, settings.arm, 0)
+    run = going_on(settings.out, run, anew=settings.force)
+    if run.start is not None:
+        print(f"the training in {settings.out} goes on after {run.start.steps:,} steps", flush=True)
     results = results_of([run], settings.out, BackendSettings(jobs=1))
+    forget_checkpoint(settings.out, run)
     mode = Arm.of(settings.arm, settings.mode).mode
     arms = {settings.arm: arm_summary(episodes_table(results), mode, fixed_policy=True)}
     certificate.save(settings.out / "certificate.json")
-    summary = {"arms": arms} | experiment_provenance("train", settings, loop, certificate, [run])
+    summary = {"arms": arms, "went_on_after": run.start.steps if run.start else 0} | experiment_provenance(
+        "train", settings, loop, certificate, [run]
+    )
     write_results(settings.out, summary)
     print(f"{results[0].train_steps:,} training steps, {settings.episodes:,} episodes\n")
     print(summary_text(arms, {}), *_hints(results[0], is_smoke=settings.smoke), sep="\n")

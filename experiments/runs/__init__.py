@@ -7,6 +7,7 @@ from experiments.runs.experiment import (
     require_trainable,
     run_of_arm,
 )
+from experiments.runs.going_on import forget_checkpoint, going_on
 from experiments.runs.loops import loop_config
 from experiments.runs.output_folder import claim_folder, prepare_output, require_place, write_results
 from experiments.runs.provenance import versions
@@ -22,6 +23,8 @@ __all__ = [
     "certificate_of",
     "claim_folder",
     "experiment_provenance",
+    "forget_checkpoint",
+    "going_on",
     "loop_config",
     "prepare_output",
     "require_place",

@@ -19,8 +19,8 @@ class RenderSettings:
         env: Id of an environment with a plant of its own; module:id first imports the module, which registers one of
             your own (`ncs_gym.register_plant`).
         out: File to write: .gif, .mp4, or .png for the last frame alone.
-        policy: "greedy" (toward the task's goal as hard as it can), "zero", "random", or the folder of a
-            trained agent.
+        policy: "greedy" (toward the task's goal as hard as it can), "zero", "random", "pretrained" (the small agent
+            that comes with the package), or the folder of a trained agent.
         shield: Mode of the shield; "none" for no shield.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
         side_by_side: Draw the same episode without a shield at the left, with it at the right.
