@@ -15,49 +15,58 @@ AUDIT_INSTALLED := $(VENV)/.installed-audit
 ZOO_INSTALLED := $(VENV)/.installed-rl-zoo
 RAY_INSTALLED := $(VENV)/.installed-ray
 
-.PHONY: compare study pretrained test test-other-processor coverage coverage-report test-slow lint types benchmark docs audit clean
+# The project's public address, written into pyproject.toml, CITATION.cff, README.md and the site by `make address`.
+ADDRESS ?=
 
-compare: $(INSTALLED)
+.DEFAULT_GOAL := help
+.PHONY: help compare study pretrained test test-other-processor coverage coverage-report test-slow lint types benchmark example-times docs audit \
+	dist address clean
+
+help: ## this list
+	@echo 'make TARGET; everything is installed into $(VENV) when it is first needed.'
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-22s%s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+
+compare: $(INSTALLED) ## agents with and without a shield, compared (OUT=runs/compare)
 	$(BIN)/ncs compare --out $(OUT)
 
 # The pages of results: runs that runs/study has already are kept, so that it can be done in parts. STUDY: more options of ncs study.
-study: $(INSTALLED)
+study: $(INSTALLED) ## the whole study, and the pages of results
 	$(BIN)/ncs study --page docs/results.md --quote README.md docs/when_not.md $(STUDY)
 
-test: $(INSTALLED)
+test: $(INSTALLED) ## the tests
 	$(BIN)/python -m pytest -n auto --dist worksteal $(TEST_FLAGS)
 
 # The small agents of the package, in agents/trained. The extra [mujoco] adds ncs_gym/InvertedPendulum-v0.
-pretrained: $(INSTALLED)
+pretrained: $(INSTALLED) ## the small agents of the package, trained again
 	$(BIN)/python benchmarks/pretrained_agents.py
 
 # What proves, verifies and decides, once more with other kernels of linear algebra and without wide instructions (x86).
-test-other-processor: $(INSTALLED)
+test-other-processor: $(INSTALLED) ## what proves and decides, as on another processor
 	OPENBLAS_CORETYPE=Prescott NPY_DISABLE_CPU_FEATURES='$(WIDE)' $(BIN)/python -m pytest -n auto --dist worksteal \
 		tests/ncs_gym/estimation tests/ncs_gym/plants tests/ncs_gym/uncertainty tests/shields tests/hardening
 
 # The suite, and the share of lines and branches it runs, by package. Tracing takes half as much time again.
-coverage: $(INSTALLED)
+coverage: $(INSTALLED) ## the tests, and what share of the code they run
 	$(MAKE) test TEST_FLAGS='--cov --cov-report='
 	$(MAKE) coverage-report
 
-coverage-report:
+coverage-report: ## that share, of the tests that ran last
 	@echo 'lines and branches run by the tests [%], without worker processes:'
 	@for package in $(PACKAGES) '*'; do \
 		printf '%-12s' "$$package"; $(BIN)/coverage report --include="$$package/*" --format=total || exit; done
 
-test-slow: $(INSTALLED) $(ZOO_INSTALLED) $(RAY_INSTALLED) $(AUDIT_INSTALLED)
+test-slow: $(INSTALLED) $(ZOO_INSTALLED) $(RAY_INSTALLED) $(AUDIT_INSTALLED) ## the long attacks, and examples in processes of their own
 	$(BIN)/python -m pytest -n auto --dist worksteal -m slow
 
-lint: $(INSTALLED)
+lint: $(INSTALLED) ## style and declared dependencies
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/deptry $(PACKAGES)
 
-types: $(INSTALLED)
+types: $(INSTALLED) ## types
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-benchmark: $(INSTALLED) $(RAY_INSTALLED)
+benchmark: $(INSTALLED) $(RAY_INSTALLED) ## times of imports, shields, environments ...
 	$(BIN)/python benchmarks/import_time.py
 	$(BIN)/python benchmarks/shield_decision.py
 	$(BIN)/python benchmarks/shield_cost.py
@@ -72,13 +81,23 @@ benchmark: $(INSTALLED) $(RAY_INSTALLED)
 	$(BIN)/python benchmarks/ppo_settings.py
 	$(BIN)/python benchmarks/ray_overhead.py
 
+example-times: $(INSTALLED) ## how long each example takes, and what it says (EXAMPLES="quick_start.py")
+	$(BIN)/python benchmarks/example_times.py $(EXAMPLES)
+
 # Fails on a broken link, anchor, reference or formula; makes a page per registered environment. Look at it: python -m http.server -d site (from a file the search is missing).
-docs: $(DOCS_INSTALLED)
+docs: $(DOCS_INSTALLED) ## the site, in site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 # Known vulnerabilities of what constraints.txt names, by OSV: any index of packages will do, a network is needed.
-audit: $(AUDIT_INSTALLED)
+audit: $(AUDIT_INSTALLED) ## known vulnerabilities of the dependencies (asks a database on the internet)
 	@$(BIN)/python .ci/audit.py
+
+dist: $(INSTALLED) ## sdist and wheel, in dist/
+	rm -rf dist
+	$(BIN)/python -m hatchling build
+
+address: $(INSTALLED) ## writes the public address everywhere (ADDRESS=https://...)
+	@$(BIN)/python .ci/address.py '$(ADDRESS)'
 
 $(INSTALLED): pyproject.toml constraints.txt tests/requirements.txt
 	$(PYTHON) -m venv $(VENV)
@@ -104,5 +123,5 @@ $(ZOO_INSTALLED): examples/rl_zoo/requirements.txt $(INSTALLED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r examples/rl_zoo/requirements.txt
 	touch $@
 
-clean:
-	rm -rf $(VENV) site
+clean: ## removes the environment and the site
+	rm -rf $(VENV) site dist

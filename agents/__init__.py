@@ -9,33 +9,32 @@ first asked for.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from ncs_gym.installation import require_own_packages
+
 if TYPE_CHECKING:
     from agents.agent import Agent, pretrained
+    from agents.algorithms import AppliedActionBuffer
     from agents.callbacks import DualAscentCallback, EvaluationCallback, SafetyCallback
     from agents.evaluation import evaluate
-    from agents.former_settings import A2CSettings, OffPolicySettings, PPOSettings, tuned_settings
     from agents.hyperparams import read_hyperparams, tuned_hyperparams, tuned_steps
-    from agents.loop import ControlLoop, LagrangianSettings, LoopConfig, ShieldSettings
-    from agents.replay import AppliedActionBuffer
+    from agents.loop import LagrangianSettings, LoopConfig, ShieldSettings
     from agents.results import Episode, Evaluation, TrainingPoint, TrainingStopped, Trajectory
     from agents.sb3_vec_env import SB3VecEnv
     from agents.sharing.agent_file import AgentError, pretrained_folder
     from agents.training import TrainingResult, train
 
+__distribution__ = "ncs-gym"
+
 __all__ = [
-    "A2CSettings",
     "Agent",
     "AgentError",
     "AppliedActionBuffer",
-    "ControlLoop",
     "DualAscentCallback",
     "Episode",
     "Evaluation",
     "EvaluationCallback",
     "LagrangianSettings",
     "LoopConfig",
-    "OffPolicySettings",
-    "PPOSettings",
     "SB3VecEnv",
     "SafetyCallback",
     "ShieldSettings",
@@ -49,18 +48,16 @@ __all__ = [
     "read_hyperparams",
     "train",
     "tuned_hyperparams",
-    "tuned_settings",
     "tuned_steps",
 ]
 
 _MODULES = {
     "agent": ("Agent", "pretrained"),
+    "algorithms": ("AppliedActionBuffer",),
     "callbacks": ("DualAscentCallback", "EvaluationCallback", "SafetyCallback"),
-    "loop": ("ControlLoop", "LagrangianSettings", "LoopConfig", "ShieldSettings"),
+    "loop": ("LagrangianSettings", "LoopConfig", "ShieldSettings"),
     "evaluation": ("evaluate",),
-    "former_settings": ("A2CSettings", "OffPolicySettings", "PPOSettings", "tuned_settings"),
     "hyperparams": ("read_hyperparams", "tuned_hyperparams", "tuned_steps"),
-    "replay": ("AppliedActionBuffer",),
     "results": ("Episode", "Evaluation", "TrainingPoint", "TrainingStopped", "Trajectory"),
     "sb3_vec_env": ("SB3VecEnv",),
     "sharing.agent_file": ("AgentError", "pretrained_folder"),
@@ -73,4 +70,5 @@ def __getattr__(name: str) -> Any:
     """Imports the module of a public name when the name is first asked for."""
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    require_own_packages("shields")
     return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)

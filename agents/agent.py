@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
+import zipfile
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,13 +17,19 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.algorithms import build_model
-from agents.former_settings import from_former
+from agents.algorithms import algorithm_class, build_model
 from agents.hyperparams import ALGORITHMS, complete_hyperparams
 from agents.loop import LoopConfig, ShieldSettings, with_gain
 from agents.results import Evaluation
 from agents.sb3_vec_env import SB3VecEnv
-from agents.sharing.agent_file import AgentError, document_of, pretrained_folder, read_files, shield_from_json
+from agents.sharing.agent_file import (
+    AGENT_FILES,
+    AgentError,
+    document_of,
+    pretrained_folder,
+    read_files,
+    shield_from_json,
+)
 from agents.sharing.model_card import card_text
 from ncs_gym import Channel, LinearPlant
 from shields.atomic_write import write_atomically
@@ -242,8 +250,7 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         raise AgentError(f"the agent was trained on another plant than that of {env_id}: their fingerprints differ")
     if algorithm not in ALGORITHMS:
         raise AgentError(f"the agent is of an unknown algorithm, {algorithm!r}")
-    given = content["hyperparams"] if "hyperparams" in content else from_former(algorithm, content["settings"])
-    hyperparams = complete_hyperparams(algorithm, given)
+    hyperparams = complete_hyperparams(algorithm, content["hyperparams"])
     loop = LoopConfig(env=env_id, kwargs={"channel": content["channel"]})
     shield_mode, horizon = shield_from_json(content.get("shield"))
     model = build_model(algorithm, SB3VecEnv(loop.vector(2)), hyperparams, seed=0)  # as in `untrained`
@@ -270,4 +277,64 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         residual_gain=gain,
         shield_mode=shield_mode,
         horizon=horizon,
+    )
+
+
+# What only one algorithm's file has among its settings; the first that fits.
+_MARKS = {"TQC": "top_quantiles_to_drop_per_net", "SAC": "target_entropy", "TD3": "target_policy_noise"}
+_MARKS |= {"PPO": "clip_range", "TRPO": "cg_max_steps", "A2C": "gae_lambda"}
+
+
+def is_sb3_zip(path: Path) -> bool:
+    """Returns whether a path is a zip of stable-baselines3, and not a file of an `Agent`."""
+    return path.suffix == ".zip" and not (path.name in AGENT_FILES and path.with_name("agent.json").exists())
+
+
+def load_sb3_zip(path: Path, env_id: str) -> Agent:
+    """Returns an agent that was saved by `model.save`, of an environment whose observations it saw as they are.
+
+    Args:
+        path: The zip.
+        env_id: Id of the environment.
+
+    Raises:
+        AgentError: If it cannot be read, is of an unknown algorithm, has settings that only unpickling would tell, or
+            does not fit the environment.
+        ModuleNotFoundError: If the algorithm's package is not installed.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            data = json.loads(archive.read("data"))
+        _, parameters, _ = load_from_zip_file(path, load_data=False, device="cpu")
+        algorithm = next((name for name, mark in _MARKS.items() if mark in data), None)
+        policy = data.get("policy_kwargs", {})
+    except Exception as error:  # a forged file may break any part of the libraries that read it
+        raise AgentError(
+            f"{path} is no agent that stable-baselines3 saved: {str(error) or type(error).__name__}"
+        ) from error
+    if algorithm is None:
+        raise AgentError(f"{path} is of none of the algorithms {', '.join(_MARKS)}")
+    if ":serialized:" in policy:
+        raise AgentError(
+            f"the policy_kwargs in {path} are pickled, and pickles are not read: load it yourself, and evaluate it "
+            "with agents.evaluate"
+        )
+    cls = algorithm_class(algorithm)
+    replay: dict[str, Any] = {"buffer_size": 1} if algorithm in ("TQC", "SAC", "TD3") else {}
+    try:
+        model = cls(
+            "MlpPolicy", SB3VecEnv(LoopConfig(env=env_id).vector(2)), policy_kwargs=policy, device="cpu", **replay
+        )
+        model.set_parameters(parameters, exact_match=True, device="cpu")
+    except Exception as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise AgentError(f"the agent in {path} does not fit {env_id}: {reason}") from error
+    size = int(np.prod(model.observation_space.shape or ()))
+    return Agent(
+        algorithm=algorithm,
+        hyperparams={"policy_kwargs": policy},
+        env=env_id,
+        channel=None,
+        model=model,
+        normalization=Normalization(np.zeros(size), np.ones(size), 0.0, float("inf")),
     )

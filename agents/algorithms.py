@@ -11,15 +11,15 @@ from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
 import numpy as np
-import torch
 from gymnasium.spaces import flatdim
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from agents.hyperparams import ALGORITHMS, ON_POLICY, rollout_steps
-from agents.replay import AppliedActionBuffer
+from ncs_gym.installation import install_command
 from ncs_gym.validation import shown
 
 # Arguments of the library that are no hyperparameters: they are given here.
@@ -37,7 +37,7 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
     if importlib.util.find_spec(package) is None:
         extra = "contrib" if package == "sb3_contrib" else "train"
         distribution = package.replace("_", "-")
-        raise ModuleNotFoundError(f"{name} needs {distribution}: in a clone of ncs-gym, pip install -e '.[{extra}]'")
+        raise ModuleNotFoundError(f"{name} needs {distribution}: {install_command(extra)}")
     return getattr(importlib.import_module(package), name)
 
 
@@ -72,7 +72,6 @@ def build_model(name: str, env: VecEnv, hyperparams: Mapping[str, Any], seed: in
         ModuleNotFoundError: If the algorithm's package is not installed.
     """
     cls = algorithm_class(name)
-    torch.set_num_threads(1)  # more threads only pay off at batches of 16384 and make results depend on their number
     try:
         return cls(env=env, seed=seed, device="cpu", **_arguments(name, cls, env, hyperparams, steps))
     except Exception as error:  # the library checks by many kinds of errors
@@ -151,3 +150,44 @@ def _fits(value: Any, annotation: Any) -> bool:
     if isinstance(value, bool):
         return bool in kinds
     return isinstance(value, (*kinds, int) if float in kinds else tuple(kinds))
+
+
+# The info that says what was applied; in its place `SB3VecEnv` has to be asked for it.
+APPLIED = "input_committed"
+
+
+class AppliedActionBuffer(ReplayBuffer):
+    """Stores, in the place of the agent's action, the one that the shield let through.
+
+    Hand it to SAC, TD3 and their kind as `replay_buffer_class`, with `replay_buffer_kwargs={"limits": plant.u_max}`;
+    `SB3VecEnv` needs `info_keys=("input_committed",)`. `train` does so with the hyperparameter
+    `stored_action="applied"`.
+
+    Args:
+        arguments: Those of `ReplayBuffer`.
+        limits: u_max, shape (m,), which actions are in units of.
+        keywords: Those of `ReplayBuffer`.
+    """
+
+    def __init__(self, *arguments: Any, limits: Any, **keywords: Any) -> None:
+        super().__init__(*arguments, **keywords)
+        self._limits = np.asarray(limits, dtype=np.float64)
+
+    def add(
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Adds a transition of every environment.
+
+        Raises:
+            ValueError: If infos do not say what was applied.
+        """
+        if any(APPLIED not in info for info in infos):
+            raise ValueError(f'infos have no "{APPLIED}": make SB3VecEnv(..., info_keys=("{APPLIED}",))')
+        applied = np.array([info[APPLIED] for info in infos]) / self._limits
+        super().add(obs, next_obs, applied.reshape(action.shape).astype(action.dtype), reward, done, infos)

@@ -87,7 +87,6 @@ class SafetyCallback(BaseCallback):
         return TrainingPoint(self.num_timesteps, mean, self.violation_steps, self.interventions)
 
     def _add_point(self) -> None:
-        """Adds the present totals to the history and to TensorBoard's next event."""
         last = self._last
         taken = max(self.num_timesteps - last.steps, 1)
         self.logger.record("safety/violation_rate", (self.violation_steps - last.violation_steps) / taken)
@@ -116,11 +115,10 @@ class DualAscentCallback(BaseCallback):
     for episodes to end, which those of many environments do in the same step, and an episode that a violation ends does
     not count as a cheap one.
 
-    This is Ray, Achiam and Amodei's constrained baseline ("Benchmarking Safe Exploration in Deep Reinforcement
-    Learning", 2019) with a plain gradient step in place of Adam, and Stooke, Achiam and Abbeel's PID controller
-    ("Responsive Safety in Reinforcement Learning by PID Lagrangian Methods", 2020) with the integral term alone. The
-    cost is part of the reward, so one value function estimates both, where theirs have one each. With a limit of zero
-    the multiplier never falls. TensorBoard gets `safety/multiplier`.
+    This is the constrained baseline of Ray et al. 2019 with a plain gradient step in place of Adam, and the PID
+    controller of Stooke et al. 2020 with the integral term alone (docs/bibliography.md). The cost is part of
+    the reward, so one value function estimates both, where theirs have one each. With a limit of zero the multiplier
+    never falls. TensorBoard gets `safety/multiplier`.
 
     Args:
         settings: Limit and learning rate.
@@ -204,7 +202,6 @@ class EvaluationCallback(BaseCallback):
         self._evaluate()
 
     def _evaluate(self) -> None:
-        """Plays the episodes and writes their results to TensorBoard."""
         episodes = evaluate(self._loop, lambda seen, _: self._act(seen), self._episodes, self._seed).episodes
         steps = sum(episode.steps for episode in episodes)
         safe = [episode.violation_steps == 0 for episode in episodes]

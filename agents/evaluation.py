@@ -118,7 +118,6 @@ class _Rollout:
         ]
 
     def _add(self, rewards: np.ndarray, info: dict[str, Any]) -> None:
-        """Adds a step to the totals of the running episodes."""
         values = {
             "return": rewards,
             "steps": 1,

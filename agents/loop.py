@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
@@ -58,7 +57,7 @@ class ShieldSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class LagrangianSettings:
-    """Settings of PPO-Lagrangian: how the price of a violating step is adapted (Ray et al. 2019).
+    """Settings of PPO-Lagrangian: how the price of a violating step is adapted (Ray et al. 2019, docs/bibliography.md).
 
     Attributes:
         cost_limit: Largest cost of an episode of full length (violating steps) that the agent is trained for.
@@ -158,19 +157,6 @@ class LoopConfig:
         return CostPenalty(envs, self.violation_penalty) if self.violation_penalty else envs
 
 
-def ControlLoop(*, env: str, **settings: Any) -> LoopConfig:
-    """Returns a `LoopConfig`, by its former name: some keyword arguments of the environment stand beside its fields.
-
-    Args:
-        env: A registered environment id.
-        settings: Fields of `LoopConfig`, or channel, downlink, noise, disturbance and process of the environment.
-    """
-    warnings.warn("ControlLoop is now LoopConfig(env=..., kwargs={...})", DeprecationWarning, stacklevel=2)
-    of_env = ("channel", "downlink", "noise", "disturbance", "process")
-    kwargs = {name: settings.pop(name) for name in of_env if name in settings}
-    return LoopConfig(env=env, kwargs=kwargs, **settings)
-
-
 class CostPenalty(VectorWrapper):
     """Subtracts a penalty from the reward of every step after which the true state violates the safe box.
 
@@ -195,7 +181,7 @@ class CostPenalty(VectorWrapper):
 
 
 class ResidualActions(VectorWrapper):
-    """Applies u = gain x_hat plus the agent's part, clipped to the limits (residual policies, Silver et al. 2018).
+    """Applies u = gain x_hat plus the agent's part, clipped to the limits (Silver et al. 2018).
 
     Args:
         env: A vector environment whose observations begin with the estimate.

@@ -8,12 +8,17 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 from ncs_gym import NCSVectorEnv
 from ncs_gym.envs.settings import CHANNELS
+
+# Networks of control loops are small: more threads wait for each other, pay off at batches of 16384 only, and make
+# results depend on their number. Set once, at the import, so that torch.set_num_threads afterwards has the last word.
+torch.set_num_threads(1)
 
 # Vector environments whose reset takes options={"reset_mask": ...} and resets only the environments in the mask.
 _WITH_RESET_MASK = (NCSVectorEnv, SyncVectorEnv, AsyncVectorEnv)
@@ -49,6 +54,9 @@ class SB3VecEnv(VecEnv):
     Therefore the dicts hold by default only what the library needs, and `cost` where there is such an info:
     `batch_info` has all values of the last step as arrays, and `info_keys` names further values to be copied into the
     dicts.
+
+    Importing this class sets torch to one thread, with which small networks train fastest; call
+    `torch.set_num_threads` after the import for another number.
 
     Args:
         vector_env: The vector environment.

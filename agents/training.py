@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,12 +15,10 @@ from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.agent import Agent, Normalization
-from agents.algorithms import build_model, normalized_env
+from agents.algorithms import APPLIED, build_model, normalized_env
 from agents.callbacks import CheckpointCallback, DualAscentCallback, EvaluationCallback, SafetyCallback
-from agents.former_settings import FormerSettings, from_former
 from agents.hyperparams import ON_POLICY, complete_hyperparams
 from agents.loop import CostPenalty, LoopConfig
-from agents.replay import APPLIED
 from agents.results import HISTORY_FILE, TrainingPoint, TrainingStopped, history_document
 from agents.sb3_vec_env import SB3VecEnv
 from shields.atomic_write import write_atomically
@@ -57,7 +54,6 @@ def train(
     algorithm: str = "PPO",
     hyperparams: Mapping[str, Any] | None = None,
     *,
-    settings: Any = None,
     log_folder: Path | None = None,
     on_progress: Callable[[int], None] | None = None,
     callbacks: Sequence[BaseCallback] = (),
@@ -67,6 +63,8 @@ def train(
 ) -> TrainingResult:
     """Returns a trained agent and what happened on the way; the same seed gives the same result on one machine.
 
+    torch has one thread once `agents.SB3VecEnv` is imported; `torch.set_num_threads` changes both that and results.
+
     Args:
         loop: The control loop the agent is trained in.
         steps: Environment steps to train for, rounded up to whole rollouts.
@@ -75,7 +73,6 @@ def train(
         algorithm: A name in `agents.hyperparams.ALGORITHMS`.
         hyperparams: Keyword arguments of the algorithm in stable-baselines3, and `n_envs` and `normalize`, JSON values;
             what is not given has the values of `agents.hyperparams.DEFAULTS`.
-        settings: Former name of `hyperparams`.
         log_folder: Folder for TensorBoard's events, with evaluations on the way; None for neither.
         on_progress: Called with the number of steps taken since its last call; `TrainingStopped` ends the training.
         callbacks: Callbacks of stable-baselines3 of your own, after those of this package.
@@ -91,7 +88,7 @@ def train(
             stable-baselines3 does not take a value, or no step is left to learn in.
         ModuleNotFoundError: If the algorithm's package is not installed.
     """
-    hyperparams = _complete(algorithm, hyperparams, settings)
+    hyperparams = complete_hyperparams(algorithm, hyperparams)
     before = history[-1].steps if history else 0
     envs, env, model = _trainable(loop, steps, seed, algorithm, hyperparams, before)
     model.set_logger(configure(str(log_folder), ["tensorboard"]) if log_folder else Logger(None, []))
@@ -124,32 +121,17 @@ def train(
 
 
 def untrained(
-    loop: LoopConfig,
-    seed: int,
-    algorithm: str = "PPO",
-    hyperparams: Mapping[str, Any] | None = None,
-    *,
-    settings: Any = None,
+    loop: LoopConfig, seed: int, algorithm: str = "PPO", hyperparams: Mapping[str, Any] | None = None
 ) -> Agent:
     """Returns an agent with the random weights that training starts from; arguments and errors as for `train`."""
-    hyperparams = _complete(algorithm, hyperparams, settings)
+    hyperparams = complete_hyperparams(algorithm, hyperparams)
     env = VecNormalize(SB3VecEnv(loop.vector(2)), training=False)  # PPO refuses rollouts of a single step
     return _agent(loop, algorithm, hyperparams, build_model(algorithm, env, hyperparams, seed), env)
 
 
 def require_trainable(loop: LoopConfig, steps: int, algorithm: str, hyperparams: Mapping[str, Any]) -> None:
     """Returns if `train` can begin with these arguments; it raises what `train` does, before anything is computed."""
-    _trainable(loop, steps, 0, algorithm, _complete(algorithm, hyperparams, None))[0].close()
-
-
-def _complete(algorithm: str, hyperparams: Any, settings: Any) -> dict[str, Any]:
-    """Returns all hyperparameters; `settings` and objects of the former classes are taken in their place."""
-    if settings is not None:
-        warnings.warn("settings= is now hyperparams=", DeprecationWarning, stacklevel=3)
-        hyperparams = settings
-    if isinstance(hyperparams, FormerSettings):
-        hyperparams = from_former(algorithm, hyperparams.settings)
-    return complete_hyperparams(algorithm, hyperparams)
+    _trainable(loop, steps, 0, algorithm, complete_hyperparams(algorithm, hyperparams))[0].close()
 
 
 def _trainable(

@@ -1,6 +1,6 @@
 """Tunes the linear-quadratic regulator of every arm of `ncs study`, each behind its own filter, with the same budget.
 
-    python benchmarks/tune_baselines.py [--env ncs_gym/CSTR-v0 ...] [--episodes 24] [--write]
+    python benchmarks/tune_baselines.py [--env ncs_gym/CSTR-v0 ...] [--arms mpc ...] [--episodes 24] [--write]
 
 A grid of weights is tried for each arm and each environment, on the environment's own channel and the same episodes for
 all; the highest mean return is chosen (a violation ends an episode, and with it what it would still have earned). The
@@ -21,7 +21,7 @@ import numpy as np
 from agents import evaluate
 from agents.loop import LoopConfig, ShieldSettings
 from experiments.baselines import FILTERS, EstimateFilterSettings, RegulatorWeights, controller
-from experiments.settings.study import NETWORK_ENVS, REGULATED_ARMS
+from experiments.settings.learning import NETWORK_ENVS, REGULATED_ARMS
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate
 from shields.runtime.wrapper import certificate_for
@@ -44,6 +44,7 @@ def main() -> None:
     """Searches, and prints or writes what was chosen."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--env", nargs="*", default=NETWORK_ENVS)
+    parser.add_argument("--arms", nargs="*", default=REGULATED_ARMS, choices=REGULATED_ARMS)
     parser.add_argument("--episodes", type=int, default=24)
     parser.add_argument("--out", type=Path, default=Path("runs/tuned_baselines.jsonl"))
     parser.add_argument("--write", action="store_true")
@@ -51,11 +52,11 @@ def main() -> None:
     options.out.parent.mkdir(parents=True, exist_ok=True)
     lines = options.out.read_text("utf-8").splitlines() if options.out.exists() else []
     found = {tuple(line["key"]): line["return"] for line in map(json.loads, lines)}
-    chosen: dict[str, dict[str, dict[str, float]]] = {}
+    chosen: dict[str, dict[str, dict[str, float]]] = json.loads(TUNED.read_text("utf-8"))
     for env_id in options.env:
         env = ncs_env(LoopConfig(env=env_id).single())
         certificate = certificate_for(env.plant, env.certificate_contract, safe_set="ellipsoid")
-        for arm in REGULATED_ARMS:
+        for arm in options.arms:
             returns = []
             for weights in GRID:
                 key = (env_id, arm, options.episodes, weights.effort, weights.state)

@@ -8,6 +8,7 @@ Takes about 40 seconds on one core.
 import argparse
 
 import gymnasium as gym
+import torch
 from sb3_contrib import RecurrentPPO
 from stable_baselines3.common.env_util import make_vec_env
 
@@ -17,6 +18,7 @@ from shields import SafetyShield
 parser = argparse.ArgumentParser()
 parser.add_argument("--steps", type=int, default=10_000)
 options = parser.parse_args()
+torch.set_num_threads(1)  # the network is small: more threads only wait for each other
 
 
 def make_env() -> gym.Env:

@@ -3,6 +3,7 @@
 Takes about ten seconds on one core. `agents.SB3VecEnv` is faster for the environments of this package.
 """
 
+import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
@@ -10,6 +11,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 from shields import SafetyShield
 
 if __name__ == "__main__":
+    torch.set_num_threads(1)  # the network is small: more threads only wait for each other
     env_id = "ncs_gym:ncs_gym/TruckTrailerCruise-v0"
     keywords = {"info_keywords": ("episode_violations", "is_success")}
     envs = make_vec_env(

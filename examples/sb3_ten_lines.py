@@ -7,6 +7,7 @@ import argparse
 
 import gymnasium as gym
 import stable_baselines3
+import torch
 from stable_baselines3.common.monitor import Monitor
 
 from shields import SafetyShield
@@ -14,6 +15,7 @@ from shields import SafetyShield
 parser = argparse.ArgumentParser()
 parser.add_argument("--steps", type=int, default=1000)
 options = parser.parse_args()
+torch.set_num_threads(1)  # the network is small: more threads only wait for each other
 
 # Monitor adds these infos of the last step to each episode; the last step has the totals of the episode.
 keys = ("episode_violations", "episode_interventions")

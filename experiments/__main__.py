@@ -9,6 +9,7 @@ import errno
 import os
 import sys
 
+_DESCRIPTION = "Safe learning control over imperfect networks. `ncs --version` prints the version."
 _ERROR = 2
 _INTERRUPTED = 130
 # What to do about an error of the operating system.
@@ -52,14 +53,22 @@ def main() -> None:
     """
     try:
         import signal
+        import warnings
         from contextlib import nullcontext
 
-        from experiments.warning_sentences import warnings_as_sentences
+        from experiments.terminal import warnings_as_sentences
 
         signal.signal(signal.SIGTERM, _interrupt)
         # Matrices are small: more threads only wait for each other. Read when numpy is imported, here and in workers.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        _require_own_agents()
+        with warnings.catch_warnings(action="ignore"):  # what it would say is an error here
+            from ncs_gym import __version__
+        from ncs_gym.installation import GENERIC_NAMES, require_own_packages
+
+        require_own_packages(*GENERIC_NAMES)
+        if sys.argv[1:] == ["--version"]:
+            print(f"ncs-gym {__version__}")
+            return
         settings = _parse(sys.argv[1:])
         with nullcontext() if os.environ.get("NCS_DEBUG") else warnings_as_sentences():
             _run(settings)
@@ -79,21 +88,17 @@ def _parse(arguments: list[str]) -> object:
     import tyro
 
     from experiments import settings
-    from experiments.settings.assignments import beside_those_of_file, with_assignments
+    from experiments.settings.arguments import beside_those_of_file
 
     arguments = [_ALIASES.get(each, each) if at == 0 else each for at, each in enumerate(arguments)]
-    arguments = ["--help" if each == "--help-all" else each for each in arguments]  # its former name
     kinds = {name: getattr(settings, kind) for name, (kind, _, _) in COMMANDS.items()}
-    arguments = with_assignments(arguments)
     command, rest = "".join(arguments[:1]), arguments[1:]
     if hasattr(kinds.get(command), "config"):
         defaults, others = settings.config_defaults(rest, command, kinds[command])
         if defaults is not None:
             given = tyro.cli(kinds[command], prog=f"ncs {command}", args=others, default=defaults)
             return beside_those_of_file(given, defaults)
-    return tyro.extras.subcommand_cli_from_dict(
-        kinds, prog="ncs", description="Safe learning control over imperfect networks.", args=arguments
-    )
+    return tyro.extras.subcommand_cli_from_dict(kinds, prog="ncs", description=_DESCRIPTION, args=arguments)
 
 
 def _run(settings: object) -> None:
@@ -113,20 +118,6 @@ def _run(settings: object) -> None:
 def _interrupt(number: int, frame: object) -> None:
     """Ends on SIGTERM as on Ctrl-C: workers are stopped, finished runs are kept."""
     raise KeyboardInterrupt
-
-
-def _require_own_agents() -> None:
-    """Refuses to run with another distribution's `agents` package, whose generic name ours shares."""
-    from importlib.util import find_spec
-    from pathlib import Path
-
-    spec = find_spec("agents")
-    here = Path(__file__).resolve().parent.parent
-    if spec is None or spec.origin is None or Path(spec.origin).resolve().parent.parent != here:
-        raise ImportError(
-            f"the package 'agents' found is not this project's ({spec.origin if spec else 'none'}): "
-            "install ncs-gym in a virtual environment of its own"
-        )
 
 
 def _sentence(error: Exception) -> str:
@@ -150,7 +141,7 @@ def _complain(sentence: str, code: int) -> int:
     """Prints an error on one line, on a terminal on lines of its width, and returns the exit code."""
     text = f"ncs: {sentence}"
     if sys.stderr.isatty():
-        from experiments.analysis.terminal_text import wrapped
+        from experiments.terminal import wrapped
 
         text = wrapped(text, indent=5)
     print(text, file=sys.stderr)

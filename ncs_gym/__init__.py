@@ -6,6 +6,7 @@ from ncs_gym.envs.spaces import ClippedObservationWarning
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlantError, certified_error_set
 from ncs_gym.estimation.estimator import Estimator
+from ncs_gym.installation import warn_of_overwritten_packages
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet, TraceChannel
 from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
 from ncs_gym.network.downlink import Actuator, Command, Echo
@@ -33,6 +34,9 @@ from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.extremal_disturbances import AdversarialDisturbance, SphereDisturbance
 from ncs_gym.uncertainty.remainder import Remainder
 
+__version__ = "0.1.0"
+
+warn_of_overwritten_packages()
 register_all()
 
 __all__ = [

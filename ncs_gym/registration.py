@@ -214,7 +214,7 @@ PERSISTENT = SinusoidDisturbance(period=100.0)
 
 
 def loaded_truck_trailer() -> LinearPlant:
-    """Returns the truck with a trailer of 4000 kg: full throttle overstretches its coupling (theory.md section 5)."""
+    """Returns the truck with a trailer of 4000 kg: full throttle overstretches its coupling."""
     return truck_trailer(mass=4000.0)
 
 

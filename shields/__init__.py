@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from shields.nodes import ActuatorNode, ControllerNode, SensorNode
     from shields.synthesis import Network, Requirement, Requirements, certify, requirements, synthesize
 
+__distribution__ = "ncs-gym"
+
 __all__ = [
     "ActuatorNode",
     "Certificate",

@@ -40,7 +40,7 @@ _FIELDS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Multipliers:
-    """The S-procedure multipliers of the conditions of theory.md section 3, all without unit.
+    """The S-procedure multipliers of the conditions of docs/shield_proof.md, all without unit.
 
     Attributes:
         error: Multiplier lam_e of the error set's condition (E1), in (0, 1).
@@ -91,7 +91,7 @@ class Proof(ReadOnlyArrays):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Updates(ReadOnlyArrays):
-    """How samples lead estimation errors of every age back into the first error set: (C2) of theory.md section 6.
+    """How samples lead estimation errors of every age back into the first error set: (C2) of docs/shield_proof.md.
 
     Attributes:
         contract: What the channel promises: the newest sample is at most h steps old.
@@ -238,7 +238,7 @@ class Certificate(ReadOnlyArrays):
         return PaperConstants(self.kappa, self.rho, self.epsilon, self.epsilon_up)
 
     def disturbances(self) -> tuple[np.ndarray, float]:
-        """Returns D and s, with which the conditions of theory.md section 3 are verified.
+        """Returns D and s, with which the conditions of docs/shield_proof.md are verified.
 
         Raises:
             CertificateError: If the method is "paper", which has no error set.

@@ -12,7 +12,7 @@ from ncs_gym.validation import printable
 
 _WIDTH, _INDENT = 110, 14
 METHODS = {
-    "certified": "certified (docs/theory.md section 3)",
+    "certified": "certified (docs/shield_proof.md)",
     "paper": "paper (OP and Algorithm 1 of Liu et al. as printed, docs/paper.md)",
 }
 

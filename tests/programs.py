@@ -6,6 +6,7 @@ import contextlib
 import io
 import runpy
 import sys
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from unittest import mock
@@ -15,8 +16,10 @@ import gymnasium as gym
 
 @contextlib.contextmanager
 def _started_with(*arguments: str) -> Iterator[io.StringIO]:
-    """What a program prints that is given some arguments; ids that it registers do not outlive it."""
+    """What a program prints that is given some arguments; neither ids that it registers nor its files outlive it."""
     with (
+        tempfile.TemporaryDirectory() as folder,
+        contextlib.chdir(folder),
         mock.patch.object(sys, "argv", [*arguments]),
         mock.patch.dict(gym.registry),
         contextlib.redirect_stdout(io.StringIO()) as printed,

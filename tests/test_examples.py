@@ -105,12 +105,11 @@ FOREIGN = {
 }
 
 
-def run_example(name, *arguments, **variables):
+def run_example(name, *arguments, cwd, **variables):
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     command = [sys.executable, str(ROOT / "examples" / name), *arguments]
-    # One thread per process: tests run side by side.
-    environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"} | variables
-    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600)
+    environment = os.environ | {"PYTHONPATH": path} | variables
+    return subprocess.run(command, capture_output=True, text=True, env=environment, cwd=cwd, timeout=600)
 
 
 def test_every_example_is_run_here():
@@ -121,6 +120,13 @@ def test_every_example_says_how_long_it_takes():
     for name in RUNS:
         text = ast.get_docstring(ast.parse((ROOT / "examples" / name).read_text()))
         assert re.search(r"^Takes about .* (seconds?) on one core", text, re.MULTILINE), name
+
+
+def test_examples_that_train_compute_with_one_thread():
+    """Those that take their environments from `agents` do so by that; where others train, a line says it."""
+    for name in TRAINING | {"single_file_ppo.py"}:
+        text = (ROOT / "examples" / name).read_text()
+        assert ("from agents import" in text) != ("torch.set_num_threads(1)" in text), name
 
 
 def test_versions_of_foreign_packages_are_those_that_the_page_names():
@@ -141,7 +147,7 @@ def test_example_runs_in_a_process_of_its_own_and_prints_what_it_is_about(name, 
     missing = [package for package in FOREIGN.get(name, ()) if importlib.util.find_spec(package) is None]
     if missing:
         pytest.skip(f"{', '.join(missing)} not installed: a virtual environment of its own (docs/integrations.md)")
-    run = run_example(name, *RUNS[name][0], MINARI_DATASETS_PATH=str(tmp_path))
+    run = run_example(name, *RUNS[name][0], cwd=tmp_path, MINARI_DATASETS_PATH=str(tmp_path))
     assert run.returncode == 0, run.stderr
     assert_expected(name, run.stdout)
 
@@ -153,10 +159,11 @@ def assert_expected(name, printed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["single_file_ppo.py", "single_file_sac.py"])
-def test_single_files_learn_and_break_the_coupling_only_without_a_shield(name):
+def test_single_files_learn_and_break_the_coupling_only_without_a_shield(name, tmp_path):
     budget = {"single_file_ppo.py": "40960", "single_file_sac.py": "6000"}[name]
     bare, shielded = (
-        run_example(name, "--shield", shield, "--total-timesteps", budget) for shield in ("none", "project")
+        run_example(name, "--shield", shield, "--total-timesteps", budget, cwd=tmp_path)
+        for shield in ("none", "project")
     )
     assert bare.returncode == shielded.returncode == 0, bare.stderr + shielded.stderr
     assert re.search(r"violating steps: [1-9]", bare.stdout), bare.stdout

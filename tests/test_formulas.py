@@ -24,11 +24,10 @@ def formulas(page):
     return parts[1::2], blocks
 
 
-def test_theory_and_proofs_have_formulas():
-    for name in ("theory.md", "shield_proof.md", "lookahead.md", "contracts.md"):
-        lines, blocks = formulas(ROOT / "docs" / name)
-        assert len(lines) > 20, name
-        assert blocks, name
+def test_proofs_have_formulas():
+    lines, blocks = formulas(ROOT / "docs" / "shield_proof.md")
+    assert len(lines) > 100
+    assert len(blocks) > 10
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

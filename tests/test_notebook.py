@@ -36,7 +36,7 @@ def test_notebook_is_stored_without_outputs(cells):
 @pytest.mark.slow
 def test_notebook_runs_from_top_to_bottom(cells):
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-    environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
+    environment = os.environ | {"PYTHONPATH": path, "MPLBACKEND": "Agg"}
     command = [sys.executable, "-c", program_of(cells)]
     run = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600)
     assert run.returncode == 0, run.stderr

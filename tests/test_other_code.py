@@ -223,7 +223,7 @@ def test_shield_that_is_a_part_of_the_id_is_inside_monitor(monkeypatch):
 
 def zoo(*arguments):
     path = [str(ROOT), str(ROOT / "examples" / "rl_zoo"), os.environ.get("PYTHONPATH")]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, path)), "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, path))}
     run = subprocess.run(
         [sys.executable, "-m", *map(str, arguments)], capture_output=True, text=True, env=environment, timeout=600
     )
@@ -239,7 +239,7 @@ def zoo(*arguments):
 @pytest.mark.parametrize("name", [CRUISE, "ShieldedCruise-v0"])
 def test_rl_zoo3_trains_with_our_file_and_shield(name, tmp_path):
     packages = ["--gym-packages", "ncs_gym", "shields", "shielded_cruise"]
-    common = ["--algo", "ppo", "--env", name, *packages, "--seed", 0, "-f", tmp_path]
+    common = ["--algo", "ppo", "--env", name, *packages, "--seed", 0, "-f", tmp_path, "--num-threads", 1]
     file = ROOT / "examples" / "rl_zoo" / "ncs.yml"
     printed = zoo("rl_zoo3.train", *common, "--conf-file", file, "-n", 2048, "--eval-freq", 1000, "--eval-episodes", 1)
     assert float(re.search(r"safety/\s+\|.*?intervention_rate +\| +([\d.e-]+)", printed, re.DOTALL)[1]) > 0.0

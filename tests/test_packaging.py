@@ -3,16 +3,22 @@
 import ast
 import importlib
 import importlib.util
+import os
 import re
 import shutil
 import subprocess
 import sys
+import tarfile
 import tomllib
 import zipfile
 from functools import cache
 from pathlib import Path
 
 import pytest
+import yaml
+
+import ncs_gym
+from ncs_gym.installation import GENERIC_NAMES, install_command
 
 ROOT = Path(__file__).resolve().parent.parent
 ORDER = ("ncs_gym", "shields", "agents", "experiments")
@@ -23,7 +29,7 @@ MODULES = sorted(path for package in ORDER for path in (ROOT / package).rglob("*
 # Folders and modules of each package, from the bottom up: a row imports from itself and from rows above it.
 LAYERS = {
     "ncs_gym": (
-        {"exact", "validation"},
+        {"exact", "installation", "validation"},
         {"uncertainty", "plants"},
         {"network", "tasks", "processes"},
         {"estimation", "rendering"},
@@ -40,13 +46,13 @@ LAYERS = {
     ),
     "agents": (
         {"hyperparams", "results", "sb3_vec_env"},
-        {"former_settings", "loop", "replay"},
+        {"loop"},
         {"algorithms", "callbacks", "evaluation", "sharing"},
         {"agent"},
-        {"sb3_zip", "training"},
+        {"training"},
     ),
     "experiments": (
-        {"errors", "warning_sentences", "json_values"},
+        {"errors", "json_values", "terminal"},
         {"settings", "baselines"},
         {"runs"},
         {"backends", "analysis", "plots"},
@@ -137,7 +143,7 @@ def test_no_modules_import_each_other():
 
 def test_only_what_solves_programs_imports_a_solver():
     users = {path.parent.relative_to(ROOT).as_posix() for path in MODULES if imports_of(path, SOLVERS)}
-    assert users == {"shields/synthesis", "shields/paper", "shields/runtime/backup_plans"}
+    assert users == {"shields/synthesis", "shields/paper", "shields/runtime/backup_plans", "experiments/baselines"}
 
 
 def test_environment_and_shields_do_not_import_the_learners():
@@ -147,7 +153,7 @@ def test_environment_and_shields_do_not_import_the_learners():
 
 
 def test_nothing_is_compiled_at_first_use():
-    """Neither imported by us, nor by what we import, nor pinned."""
+    """Neither imported by us, nor by what we import, nor pinned; nor is what draws, before anything is drawn."""
     for path in MODULES:
         assert not imports_of(path, COMPILERS), path
     pinned = {line.partition("==")[0].lower() for line in (ROOT / "constraints.txt").read_text().splitlines()}
@@ -162,7 +168,7 @@ many = shields.VectorSafetyShield(gymnasium.make_vec("ncs_gym/LinearNCS-v0", num
 for each, shape in ((env, (1,)), (many, (2, 1))):
     each.reset(seed=0)
     each.step(numpy.ones(shape, numpy.float32))
-print(sorted({COMPILERS} & set(sys.modules)))
+print(sorted(({COMPILERS} | {{"matplotlib", "filterpy", "pygame"}}) & set(sys.modules)))
 """
     run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"
@@ -190,7 +196,7 @@ def test_what_takes_long_is_imported_when_it_is_needed():
     later = {
         "experiments.backends.worker_init": {"numpy", "gymnasium"},
         "experiments.__main__": {"numpy", "tyro"},
-        "ncs_gym": {"scipy.stats", "filterpy", "pygame", "matplotlib"},
+        "ncs_gym": {"scipy.linalg", "scipy.optimize", "scipy.stats", "filterpy", "pygame", "matplotlib"},
         "shields": {"cvxpy", "clarabel", "torch", "matplotlib", "scipy.stats", "filterpy"},
         "experiments.settings": {"scipy.stats", "filterpy", "cvxpy", "matplotlib", "torch"},
         "experiments.commands.compare": {"torch", "stable_baselines3"},
@@ -222,6 +228,34 @@ def test_command_is_declared_and_runs_as_a_module():
     assert "compare" in run.stdout
 
 
+def test_make_alone_says_what_there_is():
+    alone, help_ = (
+        subprocess.run(["make", "-s", *goals], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        for goals in ([], ["help"])
+    )
+    assert alone == help_
+    (phony,) = re.findall(r"^\.PHONY: (.*?[^\\])$", (ROOT / "Makefile").read_text(), re.MULTILINE | re.DOTALL)
+    assert set(re.findall(r"^  ([a-z-]+) +\S", alone, re.MULTILINE)) == set(phony.replace("\\", "").split())
+
+
+def test_address_is_written_everywhere_and_taken_out_again(tmp_path):
+    shutil.copytree(ROOT / ".ci", tmp_path / ".ci")
+    names = ("pyproject.toml", "CITATION.cff", "README.md", "mkdocs.yml")
+    for name in names:
+        shutil.copy(ROOT / name, tmp_path / name)
+    for address in ("https://example.org/old", "https://example.org/ncs/gym"):
+        subprocess.run([sys.executable, tmp_path / ".ci" / "address.py", address], check=True, capture_output=True)
+    for name in names:
+        assert (tmp_path / name).read_text().count("https://example.org") == 1, name
+    project = tomllib.loads((tmp_path / "pyproject.toml").read_text())["project"]
+    assert project["urls"]["Source"] == "https://example.org/ncs/gym"
+    cited = yaml.safe_load((tmp_path / "CITATION.cff").read_text())
+    assert cited["repository-code"] == "https://example.org/ncs/gym"
+    assert yaml.safe_load((tmp_path / "mkdocs.yml").read_text())["repo_url"] == "https://example.org/ncs/gym"
+    subprocess.run([sys.executable, tmp_path / ".ci" / "address.py", ""], check=True, capture_output=True)
+    assert not any("https://example.org" in (tmp_path / name).read_text() for name in names)
+
+
 def test_virtual_environment_is_ignored_as_a_folder_and_as_a_link(tmp_path):
     shutil.copy(ROOT / ".gitignore", tmp_path)
     (tmp_path / ".venv").symlink_to(ROOT)
@@ -239,16 +273,94 @@ def test_files_that_the_makefile_names_exist():
     assert [name for name in named if not (ROOT / name).exists()] == []
 
 
-def test_foreign_agents_package_is_refused_in_one_sentence(tmp_path):
-    (tmp_path / "agents").mkdir()
-    (tmp_path / "agents" / "__init__.py").write_text("")
-    code = "import sys; sys.path.insert(0, sys.argv.pop()); from experiments.__main__ import main; main()"
-    run = subprocess.run(
-        [sys.executable, "-c", code, "--help", str(tmp_path)], cwd=ROOT, capture_output=True, text=True
-    )
-    assert run.returncode == 2
+@pytest.mark.parametrize("name", GENERIC_NAMES)
+def test_package_of_the_same_name_elsewhere_is_refused_in_one_sentence(name, tmp_path):
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "__init__.py").write_text("")
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); "
+    if name == "experiments":  # `ncs` itself cannot start then
+        code += f"from ncs_gym.installation import require_own_packages; require_own_packages({name!r})"
+    else:
+        code = f"from experiments.__main__ import main; {code} main()"
+    run = subprocess.run([sys.executable, "-c", code, "--help"], cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode != 0
+    assert f"the package {name!r} that Python finds ({tmp_path / name}" in run.stderr
+    assert "if it is yours, rename it" in run.stderr
     assert "virtual environment of its own" in run.stderr
-    assert len(run.stderr.strip().splitlines()) == 1
+    if name != "experiments":
+        assert run.returncode == 2
+        assert len(run.stderr.strip().splitlines()) == 1
+
+
+@pytest.fixture(scope="module")
+def installed_copy(tmp_path_factory):
+    """The four packages as in site-packages: no project around them."""
+    folder = tmp_path_factory.mktemp("site")
+    for package in ORDER:
+        shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
+    return folder
+
+
+def run_in(folder, *arguments):
+    environment = os.environ | {"PYTHONPATH": str(folder)}
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=600
+    )
+
+
+@pytest.mark.parametrize("name", GENERIC_NAMES)
+def test_package_that_was_overwritten_is_told_of(installed_copy, name, tmp_path):
+    init = installed_copy / name / "__init__.py"
+    ours = init.read_text()
+    init.write_text('"""Agents of another distribution."""\n')
+    try:
+        imported = run_in(installed_copy, "-c", "import ncs_gym")
+        command = run_in(installed_copy, "-c", "from experiments.__main__ import main; main()", "--version")
+    finally:
+        init.write_text(ours)
+    assert imported.returncode == 0
+    assert command.returncode == 2
+    assert len(command.stderr.strip().splitlines()) == 1
+    for said in (imported.stderr, command.stderr):
+        assert f"{init} is not this project's: another distribution" in said
+        assert "--force-reinstall" in said
+
+
+def test_training_behind_the_shields_of_another_package_says_so(installed_copy, tmp_path):
+    (tmp_path / "shields.py").write_text("")
+    code = f"import sys, agents; sys.path.insert(0, {str(tmp_path)!r}); agents.LoopConfig"
+    run = run_in(installed_copy, "-c", code)
+    assert f"the package 'shields' that Python finds ({tmp_path / 'shields.py'})" in run.stderr.splitlines()[-1]
+
+
+def test_what_to_install_is_said_for_a_clone_and_for_a_wheel(installed_copy):
+    assert install_command("render") == f"in {ROOT}, pip install -e '.[render]'"
+    run = run_in(installed_copy, "-c", "import ncs_gym.installation as i; print(i.install_command('render'))")
+    assert run.stdout == "pip install 'ncs-gym[render]'\n", run.stderr
+
+
+def test_version_is_one():
+    run = subprocess.run([sys.executable, "-m", "experiments", "--version"], cwd=ROOT, capture_output=True, text=True)
+    assert run.stdout == f"ncs-gym {ncs_gym.__version__}\n", run.stderr
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == ncs_gym.__version__
+    assert f"version = {{{ncs_gym.__version__}}}" in (ROOT / "docs" / "paper.md").read_text()
+    assert re.search(rf"^## \[{re.escape(ncs_gym.__version__)}\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert "version" not in project
+
+
+def test_source_distribution_holds_every_file_of_the_repository(tmp_path):
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", str(tmp_path)]
+    subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
+    (sdist,) = tmp_path.glob("*.tar.gz")
+    with tarfile.open(sdist) as archive:
+        files = {name.partition("/")[2] for name in archive.getnames()}
+    named = {"Makefile", "constraints.txt", "CONTRIBUTING.md", "CITATION.cff", "benchmarks/import_time.py", ".ci/run"}
+    assert named <= files
+    if (ROOT / ".git").exists():
+        tracked = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True)
+        present = {name for name in tracked.stdout.split("\0") if name and (ROOT / name).is_file()}
+        assert present - files == set()
 
 
 def test_wheel_holds_the_four_packages_and_nothing_else(tmp_path):

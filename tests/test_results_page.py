@@ -8,7 +8,7 @@ import pytest
 
 from experiments.plots.figure_style import CaptionedFigure
 from experiments.study.figures import study_figures
-from experiments.study.pages import quoted, results_page
+from experiments.study.study import quoted, results_page
 from experiments.study.tables import tables_by_name
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -15,6 +15,7 @@ from typing import Any
 from unittest import mock
 
 from experiments.attack import monte_carlo_batch
+from experiments.commands import attack
 
 
 class _Executor(Executor):
@@ -55,7 +56,15 @@ class _Manager:
 def no_worker_processes() -> Iterator[None]:
     """Commands execute their training runs and batches in this process."""
     with (
-        mock.patch("experiments.backends.worker_processes.ProcessPoolExecutor", _Executor),
-        mock.patch("experiments.backends.worker_processes.SyncManager", _Manager),
+        mock.patch("experiments.backends.execution.ProcessPoolExecutor", _Executor),
+        mock.patch("experiments.backends.execution.SyncManager", _Manager),
     ):
         yield
+
+
+def replace_cases(monkeypatch: Any, cases: dict[str, Any]) -> None:
+    """Has `ncs attack` attack these cases instead of its own."""
+    for module in (monte_carlo_batch, attack):
+        monkeypatch.setattr(
+            module, "cases_of", lambda settings: {name: case.with_delta(settings.delta) for name, case in cases.items()}
+        )

@@ -17,8 +17,6 @@ from shields.runtime.safety_filter import LONGEST_HORIZON, MODES
 # Files of an agent: no other name is read or written for one, whoever made the list of names.
 AGENT_FILES = ("model.zip", "agent.json")
 _FORMAT = "ncs-gym agent 2"
-# Read too: hyperparameters stand there as settings, with names of their own (`agents.former_settings`).
-_FORMER_FORMAT = "ncs-gym agent 1"
 
 
 class AgentError(ValueError):
@@ -78,7 +76,7 @@ def read_files(folder: str | Path) -> tuple[Path, dict[str, Any], bytes]:
         ) from error
     except (ValueError, RecursionError) as error:
         raise AgentError(f"{folder / 'agent.json'} is damaged: it is not valid JSON") from error
-    if not isinstance(document, dict) or document.get("format") not in (_FORMAT, _FORMER_FORMAT):
+    if not isinstance(document, dict) or document.get("format") != _FORMAT:
         raise AgentError(f"{folder / 'agent.json'} is not of format {_FORMAT!r}")
     content = document.get("agent")
     if not isinstance(content, dict) or document.get("sha256") != digest(content):

@@ -91,7 +91,6 @@ def _versions() -> str:
 
 
 def _figures(evaluation: Evaluation) -> list[str]:
-    """Returns what happened in the episodes, one line per figure."""
     episodes = evaluation.episodes
     steps = sum(episode.steps for episode in episodes)
     violating = sum(episode.violation_steps > 0 for episode in episodes)
@@ -107,7 +106,6 @@ def _figures(evaluation: Evaluation) -> list[str]:
 
 
 def _shield_text(shield: ShieldSettings | None) -> str:
-    """Returns mode, horizon and penalty of a shield in words."""
     if shield is None:
         return "none"
     horizon = "" if shield.horizon is None else f", plans of at most {shield.horizon} steps"

@@ -1,4 +1,4 @@
-"""The long table of results: one row per evaluation episode, which summaries, pages and Parquet files are made of."""
+"""The long table of results, a row per evaluation episode, and what is computed from it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from experiments.runs.scenarios import AS_TRAINED
+from experiments.analysis.statistics import bootstrap_interval, clopper_pearson, interquartile_mean, mean_interval
+from experiments.runs.arms import Arm, is_shield
+from experiments.runs.loops import AS_TRAINED
 from experiments.runs.training_run import RunResult
 
 # Key of the metadata in a file, and entries of summary.json that it holds.
@@ -66,3 +68,136 @@ def parquet(table: pd.DataFrame, summary: Mapping[str, Any]) -> bytes:
     buffer = io.BytesIO()
     pq.write_table(content.replace_schema_metadata({_METADATA: json.dumps(origin).encode()}), buffer)
     return buffer.getvalue()
+
+
+# Columns of which a run has a sum, and a mean over its episodes.
+_COUNTED = ["steps", "violation_steps", "estimate_violation_steps", "interventions", "planned", "guaranteed"]
+_COUNTED += ["violating", "outside_set"]
+_AVERAGED = ["episode_return", "violating", "outside_set"]
+
+
+def arm_summaries(episodes: pd.DataFrame, mode: str) -> dict[str, dict[str, Any]]:
+    """Returns what `arm_summary` says of every arm, by its name and in the order of the rows.
+
+    Args:
+        episodes: What `episodes_table` returns.
+        mode: Mode of the shield of arms that name none.
+    """
+    arms = {str(name): (Arm.of(str(name), mode), rows) for name, rows in episodes.groupby("arm", sort=False)}
+    return {
+        name: arm_summary(rows, arm.mode, fixed_policy=arm.policy not in ("trained", "untrained"))
+        for name, (arm, rows) in arms.items()
+    }
+
+
+def arm_summary(episodes: pd.DataFrame, mode: str | None, *, fixed_policy: bool) -> dict[str, Any]:
+    """Returns the summary of an arm, JSON values only.
+
+    `eval_violation_rate_ci95` is the Clopper-Pearson interval of the probability that an episode violates, given the
+    trained policies. `eval_violation_steps` counts violating steps of the true state and
+    `eval_estimate_violation_steps` those of the estimate; they are plain counts, because the steps of one episode are
+    dependent. `eval_return_ci95` is Student's interval over the mean returns of the runs (null for a single run),
+    because training differs from run to run; for a policy that is the same in all runs (`fixed_policy`) it is over the
+    episodes. The bootstrap intervals are over the same values. `eval_episodes_outside_set` counts episodes in which the
+    true state left the safe set. `plan_rate` is the share of steps that live from a plan: after whose decision inputs
+    of a certified plan are in store (mode "lookahead", 0 in others). `conditions` holds the same numbers of the
+    evaluation in each other scenario.
+
+    Args:
+        episodes: Rows of the arm in what `episodes_table` returns.
+        mode: Mode of its shield, or name of its other filter; None for neither.
+        fixed_policy: Whether the policy is the same in all runs.
+    """
+    training = episodes.groupby("run")[TRAINING].first()
+    steps, violations, interventions = (int(total) for total in training.sum())
+    conditions = {
+        name: _evaluated(played, fixed_policy=fixed_policy)
+        for name, played in episodes.groupby("condition", sort=False)
+    }
+    return {
+        "mode": mode,
+        "shielded": is_shield(mode),
+        "runs": len(training),
+        "train_steps": steps,
+        "train_violation_steps": violations,
+        "train_violation_steps_by_run": training["train_violation_steps"].tolist(),
+        "train_intervention_rate": interventions / steps if steps else 0.0,
+        **conditions.pop(AS_TRAINED),
+        "conditions": conditions,
+    }
+
+
+def _evaluated(episodes: pd.DataFrame, *, fixed_policy: bool) -> dict[str, Any]:
+    """Returns what a summary says of the evaluation episodes of an arm in one scenario."""
+    runs, count = episodes.groupby("run"), len(episodes)
+    means, sums = runs[_AVERAGED].mean(), runs[_COUNTED].sum()
+    total = {name: int(number) for name, number in sums.sum().items()}
+    values = (episodes if fixed_policy else means)["episode_return"].to_numpy()
+    return {
+        "eval_episodes": count,
+        "eval_steps": total["steps"],
+        "eval_violation_steps": total["violation_steps"],
+        "eval_estimate_violation_steps": total["estimate_violation_steps"],
+        "eval_violating_episodes": total["violating"],
+        "eval_violation_rate": total["violating"] / count,
+        "eval_violation_rate_ci95": clopper_pearson(total["violating"], count),
+        "eval_episodes_outside_set": total["outside_set"],
+        "eval_return_mean": float(means["episode_return"].mean()),
+        "eval_return_ci95": mean_interval(values),
+        "eval_return_bootstrap_ci95": bootstrap_interval(values),
+        "eval_return_iqm": float(interquartile_mean(values)),
+        "eval_return_iqm_bootstrap_ci95": bootstrap_interval(values, statistic=interquartile_mean),
+        "eval_return_ci95_over": "episodes" if fixed_policy else "runs",
+        "eval_return_by_run": means["episode_return"].tolist(),
+        "eval_violation_rate_by_run": means["violating"].tolist(),
+        "eval_outside_set_rate_by_run": means["outside_set"].tolist(),
+        "intervention_rate_by_run": (sums["interventions"] / sums["steps"]).tolist(),
+        "intervention_rate": total["interventions"] / total["steps"],
+        "plan_rate": total["planned"] / total["steps"],
+        "guaranteed_episodes": total["guaranteed"],
+        "largest_level": float(episodes["largest_level"].max()),
+    }
+
+
+def paired_differences(episodes: pd.DataFrame, baseline: str) -> dict[str, Any]:
+    """Returns the differences between each other arm and the baseline in the runs with equal index, JSON values.
+
+    They are the differences of the mean returns, with Student's and the bootstrap's interval over the runs, and of the
+    numbers of violating episodes.
+
+    Args:
+        episodes: Rows of the arms in what `episodes_table` returns.
+        baseline: Name of the arm that is subtracted.
+    """
+    as_trained = episodes[episodes["condition"] == AS_TRAINED]
+    runs = as_trained.groupby(["run", "arm"]).agg(mean=("episode_return", "mean"), violating=("violating", "sum"))
+    returns, violating = (
+        runs[name].unstack().pipe(lambda wide: wide.sub(wide[baseline], axis=0)) for name in ("mean", "violating")
+    )
+    return {
+        name: {
+            "return_mean": float(returns[name].mean()),
+            "return_ci95": mean_interval(returns[name].to_numpy()),
+            "return_bootstrap_ci95": bootstrap_interval(returns[name].to_numpy()),
+            "violating_episodes": int(violating[name].sum()),
+            "violating_episodes_by_run": violating[name].astype(int).tolist(),
+        }
+        for name in episodes["arm"].unique()
+        if name != baseline
+    }
+
+
+def covered_fraction(summary: dict[str, Any]) -> float | None:
+    """Returns the fraction of the return from the zero input (0) to the unshielded agent (1) that the shielded one has.
+
+    It is None without these arms, where the zero input earns as much as the unshielded agent, which learned nothing
+    then, and where episodes end early: then returns are sums over different numbers of steps.
+    """
+    named = summary["references"] | summary["arms"]
+    if not {"shielded", "unshielded", "zero input"} <= named.keys():
+        return None
+    start, goal, here = (named[name] for name in ("zero input", "unshielded", "shielded"))
+    if len({arm["eval_steps"] for arm in (start, goal, here)}) > 1:
+        return None
+    start, goal, here = (arm["eval_return_mean"] for arm in (start, goal, here))
+    return (here - start) / (goal - start) if goal > start else None

@@ -1,8 +1,10 @@
-"""Confidence intervals."""
+"""Confidence intervals, and counts beside the bound on the probability that Gaussian noise leaves the safe set."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from decimal import ROUND_CEILING, Context, Decimal
+from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest, bootstrap, sem, t, trim_mean
@@ -45,8 +47,7 @@ def bootstrap_interval(*strata: Values, statistic: Callable[..., float] = np.mea
     """Returns the percentile bootstrap's 95 % interval of a statistic of all values, each stratum resampled by itself.
 
     With a handful of values it is too narrow: it cannot reach beyond the smallest and the largest of them. To resample
-    the runs within each environment is what Agarwal et al. do, "Deep reinforcement learning at the edge of the
-    statistical precipice" (2021).
+    the runs within each environment is what Agarwal et al. 2021 do (docs/bibliography.md).
 
     Args:
         *strata: Independent values of each stratum; a single one is the ordinary bootstrap.
@@ -99,3 +100,46 @@ def hierarchical_interval(values: np.ndarray, confidence: float = CONFIDENCE) ->
             means.append(values[chosen[..., None], within].mean(axis=(1, 2)))
     tails = (0.5 - confidence / 2.0, 0.5 + confidence / 2.0)
     return [float(end) for end in np.quantile(np.concatenate(means), tails)]
+
+
+def rounded_up(bound: float) -> str:
+    """Returns a bound in two significant digits, no smaller than it is."""
+    return f"{float(Context(prec=2, rounding=ROUND_CEILING).create_decimal(Decimal(bound))):.2g}"
+
+
+def gaussian_summary(bound: float, steps: int, arms: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+    """Returns JSON values: the bound for an episode, and what the evaluation episodes of each shielded arm did.
+
+    Args:
+        bound: `ncs_gym.escape_probability` of an episode.
+        steps: Number of steps of an episode.
+        arms: What `arm_summary` returns of each arm whose claim is the safe set, in which its episodes start.
+    """
+    counts = {name: (arm["eval_episodes"], arm["eval_episodes_outside_set"]) for name, arm in arms.items()}
+    return {
+        "escape_probability": bound,
+        "steps": steps,
+        "arms": {
+            name: {
+                "episodes": episodes,
+                "episodes_outside_set": outside,
+                "rate_ci95": clopper_pearson(outside, episodes),
+            }
+            for name, (episodes, outside) in counts.items()
+        },
+    }
+
+
+def gaussian_sentences(summary: dict[str, Any]) -> list[str]:
+    """Returns what `gaussian_summary` found in a sentence per arm."""
+    bound, sentences = summary["escape_probability"], []
+    for name, arm in summary["arms"].items():
+        low, high = (100.0 * end for end in arm["rate_ci95"])
+        sentences.append(
+            f"{name}: the state left the safe set in {arm['episodes_outside_set']:,} of {arm['episodes']:,} evaluation "
+            f"episodes [{low:.2f}, {high:.2f} %]; under Gaussian noise the probability of that is at most "
+            f"{rounded_up(bound)} for an episode of {summary['steps']:,} steps."
+        )
+    if bound >= 1.0:
+        sentences.append("A bound of 1 says nothing: it takes a plant with a smaller delta (docs/shield.md).")
+    return sentences

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from math import floor, log10
 from typing import Any
 
-from experiments.analysis.terminal_text import text_table
+from experiments.terminal import text_table
 
 _HEADERS = (
     ("", "training:", "", "evaluation:", "", "", "", ""),
@@ -37,7 +37,7 @@ _OUTCOMES = (
 def summary_text(arms: dict[str, dict[str, Any]], baselines: dict[str, dict[str, Any]]) -> str:
     """Returns the table for a terminal; baselines stand below a rule.
 
-    Violating episodes have their exact interval, the return has Student's (`experiments.analysis.summary`). "Left S"
+    Violating episodes have their exact interval, the return has Student's (`experiments.analysis.episodes`). "Left S"
     counts episodes in which the true state was outside the safe set at some step, "from a plan" the steps after whose
     decision the shield of mode "lookahead" had inputs of a certified plan in store. The columns about the training are
     left out where nothing was trained.
@@ -57,7 +57,6 @@ def scenario_text(scenario: str, arms: dict[str, dict[str, Any]], baselines: dic
 
 
 def _without_training(rows: list[list[str]]) -> list[list[str]]:
-    """Returns the rows without the columns about the training."""
     return [[row[0], *row[1 + _TRAINING_COLUMNS :]] for row in rows]
 
 
@@ -76,7 +75,6 @@ def _rows(arms: dict[str, dict[str, Any]]) -> list[list[str]]:
 
 
 def _cells(arm: dict[str, Any]) -> list[str]:
-    """Returns the numbers of an arm as text."""
     low, high = arm["eval_violation_rate_ci95"]
     trained = arm["train_steps"] > 0
     return [

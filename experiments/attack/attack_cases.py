@@ -9,7 +9,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 
-from experiments.runs.environments import module_and_id, registered_env
+from experiments.runs.loops import module_and_id, registered_env
 from ncs_gym import (
     Channel,
     ChannelContract,

@@ -6,23 +6,48 @@ import math
 import re
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from experiments.attack.campaign import SHIELD_MODES, Campaign
-from experiments.attack.safety_counts import SafetyCounts
+from experiments.attack.attack_cases import AttackCase, attack_cases, plant_cases
+from experiments.attack.safety_counts import SETTLING_STEPS, SafetyCounts
 from experiments.attack.worst_case import GaussianVectorEnv, HostileAgents, WorstCaseVectorEnv, starts_in_box
+from experiments.runs.provenance import versions
+from experiments.settings import AttackSettings, BackendSettings
+from experiments.settings.certificates import changed_contract
 from ncs_gym import NCSVectorEnv
 from ncs_gym.registration import EPISODE_STEPS
 from shields import Certificate, VectorSafetyShield
 from shields.json_documents import digest
 
-# Episodes start on the boundary of S; the largest level is taken from this step on.
-SETTLING_STEPS = 20
+# Modes of the shield, one per batch in turn, where none is chosen.
+_SHIELD_MODES = ("project", "switch", "boundary")
+# Settings that the counts of a batch do not depend on; the plant of a file is known by its certificate.
+_NOT_COUNTED = {*BackendSettings.__dataclass_fields__, "steps", "out", "force", "plant"}
+
+
+def cases_of(settings: AttackSettings) -> dict[str, AttackCase]:
+    """Returns what is attacked, by name.
+
+    Raises:
+        ValueError: If there is no environment of the id, or the plant's file cannot be read.
+    """
+    if settings.plant is None:
+        found = attack_cases(settings.seed, settings.random_plants, settings.env)
+    else:
+        found = plant_cases(settings.plant, changed_contract(None, settings.max_age, settings.quantization_step))
+    return {name: case.with_delta(settings.delta) for name, case in found.items()}
+
+
+def kinds_of_batches(settings: AttackSettings) -> tuple[str, ...]:
+    """Returns the kinds of batches, which take turns: modes of the shield, or where nature pushes "lookahead"."""
+    if settings.mode == "lookahead":
+        return ("to the box", "out of S")
+    return ("monitor",) if settings.unshielded else (settings.mode,) if settings.mode else _SHIELD_MODES
 
 
 @dataclass(frozen=True)
@@ -30,13 +55,13 @@ class MonteCarloBatch:
     """A batch of episodes of one attack case, a run like any other.
 
     Attributes:
-        campaign: Settings of the campaign.
+        settings: Settings of the attack.
         case: Name of the attack case.
         index: Number of the batch within its case, from 0 on.
         certificate: Certificate of the case.
     """
 
-    campaign: Campaign
+    settings: AttackSettings
     case: str
     index: int
     certificate: Certificate
@@ -52,15 +77,16 @@ class MonteCarloBatch:
 
     @property
     def key(self) -> str:
-        """SHA-256 of everything that the counts depend on: the campaign, the case and versions of packages."""
-        attacked = self.campaign.cases()[self.case]
+        """SHA-256 of everything that the counts depend on: settings, the case and versions of packages."""
+        attacked = cases_of(self.settings)[self.case]
         channels = f"{attacked.channel} {attacked.downlink}"  # what a module registers may change
-        return digest([self.campaign.key, self.case, self.index, self.certificate.checksum, channels])
+        settings = {name: value for name, value in vars(self.settings).items() if name not in _NOT_COUNTED}
+        return digest([settings, versions(), self.case, self.index, self.certificate.checksum, channels])
 
     @property
     def total_steps(self) -> int:
         """Number of steps in the batch."""
-        return self.campaign.batch_steps
+        return self.settings.envs * EPISODE_STEPS
 
     def execute(self, on_progress: Callable[[int], None], log_folder: Path | None = None) -> SafetyCounts:
         """Returns the counts, the same in any process and after any other batch.
@@ -72,34 +98,44 @@ class MonteCarloBatch:
         Raises:
             CertificateError: If the certificate does not verify for the case's plant.
         """
-        campaign = self.campaign
-        shields = list(_shields(campaign, self.case, self.certificate).values())
-        shield = shields[self.index % len(shields)]
+        settings, envs, looks_ahead = self.settings, self.settings.envs, self.settings.mode == "lookahead"
+        kinds = kinds_of_batches(settings)
+        shield = _shields(settings, self.case, self.certificate)[kinds[self.index % len(kinds)]]
         plant, safe_set = shield.filter.plant, shield.filter.certificate.safe_set
-        seeds = np.random.SeedSequence([campaign.seed, zlib.crc32(self.case.encode()), self.index])
+        seeds = np.random.SeedSequence([settings.seed, zlib.crc32(self.case.encode()), self.index])
         seed, policy_seed = seeds.generate_state(2, np.uint64).tolist()
         rng = np.random.default_rng(policy_seed)
-        info = _begin(campaign, shield, seed >> 1, rng)
-        agents = HostileAgents(campaign.envs, plant, shield.certificate, rng)
+        info = _begin(settings, shield, seed >> 1, rng)
+        agents = HostileAgents(envs, plant, shield.certificate, rng)
         counts = SafetyCounts(
-            steps=campaign.batch_steps,
-            episodes=campaign.envs,
+            steps=self.total_steps,
+            episodes=envs,
             unproved=int(np.count_nonzero(~info["shield_guaranteed"])),
             outside_starts=int(np.count_nonzero(safe_set.gauge(info["state"]) > 1.0)),
         )
-        kept, broken = np.ones(campaign.envs, np.bool_), np.zeros(campaign.envs, np.bool_)
+        kept, broken = np.ones(envs, np.bool_), np.zeros(envs, np.bool_)
         for step in range(EPISODE_STEPS):
             *_, info = shield.step(agents.act(info["estimate"]))
             claimed, kept = _claimed_and_kept(info, kept)
-            if not campaign.shielded:  # nothing is claimed, and everything counted
+            if settings.unshielded:  # nothing is claimed, and everything counted
                 claimed[:] = True
-            outside, reached = _outside_and_reached(campaign, info, safe_set.gauge(info["state"]))
-            counts += _step_counts(info, outside, claimed, kept)
-            broken |= claimed & (outside.box | (outside.safe_set & (not campaign.looks_ahead)))
+            levels, outside_box = safe_set.gauge(info["state"]), info["cost"] != 0.0
+            outside_set = ~(levels <= 1.0)
+            reached = info["constraint_values"].max(axis=1) + 1.0 if looks_ahead else levels  # the claim limits it to 1
+            counts += SafetyCounts(
+                exits=int(np.count_nonzero(claimed & outside_set)),
+                violations=int(np.count_nonzero(claimed & outside_box)),
+                interventions=int(np.count_nonzero(info["shield_intervened"])),
+                unproved=int(np.count_nonzero(kept & ~info["shield_guaranteed"])),
+                planned=int(np.count_nonzero(info.get("shield_plan_length", 0))),
+                lapsed=int(np.count_nonzero(~claimed)),
+                lapsed_violations=int(np.count_nonzero(~claimed & outside_box)),
+            )
+            broken |= claimed & (outside_box | (outside_set & (not looks_ahead)))
             if step >= SETTLING_STEPS:
                 level = float(np.nan_to_num(reached, nan=np.inf).max(initial=0.0, where=claimed))
                 counts += SafetyCounts(level=level)
-            on_progress(campaign.envs)
+            on_progress(envs)
         return counts + SafetyCounts(broken_episodes=int(broken.sum()))
 
     def require(self, result: SafetyCounts) -> None:
@@ -108,7 +144,7 @@ class MonteCarloBatch:
         Raises:
             ValueError: If a batch of so many episodes cannot have counted this.
         """
-        steps, envs = self.campaign.batch_steps, self.campaign.envs
+        steps, envs = self.total_steps, self.settings.envs
         most = dict.fromkeys(("episodes", "broken_episodes", "outside_starts"), envs) | {"level": math.inf}
         most["unproved"] = steps + envs  # which counts starts, too
         for name, count in vars(result).items():
@@ -116,13 +152,6 @@ class MonteCarloBatch:
                 raise ValueError(f"{name} of a batch cannot be {count}")
         if (result.steps, result.episodes) != (steps, envs) or result.lapsed_violations > result.lapsed:
             raise ValueError("these are no counts of a whole batch")
-
-
-class _Outside(NamedTuple):
-    """Which true states lie outside S and outside the safe box, arrays of shape (N,)."""
-
-    safe_set: np.ndarray
-    box: np.ndarray
 
 
 def _claimed_and_kept(info: dict[str, Any], kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -139,33 +168,14 @@ def _claimed_and_kept(info: dict[str, Any], kept: np.ndarray) -> tuple[np.ndarra
     return kept | info["shield_guaranteed"], kept & ~info["contract_broken"]
 
 
-def _outside_and_reached(campaign: Campaign, info: dict[str, Any], levels: np.ndarray) -> tuple[_Outside, np.ndarray]:
-    """Returns what lies outside, and the levels that the claim limits to one, (N,): in the safe set or max |c_j x|."""
-    outside = _Outside(~(levels <= 1.0), info["cost"] != 0.0)
-    return outside, info["constraint_values"].max(axis=1) + 1.0 if campaign.looks_ahead else levels
-
-
-def _step_counts(info: dict[str, Any], outside: _Outside, claimed: np.ndarray, kept: np.ndarray) -> SafetyCounts:
-    """Returns what one step adds to the counts."""
-    return SafetyCounts(
-        exits=int(np.count_nonzero(claimed & outside.safe_set)),
-        violations=int(np.count_nonzero(claimed & outside.box)),
-        interventions=int(np.count_nonzero(info["shield_intervened"])),
-        unproved=int(np.count_nonzero(kept & ~info["shield_guaranteed"])),
-        planned=int(np.count_nonzero(info.get("shield_plan_length", 0))),
-        lapsed=int(np.count_nonzero(~claimed)),
-        lapsed_violations=int(np.count_nonzero(~claimed & outside.box)),
-    )
-
-
-def _begin(campaign: Campaign, shield: VectorSafetyShield, seed: int, rng: np.random.Generator) -> dict[str, Any]:
+def _begin(settings: AttackSettings, shield: VectorSafetyShield, seed: int, rng: np.random.Generator) -> dict[str, Any]:
     """Starts the episodes of a batch, on the boundary of the safe set, and returns their infos.
 
     In mode "lookahead" half of the starts are drawn from the box; those for which no first plan is certified, of which
     nothing is claimed, are replaced by others on the boundary of the set that episodes start in.
     """
-    plant, certificate, count = shield.filter.plant, shield.certificate, campaign.envs
-    if not campaign.looks_ahead:
+    plant, certificate, count = shield.filter.plant, shield.certificate, settings.envs
+    if settings.mode != "lookahead":
         polytope, env = certificate.polytope, shield.env.unwrapped
         assert isinstance(env, NCSVectorEnv)
         if polytope is None or env.single.downlink is not None:  # behind a downlink the first inputs are zero
@@ -181,24 +191,18 @@ def _begin(campaign: Campaign, shield: VectorSafetyShield, seed: int, rng: np.ra
 
 
 @lru_cache(maxsize=1)  # a shield's tables may take a hundred megabytes
-def _shields(campaign: Campaign, case: str, certificate: Certificate) -> dict[str, VectorSafetyShield]:
-    """Returns the shields of all kinds of batches: those of S around the same environments, one for each mode.
-
-    In mode "lookahead" disturbances push out of S in every other batch, and towards the box in between.
+def _shields(settings: AttackSettings, case: str, certificate: Certificate) -> dict[str, VectorSafetyShield]:
+    """Returns the shields of all kinds of batches, around the same environments where nature is the same.
 
     Raises:
         CertificateError: If the certificate does not verify for the case's plant.
     """
-    chosen = campaign.cases()[case]
-    settings = {each.name: getattr(chosen, each.name) for each in fields(chosen)}
-    kind = GaussianVectorEnv if campaign.gaussian else WorstCaseVectorEnv
-    env = kind(campaign.envs, certificate, **settings)
-    if campaign.looks_ahead:
-        other = (
-            env if campaign.gaussian else WorstCaseVectorEnv(campaign.envs, certificate, pushes_to_box=True, **settings)
-        )
-        envs = {"to the box": other, "out of S": env}
-        planning = {"mode": "lookahead", "horizon": campaign.horizon, "on_unproved": "ignore"}
-        return {name: VectorSafetyShield(each, certificate, **planning) for name, each in envs.items()}
-    modes = (campaign.mode,) if campaign.mode else SHIELD_MODES if campaign.shielded else ("monitor",)
-    return {mode: VectorSafetyShield(env, certificate, mode, on_unproved="ignore") for mode in modes}
+    attacked = vars(cases_of(settings)[case])
+    is_gaussian, kinds = settings.noise == "gaussian", kinds_of_batches(settings)
+    env = (GaussianVectorEnv if is_gaussian else WorstCaseVectorEnv)(settings.envs, certificate, **attacked)
+    if settings.mode != "lookahead":
+        return {mode: VectorSafetyShield(env, certificate, mode, on_unproved="ignore") for mode in kinds}
+    other = env if is_gaussian else WorstCaseVectorEnv(settings.envs, certificate, pushes_to_box=True, **attacked)
+    planning = {"mode": "lookahead", "horizon": settings.horizon, "on_unproved": "ignore"}
+    shields = (VectorSafetyShield(each, certificate, **planning) for each in (other, env))
+    return dict(zip(kinds, shields, strict=True))

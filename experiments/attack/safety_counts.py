@@ -1,11 +1,20 @@
-"""What a campaign counts; sums of counts do not depend on how the work was split."""
+"""What a campaign counts, the tables of it, and whether it is what the shield, or the bound on Gaussian noise, claims.
+
+Sums of counts do not depend on how the work was split.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar
 
-from experiments.analysis.statistics import clopper_pearson
+from experiments.analysis.statistics import clopper_pearson, rounded_up
+from experiments.errors import SafetyBroken
+from experiments.terminal import text_table
+
+# Episodes start on the boundary of S; the largest level is taken from this step on.
+SETTLING_STEPS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +32,7 @@ class SafetyCounts:
         broken_episodes: Number of episodes with an exit or a violation; in mode "lookahead" with a violation.
         interventions: Number of steps in which the shield intervened.
         unproved: Number of steps at which the shield's proof did not hold though the channels kept their contracts.
-        level: Largest sqrt(x'Mx) of a true state after `monte_carlo_batch.SETTLING_STEPS`, without lapsed steps; in
+        level: Largest sqrt(x'Mx) of a true state after `SETTLING_STEPS`, without lapsed steps; in
             mode "lookahead" the largest |c_j x|.
         planned: Number of steps after whose decision inputs of a certified plan were in store.
         outside_starts: Number of episodes that began outside S, with a certified plan.
@@ -77,3 +86,137 @@ class SafetyCounts:
     def document(self) -> dict[str, float]:
         """Returns counts, margin and bound as JSON values."""
         return asdict(self) | {"margin": self.margin, "bound": self.bound}
+
+
+# Text of a column by the two lines of its header.
+_Columns = dict[tuple[str, str], Callable[[SafetyCounts], str]]
+
+
+_EPISODES: _Columns = {("", "episodes"): lambda counts: f"{counts.episodes:,}"}
+_FAILURES: _Columns = {
+    ("", "failed"): lambda counts: f"{counts.broken_episodes:,}",
+    ("", "p <"): lambda counts: f"{counts.bound:.1e}",
+    ("", "margin"): lambda counts: f"{counts.margin:.1e}" if counts.level > 0.0 else "-",
+}
+_OUTSIDE_BOX: _Columns = {("outside", "box"): lambda counts: f"{counts.violations:,}"}
+_OVERRIDDEN: _Columns = {("over-", "ridden"): lambda counts: f"{counts.interventions / counts.steps:.1%}"}
+_LAPSED: _Columns = {
+    ("no", "claim"): lambda counts: f"{counts.lapsed / counts.steps:.1%}",
+    ("outside", "then"): lambda counts: f"{counts.lapsed_violations:,}",
+}
+_SET_COLUMNS: _Columns = {
+    **_EPISODES,
+    ("outside", "S"): lambda counts: f"{counts.exits:,}",
+    **_OUTSIDE_BOX,
+    **_FAILURES,
+    **_OVERRIDDEN,
+}
+_BOX_COLUMNS: _Columns = {
+    **_EPISODES,
+    ("began", "outside"): lambda counts: f"{counts.outside_starts:,}",
+    ("outside", "S"): lambda counts: f"{counts.exits / counts.steps:.1%}",
+    **_OUTSIDE_BOX,
+    **_FAILURES,
+    ("", "planned"): lambda counts: f"{counts.planned / counts.steps:.1%}",
+    **_OVERRIDDEN,
+}
+_SET_LEGEND = f"""\
+outside: steps with a true state outside S or the box; failed: episodes that left S or the box;
+p <: upper end of the exact 95 % interval of their probability;
+margin: smallest 1 - level from step {SETTLING_STEPS} on (episodes start on the boundary); the level in S is
+max |g x| over the rows g of a polytope, sqrt(x'Mx) in an ellipsoid;
+overridden: steps that the shield changed or, unshielded, would have changed"""
+_BOX_LEGEND = f"""\
+began outside: episodes that began outside S with a certified plan;
+outside S: steps there, which lookahead allows; outside box: steps there;
+failed: episodes that left the box; p <: upper end of the exact 95 % interval of their probability;
+margin: smallest 1 - |c_j x| from step {SETTLING_STEPS} on;
+planned: steps with inputs of a certified plan in store; overridden: steps that the shield changed"""
+
+GAUSSIAN_LEGEND = """failed: episodes that left S or the box; interval: the exact 95 % interval of their probability;
+bound: the union bound on it over all draws of noise, for the shielded loop;
+a bound of 1 says nothing (--delta makes it small)"""
+
+# What the channels of `attack_cases` do.
+_CHANNELS = {
+    "its channel": "the environment's own",
+    "late": "the oldest sample that the contract allows, at every step",
+    "rare": "the longest gap that it allows, every time",
+    "perfect": "loses and delays nothing",
+    "blackout": "no packet at all",
+    "bursts": "losses in a row",
+    "overtaking": "packets overtake one another",
+}
+_LAPSED_LEGEND = """
+no claim: steps from a broken contract on, until the proof holds again, which no failure counts;
+outside then: such steps outside the box"""
+
+
+def counts_table(counts: Mapping[str, SafetyCounts], *, looks_ahead: bool) -> str:
+    """Returns the counts as text, with a legend; the sum of all rows stands below a rule.
+
+    Args:
+        counts: Counts by the name of their case, "plant, channel"; the rows of a plant stand together.
+        looks_ahead: Whether the shield was that of mode "lookahead".
+    """
+    columns, legend = (_BOX_COLUMNS, _BOX_LEGEND) if looks_ahead else (_SET_COLUMNS, _SET_LEGEND)
+    total = sum(counts.values(), SafetyCounts())
+    if total.lapsed:
+        columns, legend = columns | _LAPSED, legend + _LAPSED_LEGEND
+    rows = [list(line) for line in zip(("", "case"), *columns, strict=True)]
+    plants = {name: name.rpartition(", ")[0] for name in counts}
+    for plant in dict.fromkeys(plants.values()):
+        rows.append([plant])
+        rows += [
+            _row("  " + name.rpartition(", ")[2], counts[name], columns) for name in counts if plants[name] == plant
+        ]
+    rows.append(_row("all", total, columns))
+    steps = f"{total.steps:,} steps, {total.steps // total.episodes} in each episode"
+    seen = dict.fromkeys(name.rpartition(", ")[2] for name in counts)
+    channels = "\n".join(f"{kind}: {_CHANNELS[kind]};" for kind in seen if kind in _CHANNELS)
+    table = text_table(rows, rules=(2, len(rows) - 1))
+    return "\n".join(filter(None, (f"{steps}\n", table, channels, legend)))
+
+
+def _row(name: str, counts: SafetyCounts, columns: _Columns) -> list[str]:
+    return [name, *(text_of(counts) for text_of in columns.values())]
+
+
+def gaussian_table(counts: Mapping[str, SafetyCounts], limits: Mapping[str, float]) -> str:
+    """Returns the observed exits of each case, their exact interval and the bound on their probability, as text."""
+    rows = [["case", "episodes", "failed", "interval", "bound"]]
+    for name, case in counts.items():
+        low, high = case.interval
+        numbers = f"{case.episodes:,}", f"{case.broken_episodes:,}"
+        rows.append([name, *numbers, f"[{low:.1e}, {high:.1e}]", rounded_up(limits[name])])
+    return text_table(rows, rules=(1,))
+
+
+def require_within(counts: Mapping[str, SafetyCounts], limits: Mapping[str, float]) -> None:
+    """Returns if no case's exact interval lies above its bound.
+
+    Raises:
+        SafetyBroken: If one does: then the bound does not hold, or there is an error of one in forty per case.
+    """
+    for name, case in counts.items():
+        if case.interval[0] > limits[name]:
+            raise SafetyBroken(
+                f"{name}: {case.broken_episodes:,} of {case.episodes:,} episodes left S, more than the bound "
+                f"{rounded_up(limits[name])} on their probability allows"
+            )
+
+
+def require_safe(total: SafetyCounts, *, looks_ahead: bool) -> None:
+    """Returns if the shield kept what it claims in every step.
+
+    Args:
+        total: Counts of all cases.
+        looks_ahead: Whether the shield was that of mode "lookahead", which does not claim to stay in S.
+
+    Raises:
+        SafetyBroken: If it did not.
+    """
+    exits = 0 if looks_ahead else total.exits
+    if exits or total.violations or total.unproved:
+        outside_set = "" if looks_ahead else f"{exits:,} steps outside S, "
+        raise SafetyBroken(f"{outside_set}{total.violations:,} outside the box, {total.unproved:,} without a proof")

@@ -28,7 +28,16 @@ def _push_out_of(certificate: Certificate) -> AdversarialDisturbance:
     return AdversarialDisturbance(rows=certificate.polytope.rows)
 
 
-class WorstCaseVectorEnv(NCSVectorEnv):
+class _OnBoundary(NCSVectorEnv):
+    """Episodes that start on the boundary of the initial set."""
+
+    def _first(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Returns starts and first errors, shape (n, count) each."""
+        states = self.single.initial_set.sample_boundary(self.np_random, count)
+        return (1.0 - 1e-9) * states.T, self._process.first_error(self.np_random, count)
+
+
+class WorstCaseVectorEnv(_OnBoundary):
     """Disturbances that push the next state farthest out of S; starts, first errors and sensor noise of full size.
 
     Args:
@@ -44,11 +53,6 @@ class WorstCaseVectorEnv(NCSVectorEnv):
         push = AdversarialDisturbance() if pushes_to_box else _push_out_of(certificate)
         initial_set = start_set(certificate, settings.get("downlink"))
         super().__init__(num_envs, disturbance=push, initial_set=initial_set, noise="extreme", **settings)
-
-    def _first(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns starts and first errors on the boundaries of their sets, shape (n, count) each."""
-        states = self.single.initial_set.sample_boundary(self.np_random, count)
-        return (1.0 - 1e-9) * states.T, self._process.first_error(self.np_random, count)
 
 
 class BoundedPush(Disturbance):
@@ -73,7 +77,7 @@ class BoundedPush(Disturbance):
         return d
 
 
-class GaussianVectorEnv(NCSVectorEnv):
+class GaussianVectorEnv(_OnBoundary):
     """Gaussian noise without a bound, and the worst of what is bounded by declaration; starts on the boundary of S.
 
     Args:
@@ -85,11 +89,6 @@ class GaussianVectorEnv(NCSVectorEnv):
     def __init__(self, num_envs: int, certificate: Certificate, **settings: Any) -> None:
         settings |= {"noise": "gaussian", "disturbance": BoundedPush(certificate.M)}
         super().__init__(num_envs, initial_set=start_set(certificate, settings.get("downlink")), **settings)
-
-    def _first(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns starts on the boundary of their set and Gaussian first errors, shape (n, count) each."""
-        states = self.single.initial_set.sample_boundary(self.np_random, count)
-        return (1.0 - 1e-9) * states.T, self._process.first_error(self.np_random, count)
 
 
 def starts_in_box(rng: np.random.Generator, plant: LinearPlant, certificate: Certificate, count: int) -> np.ndarray:

@@ -20,9 +20,9 @@ from ray.exceptions import LocalRayletDiedError, RayTaskError  # pyright: ignore
 from experiments.backends.ray_cluster import portable_task, require_answer
 from experiments.errors import ClusterError, RunError
 from experiments.runs import versions
-from experiments.runs.run import Run
+from experiments.runs.run_store import Run
 from experiments.settings import BackendSettings
-from experiments.settings.backend import OWN_CLUSTER
+from experiments.settings.learning import OWN_CLUSTER
 
 # How often Ray repeats a run whose worker died.
 RETRIES = 3

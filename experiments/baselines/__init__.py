@@ -3,9 +3,10 @@
 None of them comes with a proof under estimation errors, so none reports `shield_guaranteed`.
 """
 
-from experiments.baselines.controllers import CONTROLLERS, REGULATORS, RegulatorWeights, controller, tuned_weights
+from experiments.baselines.controllers import CONTROLLERS, REGULATORS, controller
 from experiments.baselines.estimate_filter import FILTERS, EstimateFilter, EstimateFilterSettings
 from experiments.baselines.margins import MARGINS
+from experiments.baselines.regulators import RegulatorWeights, tuned_weights
 
 __all__ = [
     "CONTROLLERS",

@@ -31,10 +31,8 @@ class PredictiveFilter:
     already, nothing is solved. Where the program has no solution, the rest of the last plan is applied, as the authors
     do, and u = K x_hat when it is used up.
 
-    Wabersich and Zeilinger: "Linear model predictive safety certification for learning-based control" (2018) and "A
-    predictive safety filter for learning-based control of constrained nonlinear dynamical systems" (2021), both of
-    which tighten; the tube of an estimate is that of Mayne et al., "Robust output feedback model predictive control of
-    constrained linear systems" (2006).
+    After Wabersich and Zeilinger 2018 and Wabersich and Zeilinger 2021, both of which tighten; the tube of an estimate
+    is that of Mayne et al. 2006 (docs/bibliography.md).
 
     Args:
         certificate: Gives S and K; verified exactly here.

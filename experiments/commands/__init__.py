@@ -1,10 +1,16 @@
-"""The commands of `ncs`, one module each: a function of its settings that runs an experiment and writes its files."""
+"""The commands of `ncs`, one module each: a function of its settings that runs an experiment and writes its files.
+
+What they raise is a sentence for the user: ValueError for settings that cannot be, the errors of `experiments.errors`,
+`shields.Infeasible` and `CertificateError`, `agents.AgentError`, and OSError.
+"""
 
 from __future__ import annotations
 
 import importlib.util
 from dataclasses import replace
 from typing import Any
+
+from ncs_gym.installation import install_command
 
 
 def require_extra(extra: str, *packages: str) -> None:
@@ -15,9 +21,7 @@ def require_extra(extra: str, *packages: str) -> None:
     """
     missing = [name for name in packages if importlib.util.find_spec(name) is None]
     if missing:
-        raise ModuleNotFoundError(
-            f"this command needs {', '.join(missing)}: in a clone of ncs-gym, pip install -e '.[{extra}]'"
-        )
+        raise ModuleNotFoundError(f"this command needs {', '.join(missing)}: {install_command(extra)}")
 
 
 def short_version(settings: Any, **budget: Any) -> Any:

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 from tqdm import tqdm
 
-from experiments.analysis.terminal_text import wrapped
-from experiments.attack import MonteCarloBatch, SafetyCounts
 from experiments.attack.attack_cases import AttackCase
-from experiments.attack.campaign import Campaign
-from experiments.attack.counts_table import GAUSSIAN_LEGEND, counts_table, gaussian_table, require_safe, require_within
+from experiments.attack.monte_carlo_batch import MonteCarloBatch, cases_of, kinds_of_batches
+from experiments.attack.safety_counts import (
+    GAUSSIAN_LEGEND,
+    SafetyCounts,
+    counts_table,
+    gaussian_table,
+    require_safe,
+    require_within,
+)
 from experiments.backends.execution import results_of
 from experiments.runs import claim_folder, versions
-from experiments.settings import AttackSettings
-from experiments.settings.certificates import FEWEST_ENVS, changed_contract
+from experiments.runs.experiment import INCIDENTAL_SETTINGS
+from experiments.settings import AttackSettings, settings_json
+from experiments.settings.certificates import FEWEST_ENVS
+from experiments.terminal import wrapped
 from ncs_gym.network import downlink_protocol
 from ncs_gym.registration import EPISODE_STEPS
 from shields import Certificate
@@ -28,80 +35,46 @@ _MOST_LISTED = 6
 
 
 def attack(settings: AttackSettings) -> None:
-    """Runs `ncs attack`.
-
-    Raises:
-        SafetyBroken: If a shielded state left S or its box (in mode "lookahead": its box), or a proof did not hold,
-            although the channels kept their contracts; with Gaussian noise, if more episodes did so than the bound on
-            their probability allows.
-        ResultsError: If a stored result is damaged.
-        FolderInUseError: If another command is writing to the output folder.
-        OtherResultsError: If the output folder holds finished results of other settings.
-        ValueError: If there is no environment of the given id, the plant's file cannot be read, or nothing is
-            claimed of an environment because its downlink promises nothing.
-        Infeasible: If there is no certificate for the plant.
-        CertificateError: If a certificate in the folder is damaged.
-        RunError: If a batch fails.
-        ClusterError: If a cluster cannot execute the batches.
-        OSError: If the folder cannot be written.
-    """
-    campaign = _campaign(settings)
-    cases = campaign.cases()
-    # Smaller batches, so that each kind of each case comes in once within the budget.
-    each = int(settings.steps / (len(cases) * campaign.kinds_of_batches * EPISODE_STEPS))
-    campaign = replace(campaign, envs=min(campaign.envs, max(each, FEWEST_ENVS)))
-    if campaign.shielded:
+    """Runs `ncs attack`."""
+    cases, kinds = cases_of(settings), len(kinds_of_batches(settings))
+    if not settings.unshielded:
         _require_claims(cases)
     with claim_folder("certify", settings):  # the name of the command in files
-        _attack_in_folder(settings, campaign, cases)
-
-
-def _attack_in_folder(settings: AttackSettings, campaign: Campaign, cases: dict[str, AttackCase]) -> None:
-    """Executes the batches that are missing, prints the table and writes the counts; raises as `attack` says."""
-    certificates = _certificates(cases, settings.out / "certificates")
-    numbers = _numbers_of_batches(len(cases), int(settings.steps // campaign.batch_steps), campaign.kinds_of_batches)
-    batches = [
-        MonteCarloBatch(campaign, case, index, certificate)
-        for (case, certificate), number in zip(certificates.items(), numbers, strict=True)
-        for index in range(number)
-    ]
-    counts = {case: SafetyCounts() for case, number in zip(cases, numbers, strict=True) if number}
-    for batch, counted in zip(batches, results_of(batches, settings.out, settings), strict=True):
-        counts[batch.case] += counted
-    total = sum(counts.values(), SafetyCounts())
-    print(counts_table(counts, looks_ahead=campaign.looks_ahead))
-    if left_out := [name for name in cases if name not in counts]:
-        listed = "; ".join([*left_out[:_MOST_LISTED], *["..."] * (len(left_out) > _MOST_LISTED)])
-        budget = f"within {settings.steps:,.0f} steps"
-        print(wrapped(f"{len(left_out)} of {len(cases)} cases are not attacked {budget}: {listed}"))
-    limits = {name: cases[name].escape_probability() for name in counts} if campaign.gaussian else {}
-    if limits:
-        print("", gaussian_table(counts, limits), GAUSSIAN_LEGEND, sep="\n")
-    document = {"settings": asdict(campaign), "versions": versions(), "total": total.document()}
-    document["cases"] = {case: each.document() for case, each in counts.items()}
-    if limits:
-        document["escape_probability"] = limits
-    write_atomically(settings.out / "certify.json", json.dumps(document, indent=1) + "\n")
-    if campaign.shielded and campaign.gaussian:
-        require_within(counts, limits)
-    elif campaign.shielded:
-        require_safe(total, looks_ahead=campaign.looks_ahead)
-
-
-def _campaign(settings: AttackSettings) -> Campaign:
-    return Campaign(
-        seed=settings.seed,
-        random_plants=settings.random_plants,
-        envs=settings.envs,
-        shielded=not settings.unshielded,
-        gaussian=settings.noise == "gaussian",
-        delta=settings.delta,
-        env=settings.env,
-        plant=settings.plant and str(settings.plant.resolve()),  # workers may have another working folder
-        contract=changed_contract(None, settings.max_age, settings.quantization_step),
-        mode=settings.mode,
-        horizon=(settings.horizon or DEFAULT_HORIZON) if settings.mode == "lookahead" else None,
-    )
+        horizon = (settings.horizon or DEFAULT_HORIZON) if settings.mode == "lookahead" else None
+        plant = settings.plant and settings.plant.resolve()  # workers may have another working folder
+        # Smaller batches, so that each kind of each case comes in once within the budget.
+        each = int(settings.steps / (len(cases) * kinds * EPISODE_STEPS))
+        settings = replace(settings, horizon=horizon, plant=plant, envs=min(settings.envs, max(each, FEWEST_ENVS)))
+        certificates = _certificates(cases, settings.out / "certificates")
+        numbers = _numbers_of_batches(len(cases), int(settings.steps // (settings.envs * EPISODE_STEPS)), kinds)
+        batches = [
+            MonteCarloBatch(settings, case, index, certificate)
+            for (case, certificate), number in zip(certificates.items(), numbers, strict=True)
+            for index in range(number)
+        ]
+        counts = {case: SafetyCounts() for case, number in zip(cases, numbers, strict=True) if number}
+        for batch, counted in zip(batches, results_of(batches, settings.out, settings), strict=True):
+            counts[batch.case] += counted
+        total, looks_ahead = sum(counts.values(), SafetyCounts()), settings.mode == "lookahead"
+        print(counts_table(counts, looks_ahead=looks_ahead))
+        if left_out := [name for name in cases if name not in counts]:
+            listed = "; ".join([*left_out[:_MOST_LISTED], *["..."] * (len(left_out) > _MOST_LISTED)])
+            budget = f"within {settings.steps:,.0f} steps"
+            print(wrapped(f"{len(left_out)} of {len(cases)} cases are not attacked {budget}: {listed}"))
+        limits = {name: cases[name].escape_probability() for name in counts} if settings.noise == "gaussian" else {}
+        if limits:
+            print("", gaussian_table(counts, limits), GAUSSIAN_LEGEND, sep="\n")
+        given = settings_json("certify", settings)["settings"]
+        document = {"settings": {name: value for name, value in given.items() if name not in INCIDENTAL_SETTINGS}}
+        document |= {"versions": versions(), "total": total.document()}
+        document["cases"] = {case: each.document() for case, each in counts.items()}
+        if limits:
+            document["escape_probability"] = limits
+        write_atomically(settings.out / "certify.json", json.dumps(document, indent=1) + "\n")
+        if limits and not settings.unshielded:
+            require_within(counts, limits)
+        elif not settings.unshielded:
+            require_safe(total, looks_ahead=looks_ahead)
 
 
 def _require_claims(cases: dict[str, AttackCase]) -> None:

@@ -8,11 +8,11 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 
-from experiments.analysis.terminal_text import terminal_width, wrapped
 from experiments.paper.audit import Claim, Verdict, audited_claims, defects
 from experiments.paper.paper_example import PaperExample
 from experiments.runs import require_place
 from experiments.settings import AuditSettings
+from experiments.terminal import terminal_width, wrapped
 from shields.atomic_write import write_atomically
 
 _INDENT = 16
@@ -20,11 +20,7 @@ _RELATIONS = re.compile(r" (=|<=|>=|<|>) ")
 
 
 def audit(settings: AuditSettings) -> None:
-    """Runs `ncs audit`.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
+    """Runs `ncs audit`."""
     require_place(settings.out)
     claims = list(audited_claims(PaperExample()))
     document = json.dumps([asdict(claim) for claim in claims], indent=1)
@@ -34,7 +30,6 @@ def audit(settings: AuditSettings) -> None:
 
 
 def _text(claims: Sequence[Claim], width: int) -> str:
-    """Returns the table and the summary for a terminal of that many columns."""
     blocks = []
     for number, claim in enumerate(claims, 1):
         lines = [_wrapped(f"{number:2d}.", f"{claim.verdict.upper()}: {claim.claim}", width, indent=4)]

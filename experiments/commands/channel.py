@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from experiments.analysis.recorded_ages import broken_contracts
-from experiments.analysis.terminal_text import text_table, wrapped
 from experiments.runs import require_place
-from experiments.runs.environments import registered_env
+from experiments.runs.loops import registered_env
 from experiments.settings import ChannelSettings
+from experiments.terminal import text_table, wrapped
 from ncs_gym import PacketLog, contract_of
 from shields.atomic_write import write_atomically
 
@@ -21,12 +20,7 @@ _MOST_ROWS = 12
 
 
 def channel(settings: ChannelSettings) -> None:
-    """Runs `ncs channel`.
-
-    Raises:
-        ValueError: If the file cannot be read, holds no packets, or the environment is unknown.
-        OSError: If the file of numbers cannot be written.
-    """
+    """Runs `ncs channel`."""
     require_place(settings.out)
     log = PacketLog.load(settings.file, settings.ping_period)
     env = None if settings.env is None else registered_env(settings.env)
@@ -40,7 +34,6 @@ def channel(settings: ChannelSettings) -> None:
 
 
 def _numbers(log: PacketLog, dt: float, seed: int) -> dict[str, Any]:
-    """Returns what the record says, as JSON values."""
     replayed, trace = log.channel(dt), np.array(log.trace(dt))
     lost, arrived = trace < 0, log.delays[np.isfinite(log.delays)]
     ages = log.ages(dt)
@@ -66,7 +59,6 @@ def _numbers(log: PacketLog, dt: float, seed: int) -> dict[str, Any]:
 
 
 def _text(log: PacketLog, dt: float, found: dict[str, Any]) -> str:
-    """Returns it for a terminal."""
     low, high = found["delays"]
     runs = ", ".join(f"{count} of {length}" for length, count in found["runs_of_losses"].items()) or "none"
     median, ninety, ninety_nine, longest = (1000.0 * each for each in found["delay_quantiles"])
@@ -96,7 +88,6 @@ def _text(log: PacketLog, dt: float, found: dict[str, Any]) -> str:
 
 
 def _compared(contract: Any, found: dict[str, Any]) -> str:
-    """Returns whether the record kept an environment's contract."""
     if contract is None:
         return "The environment's certificate needs no contract."
     row = next((row for row in found["contracts"] if row["max_age"] == contract.max_age), None)
@@ -104,3 +95,48 @@ def _compared(contract: Any, found: dict[str, Any]) -> str:
         return f"The environment's contract, max_age = {contract.max_age}, was kept throughout."
     broken = f"{100.0 * row['broken']:.3g} % of steps"
     return f"The environment's contract, max_age = {contract.max_age}, was broken in {broken}."
+
+
+# A block is this many times as long as the largest age: what happens in one hardly depends on the one before.
+_AGES_PER_BLOCK = 10
+_RESAMPLES = 2000
+
+
+def broken_contracts(ages: np.ndarray, rng: np.random.Generator) -> list[dict[str, Any]]:
+    """Returns, for every largest age up to the recorded one, in what fraction of steps it was exceeded.
+
+    The interval is that of a circular block bootstrap of the steps (95 %), blocks being ten times as long as the
+    largest age. Where an age was never exceeded it ends at 3 / (number of blocks), what is excluded at that level if
+    blocks are independent. `halves` are the two halves of the record.
+
+    Args:
+        ages: Age of the newest sample at every step, shape (k,).
+        rng: Draws the blocks.
+
+    Returns:
+        Rows of JSON values, from the age that was kept down to 0.
+    """
+    largest, steps = int(ages.max()), len(ages)
+    block = min(_AGES_PER_BLOCK * (largest + 1), steps)
+    blocks = -(-steps // block)
+    starts = rng.integers(steps, size=(_RESAMPLES, blocks))
+    halves = np.array_split(ages, 2)
+    rows = []
+    for age in range(largest, -1, -1):
+        broken = ages > age
+        sums = np.concatenate([[0], np.cumsum(np.concatenate([broken, broken[:block]]))])
+        resampled = (sums[starts + block] - sums[starts]).sum(axis=1) / (blocks * block)
+        low, high = np.quantile(resampled, [0.025, 0.975])
+        if not broken.any():
+            low, high = 0.0, min(3.0 / blocks, 1.0)
+        edges = np.diff(np.concatenate([[0], broken.astype(int)]))
+        rows.append(
+            {
+                "max_age": age,
+                "broken": float(broken.mean()),
+                "broken_ci95": [float(low), float(high)],
+                "times": int((edges > 0).sum()),
+                "halves": [float((half > age).mean()) for half in halves],
+            }
+        )
+    return rows

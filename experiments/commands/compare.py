@@ -10,15 +10,20 @@ import gymnasium as gym
 import pandas as pd
 
 from agents.loop import LoopConfig
-from experiments.analysis.episodes import episodes_table, parquet, training_table
-from experiments.analysis.gaussian_bound import gaussian_sentences, gaussian_summary
-from experiments.analysis.summary import arm_summaries, covered_fraction, paired_differences
+from experiments.analysis.episodes import (
+    arm_summaries,
+    covered_fraction,
+    episodes_table,
+    paired_differences,
+    parquet,
+    training_table,
+)
+from experiments.analysis.statistics import gaussian_sentences, gaussian_summary
 from experiments.analysis.tables import decimals_of, scenario_text, summary_text
-from experiments.analysis.terminal_text import wrapped
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.plots.comparison_figures import comparison_figures
-from experiments.report import comparison_report
+from experiments.report.html import comparison_report
 from experiments.runs import (
     Arm,
     TrainingRun,
@@ -34,6 +39,7 @@ from experiments.runs import (
 )
 from experiments.runs.experiment import certificate_line
 from experiments.settings import CompareSettings
+from experiments.terminal import wrapped
 from ncs_gym import bound_violation_probability
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, SafetyFilter, verify
@@ -44,53 +50,39 @@ _SMOKE = {"steps": 4_096, "episodes": 10, "seeds": 2}
 
 
 def compare(settings: CompareSettings) -> None:
-    """Runs `ncs compare`: prints the table and writes the files.
-
-    Raises:
-        ValueError: If a setting is out of range or a stored result is damaged.
-        FolderInUseError: If another command is writing to the output folder.
-        OtherResultsError: If the output folder holds finished results of other settings.
-        OSError: If the output folder cannot be written.
-        CertificateError: If a given certificate does not verify.
-        Infeasible: If no certificate is found.
-        RunError: If a run fails.
-        ClusterError: If a cluster cannot execute the runs.
-    """
+    """Runs `ncs compare`: prints the table and writes the files."""
     settings = _with_full_names(short_version(settings, **_SMOKE))
     loop = loop_config(settings.env, settings.channel, noise="gaussian" if settings.noise == "gaussian" else None)
     require_trainable(settings, loop)
     certificate = certificate_of(loop, settings.certificate, settings.safe_set)
     with claim_folder("compare", settings.completed):
-        _compare_in_folder(settings, loop, certificate)
-
-
-def _compare_in_folder(settings: CompareSettings, loop: LoopConfig, certificate: Certificate) -> None:
-    """Executes what is missing, prints the table and writes the files."""
-    prepare_output(settings.out)
-    plant = ncs_env(loop.single()).plant
-    verification = verify(certificate, plant)
-    print(wrapped(certificate_line(certificate, verification)), wrapped(settings.agent_line), sep="\n", flush=True)
-    settings = settings.completed
-    runs = _training_runs(settings, loop, certificate)
-    results = results_of(runs, settings.out, settings)
-    episodes = episodes_table(results)
-    summary = _summary(settings, loop, certificate, runs, episodes)
-    findings = _findings(summary)
-    if "gaussian_noise" in summary:
-        findings += gaussian_sentences(summary["gaussian_noise"])
-    figures = comparison_figures(plant, certificate, summary, by_arm(results))
-    certificate.save(settings.out / "certificate.json")
-    files = {
-        "episodes.parquet": parquet(episodes, summary),
-        "training.parquet": parquet(training_table(results), summary),
-        "report.html": comparison_report(summary, verification, dict(figures.values()), findings),
-    }
-    write_results(settings.out, summary, files, figures)
-    count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
-    trained = max(arm["train_steps"] for arm in summary["arms"].values())
-    print(f"\n{settings.env}: {count} and {trained:,} training steps per arm, {settings.episodes} episodes per run\n")
-    short = ["A smoke run shows that everything runs; its agents have hardly learned."] if settings.smoke else []
-    print(_tables(summary), *map(wrapped, [*findings, *short]), f"files: {settings.out}", sep="\n")
+        prepare_output(settings.out)
+        plant = ncs_env(loop.single()).plant
+        verification = verify(certificate, plant)
+        print(wrapped(certificate_line(certificate, verification)), wrapped(settings.agent_line), sep="\n", flush=True)
+        settings = settings.completed
+        runs = _training_runs(settings, loop, certificate)
+        results = results_of(runs, settings.out, settings)
+        episodes = episodes_table(results)
+        summary = _summary(settings, loop, certificate, runs, episodes)
+        findings = _findings(summary)
+        if "gaussian_noise" in summary:
+            findings += gaussian_sentences(summary["gaussian_noise"])
+        figures = comparison_figures(plant, certificate, summary, by_arm(results))
+        certificate.save(settings.out / "certificate.json")
+        files = {
+            "episodes.parquet": parquet(episodes, summary),
+            "training.parquet": parquet(training_table(results), summary),
+            "report.html": comparison_report(summary, verification, dict(figures.values()), findings),
+        }
+        write_results(settings.out, summary, files, figures)
+        count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
+        trained = max(arm["train_steps"] for arm in summary["arms"].values())
+        print(
+            f"\n{settings.env}: {count} and {trained:,} training steps per arm, {settings.episodes} episodes per run\n"
+        )
+        short = ["A smoke run shows that everything runs; its agents have hardly learned."] if settings.smoke else []
+        print(_tables(summary), *map(wrapped, [*findings, *short]), f"files: {settings.out}", sep="\n")
 
 
 def _with_full_names(settings: CompareSettings) -> CompareSettings:
@@ -109,7 +101,6 @@ def _with_full_names(settings: CompareSettings) -> CompareSettings:
 
 
 def _tables(summary: dict[str, Any]) -> str:
-    """Returns the tables for a terminal: training and evaluation, then one per other scenario."""
     arms, baselines = summary["arms"], summary["references"]
     scenarios = next(iter(arms.values()))["conditions"]
     others = [scenario_text(scenario, arms, baselines) for scenario in scenarios]
@@ -130,7 +121,6 @@ def _summary(
     runs: Sequence[TrainingRun],
     episodes: pd.DataFrame,
 ) -> dict[str, Any]:
-    """Returns the content of summary.json."""
     arms = arm_summaries(episodes, settings.mode)
     gaussian = {}
     if settings.noise == "gaussian":

@@ -10,16 +10,14 @@ from typing import TYPE_CHECKING
 from agents import evaluation
 from agents.loop import LoopConfig, ShieldSettings
 from agents.sharing.agent_file import pretrained_folder
-from experiments.analysis.episodes import episodes_table
-from experiments.analysis.summary import arm_summary
+from experiments.analysis.episodes import arm_summary, episodes_table
 from experiments.analysis.tables import summary_text
 from experiments.commands import short_version
 from experiments.runs import RunResult, certificate_of, require_place, versions
-from experiments.runs.environments import module_and_id, registered_env
-from experiments.runs.loops import with_channel
+from experiments.runs.loops import module_and_id, registered_env, with_channel
 from experiments.runs.policies import PRETRAINED, agent_folder, certificate_file
 from experiments.settings import EvaluateSettings
-from experiments.settings.steps import require_horizon
+from experiments.settings.arguments import require_horizon
 from ncs_gym.envs.env import ncs_env
 from shields.atomic_write import write_atomically
 
@@ -31,15 +29,7 @@ _SMOKE = {"episodes": 5}
 
 
 def evaluate(settings: EvaluateSettings) -> None:
-    """Runs `ncs evaluate`.
-
-    Raises:
-        AgentError: If the agent's files are missing, damaged or of another environment.
-        ValueError: If a setting is out of range, or the agent is of another environment.
-        CertificateError: If a given certificate does not verify.
-        Infeasible: If no certificate is found.
-        OSError: If the summary cannot be written.
-    """
+    """Runs `ncs evaluate`."""
     settings = short_version(settings, **_SMOKE)
     require_place(settings.out)
     folder = _folder(settings)
@@ -97,8 +87,11 @@ def _agent(folder: Path, env_id: str | None) -> Agent:
         AgentError: If the agent's files are missing or damaged.
         ValueError: If the environment is unknown, or not the one that the agent was trained in.
     """
-    from agents.agent import Agent  # imports torch
-    from agents.sb3_zip import is_sb3_zip, load_sb3_zip
+    from agents.agent import (
+        Agent,  # imports torch
+        is_sb3_zip,
+        load_sb3_zip,
+    )
 
     if env_id is not None:
         registered_env(env_id)

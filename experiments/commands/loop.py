@@ -23,9 +23,9 @@ from experiments.network_loop.processes import (
     run_network,
     run_plant,
 )
-from experiments.runs.environments import import_module, module_and_id, registered_env
-from experiments.runs.synthesis_status import synthesis_status
+from experiments.runs.loops import import_module, module_and_id, registered_env
 from experiments.settings import LoopSettings
+from experiments.terminal import synthesis_status
 from ncs_gym import NCSEnv
 from ncs_gym.network import contract_of, downlink_protocol
 from ncs_gym.network.wire import SHORTEST_KEY

@@ -11,7 +11,7 @@ from tqdm import tqdm
 from experiments.commands import require_extra, short_version
 from experiments.plots.animation import FORMATS, save_animation
 from experiments.runs import require_place
-from experiments.runs.environments import module_and_id, registered_env
+from experiments.runs.loops import module_and_id, registered_env
 from experiments.runs.policies import UNTRAINED_POLICIES, policy_by_name
 from experiments.settings import RenderSettings
 from ncs_gym.envs.env import ncs_env
@@ -28,13 +28,7 @@ _GRAY = 120
 
 
 def render(settings: RenderSettings) -> None:
-    """Runs `ncs render`.
-
-    Raises:
-        ValueError: If a setting is wrong.
-        OSError: If a file cannot be read or written.
-        Infeasible: If a shield is asked for and no certificate is found.
-    """
+    """Runs `ncs render`."""
     settings = short_version(settings, **_SMOKE)
     _check(settings)
     if settings.policy not in UNTRAINED_POLICIES:
@@ -115,7 +109,6 @@ def _frames(renderers: list[_EpisodeRenderer], steps: int) -> Iterator[list[np.n
 
 
 def _side_by_side(frames: list[np.ndarray]) -> np.ndarray:
-    """Returns frames side by side with a line between them."""
     gap = np.full((len(frames[0]), _GAP, 3), 255, np.uint8)
     gap[:, _GAP // 2 - 1 : _GAP // 2 + 1] = _GRAY
     parts = [part for frame in frames for part in (gap, frame)][1:]

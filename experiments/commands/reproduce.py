@@ -7,42 +7,29 @@ from dataclasses import asdict
 
 from tqdm import tqdm
 
-from experiments.analysis.terminal_text import text_table
-from experiments.paper.reproduction import Outcome, designs, simulate
-from experiments.paper.reproduction_figures import reproduction_figures
+from experiments.paper.reproduction import Outcome, designs, reproduction_figures, simulate
 from experiments.runs import claim_folder, prepare_output
 from experiments.settings import ReproduceSettings
+from experiments.terminal import text_table
 from shields.atomic_write import write_atomically
 
 
 def reproduce(settings: ReproduceSettings) -> None:
-    """Runs `ncs reproduce`.
-
-    Raises:
-        FolderInUseError: If another command is writing to the output folder.
-        OtherResultsError: If the output folder holds finished results of other settings.
-        OSError: If the output folder cannot be written.
-    """
+    """Runs `ncs reproduce`."""
     with claim_folder("reproduce", settings):
-        _reproduce_in_folder(settings)
-
-
-def _reproduce_in_folder(settings: ReproduceSettings) -> None:
-    """Simulates, prints the table and writes the files."""
-    prepare_output(settings.out)
-    with tqdm(total=3 * settings.starts, unit="start", mininterval=1.0) as bar:
-        simulations = [simulate(design, settings, bar) for design in designs()]
-    for name, png in reproduction_figures(simulations).items():
-        write_atomically(settings.out / "figures" / f"{name}.png", png)
-    outcomes = {simulation.design.name: simulation.outcome for simulation in simulations}
-    summary = {name: asdict(outcome) for name, outcome in outcomes.items()}
-    write_atomically(settings.out / "summary.json", json.dumps(summary, indent=1) + "\n")
-    print(_table(outcomes))
-    print(f"files: {settings.out}")
+        prepare_output(settings.out)
+        with tqdm(total=3 * settings.starts, unit="start", mininterval=1.0) as bar:
+            simulations = [simulate(design, settings, bar) for design in designs()]
+        for name, png in reproduction_figures(simulations).items():
+            write_atomically(settings.out / "figures" / f"{name}.png", png)
+        outcomes = {simulation.design.name: simulation.outcome for simulation in simulations}
+        summary = {name: asdict(outcome) for name, outcome in outcomes.items()}
+        write_atomically(settings.out / "summary.json", json.dumps(summary, indent=1) + "\n")
+        print(_table(outcomes))
+        print(f"files: {settings.out}")
 
 
 def _table(outcomes: dict[str, Outcome]) -> str:
-    """Returns the table for a terminal, a column per design."""
     rows = [
         ("steps outside the safe set", lambda o: f"{o.outside_set:,} of {o.steps:,}"),
         ("steps outside the safe box", lambda o: f"{o.outside_box:,} of {o.steps:,}"),

@@ -15,14 +15,14 @@ import numpy as np
 from tqdm import tqdm
 
 import shields
-from experiments.analysis.terminal_text import text_table, wrapped
 from experiments.backends.execution import execute, executor_of
 from experiments.errors import ResultsError
-from experiments.plots.requirements_map import requirements_map
+from experiments.plots.heatmaps import requirements_map
 from experiments.runs import claim_folder, prepare_output, write_results
-from experiments.runs.environments import registered_env
+from experiments.runs.loops import registered_env
 from experiments.runs.provenance import versions
 from experiments.settings import RequirementsSettings
+from experiments.terminal import text_table, wrapped
 from ncs_gym import LinearPlant
 from shields import Certificate, Network, Requirement, Requirements
 from shields.atomic_write import write_atomically

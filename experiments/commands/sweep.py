@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from itertools import product
 from typing import Any
@@ -10,14 +9,12 @@ from typing import Any
 import pandas as pd
 
 from agents.loop import LoopConfig
-from experiments.analysis.episodes import episodes_table, parquet
-from experiments.analysis.summary import arm_summaries
+from experiments.analysis.episodes import arm_summaries, episodes_table, parquet
 from experiments.analysis.tables import sweep_table
-from experiments.analysis.terminal_text import wrapped
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.plots.heatmaps import sweep_figures
-from experiments.report import sweep_report
+from experiments.report.html import sweep_report
 from experiments.runs import (
     Arm,
     certificate_of,
@@ -30,8 +27,9 @@ from experiments.runs import (
     write_results,
 )
 from experiments.settings import SweepSettings
+from experiments.terminal import wrapped
 from ncs_gym.envs.env import ncs_env
-from shields import Certificate, verify
+from shields import verify
 
 # Budget of `--smoke`, which takes the first and the last value of each side of the grid.
 _SMOKE = {"steps": 1_024, "episodes": 4, "seeds": 1}
@@ -49,18 +47,7 @@ _GridPoint = dict[str, Any]
 
 
 def sweep(settings: SweepSettings) -> None:
-    """Runs `ncs sweep`.
-
-    Raises:
-        ValueError: If a setting is out of range, a channel impossible, or a stored result damaged.
-        FolderInUseError: If another command is writing to the output folder.
-        OtherResultsError: If the output folder holds finished results of other settings.
-        OSError: If the output folder cannot be written.
-        CertificateError: If a given certificate does not verify.
-        Infeasible: If no certificate is found.
-        RunError: If a run fails.
-        ClusterError: If a cluster cannot execute the runs.
-    """
+    """Runs `ncs sweep`."""
     ends = {name: tuple(dict.fromkeys((side[0], side[-1]))) for name in _SIDES if (side := getattr(settings, name))}
     settings = short_version(settings, **_SMOKE, **ends)
     points = _grid_points(settings)
@@ -73,49 +60,39 @@ def sweep(settings: SweepSettings) -> None:
     require_trainable(settings, loops[0])
     certificates = [certificate_of(loop, settings.certificate, settings.safe_set) for loop in loops]
     with claim_folder("sweep", settings.completed):
-        _sweep_in_folder(settings, points, loops, certificates)
-
-
-def _sweep_in_folder(
-    settings: SweepSettings,
-    points: Sequence[_GridPoint],
-    loops: Sequence[LoopConfig],
-    certificates: Sequence[Certificate],
-) -> None:
-    """Executes what is missing, prints the table and writes the files."""
-    prepare_output(settings.out)
-    print(wrapped(settings.agent_line), flush=True)
-    settings = settings.completed
-    runs = [
-        run_of_arm(settings, loop, certificate, name, index, grid_point=_name(point))
-        for point, loop, certificate in zip(points, loops, certificates, strict=True)
-        for index in range(settings.seeds)
-        for name in settings.arms
-    ]
-    results = results_of(runs, settings.out, settings)
-    per_point = len(runs) // len(points)
-    parts = [
-        episodes_table(
-            results[i * per_point : (i + 1) * per_point],
-            **{name: float("nan" if value is None else value) for name, value in point.items()},
-        )
-        for i, point in enumerate(points)
-    ]
-    arms = [arm_summaries(part, settings.mode) for part in parts]
-    summary = {
-        "cells": [point | {"arms": each} for point, each in zip(points, arms, strict=True)]
-    } | experiment_provenance("sweep", settings, loops[0], certificates[0], runs)
-    figures = sweep_figures(summary, settings.arms)
-    certificates[0].save(settings.out / "certificate.json")
-    verification = verify(certificates[0], ncs_env(loops[0].single()).plant)
-    files = {
-        "episodes.parquet": parquet(pd.concat(parts), summary),
-        "report.html": sweep_report(summary, verification, dict(figures.values())),
-    }
-    write_results(settings.out, summary, files, figures)
-    count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
-    print(f"{settings.env}: {count} per arm and channel\n", sweep_table(summary["cells"]), sep="\n")
-    print(f"files: {settings.out}")
+        prepare_output(settings.out)
+        print(wrapped(settings.agent_line), flush=True)
+        settings = settings.completed
+        runs = [
+            run_of_arm(settings, loop, certificate, name, index, grid_point=_name(point))
+            for point, loop, certificate in zip(points, loops, certificates, strict=True)
+            for index in range(settings.seeds)
+            for name in settings.arms
+        ]
+        results = results_of(runs, settings.out, settings)
+        per_point = len(runs) // len(points)
+        parts = [
+            episodes_table(
+                results[i * per_point : (i + 1) * per_point],
+                **{name: float("nan" if value is None else value) for name, value in point.items()},
+            )
+            for i, point in enumerate(points)
+        ]
+        arms = [arm_summaries(part, settings.mode) for part in parts]
+        summary = {
+            "cells": [point | {"arms": each} for point, each in zip(points, arms, strict=True)]
+        } | experiment_provenance("sweep", settings, loops[0], certificates[0], runs)
+        figures = sweep_figures(summary, settings.arms)
+        certificates[0].save(settings.out / "certificate.json")
+        verification = verify(certificates[0], ncs_env(loops[0].single()).plant)
+        files = {
+            "episodes.parquet": parquet(pd.concat(parts), summary),
+            "report.html": sweep_report(summary, verification, dict(figures.values())),
+        }
+        write_results(settings.out, summary, files, figures)
+        count = "1 run" if settings.seeds == 1 else f"{settings.seeds} runs"
+        print(f"{settings.env}: {count} per arm and channel\n", sweep_table(summary["cells"]), sep="\n")
+        print(f"files: {settings.out}")
 
 
 def _grid_points(settings: SweepSettings) -> list[_GridPoint]:
@@ -133,7 +110,6 @@ def _grid_points(settings: SweepSettings) -> list[_GridPoint]:
 
 
 def _name(point: _GridPoint) -> str:
-    """Returns the name of a point in file names."""
     short = {"quantization_step": "q", "burst_length": "burst", "mass_factor": "mass", "downlink_loss": "down"}
     return "-".join(f"{short.get(name, name)}{value}" for name, value in point.items() if value is not None)
 

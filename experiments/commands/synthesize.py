@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import shields
 from experiments.runs import require_place
-from experiments.runs.environments import registered_env
-from experiments.runs.synthesis_status import synthesis_status
+from experiments.runs.loops import registered_env
 from experiments.settings import SynthesizeSettings
 from experiments.settings.certificates import changed_contract
+from experiments.terminal import synthesis_status
 from ncs_gym import ChannelContract, LinearPlant
 from shields.certificate_text import size_of
 from shields.errors import SynthesisInterrupted
@@ -16,14 +16,7 @@ _DEFAULT_ENV = "ncs_gym/TruckTrailerCruise-v0"
 
 
 def synthesize(settings: SynthesizeSettings) -> None:
-    """Runs `ncs synthesize`.
-
-    Raises:
-        ValueError: If the environment is unknown, the plant's file cannot be read, or a setting is out of range.
-        Infeasible: If no certificate is found.
-        SynthesisInterrupted: If it is interrupted; the best certificate so far is saved.
-        OSError: If the file cannot be written.
-    """
+    """Runs `ncs synthesize`."""
     require_place(settings.out)
     plant, contract = _plant_and_contract(settings)
     try:

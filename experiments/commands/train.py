@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from agents.loop import LoopConfig
-from experiments.analysis.episodes import episodes_table
-from experiments.analysis.summary import arm_summary
+from experiments.analysis.episodes import arm_summary, episodes_table
 from experiments.analysis.tables import summary_text
-from experiments.analysis.terminal_text import wrapped
 from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.runs import (
@@ -24,54 +21,38 @@ from experiments.runs import (
     write_results,
 )
 from experiments.settings import BackendSettings, TrainSettings
-from shields import Certificate
+from experiments.terminal import wrapped
 
 # Budget of `--smoke`.
 _SMOKE = {"steps": 4_096, "episodes": 10}
 
 
 def train(settings: TrainSettings) -> None:
-    """Runs `ncs train`.
-
-    Raises:
-        ValueError: If a setting is out of range or a stored result is damaged.
-        FolderInUseError: If another command is writing to the output folder.
-        OtherResultsError: If the output folder holds finished results of other settings.
-        OSError: If the output folder cannot be written.
-        CertificateError: If a given certificate does not verify.
-        Infeasible: If no certificate is found.
-        RunError: If the run fails.
-    """
+    """Runs `ncs train`."""
     settings = short_version(settings, **_SMOKE)
     Arm.of(settings.arm, settings.mode)
     loop = loop_config(settings.env, settings.channel)
     require_trainable(settings, loop)
     certificate = certificate_of(loop, settings.certificate, settings.safe_set)
     with claim_folder("train", settings.completed):
-        _train_in_folder(settings, loop, certificate)
-
-
-def _train_in_folder(settings: TrainSettings, loop: LoopConfig, certificate: Certificate) -> None:
-    """Trains and evaluates, prints the table and writes the files."""
-    prepare_output(settings.out)
-    print(wrapped(settings.agent_line), flush=True)
-    settings = settings.completed
-    run = run_of_arm(settings, loop, certificate, settings.arm, 0)
-    run = going_on(settings.out, run, anew=settings.force)
-    if run.start is not None:
-        print(f"the training in {settings.out} goes on after {run.start.steps:,} steps", flush=True)
-    results = results_of([run], settings.out, BackendSettings(jobs=1))
-    forget_checkpoint(settings.out, run)
-    mode = Arm.of(settings.arm, settings.mode).mode
-    arms = {settings.arm: arm_summary(episodes_table(results), mode, fixed_policy=True)}
-    certificate.save(settings.out / "certificate.json")
-    summary = {"arms": arms, "went_on_after": run.start.steps if run.start else 0} | experiment_provenance(
-        "train", settings, loop, certificate, [run]
-    )
-    write_results(settings.out, summary)
-    print(f"{results[0].train_steps:,} training steps, {settings.episodes:,} episodes\n")
-    print(summary_text(arms, {}), *_hints(results[0], is_smoke=settings.smoke), sep="\n")
-    print(f"agent: {settings.out / 'models' / run.name}")
+        prepare_output(settings.out)
+        print(wrapped(settings.agent_line), flush=True)
+        settings = settings.completed
+        run = run_of_arm(settings, loop, certificate, settings.arm, 0)
+        run = going_on(settings.out, run, anew=settings.force)
+        if run.start is not None:
+            print(f"the training in {settings.out} goes on after {run.start.steps:,} steps", flush=True)
+        results = results_of([run], settings.out, BackendSettings(jobs=1))
+        forget_checkpoint(settings.out, run)
+        mode = Arm.of(settings.arm, settings.mode).mode
+        arms = {settings.arm: arm_summary(episodes_table(results), mode, fixed_policy=True)}
+        certificate.save(settings.out / "certificate.json")
+        summary = {"arms": arms, "went_on_after": run.start.steps if run.start else 0}
+        summary |= experiment_provenance("train", settings, loop, certificate, [run])
+        write_results(settings.out, summary)
+        print(f"{results[0].train_steps:,} training steps, {settings.episodes:,} episodes\n")
+        print(summary_text(arms, {}), *_hints(results[0], is_smoke=settings.smoke), sep="\n")
+        print(f"agent: {settings.out / 'models' / run.name}")
 
 
 def _hints(result: RunResult, *, is_smoke: bool) -> list[str]:

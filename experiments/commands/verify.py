@@ -7,7 +7,7 @@ from dataclasses import asdict
 
 import shields
 from experiments.runs import require_place
-from experiments.runs.environments import registered_env
+from experiments.runs.loops import registered_env
 from experiments.settings import VerifySettings
 from ncs_gym import LinearPlant
 from ncs_gym.registration import registered_ids
@@ -16,14 +16,7 @@ from shields.atomic_write import write_atomically
 
 
 def verify(settings: VerifySettings) -> None:
-    """Runs `ncs verify`.
-
-    Raises:
-        CertificateError: If the certificate is damaged, of an unknown plant or does not verify.
-        ValueError: If the environment is unknown, or the plant's file cannot be read.
-        ModuleNotFoundError: If the engine is "flint" and python-flint is not installed.
-        OSError: If the verdicts cannot be written.
-    """
+    """Runs `ncs verify`."""
     require_place(settings.out)
     certificate = Certificate.load(settings.file)
     if settings.plant is None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from experiments.network_loop.impairment import Impairment, open_line
 from experiments.network_loop.log import StepLog
-from experiments.runs.environments import registered_env
+from experiments.runs.loops import registered_env
 from experiments.runs.policies import policy_by_name
 from ncs_gym import Actuator, AdversarialDisturbance, Channel, NCSEnv
 from ncs_gym.network import downlink_protocol

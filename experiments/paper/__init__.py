@@ -4,19 +4,6 @@
 `late_packets` has the filter of the paper, which the rest of this project does not use.
 """
 
-from experiments.paper.audit import Claim, Verdict, audited_claims, defects
 from experiments.paper.paper_example import PaperExample
-from experiments.paper.reproduction import Outcome, Simulation, StateFeedback, designs, simulate
 
-__all__ = [
-    "Claim",
-    "Outcome",
-    "PaperExample",
-    "Simulation",
-    "StateFeedback",
-    "Verdict",
-    "audited_claims",
-    "defects",
-    "designs",
-    "simulate",
-]
+__all__ = ["PaperExample"]

@@ -205,7 +205,6 @@ def _effort(K: np.ndarray, L: np.ndarray) -> float:
 
 
 def _limited(claim: str, printed: str, computed: str, holds: bool) -> Claim:
-    """Returns a row about the input limit, which row 12 explains."""
     explained = "" if holds else "row 12 explains rows 5 and 6 together: K is OP's optimum for another limit"
     return Claim(claim, printed, computed, Verdict.of(holds), explained, Defect.INPUT_LIMIT)
 
@@ -288,7 +287,6 @@ def simulated_error(example: PaperExample) -> Claim:
 
 
 def _gain_norm(example: PaperExample) -> float:
-    """Returns |B K|_2."""
     return float(np.linalg.norm(example.B @ example.K, 2))
 
 
@@ -372,7 +370,6 @@ def optimum(example: PaperExample, u_max: float, *, with_misread_margin: bool = 
 
 
 def _design_text(L: np.ndarray, K: np.ndarray) -> str:
-    """Returns K, the off-diagonal entry of M and the effort."""
     gain = ", ".join(f"{entry:.4f}" for entry in K.ravel())
     return f"K = [{gain}], M12 = {float(np.linalg.inv(L)[0, 1]):.2e}, K L K' = {_effort(K, L):.2f}"
 

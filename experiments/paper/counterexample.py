@@ -187,7 +187,6 @@ def contracts(closed: np.ndarray, M: np.ndarray) -> bool:
 
 
 def _squared(point: np.ndarray) -> Fraction:
-    """Returns z'z exactly."""
     return sum((Fraction(float(entry)) ** 2 for entry in point), Fraction(0))
 
 

@@ -1,15 +1,20 @@
-"""What all figures share: a caption, the PNG file, settings of matplotlib, labels and legends."""
+"""What all figures share: a caption, the PNG file, settings of matplotlib, labels, legends, and the look of an arm."""
 
 from __future__ import annotations
 
 import io
+from dataclasses import dataclass
 from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from experiments.runs.arms import Arm
 
 # Keys of matplotlib's settings are a type of their own, which plain text is not.
 STYLE: dict[Any, Any] = {
@@ -82,3 +87,120 @@ def thousands(value: float, _: object = None) -> str:
 def _width(names: list[str], columns: int) -> float:
     """Returns about how wide a legend is [inches]; matplotlib fills one column after the other."""
     return sum(_LETTER * max(map(len, part)) + _HANDLE for part in np.array_split(np.array(names), columns))
+
+
+# Color (Okabe and Ito's palette, which color-blind readers can distinguish) and marker (for print without color).
+ARM_COLORS_AND_MARKERS = {
+    "unshielded": ("#D55E00", "o"),
+    "monitor": ("#4D4D4D", "D"),
+    "penalized": ("#E69F00", "s"),
+    "shielded": ("#0072B2", "^"),
+    "shielded:project": ("#56B4E9", "v"),
+    "shielded:switch": ("#009E73", "P"),
+    "shielded:boundary": ("#CC79A7", "X"),
+    "shielded:lookahead": ("#000080", "p"),
+    "lagrangian": ("#DDCC77", "d"),
+    "trusting": ("#7F0000", "<"),
+    "psf": ("#117733", ">"),
+    "controller": ("#BBBBBB", "*"),
+}
+# Markers of policies that are not trained, in the color of what they are behind.
+_CONTROLLER_MARKERS = {
+    "proportional": "*",
+    "lqr": "H",
+    "governor": "^",
+    "random": "8",
+    "K x_hat": "1",
+    "zero input": "2",
+    "untrained": "3",
+}
+# Filters that share the color of another one.
+_HOLLOW = ("trusting:lookahead", "psf:tube")
+_SOLID, _DOTTED, _DASHED = "-", (0, (1.0, 1.3)), (0, (4.5, 1.6))
+# Length of a dash that stands for a price of 1 per violating step, in line widths; it doubles with every factor of ten.
+_PRICE_DASH = 6.0
+# Size of the marker of that price [points], and what every factor of ten adds.
+_PRICE_SIZE, _PRICE_GROWTH = 7.0, 3.0
+
+
+@dataclass(frozen=True)
+class ArmStyle:
+    """Style of an arm.
+
+    Attributes:
+        color: Hexadecimal color.
+        dashes: Line style of matplotlib.
+        marker: Marker of matplotlib.
+        hollow: Whether markers are outlines.
+        size: Size of the markers [points].
+    """
+
+    color: str
+    dashes: Any
+    marker: str
+    hollow: bool
+    size: float
+
+    @classmethod
+    def of(cls, name: str) -> ArmStyle:
+        """Returns the style of an arm: the color stands for the shield, dashed lines and hollow markers for a penalty.
+
+        Dotted lines and hollow markers stand for what acts in evaluation alone; so they do for the monitor, whose agent
+        is the unshielded one and whose curves lie on that arm's. The higher a price, the longer the dashes and the
+        larger the marker. Of fixed policies that share a color, the one behind a trusting lookahead is hollow.
+
+        Raises:
+            ValueError: If the arm is unknown.
+        """
+        arm = Arm.of(name)
+        color, marker = ARM_COLORS_AND_MARKERS[_look_of(arm)]
+        if name == "monitor" or not arm.filters_training:
+            return cls(color, _DOTTED, marker if arm.filters_training else "h", hollow=True, size=11.0)
+        if not arm.is_trained:
+            hollow = str(arm.mode).startswith(_HOLLOW)
+            return cls(color, _DASHED, _CONTROLLER_MARKERS[arm.policy.partition(":")[0]], hollow, size=9.0)
+        if arm.violation_weight is not None:
+            decades = np.log10(max(arm.violation_weight, 1e-9))
+            dash = float(np.clip(_PRICE_DASH * 2.0**decades, 0.5, 50.0))
+            size = float(np.clip(_PRICE_SIZE + _PRICE_GROWTH * decades, 3.0, 14.0))
+            return cls(color, (0, (dash, 1.6)), marker, hollow=True, size=size)
+        changed = arm.penalizes_interventions or arm.is_residual or str(arm.mode).startswith(_HOLLOW)
+        return cls(color, _DASHED if changed else _SOLID, marker, hollow=changed, size=10.0 if changed else 7.0)
+
+    @property
+    def line(self) -> dict[str, Any]:
+        """Keyword arguments of matplotlib for lines."""
+        return {"color": self.color, "ls": self.dashes}
+
+    @property
+    def points(self) -> dict[str, Any]:
+        """Keyword arguments of matplotlib for markers; their fill is transparent."""
+        return {
+            "marker": self.marker,
+            "ms": self.size,
+            "mfc": "none" if self.hollow else to_rgba(self.color, 0.45),
+            "mec": self.color,
+            "mew": 1.3,
+        }
+
+    def handle(self, *, line: bool = True, points: bool = False) -> Line2D:
+        """Returns the arm's entry in a legend."""
+        shape = self.line | {"lw": 2.0} if line else {"ls": "none"}
+        return Line2D([], [], **shape, **(self.points if points else {}))
+
+
+def _look_of(arm: Arm) -> str:
+    """Returns the key of an arm's color and marker."""
+    if not arm.is_trained and arm.mode is None:
+        return "controller"
+    if arm.penalizes_violations:
+        return "lagrangian" if arm.adapts_penalty else "penalized"
+    if arm.mode is None:
+        return "unshielded"
+    named = f"shielded:{arm.mode}"
+    return named if arm.is_shielded and (named in arm.name or arm.mode == "lookahead") else _default(arm)
+
+
+def _default(arm: Arm) -> str:
+    """Returns the key of an arm behind a filter that does not name a mode of the shield."""
+    return "shielded" if arm.is_shielded else str(arm.mode).partition(":")[0]

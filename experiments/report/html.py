@@ -1,8 +1,9 @@
-"""The reports of `ncs compare` and `ncs sweep`, and the templates; everything that a template inserts is escaped."""
+"""Pages with tables and figures; everything that a template inserts is escaped."""
 
 from __future__ import annotations
 
 import base64
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -10,7 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from experiments.analysis.statistics import CONFIDENCE, RESAMPLES
 from experiments.json_values import flat
-from experiments.plots.arm_style import ArmStyle
+from experiments.plots.figure_style import ArmStyle
 from experiments.runs.arms import Arm
 from shields import Report
 
@@ -23,7 +24,7 @@ _PNG_WIDTH = slice(16, 20)
 def comparison_report(
     summary: dict[str, Any], verification: Report, figures: dict[str, bytes], findings: list[str]
 ) -> str:
-    """Returns the page: tables, findings, figures, certificate and settings; opens offline.
+    """Returns the page of `ncs compare`: tables, findings, figures, certificate and settings; opens offline.
 
     Args:
         summary: Content of summary.json.
@@ -31,71 +32,25 @@ def comparison_report(
         figures: PNG files by caption.
         findings: Sentences to print under the first table.
     """
-    return _rendered(
-        "comparison.html.j2",
-        f"Safe learning on {summary['settings']['env']}",
-        "compare",
-        summary,
-        verification,
-        figures,
-        runs=max(arm["runs"] for arm in summary["arms"].values()),
-        findings=findings,
-    )
+    runs, title = max(arm["runs"] for arm in summary["arms"].values()), f"Safe learning on {summary['settings']['env']}"
+    context = _origin("compare", summary, verification)
+    return render_page("comparison.html.j2", _named(figures), title=title, runs=runs, findings=findings, **context)
 
 
 def sweep_report(summary: dict[str, Any], verification: Report, figures: dict[str, bytes]) -> str:
-    """Returns the page: figures, a table of every channel and arm, certificate and settings; opens offline.
+    """Returns the page of `ncs sweep`: figures, a table of every channel and arm, certificate and settings.
 
     Args:
         summary: Content of summary.json.
         verification: Exact verification of the certificate.
         figures: PNG files by caption.
     """
-    title = f"Channels of {summary['settings']['env']}"
-    return _rendered("sweep.html.j2", title, "sweep", summary, verification, figures)
+    title, context = f"Channels of {summary['settings']['env']}", _origin("sweep", summary, verification)
+    return render_page("sweep.html.j2", _named(figures), title=title, **context)
 
 
-def _rendered(
-    template: str,
-    title: str,
-    command: str,
-    summary: dict[str, Any],
-    verification: Report,
-    figures: dict[str, bytes],
-    **context: Any,
-) -> str:
-    """Returns a report: one HTML page that contains its figures and opens offline.
-
-    Args:
-        template: Name of the template.
-        title: Title of the page.
-        command: Command of `ncs` that made the results.
-        summary: Content of summary.json.
-        verification: Exact verification of the certificate.
-        figures: PNG files by caption.
-        **context: Further variables of the template.
-    """
-    settings = summary["settings"]
-    return (
-        _environment()
-        .get_template(template)
-        .render(
-            title=title,
-            command=command,
-            summary=summary,
-            settings=settings,
-            shown_settings={name: _text(value) for name, value in flat(settings).items()},
-            verification=verification,
-            images=[_image(caption, png) for caption, png in figures.items()],
-            percent=f"{100 * CONFIDENCE:.0f}\N{NO-BREAK SPACE}%",
-            resamples=RESAMPLES,
-            **context,
-        )
-    )
-
-
-def render_page(template: str, figures: dict[str, tuple[str, bytes]], **context: Any) -> str:
-    """Returns a page that is not about a single environment: HTML that contains its figures, or Markdown.
+def render_page(template: str, figures: Mapping[str, tuple[str, bytes]], **context: Any) -> str:
+    """Returns a page: HTML that contains its figures and opens offline, or Markdown.
 
     Args:
         template: Name of the template; only that of an HTML page escapes what it inserts.
@@ -105,6 +60,17 @@ def render_page(template: str, figures: dict[str, tuple[str, bytes]], **context:
     images = {name: _image(caption, png) for name, (caption, png) in figures.items()}
     percent = f"{100 * CONFIDENCE:.0f}\N{NO-BREAK SPACE}%"
     return _environment().get_template(template).render(images=images, percent=percent, resamples=RESAMPLES, **context)
+
+
+def _origin(command: str, summary: dict[str, Any], verification: Report) -> dict[str, Any]:
+    """Returns the variables that say where results of a command come from."""
+    settings = summary["settings"]
+    shown = {name: _text(value) for name, value in flat(settings).items()}
+    return dict(command=command, summary=summary, settings=settings, shown_settings=shown, verification=verification)
+
+
+def _named(figures: dict[str, bytes]) -> dict[str, tuple[str, bytes]]:
+    return {str(number): figure for number, figure in enumerate(figures.items())}
 
 
 @cache
@@ -140,16 +106,11 @@ def _is_trained_arm(name: str) -> bool:
 def _image(caption: str, png: bytes) -> dict[str, Any]:
     """Returns a figure as a template inserts it; the first sentence of its caption is its title."""
     width = round(int.from_bytes(png[_PNG_WIDTH]) / _PIXEL_RATIO)
-    return {
-        "caption": caption,
-        "title": caption.partition(". ")[0],
-        "width": width,
-        "data": base64.b64encode(png).decode(),
-    }
+    title, data = caption.partition(". ")[0], base64.b64encode(png).decode()
+    return {"caption": caption, "title": title, "width": width, "data": data}
 
 
 def _text(value: Any) -> str:
-    """Returns a setting as text."""
     if isinstance(value, list):
         return " ".join(map(str, value)) or "none"
     return "none" if value is None else str(value)
@@ -160,7 +121,6 @@ def _decimal(value: float, sign: str = "") -> str:
 
 
 def _interval(interval: list[float] | None, sign: str = "") -> str:
-    """Returns an interval as text, or that there is none."""
     return f"[{_decimal(interval[0], sign)}, {_decimal(interval[1], sign)}]" if interval else "none: one run"
 
 

@@ -160,7 +160,6 @@ def _trained_arms(filters: dict[str, str]) -> Iterator[Arm]:
 
 
 def _is_weight(text: str) -> bool:
-    """Returns whether a text is a number that a violating step may cost."""
     try:
         return 0.0 <= float(text) < float("inf")
     except ValueError:

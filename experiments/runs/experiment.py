@@ -8,12 +8,11 @@ from typing import Any
 
 from agents.loop import LoopConfig
 from experiments.runs.arms import Arm
-from experiments.runs.environments import module_and_id
+from experiments.runs.loops import module_and_id, other_scenarios
 from experiments.runs.provenance import versions
-from experiments.runs.scenarios import other_scenarios
-from experiments.runs.synthesis_status import synthesis_status
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings, LearningSettings, settings_json
+from experiments.terminal import synthesis_status
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, Report
 from shields.certificate_text import size_of

@@ -1,15 +1,76 @@
-"""The control loop that a command's settings ask for: a registered environment, with changes of its channel by name."""
+"""The control loop that settings ask for: a registered environment, its channel, and scenarios of evaluation."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+import importlib
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields, replace
+from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+
 from agents.loop import LoopConfig
-from experiments.runs.environments import module_and_id, registered_env
-from ncs_gym import Channel, GilbertElliott
+from ncs_gym import Channel, ChannelContract, GilbertElliott, NCSEnv
 from ncs_gym.envs.env import ncs_env
+from ncs_gym.network import contract_of
+from ncs_gym.registration import needing_extras, registered_ids
+
+
+def registered_env(env_id: str) -> NCSEnv:
+    """Returns a registered environment that has a plant of its own.
+
+    Args:
+        env_id: Id, or "module:id" as Gymnasium takes it, which imports the module: only for ids that the user gave.
+
+    Raises:
+        ValueError: If the id is not registered or has no plant of its own, or there is no such module.
+    """
+    module, name = module_and_id(env_id)
+    if module:
+        import_module(module)
+        if name not in gym.registry:
+            raise ValueError(f"module {module!r} registers no environment {name!r}")
+    elif name not in registered_ids() and name not in needing_extras():
+        raise ValueError(
+            f"unknown environment {env_id!r}; known are {', '.join(registered_ids())}, and --env module:id imports the "
+            "module that registers one of your own"
+        )
+    return ncs_env(gym.make(name))
+
+
+def module_and_id(env_id: str) -> tuple[str, str]:
+    """Returns the module of "module:id", empty for an id alone, and the id by which the environment is registered."""
+    module, _, name = env_id.rpartition(":")
+    return module, name
+
+
+def import_module(module: str) -> None:
+    """Imports a module of the user's, which registers environments; it may lie in the working directory.
+
+    Raises:
+        ValueError: If there is no such module.
+    """
+    if not all(part.isidentifier() for part in module.split(".")):
+        raise ValueError(f"--env module:id needs the name of a module, got {module!r}")
+    folder = os.getcwd()
+    if folder not in sys.path:
+        sys.path.append(folder)  # last, so that no file there stands in for an installed module
+    try:
+        importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise  # something that the module itself imports is missing
+        raise ValueError(f"there is no module {module!r}, neither installed nor in {folder}") from error
+
+
+def module_digest(module: str) -> str:
+    """Returns the SHA-256 of an imported module's source, empty for no module: what it registers may change."""
+    file = getattr(sys.modules.get(module), "__file__", None)
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest() if file else ""
 
 
 def loop_config(env_id: str, channel: Mapping[str, Any] | None = None, **kwargs: Any) -> LoopConfig:
@@ -82,3 +143,107 @@ def _bursts(loss: float, length: float, send_period: int = 1) -> GilbertElliott:
         factor = (1.0 - eigenvalue ** (1.0 / send_period)) / (left + entered)
         left, entered = factor * left, factor * entered
     return GilbertElliott(p_good_to_bad=entered, p_bad_to_good=left)
+
+
+# The scenario that agents are trained under.
+AS_TRAINED = "as trained"
+
+
+def scenario_named(name: str) -> str:
+    """Returns a scenario's name as it is printed; hyphens stand for spaces.
+
+    Raises:
+        ValueError: If it is unknown.
+    """
+    for known in (AS_TRAINED, *_CHANGES):
+        if known.replace("-", " ") == name.replace("-", " "):
+            return known
+    raise ValueError(f"unknown scenario {name!r}; known are {', '.join((AS_TRAINED, *_CHANGES))}")
+
+
+def other_scenarios(names: Sequence[str]) -> tuple[str, ...]:
+    """Returns the different scenarios that are named, without that of the training.
+
+    Raises:
+        ValueError: If one is unknown.
+    """
+    return tuple(dict.fromkeys(name for each in names if (name := scenario_named(each)) != AS_TRAINED))
+
+
+def under(scenario: str, loop: LoopConfig) -> LoopConfig:
+    """Returns a control loop under a scenario; everything else stays the same.
+
+    Args:
+        scenario: A name that `scenario_named` returns.
+        loop: The control loop as it was in training.
+
+    Raises:
+        ValueError: If the scenario is unknown, or the channel cannot be worse within the contract.
+    """
+    return loop if scenario == AS_TRAINED else _CHANGES[scenario_named(scenario)](loop)
+
+
+def worse_channel(channel: Channel, contract: ChannelContract | None) -> Channel:
+    """Returns a channel on which half of the packets that arrived are lost too, and the others are later.
+
+    All are as late as the latest were, and, as far as a contract allows it, later by one transmission period. Without
+    a contract every delay is allowed; with one, losses are where the channel loses packets at all.
+
+    Args:
+        channel: The channel that agents were trained with.
+        contract: What the certificate assumes of the channel; None for nothing.
+
+    Raises:
+        ValueError: If there is no worse channel within the contract.
+    """
+    later = channel.send_period
+    promised = contract_of(channel)
+    if contract is not None:
+        later = max(0, min(later, contract.max_age - promised.max_age)) if promised is not None else 0
+    loses = contract is None or channel.most_consecutive_losses != 0
+    worse = replace(
+        channel,
+        loss=_more_loss(channel.loss) if loses else channel.loss,
+        delay=channel.longest_delay + later,
+        jitter=0,
+    )
+    if worse == channel or (contract is not None and not contract.is_kept_by(worse)):
+        raise ValueError(f"no channel within the contract is worse than {channel}")
+    return worse
+
+
+def _more_loss(loss: float | GilbertElliott) -> float | GilbertElliott:
+    """Returns losses that let half as many packets through, in each state of a bursty channel."""
+    if isinstance(loss, GilbertElliott):
+        return replace(loss, loss_good=_more_loss(loss.loss_good), loss_bad=_more_loss(loss.loss_bad))
+    return 0.5 * (1.0 + loss)
+
+
+def _on_worse_channel(loop: LoopConfig) -> LoopConfig:
+    env = ncs_env(loop.single())
+    return loop.with_kwargs(channel=asdict(worse_channel(env.channel, env.contract)))
+
+
+def bursts_at_their_longest(channel: Channel) -> Channel:
+    """Returns a channel that loses as many packets in a row as it may, each time; one without losses as it is."""
+    return channel if channel.most_consecutive_losses == 0 else replace(channel, loss=1.0)
+
+
+def _on_ideal_channel(loop: LoopConfig) -> LoopConfig:
+    return loop.with_kwargs(channel=asdict(Channel()))
+
+
+def _attacked(loop: LoopConfig) -> LoopConfig:
+    """Returns a loop with the disturbance that does the most harm, noise of full size, and bursts at their longest."""
+    worst = bursts_at_their_longest(ncs_env(loop.single()).channel)
+    return loop.with_kwargs(disturbance="adversarial", noise="extreme", channel=asdict(worst))
+
+
+_CHANGES: dict[str, Callable[[LoopConfig], LoopConfig]] = {
+    "worst-case disturbance": lambda loop: loop.with_kwargs(disturbance="adversarial"),
+    "worse channel": _on_worse_channel,
+    "gaussian": lambda loop: loop.with_kwargs(noise="gaussian"),
+    "ideal channel": _on_ideal_channel,
+    "attacked": _attacked,
+    "attacked on an ideal channel": lambda loop: _on_ideal_channel(_attacked(loop)),
+}

@@ -17,7 +17,6 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from agents.former_settings import from_former_file
 from experiments.errors import FolderInUseError, OtherResultsError, ResultsError
 from experiments.json_values import flat
 from experiments.runs.experiment import INCIDENTAL_SETTINGS
@@ -26,7 +25,7 @@ from experiments.settings.settings_file import FORMAT as SETTINGS_FORMAT
 from shields.atomic_write import write_atomically
 
 # Files by which a folder is known to hold something finished.
-_FINISHED = ("summary.json", "certify.json", "runs/*.json", "units/*.json")  # the last of earlier versions
+_FINISHED = ("summary.json", "certify.json", "runs/*.json")
 _FINISHED_PARTS = {"study": ("*/summary.json",), "train": ("tensorboard/*/checkpoint/agent.json",)}
 # Settings that results do not depend on; what "smoke" changes is compared by itself.
 _IGNORED = {*INCIDENTAL_SETTINGS, "smoke", "page", "quote"}
@@ -209,7 +208,6 @@ def _require_same(folder: Path, command: str, settings: Any) -> None:
         kept_command, kept = document["command"], document["settings"]
         if not isinstance(kept, dict):
             raise TypeError("settings")
-        kept = from_former_file(kept)
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise OtherResultsError(
             f"{folder} holds finished results, and no settings.json that says of what: {advice}"

@@ -42,8 +42,11 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
         return lambda observation, info: rng.uniform(-1.0, 1.0, size).astype(np.float32)
     if name == "greedy":
         return lambda observation, info: _greedy_action(env, observation, info["estimate"])
-    from agents.agent import Agent  # imports torch
-    from agents.sb3_zip import is_sb3_zip, load_sb3_zip
+    from agents.agent import (
+        Agent,  # imports torch
+        is_sb3_zip,
+        load_sb3_zip,
+    )
 
     path = pretrained_folder(env_id) if name == PRETRAINED else Path(name)
     agent = load_sb3_zip(path, env_id) if is_sb3_zip(path) else Agent.load(agent_folder(path))

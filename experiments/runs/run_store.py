@@ -1,4 +1,4 @@
-"""Results of finished runs in a folder, so that an interrupted experiment continues where it stopped.
+"""What a run is to those who execute it and keep its result, and the store of results, from which experiments go on.
 
 Checksums find damage, not forgery: of what is read, only what can be a result of its run comes back.
 """
@@ -7,17 +7,78 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from agents.sharing.agent_file import require_names, write_files
 from experiments.errors import ResultsError
 from experiments.json_values import from_json, to_json
-from experiments.runs.run import Result, Run
 from ncs_gym.validation import MAX_QUOTED_LENGTH
 from shields.atomic_write import write_atomically
 from shields.json_documents import document_of, read_content
+
+
+class Result(Protocol):
+    """What a run leaves: a dataclass of numbers, texts and arrays, and the files of an agent."""
+
+    @property
+    def outcome(self) -> str:
+        """What came out, in one line; empty for nothing that somebody waits for."""
+        ...
+
+    @property
+    def files(self) -> Mapping[str, bytes]:
+        """Contents of the agent's files by name; no field where a run leaves none."""
+        ...
+
+
+class Run(Protocol):
+    """Settings of something that one process executes; its result is a pure function of them. Runs are pickled."""
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """What its steps belong to, for the progress bar."""
+        ...
+
+    @property
+    def result_type(self) -> type:
+        """Dataclass of its result."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """Name in file names, progress lines and messages."""
+        ...
+
+    @property
+    def key(self) -> str:
+        """SHA-256 of everything that the result depends on."""
+        ...
+
+    @property
+    def total_steps(self) -> int:
+        """Number of simulated steps."""
+        ...
+
+    @property
+    def leaves(self) -> tuple[str, ...]:
+        """Names of the files that it leaves."""
+        ...
+
+    def execute(self, on_progress: Callable[[int], None], log_folder: Path | None = None) -> Any:
+        """Returns the result; calls `on_progress` with the number of steps taken since its last call."""
+        ...
+
+    def require(self, result: Any) -> None:
+        """Returns if a result of the right type, from a file say, can be the run's.
+
+        Raises:
+            ValueError: If it has a value that the run cannot have had; the message names it.
+        """
+        ...
+
 
 _FORMAT = "ncs-gym run 3"
 
@@ -81,7 +142,6 @@ class RunStore:
             raise ResultsError(f"{path} is no result of its run ({reason}): delete it to repeat the run") from error
 
     def _files(self, run: Run, digests: dict[str, str]) -> dict[str, bytes]:
-        """Returns the contents of the agent's files; ValueError if one is missing or is not the one stored."""
         files = {}
         for name, checksum in digests.items():
             path = self._folder / "models" / run.name / name

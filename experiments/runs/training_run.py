@@ -21,9 +21,8 @@ from agents.results import Episode, TrainingPoint, Trajectory
 from agents.sharing.agent_file import AGENT_FILES, write_files
 from experiments.baselines import controller, tuned_weights
 from experiments.json_values import to_json
-from experiments.runs.environments import import_module, module_digest
+from experiments.runs.loops import AS_TRAINED, import_module, module_digest, under
 from experiments.runs.provenance import versions
-from experiments.runs.scenarios import AS_TRAINED, under
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import LARGEST_NUMBER, shown
 from shields import Certificate

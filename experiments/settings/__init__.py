@@ -1,26 +1,27 @@
 """What each command can be told: frozen dataclasses that the parser turns into flags, and the file that keeps them."""
 
-from experiments.settings.assignments import Assignments
-from experiments.settings.backend import BackendSettings
+from experiments.settings.arguments import Assignments
 from experiments.settings.certificates import (
     AttackSettings,
     AuditSettings,
     ChannelSettings,
+    RenderSettings,
     ReproduceSettings,
     RequirementsSettings,
     SynthesizeSettings,
     VerifySettings,
 )
 from experiments.settings.learning import (
+    BackendSettings,
     CompareSettings,
     EvaluateSettings,
     LearningSettings,
+    StudySettings,
+    SweepSettings,
     TrainSettings,
 )
 from experiments.settings.network_loop import LoopSettings
-from experiments.settings.rendering import RenderSettings
 from experiments.settings.settings_file import config_defaults, save_settings, settings_json
-from experiments.settings.study import StudySettings, SweepSettings
 
 __all__ = [
     "Assignments",

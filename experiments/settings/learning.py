@@ -1,26 +1,63 @@
-"""Settings of the commands that train agents or evaluate them."""
+"""Settings of the commands that train agents or evaluate them, and of what executes their runs."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import re
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Any, Literal, Self
 
 import tyro
 
 from agents.hyperparams import DEFAULTS, read_hyperparams, tuned_hyperparams, tuned_steps, with_changes
 from agents.loop import LagrangianSettings
-from experiments.settings.assignments import Assignments
-from experiments.settings.backend import BackendSettings
-from experiments.settings.steps import OptionalStepCount, require_horizon, require_least
+from experiments.baselines.margins import MARGINS
+from experiments.settings.arguments import Assignments, OptionalStepCount, StepCount, require_horizon, require_least
 from ncs_gym.validation import shown
+
+# Address that starts a Ray cluster of its own on this machine.
+OWN_CLUSTER = "local"
+_ADDRESS = re.compile(r"local|auto|[\w.-]+:\d{1,5}|\[[0-9a-fA-F:]+\]:\d{1,5}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BackendSettings:
+    """Where training runs are executed; their results do not depend on it.
+
+    Attributes:
+        engine: "local" uses processes of this machine, "ray" a Ray cluster (docs/scaling.md).
+        jobs: Number of worker processes of the engine "local".
+        ray_address: "local" starts a Ray on this machine for as long as it is needed, "auto" joins the one that runs
+            here, HOST:PORT joins the cluster whose head that is; this machine has to be one of its nodes.
+        ray_wait: Seconds to wait for a node that is large enough for a run: for clusters that grow on demand.
+        cpus_per_run: Processor cores that Ray reserves for a run.
+        gpus_per_run: Graphics cards that Ray reserves for a run.
+    """
+
+    engine: Literal["local", "ray"] = "local"
+    jobs: int = 2
+    ray_address: str = OWN_CLUSTER
+    ray_wait: float = 0.0
+    cpus_per_run: float = 1.0
+    gpus_per_run: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range or belongs to another engine."""
+        require_least(self, jobs=1, ray_wait=0, cpus_per_run=0.0001)
+        if not _ADDRESS.fullmatch(self.ray_address):
+            raise ValueError(f"--ray-address must be local, auto or HOST:PORT, got {self.ray_address!r}")
+        whole = self.gpus_per_run <= 1.0 or self.gpus_per_run.is_integer()
+        if not 0.0 <= self.gpus_per_run < float("inf") or not whole:
+            raise ValueError(f"--gpus-per-run must be in [0, 1] or a whole number, got {self.gpus_per_run}")
+        if self.engine == "local":
+            for field in fields(BackendSettings)[2:]:
+                if getattr(self, field.name) != field.default:
+                    raise ValueError(f"--{field.name.replace('_', '-')} is a setting of --engine ray")
+
 
 # Training steps where none belong to tuned hyperparameters.
 _DEFAULT_STEPS = 150_000
 Algorithm = Literal["PPO", "A2C", "SAC", "TD3", "TRPO", "TQC", "CrossQ"]
-# Settings with the flags that they had before.
-Baselines = Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--references"])]
-Scenarios = Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--conditions"])]
 Mode = Literal["project", "lookahead", "switch", "boundary"]
 
 
@@ -175,7 +212,7 @@ class CompareSettings(BackendSettings, LearningSettings):
     out: Path = Path("runs/compare")
     seeds: int = 3
     arms: tuple[str, ...] = ("unshielded", "penalized", "trusting", "shielded")
-    baselines: Baselines = (
+    baselines: tuple[str, ...] = (
         "zero input",
         "K x_hat",
         "untrained",
@@ -183,7 +220,7 @@ class CompareSettings(BackendSettings, LearningSettings):
         "proportional+trusting",
         "proportional+shielded",
     )
-    scenarios: Scenarios = ("as trained",)
+    scenarios: tuple[str, ...] = ("as trained",)
     noise: Literal["truncated", "gaussian"] = "truncated"
 
     @property
@@ -249,3 +286,129 @@ class EvaluateSettings:
         require_least(self, episodes=1, seed=0)
         if self.shield != "as-trained":  # otherwise the agent knows
             require_horizon(self.horizon, self.shield)
+
+
+# Environments in which the network decides.
+NETWORK_ENVS = ("ncs_gym/CSTR-v0", "ncs_gym/Convoy-v0", "ncs_gym/LaneKeeping-v0")
+# What the shield is compared with and needs no training, margins in percent: a regulator alone, with a governor of its
+# references, or behind a filter, and model predictive control. The weights of each are tuned by themselves
+# (benchmarks/tune_baselines.py).
+_MARGINS = ("", *(f":{margin}" for margin in MARGINS))
+REGULATED_ARMS = (
+    "lqr",
+    *(f"governor{margin}" for margin in _MARGINS),
+    *(f"mpc{margin}" for margin in ("", ":20", ":40")),
+    *(f"lqr+{name}{margin}" for name in ("psf", "trusting", "trusting:lookahead") for margin in _MARGINS),
+    "lqr+psf:tube",
+    "lqr+shielded",
+    "lqr+lookahead",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepSettings(BackendSettings, LearningSettings):
+    """Compares arms over a grid of channels: how safety, return and interventions depend on the channel.
+
+    Every point of the grid is a comparison of its own with the same seeds. Leaves episodes.parquet, summary.json,
+    settings.json, report.html with heatmaps, and the models. Started again with the same folder, finished runs are
+    kept.
+
+    Attributes:
+        out: Output folder; created if it does not exist.
+        seeds: Number of paired training runs per arm and channel.
+        steps: Training steps per run, rounded up to whole rollouts.
+        episodes: Evaluation episodes per run.
+        arms: Arms of the comparison; see `ncs compare`.
+        losses: Loss probabilities of the grid.
+        delays: Delays of the grid [steps].
+        quantization_steps: Quantization steps of the grid; the environment's own if none is given.
+        burst_lengths: Mean numbers of packets lost in a row; 0 stands for independent losses.
+        mass_factors: Factors of the mass in the environment's process, the certificate being that of the model (factor
+            1); for environments whose process has a mass.
+        downlink_losses: Loss probabilities of commands, for environments with a downlink; the environment's own if none
+            is given. The heatmaps then show losses of samples against losses of commands. Where none are lost, inputs
+            are committed for the delay only.
+    """
+
+    out: Path = Path("runs/sweep")
+    seeds: int = 1
+    steps: StepCount = 50_000
+    episodes: int = 100
+    arms: tuple[str, ...] = ("unshielded", "shielded")
+    losses: tuple[float, ...] = (0.0, 0.3, 0.6)
+    delays: tuple[int, ...] = (0, 2, 4)
+    quantization_steps: tuple[float, ...] = ()
+    burst_lengths: tuple[float, ...] = (0.0,)
+    mass_factors: tuple[float, ...] = ()
+    downlink_losses: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        LearningSettings.__post_init__(self)
+        BackendSettings.__post_init__(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudySettings(BackendSettings):
+    """Compares arms in several environments and under several scenarios, with the statistics to judge them by.
+
+    Every environment is a comparison of its own (`ncs compare`) in a folder below the output folder, with the settings
+    of that command; then linear controllers and trained agents are attacked with every impairment of the channel on and
+    off. Leaves report.html, the same as a page of Markdown (docs/results.md is one), figures,
+    summary.json and episodes.parquet. Started again with the same folder, finished runs are kept: a long study can be
+    run in parts.
+
+    Attributes:
+        config: Settings file (settings.json) of an earlier study; its settings hold where none are given here.
+        out: Output folder; created if it does not exist.
+        envs: Ids of the environments; the first one comes first in the report.
+        seed: Seed of the study, >= 0.
+        seeds: Number of paired training runs per arm and environment.
+        budget: Fraction of the training steps of each environment, in (0, 1].
+        episodes: Evaluation episodes per run and scenario.
+        algo: Learning algorithm.
+        arms: Trained arms; see `ncs compare`.
+        baselines: Arms in which nothing is trained.
+        scenarios: What policies are evaluated under besides "as trained".
+        safe_set: What shields keep: the ellipsoid, which the filters beside them have too, or the polytope that other
+            commands take.
+        channel_episodes: Episodes per arm and combination of impairments; 0 leaves them out.
+        page: Also write the page of Markdown to this file, its figures into the folder images beside it, and its
+            numbers into the file with the ending .json.
+        quote: Pages in which the marked tables are replaced by those of this study.
+        smoke: Run a short version, whatever else is asked for, to see that everything works; if `--out` is not given,
+            in a folder of its own, with -smoke at the end of its name.
+        force: Replace finished results of other settings in the output folder, which otherwise is refused.
+    """
+
+    config: Path | None = None
+    out: Path = Path("runs/study")
+    envs: tuple[str, ...] = NETWORK_ENVS
+    seed: int = 0
+    seeds: int = 5
+    budget: float = 1.0
+    episodes: int = 100
+    algo: Algorithm = "PPO"
+    arms: tuple[str, ...] = ("unshielded", "penalized:10", "lagrangian", "trusting:20", "shielded", "lookahead")
+    baselines: tuple[str, ...] = REGULATED_ARMS
+    scenarios: tuple[str, ...] = ("ideal-channel", "worse-channel", "attacked", "attacked-on-an-ideal-channel")
+    safe_set: Literal["polytope", "ellipsoid"] = "ellipsoid"
+    channel_episodes: int = 100
+    page: Path | None = None
+    quote: tuple[Path, ...] = ()
+    smoke: bool = False
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a value is out of range."""
+        BackendSettings.__post_init__(self)
+        require_least(self, seeds=1, episodes=1, seed=0, channel_episodes=0)
+        if not 0.0 < self.budget <= 1.0:
+            raise ValueError(f"--budget must be in (0, 1], got {self.budget}")
+        if not self.envs or len(set(map(short_name, self.envs))) != len(self.envs):
+            raise ValueError(f"--envs must be different ones, at least one, got {' '.join(self.envs) or 'none'}")
+
+
+def short_name(env_id: str) -> str:
+    """Returns an environment's id without its namespace and module, as in names of folders."""
+    return env_id.rpartition(":")[2].rpartition("/")[2]

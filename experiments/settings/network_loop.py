@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from experiments.settings.steps import StepCount, require_horizon
+from experiments.settings.arguments import StepCount, require_horizon
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from agents.former_settings import from_former_file
 from experiments.errors import SettingsError
 from experiments.json_values import from_json
 from ncs_gym.validation import MAX_QUOTED_LENGTH, shown
@@ -99,7 +98,7 @@ def _load(path: Path, command: str, kind: type, names_folder: bool) -> Any:
                 "alone, and give --env module:id if you trust the module"
             )
     try:
-        settings = _read(from_former_file(values), kind)
+        settings = _read(values, kind)
         if not names_folder and not _is_near(settings.out, path):
             raise ValueError(f"out = {shown(str(settings.out))} lies neither here nor beside the file: give --out")
         return settings

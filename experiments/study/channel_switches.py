@@ -12,7 +12,7 @@ from experiments.analysis.statistics import clopper_pearson
 from experiments.backends.execution import results_of
 from experiments.errors import ResultsError
 from experiments.runs import Arm, RunStore, TrainingRun, certificate_of, loop_config, run_of_arm
-from experiments.runs.environments import registered_env
+from experiments.runs.loops import registered_env
 from experiments.settings import Assignments, CompareSettings
 from experiments.study.summary import ATTACKED
 from ncs_gym import Channel, ChannelContract
@@ -123,7 +123,6 @@ def channel_switches(settings: CompareSettings, agents: Mapping[str, AgentFiles]
 
 
 def _files(store: RunStore, run: TrainingRun) -> dict[str, bytes]:
-    """Returns the files of the agent that a run left."""
     result = store.load(run)
     if result is None:
         raise ResultsError(f"there is no result of the training {run.name}: run the comparison again")

@@ -8,9 +8,8 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 
-from experiments.plots.arm_style import ArmStyle
-from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below, thousands
-from experiments.runs.scenarios import AS_TRAINED
+from experiments.plots.figure_style import STYLE, ArmStyle, CaptionedFigure, label, legend_below, thousands
+from experiments.runs.loops import AS_TRAINED
 from experiments.study.summary import ATTACKED
 
 
@@ -111,12 +110,10 @@ def _by_run_figure(summary: dict[str, Any], caption: str, quantity: str, draw: A
 
 
 def _trained(env: dict[str, Any]) -> list[str]:
-    """Returns the arms of an environment in which agents were trained."""
     return [name for name in env["trained"] if env["arms"][name]["train_steps"]]
 
 
 def _draw_runs(axis: Axes, style: ArmStyle, values: list[float], height: int) -> None:
-    """Draws a number per run, and their mean."""
     axis.plot(values, [height] * len(values), "o", ms=4.0, mfc=style.color, mec="white", mew=0.5)
     axis.plot(np.mean(values), height, ls="none", **style.points)
 

@@ -1,9 +1,11 @@
-"""`ncs study`: the same arms in several environments and under several scenarios, and what can be concluded."""
+"""`ncs study`: the same arms in several environments and under several scenarios, and the pages that tell of it."""
 
 from __future__ import annotations
 
 import json
 import math
+import re
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,67 +15,62 @@ import pandas as pd
 from experiments.analysis.episodes import parquet
 from experiments.commands import short_version
 from experiments.commands.compare import compare
+from experiments.report.html import render_page
 from experiments.runs import claim_folder, prepare_output, versions, write_results
 from experiments.runs.experiment import INCIDENTAL_SETTINGS
 from experiments.settings import BackendSettings, CompareSettings, StudySettings, settings_json
-from experiments.settings.study import short_name
+from experiments.settings.learning import short_name
 from experiments.study.channel_switches import channel_switches, trained_agents
 from experiments.study.figures import study_figures
-from experiments.study.pages import quoted, require_marks, results_page, study_report
 from experiments.study.summary import study_summary
-from experiments.study.tables import tables_by_name
+from experiments.study.tables import (
+    QUOTABLE,
+    budget_text,
+    comparisons_table,
+    evaluation_table,
+    margins_table,
+    prices_table,
+    switches_table,
+    tables_by_name,
+    training_table,
+)
 from shields.atomic_write import write_atomically
 
-# Budget of `--smoke`: enough to pass through every part.
-_SMOKE = {"seeds": 2, "budget": 0.01, "episodes": 4, "channel_episodes": 1}
+# Budget of `--smoke`: enough to pass through every part, in the first environment, with baselines of one margin each.
+_SMOKE = {"seeds": 2, "budget": 0.01, "episodes": 2, "channel_episodes": 1, "scenarios": ("ideal-channel", "attacked")}
 # Folder of the sweep of channels below that of its environment, and settings that say nothing of results.
 _CHANNELS, _INCIDENTAL = "channels", (*INCIDENTAL_SETTINGS, "smoke")
 
 
 def study(settings: StudySettings) -> None:
-    """Runs `ncs study`: prints the table of every environment and writes the files.
-
-    Raises:
-        ValueError: If a setting is out of range, a page quotes no table, or a stored result is damaged.
-        FolderInUseError: If another command is writing to the output folder.
-        OtherResultsError: If the output folder holds finished results of other settings.
-        OSError: If a file cannot be read or written.
-        Infeasible: If no certificate is found.
-        RunError: If a run fails.
-        ClusterError: If a cluster cannot execute the runs.
-    """
-    settings = short_version(settings, **_SMOKE)
+    """Runs `ncs study`: prints the table of every environment and writes the files."""
+    baselines = tuple(name for name in settings.baselines if ":" not in name)
+    settings = short_version(settings, **_SMOKE, envs=settings.envs[:1], baselines=baselines)
     for path in settings.quote:
         require_marks(path.read_text("utf-8"))
     with claim_folder("study", settings):
-        _study_in_folder(settings)
-
-
-def _study_in_folder(settings: StudySettings) -> None:
-    """Executes what is missing, prints the tables and writes the files."""
-    prepare_output(settings.out)
-    parts = {short_name(env): _comparison_settings(settings, env) for env in settings.envs}
-    comparisons, channels = {}, {}
-    for name, part in parts.items():
-        compare(part)
-        comparisons[name] = json.loads((part.out / "summary.json").read_bytes())
-        if settings.channel_episodes:
-            sweep = replace(part, out=part.out / _CHANNELS, episodes=settings.channel_episodes)
-            channels[name] = channel_switches(sweep, trained_agents(part))
-        print(flush=True)
-    content = settings_json("study", settings)["settings"]
-    provenance = {
-        "settings": {key: value for key, value in content.items() if key not in _INCIDENTAL},
-        "versions": versions(),
-    }
-    episodes = {name: pd.read_parquet(part.out / "episodes.parquet") for name, part in parts.items()}
-    summary = study_summary(comparisons, episodes) | {"channels": channels} | provenance
-    _write(settings, summary, pd.concat(episodes, names=["environment"]).reset_index("environment"))
-    print(f"files: {settings.out}")
+        prepare_output(settings.out)
+        parts = {short_name(env): _comparison_settings(settings, env) for env in settings.envs}
+        comparisons, channels = {}, {}
+        for name, part in parts.items():
+            compare(part)
+            comparisons[name] = json.loads((part.out / "summary.json").read_bytes())
+            if settings.channel_episodes:
+                sweep = replace(part, out=part.out / _CHANNELS, episodes=settings.channel_episodes)
+                channels[name] = channel_switches(sweep, trained_agents(part))
+            print(flush=True)
+        content = settings_json("study", settings)["settings"]
+        provenance = {
+            "settings": {key: value for key, value in content.items() if key not in _INCIDENTAL},
+            "versions": versions(),
+        }
+        episodes = {name: pd.read_parquet(part.out / "episodes.parquet") for name, part in parts.items()}
+        summary = study_summary(comparisons, episodes) | {"channels": channels} | provenance
+        _write(settings, summary, pd.concat(episodes, names=["environment"]).reset_index("environment"))
+        print(f"files: {settings.out}")
 
 
 def _comparison_settings(settings: StudySettings, env_id: str) -> CompareSettings:
-    """Returns the settings of the comparison in an environment."""
     backend = {name: getattr(settings, name) for name in BackendSettings.__dataclass_fields__}
     part = CompareSettings(
         env=env_id,
@@ -93,7 +90,6 @@ def _comparison_settings(settings: StudySettings, env_id: str) -> CompareSetting
 
 
 def _write(settings: StudySettings, summary: dict[str, Any], episodes: pd.DataFrame) -> None:
-    """Writes every file."""
     figures = study_figures(summary)
     if settings.page is not None:
         _write_page(settings.page, summary, figures)
@@ -108,10 +104,78 @@ def _write(settings: StudySettings, summary: dict[str, Any], episodes: pd.DataFr
 
 
 def _write_page(page: Path, summary: dict[str, Any], figures: dict[str, tuple[str, bytes]]) -> None:
-    """Writes the page of the documentation, its figures, and the numbers that it shows."""
     images = page.parent / "images"
     images.mkdir(parents=True, exist_ok=True)
     for name, (_, png) in figures.items():
         write_atomically(images / f"{page.stem}-{name}.png", png)
     write_atomically(page.with_suffix(".json"), json.dumps(summary, allow_nan=False) + "\n")
     write_atomically(page, results_page(summary, figures, f"images/{page.stem}-"))
+
+
+# A mark names a table; what stands between it and the end is replaced.
+_MARKED = re.compile(r"(<!-- ncs study: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def study_report(summary: dict[str, Any], figures: dict[str, tuple[str, bytes]]) -> str:
+    """Returns the HTML page; opens offline, but for its links to the comparisons beside it.
+
+    Args:
+        summary: What `study_summary` returns, with the sweep of channels, settings and versions.
+        figures: Caption and PNG file by name.
+    """
+    return render_page("study.html.j2", figures, title="Safe learning: the study", **_context(summary))
+
+
+def results_page(summary: dict[str, Any], figures: dict[str, tuple[str, bytes]], prefix: str) -> str:
+    """Returns the Markdown page.
+
+    Args:
+        summary: As for `study_report`.
+        figures: As for `study_report`.
+        prefix: What stands before a figure's name in its link.
+    """
+    links = {name: f"{prefix}{name}.png" for name in figures}
+    return render_page("results.md.j2", figures, links=links, **_context(summary))
+
+
+def _context(summary: dict[str, Any]) -> dict[str, Any]:
+    environments = summary["environments"]
+    return {
+        "summary": summary,
+        "budget": budget_text(summary),
+        "comparisons": comparisons_table(summary),
+        "prices": prices_table(summary),
+        "margins": margins_table(summary),
+        "evaluation": {name: evaluation_table(env) for name, env in environments.items()},
+        "training": {name: training_table(env) for name, env in environments.items()},
+        "channels": {name: switches_table(rows) for name, rows in summary["channels"].items()},
+    }
+
+
+def quoted(page: str, tables: Mapping[str, str]) -> str:
+    """Returns a page with the tables between its marks replaced.
+
+    A mark is `<!-- ncs study: NAME -->` on a line of its own, and `<!-- end -->` after the table.
+
+    Args:
+        page: Text of the page.
+        tables: What `tables_by_name` returns.
+
+    Raises:
+        ValueError: If the page has no mark, or one of a table that there is not.
+    """
+    require_marks(page)
+    return _MARKED.sub(lambda found: f"{found[1]}```\n{tables[found[2]]}\n```\n{found[3]}", page)
+
+
+def require_marks(page: str) -> None:
+    """Returns if a page quotes tables of a study, and none that there is not.
+
+    Raises:
+        ValueError: If it does not.
+    """
+    names = [name for _, name, _ in _MARKED.findall(page)]
+    if not names:
+        raise ValueError("the page quotes no table of a study: it has no mark <!-- ncs study: NAME -->")
+    if unknown := set(names) - set(QUOTABLE):
+        raise ValueError(f"unknown table {min(unknown)!r} of a study; known are {', '.join(QUOTABLE)}")

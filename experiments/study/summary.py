@@ -11,7 +11,7 @@ import pandas as pd
 from experiments.analysis.statistics import CONFIDENCE, clopper_pearson, hierarchical_interval
 from experiments.baselines import MARGINS
 from experiments.runs.arms import Arm
-from experiments.runs.scenarios import AS_TRAINED
+from experiments.runs.loops import AS_TRAINED
 
 IDEAL, ATTACKED = "ideal channel", "attacked"
 # Arms with a proof: no scenario leaves the assumptions of the certificate.
@@ -88,7 +88,6 @@ def difference(
 
 
 def _environment(comparison: dict[str, Any], episodes: pd.DataFrame) -> dict[str, Any]:
-    """Returns what a study keeps of an environment."""
     settings, known = comparison["settings"], comparison["arms"] | comparison["references"]
     arms = {name: _arm(name, arm, episodes[episodes["arm"] == name]) for name, arm in known.items()}
     level = 1.0 - (1.0 - CONFIDENCE) / len(SECONDARY)

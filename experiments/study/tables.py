@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from experiments.analysis.terminal_text import text_table
-from experiments.runs.scenarios import AS_TRAINED
+from experiments.runs.loops import AS_TRAINED
 from experiments.study.channel_switches import SWITCHES
 from experiments.study.summary import ATTACKED, FAMILIES, IDEAL, margins_needed, members
+from experiments.terminal import text_table
 
 # Narrow headers of the scenarios, in the order of the columns.
 _SCENARIOS = {
@@ -175,7 +175,6 @@ def tables_by_name(summary: dict[str, Any]) -> dict[str, str]:
 
 
 def _margin(name: str, family: str) -> str:
-    """Returns the margin of an arm of a family, in words."""
     return f"{name.removeprefix(family).removeprefix(':') or '0'} %"
 
 

@@ -73,7 +73,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
     ## Step
     x+ = A x + B u + d (where an unstable plant runs away, up to `plant.state_limit`). The sensor measures y = H x+ + v;
     the channel quantizes it, sends it every few steps, loses and delays it; the estimator predicts with the input that
-    was really applied and takes in what arrived (`theory.md` section 1).
+    was really applied and takes in what arrived (docs/shield_proof.md).
 
     ## Rewards
     The task's; see `Regulation`, `SpeedTracking` and `SetpointTracking`.

@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, overload
 
 import numpy as np
-from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov
-from scipy.optimize import minimize_scalar
 
 from ncs_gym import exact
 from ncs_gym.estimation.error_bounds_by_age import ErrorSetsByAge, congruence_sum, error_sets_by_age
@@ -17,7 +15,7 @@ from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.shape_matrices import rounded_up
 from ncs_gym.validation import ReadOnlyArrays
 
-# Growth c of the optimal set: gives (E1) slack that an exact check can see, and updates room (theory.md section 3).
+# Growth c of the optimal set: gives (E1) slack that an exact check can see, and updates room (docs/shield_proof.md).
 GROWTH = 1.1
 # Digits of a set relative to its extents, and of 1 - rate: what differs between processors beyond them is cut off.
 DIGITS, RATE_DIGITS = 11, 4
@@ -178,7 +176,7 @@ def _holds(outer: np.ndarray, inner: np.ndarray, size: np.ndarray) -> bool:
 
 
 def _unconditional_set(plant: LinearPlant) -> ErrorSet:
-    """Returns the error set of a stable plant in closed form (theory.md section 3, (E0) and (E1)).
+    """Returns the error set of a stable plant in closed form (docs/shield_proof.md, (E0) and (E1)).
 
     For a fixed rate the smallest solution of (E1) is a Lyapunov series; where it does not cover the first
     estimate, the missing part is added as a source to the same series. The rate minimizes tr(W Sigma), W the
@@ -192,6 +190,8 @@ def _unconditional_set(plant: LinearPlant) -> ErrorSet:
         UnstablePlantError: If the spectral radius of A is 1 or more.
         ErrorSetError: If the plant is so ill-conditioned that the result fails (E0) or (E1).
     """
+    from scipy.optimize import minimize_scalar  # takes long to import
+
     radius = plant.spectral_radius
     if not radius < 1.0:
         raise UnstablePlantError(
@@ -253,6 +253,8 @@ def _smallest_solution(A: np.ndarray, D: np.ndarray, first: np.ndarray, rate: fl
 
 def _lyapunov(A: np.ndarray, source: np.ndarray) -> np.ndarray:
     """Returns X = A X A' + source by the direct method (the other fails silently)."""
+    from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov  # takes long to import
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LinAlgWarning)
         return solve_discrete_lyapunov(A, source, method="direct")

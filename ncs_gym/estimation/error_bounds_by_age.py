@@ -40,7 +40,7 @@ LARGEST = 1e6
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ErrorSetsByAge(ReadOnlyArrays):
-    """E(Sigma_0) .. E(Sigma_{h+1}), h the contract's largest age (docs/theory.md section 6).
+    """E(Sigma_0) .. E(Sigma_{h+1}), h the contract's largest age (docs/shield_proof.md, "Channel contracts").
 
         (C0) Sigma_0 >= r0^2 I
         (C1) Sigma_{j+1} >= A Sigma_j A'/lam_j + D/(1-lam_j)                             j = 0..h

@@ -44,7 +44,7 @@ class Estimator:
 
     The packets of a step are applied at the steps their samples were taken at, and everything after is replayed. Next
     to mean and covariance runs a hard ellipsoid E(Sigma_k) that holds the error at every step and never leaves the
-    certified E(Sigma) (theory.md section 3): predictions and updates are accepted only inside it. What depends only on
+    certified E(Sigma) (docs/shield_proof.md): predictions and updates are accepted only inside it. What depends only on
     when packets arrive is looked up (`ArrivalHistories`).
 
     Args:

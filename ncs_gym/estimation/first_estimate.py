@@ -26,8 +26,8 @@ def first_estimate(
     With z the state at the oldest sample, w steps ago, every sample is y_a = H x_a + v_a, and x_a = A^(w-a) z plus what
     inputs and disturbances since then add. Weighted least squares give z, and the inputs x_hat. Its error is a sum of
     independent terms M d of every disturbance and T v of every sample, so that it lies in an ellipsoid around the sum
-    of all E(M D M') and E(T N T') (theory.md section 1). Where that lies inside the certified set of its age, the
-    estimate is as good as one that was always followed. The fewest newest samples that prove it are taken.
+    of all E(M D M') and E(T N T') (docs/shield_proof.md, "Unknown start"). Where that lies inside the certified set of
+    its age, the estimate is as good as one that was always followed. The fewest newest samples that prove it are taken.
 
     Args:
         plant: The plant, without a remainder: its bound would need to be known to hold for the states that are sought.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.plants.linear_plant import FLAT_INFLATION, INFLATION, LinearPlant
@@ -19,7 +18,7 @@ MULTIPLIERS = np.linspace(0.01, 0.99, 99)[:, None]
 
 
 class SetMembership:
-    """Moves the shape Sigma_k of the running ellipsoid: the error x_hat - x lies in E(Sigma_k) (theory.md section 3).
+    """Moves the shape Sigma_k of the running ellipsoid: the error x_hat - x lies in E(Sigma_k) (docs/shield_proof.md).
 
     Args:
         plant: The plant with its bounds.
@@ -34,6 +33,8 @@ class SetMembership:
     def __init__(
         self, plant: LinearPlant, quantization_step: float, error_set: ErrorSet, shape_step: float = SHAPE_STEP
     ) -> None:
+        from scipy.linalg import solve_triangular  # takes long to import
+
         self.plant, self.error_set, self._step = plant, error_set, shape_step
         Sigma = error_set.Sigma
         self._ball = np.linalg.cholesky(error_set.shape_at(0))
@@ -95,7 +96,7 @@ class SetMembership:
     def gain(self, shape: np.ndarray) -> np.ndarray:
         """Returns T_mu = S H'/mu (H S H'/mu + N/(1-mu))^-1, shape (n, p), S = Sigma_k, with the trace-optimal mu.
 
-        Its updated shape is (mu S^-1 + (1-mu) H' N^-1 H)^-1 (theory.md section 3); with S = G G' and
+        Its updated shape is (mu S^-1 + (1-mu) H' N^-1 H)^-1 (docs/shield_proof.md); with S = G G' and
         G'H'N^-1HG = V diag(j) V' the weighted trace is a sum of w_i / (mu + (1-mu) j_i).
         """
         H = self.plant.H

@@ -32,7 +32,7 @@ class Packet(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class GilbertElliott:
-    """Bursty loss: a two-state Markov chain that moves once per control step.
+    """Bursty loss: a two-state Markov chain that moves once per control step (Gilbert 1960, Elliott 1963).
 
     Attributes:
         p_good_to_bad: Probability to go from good to bad.

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
     from ncs_gym.uncertainty.declared_bound import Bound
 
-# Relative growth of every hard bound, so that rounding in sampling and quantizing stays inside (theory.md section 1).
+# Relative growth of every hard bound, so that rounding in sampling and quantizing stays inside (docs/shield_proof.md).
 INFLATION = 1.0 + 1e-9
 # The same for directions in which a bound is flat: growth of its diagonal alone.
 FLAT_INFLATION = 1e-12
@@ -145,7 +145,7 @@ def explains_arguments(kind: Kind) -> Kind:
 @explains_arguments
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinearPlant(ReadOnlyArrays):
-    """x+ = A x + B u + d, y = H x + v, with limits and bounds (theory.md section 1).
+    """x+ = A x + B u + d, y = H x + v, with limits and bounds (docs/shield_proof.md).
 
     All of it is in deviations from an operating point, (0, 0) unless given. What is declared of the uncertainties adds
     up: `disturbance_bound`, `sensor_bound` and `initial_bound` bound d, v and the error of the first estimate in the

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
 
 def lqr_gain(
@@ -13,6 +12,8 @@ def lqr_gain(
 
     None where the Riccati equation has no solution that scipy finds.
     """
+    from scipy.linalg import solve_discrete_are  # takes long to import
+
     try:
         P = solve_discrete_are(A, B, Q, R, s=N)
         answer = B.T @ P @ A if N is None else B.T @ P @ A + N.T

@@ -18,7 +18,7 @@ def stirred_tank(dt: float = 3.0, **bounds: Any) -> LinearPlant:
     by a factor of 2.7 in 21 s (a pole at +2.83/min). Safe box 10 and 5 K. What comes in is up to 2 K/min too warm or
     too cold; both states are measured to within 0.02 of their units.
 
-    Seborg, Edgar, Mellichamp and Doyle: "Process Dynamics and Control", the reactor of chapter 2.
+    Seborg et al. 2016 (docs/bibliography.md), the reactor of chapter 2.
 
     Args:
         dt: Step [s].

@@ -11,6 +11,7 @@ from typing import Any, Self
 import gymnasium as gym
 import numpy as np
 
+from ncs_gym.installation import install_command
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.gym_process import GymProcess
 from ncs_gym.processes.linearization import linear_model
@@ -51,9 +52,7 @@ class InvertedPendulumProcess(Process):
             ModuleNotFoundError: If MuJoCo is missing.
         """
         if find_spec("mujoco") is None:
-            raise ModuleNotFoundError(
-                "InvertedPendulum-v5 needs MuJoCo: in a clone of ncs-gym, pip install -e '.[mujoco]'"
-            )
+            raise ModuleNotFoundError(f"InvertedPendulum-v5 needs MuJoCo: {install_command('mujoco')}")
         return GymProcess(self._make, read_state=_read, write_state=_write).opened(plant, size)
 
     def _make(self) -> gym.Env:

@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from ncs_gym.installation import install_command
 from ncs_gym.rendering.theme import PAPER, SMALL, Color, Rect
 
 # Everything is drawn this many times larger than shown and then scaled down, so that edges come out smooth.
@@ -30,9 +31,7 @@ def _require_pygame() -> Any:
         import pygame
         import pygame.font
     except ImportError as error:
-        raise gym.error.DependencyNotInstalled(
-            "rendering needs pygame-ce: in a clone of ncs-gym, pip install -e '.[render]'"
-        ) from error
+        raise gym.error.DependencyNotInstalled(f"rendering needs pygame-ce: {install_command('render')}") from error
     return pygame
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy.optimize import linprog
 
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.tasks.task import Task
@@ -134,6 +133,8 @@ def farthest_equilibrium(plant: LinearPlant, output: np.ndarray) -> float:
     Returns:
         Infinity where nothing limits it.
     """
+    from scipy.optimize import linprog  # takes long to import
+
     n, m = plant.n, plant.m
     rows = np.hstack([plant.box_rows, np.zeros((len(plant.box_rows), m))])
     scale = np.concatenate([plant.half_widths, plant.u_max])  # all variables are of the same size then

@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, outer_sum
 from ncs_gym.validation import ReadOnlyArrays, as_covariance, read_only
@@ -201,7 +200,7 @@ def sum_gauge(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> float
     """Returns sqrt(max over nu of r'(P1/nu + P2/(1-nu))^-1 r): at most 1 exactly if r is in E(P1) + E(P2).
 
     The intersection of all E(P1/nu + P2/(1-nu)) is the Minkowski sum, and the form is concave in nu
-    (theory.md section 1). A result above 1 proves that the point lies outside.
+    (docs/shield_proof.md, "Sums"). A result above 1 proves that the point lies outside.
 
     Args:
         point: r, shape (n,).
@@ -221,6 +220,8 @@ def sum_gauge(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> float
         return Ellipsoid(first).gauge(point)
     if not np.any(first):
         return Ellipsoid(second).gauge(point)
+    from scipy.optimize import minimize_scalar  # takes long to import
+
     best: Any = minimize_scalar(
         lambda nu: -gauge(nu),
         bounds=(SMALLEST_MULTIPLIER, 1.0 - SMALLEST_MULTIPLIER),

@@ -74,7 +74,7 @@ def _has_clear_pivots(rows: list[list[float]], scales: list[float]) -> bool:
 def outer_sum(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Returns P1/nu + P2/(1-nu), an ellipsoid around E(P1) + E(P2), with the smallest tr(W P).
 
-    Source: theory.md section 1 (Cauchy-Schwarz on the supports); the best multiplier is
+    Source: docs/shield_proof.md, "Sums" (Cauchy-Schwarz on the supports); the best multiplier is
     nu = sqrt(tr W P1) / (sqrt(tr W P1) + sqrt(tr W P2)).
 
     Args:

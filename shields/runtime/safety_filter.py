@@ -43,7 +43,7 @@ class SafetyFilter(ReadOnlyArrays):
 
     An input passes if everything that one step can reach with it, for every error in E(Sigma_k) and disturbance in
     E(D), lies in S (`OneStepTest`), or in the certificate's polytope if it has one (`PolytopeTest`). K x_hat needs no
-    test: its safety follows from x in S by (I) and (U) of docs/theory.md section 3, or from x in the polytope by (P)
+    test: its safety follows from x in S by (I) and (U) of docs/shield_proof.md, or from x in the polytope by (P)
     and (PU) of docs/shield_proof.md.
 
     Args:

@@ -1,4 +1,4 @@
-"""The largest invariant set by alternation between linear matrix inequalities and multipliers (theory.md section 3)."""
+"""The largest invariant set: linear matrix inequalities and multipliers alternate (docs/shield_proof.md)."""
 
 from __future__ import annotations
 

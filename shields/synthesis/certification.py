@@ -60,7 +60,7 @@ def synthesize(
 ) -> Certificate:
     """Returns a verified certificate.
 
-    Method "certified" (docs/theory.md section 3) seeks the largest ellipsoid with hard bounds. Method "paper" solves OP
+    Method "certified" (docs/shield_proof.md) seeks the largest ellipsoid with hard bounds. Method "paper" solves OP
     of Liu et al. as printed with their Algorithm 1; its certificate carries no error set (docs/paper.md).
 
     Args:
@@ -68,9 +68,9 @@ def synthesize(
         method: "certified" or "paper".
         contract: Channel contract; with one, the error sets depend on the age of the newest sample ("certified").
         safe_set: What a shield keeps: "polytope", the largest one that the gain of the ellipsoid keeps in the box
-            (docs/theory.md, "Polytopes"), or "ellipsoid". Where there is no polytope within limits of rows and time the
-            ellipsoid stays, and the printed certificate says why. None is "polytope" for "certified"; "paper" has an
-            ellipsoid.
+            (docs/shield_proof.md, "Polytopes"), or "ellipsoid". Where there is no polytope within limits of rows and
+            time the ellipsoid stays, and the printed certificate says why. None is "polytope" for "certified"; "paper"
+            has an ellipsoid.
         progress: Called with a line of text per stage: what is sought, and the volume reached so far ("certified").
         dkappa: Grid step of kappa ("paper").
         drho: Grid step of rho ("paper").
@@ -449,7 +449,7 @@ def _certificate(
         method="certified",
         fingerprint=plant.fingerprint,
         provenance={
-            "source": "docs/theory.md section 3",
+            "source": "docs/shield_proof.md",
             "solver": f"Clarabel {version('clarabel')} through cvxpy {version('cvxpy')}",
             "slack": slack,
         }

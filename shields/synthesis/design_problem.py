@@ -37,7 +37,7 @@ class DesignProblem:
         A: State matrix in scaled coordinates, shape (n, n).
         B: Input matrix in scaled coordinates, shape (n, m).
         C: Rows of the safe box in scaled coordinates, shape (k, n).
-        D_u: Shape of the disturbance set with the rounding of actions (theory.md section 3), scaled, (n, n).
+        D_u: Shape of the disturbance set with the rounding of actions (docs/shield_proof.md), scaled, (n, n).
         error_shapes: Shapes of the error sets for which K x_hat must be safe, scaled, (k, n, n).
         transform: The transformation T, shape (n, n).
         u_max: Input limits in physical units, shape (m,).

@@ -1,4 +1,4 @@
-"""Initial designs for the alternation, which stalls if it begins at a poor one (theory.md section 3)."""
+"""Initial designs for the alternation, which stalls if it begins at a poor one (docs/shield_proof.md)."""
 
 from __future__ import annotations
 

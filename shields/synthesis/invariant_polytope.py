@@ -1,4 +1,4 @@
-"""The largest polytope that the certified gain keeps in the safe box (docs/theory.md, "Polytopes").
+"""The largest polytope that the certified gain keeps in the safe box (docs/shield_proof.md, "Polytopes").
 
 It begins with the rows of the box and of the input limits. For every row g with |g x| <= 1, the states after one step
 fulfil it if |g (A+BK) x| <= 1 - s - d, where s and d are the supports of the estimation error and of the disturbance:

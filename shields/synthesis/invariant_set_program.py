@@ -1,4 +1,4 @@
-"""The linear matrix inequalities of the certified method for fixed multipliers (theory.md section 3)."""
+"""The linear matrix inequalities of the certified method for fixed multipliers (docs/shield_proof.md)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class InvariantSetProgram:
     """Maximizes log det L over (L, K) for fixed multipliers, with X <= L Sigma^-1 L linearized at a given L0.
 
     With F = K L, S >= F L^-1 F' and T_j >= F G_j (le X_j)^-1 G_j' F' for every error set E(G_j G_j'), X_j being
-    G_j' L Sigma_j^-1 L G_j, the conditions of theory.md section 3 are linear in (L, F, S, T_j) for fixed multipliers:
+    G_j' L Sigma_j^-1 L G_j, the conditions of docs/shield_proof.md are linear in (L, F, S, T_j) for fixed multipliers:
 
         (I)  L - D_u/ld - (A L A' + A F' B' + B F A' + B S B')/lx - B T_j B' >= 0
         (U)  S_ii/mu_i + le T_j,ii/(1 - mu_i) <= 1

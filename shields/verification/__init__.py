@@ -2,7 +2,7 @@
 
 `verify` reports all conditions of a certificate with their margins; `require_valid` raises at the first that fails.
 Every float is a dyadic rational, so `rational_matrix` evaluates a condition without rounding; `certified_conditions`
-states the conditions of theory.md section 3.
+states the conditions of docs/shield_proof.md, "Conditions".
 """
 
 from shields.verification.certified_conditions import ACTION_ROUNDING

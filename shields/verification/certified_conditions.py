@@ -1,4 +1,4 @@
-"""The conditions of the certified method (theory.md sections 1, 3 and 6), evaluated in rational arithmetic."""
+"""The conditions of the certified method (docs/shield_proof.md), evaluated in rational arithmetic."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def _multiplier_conditions(certificate: Certificate) -> Iterator[Condition]:
 
 
 def _bound_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
-    """Checks that D, N and r0^2 I contain what theory.md section 1 says they contain."""
+    """Checks that D, N and r0^2 I contain what docs/shield_proof.md, "Setting", says they contain."""
     ball = scale(Fraction(plant.gamma), rational(np.eye(plant.n)))
     noise = scale(Fraction(plant.process_noise.energy), rational(plant.process_noise_cov))
     weight = rational(plant.relative_weight)

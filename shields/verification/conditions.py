@@ -18,7 +18,7 @@ class Condition:
     """One checked condition.
 
     Attributes:
-        name: Label of the condition in theory.md section 3 and what it says.
+        name: Label of the condition in docs/shield_proof.md and what it says.
         margin: Signed margin as a float, for people: the smallest eigenvalue of a matrix inequality or the slack of a
             scalar one; at least 0 exactly if the condition holds.
         holds: Whether the condition holds, decided in exact arithmetic.

@@ -66,8 +66,8 @@ def verify(
 ) -> Report:
     """Returns whether a certificate proves what it claims for a plant, in exact rational arithmetic.
 
-    The conditions are (E0), (E1), (I), (S), (U) of theory.md section 3, and that D, N and r0^2 I contain what
-    section 1 says they contain; where there is a polytope (P) and (PU) of docs/shield_proof.md, too. For a
+    The conditions are (E0), (E1), (I), (S), (U) of docs/shield_proof.md, and that D, N and r0^2 I contain what
+    its "Setting" says they contain; where there is a polytope (P) and (PU) of docs/shield_proof.md, too. For a
     certificate of method "paper" they are the constraints of OP (docs/paper.md).
     Neither a tolerance nor a solver nor a float decides; the margins are for people.
 

@@ -228,7 +228,7 @@ SHORT = {"mean": [0.0], "variance": [1.0], "epsilon": 1, "clip": 1}
         (lambda folder: (folder / "model.zip").unlink(), "No such file"),
         (lambda folder: (folder / "agent.json").write_text("{"), "not valid JSON"),
         (lambda folder: (folder / "agent.json").write_text("[]"), "not of format"),
-        (lambda folder: (folder / "agent.json").write_text('{"format": "ncs-gym agent 1"}'), "altered"),
+        (lambda folder: (folder / "agent.json").write_text('{"format": "ncs-gym agent 2"}'), "altered"),
         (lambda folder: (folder / "model.zip").write_bytes(b"PK"), "altered"),
         (lambda folder: change(folder, env="Nowhere-v0"), "Nowhere-v0, which is not registered"),
         (lambda folder: change(folder, env="ncs_gym/TruckTrailer-v0"), "another plant"),

@@ -1,11 +1,8 @@
-"""Hyperparameters: those tuned for each environment, those of a file, and those of former settings."""
-
-import json
+"""Hyperparameters: those tuned for each environment, and those of a file."""
 
 import pytest
 
 from agents import read_hyperparams, tuned_hyperparams, tuned_steps
-from agents.former_settings import from_former, from_former_file
 from agents.hyperparams import DEFAULTS, _tuned, complete_hyperparams, literal, with_changes
 from ncs_gym.registration import ENVIRONMENTS, needing_extras, registered_ids
 
@@ -81,34 +78,3 @@ def test_part_of_the_networks_arguments_may_be_changed():
     assert changed == DEFAULTS["PPO"] | expected
     assert complete_hyperparams("PPO", expected) == changed
     assert DEFAULTS["PPO"]["policy_kwargs"]["net_arch"] == [64, 64]
-
-
-FORMER = {"envs": 128, "rollout": 32, "batch_size": 512, "epochs": 5, "learning_rate": 1e-3, "discount": 0.98}
-FORMER |= {"gae_lambda": 0.95, "log_std": -1.5, "width": 32, "entropy": 0.0, "normalize_rewards": False}
-
-
-def test_former_settings_have_the_names_of_the_library():
-    assert from_former("PPO", FORMER) == {
-        "n_envs": 128,
-        "n_steps": 32,
-        "batch_size": 512,
-        "n_epochs": 5,
-        "learning_rate": "lin_0.001",
-        "gamma": 0.98,
-        "gae_lambda": 0.95,
-        "policy_kwargs": {"log_std_init": -1.5, "net_arch": [32, 32]},
-        "ent_coef": 0.0,
-        "normalize": {"norm_reward": False},
-    }
-
-
-def test_former_file_is_that_of_its_algorithm():
-    groups = {"ppo": FORMER, "a2c": dict.fromkeys(FORMER), "off_policy": {"envs": 4, "noise": 0.3}}
-    for algorithm, expected in (
-        ("PPO", from_former("PPO", FORMER)),
-        ("A2C", {}),
-        ("TD3", {"n_envs": 4, "noise_std": 0.3}),
-        ("SAC", {"n_envs": 4}),
-    ):
-        settings = json.loads(json.dumps({"algo": algorithm, "seed": 3} | groups))
-        assert from_former_file(settings) == {"algo": algorithm, "seed": 3, "hyperparams": expected}

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from agents.loop import ControlLoop, CostPenalty, LoopConfig, ShieldSettings
+from agents.loop import CostPenalty, LoopConfig, ShieldSettings
 from ncs_gym import Channel
 from shields import SafetyShield, VectorSafetyShield
 
@@ -68,14 +68,6 @@ def test_loop_without_penalties_has_the_environments_own_rewards(certificate):
     assert isinstance(loop.vector(1), CostPenalty)
     assert not isinstance(loop.without_penalties.vector(1), CostPenalty)
     assert loop.without_penalties.shield.penalty == 0.0
-
-
-def test_former_name_takes_the_environments_keyword_arguments_beside_its_own(certificate):
-    shield, channel = ShieldSettings(certificate, "switch"), Channel(delay=7)
-    with pytest.warns(DeprecationWarning, match="ControlLoop is now LoopConfig"):
-        former = ControlLoop(env=CRUISE, channel=channel, downlink=None, noise="gaussian", shield=shield)
-    assert vars(former) == vars(LoopConfig(env=CRUISE, kwargs={"channel": channel, "noise": "gaussian"}, shield=shield))
-    assert former.single().unwrapped.noise == "gaussian"
 
 
 def test_changed_arguments_are_those_of_the_changed_loop_alone():

@@ -25,7 +25,7 @@ def test_results_and_settings_need_neither_stable_baselines3_nor_torch():
     code = """if True:
         import sys
         from agents import LoopConfig, Episode, Evaluation, ShieldSettings, TrainingPoint, evaluate
-        from agents import PPOSettings, tuned_hyperparams
+        from agents import tuned_hyperparams
         assert not {"stable_baselines3", "torch"} & sys.modules.keys()
     """
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)

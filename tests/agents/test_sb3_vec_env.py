@@ -1,3 +1,7 @@
+import os
+import subprocess
+import sys
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -239,3 +243,19 @@ def test_actions_are_those_that_were_handed_over_whatever_is_written_into_them_l
     actions[:] = 1.0
     _, _, _, infos = env.step_wait()
     assert [info["input"] for info in infos] == [1.0, 1.0]  # a quarter of u_max = 4
+
+
+def test_importing_sets_torch_to_one_thread_and_a_later_choice_stays():
+    code = """
+import torch
+torch.set_num_threads(3)
+from agents import LoopConfig, train
+train(LoopConfig(env="ncs_gym/TruckTrailerCruise-v0"), 64, 0, hyperparams={"n_envs": 1, "n_steps": 64})
+print(torch.get_num_threads())
+torch.set_num_threads(2)
+train(LoopConfig(env="ncs_gym/TruckTrailerCruise-v0"), 64, 0, hyperparams={"n_envs": 1, "n_steps": 64})
+print(torch.get_num_threads())
+"""
+    environment = os.environ | {"OMP_NUM_THREADS": "4"}
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=600)
+    assert run.stdout.split() == ["1", "2"], run.stderr

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO, SAC
 
+from agents.agent import is_sb3_zip, load_sb3_zip
 from agents.loop import LoopConfig
 from agents.sb3_vec_env import SB3VecEnv
-from agents.sb3_zip import is_sb3_zip, load_sb3_zip
 from agents.sharing.agent_file import AgentError
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from agents.results import Episode, TrainingPoint, Trajectory
-from experiments.analysis.episodes import episodes_table
-from experiments.analysis.summary import arm_summary, paired_differences
+from experiments.analysis.episodes import arm_summary, episodes_table, paired_differences
 from experiments.runs.arms import Arm
 from experiments.runs.training_run import RunResult
 

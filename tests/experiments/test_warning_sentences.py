@@ -10,7 +10,7 @@ import pytest
 from tqdm import tqdm
 
 from experiments.__main__ import _complain
-from experiments.warning_sentences import warnings_as_sentences, warnings_sent
+from experiments.terminal import warnings_as_sentences, warnings_sent
 from tests.command import ncs
 
 # Samples may become older than the contract allows from a delay of 5 steps on.

@@ -151,7 +151,7 @@ def test_agent_and_finished_runs_of_one_processor_are_taken_by_another(tmp_path)
         "1",
         "--arms",
         "shielded",
-        "--references",
+        "--baselines",
         "lqr",
     )
     compare = (*compare, "--hyperparams", "n_envs=4", "n_steps=16", "batch_size=64")

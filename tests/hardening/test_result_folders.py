@@ -11,13 +11,10 @@ from hypothesis import strategies as st
 
 from agents.loop import LoopConfig, ShieldSettings
 from agents.sharing.agent_file import AgentError
-from experiments.analysis.episodes import episodes_table, parquet, training_table
-from experiments.analysis.summary import arm_summary
+from experiments.analysis.episodes import arm_summary, episodes_table, parquet, training_table
 from experiments.analysis.tables import summary_text
-from experiments.attack.campaign import Campaign
-from experiments.attack.counts_table import counts_table
 from experiments.attack.monte_carlo_batch import MonteCarloBatch
-from experiments.attack.safety_counts import SafetyCounts
+from experiments.attack.safety_counts import SafetyCounts, counts_table
 from experiments.errors import ResultsError
 from experiments.runs import claim_folder, prepare_output
 from experiments.runs.run_store import RunStore
@@ -294,7 +291,7 @@ COUNTS = {"steps": 800, "episodes": 4, "interventions": 10, "level": 0.5}
 @pytest.fixture(scope="module")
 def batch(certificate, tmp_path_factory):
     """A batch, and the folder with its result, for tests that change it."""
-    campaign = Campaign(seed=0, random_plants=0, envs=4, shielded=True)
+    campaign = AttackSettings(seed=0, random_plants=0, envs=4)
     batch = MonteCarloBatch(campaign, "TruckTrailerCruise-v0, bursts", 0, certificate)
     folder = tmp_path_factory.mktemp("batch")
     RunStore(folder).save(batch, SafetyCounts(**COUNTS))

@@ -1,4 +1,4 @@
-"""Whether the sets D, N and r0^2 I of a plant hold what was declared of it (theory.md section 1)."""
+"""Whether the sets D, N and r0^2 I of a plant hold what was declared of it (docs/shield_proof.md, "Setting")."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The conditions of the certified method (theory.md sections 3 and 6), with denominators multiplied out."""
+"""The conditions of the certified method (docs/shield_proof.md), with denominators multiplied out."""
 
 from __future__ import annotations
 

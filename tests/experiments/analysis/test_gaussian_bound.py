@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from agents.results import Episode
-from experiments.analysis.episodes import episodes_table
-from experiments.analysis.gaussian_bound import gaussian_sentences, gaussian_summary, rounded_up
-from experiments.analysis.statistics import clopper_pearson
-from experiments.analysis.summary import arm_summaries, arm_summary
+from experiments.analysis.episodes import arm_summaries, arm_summary, episodes_table
+from experiments.analysis.statistics import clopper_pearson, gaussian_sentences, gaussian_summary, rounded_up
 from experiments.commands.compare import _findings, _gaussian_noise
 from experiments.runs import certificate_of, loop_config, run_of_arm
 from experiments.runs.training_run import RunResult

@@ -2,7 +2,7 @@
 
 import pytest
 
-from experiments.analysis.terminal_text import wrapped
+from experiments.terminal import wrapped
 
 SENTENCE = "The sentence of a well-known length goes on and on. " * 8
 

@@ -7,15 +7,15 @@ import pytest
 
 from experiments.attack import monte_carlo_batch
 from experiments.attack.attack_cases import attack_cases
-from experiments.attack.campaign import Campaign
 from experiments.attack.monte_carlo_batch import MonteCarloBatch, _claimed_and_kept
 from experiments.commands.attack import attack
 from experiments.settings.certificates import AttackSettings
 from ncs_gym import Channel
 from tests.certificates import certificate_of
+from tests.workers import replace_cases
 
 NAME = "BatchReactor-v0, late"
-CAMPAIGN = Campaign(seed=0, random_plants=0, envs=16, shielded=True)
+CAMPAIGN = AttackSettings(seed=0, random_plants=0, envs=16)
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def attacked(monkeypatch):
 
     def counts_behind(channel, campaign=CAMPAIGN, **changes):
         case = replace(attack_cases(0, 0)[NAME], channel=channel, **changes)
-        monkeypatch.setattr(Campaign, "cases", lambda self: {NAME: case})
+        replace_cases(monkeypatch, {NAME: case})
         monte_carlo_batch._shields.cache_clear()
         certificate = certificate_of(case.plant, case.certificate_contract)
         return MonteCarloBatch(campaign, NAME, 0, certificate).execute(lambda steps: None)
@@ -46,7 +46,7 @@ def test_states_outside_after_a_broken_contract_are_no_failure_and_not_hidden(at
     assert counts.lapsed > 0.9 * counts.steps
     assert counts.lapsed_violations > 1000
     assert counts.level == 0.0  # nothing was claimed that late
-    watched = attacked(Channel(loss=1.0, quantization_step=1e-3), replace(CAMPAIGN, shielded=False))
+    watched = attacked(Channel(loss=1.0, quantization_step=1e-3), replace(CAMPAIGN, unshielded=True))
     assert (watched.lapsed, watched.lapsed_violations) == (0, 0)
     assert watched.violations > 1000
     assert watched.broken_episodes == watched.episodes
@@ -106,7 +106,7 @@ def test_a_shield_that_claims_too_much_after_a_broken_contract_is_found_out(atta
 
 def test_a_downlink_without_a_contract_is_refused(monkeypatch, tmp_path):
     case = replace(attack_cases(0, 0)[NAME], downlink=Channel(loss=0.3))
-    monkeypatch.setattr(Campaign, "cases", lambda self: {NAME: case})
+    replace_cases(monkeypatch, {NAME: case})
     with pytest.raises(ValueError, match="BatchReactor-v0, late: nothing is claimed behind a downlink without a contr"):
         attack(AttackSettings(out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()

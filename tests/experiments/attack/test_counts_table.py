@@ -5,8 +5,7 @@ from dataclasses import replace
 import pytest
 
 from experiments.attack.attack_cases import attack_cases
-from experiments.attack.counts_table import GAUSSIAN_LEGEND, counts_table, gaussian_table
-from experiments.attack.safety_counts import SafetyCounts
+from experiments.attack.safety_counts import GAUSSIAN_LEGEND, SafetyCounts, counts_table, gaussian_table
 
 LONG_CAMPAIGN = SafetyCounts(
     steps=40_000_000,

@@ -3,9 +3,9 @@
 import pytest
 
 from experiments.attack.attack_cases import attack_cases
-from experiments.attack.campaign import Campaign
 from experiments.attack.monte_carlo_batch import MonteCarloBatch
 from experiments.attack.safety_counts import SafetyCounts
+from experiments.settings.certificates import AttackSettings
 from ncs_gym.registration import EPISODE_STEPS, needing_extras
 from tests.certificates import certificate_of
 
@@ -21,7 +21,7 @@ def attacked(name, envs, kinds=KINDS, *, shielded=True):
     env_id = f"ncs_gym/{name}"
     if env_id in needing_extras():
         pytest.skip("the extra of this environment is not installed")
-    campaign = Campaign(seed=1, random_plants=0, envs=envs, shielded=shielded, env=env_id)
+    campaign = AttackSettings(seed=1, random_plants=0, envs=envs, unshielded=not shielded, env=env_id)
     cases, total = attack_cases(0, 0, env_id), SafetyCounts()
     for index, kind in enumerate(kinds):
         case = cases[f"{env_id}, {kind}"]

@@ -8,8 +8,7 @@ from queue import Queue
 import pytest
 
 from agents.loop import LoopConfig
-from experiments.backends.execution import execute, results_of
-from experiments.backends.worker_processes import _execute, local_workers
+from experiments.backends.execution import _execute, execute, local_workers, results_of
 from experiments.errors import RunStopped
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings

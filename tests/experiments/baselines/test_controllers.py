@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from experiments.baselines import CONTROLLERS, RegulatorWeights, controller, tuned_weights
-from experiments.baselines.controllers import equilibrium
-from experiments.settings.study import NETWORK_ENVS, REGULATED_ARMS
+from experiments.baselines.regulators import equilibrium
+from experiments.settings.learning import NETWORK_ENVS, REGULATED_ARMS
 from ncs_gym.envs.env import ncs_env
 
 SETPOINTS = ("ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0")
@@ -99,15 +99,28 @@ def nominal(env, name, weights, steps=150):
     return reached, np.array(applied)
 
 
+@pytest.mark.parametrize("name", ["governor", "mpc"])
 @pytest.mark.parametrize("env_id", ["ncs_gym/LaneKeeping-v0", "ncs_gym/CSTR-v0", "ncs_gym/Convoy-v0"])
-def test_governor_keeps_limits_and_margins_that_its_regulator_leaves(env_id):
+def test_governor_and_mpc_keep_limits_and_margins_that_the_regulator_leaves(env_id, name):
     env, weights = env_of(env_id), RegulatorWeights(1e-3, 0.0)
     free, _ = nominal(env, "lqr", weights)
-    governed, _ = nominal(env, "governor", weights)
-    with_margin, _ = nominal(env, "governor:20", weights)
-    assert governed <= 1.0 + 1e-6
+    kept, _ = nominal(env, name, weights)
+    with_margin, _ = nominal(env, f"{name}:20", weights)
+    assert kept <= 1.0 + 1e-6
     assert with_margin <= 0.8 + 1e-6
     assert with_margin < free
+
+
+@pytest.mark.parametrize("env_id", ["ncs_gym/CSTR-v0", "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/TruckTrailer-v0"])
+def test_mpc_far_from_all_limits_is_the_regulator(env_id):
+    env, rng = env_of(env_id), np.random.default_rng(0)
+    observations = 2e-2 * rng.standard_normal((3, *env.observation_space.shape))
+    estimates = {"estimate": observations[:, : env.plant.n]}
+    predicted, optimal = (
+        controller(name, env, np.zeros((1, 2)), 0)(observations, estimates) for name in ("mpc", "lqr")
+    )
+    assert np.abs(optimal).max() > 1e-5
+    np.testing.assert_allclose(predicted, optimal, atol=1e-2 * np.abs(optimal).max())
 
 
 def test_regulator_moves_before_a_target_that_it_knows_does():

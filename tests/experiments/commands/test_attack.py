@@ -2,16 +2,15 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from experiments.attack import monte_carlo_batch
 from experiments.attack.attack_cases import AttackCase, attack_cases
-from experiments.attack.campaign import Campaign
-from experiments.attack.counts_table import gaussian_table, require_within
 from experiments.attack.monte_carlo_batch import MonteCarloBatch
-from experiments.attack.safety_counts import SafetyCounts
+from experiments.attack.safety_counts import SafetyCounts, gaussian_table, require_within
 from experiments.commands import attack as command
 from experiments.commands.attack import attack
 from experiments.errors import OtherResultsError, ResultsError, RunError, SafetyBroken
@@ -23,9 +22,9 @@ from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from shields import Certificate
 from shields import certify as smaller_set
 from tests.command import ncs
-from tests.workers import no_worker_processes
+from tests.workers import no_worker_processes, replace_cases
 
-CAMPAIGN = Campaign(seed=0, random_plants=1, envs=32, shielded=True)
+CAMPAIGN = AttackSettings(seed=0, random_plants=1, envs=32)
 CRUISE, OTHER = "TruckTrailerCruise-v0, overtaking", "CartPole-v0, rare"
 
 
@@ -78,7 +77,7 @@ def test_batch_has_the_same_counts_after_any_other(certificates):
 
 
 def test_without_the_shield_the_attack_breaks_out_and_is_counted(certificates):
-    watching = replace(CAMPAIGN, shielded=False)
+    watching = replace(CAMPAIGN, unshielded=True)
     counts = counts_of(watching, certificates[CRUISE], CRUISE)
     assert counts.exits > 1000
     assert counts.violations > 1000
@@ -124,18 +123,22 @@ def test_lookahead_that_leaves_the_box_is_counted(certificates, monkeypatch):
 def test_nature_pushes_lookahead_to_the_box_and_out_of_the_safe_set_in_turn(certificates):
     shields = monte_carlo_batch._shields(LOOKAHEAD, CRUISE, certificates[CRUISE])
     sources = {name: shield.unwrapped._process.disturbance for name, shield in shields.items()}
-    assert len(shields) == LOOKAHEAD.kinds_of_batches == 2
+    assert list(shields) == list(monte_carlo_batch.kinds_of_batches(LOOKAHEAD))
     assert sources["to the box"].M is None
     np.testing.assert_array_equal(sources["out of S"].rows, certificates[CRUISE].polytope.rows)
     for shield in shields.values():
         assert (shield.filter.mode, shield.filter.horizon) == ("lookahead", 6)
 
 
-def test_stored_counts_belong_to_their_mode_and_horizon():
-    keys = [replace(CAMPAIGN, mode=mode, horizon=horizon).key for mode, horizon in
-            ((None, None), ("project", None), ("lookahead", 6), ("lookahead", 7))]  # fmt: skip
+def test_stored_counts_belong_to_their_mode_and_horizon(monkeypatch):
+    chosen = {CRUISE: attack_cases(0, 1)[CRUISE]}
+    replace_cases(monkeypatch, chosen)
+    batch = MonteCarloBatch(CAMPAIGN, CRUISE, 0, chosen[CRUISE].certificate)
+    given = ({}, {"mode": "project"}, {"mode": "lookahead", "horizon": 6}, {"mode": "lookahead", "horizon": 7})
+    keys = [replace(batch, settings=replace(CAMPAIGN, **each)).key for each in given]
     assert len(set(keys)) == 4
-    assert keys[0] == CAMPAIGN.key
+    moved = replace(CAMPAIGN, out=Path("elsewhere"), jobs=7, steps=1.0, force=True)
+    assert keys[0] == batch.key == replace(batch, settings=moved).key
 
 
 def test_episodes_begin_on_the_boundary_of_the_polytope(certificates):
@@ -166,7 +169,7 @@ def test_nature_attains_every_bound(certificates):
 
 
 # So many draws leave their ellipsoids that the monitor sees some of it, and episodes leave S.
-GAUSSIAN = replace(CAMPAIGN, gaussian=True, delta=0.4)
+GAUSSIAN = replace(CAMPAIGN, noise="gaussian", delta=0.4)
 
 
 def test_gaussian_nature_attains_what_is_bounded_and_draws_the_rest(tmp_path):
@@ -196,7 +199,7 @@ def test_counts_of_gaussian_noise_lie_within_the_bound_and_do_not_end_with_an_er
     assert [row.split()[-1] for row in rows] == ["0.031", "0.041"]
     stored = document(tmp_path)
     assert stored["escape_probability"][CRUISE] == pytest.approx((200 + 100 + 1) * 1e-4)
-    assert stored["settings"]["gaussian"]
+    assert stored["settings"]["noise"] == "gaussian"
     assert stored["settings"]["delta"] == 1e-4
 
 
@@ -220,9 +223,7 @@ def test_more_exits_than_the_bound_allows_are_an_error():
 def small(monkeypatch):
     """A campaign of two cases."""
     chosen = {name: attack_cases(0, 1)[name] for name in (CRUISE, "TruckTrailer-v0, perfect")}
-    monkeypatch.setattr(
-        Campaign, "cases", lambda self: {name: case.with_delta(self.delta) for name, case in chosen.items()}
-    )
+    replace_cases(monkeypatch, chosen)
 
 
 # Steps in which each kind of both cases comes in once.
@@ -326,7 +327,7 @@ def test_another_certificate_makes_stored_counts_void(tmp_path, small, without_w
 def counted(monkeypatch):
     """Makes a campaign of one batch that is said to have counted something."""
     case = attack_cases(0, 1)[CRUISE]
-    monkeypatch.setattr(Campaign, "cases", lambda self: {CRUISE: case})
+    replace_cases(monkeypatch, {CRUISE: case})
 
     def counts(**counts):
         found = SafetyCounts(steps=3200, episodes=16, exits=2, **counts)
@@ -368,7 +369,7 @@ def test_damaged_counts_are_refused_and_those_of_other_settings_not_taken(tmp_pa
     counts = SafetyCounts(steps=32 * 200, episodes=32, exits=3, level=0.5)
     store.save(batch, counts)
     assert store.load(batch) == counts
-    for other in (replace(batch, campaign=replace(CAMPAIGN, seed=1)), replace(batch, certificate=certificates[OTHER])):
+    for other in (replace(batch, settings=replace(CAMPAIGN, seed=1)), replace(batch, certificate=certificates[OTHER])):
         assert store.load(other) is None
     path = tmp_path / "runs" / f"{batch.name}.json"
     whole = path.read_bytes()

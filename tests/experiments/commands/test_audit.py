@@ -8,7 +8,8 @@ from dataclasses import replace
 import pytest
 
 from experiments.commands.audit import _text
-from experiments.paper import Claim, PaperExample, Verdict, audited_claims, defects
+from experiments.paper.audit import Claim, Verdict, audited_claims, defects
+from experiments.paper.paper_example import PaperExample
 from tests.command import ROOT, ncs
 
 HOLDS, ROUNDED, FAILS, UNDECIDED = Verdict.HOLDS, Verdict.ROUNDED, Verdict.FAILS, Verdict.UNDECIDED

@@ -7,8 +7,7 @@ from agents import tuned_hyperparams
 from agents.hyperparams import complete_hyperparams
 from agents.loop import LoopConfig
 from agents.results import Episode
-from experiments.analysis.episodes import episodes_table
-from experiments.analysis.summary import arm_summary, covered_fraction, paired_differences
+from experiments.analysis.episodes import arm_summary, covered_fraction, episodes_table, paired_differences
 from experiments.analysis.tables import _rows
 from experiments.commands.compare import _findings, _training_runs
 from experiments.runs.arms import Arm, by_arm

@@ -41,7 +41,7 @@ def settings(**changes):
 
 def test_command_writes_a_gif_of_both_arms_below_two_megabytes(tmp_path, certificate_file):
     file = tmp_path / "both.gif"
-    run = ncs("render", "--gif", file, "--side-by-side", "--steps", 30, "--certificate", certificate_file)
+    run = ncs("render", "--out", file, "--side-by-side", "--steps", 30, "--certificate", certificate_file)
     assert run.returncode == 0, run.stderr
     assert file.stat().st_size < 2e6
     with Image.open(file) as image:

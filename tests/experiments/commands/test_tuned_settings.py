@@ -26,21 +26,3 @@ def test_command_trains_with_tuned_hyperparameters_and_records_all_of_them(tmp_p
     assert again.returncode == 0, again.stderr
     assert "PPO, hyperparameters as given: " in again.stdout
     assert Agent.load(tmp_path / "again" / "models" / "shielded-0").checksum == agent.checksum
-
-
-def test_file_of_former_settings_and_former_flags_train_the_same_agent(tmp_path, without_workers):
-    former = {"format": "ncs-gym settings 1", "command": "train"}
-    former["settings"] = {"env": ENV, "steps": 64, "episodes": 2, "ppo": {"envs": 2, "rollout": 16, "width": 8}}
-    (tmp_path / "settings.json").write_text(json.dumps(former))
-    flags = ("--ppo.envs", 2, "--ppo.rollout", 16, "--ppo.width", 8)
-    now = ("--hyperparams", "n_envs=2", "n_steps=16", "policy_kwargs=dict(net_arch=[8, 8])")
-    checksums = set()
-    for name, given in (
-        ("file", ("--config", tmp_path / "settings.json")),
-        ("flags", ("--env", ENV, *SMALL[:4], *flags)),
-        ("now", ("--env", ENV, *SMALL[:4], *now)),
-    ):
-        run = ncs("train", *given, "--out", tmp_path / name)
-        assert run.returncode == 0, run.stderr
-        checksums.add(Agent.load(tmp_path / name / "models" / "shielded-0").checksum)
-    assert len(checksums) == 1

@@ -8,13 +8,21 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex, to_rgb
 from scipy.optimize import linprog
 
-from experiments.plots.arm_style import ARM_COLORS_AND_MARKERS, ArmStyle
-from experiments.plots.comparison_figures import comparison_figures
-from experiments.plots.figure_style import thousands
-from experiments.plots.phase_plane import _plane, phase_figure, projected_box, projected_ellipsoid
-from experiments.plots.scatter import scatter_figure
-from experiments.plots.time_series import _shown_arms, episode_figure
-from experiments.plots.training_curves import _RATE_WINDOW, _common_steps, _rates, training_figure
+from experiments.plots.comparison_figures import (
+    _RATE_WINDOW,
+    _common_steps,
+    _plane,
+    _rates,
+    _shown_arms,
+    comparison_figures,
+    episode_figure,
+    phase_figure,
+    projected_box,
+    projected_ellipsoid,
+    scatter_figure,
+    training_figure,
+)
+from experiments.plots.figure_style import ARM_COLORS_AND_MARKERS, ArmStyle, thousands
 from ncs_gym import Ellipsoid, LinearPlant
 from tests.experiments.results import ALL_ARMS, history, run, summary_of, trajectory
 from tests.plants import random_plant

@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 import pytest
 from jinja2 import UndefinedError
 
-from experiments.report import comparison_report, sweep_report
+from experiments.report.html import comparison_report, sweep_report
 from experiments.runs.arms import Arm
 from shields import Report
 from shields.verification.conditions import flag

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from agents.loop import LoopConfig
-from experiments.analysis.episodes import episodes_table
-from experiments.analysis.summary import arm_summary
+from experiments.analysis.episodes import arm_summary, episodes_table
 from experiments.analysis.tables import scenario_text, summary_text
 from experiments.runs import RunStore, run_of_arm
-from experiments.runs.scenarios import other_scenarios, scenario_named, under, worse_channel
+from experiments.runs.loops import other_scenarios, scenario_named, under, worse_channel
 from experiments.settings import CompareSettings
 from ncs_gym import AdversarialDisturbance, Channel, ChannelContract, GilbertElliott
 from ncs_gym.envs.env import ncs_env

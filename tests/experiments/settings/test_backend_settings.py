@@ -6,8 +6,7 @@ from experiments.__main__ import COMMANDS, _run
 from experiments.runs.experiment import INCIDENTAL_SETTINGS
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings
-from experiments.settings.learning import CompareSettings
-from experiments.settings.study import SweepSettings
+from experiments.settings.learning import CompareSettings, SweepSettings
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import pytest
 from experiments.commands.sweep import _grid_points, _loop, _name
 from experiments.runs import certificate_of, run_of_arm
 from experiments.runs.loops import _bursts, changed_channel
-from experiments.settings.study import SweepSettings
+from experiments.settings.learning import SweepSettings
 from ncs_gym import Channel, ChannelContract, GilbertElliott
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.network.packet_transmission import ChannelState

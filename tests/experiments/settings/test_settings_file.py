@@ -58,14 +58,6 @@ def test_hyperparameters_of_the_file_give_way_to_another_algorithm_and_to_their_
     assert _parse([*config, "--hyperparams", "gamma=0.8"]).hyperparams == {"gamma": 0.8}
 
 
-def test_former_names_of_settings_and_flags_are_read(tmp_path):
-    now = _parse(["compare", "--baselines", "lqr", "--scenarios", "gaussian"])
-    assert (now.baselines, now.scenarios) == (("lqr",), ("gaussian",))
-    assert _parse(["compare", "--references", "lqr", "--conditions", "gaussian"]) == now
-    file = written(tmp_path, {"references": ["lqr"], "conditions": ["gaussian"]})
-    assert _parse(["compare", "--config", file]) == now
-
-
 def test_without_config_nothing_changes():
     for arguments in ([], ["--help"], ["--steps", "9"]):
         assert config_defaults(arguments, "compare", CompareSettings) == (None, arguments)
@@ -114,7 +106,7 @@ def test_values_in_a_file_are_no_flags(values, tmp_path):
         ({"seed": True}, "seed = true"),
         ({"steps": 10**400, "violation_penalty": 10**400}, "violation_penalty = 1000"),
         ({"ppo": 3}, "ppo = 3"),
-        ({"ppo": {}, "hyperparams": 3}, "hyperparams = 3"),
+        ({"hyperparams": 3}, "hyperparams = 3"),
         ({"channel": {"loss": float("nan")}}, "channel.loss = NaN"),
         ({"hyperparams": {"gamma": float("inf")}}, "hyperparams.gamma = Infinity"),
         ({"steps": 0}, "--steps must be at least 1"),

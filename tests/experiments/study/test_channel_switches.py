@@ -12,7 +12,7 @@ from experiments.errors import ResultsError
 from experiments.runs import certificate_of, loop_config, run_of_arm
 from experiments.runs.loops import changed_channel
 from experiments.settings import CompareSettings
-from experiments.settings.study import NETWORK_ENVS
+from experiments.settings.learning import NETWORK_ENVS
 from experiments.study.channel_switches import SWITCHES, channel_switches, switched, trained_agents
 from ncs_gym.envs.env import ncs_env
 from tests.workers import no_worker_processes

@@ -5,7 +5,7 @@ import pytest
 
 from experiments.analysis.episodes import episodes_table
 from experiments.study.figures import study_figures
-from experiments.study.pages import quoted
+from experiments.study.study import quoted
 from experiments.study.summary import PRIMARY, Comparison, difference, margins_needed, members, study_summary
 from experiments.study.tables import (
     agents_table,

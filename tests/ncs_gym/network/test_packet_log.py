@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from experiments.analysis.recorded_ages import broken_contracts
+from experiments.commands.channel import broken_contracts
 from ncs_gym import ChannelContract, PacketLog, TraceChannel, contract_of
 from ncs_gym.network.packet_transmission import ChannelState, side_by_side
 

@@ -1,10 +1,14 @@
-"""Tables and prose for a terminal."""
+"""What commands show on a terminal: tables, prose, warnings as sentences, and how far a synthesis is."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Collection, Sequence
+import sys
+import warnings
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 from textwrap import TextWrapper
+from typing import Any
 
 # Lines of prose follow the terminal between these widths, and have the greatest where there is no terminal; columns of
 # a table that would be wider than the greatest stand closer together [characters].
@@ -55,3 +59,55 @@ def wrapped(text: str, width: int | None = None, *, label: str = "", indent: int
         break_long_words=False,
     )
     return wrapper.fill(text)
+
+
+@contextmanager
+def warnings_as_sentences() -> Iterator[None]:
+    """Prints the text of each warning once on stderr, without the file and the line of code that it comes from."""
+    shown: set[str] = set()
+
+    def show(message: Warning | str, *origin: Any, **more: Any) -> None:
+        text = " ".join(str(message).split())
+        if text not in shown:
+            shown.add(text)
+            from tqdm import tqdm  # only where there is something to say: `ncs --help` starts sooner
+
+            line = f"ncs: warning: {text}"
+            tqdm.write(wrapped(line, indent=5) if sys.stderr.isatty() else line, file=sys.stderr)
+
+    with _shown_by(show):
+        yield
+
+
+@contextmanager
+def warnings_sent(send: Callable[[str], object]) -> Iterator[None]:
+    """Sends the text of each warning, for instance from a worker process to where the progress bar is."""
+    with _shown_by(lambda message, *origin, **more: send(str(message))):
+        yield
+
+
+@contextmanager
+def _shown_by(show: Callable[..., object]) -> Iterator[None]:
+    """Has warnings shown by a function; which ones are shown stays as it is."""
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
+
+
+# Most syntheses are over before anybody wonders [s].
+_SILENT_SECONDS = 3.0
+
+
+@contextmanager
+def synthesis_status() -> Iterator[Callable[[str], None]]:
+    """Yields what shows a line of progress on stderr, if that is a terminal and some seconds have passed."""
+    from tqdm import tqdm
+
+    form = "synthesis, {desc} [{elapsed}]"
+    with tqdm(bar_format=form, leave=False, disable=None, delay=_SILENT_SECONDS) as line:
+
+        def show(text: str) -> None:
+            line.set_description_str(text, refresh=False)
+            line.update(0)  # which draws, unlike the text alone, only after the delay
+
+        yield show
