@@ -19,7 +19,7 @@ RAY_INSTALLED := $(VENV)/.installed-ray
 ADDRESS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help compare study pretrained test test-other-processor coverage coverage-report test-slow lint types benchmark example-times docs audit \
+.PHONY: help compare study pretrained test test-other-processor coverage coverage-report test-slow lint types benchmark example-times docs words audit \
 	dist address clean
 
 help: ## this list
@@ -31,7 +31,7 @@ compare: $(INSTALLED) ## agents with and without a shield, compared (OUT=runs/co
 
 # The pages of results: runs that runs/study has already are kept, so that it can be done in parts. STUDY: more options of ncs study.
 study: $(INSTALLED) ## the whole study, and the pages of results
-	$(BIN)/ncs study --page docs/results.md --quote README.md docs/when_not.md $(STUDY)
+	$(BIN)/ncs study --page docs/results.md --quote README.md docs/index.md docs/when_not.md $(STUDY)
 
 test: $(INSTALLED) ## the tests
 	$(BIN)/python -m pytest -n auto --dist worksteal $(TEST_FLAGS)
@@ -87,6 +87,9 @@ example-times: $(INSTALLED) ## how long each example takes, and what it says (EX
 # Fails on a broken link, anchor, reference or formula; makes a page per registered environment. Look at it: python -m http.server -d site (from a file the search is missing).
 docs: $(DOCS_INSTALLED) ## the site, in site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
+words: ## words of README and of every page
+	@wc -w README.md docs/*.md
 
 # Known vulnerabilities of what constraints.txt names, by OSV: any index of packages will do, a network is needed.
 audit: $(AUDIT_INSTALLED) ## known vulnerabilities of the dependencies (asks a database on the internet)

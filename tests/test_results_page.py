@@ -8,7 +8,7 @@ import pytest
 
 from experiments.plots.figure_style import CaptionedFigure
 from experiments.study.figures import study_figures
-from experiments.study.study import quoted, results_page
+from experiments.study.study import quoted, results_page, results_tables
 from experiments.study.tables import tables_by_name
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -20,7 +20,7 @@ def stored():
     return json.loads(STORED.read_text())
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/when_not.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/index.md", "docs/when_not.md"])
 def test_quoted_tables_are_those_of_the_stored_study(page, stored):
     text = (ROOT / page).read_text()
     assert quoted(text, tables_by_name(stored)) == text
@@ -32,4 +32,5 @@ def test_results_are_the_page_of_the_stored_study(stored):
     with mock.patch.object(CaptionedFigure, "png", b""):  # the page has their names and captions
         figures = study_figures(stored)
     assert results_page(stored, figures, "images/results-") == (ROOT / "docs" / "results.md").read_text()
+    assert results_tables(stored) == (ROOT / "docs" / "results.txt").read_text()
     assert all((ROOT / "docs" / "images" / f"results-{name}.png").is_file() for name in figures)

@@ -9,6 +9,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from experiments.terminal import synthesis_status
 from ncs_gym import NCSEnv
 from ncs_gym.network import contract_of, downlink_protocol
 from ncs_gym.network.wire import SHORTEST_KEY
-from shields import Certificate
+from shields import Certificate, Infeasible
 from shields.atomic_write import write_atomically
 from shields.runtime.wrapper import certificate_for
 from shields.verification import require_valid
@@ -44,8 +45,8 @@ def loop(settings: LoopSettings) -> None:
     """Runs `ncs loop`.
 
     Raises:
-        ValueError: If a setting is wrong, or the key too short.
-        Infeasible: If there is no certificate for the plant behind this network.
+        ValueError: If a setting is wrong or the key too short, or there is no certificate for the plant behind this
+            network.
         CertificateError: If a given certificate is damaged or does not verify.
         OSError: If a file cannot be read or written, or an address is in use.
         ChildProcessError: If a process ended by itself.
@@ -64,14 +65,17 @@ def loop(settings: LoopSettings) -> None:
     try:
         if settings.role == "plant":
             print(f"the plant waits for a controller at {settings.host}, port {settings.port}; end it with Ctrl-C")
-            while all(process.is_alive() for process in processes):
-                time.sleep(_PERIOD / 4)
+            with suppress(KeyboardInterrupt):  # which ends both processes, too
+                while all(process.is_alive() for process in processes):
+                    time.sleep(_PERIOD / 4)
+                raise ChildProcessError("a process of the loop ended by itself; its message is above")
         else:
             with _view(settings, env) as show:
                 known = not settings.restarted
-                run_controller_node(network_loop, known, show, lambda: not all(each.is_alive() for each in processes))
-        if not all(process.is_alive() for process in processes):
-            raise ChildProcessError("a process of the loop ended by itself; its message is above")
+                alone = lambda: not all(each.is_alive() for each in processes)  # noqa: E731
+                was_told = run_controller_node(network_loop, known, show, alone)
+            if not was_told and alone():
+                raise ChildProcessError("a process of the loop ended by itself; its message is above")
     finally:
         for process in processes:
             process.terminate()
@@ -79,11 +83,10 @@ def loop(settings: LoopSettings) -> None:
             process.join(_PATIENCE)
             if process.is_alive():
                 process.kill()
-    if settings.role != "plant":
-        summary = summary_of(settings.out)
-        write_atomically(settings.out / "summary.json", json.dumps(summary, indent=1) + "\n")
-        width = max(map(len, summary))
-        print("\n".join(f"{name:>{width}}  {value}" for name, value in summary.items()))
+    summary = summary_of(settings.out)
+    write_atomically(settings.out / "summary.json", json.dumps(summary, indent=1) + "\n")
+    width = max(map(len, summary))
+    print("\n".join(f"{name:>{width}}  {value}" for name, value in summary.items()))
 
 
 def _in_process(run: Callable[[NetworkLoop], None], network_loop: NetworkLoop, env: str) -> None:
@@ -104,8 +107,19 @@ def _network_loop(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
     assert protocol is not None
     contract = None if env.contract is None else protocol.behind(contract_of(uplink))
     if settings.certificate is None:
-        with synthesis_status() as show:
-            certificate = certificate_for(env.plant, contract, show)
+        try:
+            with synthesis_status() as show:
+                certificate = certificate_for(env.plant, contract, show)
+        except Infeasible as error:
+            ages = [
+                f"{way.most_consecutive_losses} + {way.delay} + {way.jitter} + {settings.room}"
+                for way in (given.uplink, given.downlink)
+            ]
+            raise ValueError(
+                f"{error}. There and back, what the network promises adds up to max_age: max_consecutive_losses + "
+                f"delay + jitter + --room, now {ages[0]} by --channel NAME=VALUE ... and {ages[1]} by --downlink "
+                "NAME=VALUE ..."
+            ) from error
     else:
         certificate = Certificate.load(settings.certificate)
         require_valid(certificate, env.plant)
@@ -114,7 +128,7 @@ def _network_loop(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
 
 
 def _given(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
-    uplink, downlink = network_channels(env)
+    uplink, downlink = network_channels(env, settings.channel, settings.downlink)
     key = os.urandom(32) if settings.key_file is None else settings.key_file.read_bytes()
     if len(key) < SHORTEST_KEY:
         raise ValueError(f"{settings.key_file} must hold at least {SHORTEST_KEY} bytes")
@@ -125,7 +139,7 @@ def _given(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
         uplink=uplink,
         downlink=downlink,
         room=settings.room,
-        key=key,
+        secret=key,
         seed=settings.seed,
         speed=settings.speed,
         policy=settings.policy,
@@ -218,26 +232,26 @@ def summary_of(folder: Path) -> dict[str, Any]:
         counts["outside"] += row["outside"] == "1"
         counts["outside, proved"] += row["outside"] == "1" and proved.get(key) == "1" and missing == 0
         counts["proved, missed"] += proved.get(key) == "1" and missing > 0
-    summary: dict[str, Any] = {
-        "episodes": len({episode for episode, _ in proved}),
-        "steps of the controller": counts["steps"],
-        "steps of the plant": counts["plant"],
-        "proved": counts["proved"],
-        "outside the box": counts["outside"],
-        "outside although proved": counts["outside, proved"],
-        "overridden": counts["overridden"],
-        "inputs missing": sum(last_of.values()),
-        "proved, a miss not yet heard": counts["proved, missed"],
-        "decided too late": int(last["skipped"]) if counts["steps"] else 0,
-        "datagrams refused": int(last["refused"]) if counts["steps"] else 0,
-        "oldest sample in use": max(ages, default=0),
-    }
-    if times:
+    summary: dict[str, Any] = {"episodes": len(last_of.keys() | {episode for episode, _ in proved})}
+    if proved:  # else the controller's log is on the other machine
+        summary |= {
+            "steps of the controller": counts["steps"],
+            "proved": counts["proved"],
+            "overridden": counts["overridden"],
+            "decided too late": int(last["skipped"]),
+            "datagrams refused": int(last["refused"]),
+            "oldest sample in use": max(ages),
+        }
         q = np.quantile(times, [0.5, 0.999, 1.0]).round().astype(int).tolist()
         summary["ms into the step, 50/99.9/100 %"] = " / ".join(f"{each / 1000:.2f}" for each in q)
-    if not counts["plant"]:  # its log is on the other machine
-        for name in ("steps of the plant", "outside the box", "outside although proved", "inputs missing"):
-            del summary[name]
-        del summary["proved, a miss not yet heard"]
+    if last_of:  # else the plant's is
+        summary |= {
+            "steps of the plant": counts["plant"],
+            "outside the box": counts["outside"],
+            "inputs missing": sum(last_of.values()),
+        }
+    if proved and last_of:
+        summary["outside although proved"] = counts["outside, proved"]
+        summary["proved, a miss not yet heard"] = counts["proved, missed"]
     reasons = {name.removeprefix("reason: "): count for name, count in counts.items() if name.startswith("reason: ")}
     return summary | {f"not proved, {name}": count for name, count in reasons.items() if count}

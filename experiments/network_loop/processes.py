@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import hmac
 import signal
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,7 @@ import numpy as np
 
 from experiments.network_loop.impairment import Impairment, open_line
 from experiments.network_loop.log import StepLog
-from experiments.runs.loops import registered_env
+from experiments.runs.loops import changed_channel, registered_env
 from experiments.runs.policies import policy_by_name
 from ncs_gym import Actuator, AdversarialDisturbance, Channel, NCSEnv
 from ncs_gym.network import downlink_protocol
@@ -37,6 +39,8 @@ from shields.nodes import (
 ECHO_ROOM, ECHO_AGE = 5, 50
 # Steps in a row that are not proved after which the controller begins another episode.
 RENEWED = 250
+# Seconds after which a controller that waits says so.
+SILENCE = 5.0
 # Steps between two changes of direction of the controller "push".
 PUSH = 100
 
@@ -51,7 +55,7 @@ class NetworkLoop:
         uplink: What the network does to samples and echoes.
         downlink: What it does to commands.
         room: Steps by which both may be later than that, because the processes are: what is promised counts them.
-        key: What the nodes share.
+        secret: What both machines share.
         seed: Of network, disturbance and controller.
         speed: Steps of the plant per duration of a step.
         policy: Name of the controller.
@@ -69,7 +73,7 @@ class NetworkLoop:
     uplink: Channel
     downlink: Channel
     room: int
-    key: bytes
+    secret: bytes
     seed: int
     speed: float
     policy: str
@@ -96,6 +100,12 @@ class NetworkLoop:
         assert protocol is not None
         return protocol.lead
 
+    @property
+    def key(self) -> bytes:
+        """Key of the messages: machines that were told other things refuse each other's."""
+        told = self.env, self.speed, self.room, self.uplink, self.downlink
+        return hmac.digest(self.secret, repr(told).encode(), "sha256")
+
     def dt(self, env: NCSEnv) -> float:
         """Returns the duration of a step in real time [s]."""
         return env.plant.dt / self.speed
@@ -110,10 +120,20 @@ class NetworkLoop:
         return SafeLoop(certificate, env.plant, uplink, self.mode, self.horizon, **settings)
 
 
-def network_channels(env: NCSEnv) -> tuple[Channel, Channel]:
+def network_channels(
+    env: NCSEnv, up_changes: Mapping[str, Any], down_changes: Mapping[str, Any]
+) -> tuple[Channel, Channel]:
     """Returns uplink and downlink of an environment as a real network has them: what is sent now arrives a step later.
 
     Without a downlink of its own it has one like its uplink.
+
+    Args:
+        env: The environment.
+        up_changes: Changes of the uplink by name; see `changed_channel`.
+        down_changes: Those of the downlink.
+
+    Raises:
+        ValueError: If a change is wrong, or is none that a real network can have.
     """
     up = env.channel
     down = env.downlink or Channel(loss=up.loss, jitter=up.jitter, max_consecutive_losses=up.max_consecutive_losses)
@@ -124,7 +144,15 @@ def network_channels(env: NCSEnv) -> tuple[Channel, Channel]:
         settings = {name: getattr(channel, name) for name in ("loss", "quantization_step", "jitter")}
         return Channel(**settings, delay=max(channel.delay, 1), max_consecutive_losses=channel.max_consecutive_losses)
 
-    return late(up), late(down)
+    def changed(own: Channel, changes: Mapping[str, Any], flag: str) -> Channel:
+        channel = changed_channel(own, changes, flag) or own
+        if channel.delay < 1 or channel.send_period != 1:
+            raise ValueError(
+                f"{flag}: what is sent at each step arrives at the next at best: delay >= 1, send_period 1"
+            )
+        return channel
+
+    return changed(late(up), up_changes, "--channel"), changed(late(down), down_changes, "--downlink")
 
 
 def run_plant(loop: NetworkLoop) -> None:
@@ -142,7 +170,7 @@ def run_controller_node(
     known: bool = True,
     show: Callable[[dict[str, Any]], None] | None = None,
     is_alone: Callable[[], bool] = lambda: False,
-) -> None:
+) -> bool:
     """Runs the controller in real time, until it has made its steps, the process is ended or is left alone.
 
     Args:
@@ -150,9 +178,13 @@ def run_controller_node(
         known: Whether the plant starts where the first estimate says.
         show: Called with each row of the log.
         is_alone: Whether processes that it needs have ended.
+
+    Returns:
+        Whether it was told to stop.
     """
     told = _told_to_stop()
     asyncio.run(_controller(loop, known, show, lambda: told() or is_alone()))
+    return told()
 
 
 def _told_to_stop() -> Callable[[], bool]:
@@ -253,12 +285,29 @@ async def _controller(
             node.begin(safe.estimate, known=False)
             unproved = 0
 
+    began, is_told = time.monotonic(), False
+
     def has_ended() -> bool:
+        nonlocal is_told
+        if node.episode == 0 and not is_told and time.monotonic() - began > SILENCE:
+            is_told = True
+            print(waiting_text(node.refused), file=sys.stderr, flush=True)
         return is_over() or (loop.steps is not None and steps >= loop.steps)
 
     await run_controller(node, propose, on_step, has_ended)
     log.close()
     packets.close()
+
+
+def waiting_text(refused: Mapping[str, int]) -> str:
+    """Returns what a controller says that waits, given how many datagrams were refused by reason."""
+    if not refused:
+        return "the controller waits for sensor and actuator; nothing has arrived yet"
+    why = ", ".join(f"{count} by {reason}" for reason, count in refused.items())
+    return (
+        f"the controller waits for sensor and actuator; datagrams were refused: {why}. Where it is the tag, the other "
+        "machine has another key, or another --env, --speed, --room, --channel or --downlink"
+    )
 
 
 def controller_named(name: str, env_id: str, env: NCSEnv, seed: int) -> Callable[[np.ndarray], np.ndarray]:

@@ -354,7 +354,7 @@ class StudySettings(BackendSettings):
 
     Every environment is a comparison of its own (`ncs compare`) in a folder below the output folder, with the settings
     of that command; then linear controllers and trained agents are attacked with every impairment of the channel on and
-    off. Leaves report.html, the same as a page of Markdown (docs/results.md is one), figures,
+    off. Leaves report.html, a page of Markdown (docs/results.md is one) beside all tables (results.txt), figures,
     summary.json and episodes.parquet. Started again with the same folder, finished runs are kept: a long study can be
     run in parts.
 
@@ -373,8 +373,8 @@ class StudySettings(BackendSettings):
         safe_set: What shields keep: the ellipsoid, which the filters beside them have too, or the polytope that other
             commands take.
         channel_episodes: Episodes per arm and combination of impairments; 0 leaves them out.
-        page: Also write the page of Markdown to this file, its figures into the folder images beside it, and its
-            numbers into the file with the ending .json.
+        page: Also write the page of Markdown to this file, its figures into the folder images beside it, all tables
+            and their numbers into the files with the endings .txt and .json.
         quote: Pages in which the marked tables are replaced by those of this study.
         smoke: Run a short version, whatever else is asked for, to see that everything works; if `--out` is not given,
             in a folder of its own, with -smoke at the end of its name.

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from experiments.settings.arguments import StepCount, require_horizon
+from experiments.settings.arguments import Assignments, StepCount, require_horizon
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,6 +15,9 @@ class LoopSettings:
 
     Attributes:
         env: Id of an environment with a plant of its own; module:id first imports the module.
+        channel: Changes of what the network does to samples and echoes, by the names that `ncs compare` lists, such as
+            loss=0.3 burst_length=2 max_consecutive_losses=3; by default the environment's channel.
+        downlink: Changes of what it does to commands; by default the environment's downlink, or else like its channel.
         policy: "push" (the largest input one way, then the other), "greedy", "zero", "random", or the folder of a
             trained agent.
         shield: Mode of the shield.
@@ -39,6 +42,8 @@ class LoopSettings:
     """
 
     env: str = "ncs_gym/CartPole-v0"
+    channel: Assignments = field(default_factory=dict)
+    downlink: Assignments = field(default_factory=dict)
     policy: str = "push"
     shield: Literal["project", "lookahead", "switch", "boundary", "monitor"] = "project"
     horizon: int | None = None

@@ -25,6 +25,7 @@ from experiments.study.figures import study_figures
 from experiments.study.summary import study_summary
 from experiments.study.tables import (
     QUOTABLE,
+    agents_of,
     budget_text,
     comparisons_table,
     evaluation_table,
@@ -97,6 +98,7 @@ def _write(settings: StudySettings, summary: dict[str, Any], episodes: pd.DataFr
         "episodes.parquet": parquet(episodes, summary),
         "report.html": study_report(summary, figures),
         "results.md": results_page(summary, figures, "figures/"),
+        "results.txt": results_tables(summary),
     }
     write_results(settings.out, summary, files, figures)
     for path in settings.quote:
@@ -109,7 +111,9 @@ def _write_page(page: Path, summary: dict[str, Any], figures: dict[str, tuple[st
     for name, (_, png) in figures.items():
         write_atomically(images / f"{page.stem}-{name}.png", png)
     write_atomically(page.with_suffix(".json"), json.dumps(summary, allow_nan=False) + "\n")
-    write_atomically(page, results_page(summary, figures, f"images/{page.stem}-"))
+    tables = page.with_suffix(".txt")
+    write_atomically(tables, results_tables(summary))
+    write_atomically(page, results_page(summary, figures, f"images/{page.stem}-", tables.name))
 
 
 # A mark names a table; what stands between it and the end is replaced.
@@ -126,16 +130,34 @@ def study_report(summary: dict[str, Any], figures: dict[str, tuple[str, bytes]])
     return render_page("study.html.j2", figures, title="Safe learning: the study", **_context(summary))
 
 
-def results_page(summary: dict[str, Any], figures: dict[str, tuple[str, bytes]], prefix: str) -> str:
+def results_page(
+    summary: dict[str, Any], figures: dict[str, tuple[str, bytes]], prefix: str, tables: str = "results.txt"
+) -> str:
     """Returns the Markdown page.
 
     Args:
         summary: As for `study_report`.
         figures: As for `study_report`.
         prefix: What stands before a figure's name in its link.
+        tables: Link to the file of all tables (`results_tables`).
     """
     links = {name: f"{prefix}{name}.png" for name in figures}
-    return render_page("results.md.j2", figures, links=links, **_context(summary))
+    return render_page("results.md.j2", figures, links=links, tables=tables, **_context(summary))
+
+
+def results_tables(summary: dict[str, Any]) -> str:
+    """Returns all tables as plain text: every arm and every combination of impairments.
+
+    Args:
+        summary: As for `study_report`.
+    """
+    known = _context(summary)
+    parts = [known["budget"], known["comparisons"], known["prices"], known["margins"]]
+    for name in summary["environments"]:
+        parts.append(f"{name}\n{known['evaluation'][name]}")
+        if name in known["channels"]:
+            parts.append(f"{name}\n{known['channels'][name]}")
+    return "\n\n\n".join([*parts, known["training"]]) + "\n"
 
 
 def _context(summary: dict[str, Any]) -> dict[str, Any]:
@@ -147,8 +169,10 @@ def _context(summary: dict[str, Any]) -> dict[str, Any]:
         "prices": prices_table(summary),
         "margins": margins_table(summary),
         "evaluation": {name: evaluation_table(env) for name, env in environments.items()},
-        "training": {name: training_table(env) for name, env in environments.items()},
+        "agents": {name: agents_of(env) for name, env in environments.items()},
+        "training": training_table(summary),
         "channels": {name: switches_table(rows) for name, rows in summary["channels"].items()},
+        "switches": {name: switches_table(rows, combined=False) for name, rows in summary["channels"].items()},
     }
 
 

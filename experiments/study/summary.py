@@ -13,7 +13,7 @@ from experiments.baselines import MARGINS
 from experiments.runs.arms import Arm
 from experiments.runs.loops import AS_TRAINED
 
-IDEAL, ATTACKED = "ideal channel", "attacked"
+IDEAL, ATTACKED, ATTACKED_IDEAL = "ideal channel", "attacked", "attacked on an ideal channel"
 # Arms with a proof: no scenario leaves the assumptions of the certificate.
 SOUND = "lookahead"
 

@@ -7,7 +7,16 @@ from typing import Any
 
 from experiments.runs.loops import AS_TRAINED
 from experiments.study.channel_switches import SWITCHES
-from experiments.study.summary import ATTACKED, FAMILIES, IDEAL, margins_needed, members
+from experiments.study.summary import (
+    ATTACKED,
+    ATTACKED_IDEAL,
+    FAMILIES,
+    IDEAL,
+    SECONDARY,
+    SOUND,
+    margins_needed,
+    members,
+)
 from experiments.terminal import text_table
 
 # Narrow headers of the scenarios, in the order of the columns.
@@ -16,7 +25,7 @@ _SCENARIOS = {
     AS_TRAINED: ("as", "trained"),
     "worse channel": ("worse", "chan."),
     ATTACKED: ("at-", "tacked"),
-    "attacked on an ideal channel": ("att.,", "ideal"),
+    ATTACKED_IDEAL: ("att.,", "ideal"),
     "worst-case disturbance": ("worst", "dist."),
     "gaussian": ("Gauss", "noise"),
 }
@@ -93,6 +102,22 @@ def margins_table(summary: dict[str, Any]) -> str:
     return text_table(rows)
 
 
+def network_table(summary: dict[str, Any]) -> str:
+    """Returns what the network does to a filter that trusts its estimate, beside the arm with a proof.
+
+    These are violating episodes under attack, on an ideal channel and over the environment's own network.
+    """
+    rows = [["violating episodes under attack [%]", "", "ideal channel", "over the network", "95 % interval"]]
+    for title, env in summary["environments"].items():
+        for name in (SECONDARY[0].first, SECONDARY[0].second):
+            scenarios = env["arms"].get(name, {"scenarios": {}})["scenarios"]
+            if {ATTACKED, ATTACKED_IDEAL} <= set(scenarios):
+                ideal, own = scenarios[ATTACKED_IDEAL], scenarios[ATTACKED]
+                rates = [f"{100 * each['rate']:.1f}" for each in (ideal, own)]
+                rows.append([title, name, *rates, _interval(own["rate_ci95"], 100.0)])
+    return text_table(rows, left_columns=2)
+
+
 def regulators_table(summary: dict[str, Any]) -> str:
     """Returns of the first environment the arms in which nothing is trained."""
     env = next(iter(summary["environments"].values()))
@@ -103,39 +128,50 @@ def regulators_table(summary: dict[str, Any]) -> str:
 
 def agents_table(summary: dict[str, Any]) -> str:
     """Returns of every environment the arms that were trained, and the regulator behind lookahead."""
-    parts = []
-    for title, env in summary["environments"].items():
-        arms = {name: arm for name, arm in env["arms"].items() if arm["train_steps"] or name == "lqr+lookahead"}
-        if env["trained"]:
-            parts.append(f"{title}\n{evaluation_table(env | {'arms': arms})}")
-    return "\n\n".join(parts)
+    trained = {title: env for title, env in summary["environments"].items() if env["trained"]}
+    return "\n\n".join(f"{title}\n{agents_of(env)}" for title, env in trained.items())
 
 
-def training_table(env: dict[str, Any]) -> str:
+def agents_of(env: dict[str, Any]) -> str:
+    """Returns of an environment the arms that were trained, and the regulator behind lookahead.
+
+    Args:
+        env: An environment of `study_summary`.
+    """
+    arms = {name: arm for name, arm in env["arms"].items() if arm["train_steps"] or name == f"lqr+{SOUND}"}
+    return evaluation_table(env | {"arms": arms})
+
+
+def training_table(summary: dict[str, Any]) -> str:
     """Returns how many steps violated while the agents learned."""
-    rows = [["", "violating steps in training", "of all", "fewest and most in a run"]]
-    for name in env["trained"]:
-        arm = env["arms"][name]
-        by_run = arm["train_violation_steps_by_run"]
-        rows.append(
-            [
-                name,
-                f"{arm['train_violation_steps']:,} of {arm['train_steps']:,}",
-                f"{100 * arm['train_violation_steps'] / max(arm['train_steps'], 1):.2f} %",
-                f"{min(by_run):,} to {max(by_run):,}",
-            ]
-        )
-    return text_table(rows)
+    rows = [["violating steps in training", "", "steps", "of all", "by run"]]
+    for title, env in summary["environments"].items():
+        for name in env["trained"]:
+            arm = env["arms"][name]
+            by_run = arm["train_violation_steps_by_run"]
+            rows.append(
+                [
+                    title,
+                    name,
+                    f"{arm['train_violation_steps']:,}",
+                    f"{100 * arm['train_violation_steps'] / max(arm['train_steps'], 1):.2f} %",
+                    f"{min(by_run):,} to {max(by_run):,}",
+                ]
+            )
+    return text_table(rows, left_columns=2)
 
 
-def switches_table(rows: Sequence[dict[str, Any]]) -> str:
+def switches_table(rows: Sequence[dict[str, Any]], *, combined: bool = True) -> str:
     """Returns violating episodes under attack [%] with each impairment of the channel on or off.
 
     Args:
         rows: What `channel_switches` returns.
+        combined: Whether to show combinations, beside each impairment alone, none and all.
     """
     arms = list(dict.fromkeys(row["arm"] for row in rows))
     points = list(dict.fromkeys(tuple(row["on"]) for row in rows))
+    if not combined:
+        points = [point for point in points if len(point) in (0, 1, len(SWITCHES))]
     table = [["attacked, violating [%]", *arms]]
     for point in points:
         at_point = {row["arm"]: row for row in rows if tuple(row["on"]) == point}
@@ -158,6 +194,7 @@ def budget_text(summary: dict[str, Any]) -> str:
 QUOTABLE: dict[str, Callable[[dict[str, Any]], str]] = {
     "regulators": regulators_table,
     "agents": agents_table,
+    "network": network_table,
     "comparisons": comparisons_table,
     "prices": prices_table,
     "margins": margins_table,
@@ -166,7 +203,7 @@ QUOTABLE: dict[str, Callable[[dict[str, Any]], str]] = {
 
 
 def tables_by_name(summary: dict[str, Any]) -> dict[str, str]:
-    """Returns the tables that pages quote: regulators (of the first environment), agents, comparisons, prices, ...
+    """Returns the tables that pages quote: regulators (of the first environment), agents, network, comparisons, ...
 
     Args:
         summary: What `study_summary` returns, with the switches of the channels.

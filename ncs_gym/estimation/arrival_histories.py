@@ -230,10 +230,13 @@ class ArrivalHistories:
         recursion: Moves the error statistics.
         channel: Gives the length of the replay buffer.
         table: Error statistics to begin with; none by default.
+        coarsens: Whether shapes are rounded more coarsely from each time on that histories are forgotten: bounds are
+            still bounds, but how large they are depends on what was met before.
 
     Attributes:
         recursion: The same.
         channel: The same.
+        coarsens: The same.
         buffer: Age of the oldest sample that is of use [steps].
         root: Number of the history at the start of an episode.
         table: The distinct error statistics met so far.
@@ -248,8 +251,10 @@ class ArrivalHistories:
         used: Statistics before the update at each age, NO_SAMPLE without one, shape (buffer + 1, capacity).
     """
 
-    def __init__(self, recursion: ErrorRecursion, channel: Channel, table: ErrorTable | None = None) -> None:
-        self.recursion, self.channel = recursion, channel
+    def __init__(
+        self, recursion: ErrorRecursion, channel: Channel, table: ErrorTable | None = None, coarsens: bool = False
+    ) -> None:
+        self.recursion, self.channel, self.coarsens = recursion, channel, coarsens
         self.buffer, ages, size = channel.longest_delay, recursion.error_set.ages, _FIRST_CAPACITY
         # Ages above this make no difference: neither to a certified set nor to what the buffer holds.
         oldest = max(self.buffer + 1, 0 if ages is None else len(ages.shapes))
@@ -360,14 +365,17 @@ class ArrivalHistories:
     def keeping(self, histories: np.ndarray) -> tuple[ArrivalHistories, np.ndarray]:
         """Returns a graph with some histories, shape (k,), only, and their numbers there.
 
-        Error statistics that recurred are kept as well, since they take the longest to work out.
+        Error statistics that recurred are kept as well, since they take the longest to work out, unless they are
+        rounded more coarsely from now on.
         """
         with self._lock:
             successor = None if self._successor is None else self._successor()
             if successor is None or successor.is_full:
-                self.table.mark(self.present[: self._count][self._recurs[: self._count]])
-                table = self.table.recurring(MAX_BYTES // (4 * self.table.bytes_each))
-                successor = ArrivalHistories(self.recursion, self.channel, table)
+                recursion, table = self.recursion.coarser() if self.coarsens else self.recursion, None
+                if recursion is self.recursion:
+                    self.table.mark(self.present[: self._count][self._recurs[: self._count]])
+                    table = self.table.recurring(MAX_BYTES // (4 * self.table.bytes_each))
+                successor = ArrivalHistories(recursion, self.channel, table, self.coarsens)
                 self._successor = weakref.ref(successor)
             for key, shared in list(_shared.items()):
                 if shared is self:
@@ -450,11 +458,16 @@ def _with_room(array: np.ndarray, count: int, axis: int = -1) -> np.ndarray:
     return np.concatenate([array, np.zeros_like(array)], axis=axis)
 
 
-_shared: dict[tuple[str, Channel, ChannelContract | None], ArrivalHistories] = {}
+_shared: dict[tuple[str, Channel, ChannelContract | None, bool], ArrivalHistories] = {}
 
 
-def arrival_histories(plant: LinearPlant, channel: Channel, contract: ChannelContract | None) -> ArrivalHistories:
+def arrival_histories(
+    plant: LinearPlant, channel: Channel, contract: ChannelContract | None, coarsens: bool = False
+) -> ArrivalHistories:
     """Returns the graph that all estimators of a plant behind a channel share in this process.
+
+    Simulations share one that does not coarsen, so that they say the same whatever ran before; loops in real time one
+    that does, so that each step soon is a look-up.
 
     Raises:
         UnstablePlantError: If the plant is not Schur stable and there is no contract.
@@ -462,16 +475,19 @@ def arrival_histories(plant: LinearPlant, channel: Channel, contract: ChannelCon
     """
     # Only delays and quantization matter to it, not how packets are lost or when they are sent.
     kept = Channel(quantization_step=channel.quantization_step, delay=channel.delay, jitter=channel.jitter)
-    key = plant.fingerprint, kept, contract
+    key = plant.fingerprint, kept, contract, coarsens
     histories = _shared.pop(key, None)
     if histories is None:
-        histories = histories_of(plant, kept, certified_error_set(plant, contract))
+        histories = histories_of(plant, kept, certified_error_set(plant, contract), coarsens)
     _shared[key] = histories
     if len(_shared) > MAX_GRAPHS:  # the one that was asked for the longest ago
         _shared.pop(next(iter(_shared)), None)
     return histories
 
 
-def histories_of(plant: LinearPlant, channel: Channel, error_set: ErrorSet, **precision: Any) -> ArrivalHistories:
+def histories_of(
+    plant: LinearPlant, channel: Channel, error_set: ErrorSet, coarsens: bool = False, **precision: Any
+) -> ArrivalHistories:
     """Returns a graph of its own; see `ErrorRecursion` for the precision of covariances and shapes."""
-    return ArrivalHistories(ErrorRecursion(plant, channel.quantization_step, error_set, **precision), channel)
+    recursion = ErrorRecursion(plant, channel.quantization_step, error_set, **precision)
+    return ArrivalHistories(recursion, channel, coarsens=coarsens)

@@ -121,7 +121,8 @@ class Estimator:
         shape = self._error_set.shape_at(age)
         assert shape is not None
         first = ErrorStatistics(self._plant.kalman_covariances[2].copy(), shape.copy(), age)
-        self._histories = histories_of(self._plant, self._channel, self._error_set, first=first)
+        coarsens = self._usual.coarsens
+        self._histories = histories_of(self._plant, self._channel, self._error_set, coarsens, first=first)
         self._begin(mean, self.step, age)
 
     def _begin(self, mean: np.ndarray, step: int = 0, age: int = 0) -> None:

@@ -28,6 +28,7 @@ def first_estimate(
     independent terms M d of every disturbance and T v of every sample, so that it lies in an ellipsoid around the sum
     of all E(M D M') and E(T N T') (docs/shield_proof.md, "Unknown start"). Where that lies inside the certified set of
     its age, the estimate is as good as one that was always followed. The fewest newest samples that prove it are taken.
+    Older ones are a second opinion: what they alone say must have a state in common with it, or one of them is wrong.
 
     Args:
         plant: The plant, without a remainder: its bound would need to be known to hold for the states that are sought.
@@ -37,7 +38,7 @@ def first_estimate(
         sensor_error: N, shape (p, p).
 
     Returns:
-        None if nothing is proved.
+        None if nothing is proved, or samples contradict each other.
     """
     ages = sorted(samples)
     certified = error_set.shape_at(ages[0]) if ages and plant.remainder is None else None
@@ -48,8 +49,19 @@ def first_estimate(
         estimate, shape = _least_squares(plant, {age: samples[age] for age in ages[:count]}, inputs, sensor_error)
         rest = (certified - (1.0 + ROUNDING) * shape) / np.outer(size, size)
         if np.isfinite(estimate).all() and np.isfinite(rest).all() and np.linalg.eigvalsh(rest)[0] > ROUNDING:
-            return estimate, ages[0]
+            older = [{age: samples[age] for age in ages[count:end]} for end in range(count + 1, len(ages) + 1)]
+            others = [_least_squares(plant, each, inputs, sensor_error) for each in older]
+            return None if any(_are_apart(estimate, shape, *each) for each in others) else (estimate, ages[0])
     return None
+
+
+def _are_apart(x: np.ndarray, X: np.ndarray, z: np.ndarray, Z: np.ndarray) -> bool:
+    """Returns whether x + E(X) and z + E(Z) have surely no point in common; of what is NaN that is not sure."""
+    if not np.isfinite(Z).all():
+        return False
+    direction = np.linalg.lstsq(X + Z, x - z, rcond=None)[0]
+    widths = np.sqrt([max(direction @ shape @ direction, 0.0) for shape in (X, Z)])
+    return bool(direction @ (x - z) > (1.0 + ROUNDING) * widths.sum())
 
 
 def _least_squares(

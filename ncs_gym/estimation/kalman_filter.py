@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym.estimation.error_bound import ErrorSet
-from ncs_gym.estimation.set_membership import SHAPE_STEP, SetMembership
+from ncs_gym.estimation.set_membership import COARSER, COARSEST_STEP, SHAPE_STEP, SetMembership
 from ncs_gym.plants.linear_plant import FLAT_INFLATION, LinearPlant
 from ncs_gym.uncertainty.shape_matrices import is_inside
 
@@ -91,9 +91,18 @@ class ErrorRecursion:
         first: ErrorStatistics | None = None,
     ) -> None:
         self.plant, self.error_set, self._bits = plant, error_set, covariance_bits
+        self._quantization_step = quantization_step
         self.sets = SetMembership(plant, quantization_step, error_set, shape_step)
         self.Q, self.R = plant.kalman_covariances[0], _sensor_covariance(plant, quantization_step)
         self._first = first
+
+    def coarser(self) -> ErrorRecursion:
+        """Returns a recursion that rounds shapes up more coarsely, so that fewer differ; itself if it is coarse."""
+        coarser = min(COARSER * self.sets.shape_step, COARSEST_STEP)
+        if coarser <= self.sets.shape_step:
+            return self
+        settings = self._bits, coarser, self._first
+        return ErrorRecursion(self.plant, self._quantization_step, self.error_set, *settings)
 
     @property
     def first(self) -> ErrorStatistics:

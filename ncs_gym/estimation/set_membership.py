@@ -13,6 +13,11 @@ ROUNDING = 1e-13
 # Shapes are rounded up to multiples of this in coordinates where the certified set of age 0 is the unit ball: then they
 # recur when a pattern of arrivals does, and can be looked up.
 SHAPE_STEP = 2.0**-13
+# Where histories hardly recur so, the step becomes so many times larger, up to the coarsest one: beyond it shapes soon
+# reach the certified set.
+COARSER, COARSEST_STEP = 16.0, 2.0**-7
+# Room for the rounding of an eigenvalue, in steps.
+EIGENVALUE_ROOM = 1e-6
 # Multipliers mu that the set-membership gain is chosen from; any of them is sound.
 MULTIPLIERS = np.linspace(0.01, 0.99, 99)[:, None]
 
@@ -27,6 +32,7 @@ class SetMembership:
         shape_step: What shapes are rounded up to, as a fraction of the certified set's square extent.
 
     Attributes:
+        shape_step: The same.
         noise: N, shape (p, p): holds sensor noise and quantization error.
     """
 
@@ -35,7 +41,7 @@ class SetMembership:
     ) -> None:
         from scipy.linalg import solve_triangular  # takes long to import
 
-        self.plant, self.error_set, self._step = plant, error_set, shape_step
+        self.plant, self.error_set, self.shape_step = plant, error_set, shape_step
         Sigma = error_set.Sigma
         self._ball = np.linalg.cholesky(error_set.shape_at(0))
         self._to_ball = solve_triangular(self._ball, np.eye(plant.n), lower=True)
@@ -114,12 +120,19 @@ class SetMembership:
         """Returns a shape rounded up to multiples of a step where the certified set of age 0 is the unit ball.
 
         Rounding moves an entry by half a step, hence no direction by more than n halves of one, which is added before.
+        Where steps are coarse, the whole steps that are missing are added afterwards, which is about a third of that.
         """
         inward, outward, size = self._to_ball, self._ball, len(shape)
         extent = np.sqrt(np.abs(shape.diagonal()))
         inner = enlarged_by_rounding(inward.dot(shape).dot(inward.T), self._abs_to_ball.dot(extent))
-        inner.flat[:: size + 1] += size * self._step
-        inner = self._step * np.rint(inner / self._step)
+        if self.shape_step <= SHAPE_STEP:
+            inner.flat[:: size + 1] += size * self.shape_step
+        given = inner / self.shape_step
+        steps = np.rint(given)
+        if self.shape_step > SHAPE_STEP:
+            missing = EIGENVALUE_ROOM - np.linalg.eigvalsh(steps - given)[0]
+            steps.flat[:: size + 1] += max(np.ceil(missing), 0.0)
+        inner = self.shape_step * steps
         reach = self._abs_ball.dot(np.sqrt(inner.diagonal()))
         rounded = enlarged_by_rounding(outward.dot(inner).dot(outward.T), reach)
         # Both products together move the shape S by at most E S + S E', |E| at most `ball_error`; with s the extent and

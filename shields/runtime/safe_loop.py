@@ -150,7 +150,8 @@ class SafeLoop:
             raise ValueError(f"channel must be a Channel (its contract is the certificate's), got {shown(channel)}")
         self._lost = LostGuarantee(on_unproved)
         self._contract = certificate.contract
-        self._estimator = Estimator(plant, channel, histories=arrival_histories(plant, channel, self._contract))
+        histories = arrival_histories(plant, channel, self._contract, coarsens=True)
+        self._estimator = Estimator(plant, channel, histories=histories)
         protocol = downlink_protocol(downlink, downlink_contract)
         self._monitored = MonitoredFilter(self._filter, protocol)
         self._lead = self._monitored.lead

@@ -7,12 +7,18 @@ import socket
 import subprocess
 import sys
 import time
+from dataclasses import fields
 
 import pandas as pd
 import pytest
+import tyro
 
 from experiments.commands.loop import summary_of
 from experiments.network_loop.log import StepLog, rows_of
+from experiments.network_loop.processes import NetworkLoop, network_channels, waiting_text
+from experiments.runs.loops import registered_env
+from experiments.settings import LoopSettings
+from ncs_gym import Channel
 from tests.certificates import certificate_of
 from tests.command import environment, ncs, ncs_process
 
@@ -97,7 +103,52 @@ def test_controller_that_is_killed_is_restarted_beside_the_running_plant(tmp_pat
         assert any(row["guaranteed"] == "1" for row in rows)
     finally:
         plant.send_signal(signal.SIGINT)
-        plant.communicate(timeout=60)
+        text, _ = plant.communicate(timeout=60)
+    assert plant.returncode == 0, text
+    assert "steps of the plant" in text
+    assert "steps of the controller" not in text
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"speed": 2.0}, {"room": 3}, {"uplink": Channel(loss=0.1)}, {"downlink": Channel(loss=0.1)}, {"env": "a"}],
+)
+def test_machines_that_were_told_other_things_have_other_keys(changes):
+    told = {field.name: None for field in fields(NetworkLoop)} | {"secret": bytes(16), "speed": 1.0, "room": 1}
+    one, other = NetworkLoop(**told), NetworkLoop(**told | changes)
+    assert one.key == NetworkLoop(**told | {"seed": 7, "out": "elsewhere"}).key
+    assert one.key != other.key
+    assert "--speed, --room" in waiting_text({"tag": 3})
+
+
+def test_controller_that_waits_says_what_it_waits_for(tmp_path):
+    key = tmp_path / "key"
+    key.write_bytes(bytes(range(32)))
+    command = [sys.executable, "-m", "experiments", "loop", "--env", CRUISE, "--role", "controller"]
+    command += ["--key-file", str(key), "--port", str(free_port()), "--out", str(tmp_path / "out"), "--live", "no"]
+    waits = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert waits.stderr is not None
+    line = waits.stderr.readline()
+    waits.send_signal(signal.SIGINT)
+    waits.communicate(timeout=60)
+    assert "the controller waits for sensor and actuator; nothing has arrived yet" in line
+    assert waits.returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("env", "more"),
+    [
+        ("CSTR", "--channel max_consecutive_losses=2 --downlink max_consecutive_losses=1"),
+        ("Convoy", "--channel max_consecutive_losses=3 --downlink max_consecutive_losses=3"),
+    ],
+)
+def test_networks_of_both_ways_are_chosen_by_name(env, more):
+    arguments = ["--env", f"ncs_gym/{env}-v0", *more.split()]
+    settings = tyro.cli(LoopSettings, args=arguments)
+    up, down = network_channels(registered_env(settings.env), settings.channel, settings.downlink)
+    assert (up.delay, down.delay) == (1, 1)
+    assert up.max_consecutive_losses == settings.channel["max_consecutive_losses"]
+    assert down.max_consecutive_losses == settings.downlink["max_consecutive_losses"]
 
 
 @pytest.mark.parametrize(
@@ -108,6 +159,9 @@ def test_controller_that_is_killed_is_restarted_beside_the_running_plant(tmp_pat
         (["--port", 70000], "--port must be between 1 and 65533"),
         (["--room", -1], "--room must be between 0 and 100 steps"),
         (["--role", "plant"], "give both the same --key-file"),
+        (["--channel", "lag=3"], "--channel lag: a channel has no such setting"),
+        (["--downlink", "delay=0"], "--downlink: what is sent at each step arrives at the next at best"),
+        (["--env", "ncs_gym/CSTR-v0"], "by --channel NAME=VALUE ... and 5 + 1 + 0 + 1 by --downlink NAME=VALUE"),
         (["--env", "ncs_gym/Nothing-v0"], "ncs_gym/Nothing-v0"),
         (["--key-file", "/dev/null", "--role", "plant"], "must hold at least 16 bytes"),
     ],

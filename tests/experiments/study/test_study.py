@@ -38,7 +38,8 @@ def finished(tmp_path_factory):
 
 def test_study_leaves_its_files(finished):
     names = {path.name for path in finished.out.iterdir()}
-    assert names >= {"report.html", "results.md", "summary.json", "episodes.parquet", "settings.json", "figures"}
+    assert names >= {"report.html", "results.md", "results.txt", "figures"}
+    assert names >= {"summary.json", "episodes.parquet", "settings.json"}
     summary = json.loads((finished.out / "summary.json").read_text())
     env = summary["environments"]["TruckTrailerCruise-v0"]
     assert env["steps"] == 1500  # one per cent of the steps tuned for the cruise
@@ -64,6 +65,14 @@ def test_page_quotes_and_figures_are_written_where_they_were_asked_for(finished)
         assert (finished.page.parent / "images" / link).is_file()
     assert "TruckTrailerCruise-v0 lqr+trusting" in finished.quote[0].read_text()
     assert json.loads(finished.page.with_suffix(".json").read_text())["environments"]
+
+
+def test_all_tables_stand_beside_the_page_that_links_to_them(finished):
+    assert "(results.txt)" in finished.page.read_text()
+    tables = finished.page.with_suffix(".txt").read_text()
+    for arm in ("lqr+trusting", "lqr+shielded", "unshielded"):
+        assert f"\n{arm} " in tables
+    assert tables == (finished.out / "results.txt").read_text()
 
 
 def test_finished_runs_are_kept_and_give_the_same_summary(finished, capsys):

@@ -12,6 +12,7 @@ from experiments.study.tables import (
     comparisons_table,
     evaluation_table,
     margins_table,
+    network_table,
     prices_table,
     switches_table,
     tables_by_name,
@@ -47,6 +48,7 @@ def study(**changed):
 
             each = run(name, index, (int(index < own * RUNS), 0), (offset, offset + 2.0), train_steps=100)
             each.scenarios.update({"ideal channel": played(0.0), "attacked": played(attacked)})
+            each.scenarios["attacked on an ideal channel"] = played(0.0)
             results[name].append(each if name in TRAINED else run(name, index, train_steps=0, train_violation_steps=0))
             if name not in TRAINED:
                 results[name][-1].scenarios.update(each.scenarios)
@@ -122,10 +124,16 @@ def test_margins_are_the_smallest_without_a_violation(made):
 
 def test_tables_fit_a_terminal(made):
     env = env_of(made)
-    tables = [evaluation_table(env), training_table(env), agents_table(made[0]), comparisons_table(made[0])]
-    tables += [prices_table(made[0]), margins_table(made[0])]
+    tables = [evaluation_table(env), training_table(made[0]), agents_table(made[0]), comparisons_table(made[0])]
+    tables += [prices_table(made[0]), margins_table(made[0]), network_table(made[0])]
     assert max(len(line) for table in tables for line in table.splitlines()) <= 100
     assert "50.0" in row(tables[0], "unshielded")
+
+
+def test_effect_of_the_network_is_shown_of_the_filter_that_trusts_its_estimate_and_of_the_proof(made):
+    trusting, sound = [line.split() for line in network_table(made[0]).splitlines()[2:]]
+    assert trusting[:4] == ["Plant-v0", "trusting:20", "0.0", "25.0"]
+    assert sound[:4] == ["Plant-v0", "lookahead", "0.0", "0.0"]
 
 
 def test_switches_are_a_row_per_combination():
@@ -142,6 +150,8 @@ def test_switches_are_a_row_per_combination():
         ["100", "0"],
     ]
     assert table.splitlines()[-1].startswith("all four")
+    alone = switches_table(rows, combined=False).splitlines()[2:]
+    assert [line.partition(" ")[0] for line in alone] == ["ideal", "loss", "all"]
 
 
 def test_pages_show_the_same_after_their_numbers_were_stored(made):

@@ -221,6 +221,17 @@ def test_first_estimate_holds_what_it_claims_against_the_worst_disturbance_and_n
     assert 5 < found < 60
 
 
+@pytest.mark.parametrize("plant", [PLANT, cart_pole(full_state=False)])
+def test_sample_that_contradicts_the_others_leaves_the_state_unknown(plant):
+    ages, noise = certified_error_set(plant, ChannelContract(5)), plant.sensor_error.shape_matrix
+    inputs = [np.zeros(plant.m)] * 8
+    samples = {age: np.zeros(plant.p) for age in range(9)}
+    assert first_estimate(plant, ages, samples, inputs, noise) is not None
+    for wrong in range(9):
+        given = samples | {wrong: 0.5 * plant.H @ plant.half_widths}
+        assert first_estimate(plant, ages, given, inputs, noise) is None
+
+
 def test_too_few_or_too_coarse_samples_are_no_first_estimate():
     position, contract = cart_pole(full_state=False), ChannelContract(5)
     N, ages = position.sensor_error.shape_matrix, certified_error_set(position, contract)

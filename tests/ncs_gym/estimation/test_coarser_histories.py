@@ -1,0 +1,82 @@
+"""Graphs of arrival histories that round error shapes more coarsely where histories hardly recur."""
+
+import numpy as np
+import pytest
+
+from ncs_gym import Channel, ChannelContract, Estimator, LinearPlant, Packet
+from ncs_gym.estimation import arrival_histories
+from ncs_gym.estimation.arrival_histories import histories_of
+from ncs_gym.estimation.error_bound import certified_error_set
+from ncs_gym.estimation.set_membership import COARSEST_STEP, SHAPE_STEP, SetMembership
+from ncs_gym.uncertainty.shape_matrices import is_inside
+
+# A motor whose speed is not measured, with sensors that are worth averaging over many samples.
+PLANT = LinearPlant(
+    A=[[1.0, 0.0099, 0.0010], [0.0, 0.98, 0.19], [0.0, -0.0047, 0.90]],
+    B=[[0.0], [0.01], [0.095]],
+    H=[[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
+    box=[1.0, 5.0, 3.0],
+    u_max=5.0,
+    dt=0.01,
+    disturbance_bound=[5e-4, 5e-3, 5e-3],
+    sensor_bound=[2e-3, 0.01],
+    initial_bound=[2e-3, 0.01, 0.01],
+)
+SETS = certified_error_set(PLANT, ChannelContract(2))
+CHANNEL = Channel(loss=0.3, max_consecutive_losses=2)
+
+
+def run(coarsens, steps):
+    """Follows the plant; returns the estimator, the largest level of the error in its shape, and the new histories."""
+    rng, state = np.random.default_rng(0), np.zeros(3)
+    estimator = Estimator(PLANT, CHANNEL, SETS, histories_of(PLANT, CHANNEL, SETS, coarsens))
+    level, lost, unmet = 0.0, 0, 0
+    estimator.reset(state)
+    for step in range(1, steps):
+        state = PLANT.A @ state + PLANT.nominal_disturbance.sample_boundary(rng)
+        lost = lost + 1 if rng.random() < 0.3 and lost < 2 else 0
+        sample = PLANT.H @ state + PLANT.sensor_noise.bound.sample_boundary(rng)
+        before = len(estimator._histories)
+        estimator.advance(np.zeros(1), [] if lost else [Packet(step, sample)])
+        unmet += step > steps // 2 and len(estimator._histories) != before
+        error = estimator.mean - state
+        level = max(level, float(error @ np.linalg.solve(estimator.shape, error)))
+        assert is_inside(estimator.shape, SETS.shape_at(estimator.age))
+    return estimator, level, unmet
+
+
+def test_histories_that_hardly_recur_soon_do_and_the_error_stays_in_its_set(monkeypatch):
+    monkeypatch.setattr(arrival_histories, "MAX_BYTES", 1 << 19)
+    fine, _, many = run(False, 2000)
+    coarse, level, few = run(True, 2000)
+    assert level <= 1.0
+    assert not coarse.alarm
+    assert fine._histories.recursion.sets.shape_step == SHAPE_STEP
+    assert coarse._histories.recursion.sets.shape_step == COARSEST_STEP
+    assert few < 0.5 * many
+
+
+def test_coarse_graph_stays_coarse_where_it_begins_anew_and_where_it_is_full_again(monkeypatch):
+    monkeypatch.setattr(arrival_histories, "MAX_BYTES", 1 << 17)
+    estimator, level, _ = run(True, 1500)
+    assert level <= 1.0
+    assert estimator._histories.recursion.sets.shape_step == COARSEST_STEP
+    assert estimator._histories.recursion.coarser() is estimator._histories.recursion
+    estimator.restart(np.zeros(3), 0)
+    assert estimator._histories.coarsens
+
+
+@pytest.mark.parametrize("step", [SHAPE_STEP, 2.0**-9, COARSEST_STEP])
+def test_rounded_shape_holds_the_shape_and_is_not_much_larger(step):
+    rng, sets = np.random.default_rng(1), SetMembership(PLANT, 0.0, SETS, shape_step=step)
+    ball = np.linalg.cholesky(SETS.shape_at(0))
+    added = []
+    for _ in range(200):
+        factor = rng.normal(size=(3, 3)) * 0.4
+        shape = ball @ factor @ factor.T @ ball.T
+        rounded = sets.rounded_up(shape)
+        assert is_inside(shape, rounded)
+        inner = np.linalg.solve(ball, np.linalg.solve(ball, rounded).T)
+        assert np.allclose(inner / step, np.rint(inner / step), atol=1e-6)
+        added.append(np.trace(inner - factor @ factor.T) / (3.0 * step))
+    assert np.mean(added) < (3.1 if step == SHAPE_STEP else 1.5)
