@@ -19,7 +19,7 @@ RAY_INSTALLED := $(VENV)/.installed-ray
 ADDRESS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help compare study test test-other-processor coverage coverage-report test-slow lint types benchmark example-times docs words audit \
+.PHONY: help compare study pretrained test test-other-processor coverage coverage-report test-slow lint types benchmark example-times docs words audit \
 	dist address clean
 
 help: ## this list
@@ -35,6 +35,10 @@ study: $(INSTALLED) ## the whole study, and the pages of results
 
 test: $(INSTALLED) ## the tests
 	$(BIN)/python -m pytest -n auto --dist worksteal $(TEST_FLAGS)
+
+# The small agents of the package, in agents/trained. The extra [mujoco] adds ncs_gym/InvertedPendulum-v0.
+pretrained: $(INSTALLED) ## the small agents of the package, trained again
+	$(BIN)/python benchmarks/pretrained_agents.py
 
 # What proves, verifies and decides, once more with other kernels of linear algebra and without wide instructions (x86).
 test-other-processor: $(INSTALLED) ## what proves and decides, as on another processor

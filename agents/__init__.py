@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any
 from ncs_gym.installation import require_own_packages
 
 if TYPE_CHECKING:
-    from agents.agent import Agent
-    from agents.agent_file import AgentError
+    from agents.agent import Agent, pretrained
+    from agents.agent_file import AgentError, pretrained_folder
     from agents.algorithms import AppliedActionBuffer
     from agents.callbacks import DualAscentCallback, EvaluationCallback, SafetyCallback
     from agents.evaluation import evaluate
     from agents.hyperparams import read_hyperparams, tuned_hyperparams, tuned_steps
     from agents.loop import LagrangianSettings, LoopConfig, ShieldSettings
-    from agents.results import Episode, Evaluation, TrainingPoint, Trajectory
+    from agents.results import Episode, Evaluation, TrainingPoint, TrainingStopped, Trajectory
     from agents.sb3_vec_env import SB3VecEnv
     from agents.training import TrainingResult, train
 
@@ -40,8 +40,11 @@ __all__ = [
     "ShieldSettings",
     "TrainingPoint",
     "TrainingResult",
+    "TrainingStopped",
     "Trajectory",
     "evaluate",
+    "pretrained",
+    "pretrained_folder",
     "read_hyperparams",
     "train",
     "tuned_hyperparams",
@@ -49,15 +52,15 @@ __all__ = [
 ]
 
 _MODULES = {
-    "agent": ("Agent",),
+    "agent": ("Agent", "pretrained"),
     "algorithms": ("AppliedActionBuffer",),
     "callbacks": ("DualAscentCallback", "EvaluationCallback", "SafetyCallback"),
     "loop": ("LagrangianSettings", "LoopConfig", "ShieldSettings"),
     "evaluation": ("evaluate",),
     "hyperparams": ("read_hyperparams", "tuned_hyperparams", "tuned_steps"),
-    "results": ("Episode", "Evaluation", "TrainingPoint", "Trajectory"),
+    "results": ("Episode", "Evaluation", "TrainingPoint", "TrainingStopped", "Trajectory"),
     "sb3_vec_env": ("SB3VecEnv",),
-    "agent_file": ("AgentError",),
+    "agent_file": ("AgentError", "pretrained_folder"),
     "training": ("TrainingResult", "train"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

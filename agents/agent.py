@@ -17,7 +17,15 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.agent_file import AGENT_FILES, AgentError, card_text, document_of, read_files, shield_from_json
+from agents.agent_file import (
+    AGENT_FILES,
+    AgentError,
+    card_text,
+    document_of,
+    pretrained_folder,
+    read_files,
+    shield_from_json,
+)
 from agents.algorithms import algorithm_class, build_model
 from agents.hyperparams import ALGORITHMS, complete_hyperparams
 from agents.loop import LoopConfig, ShieldSettings, with_gain
@@ -111,6 +119,24 @@ class Agent:
             actions = with_gain(self.residual_gain, batch, actions)
         return actions[0] if len(shape) == 1 else actions
 
+    def predict(
+        self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[np.ndarray, None]:
+        """Returns actions as `act` does, and no state: what code that has a model of stable-baselines3 calls.
+
+        Args:
+            observation: As for `act`.
+            state: Not used, no policy here is recurrent.
+            episode_start: Not used, either.
+            deterministic: Must be True.
+
+        Raises:
+            ValueError: As `act` does, or if actions are to be drawn.
+        """
+        if not deterministic:
+            raise ValueError("agents act deterministically: agent.model.predict draws, from normalized observations")
+        return self.act(observation), None
+
     @cached_property
     def checksum(self) -> str:
         """SHA-256 of the weights."""
@@ -185,6 +211,20 @@ class Agent:
         except Exception as error:  # a forged file may break any part of the libraries that read it
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise AgentError(f"the agent in {folder} is damaged: {reason}") from error
+
+
+def pretrained(env_id: str) -> Agent:
+    """Returns the small agent of an environment that comes with the package.
+
+    It was trained behind the shield of the certificate beside it (`pretrained_folder(env_id) / "certificate.json"`).
+
+    Args:
+        env_id: Id of an environment of this package.
+
+    Raises:
+        AgentError: If the package has none for it, or the environment has changed since.
+    """
+    return Agent.load(pretrained_folder(env_id))
 
 
 def _plant_of(env_id: str) -> LinearPlant | None:

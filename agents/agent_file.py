@@ -7,7 +7,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import platform
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from importlib import resources
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +98,22 @@ def read_files(folder: str | Path) -> tuple[Path, dict[str, Any], bytes]:
     return folder, content, weights
 
 
+def pretrained_folder(env_id: str) -> Path:
+    """Returns the folder of the small agent that comes with the package, with its card and its certificate.
+
+    Args:
+        env_id: Id of an environment of this package.
+
+    Raises:
+        AgentError: If the package has none for it; the message names those that it has.
+    """
+    root = Path(str(resources.files("agents"))) / "trained"
+    found = {f"ncs_gym/{file.parent.name}": file.parent for file in sorted(root.glob("*/agent.json"))}
+    if env_id not in found:
+        raise AgentError(f"there is no pretrained agent of {shown(env_id)}, only of {', '.join(found)}")
+    return found[env_id]
+
+
 def shield_from_json(content: dict[str, Any] | None) -> tuple[str | None, int | None]:
     """Returns mode and horizon of the shield that an agent was trained behind; None each for no shield."""
     if content is None:
@@ -104,6 +124,7 @@ def shield_from_json(content: dict[str, Any] | None) -> tuple[str | None, int | 
     return mode, horizon
 
 
+_PACKAGES = ("ncs-gym", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "mujoco", "numpy")
 _USE = """## Use
 
 The weights are in `model.zip`, everything else in `agent.json`. Nothing is unpickled. Checksums find damage, not
@@ -147,6 +168,7 @@ def card_text(
         "shield": _shield_text(shield),
         "hyperparameters": ", ".join(f"{name}={value!r}" for name, value in hyperparams.items()),
         "SHA-256 of the weights": f"`{checksum}`",
+        "saved with": _versions(),
     }
     table = [f"| {name} | {value} |" for name, value in rows.items()]
     parts = [f"# {algorithm} in {env}\n", "| | |", "|---|---|", *table, ""]
@@ -166,6 +188,15 @@ def _channel(env: str, channel: Channel | None) -> str:
     """Returns the channel in words of Python; that of the id where the agent has none of its own."""
     own: Any = channel or getattr(gym.make(env).unwrapped, "channel", None)
     return f"`{own}`" + ("" if channel else ", that of the id")
+
+
+def _versions() -> str:
+    """Returns the versions of Python and of the packages that an agent is made of."""
+    found = [f"Python {platform.python_version()}"]
+    for name in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            found.append(f"{name} {version(name)}")
+    return ", ".join(found)
 
 
 def _figures(evaluation: Evaluation) -> list[str]:

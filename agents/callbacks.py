@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,7 @@ class SafetyCallback(BaseCallback):
 
     Args:
         on_progress: Called with the number of steps taken since its last call.
+        history: Totals of the training that this one goes on from; empty for one that begins.
 
     Attributes:
         history: Totals after every rollout; where rollouts are single steps, after every 200th part of the training.
@@ -41,11 +42,11 @@ class SafetyCallback(BaseCallback):
         interventions: Steps so far in which the shield intervened.
     """
 
-    def __init__(self, on_progress: Callable[[int], None] | None = None) -> None:
+    def __init__(self, on_progress: Callable[[int], None] | None = None, history: Sequence[TrainingPoint] = ()) -> None:
         super().__init__()
-        self.history: list[TrainingPoint] = []
+        self.history = list(history)
         self._on_progress = on_progress
-        self.violation_steps = self.interventions = 0
+        self.violation_steps, self.interventions = self._last.violation_steps, self._last.interventions
         self._corrections: float | None = None
         self._guaranteed: int | None = None
 
@@ -63,15 +64,30 @@ class SafetyCallback(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        if self.num_timesteps - (self.history[-1].steps if self.history else 0) >= self._interval:
+        if self.num_timesteps - self._last.steps >= self._interval:
             self._add_point()
 
     def _on_training_end(self) -> None:
-        if not self.history or self.history[-1].steps < self.num_timesteps:
+        if self._last.steps < self.num_timesteps:
             self._add_point()
 
+    @property
+    def so_far(self) -> list[TrainingPoint]:
+        """The history, to the present step."""
+        return self.history + [self._present] * (self._last.steps < self.num_timesteps)
+
+    @property
+    def _last(self) -> TrainingPoint:
+        return self.history[-1] if self.history else TrainingPoint(0, float("nan"), 0, 0)
+
+    @property
+    def _present(self) -> TrainingPoint:
+        returns = [episode["r"] for episode in self.model.ep_info_buffer or ()]
+        mean = float(np.mean(returns)) if returns else float("nan")
+        return TrainingPoint(self.num_timesteps, mean, self.violation_steps, self.interventions)
+
     def _add_point(self) -> None:
-        last = self.history[-1] if self.history else TrainingPoint(0, float("nan"), 0, 0)
+        last = self._last
         taken = max(self.num_timesteps - last.steps, 1)
         self.logger.record("safety/violation_rate", (self.violation_steps - last.violation_steps) / taken)
         self.logger.record("safety/intervention_rate", (self.interventions - last.interventions) / taken)
@@ -82,9 +98,7 @@ class SafetyCallback(BaseCallback):
         if self._guaranteed is not None:
             self.logger.record("safety/guaranteed_rate", self._guaranteed / taken)
             self._guaranteed = 0
-        returns = [episode["r"] for episode in self.model.ep_info_buffer or ()]
-        mean = float(np.mean(returns)) if returns else float("nan")
-        self.history.append(TrainingPoint(self.num_timesteps, mean, self.violation_steps, self.interventions))
+        self.history.append(self._present)
         if self._on_progress is not None:
             self._on_progress(self.num_timesteps - last.steps)
 

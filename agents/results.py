@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 
 import numpy as np
+
+# File beside a checkpoint with the totals of its training.
+HISTORY_FILE = "history.json"
+
+
+class TrainingStopped(RuntimeError):
+    """Ends a training from a callback as Ctrl-C does: what was learned is kept."""
 
 
 @dataclass(frozen=True)
@@ -22,6 +31,12 @@ class TrainingPoint:
     episode_return: float
     violation_steps: int
     interventions: int
+
+
+def history_document(history: Sequence[TrainingPoint]) -> str:
+    """Returns totals as JSON, NaN as null."""
+    points = [{name: None if value != value else value for name, value in asdict(point).items()} for point in history]
+    return json.dumps(points, allow_nan=False) + "\n"
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,9 @@ from agents.algorithms import APPLIED, build_model, normalized_env
 from agents.callbacks import DualAscentCallback, EvaluationCallback, RegularCallback, SafetyCallback
 from agents.hyperparams import ON_POLICY, complete_hyperparams
 from agents.loop import CostPenalty, LoopConfig
-from agents.results import TrainingPoint
+from agents.results import HISTORY_FILE, TrainingPoint, TrainingStopped, history_document
 from agents.sb3_vec_env import SB3VecEnv
+from shields.atomic_write import write_atomically
 
 # Observations that the normalization of an agent to go on from counts as.
 KNOWN_STEPS = 100_000
@@ -33,7 +34,8 @@ class TrainingResult:
     Attributes:
         agent: The trained policy.
         history: Totals up to different steps of the training.
-        steps: Environment steps taken, in whole rollouts: at least as many as were asked for.
+        steps: Environment steps taken, in whole rollouts: at least as many as were asked for. Like all totals, with
+            those of the training that it went on from.
         violation_steps: Training steps whose true state violated the safe box.
         interventions: Training steps in which the shield intervened.
     """
@@ -56,6 +58,7 @@ def train(
     on_progress: Callable[[int], None] | None = None,
     callbacks: Sequence[BaseCallback] = (),
     start: Agent | None = None,
+    history: Sequence[TrainingPoint] = (),
     checkpoints: Path | None = None,
 ) -> TrainingResult:
     """Returns a trained agent and what happened on the way; the same seed gives the same result on one machine.
@@ -71,12 +74,14 @@ def train(
         hyperparams: Keyword arguments of the algorithm in stable-baselines3, and `n_envs` and `normalize`, JSON values;
             what is not given has the values of `agents.hyperparams.DEFAULTS`.
         log_folder: Folder for TensorBoard's events, with evaluations on the way; None for neither.
-        on_progress: Called with the number of steps taken since its last call.
+        on_progress: Called with the number of steps taken since its last call; `TrainingStopped` ends the training.
         callbacks: Callbacks of stable-baselines3 of your own, after those of this package.
         start: An agent to go on from, of the same environment, algorithm and networks: its weights, the state of its
-            optimizers and its normalization; rates that fall, and replay buffers, begin anew.
-        checkpoints: Folder that holds the agent as it is, written ten times on the way and when the training is
-            interrupted (Ctrl-C); None for none.
+            optimizers and its normalization; replay buffers begin anew.
+        history: Totals of the training of that agent: counts go on from the last, and rates fall as in one training of
+            all steps. Empty to count from 0, and for rates that begin anew.
+        checkpoints: Folder that holds the agent as it is and its history, written ten times on the way and when the
+            training is interrupted (Ctrl-C); None for none.
 
     Raises:
         ValueError: If the agent to go on from does not fit, the algorithm or a hyperparameter is unknown,
@@ -84,9 +89,10 @@ def train(
         ModuleNotFoundError: If the algorithm's package is not installed.
     """
     hyperparams = complete_hyperparams(algorithm, hyperparams)
-    envs, env, model = _trainable(loop, steps, seed, algorithm, hyperparams)
+    before = history[-1].steps if history else 0
+    envs, env, model = _trainable(loop, steps, seed, algorithm, hyperparams, before)
     model.set_logger(configure(str(log_folder), ["tensorboard"]) if log_folder else Logger(None, []))
-    callback = SafetyCallback(on_progress)
+    callback = SafetyCallback(on_progress, history)
     beside: list[BaseCallback] = [callback]
     if loop.lagrangian is not None and isinstance(envs, CostPenalty):
         beside.append(DualAscentCallback(loop.lagrangian, envs))
@@ -95,13 +101,18 @@ def train(
     if start is not None:
         _go_on(start, loop, algorithm, model, env)
     current = partial(_agent, loop, algorithm, hyperparams, model, env)
-    if checkpoints is not None:
-        beside.append(RegularCallback(lambda: current().save(checkpoints, loop.shield)))
-    try:
-        model.learn(steps, callback=[*beside, *callbacks])
-    except KeyboardInterrupt:
+
+    def keep() -> None:
         if checkpoints is not None:
             current().save(checkpoints, loop.shield)
+            write_atomically(checkpoints / HISTORY_FILE, history_document(callback.so_far))
+
+    if checkpoints is not None:
+        beside.append(RegularCallback(keep))
+    try:
+        model.learn(steps, callback=[*beside, *callbacks], reset_num_timesteps=False)
+    except (KeyboardInterrupt, TrainingStopped):
+        keep()
         raise
     agent = current()
     return TrainingResult(
@@ -124,18 +135,24 @@ def require_trainable(loop: LoopConfig, steps: int, algorithm: str, hyperparams:
 
 
 def _trainable(
-    loop: LoopConfig, steps: int, seed: int, algorithm: str, hyperparams: dict[str, Any]
+    loop: LoopConfig, steps: int, seed: int, algorithm: str, hyperparams: dict[str, Any], before: int = 0
 ) -> tuple[VectorEnv, VecNormalize, BaseAlgorithm]:
-    """Returns what a training begins with: the environments, the same as stable-baselines3 sees them, and the model."""
+    """Returns what a training begins with: the environments, the same as stable-baselines3 sees them, and the model.
+
+    The model has taken `before` steps.
+    """
     if steps < 1:
         raise ValueError(f"steps must be at least 1, got {steps}")
     envs = loop.vector(hyperparams["n_envs"])
     if (is_applied := hyperparams.get("stored_action") == "applied") and loop.residual_gain is not None:
         raise ValueError('stored_action="applied" stores whole inputs, a residual policy has only a part of them')
     env = normalized_env(algorithm, SB3VecEnv(envs, info_keys=(APPLIED,) if is_applied else ()), hyperparams)
-    model = build_model(algorithm, env, hyperparams, seed, steps)
-    if algorithm not in ON_POLICY and steps <= hyperparams["learning_starts"]:
-        raise ValueError(f"{steps} steps train nothing: learning starts after {hyperparams['learning_starts']}")
+    model = build_model(algorithm, env, hyperparams, seed, before + steps)
+    model.num_timesteps = before
+    if algorithm not in ON_POLICY:
+        if steps <= hyperparams["learning_starts"]:
+            raise ValueError(f"{steps} steps train nothing: learning starts after {hyperparams['learning_starts']}")
+        model.learning_starts += before  # type: ignore[attr-defined]  # the replay buffer is filled first, as always
     return envs, env, model
 
 

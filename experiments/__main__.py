@@ -138,7 +138,13 @@ def _sentence(error: Exception) -> str:
 
 
 def _complain(sentence: str, code: int) -> int:
-    print(f"ncs: {sentence}", file=sys.stderr)
+    """Prints an error on one line, on a terminal on lines of its width, and returns the exit code."""
+    text = f"ncs: {sentence}"
+    if sys.stderr.isatty():
+        from experiments.terminal import wrapped
+
+        text = wrapped(text, indent=5)
+    print(text, file=sys.stderr)
     return code
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from agents.results import TrainingStopped
+
 
 class SettingsError(ValueError):
     """A settings file is missing or damaged, or holds settings that the command does not take."""
@@ -30,7 +32,7 @@ class RunError(RuntimeError):
         return cls(f"run {name}: {type(error).__name__}: {error} (NCS_DEBUG=1 shows the traceback)")
 
 
-class RunStopped(RuntimeError):
+class RunStopped(TrainingStopped):
     """A training run gave up because another run failed or the user interrupted."""
 
 

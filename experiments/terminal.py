@@ -72,7 +72,8 @@ def warnings_as_sentences() -> Iterator[None]:
             shown.add(text)
             from tqdm import tqdm  # only where there is something to say: `ncs --help` starts sooner
 
-            tqdm.write(f"ncs: warning: {text}", file=sys.stderr)
+            line = f"ncs: warning: {text}"
+            tqdm.write(wrapped(line, indent=5) if sys.stderr.isatty() else line, file=sys.stderr)
 
     with _shown_by(show):
         yield

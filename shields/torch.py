@@ -64,14 +64,30 @@ class SafeLayer(nn.Module):
         Args:
             actions: Shape (N, m), in units of the limits; clipped to [-1, 1] first.
             estimates: x_hat, shape (N, n) [physical units].
-            error_shapes: Sigma_k, shape (N, n, n); None for that of the layer.
+            error_shapes: Sigma_k, shape (N, n, n), or (n, n) for all; None for that of the layer.
 
         Raises:
-            ValueError: If a shape is wrong.
+            ValueError: If the actions are no tensor of floats, a shape is wrong, or a number is NaN or infinite: the
+                shield would apply K x_hat, and the model learn nothing of its mistake.
         """
-        clipped = actions.clamp(-1.0, 1.0)
-        shapes = self._shape if error_shapes is None else _numbers(error_shapes)
-        safe: torch.Tensor = _Projected.apply(clipped, self.filter, _numbers(estimates), shapes)  # pyright: ignore
+        if not isinstance(actions, torch.Tensor) or not actions.is_floating_point():
+            got = f"one of {actions.dtype}" if isinstance(actions, torch.Tensor) else type(actions).__name__
+            raise ValueError(f"actions must be a tensor of floats, shape (N, {self.filter.plant.m}), got {got}")
+        given = {"actions": actions, "estimates": estimates}
+        given |= {"error_shapes": self._shape if error_shapes is None else error_shapes}
+        numbers = {name: _numbers(value, name) for name, value in given.items()}
+        n, m = self.filter.plant.n, self.filter.plant.m
+        count = len(numbers["actions"]) if actions.ndim else 0
+        fitting = {"actions": [(count, m)], "estimates": [(count, n)], "error_shapes": [(n, n), (count, n, n)]}
+        for name, array in numbers.items():
+            if array.shape not in fitting[name]:
+                wanted = " or ".join(map(str, fitting[name]))
+                raise ValueError(f"{name} must have shape {wanted} beside {count} actions, got {array.shape}")
+            if not np.isfinite(array).all():
+                raise ValueError(f"{name} must be finite numbers, got NaN or infinity")
+        safe: torch.Tensor = _Projected.apply(  # pyright: ignore
+            actions.clamp(-1.0, 1.0), self.filter, numbers["estimates"], numbers["error_shapes"]
+        )
         return safe
 
 
@@ -80,7 +96,7 @@ class _Projected(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, actions: torch.Tensor, shield: SafetyFilter, estimates: Any, shapes: Any) -> torch.Tensor:
-        limits, numbers = shield.plant.u_max, _numbers(actions)
+        limits, numbers = shield.plant.u_max, _numbers(actions, "actions")
         decided = shield.decide_many(estimates, shapes, limits * numbers)
         safe = np.where(decided.intervened[:, None], decided.input / limits, numbers)
         jacobians = decided.passed[:, None, None] * np.eye(len(limits))
@@ -163,5 +179,9 @@ def _null_space(active: np.ndarray, limits: np.ndarray) -> np.ndarray:
     return rows[np.count_nonzero(sizes > 1e-9) :].T
 
 
-def _numbers(tensor: Any) -> np.ndarray:
-    return tensor.detach().cpu().double().numpy() if isinstance(tensor, torch.Tensor) else np.asarray(tensor, float)
+def _numbers(value: Any, name: str) -> np.ndarray:
+    """Returns the numbers of a tensor or of nested lists; raises ValueError if they are none."""
+    try:
+        return np.asarray(value.detach().cpu() if isinstance(value, torch.Tensor) else value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be numbers, got {type(value).__name__}") from error

@@ -24,11 +24,15 @@ from experiments.runs.output_folder import claim_folder
 from experiments.runs.provenance import versions
 from experiments.settings import AttackSettings, settings_json
 from experiments.settings.certificates import FEWEST_ENVS
+from experiments.terminal import wrapped
 from ncs_gym.network import downlink_protocol
 from ncs_gym.registration import EPISODE_STEPS
 from shields import Certificate
 from shields.atomic_write import write_atomically
 from shields.runtime.safety_filter import DEFAULT_HORIZON
+
+# Cases that a line names.
+_MOST_LISTED = 6
 
 
 def attack(settings: AttackSettings) -> None:
@@ -54,8 +58,10 @@ def attack(settings: AttackSettings) -> None:
             counts[batch.case] += counted
         total, looks_ahead = sum(counts.values(), SafetyCounts()), settings.mode == "lookahead"
         print(counts_table(counts, looks_ahead=looks_ahead))
-        if left_out := len(cases) - len(counts):
-            print(f"{left_out} of {len(cases)} cases are not attacked within {settings.steps:,.0f} steps")
+        if left_out := [name for name in cases if name not in counts]:
+            listed = "; ".join([*left_out[:_MOST_LISTED], *["..."] * (len(left_out) > _MOST_LISTED)])
+            budget = f"within {settings.steps:,.0f} steps"
+            print(wrapped(f"{len(left_out)} of {len(cases)} cases are not attacked {budget}: {listed}"))
         limits = {name: cases[name].escape_probability() for name in counts} if settings.noise == "gaussian" else {}
         if limits:
             print("", gaussian_table(counts, limits), GAUSSIAN_LEGEND, sep="\n")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from agents import evaluation
+from agents.agent_file import pretrained_folder
 from agents.loop import LoopConfig, ShieldSettings
 from experiments.analysis.episodes import arm_summary, episodes_table
 from experiments.analysis.tables import summary_text
@@ -15,7 +16,7 @@ from experiments.commands import short_version
 from experiments.runs.experiment import certificate_of
 from experiments.runs.loops import module_and_id, registered_env, with_channel
 from experiments.runs.output_folder import require_place
-from experiments.runs.policies import agent_folder, certificate_file
+from experiments.runs.policies import PRETRAINED, agent_folder, certificate_file
 from experiments.runs.provenance import versions
 from experiments.runs.training_run import RunResult
 from experiments.settings import EvaluateSettings
@@ -34,7 +35,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     """Runs `ncs evaluate`."""
     settings = short_version(settings, **_SMOKE)
     require_place(settings.out)
-    folder = agent_folder(settings.model)
+    folder = _folder(settings)
     agent = _agent(folder, settings.env)
     loop = with_channel(LoopConfig(env=agent.env, kwargs={"channel": agent.channel}), settings.channel)
     mode = _mode(settings, agent)
@@ -67,6 +68,15 @@ def evaluate(settings: EvaluateSettings) -> None:
             "versions": versions(),
         }
         write_atomically(settings.out, json.dumps(content, indent=1) + "\n")
+
+
+def _folder(settings: EvaluateSettings) -> Path:
+    """Returns the folder of the agent that is asked for."""
+    if str(settings.model) != PRETRAINED:
+        return agent_folder(settings.model)
+    if settings.env is None:
+        raise ValueError(f"{PRETRAINED} agents are of an environment each: give --env")
+    return pretrained_folder(module_and_id(settings.env)[1])
 
 
 def _agent(folder: Path, env_id: str | None) -> Agent:

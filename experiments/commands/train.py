@@ -8,6 +8,7 @@ from experiments.backends.execution import results_of
 from experiments.commands import short_version
 from experiments.runs.arms import Arm
 from experiments.runs.experiment import certificate_of, experiment_provenance, require_trainable, run_of_arm
+from experiments.runs.going_on import forget_checkpoint, going_on
 from experiments.runs.loops import loop_config
 from experiments.runs.output_folder import claim_folder, prepare_output, write_results
 from experiments.runs.training_run import RunResult
@@ -30,11 +31,16 @@ def train(settings: TrainSettings) -> None:
         print(wrapped(settings.agent_line), flush=True)
         settings = settings.completed
         run = run_of_arm(settings, loop, certificate, settings.arm, 0)
+        run = going_on(settings.out, run, anew=settings.force)
+        if run.start is not None:
+            print(f"the training in {settings.out} goes on after {run.start.steps:,} steps", flush=True)
         results = results_of([run], settings.out, settings)
+        forget_checkpoint(settings.out, run)
         mode = Arm.of(settings.arm, settings.mode).mode
         arms = {settings.arm: arm_summary(episodes_table(results), mode, fixed_policy=True)}
         certificate.save(settings.out / "certificate.json")
-        summary = {"arms": arms} | experiment_provenance("train", settings, loop, certificate, [run])
+        summary = {"arms": arms, "went_on_after": run.start.steps if run.start else 0}
+        summary |= experiment_provenance("train", settings, loop, certificate, [run])
         write_results(settings.out, summary)
         print(f"{results[0].train_steps:,} training steps, {settings.episodes:,} episodes\n")
         print(summary_text(arms, {}), *_hints(results[0], is_smoke=settings.smoke), sep="\n")

@@ -109,6 +109,7 @@ _CONTROLLER_MARKERS = {
     "proportional": "*",
     "lqr": "H",
     "governor": "^",
+    "mpc": "x",
     "random": "8",
     "K x_hat": "1",
     "zero input": "2",

@@ -26,7 +26,7 @@ from shields.atomic_write import write_atomically
 
 # Files by which a folder is known to hold something finished.
 _FINISHED = ("summary.json", "certify.json", "runs/*.json")
-_FINISHED_PARTS = {"study": ("*/summary.json",)}
+_FINISHED_PARTS = {"study": ("*/summary.json",), "train": ("tensorboard/*/checkpoint/agent.json",)}
 # Settings that results do not depend on; what "smoke" changes is compared by itself.
 _IGNORED = {*INCIDENTAL_SETTINGS, "smoke", "page", "quote"}
 # Settings that may grow in the same folder, because the results that are there become part of the larger ones.
@@ -35,6 +35,7 @@ _GROWING = {
     "study": ("seeds", "arms", "baselines", "envs"),
     "sweep": ("seeds", "arms", "losses", "delays", "quantization_steps", "burst_lengths", "downlink_losses"),
     "certify": ("steps",),
+    "train": ("steps",),
 }
 # Whoever holds the lock of this file has the folder. It is the operating system's: it ends with the process.
 _LOCK = ".lock"
@@ -58,7 +59,8 @@ def claim_folder(command: str, settings: Any) -> Iterator[None]:
     """Creates the output folder of a command and writes `settings.json` in it; no other command has it meanwhile.
 
     A folder with finished results is taken only if they have the same settings, apart from those that change no result,
-    or if the new ones contain them: more seeds or arms, a larger grid of `ncs sweep`, more steps of `ncs attack`.
+    or if the new ones contain them: more seeds or arms, a larger grid of `ncs sweep`, more steps of `ncs attack` or
+    `ncs train`.
 
     Args:
         command: Name of the command.

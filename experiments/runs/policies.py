@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from agents.agent_file import AgentError
+from agents.agent_file import AgentError, pretrained_folder
 from ncs_gym import NCSEnv, SetpointTracking, SpeedTracking
 
 UNTRAINED_POLICIES = ("greedy", "zero", "random")
+# Stands for the agent of the environment that comes with the package.
+PRETRAINED = "pretrained"
 # Agents that a message names.
 _MOST_LISTED = 4
 
@@ -22,8 +24,8 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
     """Returns a policy for an environment.
 
     Args:
-        name: "greedy", "zero", "random", the folder of a trained agent or of the run that left it, or a zip of
-            stable-baselines3.
+        name: "greedy", "zero", "random", "pretrained" for the agent that comes with the package, the folder of a
+            trained agent or of the run that left it, or a zip of stable-baselines3.
         env_id: Id of the environment.
         env: The environment.
         seed: Seed of the random policy.
@@ -46,7 +48,7 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
         load_sb3_zip,
     )
 
-    path = Path(name)
+    path = pretrained_folder(env_id) if name == PRETRAINED else Path(name)
     agent = load_sb3_zip(path, env_id) if is_sb3_zip(path) else Agent.load(agent_folder(path))
     if agent.env != env_id:
         raise AgentError(f"the agent in {name} was trained in {agent.env}, not in {env_id}")

@@ -113,8 +113,12 @@ class RunStore:
         content = {"key": run.key, "result": to_json(result) | {"files": digests}}
         write_atomically(self._path(run), json.dumps(document_of("run", _FORMAT, content)) + "\n")
 
-    def load(self, run: Run) -> Any:
+    def load(self, run: Run, *, of_other_settings: bool = False) -> Any:
         """Returns the stored result of a run; None if there is none or if it belongs to other settings.
+
+        Args:
+            run: The run.
+            of_other_settings: Take a result of the run's name whatever the settings, if it can be the run's.
 
         Raises:
             ResultsError: If a file is damaged, or holds what no result of the run can be.
@@ -124,7 +128,7 @@ class RunStore:
             return None
         try:
             content = read_content(path, "run", _FORMAT)
-            if content["key"] != run.key:
+            if content["key"] != run.key and not of_other_settings:
                 return None
             values = dict(content["result"])
             digests = values.pop("files")

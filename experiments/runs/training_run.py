@@ -20,6 +20,7 @@ from agents.hyperparams import rollout_steps
 from agents.loop import LoopConfig
 from agents.results import Episode, TrainingPoint, Trajectory
 from experiments.baselines import controller, tuned_weights
+from experiments.json_values import to_json
 from experiments.runs.loops import AS_TRAINED, import_module, module_digest, under
 from experiments.runs.provenance import versions
 from ncs_gym.envs.env import ncs_env
@@ -30,8 +31,28 @@ from shields.json_documents import digest
 if TYPE_CHECKING:
     from agents.agent import Agent
 
+# Folder of a run's checkpoints below that of its events.
+CHECKPOINT = "checkpoint"
 # Counts are numbers that floats and tables hold exactly.
 _LARGEST_COUNT = 2**53
+
+
+@dataclass(frozen=True)
+class Start:
+    """An agent that a training goes on from, and what happened in its training.
+
+    Attributes:
+        files: Files of the agent.
+        history: Totals of its training, one point at least.
+    """
+
+    files: dict[str, bytes]
+    history: list[TrainingPoint]
+
+    @property
+    def steps(self) -> int:
+        """Steps that the agent was trained for."""
+        return self.history[-1].steps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +78,7 @@ class TrainingRun:
         settings: Hyperparameters of the learning algorithm.
         grid_point: Name of the point of a sweep's grid; part of the run's name only.
         agent_files: Files of an agent that was trained before: it is evaluated, and nothing is trained. Empty for none.
+        start: What the training goes on from; None for one that begins.
     """
 
     arm: str
@@ -75,6 +97,7 @@ class TrainingRun:
     settings: dict[str, Any]
     grid_point: str = ""
     agent_files: dict[str, bytes] = field(default_factory=dict)
+    start: Start | None = None
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -103,8 +126,11 @@ class TrainingRun:
 
     @property
     def training_seed(self) -> int:
-        """Seed of the training environments and of the networks; the same in all arms."""
-        return self._seeds()[0]
+        """Seed of the training environments and of the networks; the same in all arms.
+
+        A training that goes on meets other random numbers than it had before.
+        """
+        return self._seeds(*([self.start.steps] if self.start else []))[0]
 
     @property
     def evaluation_seed(self) -> int:
@@ -122,7 +148,8 @@ class TrainingRun:
             "certificate": certificate,
             "training_loop": _described(self.training_loop, certificate),
             "loop": _described(self.loop, certificate),
-            "agent_files": {name: hashlib.sha256(file).hexdigest() for name, file in self.agent_files.items()},
+            "agent_files": _digests(self.agent_files),
+            "start": self.start and {"files": _digests(self.start.files), "history": to_json(self.start.history)},
         }
         return digest(content | {"versions": versions()})
 
@@ -133,7 +160,12 @@ class TrainingRun:
         if not self.trains:
             return evaluation
         rollout = rollout_steps(self.algorithm, self.settings)
-        return -(-self.steps // rollout) * rollout + evaluation
+        return -(-self.remaining_steps // rollout) * rollout + evaluation
+
+    @property
+    def remaining_steps(self) -> int:
+        """Training steps that are left, one at least."""
+        return max(self.steps - self.start.steps, 1) if self.start else self.steps
 
     def execute(self, on_progress: Callable[[int], None], log_folder: Path | None = None) -> RunResult:
         """Returns the result; only TensorBoard's events are written."""
@@ -146,17 +178,19 @@ class TrainingRun:
             )  # imports torch, which the process that only collects results does without
 
             logs = log_folder and log_folder / self.name
-            if logs is not None:
+            if logs is not None and self.start is None:
                 shutil.rmtree(logs, ignore_errors=True)
             trained = train(
                 self.training_loop,
-                self.steps,
+                self.remaining_steps,
                 self.training_seed,
                 self.algorithm,
                 self.settings,
                 log_folder=logs,
-                checkpoints=logs and logs / "checkpoint",
+                checkpoints=logs and logs / CHECKPOINT,
                 on_progress=on_progress,
+                start=self.start and _loaded(self.start.files),
+                history=self.start.history if self.start else (),
             )
         agent = trained.agent if trained else _agent_of(self)
         evaluations = {}
@@ -188,9 +222,9 @@ class TrainingRun:
             if not holds:
                 raise ValueError(f"{name} of this run cannot be {shown(value)}")
 
-    def _seeds(self) -> list[int]:
+    def _seeds(self, *more: int) -> list[int]:
         """Returns two 31-bit numbers that depend on the experiment's seed and the run's index, not on the arm."""
-        return [int(word >> 1) for word in np.random.SeedSequence([self.seed, self.index]).generate_state(2)]
+        return [int(word >> 1) for word in np.random.SeedSequence([self.seed, self.index, *more]).generate_state(2)]
 
 
 @dataclass(frozen=True)
@@ -279,16 +313,24 @@ def _agent_of(run: TrainingRun) -> Agent | None:
         AgentError: If the files are no agent of an environment that is registered here.
     """
     if run.agent_files:
-        from agents.agent import Agent  # imports torch
-
-        with TemporaryDirectory() as folder:
-            write_files(Path(folder), run.agent_files)
-            return Agent.load(folder)
+        return _loaded(run.agent_files)
     if run.policy_kind != "untrained":
         return None
     from agents.training import untrained
 
     return untrained(run.loop, run.training_seed, run.algorithm, run.settings)
+
+
+def _loaded(files: dict[str, bytes]) -> Agent:
+    from agents.agent import Agent  # imports torch
+
+    with TemporaryDirectory() as folder:
+        write_files(Path(folder), files)
+        return Agent.load(folder)
+
+
+def _digests(files: dict[str, bytes]) -> dict[str, str]:
+    return {name: hashlib.sha256(file).hexdigest() for name, file in files.items()}
 
 
 def _policy(run: TrainingRun, agent: Agent | None) -> Policy:

@@ -224,6 +224,9 @@ class CompareSettings(LearningSettings):
 class TrainSettings(LearningSettings):
     """Trains one agent, evaluates it, and saves it with everything needed to use it.
 
+    Started again with the same folder, an interrupted training goes on from its last checkpoint, and a finished one
+    with more --steps from its agent; --force begins anew.
+
     Attributes:
         out: Output folder; created if it does not exist.
         arm: Arm that the agent is trained in; see the arms of `ncs compare`.
@@ -239,7 +242,8 @@ class EvaluateSettings:
 
     Attributes:
         model: Folder of a trained agent, such as models/shielded-0 in the output of `ncs compare`, or the output of
-            `ncs train`; or the zip that `model.save` of stable-baselines3 wrote, with --env.
+            `ncs train`; or the zip that `model.save` of stable-baselines3 wrote, with --env; or "pretrained", for the
+            agent of --env that comes with the package.
         env: Id of the environment the agent was trained in; module:id, to import the module that registers it.
         shield: Mode of the shield, by default that of the agent's training; "none" for no shield; "monitor" changes
             nothing and counts what it would have done.

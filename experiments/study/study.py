@@ -37,15 +37,16 @@ from experiments.study.tables import (
 )
 from shields.atomic_write import write_atomically
 
-# Budget of `--smoke`: enough to pass through every part.
-_SMOKE = {"seeds": 2, "budget": 0.01, "episodes": 4, "channel_episodes": 1}
+# Budget of `--smoke`: enough to pass through every part, in the first environment, with baselines of one margin each.
+_SMOKE = {"seeds": 2, "budget": 0.01, "episodes": 2, "channel_episodes": 1, "scenarios": ("ideal-channel", "attacked")}
 # Folder of the sweep of channels below that of its environment, and settings that say nothing of results.
 _CHANNELS, _INCIDENTAL = "channels", (*INCIDENTAL_SETTINGS, "smoke")
 
 
 def study(settings: StudySettings) -> None:
     """Runs `ncs study`: prints the table of every environment and writes the files."""
-    settings = short_version(settings, **_SMOKE)
+    baselines = tuple(name for name in settings.baselines if ":" not in name)
+    settings = short_version(settings, **_SMOKE, envs=settings.envs[:1], baselines=baselines)
     for path in settings.quote:
         require_marks(path.read_text("utf-8"))
     with claim_folder("study", settings):

@@ -13,7 +13,7 @@ from ncs_gym.plants.statespace import zero_order_hold
 def stirred_tank(dt: float = 3.0, **bounds: Any) -> LinearPlant:
     """Returns the continuous stirred-tank reactor of Seborg et al. at its unstable point, by exact zero-order hold.
 
-    x = (concentration [0.01 mol/L], temperature [K]) and u the temperature of the coolant [K], |u| <= 20, all in
+    x = (concentration [cmol/L], temperature [K]) and u the temperature of the coolant [K], |u| <= 20, all in
     deviations from the operating point. An exothermic reaction heats what it is sped up by: left alone, deviations grow
     by a factor of 2.7 in 21 s (a pole at +2.83/min). Safe box 10 and 5 K. What comes in is up to 2 K/min too warm or
     too cold; both states are measured to within 0.02 of their units.
@@ -36,7 +36,7 @@ def stirred_tank(dt: float = 3.0, **bounds: Any) -> LinearPlant:
         "initial_bound": 0.1,
         "error_gain": ((-0.6, -3.0),),
         "state_names": ("concentration", "temperature"),
-        "state_units": ("0.01 mol/L", "K"),
+        "state_units": ("cmol/L", "K"),
         "input_names": ("coolant temperature",),
         "input_units": ("K",),
     }

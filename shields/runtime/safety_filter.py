@@ -214,8 +214,9 @@ class SafetyFilter(ReadOnlyArrays):
             stored: In mode "lookahead" the `plan` of the last decisions, shape (N, horizon, m); None for none.
 
         Returns:
-            A `Decision` of arrays: `input` of shape (N, m), `plan` (N, horizon, m), `reason` of texts, and truth values
-            and margins of shape (N,). Rows that are not finite are "invalid", as single ones are.
+            A `Decision` of arrays, empty ones for N = 0: `input` of shape (N, m), `plan` (N, horizon, m), `reason` of
+            texts, and truth values and margins of shape (N,). Rows that are not finite are "invalid", as single ones
+            are.
 
         Raises:
             ValueError: If an argument does not consist of numbers of these shapes.
@@ -228,7 +229,7 @@ class SafetyFilter(ReadOnlyArrays):
         if stored is not None:
             arrays["stored"], shapes["stored"] = _as_array(stored), [(count, self.horizon or 0, m)]
         for name, array in arrays.items():
-            if array.shape not in shapes[name] or not count:
+            if array.shape not in shapes[name]:
                 wanted = " or ".join(str(shape).replace(f"({count},", "(N,", 1) for shape in shapes[name])
                 raise ValueError(f"{name} must be numbers of shape {wanted}, got {array.shape}; N = {count}")
         one_shape = arrays["error_shapes"].ndim == 2

@@ -1,10 +1,13 @@
 """Trainings that go on from an agent, keep what they learned when they are interrupted, and learn what was applied."""
 
+import json
+
 import numpy as np
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 
-from agents import Agent, LoopConfig, ShieldSettings, train
+from agents import Agent, LoopConfig, ShieldSettings, TrainingStopped, train
+from agents.results import HISTORY_FILE
 from ncs_gym import truck_trailer
 from tests.certificates import certificate_of
 
@@ -19,11 +22,15 @@ def loop():
 
 
 class Interrupting(BaseCallback):
-    """Ctrl-C after some steps."""
+    """Ctrl-C, or what a callback raises in its place, after some steps."""
+
+    def __init__(self, kind):
+        super().__init__()
+        self._kind = kind
 
     def _on_step(self):
         if self.num_timesteps >= 1000:
-            raise KeyboardInterrupt
+            raise self._kind
         return True
 
 
@@ -42,13 +49,27 @@ def test_training_goes_on_from_an_agent(loop):
         train(loop, 512, 0, hyperparams=SMALL | {"policy_kwargs": {"net_arch": [8]}}, start=first)
 
 
-def test_interrupted_training_leaves_what_it_learned(loop, tmp_path):
-    with pytest.raises(KeyboardInterrupt):
-        train(loop, 100_000, 0, hyperparams=SMALL, callbacks=[Interrupting()], checkpoints=tmp_path)
+@pytest.mark.parametrize("kind", [KeyboardInterrupt, TrainingStopped])
+def test_interrupted_training_leaves_what_it_learned(loop, tmp_path, kind):
+    with pytest.raises((KeyboardInterrupt, TrainingStopped)):
+        train(loop, 100_000, 0, hyperparams=SMALL, callbacks=[Interrupting(kind)], checkpoints=tmp_path)
+    assert json.loads((tmp_path / HISTORY_FILE).read_text())[-1]["steps"] == 1000
     kept = Agent.load(tmp_path)
     assert kept.act(np.zeros(3)).shape == (1,)
     assert (tmp_path / "certificate.json").exists()
     assert train(loop, 128, 0, hyperparams=SMALL, start=kept).steps == 128
+
+
+def test_history_makes_two_trainings_count_as_one(loop):
+    first = train(loop, 512, 0, hyperparams=SMALL)
+    second = train(loop, 512, 1, hyperparams=SMALL, start=first.agent, history=first.history)
+    assert second.steps == 1024
+    assert second.history[: len(first.history)] == first.history
+    assert second.history[-1].steps == 1024
+    assert second.interventions >= first.interventions > 0
+    rate = second.agent.model.policy.optimizer.param_groups[0]["lr"]
+    whole = train(loop, 1024, 0, hyperparams=SMALL).agent.model.policy.optimizer.param_groups[0]["lr"]
+    assert rate == pytest.approx(whole)
 
 
 def test_training_leaves_checkpoints_on_the_way(loop, tmp_path):

@@ -1,5 +1,6 @@
 """Warnings of a command are sentences, each printed once on a line of its own."""
 
+import io
 import re
 import sys
 import warnings
@@ -8,6 +9,7 @@ from queue import Queue
 import pytest
 from tqdm import tqdm
 
+from experiments.__main__ import _complain
 from experiments.terminal import warnings_as_sentences, warnings_sent
 from tests.command import ncs
 
@@ -32,6 +34,23 @@ def assert_said_once_for_each_delay(run):
 
 def test_warning_of_a_sweep_is_one_sentence_on_its_own_line(tmp_path, without_workers):
     assert_said_once_for_each_delay(ncs(*SWEEP, "--out", tmp_path))
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize(("kind", "width"), [(io.StringIO, 400), (Terminal, 60)])
+def test_long_sentences_fill_the_lines_of_a_terminal_and_one_elsewhere(monkeypatch, kind, width):
+    monkeypatch.setenv("COLUMNS", "60")
+    monkeypatch.setattr(sys, "stderr", kind())
+    assert _complain(f"{'so many words ' * 15}end", 2) == 2
+    with warnings_as_sentences():
+        warnings.warn("so many words " * 15, stacklevel=1)
+    lines = sys.stderr.getvalue().splitlines()
+    assert width / 2 < max(map(len, lines)) <= width
+    assert [line for line in lines if line.startswith("ncs: ")] == (lines if width > 60 else [lines[0], lines[4]])
 
 
 @pytest.mark.slow

@@ -296,7 +296,13 @@ def test_results_do_not_depend_on_worker_processes(tmp_path, small, capsys):
 def test_a_budget_of_steps_is_kept(tmp_path, small, capsys, without_workers, steps, envs, batches, left_out):
     attack(settings(tmp_path, steps=steps, envs=16))
     assert document(tmp_path)["total"]["steps"] == batches * envs * 200 <= steps
-    assert ("1 of 2 cases are not attacked" in capsys.readouterr().out) is bool(left_out)
+    said = [line for line in capsys.readouterr().out.splitlines() if "not attacked" in line]
+    assert len(said) == left_out
+    for line in said:
+        start, _, name = line.partition(": ")
+        assert start == "1 of 2 cases are not attacked within 2,500 steps"
+        assert name
+        assert name not in document(tmp_path)["cases"]
 
 
 def stored(folder):

@@ -4,7 +4,9 @@ import json
 
 import pytest
 
-from tests.command import ncs
+from agents import Agent, SafetyCallback
+from experiments.errors import RunStopped
+from tests.command import assert_one_sentence, ncs
 
 SMALL = ("n_envs=8", "n_steps=64", "batch_size=64")
 HINT = "This training had no violation and no override"
@@ -37,3 +39,61 @@ def test_hint_of_a_smoke_run_names_the_flag_that_keeps_it_short(tmp_path, withou
     assert run.returncode == 0, run.stderr
     assert f"{HINT}, so it does not show what the shield is for: leave out --smoke" in " ".join(run.stdout.split())
     assert run.stdout.splitlines()[-1].startswith("agent: ")
+
+
+SHORT = ("--episodes", 1, "--hyperparams", *SMALL, "policy_kwargs=dict(net_arch=[8, 8])", "--out")
+
+
+def test_more_steps_go_on_from_the_agent_and_everything_else_is_refused(tmp_path, without_workers):
+    folder = tmp_path / "r"
+    assert ncs("train", "--steps", 512, *SHORT, folder).returncode == 0
+    first, before = stored(folder), (folder / "models" / "shielded-0" / "model.zip").read_bytes()
+    run = ncs("train", "--steps", 1536, *SHORT, folder)
+    assert "goes on after 512 steps" in run.stdout
+    assert "1,536 training steps" in run.stdout
+    result = stored(folder)
+    assert result["history"][: len(first["history"])] == first["history"]
+    assert [point["steps"] for point in result["history"]] == [512, 1024, 1536]
+    assert (folder / "start" / "model.zip").read_bytes() == before
+    again = ncs("train", "--steps", 1536, *SHORT, folder)
+    assert "1 of 1 runs were finished before" in again.stderr
+    assert stored(folder) == result
+    assert_one_sentence(ncs("train", "--steps", 512, *SHORT, folder), "steps 1536, now 512", "--force")
+    assert_one_sentence(ncs("train", "--steps", 2048, "--seed", 1, *SHORT, folder), "seed 0, now 1", "--force")
+    anew = ncs("train", "--steps", 512, "--force", *SHORT, folder)
+    assert "goes on" not in anew.stdout
+    assert stored(folder) == first
+
+
+def test_interrupted_training_goes_on_where_it_was(tmp_path, without_workers, monkeypatch):
+    folder, add_point = tmp_path / "r", SafetyCallback._add_point
+
+    def interrupt(callback):
+        add_point(callback)
+        if callback.num_timesteps >= 1024:
+            raise RunStopped("the user interrupted")
+
+    monkeypatch.setattr(SafetyCallback, "_add_point", interrupt)
+    assert ncs("train", "--steps", 2048, *SHORT, folder).returncode == 2
+    monkeypatch.undo()
+    checkpoint = folder / "tensorboard" / "shielded-0" / "checkpoint"
+    assert Agent.load(checkpoint).model.num_timesteps == 0  # nothing but weights is read of a model
+    assert_one_sentence(ncs("train", "--steps", 1024, *SHORT, folder), "steps 2048, now 1024")
+    run = ncs("train", "--steps", 2048, *SHORT, folder)
+    assert "goes on after 1,024 steps" in run.stdout
+    assert [point["steps"] for point in stored(folder)["history"]] == [512, 1024, 1536, 2048]
+    assert not checkpoint.exists()
+
+
+@pytest.mark.parametrize("text", ["[", "[]", '[{"steps": 1}]', '{"steps": 512}'])
+def test_damaged_history_is_one_sentence(tmp_path, without_workers, text):
+    folder = tmp_path / "r"
+    (folder / "start").mkdir(parents=True)
+    (folder / "start" / "history.json").write_text(text)
+    run = ncs("train", "--steps", 512, *SHORT, folder)
+    assert_one_sentence(run, "no training can go on from", "--force")
+
+
+def stored(folder):
+    result = json.loads((folder / "runs" / "shielded-0.json").read_text())["run"]["result"]
+    return {name: value for name, value in result.items() if name != "files"}  # which have the time in them

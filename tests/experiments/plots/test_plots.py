@@ -22,6 +22,7 @@ from experiments.plots.comparison_figures import (
     training_figure,
 )
 from experiments.plots.figure_style import ARM_COLORS_AND_MARKERS, ArmStyle, thousands
+from experiments.settings.learning import REGULATED_ARMS
 from ncs_gym import Ellipsoid, LinearPlant
 from tests.experiments.results import ALL_ARMS, history, run, summary_of, trajectory
 from tests.plants import random_plant
@@ -60,6 +61,7 @@ def by_color(axis):
 
 
 def test_all_arms_look_different_and_a_penalty_keeps_the_color():
+    assert all(ArmStyle.of(arm).marker for arm in REGULATED_ARMS)
     looks = [ArmStyle.of(arm) for arm in ALL_ARMS]
     assert len({(look.color, str(look.dashes)) for look in looks}) == len(ALL_ARMS)
     assert len({(look.marker, look.hollow) for look in looks}) == len(ALL_ARMS)

@@ -79,15 +79,50 @@ def test_gradients_are_those_of_the_projection(setting):
     assert curved >= 3 or plant.m == 1
 
 
-def test_fallback_and_unusable_estimates_have_no_gradient():
+def test_fallback_has_no_gradient():
     plant = truck_trailer(mass=4000.0)
     layer = SafeLayer(certificate_of(plant), plant)
     actions = torch.zeros((2, 1), requires_grad=True)
-    safe = layer(actions, torch.tensor([[9.0, 0.0], [np.nan, 0.0]]))
-    safe.sum().backward()
+    layer(actions, torch.tensor([[9.0, 0.0], [0.1, 0.0]])).sum().backward()
     assert actions.grad is not None
-    np.testing.assert_array_equal(actions.grad.numpy(), np.zeros((2, 1)))
-    assert safe[1].item() == 0.0
+    np.testing.assert_array_equal(actions.grad.numpy(), [[0.0], [1.0]])
+
+
+def test_empty_batches_give_empty_ones(setting):
+    plant, certificate, *_ = setting
+    layer, empty = SafeLayer(certificate, plant), np.zeros((0, plant.n))
+    many = layer.filter.decide_many(empty, certificate.Sigma, np.zeros((0, plant.m)))
+    assert (many.input.shape, many.reason.shape, many.margin.shape) == ((0, plant.m), (0,), (0,))
+    actions = torch.zeros((0, plant.m), requires_grad=True)
+    safe = layer(actions, torch.tensor(empty))
+    safe.sum().backward()
+    assert safe.shape == (0, plant.m)
+
+
+TWO = torch.zeros((2, 1))
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ((torch.tensor([[np.nan], [0.0]]), torch.zeros(2, 2)), "actions must be finite numbers"),
+        ((torch.tensor([[np.inf], [0.0]]), torch.zeros(2, 2)), "actions must be finite numbers"),
+        ((TWO, torch.tensor([[np.nan, 0.0], [0.0, 0.0]])), "estimates must be finite numbers"),
+        ((TWO, torch.zeros(2, 2), torch.full((2, 2), np.nan)), "error_shapes must be finite numbers"),
+        ((np.zeros((2, 1)), torch.zeros(2, 2)), "actions must be a tensor of floats.* got ndarray"),
+        ((torch.zeros((2, 1), dtype=torch.int64), torch.zeros(2, 2)), "tensor of floats.* got one of torch.int64"),
+        ((torch.tensor(0.0), torch.zeros(2, 2)), r"actions must have shape \(0, 1\)"),
+        ((torch.zeros(1), torch.zeros(2)), r"actions must have shape \(1, 1\) beside 1 actions, got \(1,\)"),
+        ((TWO, torch.zeros(3, 2)), r"estimates must have shape \(2, 2\) beside 2 actions, got \(3, 2\)"),
+        ((TWO, torch.zeros(2, 2), torch.zeros(3, 2, 2)), r"error_shapes must have shape \(2, 2\) or \(2, 2, 2\)"),
+        ((TWO, "estimates"), "estimates must be numbers, got str"),
+        ((TWO, None), "estimates must"),
+    ],
+)
+def test_what_is_no_batch_of_numbers_is_refused(given, words):
+    plant = truck_trailer(mass=4000.0)
+    with pytest.raises(ValueError, match=words):
+        SafeLayer(certificate_of(plant), plant)(*given)
 
 
 def test_error_shapes_that_are_none_are_refused():

@@ -1,0 +1,69 @@
+"""The agents that come with the package: one for every id, small, and safe behind the shield of its certificate."""
+
+import numpy as np
+import pytest
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from agents import AgentError, LoopConfig, ShieldSettings, evaluate, pretrained, pretrained_folder
+from ncs_gym.registration import ENVIRONMENTS
+from shields import Certificate
+from tests.command import assert_one_sentence, ncs
+
+IDS = [env_id for env_id, each in ENVIRONMENTS.items() if each.plant is not None]
+LARGEST = 200_000
+
+
+def folder_of(env_id):
+    try:
+        return pretrained_folder(env_id)
+    except AgentError:
+        pytest.fail(f"{env_id} has no pretrained agent: python benchmarks/pretrained_agents.py --env {env_id}")
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_every_id_has_a_small_agent_with_its_card_and_certificate(env_id):
+    files = {file.name: file.stat().st_size for file in folder_of(env_id).iterdir()}
+    assert files.keys() == {"model.zip", "agent.json", "README.md", "certificate.json"}
+    assert sum(files.values()) < LARGEST
+    card = (folder_of(env_id) / "README.md").read_text()
+    assert f"`{env_id}`" in card
+    assert "stable-baselines3 2" in card
+    assert "violating steps: 0 of 40000" in card
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_every_agent_keeps_its_plant_safe_behind_its_shield(env_id):
+    if not ENVIRONMENTS[env_id].is_installed:
+        pytest.skip(f"{env_id} needs {ENVIRONMENTS[env_id].extra}")
+    certificate = Certificate.load(folder_of(env_id) / "certificate.json")
+    agent = pretrained(env_id)
+    assert (agent.env, agent.channel, agent.shield_mode) == (env_id, None, "project")
+    loop = LoopConfig(env=env_id, shield=ShieldSettings(certificate, "project", on_unproved="raise"))
+    episode = evaluate(loop, lambda observations, infos: agent.act(observations), 1, seed=0).episodes[0]
+    assert (episode.steps, episode.violation_steps, episode.guaranteed) == (200, 0, True)
+
+
+def test_agent_is_evaluated_as_a_model_of_stable_baselines3():
+    agent = pretrained("ncs_gym/CSTR-v0")
+    env = LoopConfig(env=agent.env).single()
+    mean, _ = evaluate_policy(agent, env, n_eval_episodes=1, warn=False)
+    assert np.isfinite(mean)
+    with pytest.raises(ValueError, match="act deterministically"):
+        agent.predict(env.reset(seed=0)[0], deterministic=False)
+
+
+def test_ids_without_an_agent_are_one_sentence(tmp_path):
+    with pytest.raises(AgentError, match="no pretrained agent of 'Plants/CSTR-v0', only of ncs_gym/BatchReactor-v0"):
+        pretrained("Plants/CSTR-v0")
+    assert_one_sentence(ncs("evaluate", "pretrained"), "give --env")
+
+
+def test_commands_take_pretrained_agents(tmp_path):
+    run = ncs("evaluate", "pretrained", "--env", "ncs_gym/CSTR-v0", "--episodes", 2)
+    assert run.returncode == 0, run.stderr
+    assert "PPO of" in run.stdout
+    assert "shield: project" in run.stdout
+    out = tmp_path / "episode.png"
+    drawn = ncs("render", "--env", "ncs_gym/CSTR-v0", "--policy", "pretrained", "--steps", 3, "--out", out)
+    assert drawn.returncode == 0, drawn.stderr
+    assert out.exists()
