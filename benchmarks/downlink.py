@@ -29,9 +29,9 @@ ENVS = ("ncs_gym/TruckTrailerCruise-v0", "ncs_gym/CartPole-v0", "ncs_gym/BatchRe
 STEPS, LEAD, DELAY, LOST = 8, 2, 1, 3
 
 
-def row(env_id: str, lead: int, episodes: int) -> str:
+def row(env_id: str, input_delay: int, episodes: int) -> str:
     """A line of the table."""
-    settings: dict[str, Any] = {"downlink": Channel(delay=lead)} if lead else {}
+    settings: dict[str, Any] = {"downlink": Channel(delay=input_delay)} if input_delay else {}
     env = gym.make(env_id, **settings).unwrapped
     certificate = certificate_for(env.plant, env.certificate_contract)
     shield = VectorSafetyShield(gym.make_vec(env_id, num_envs=episodes, **settings), certificate, on_unproved="ignore")
@@ -50,7 +50,7 @@ def row(env_id: str, lead: int, episodes: int) -> str:
     age = "-" if contract is None else str(contract.max_age)
     share = certificate.provenance["share_of_box"]
     return (
-        f"{env_id.removeprefix('ncs_gym/'):24s}{lead:3d}{age:>9s}{share:10.1%}{overridden / steps:12.1%}"
+        f"{env_id.removeprefix('ncs_gym/'):24s}{input_delay:3d}{age:>9s}{share:10.1%}{overridden / steps:12.1%}"
         f"{returns.mean():10.1f}{violations:12.0f}"
     )
 
@@ -115,8 +115,8 @@ def main() -> None:
         f"{'overridden':>12s}{'return':>10s}{'violations':>12s}"
     )
     for env_id in options.envs:
-        for lead in options.leads:
-            print(row(env_id, lead, options.episodes), flush=True)
+        for input_delay in options.leads:
+            print(row(env_id, input_delay, options.episodes), flush=True)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import numpy as np
 
 from ncs_gym import LinearPlant, Regulation, SetpointTracking, SpeedTracking
 from ncs_gym.plants.lqr import lqr_gain
-from ncs_gym.tasks.task import Task
+from ncs_gym.tasks.base_task import Task
 
 EFFORTS = tuple(10.0**power for power in (-4, -3, -2, -1, 0))
 # Weights of the safe box beside that of the task's own error.

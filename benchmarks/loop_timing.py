@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from ncs_gym import Actuator, Channel, ChannelContract, Echo, batch_reactor, cart_pole, truck_trailer
-from ncs_gym.network.packet_transmission import ChannelState
+from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.network.wire import Kind, Message, Wire
 from shields import SafeLoop, synthesize
 
@@ -38,7 +38,7 @@ def resident() -> float:
 def run(loop: SafeLoop, steps: int) -> tuple[np.ndarray, float]:
     """Microseconds of each step on the processor and on the clock, shape (2, steps), and the growth of memory [MB]."""
     plant, rng = loop.filter.plant, np.random.default_rng(0)
-    wire, actuator = Wire(plant, loop.lead, bytes(32)), Actuator(loop.lead, plant.m)
+    wire, actuator = Wire(plant, loop.input_delay, bytes(32)), Actuator(loop.input_delay, plant.m)
     ways = ChannelState(ON_AIR, rng), ChannelState(ON_AIR, rng)
     state, taken, arrived, began = np.zeros(plant.n), np.zeros((2, steps)), [], 0.0
     taken += 1.0  # in memory from now on

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from ncs_gym import Channel, ChannelContract, LinearPlant, batch_reactor, cart_pole, truck_trailer
-from ncs_gym.network.packet_transmission import ChannelState
+from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.plants.statespace import zero_order_hold
 from shields import SafeLoop, synthesize
 

@@ -14,7 +14,7 @@ plant = cart_pole()
 uplink = downlink = Channel(loss=0.4, delay=1, max_consecutive_losses=2)
 ages = contract_of(uplink).max_age + contract_of(downlink).max_age
 loop = SafeLoop(synthesize(plant, contract=ChannelContract(ages)), plant, uplink, downlink=downlink)
-actuator = Actuator(loop.lead, plant.m, plant.u_max)  # This would run next to the motor.
+actuator = Actuator(loop.input_delay, plant.m, plant.u_max)  # This would run next to the motor.
 
 
 class Radio:
@@ -36,7 +36,7 @@ up, down = Radio(uplink, rng), Radio(downlink, rng)
 state = np.zeros(plant.n)  # This simulation takes the place of the real plant.
 loop.start(state + plant.initial_noise.sample(rng))
 actuator.start(loop.episode)
-decided, as_decided, overridden, proved, worst = [np.zeros(plant.m)] * loop.lead, 0, 0, 0, 0.0
+decided, as_decided, overridden, proved, worst = [np.zeros(plant.m)] * loop.input_delay, 0, 0, 0, 0.0
 for step in range(3000):
     loop.receive(up.send(Packet(step, plant.H @ state + plant.sensor_noise.sample(rng), loop.episode)))
     proved += loop.guaranteed
@@ -49,6 +49,6 @@ for step in range(3000):
     as_decided += np.array_equal(applied, decided[step])  # Three steps ago; nobody acknowledged it.
     state = plant.A @ state + plant.B @ applied + plant.nominal_disturbance.sample_boundary(rng)
     worst = max(worst, float(np.abs(plant.box_rows @ state).max()))
-print(f"decided {loop.lead} steps ahead; applied as decided: {as_decided} of 3000")
+print(f"decided {loop.input_delay} steps ahead; applied as decided: {as_decided} of 3000")
 print(f"overridden: {overridden} of 3000, closest to the limit: {worst:.3f} (violated above 1)")
 print(f"proved: {proved} of 3000 steps")

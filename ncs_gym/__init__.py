@@ -25,10 +25,10 @@ from ncs_gym.plants.truck_trailer import truck_trailer
 from ncs_gym.processes import FunctionProcess, GymProcess, LinearProcess, Process, linear_model
 from ncs_gym.registration import register_all, register_plant
 from ncs_gym.rendering import Annotation
+from ncs_gym.tasks.base_task import Task
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.tasks.setpoint_tracking import SetpointTracking
 from ncs_gym.tasks.speed_tracking import SpeedTracking
-from ncs_gym.tasks.task import Task
 from ncs_gym.uncertainty.bounded_disturbances import BallDisturbance, BoxDisturbance, SinusoidDisturbance
 from ncs_gym.uncertainty.disturbance import Disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid

@@ -33,10 +33,10 @@ from ncs_gym.processes import (
     nonlinear_cart_pole,
     pendulum,
 )
+from ncs_gym.tasks.base_task import Task
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.tasks.setpoint_tracking import SetpointTracking
 from ncs_gym.tasks.speed_tracking import SpeedTracking
-from ncs_gym.tasks.task import Task
 from ncs_gym.uncertainty.bounded_disturbances import BallDisturbance, BoxDisturbance, SinusoidDisturbance
 from ncs_gym.uncertainty.disturbance import Disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid

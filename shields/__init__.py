@@ -51,12 +51,15 @@ __all__ = [
 
 
 # Imported at first use: these need the solver, or asyncio.
-_LAZY = dict.fromkeys(("Network", "Requirement", "Requirements", "certify", "requirements", "synthesize"), "synthesis")
-_LAZY |= dict.fromkeys(("ActuatorNode", "ControllerNode", "SensorNode"), "nodes")
+_NAMES = {
+    "synthesis": ("Network", "Requirement", "Requirements", "certify", "requirements", "synthesize"),
+    "nodes": ("ActuatorNode", "ControllerNode", "SensorNode"),
+}
+_MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
     """Returns a public name whose import takes long."""
-    if name in _LAZY:
-        return getattr(import_module(f"shields.{_LAZY[name]}"), name)
+    if name in _MODULE_OF:
+        return getattr(import_module(f"shields.{_MODULE_OF[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

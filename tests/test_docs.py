@@ -156,7 +156,7 @@ def test_architecture_describes_every_folder_and_no_other():
 def test_functions_that_architecture_names_exist():
     page = (ROOT / "docs" / "architecture.md").read_text()
     named = re.findall(r"`(\w+)` in `([\w/]+\.py)`", page)
-    assert ("transmit", "ncs_gym/network/packet_transmission.py") in named
+    assert ("transmit", "ncs_gym/network/packet_loss_and_delay.py") in named
     for name, path in named:
         assert re.search(rf"^\s*(?:def|class) {name}\b", (ROOT / path).read_text(), re.MULTILINE), (name, path)
 

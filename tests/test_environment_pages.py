@@ -107,7 +107,7 @@ def test_channel_is_said_in_words(channel, sentence):
 
 def test_downlink_is_said_in_words(pages):
     env = SimpleNamespace(
-        channel=Channel(), contract=None, downlink_protocol=SimpleNamespace(channel=Channel(loss=0.1), lead=2)
+        channel=Channel(), contract=None, downlink_protocol=SimpleNamespace(channel=Channel(loss=0.1), input_delay=2)
     )
     text = pages._channel(env)
     assert "Between controller and actuator is a network as well: `Channel(loss=0.1," in text

@@ -157,7 +157,7 @@ def _channel(env: NCSEnv) -> str:
     if downlink is not None:
         texts.append(
             f"Between controller and actuator is a network as well: `{downlink.channel}`. "
-            f"An action takes effect {_steps(downlink.lead)} later."
+            f"An action takes effect {_steps(downlink.input_delay)} later."
         )
         if env.contract is not None:
             texts[-1] += f" The certificate rests on both, {_steps(env.certificate_contract.max_age)} in all."

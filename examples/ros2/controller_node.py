@@ -54,7 +54,7 @@ class SafeController(Node):
         network = Channel(delay=1, jitter=2)
         loop = SafeLoop(Certificate.load("truck.json"), plant, network, downlink=network, echo_age=20)
         with open("key", "rb") as file:
-            wire = Wire(plant, loop.lead, file.read())
+            wire = Wire(plant, loop.input_delay, file.read())
         transport = TopicTransport(self, "to_controller", "from_controller")
         self.node = ControllerNode(loop, wire, transport, StepClock(plant.dt), np.zeros(plant.n), known=False)
         self.create_timer(plant.dt, self.step, clock=Clock(clock_type=ClockType.STEADY_TIME))

@@ -111,7 +111,7 @@ def gaussian_summary(bound: float, steps: int, arms: Mapping[str, dict[str, Any]
     """Returns JSON values: the bound for an episode, and what the evaluation episodes of each shielded arm did."""
     counts = {name: (arm["eval_episodes"], arm["eval_episodes_outside_set"]) for name, arm in arms.items()}
     return {
-        "escape_probability": bound,
+        "bound_violation_probability": bound,
         "steps": steps,
         "arms": {
             name: {
@@ -126,7 +126,7 @@ def gaussian_summary(bound: float, steps: int, arms: Mapping[str, dict[str, Any]
 
 def gaussian_sentences(summary: dict[str, Any]) -> list[str]:
     """Returns what `gaussian_summary` found in a sentence per arm."""
-    bound, sentences = summary["escape_probability"], []
+    bound, sentences = summary["bound_violation_probability"], []
     for name, arm in summary["arms"].items():
         low, high = (100.0 * end for end in arm["rate_ci95"])
         sentences.append(

@@ -66,7 +66,7 @@ class AttackCase:
         """Returns the case with a plant whose bounds hold for Gaussian noise at another level; None keeps it."""
         return self if delta is None else replace(self, plant=replace(self.plant, delta=delta))
 
-    def escape_probability(self) -> float:
+    def bound_violation_probability(self) -> float:
         """Returns the bound on the probability that Gaussian noise drives an episode out of S."""
         return bound_violation_probability(self.plant, self.channel, EPISODE_STEPS)
 

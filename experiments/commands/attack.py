@@ -62,7 +62,9 @@ def attack(settings: AttackSettings) -> None:
             listed = "; ".join([*left_out[:_MOST_LISTED], *["..."] * (len(left_out) > _MOST_LISTED)])
             budget = f"within {settings.steps:,.0f} steps"
             print(wrapped(f"{len(left_out)} of {len(cases)} cases are not attacked {budget}: {listed}"))
-        limits = {name: cases[name].escape_probability() for name in counts} if settings.noise == "gaussian" else {}
+        limits = (
+            {name: cases[name].bound_violation_probability() for name in counts} if settings.noise == "gaussian" else {}
+        )
         if limits:
             print("", gaussian_table(counts, limits), GAUSSIAN_LEGEND, sep="\n")
         given = settings_json("certify", settings)["settings"]
@@ -70,7 +72,7 @@ def attack(settings: AttackSettings) -> None:
         document |= {"versions": versions(), "total": total.document()}
         document["cases"] = {case: each.document() for case, each in counts.items()}
         if limits:
-            document["escape_probability"] = limits
+            document["bound_violation_probability"] = limits
         write_atomically(settings.out / "certify.json", json.dumps(document, indent=1) + "\n")
         if limits and not settings.unshielded:
             require_within(counts, limits)

@@ -137,8 +137,8 @@ def _gaussian_noise(loop: LoopConfig, certificate: Certificate, arms: Mapping[st
     env = ncs_env(loop.single())
     steps = gym.spec(loop.env).max_episode_steps or 1
     protocol = env.downlink_protocol
-    lead, is_promised = (0, True) if protocol is None else (protocol.lead, protocol.contract is not None)
-    known = starts_known(SafetyFilter(certificate, env.plant), env.initial_set, lead)
+    input_delay, is_promised = (0, True) if protocol is None else (protocol.input_delay, protocol.contract is not None)
+    known = starts_known(SafetyFilter(certificate, env.plant), env.initial_set, input_delay)
     begins_inside = is_promised and all(each.in_safe_set for each in known)
     bound = bound_violation_probability(env.plant, env.channel, steps) if begins_inside else 1.0
     claimed = {name: arm for name, arm in arms.items() if arm["shielded"] and arm["mode"] != "lookahead"}

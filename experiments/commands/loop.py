@@ -116,7 +116,7 @@ def _network_loop(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
                 for way in (given.uplink, given.downlink)
             ]
             raise ValueError(
-                f"{error}. There and back, what the network promises adds up to max_age: max_consecutive_losses + "
+                f"{error}; there and back, what the network promises adds up to max_age: max_consecutive_losses + "
                 f"delay + jitter + --room, now {ages[0]} by --channel NAME=VALUE ... and {ages[1]} by --downlink "
                 "NAME=VALUE ..."
             ) from error

@@ -110,7 +110,7 @@ def _plant_and_network(settings: RequirementsSettings) -> tuple[LinearPlant, Net
         losses=channel.most_consecutive_losses,
         delay=channel.delay,
         jitter=channel.jitter,
-        input_delay=0 if env.downlink_protocol is None else env.downlink_protocol.lead,
+        input_delay=0 if env.downlink_protocol is None else env.downlink_protocol.input_delay,
         quantization_step=channel.quantization_step,
     )
     return plant, network

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import Channel
-from ncs_gym.network.packet_transmission import first_loss_state, transmit
+from ncs_gym.network.packet_loss_and_delay import first_loss_state, transmit
 
 # A datagram that is to be used j steps after it was sent is handed over within this part of the step before.
 EARLIEST, LATEST = 0.02, 0.3

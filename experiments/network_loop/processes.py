@@ -23,7 +23,7 @@ from ncs_gym import Actuator, AdversarialDisturbance, Channel, NCSEnv
 from ncs_gym.network import downlink_protocol
 from ncs_gym.network.contract import contract_of
 from ncs_gym.network.wire import Wire
-from ncs_gym.processes.simulation import PlantSimulation
+from ncs_gym.processes.plant_simulation import PlantSimulation
 from shields import Certificate, SafeLoop
 from shields.nodes import (
     ActuatorNode,
@@ -94,11 +94,11 @@ class NetworkLoop:
         return tuple(replace(each, jitter=each.jitter + self.room) for each in (self.uplink, self.downlink))  # pyright: ignore
 
     @property
-    def lead(self) -> int:
+    def input_delay(self) -> int:
         """c, the number of steps from a decision to its effect."""
         protocol = downlink_protocol(self.promised[1], None)
         assert protocol is not None
-        return protocol.lead
+        return protocol.input_delay
 
     @property
     def key(self) -> bytes:
@@ -206,9 +206,9 @@ async def _plant(loop: NetworkLoop, is_over: Callable[[], bool]) -> None:
     linear = plant.remainder is None
     disturbance = AdversarialDisturbance(certificate.M) if linear else env.disturbance
     simulation = PlantSimulation(plant, disturbance, False, process=env.process)
-    wire, clock = Wire(plant, loop.lead, loop.key), StepClock(loop.dt(env))
+    wire, clock = Wire(plant, loop.input_delay, loop.key), StepClock(loop.dt(env))
     sensor = SensorNode(wire, await UdpTransport.open(peer=loop.sensor), clock)
-    actuator = Actuator(loop.lead, plant.m, plant.u_max)
+    actuator = Actuator(loop.input_delay, plant.m, plant.u_max)
     node = ActuatorNode(wire, await UdpTransport.open(peer=loop.actuator), clock, actuator)
     names = [*(f"x_{name}" for name in plant.state_names), *(f"u_{name}" for name in plant.input_names)]
     log = StepLog(loop.out, "plant", ["time", "episode", "step", *names, "missing", "outside", "drift"])
@@ -256,7 +256,7 @@ async def _controller(
     loop: NetworkLoop, known: bool, show: Callable[[dict[str, Any]], None] | None, is_over: Callable[[], bool]
 ) -> None:
     env = registered_env(loop.env)
-    plant, wire = env.plant, Wire(env.plant, loop.lead, loop.key)
+    plant, wire = env.plant, Wire(env.plant, loop.input_delay, loop.key)
     transport = await UdpTransport.open(local=loop.listen)
     node = ControllerNode(loop.safe_loop(env), wire, transport, StepClock(loop.dt(env)), np.zeros(plant.n), known=known)
     inputs = plant.input_names

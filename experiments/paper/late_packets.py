@@ -14,8 +14,8 @@ from experiments.paper.paper_example import PaperExample
 from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.estimation import VectorEstimator
 from ncs_gym.estimation.arrival_histories import arrival_histories
-from ncs_gym.network.packet_transmission import VectorChannelState
-from ncs_gym.processes.simulation import PlantSimulation
+from ncs_gym.network.packet_loss_and_delay import VectorChannelState
+from ncs_gym.processes.plant_simulation import PlantSimulation
 from ncs_gym.registration import CASE_STUDY_CHANNEL
 
 # As in Section 5.

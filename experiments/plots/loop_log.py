@@ -32,7 +32,7 @@ def loop_log_figure(folder: Path, plant: LinearPlant, steps: int) -> CaptionedFi
         if missing := [each for each in plant.state_names if columns[name] + each not in log]:
             raise ValueError(f"the logs in {folder} are of another plant, without {', '.join(missing)}: give its --env")
     logs = {name: log[log["episode"] == log["episode"].iloc[-1]] for name, log in logs.items()}
-    names, units = plant.state_names + plant.input_names, plant.state_units + plant.input_units
+    names, units = [*plant.state_names, *plant.input_names], [*plant.state_units, *plant.input_units]
     widths = [*plant.half_widths, *plant.u_max]
     with matplotlib.rc_context(STYLE):
         figure = CaptionedFigure(

@@ -28,15 +28,15 @@ from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.downlink import DownlinkProtocol, DownlinkState, Inputs, no_inputs
+from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.network.packet_reception import UnusedPacketsWarning
-from ncs_gym.network.packet_transmission import ChannelState
 from ncs_gym.network.requests import Requested, Requests, require_on_request
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.processes.plant_simulation import PlantSimulation
 from ncs_gym.processes.process import LinearProcess, Process
-from ncs_gym.processes.simulation import PlantSimulation
 from ncs_gym.rendering import Annotation, Renderer, sent_at
+from ncs_gym.tasks.base_task import Task
 from ncs_gym.tasks.regulation import Regulation
-from ncs_gym.tasks.task import Task
 from ncs_gym.uncertainty.disturbance import Disturbance
 from ncs_gym.uncertainty.disturbance_settings import as_disturbance, as_noise
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
@@ -136,7 +136,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
             [steps], and "error", the n half-widths of the error's ellipsoid E(Sigma_k) [units of the states].
 
     Attributes:
-        downlink_protocol: How commands are sent over the downlink, with c as its `lead`; None for an ideal downlink.
+        downlink_protocol: How commands are sent over the downlink, with its `input_delay`; None for an ideal downlink.
         certificate_contract: Contract that a certificate for this environment rests on: `contract` with c steps added.
         steps: Steps taken in this episode.
         episodes: Episodes begun.
@@ -220,8 +220,8 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._estimator = Estimator(plant, self._channel, histories=histories)
         self._downlink_state = DownlinkState(self._protocol, plant.m)
         self._uplinks, self._downlinks = uplinks([self._channel], self._channel), downlinks([downlink], self._protocol)
-        on_request, lead = self._channel.on_request, len(self._pending)
-        self._requests = Requests(self._channel, self._contract, lead) if on_request else None
+        on_request, input_delay = self._channel.on_request, len(self._pending)
+        self._requests = Requests(self._channel, self._contract, input_delay) if on_request else None
         self._noise = as_noise(noise, plant)
         self._process_given = LinearProcess() if process is None else expect(process, Process, "process")
         allowed = self._allow_assumption_violation
@@ -233,7 +233,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         steps = self._horizon + len(self._pending)
         self._observe = read_observed(observe)
         sets = self._error_set, self._initial_set
-        self.observation_space = observation_space(plant, self._task, *sets, steps, lead, self._observe)
+        self.observation_space = observation_space(plant, self._task, *sets, steps, input_delay, self._observe)
         self._low, self._high = self.observation_space.low, self.observation_space.high
         self.steps = self.episodes = 0
         self.start: Ellipsoid | np.ndarray = self._initial_set

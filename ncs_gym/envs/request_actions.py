@@ -133,16 +133,16 @@ def _on_request(env: Any, kind: type) -> Any:
 
 def _bounds(env: NCSEnv) -> np.ndarray:
     """Returns the largest age and the largest number of outstanding samples that are told apart, shape (2,)."""
-    lead = 0 if env.downlink_protocol is None else env.downlink_protocol.lead
+    input_delay = 0 if env.downlink_protocol is None else env.downlink_protocol.input_delay
     if env.contract is None:
-        return np.array([env.horizon, max(env.channel.longest_delay + lead, 1)], dtype=np.float64)
-    return np.array([env.contract.max_age, env.contract.max_age + lead], dtype=np.float64).clip(min=1.0)
+        return np.array([env.horizon, max(env.channel.longest_delay + input_delay, 1)], dtype=np.float64)
+    return np.array([env.contract.max_age, env.contract.max_age + input_delay], dtype=np.float64).clip(min=1.0)
 
 
 def _wider(space: Any, low: Any, high: Any) -> Box:
     """Returns a space with more entries, within bounds."""
-    bounds = [np.concatenate(pair).astype(np.float32) for pair in ((space.low, low), (space.high, high))]
-    return Box(*bounds, dtype=np.float32)
+    least, most = (np.concatenate(pair).astype(np.float32) for pair in ((space.low, low), (space.high, high)))
+    return Box(least, most, dtype=np.float32)
 
 
 def _parted(actions: Any, shape: Any) -> tuple[np.ndarray, np.ndarray]:

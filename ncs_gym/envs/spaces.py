@@ -11,7 +11,7 @@ from gymnasium.spaces import Box
 
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.tasks.task import Task
+from ncs_gym.tasks.base_task import Task
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_numbers, shown
 
@@ -38,7 +38,7 @@ def observation_space(
     error_set: ErrorSet,
     initial_set: Ellipsoid,
     horizon: int,
-    lead: int = 0,
+    input_delay: int = 0,
     observe: tuple[str, ...] = (),
 ) -> Box:
     """Returns the finite box of estimate and task entries that can be reached within some steps, float32.
@@ -53,7 +53,7 @@ def observation_space(
         error_set: Bounds the errors.
         initial_set: Bounds the starts.
         horizon: Number of steps.
-        lead: c, the number of steps from a decision to its effect, of which observations tell.
+        input_delay: c, the number of steps from a decision to its effect, of which observations tell.
         observe: What is observed besides; see `read_observed`.
 
     Raises:
@@ -71,7 +71,7 @@ def observation_space(
     estimate = reach.max(axis=0) + errors
     if plant.spectral_radius >= 1.0:
         known = np.maximum(plant.half_widths, initial_set.support(np.eye(plant.n)))
-        for _ in range(lead + 1):
+        for _ in range(input_delay + 1):
             pushed = np.abs(plant.B) @ plant.u_max + plant.disturbance.support(np.eye(plant.n))
             known = np.maximum(known, np.abs(plant.A) @ known + pushed)
         estimate = np.minimum(estimate, known + errors)

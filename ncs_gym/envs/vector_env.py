@@ -21,13 +21,13 @@ from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.channel import Channel, widest
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.downlink import DownlinkProtocol, Inputs, VectorDownlinkState, no_inputs
-from ncs_gym.network.packet_transmission import VectorChannelState
+from ncs_gym.network.packet_loss_and_delay import VectorChannelState
 from ncs_gym.network.requests import Requested, Requests, require_on_request
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.processes.plant_simulation import PlantSimulation
 from ncs_gym.processes.process import Process
-from ncs_gym.processes.simulation import PlantSimulation
 from ncs_gym.rendering import Annotation, PacketRecord
-from ncs_gym.tasks.task import Task
+from ncs_gym.tasks.base_task import Task
 from ncs_gym.uncertainty.disturbance import Disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_count, setting, shown
@@ -132,8 +132,8 @@ class NCSVectorEnv(VectorEnv):
         self._downlink_state = VectorDownlinkState(self._protocol, self._plant.m, self.num_envs)
         self._requests = None
         if self._channel.on_request:
-            lead = 0 if self._protocol is None else self._protocol.lead
-            self._requests = Requests(self._channel, self._contract, lead, self.num_envs)
+            input_delay = 0 if self._protocol is None else self._protocol.input_delay
+            self._requests = Requests(self._channel, self._contract, input_delay, self.num_envs)
         self._packets, self._nothing = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, np.bool_)
         self._belief = self._predicted_estimates()
         self._state = np.zeros((self._plant.n, self.num_envs))
@@ -449,11 +449,11 @@ class NCSVectorEnv(VectorEnv):
         constraints = Constraints(values, self._worst, cost, self._violations.copy())
         alarm = self._estimator.alarm | self._process.alarm
         self._known = Known(*belief, self._estimator.age.copy(), alarm.copy(), *(each.copy() for each in inputs[:2]))
-        requested = (self._nothing,) * 2
+        asked, forced = self._nothing, self._nothing
         if self._requests is not None:
-            requested = self._requests.requested, self._requests.forced
+            asked, forced = self._requests.requested, self._requests.forced
         loop = self._estimator, belief, self._contract, self._state, inputs, arrived, constraints, alarm
-        return loop_info(*loop, Requested(*requested, self._packets))
+        return loop_info(*loop, Requested(asked, forced, self._packets))
 
     def _restarted(self, observation: np.ndarray, info: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
         """Returns the first of new episodes where old ones ended, whose last go to final_obs and final_info."""

@@ -60,7 +60,7 @@ def _are_apart(x: np.ndarray, X: np.ndarray, z: np.ndarray, Z: np.ndarray) -> bo
     if not np.isfinite(Z).all():
         return False
     direction = np.linalg.lstsq(X + Z, x - z, rcond=None)[0]
-    widths = np.sqrt([max(direction @ shape @ direction, 0.0) for shape in (X, Z)])
+    widths = np.sqrt(np.array([max(float(direction @ shape @ direction), 0.0) for shape in (X, Z)]))
     return bool(direction @ (x - z) > (1.0 + ROUNDING) * widths.sum())
 
 

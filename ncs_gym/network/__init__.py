@@ -1,6 +1,6 @@
 """The network between sensor and controller, and between controller and actuator.
 
-`channel` has the settings (packet loss, quantization, transmission period, delay and jitter), `packet_transmission`
+`channel` has the settings (packet loss, quantization, transmission period, delay and jitter), `packet_loss_and_delay`
 what happens to packets during an episode, `contract` what a channel guarantees about the age of samples,
 `packet_reception` which packets a receiver can use, and `gaussian_bound` says how likely Gaussian noise is to leave its
 bounds, given how many samples a channel takes. `packet_log` reads recorded packets, which a `TraceChannel` replays.
@@ -20,8 +20,8 @@ from ncs_gym.network.downlink import (
 )
 from ncs_gym.network.gaussian_bound import bound_violation_probability
 from ncs_gym.network.packet_log import PacketLog
+from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.network.packet_reception import DiscardedPackets, UnusedPacketsWarning
-from ncs_gym.network.packet_transmission import ChannelState
 
 __all__ = [
     "Actuator",

@@ -65,14 +65,19 @@ def contract_of(channel: Channel) -> ChannelContract | None:
 
 
 def warn_of_broken_contract(
-    contract: ChannelContract | None, channel: Channel, lead: int, *, counts_losses: bool = False, stacklevel: int = 3
+    contract: ChannelContract | None,
+    channel: Channel,
+    input_delay: int,
+    *,
+    counts_losses: bool = False,
+    stacklevel: int = 3,
 ) -> None:
     """Warns the caller of the calling constructor if a channel cannot keep the contract that a certificate assumes.
 
     Args:
         contract: That of the certificate; None for none.
         channel: The channel of the samples.
-        lead: c, the number of steps from a decision to its effect.
+        input_delay: c, the number of steps from a decision to its effect.
         counts_losses: Whether losses and jitter count, as of a real channel; one that may lose any number of packets
             in a row promises nothing. Without them it is warned only of what breaks the contract although no packet is
             lost.
@@ -89,13 +94,13 @@ def warn_of_broken_contract(
         )
         return
     age = channel.send_period - 1 + channel.delay if promised is None else promised.max_age
-    if contract is None or age + lead <= contract.max_age:
+    if contract is None or age + input_delay <= contract.max_age:
         return
-    later = f", and what is decided takes effect {_steps(lead)} later" if lead else ""
+    later = f", and what is decided takes effect {_steps(input_delay)} later" if input_delay else ""
     warnings.warn(
         f"the channel lets the newest sample become {_steps(age)} old{later}, but the certificate's contract allows "
         f"{_steps(contract.max_age)} in all, so that the guarantee is likely to be lost: give a certificate of "
-        f"ChannelContract(max_age={age + lead}), or of a larger max_age where packets are lost",
+        f"ChannelContract(max_age={age + input_delay}), or of a larger max_age where packets are lost",
         BrokenContractWarning,
         stacklevel=stacklevel,
     )

@@ -16,7 +16,7 @@ import numpy as np
 
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import MAX_AGE, ChannelContract, contract_of
-from ncs_gym.network.packet_transmission import ChannelState, VectorChannelState
+from ncs_gym.network.packet_loss_and_delay import ChannelState, VectorChannelState
 from ncs_gym.validation import as_count, as_flag, as_numbers, read_only, shown
 
 # Stamp of the newest command where none has arrived.
@@ -34,12 +34,12 @@ class DownlinkProtocol:
 
     Attributes:
         channel: What happens to the commands.
-        lead: c, the number of steps from a decision to its effect.
+        input_delay: c, the number of steps from a decision to its effect.
         contract: What the channel guarantees, or what is assumed of it; None for nothing.
     """
 
     channel: Channel
-    lead: int
+    input_delay: int
     contract: ChannelContract | None
 
     def behind(self, contract: ChannelContract | None) -> ChannelContract | None:
@@ -50,9 +50,9 @@ class DownlinkProtocol:
         Raises:
             ValueError: If that is older than contracts can be.
         """
-        if contract is None or self.lead == 0:
+        if contract is None or self.input_delay == 0:
             return contract
-        age = contract.max_age + self.lead
+        age = contract.max_age + self.input_delay
         if age > MAX_AGE:
             raise ValueError(f"contracts of uplink and downlink add up to {age} steps, more than {MAX_AGE}")
         return ChannelContract(age, contract.quantization_step)
@@ -98,8 +98,8 @@ def downlink_protocol(downlink: Channel | None, contract: ChannelContract | None
             f"the downlink delays commands by up to {downlink.longest_delay} steps, which a contract of max_age = "
             f"{contract.max_age} never allows"
         )
-    lead = downlink.longest_delay if contract is None else contract.max_age
-    return DownlinkProtocol(downlink, lead, contract)
+    input_delay = downlink.longest_delay if contract is None else contract.max_age
+    return DownlinkProtocol(downlink, input_delay, contract)
 
 
 def require_fitting_downlink(protocol: DownlinkProtocol | None, downlink: Channel) -> None:
@@ -113,7 +113,7 @@ def require_fitting_downlink(protocol: DownlinkProtocol | None, downlink: Channe
         raise ValueError(
             "the environment has an ideal downlink, and commits no inputs ahead: make it with downlink=Channel(...)"
         )
-    downlink_protocol(downlink, ChannelContract(protocol.lead))
+    downlink_protocol(downlink, ChannelContract(protocol.input_delay))
 
 
 class Command(NamedTuple):
@@ -167,12 +167,12 @@ class Actuator:
     beyond the limits.
 
     Args:
-        lead: c, the number of steps from a decision to its effect.
+        input_delay: c, the number of steps from a decision to its effect.
         inputs: m, the number of inputs.
         u_max: Largest size of each input, a number or shape (m,) [physical units]; None where the plant limits them.
 
     Attributes:
-        lead, inputs: c and m.
+        input_delay, inputs: c and m.
         missing: Whether the input applied last was zero because the committed one had not arrived.
         requested: After `apply`, whether a sensor beside the actuator takes the sample of the next step, where samples
             are on request: not if a command said so, and always where none has arrived.
@@ -183,8 +183,8 @@ class Actuator:
         ValueError: If an argument is no whole number of its range, or the limits are no sizes of m inputs.
     """
 
-    def __init__(self, lead: int, inputs: int, u_max: Any = None) -> None:
-        self.lead = as_count(lead, "lead", low=0)
+    def __init__(self, input_delay: int, inputs: int, u_max: Any = None) -> None:
+        self.input_delay = as_count(input_delay, "input_delay", low=0)
         self.inputs = as_count(inputs, "inputs", low=1)
         self._nothing = np.zeros(self.inputs)
         self._limits = np.full_like(self._nothing, np.inf)
@@ -217,10 +217,10 @@ class Actuator:
                 f"commands must be a list of Command(stamp, inputs), empty if nothing arrived, got {shown(commands)}"
             )
         now = self.echo.steps
-        for command in [_as_command(each, (self.lead + 1, len(self._nothing))) for each in commands]:
+        for command in [_as_command(each, (self.input_delay + 1, len(self._nothing))) for each in commands]:
             if command.episode != self.echo.episode:
                 continue
-            if command.stamp > now + self.lead + 1 or (np.abs(command.inputs) > self._limits).any():
+            if command.stamp > now + self.input_delay + 1 or (np.abs(command.inputs) > self._limits).any():
                 self.refused += 1
                 continue
             for ahead, u in enumerate(command.inputs, command.stamp):
@@ -239,15 +239,15 @@ class Actuator:
             ValueError: If the step is no whole number from 0 on.
         """
         step = as_count(step, "step", low=0)
-        committed = self._committed.get(step) if step >= self.lead else self._nothing
+        committed = self._committed.get(step) if step >= self.input_delay else self._nothing
         self.missing = committed is None
         self.requested = self._requested.get(step, True)
         u = (self._nothing if committed is None else committed).copy()
         steps, missing, digest, episode = self.echo
         if step >= steps:
-            for _ in range(steps, min(step, self.lead)):
+            for _ in range(steps, min(step, self.input_delay)):
                 digest = digest_of_inputs(digest, self._nothing)
-            left_out = step - max(steps, min(step, self.lead))
+            left_out = step - max(steps, min(step, self.input_delay))
             if left_out > 0:
                 missing, digest = missing + left_out, digest_of_inputs(digest, None)
             self.echo = Echo(step + 1, missing + self.missing, digest_of_inputs(digest, u), episode)
@@ -301,15 +301,15 @@ class CommittedInputs:
     """The inputs decided for the next c steps, the earliest first; once an input is among them, it is never changed.
 
     Args:
-        lead: c, the number of steps from a decision to its effect.
+        input_delay: c, the number of steps from a decision to its effect.
         shape: Of an input: m, or (m, N) for N environments.
 
     Attributes:
         pending: These inputs.
     """
 
-    def __init__(self, lead: int, shape: int | tuple[int, int]) -> None:
-        self._lead, self._nothing = lead, read_only(np.zeros(shape))
+    def __init__(self, input_delay: int, shape: int | tuple[int, int]) -> None:
+        self._input_delay, self._nothing = input_delay, read_only(np.zeros(shape))
         self.start()
 
     def start(self, chosen: np.ndarray | None = None) -> None:
@@ -318,7 +318,7 @@ class CommittedInputs:
         In all of them, whatever interrupted the last step leaves nothing behind.
         """
         if chosen is None or chosen.all():
-            self.pending: tuple[np.ndarray, ...] = (self._nothing,) * self._lead
+            self.pending: tuple[np.ndarray, ...] = (self._nothing,) * self._input_delay
         else:
             self.pending = tuple(np.where(chosen, 0.0, u) for u in self.pending)
 
@@ -426,9 +426,9 @@ class DownlinkState:
     """
 
     def __init__(self, protocol: DownlinkProtocol | None, inputs: int) -> None:
-        lead = 0 if protocol is None else protocol.lead
+        input_delay = 0 if protocol is None else protocol.input_delay
         self._channel = None if protocol is None else protocol.channel
-        self._actuator, self.committed = Actuator(lead, inputs), CommittedInputs(lead, inputs)
+        self._actuator, self.committed = Actuator(input_delay, inputs), CommittedInputs(input_delay, inputs)
         self.in_flight: ChannelState
 
     def begin(self, rng: np.random.Generator, episode: int = 0, channel: Channel | None = None) -> None:
@@ -465,9 +465,9 @@ class VectorDownlinkState:
     """
 
     def __init__(self, protocol: DownlinkProtocol | None, inputs: int, size: int) -> None:
-        self._lead, self._size = 0 if protocol is None else protocol.lead, size
+        self._input_delay, self._size = 0 if protocol is None else protocol.input_delay, size
         self._channel = None if protocol is None else protocol.channel
-        self.committed = CommittedInputs(self._lead, (inputs, size))
+        self.committed = CommittedInputs(self._input_delay, (inputs, size))
         self._newest, self._on_time = np.full(size, NEVER, np.int64), np.zeros(size, np.bool_)
         self._channel_state: VectorChannelState
 
@@ -496,5 +496,5 @@ class VectorDownlinkState:
         self._channel_state.send(rng, steps)
         for age, arrives in self._channel_state.arrivals():
             self._newest = np.where(arrives, np.maximum(self._newest, steps - age), self._newest)
-        missing = (self._newest < steps - self._lead) & (steps >= self._lead)
+        missing = (self._newest < steps - self._input_delay) & (steps >= self._input_delay)
         return Inputs(np.where(missing, 0.0, scheduled), u, missing)

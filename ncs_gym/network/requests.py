@@ -59,8 +59,8 @@ class Requests:
     Args:
         channel: The channel.
         contract: What is to be kept; None if nothing is promised and nothing is forced.
-        lead: c, the number of steps from a decision to its effect. The samples of the first c steps are requested by
-            agreement.
+        input_delay: c, the number of steps from a decision to its effect. The samples of the first c steps are
+            requested by agreement.
         size: N; None for one control loop, whose values are no arrays but numbers.
 
     Attributes:
@@ -72,20 +72,20 @@ class Requests:
     """
 
     def __init__(
-        self, channel: Channel, contract: ChannelContract | None, lead: int = 0, size: int | None = None
+        self, channel: Channel, contract: ChannelContract | None, input_delay: int = 0, size: int | None = None
     ) -> None:
-        self._spare, self._lead = spare_samples(channel, contract), lead
+        self._spare, self._input_delay = spare_samples(channel, contract), input_delay
         self._shape = () if size is None else (size,)
         # Without a contract it is enough to know which packets may still arrive.
         self._oldest = channel.longest_delay if contract is None else contract.max_age
-        self._back = np.arange(lead + self._oldest + 1).reshape(-1, *[1] * len(self._shape))
+        self._back = np.arange(input_delay + self._oldest + 1).reshape(-1, *[1] * len(self._shape))
         self.begin()
 
     def begin(self, chosen: np.ndarray | None = None) -> None:
         """Starts episodes, in all environments or in those of a mask (N,)."""
         # Whether the samples of k + c, k + c - 1, ... were requested.
         first = np.zeros((len(self._back), *self._shape), np.bool_)
-        first[: self._lead] = True
+        first[: self._input_delay] = True
         nothing: Any = np.zeros(self._shape, np.bool_) if self._shape else False
         if chosen is None or chosen.all():
             self._flags, self.requested, self.forced, self._asked = first, nothing, nothing, nothing
@@ -122,7 +122,7 @@ class Requests:
         Args:
             age: Steps since the newest sample that arrived was taken, or shape (N,).
         """
-        return np.count_nonzero(self._flags & (self._back < age + self._lead), axis=0)
+        return np.count_nonzero(self._flags & (self._back < age + self._input_delay), axis=0)
 
     def decide(self, age: Any) -> None:
         """Decides the request of sample k + c + 1.
@@ -132,7 +132,7 @@ class Requests:
         """
         asked, needed = self._asked, self._asked & False
         if self._spare is not None:
-            needed = (self.outstanding(age) + self._spare <= age + self._lead) | (age > self._oldest)
+            needed = (self.outstanding(age) + self._spare <= age + self._input_delay) | (age > self._oldest)
         self.requested = asked | needed if self._shape else bool(asked | needed)
         self.forced = self.requested != asked
         self._flags = np.concatenate([np.asarray(self.requested)[None], self._flags[:-1]])
@@ -144,7 +144,7 @@ class Requests:
 
         Shape (c+1,) or (c+1, N); the first is the one that is due.
         """
-        return self._flags[self._lead :: -1]
+        return self._flags[self._input_delay :: -1]
 
 
 def require_on_request(requests: Requests | None) -> Requests:

@@ -90,18 +90,18 @@ class Wire:
 
     Args:
         plant: Gives sizes and fingerprint: what was sent for another plant is refused.
-        lead: c, the number of steps from a decision to its effect.
+        input_delay: c, the number of steps from a decision to its effect.
         key: What sensor, controller and actuator share and nobody else knows, at least 16 bytes.
 
     Raises:
         ValueError: If the key is too short, or a command does not fit into one datagram.
     """
 
-    def __init__(self, plant: LinearPlant, lead: int, key: bytes) -> None:
+    def __init__(self, plant: LinearPlant, input_delay: int, key: bytes) -> None:
         if not isinstance(key, bytes) or len(key) < SHORTEST_KEY:
             raise ValueError(f"the key must be at least {SHORTEST_KEY} bytes, as os.urandom(32) makes them")
         self._key, self._fingerprint = key, bytes.fromhex(plant.fingerprint)[:8]
-        shapes = {Kind.SAMPLE: (plant.p,), Kind.COMMAND: (as_count(lead, "lead", low=0) + 1, plant.m)}
+        shapes = {Kind.SAMPLE: (plant.p,), Kind.COMMAND: (as_count(input_delay, "input_delay", low=0) + 1, plant.m)}
         self._shapes = shapes | {Kind.ECHO: (0,), Kind.BEACON: (0,)}
         sizes = {kind: 8 * int(np.prod(shape)) for kind, shape in self._shapes.items()} | {Kind.ECHO: _ECHO.size}
         if max(sizes.values()) > LARGEST_BODY:

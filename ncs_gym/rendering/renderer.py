@@ -16,7 +16,7 @@ from ncs_gym.rendering.episode_record import Annotation, EpisodeRecord, FrameRec
 from ncs_gym.rendering.panel import draw_header, draw_legend, draw_panel
 from ncs_gym.rendering.phase_plane import PhasePlane, TimePlot
 from ncs_gym.rendering.truck_trailer import TruckTrailerDrawing
-from ncs_gym.tasks.task import Task
+from ncs_gym.tasks.base_task import Task
 
 _TITLE = "ncs-gym"
 # A background is kept for each safe set and color behind the plant, at most this many.

@@ -1,11 +1,11 @@
 """Tasks: what an agent is rewarded for, and the perfectly known states that belong to it.
 
-`task` is the base class of tasks of your own; the others are regulation, speed tracking and set-point tracking.
+`base_task` has the base class of tasks of your own; the others are regulation, speed tracking and set-point tracking.
 """
 
+from ncs_gym.tasks.base_task import Task
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.tasks.setpoint_tracking import SetpointTracking
 from ncs_gym.tasks.speed_tracking import SpeedTracking
-from ncs_gym.tasks.task import Task
 
 __all__ = ["Regulation", "SetpointTracking", "SpeedTracking", "Task"]

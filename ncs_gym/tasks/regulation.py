@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.tasks.task import Task
+from ncs_gym.tasks.base_task import Task
 from ncs_gym.validation import as_covariance
 
 

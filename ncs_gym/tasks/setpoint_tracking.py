@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.tasks.task import Task
+from ncs_gym.tasks.base_task import Task
 from ncs_gym.validation import as_count, as_number, as_vector
 
 # Targets beyond the farthest equilibrium by less than this fraction are within it but for rounding.

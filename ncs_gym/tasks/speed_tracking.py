@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ncs_gym.tasks.task import Task
+from ncs_gym.tasks.base_task import Task
 from ncs_gym.validation import as_count, as_number
 
 

@@ -187,7 +187,7 @@ class ControllerNode:
     def __init__(
         self, loop: SafeLoop, wire: Wire, transport: Transport, clock: StepClock, x_hat0: Any, *, known: bool
     ) -> None:
-        if loop.lead == 0 or loop.echo_age is None:
+        if loop.input_delay == 0 or loop.echo_age is None:
             raise ValueError("commands that go over a network need SafeLoop(..., downlink=Channel(...), echo_age=...)")
         if loop.channel.on_request:
             raise ValueError("datagrams carry no requests for samples yet: leave out on_request of the loop's channel")

@@ -96,16 +96,16 @@ class GuaranteeMonitor:
     """
 
     def __init__(self, safety_filter: SafetyFilter, downlink: DownlinkProtocol | None = None) -> None:
-        self._lead = 0 if downlink is None else downlink.lead
+        self._input_delay = 0 if downlink is None else downlink.input_delay
         self._on_grid = safety_filter.plant.grid_rows is not None
         self._is_promised = downlink is None or downlink.contract is not None
         self._test = safety_filter.test
         # The present estimate, which is not observed then, is near where what was predicted of it is nearer still.
-        self._reach = SIMULATED_REACH * safety_filter.plant.half_widths / (2.0 if self._lead else 1.0)
+        self._reach = SIMULATED_REACH * safety_filter.plant.half_widths / (2.0 if self._input_delay else 1.0)
         certificate = safety_filter.certificate
         self._has_error_set = certificate.Sigma is not None
         # Of the newest sample at present, while the contract of the certificate holds.
-        self._largest_age = np.inf if certificate.contract is None else certificate.contract.max_age - self._lead
+        self._largest_age = np.inf if certificate.contract is None else certificate.contract.max_age - self._input_delay
         plant = safety_filter.plant
         self._is_local = plant.remainder is not None
         # S holds inputs under way beyond their limits, where a remainder has no bound; only a start can have them.
@@ -181,7 +181,7 @@ class GuaranteeMonitor:
         if not self._is_promised:
             reason = _first(reason, True, NO_DOWNLINK_CONTRACT)
         reason = _first(reason, _not(state.inside), NOT_KNOWN_INSIDE)
-        if self._lead or self._on_grid:
+        if self._input_delay or self._on_grid:
             reason = _first(reason, state.wait > 0, NOT_KNOWN_INSIDE)
         if _all(state.certified):
             return reason
@@ -214,9 +214,9 @@ class GuaranteeMonitor:
             inside = inside | self._test.knows_inside(estimate, errors, MARGIN)
             if self._is_local:
                 broken = _first(broken, _not(inside), LEFT_MODEL)
-        if self._lead or self._on_grid:
+        if self._input_delay or self._on_grid:
             proved = inside & on_the_way if self._on_grid else inside
-            wait = (proved & (wait > 1)) * (wait - 1) + _not(proved) * (self._lead + 1)
+            wait = (proved & (wait > 1)) * (wait - 1) + _not(proved) * (self._input_delay + 1)
         return MonitorState(broken, inside, errors.certified, wait)
 
 

@@ -29,16 +29,16 @@ class MonitoredFilter:
 
     Attributes:
         filter: The same.
-        lead: c, the number of steps from a decision to its effect.
+        input_delay: c, the number of steps from a decision to its effect.
         report: What was observed last.
         decided: Entries of the input decided last, [physical units].
     """
 
     def __init__(self, safety_filter: SafetyFilter, downlink: DownlinkProtocol | None = None) -> None:
         self.filter = safety_filter
-        self.lead = 0 if downlink is None else downlink.lead
+        self.input_delay = 0 if downlink is None else downlink.input_delay
         self._monitor = GuaranteeMonitor(safety_filter, downlink)
-        self._schedule = None if downlink is None else CommittedInputs(self.lead, safety_filter.plant.m)
+        self._schedule = None if downlink is None else CommittedInputs(self.input_delay, safety_filter.plant.m)
         self.report: LoopObservation
         self._state: MonitorState
         self._decision: Decision

@@ -97,8 +97,8 @@ class SafeLoop:
     happened: call it again.
 
     Behind a downlink that is late or loses commands, send `command` after each `decide` instead, and let an
-    `ncs_gym.Actuator` apply what it holds (docs/contracts.md, "Both directions"). What is decided takes effect `lead`
-    steps later; estimate and error shape belong to that time.
+    `ncs_gym.Actuator` apply what it holds (docs/contracts.md, "Both directions"). What is decided takes effect
+    `input_delay` steps later; estimate and error shape belong to that time.
 
     Where the channel takes samples on request (docs/requests.md), `request` says after each `decide` whether the sample
     of the next step is to be taken; behind a downlink commands say it, and the actuator's `requested`.
@@ -123,7 +123,7 @@ class SafeLoop:
         filter: Makes the decisions.
         contract: Channel contract of the certificate; None without one. Behind a downlink it counts c steps more than
             that of the channel.
-        lead: c, the number of steps from a decision to its effect; 0 without a downlink.
+        input_delay: c, the number of steps from a decision to its effect; 0 without a downlink.
         channel: The channel of the samples.
         echo_age: The largest age of an echo [steps]; None without echoes.
 
@@ -135,7 +135,7 @@ class SafeLoop:
 
     filter: SafetyFilter = setting("filter")
     contract: ChannelContract | None = setting("contract")
-    lead: int = setting("lead")
+    input_delay: int = setting("input_delay")
     echo_age: int | None = setting("echo_age")
     channel: Channel = setting("channel", "_estimator.channel")
 
@@ -160,13 +160,15 @@ class SafeLoop:
         self._estimator = Estimator(plant, channel, histories=histories)
         protocol = downlink_protocol(downlink, downlink_contract)
         self._monitored = MonitoredFilter(self._filter, protocol)
-        self._lead = self._monitored.lead
-        warn_of_broken_contract(self._contract, channel, self._lead, counts_losses=True)
-        self._inputs = CommittedInputs(self._lead, plant.m)
+        self._input_delay = self._monitored.input_delay
+        warn_of_broken_contract(self._contract, channel, self._input_delay, counts_losses=True)
+        self._inputs = CommittedInputs(self._input_delay, plant.m)
         self._requests = None
         if channel.on_request:
-            assumed = self._contract and replace(self._contract, max_age=max(self._contract.max_age - self._lead, 0))
-            self._requests = Requests(channel, assumed, self._lead)
+            assumed = self._contract and replace(
+                self._contract, max_age=max(self._contract.max_age - self._input_delay, 0)
+            )
+            self._requests = Requests(channel, assumed, self._input_delay)
         self._echo_age = None if echo_age is None else as_count(echo_age, "echo_age", low=0, high=MAX_AGE)
         self._applied = AppliedInputs(self._echo_age)
         # Samples by stamp and inputs, the newest first, from which the state is to be found; None once it is known.
@@ -178,7 +180,7 @@ class SafeLoop:
         certificate, mode, horizon = self._filter.certificate, self._filter.mode, self._filter.horizon
         fingerprint = f"of the plant with fingerprint {certificate.fingerprint[:16]}"
         age = f"the newest sample is {counted(self.measurement_age, 'step')} old"
-        if self._contract is not None and self.measurement_age > self._contract.max_age - self._lead:
+        if self._contract is not None and self.measurement_age > self._contract.max_age - self._input_delay:
             age += ", older than the contract allows"
         proved = "the state stays in the box" if mode == "lookahead" else "the state is in S"
         proved += "" if self._echo_age is not None else ", if everything that is decided is applied"
@@ -186,8 +188,13 @@ class SafeLoop:
         rows = [
             ("mode", mode if horizon is None else f"{mode}, horizon {counted(horizon, 'step')}"),
             ("certificate", ", ".join(filter(None, (fingerprint, size_of(certificate.provenance))))),
-            ("contract", contract_text(certificate.method, self._contract, self._lead)),
-            ("downlink", f"inputs take effect {counted(self._lead, 'step')} after the decision" if self._lead else ""),
+            ("contract", contract_text(certificate.method, self._contract, self._input_delay)),
+            (
+                "downlink",
+                f"inputs take effect {counted(self._input_delay, 'step')} after the decision"
+                if self._input_delay
+                else "",
+            ),
             ("step", f"{self.steps} of episode {self.episode}, {age}" if is_started else ""),
             ("guaranteed", f"yes: {proved}" if self.guaranteed else f"no: {self.reason}"),
         ]
@@ -222,7 +229,7 @@ class SafeLoop:
             raise ValueError(f"initial_set must have dimension {n}, got {initial_set.dim}")
         if not as_flag(known, "known") and initial_set is not None:
             raise ValueError("initial_set says what is known of the state: leave it out, or leave out known=False")
-        inside = starts_known(self._filter, initial_set, self._lead)
+        inside = starts_known(self._filter, initial_set, self._input_delay)
         self._phase = _Phase.STOPPED
         self._estimator.reset(mean)
         self._discarded = DiscardedPackets()
@@ -380,7 +387,7 @@ class SafeLoop:
         if self._phase is _Phase.STOPPED:
             return NOT_STARTED
         if self._applied.is_other:
-            return LATE_INPUT if self._lead else OTHER_INPUT
+            return LATE_INPUT if self._input_delay else OTHER_INPUT
         if self._unknown is not None:
             return UNKNOWN_START
         unconfirmed = "" if self._applied.is_confirmed(self.steps) else NOT_CONFIRMED
@@ -432,7 +439,7 @@ class SafeLoop:
     def _begin(self, known: Sequence[StartKnown]) -> None:
         """Begins to follow whether the state is proved safe, with what is known of x_0 .. x_c."""
         pending = self._inputs.pending
-        earlier = [self._estimator.predicted(pending[:ahead]) for ahead in range(self._lead)]
+        earlier = [self._estimator.predicted(pending[:ahead]) for ahead in range(self._input_delay)]
         self._monitored.begin(self._report(), known, beliefs=earlier, pending=pending)
 
     def _find(self, packets: Iterable[Packet]) -> None:
@@ -450,7 +457,7 @@ class SafeLoop:
         if found is not None:
             self._unknown = None
             self._estimator.restart(*found)
-            self._begin(starts_known(self._filter, None, self._lead))
+            self._begin(starts_known(self._filter, None, self._input_delay))
 
     def _report(self) -> LoopObservation:
         """Returns what the estimator says now."""
@@ -458,7 +465,7 @@ class SafeLoop:
 
     def _belief(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimate and error shape of the time at which the next input takes effect."""
-        return self._estimator.predicted(self._inputs.pending[: self._lead])
+        return self._estimator.predicted(self._inputs.pending[: self._input_delay])
 
     def _clipped(self, proposed: Any) -> np.ndarray:
         """Returns a copy of the proposal within the limits, (m,); as it is, or empty, where it is no finite input."""

@@ -103,7 +103,7 @@ def start_known(safety_filter: SafetyFilter, initial: Ellipsoid | np.ndarray | N
 
 
 def starts_known(
-    safety_filter: SafetyFilter, initial: Ellipsoid | np.ndarray | None, lead: int
+    safety_filter: SafetyFilter, initial: Ellipsoid | np.ndarray | None, input_delay: int
 ) -> tuple[StartKnown, ...]:
     """Returns what is known of x_0 .. x_c, given where starts are possible.
 
@@ -114,17 +114,17 @@ def starts_known(
     Args:
         safety_filter: Gives the safe set, the box and the plant.
         initial: An ellipsoid, one state, shape (n,), or None for any start.
-        lead: c.
+        input_delay: c.
     """
     known = [start_known(safety_filter, initial)]
     if initial is None:
-        return tuple(known * (lead + 1))
+        return tuple(known * (input_delay + 1))
     plant = safety_filter.plant
     if isinstance(initial, Ellipsoid):
         center, shape = np.zeros(plant.n), initial.shape_matrix
     else:
         center, shape = np.asarray(initial, dtype=np.float64), np.zeros((plant.n, plant.n))
-    for ahead in range(lead):
+    for ahead in range(input_delay):
         if not safety_filter.test.keeps_between(center, safety_filter.errors_of(shape), MARGIN):
             known[ahead] = StartKnown(False, False)
         center, shape = _moved(plant, center, shape)

@@ -103,12 +103,12 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         )
         self._filter = SafetyFilter(self._certificate, inner.plant, mode, horizon)
         self._monitor = GuaranteeMonitor(self._filter, inner.downlink_protocol)
-        self._lead = 0 if inner.downlink_protocol is None else inner.downlink_protocol.lead
-        self._channels = warned_of({*inner.episode_channels}, set(), self._certificate, self._lead)
-        self._start_known = starts_known(self._filter, inner.single.initial_set, self._lead)
+        self._input_delay = 0 if inner.downlink_protocol is None else inner.downlink_protocol.input_delay
+        self._channels = warned_of({*inner.episode_channels}, set(), self._certificate, self._input_delay)
+        self._start_known = starts_known(self._filter, inner.single.initial_set, self._input_delay)
         count, nothing = self.num_envs, np.zeros(self.num_envs, np.bool_)
         self._schedule = (
-            None if inner.downlink_protocol is None else CommittedInputs(self._lead, (inner.plant.m, count))
+            None if inner.downlink_protocol is None else CommittedInputs(self._input_delay, (inner.plant.m, count))
         )
         self._state = MonitorState(np.full(count, CODES[OTHER_STEPS]), nothing, nothing, np.zeros(count, np.int64))
         self._interventions, self._proved = np.zeros((2, count), np.int64)
@@ -143,7 +143,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
             raise
         inner = self._environment_in(self.env)
         require_same(self._made_for, premises_of(inner, inner.single))
-        self._channels = warned_of({*inner.episode_channels}, self._channels, self._certificate, self._lead)
+        self._channels = warned_of({*inner.episode_channels}, self._channels, self._certificate, self._input_delay)
         now = self._read_clock()
         restarted = now.episodes != before.episodes
         unmoved = (now.steps == before.steps) & (now.ticks == before.ticks)
@@ -186,7 +186,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         restarted, moved_once = _moved(before, now)
         if np.count_nonzero(restarted):
             channels = {*self._inner.episode_channels}
-            self._channels = warned_of(channels, self._channels, self._certificate, self._lead)
+            self._channels = warned_of(channels, self._channels, self._certificate, self._input_delay)
         known = self._inner.known
         self._report = self._observed(known)
         due = None if self._schedule is None else self._schedule.due(decided.input)
@@ -251,7 +251,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
         self._lost.begin(restarted)
         known, starts = [self._start_known] * self.num_envs, self._inner.starts
         for e in np.flatnonzero(restarted & ~np.isnan(starts[:, 0])).tolist():
-            known[e] = starts_known(self._filter, starts[e], self._lead)
+            known[e] = starts_known(self._filter, starts[e], self._input_delay)
         is_safe = np.array([each[-1].in_safe_set for each in known])
         if len(self._stored):
             self._stored[..., restarted] = np.nan

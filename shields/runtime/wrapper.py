@@ -115,7 +115,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
         )
         self._filter = SafetyFilter(self._certificate, inner.plant, mode, horizon)
         self._monitored = MonitoredFilter(self._filter, inner.downlink_protocol)
-        self._channels = warned_of({inner.channel}, set(), self._certificate, self._monitored.lead)
+        self._channels = warned_of({inner.channel}, set(), self._certificate, self._monitored.input_delay)
         self._clock: tuple[int, int] | None = None
         self._start: Any = None
         self._known: tuple[StartKnown, ...] = ()
@@ -140,11 +140,13 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
             raise
         inner = self._environment_in(self.env)
         require_same(self._made_for, premises_of(inner, inner))
-        self._channels = warned_of({inner.episode_channel}, self._channels, self._certificate, self._monitored.lead)
+        self._channels = warned_of(
+            {inner.episode_channel}, self._channels, self._certificate, self._monitored.input_delay
+        )
         clock, report = self._read_clock(), self._observed(inner.known)
         start = self._inner.start
         if start is not self._start:  # decided exactly, which takes longer than a step; starts are read-only
-            self._start, self._known = start, starts_known(self._filter, start, self._monitored.lead)
+            self._start, self._known = start, starts_known(self._filter, start, self._monitored.input_delay)
         self._monitored.begin(report, self._known, clock[1] == 0, self._inner.beliefs()[:-1])
         self._interventions = self._proved = 0
         u = np.zeros(self._filter.plant.m)
@@ -271,17 +273,17 @@ def certificate_for(
     return _synthesized[key]
 
 
-def warned_of(now: set[Channel], before: set[Channel], certificate: Certificate, lead: int) -> set[Channel]:
+def warned_of(now: set[Channel], before: set[Channel], certificate: Certificate, input_delay: int) -> set[Channel]:
     """Returns the channels of the present episodes; warns the caller's caller of new ones that break the contract.
 
     Args:
         now: These channels.
         before: Those that were looked at before.
         certificate: Rests on a contract.
-        lead: c.
+        input_delay: c.
     """
     for channel in now - before:
-        warn_of_broken_contract(certificate.contract, channel, lead, stacklevel=4)
+        warn_of_broken_contract(certificate.contract, channel, input_delay, stacklevel=4)
     return now
 
 

@@ -79,6 +79,10 @@ def test_changed_arguments_are_those_of_the_changed_loop_alone():
 
 def test_loop_replaces_the_downlink():
     env = "ncs_gym/TruckTrailerCruiseTwoWay-v0"
-    assert LoopConfig(env=env).single().unwrapped.downlink_protocol.lead == 3
+    assert LoopConfig(env=env).single().unwrapped.downlink_protocol.input_delay == 3
     loop = LoopConfig(env=env, kwargs={"downlink": Channel(delay=1)})
-    assert loop.single().unwrapped.downlink_protocol.lead == loop.vector(2).unwrapped.downlink_protocol.lead == 1
+    assert (
+        loop.single().unwrapped.downlink_protocol.input_delay
+        == loop.vector(2).unwrapped.downlink_protocol.input_delay
+        == 1
+    )

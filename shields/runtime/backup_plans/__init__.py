@@ -5,8 +5,8 @@
 it. Importing this package imports the solver.
 """
 
+from shields.runtime.backup_plans.lookahead import Lookahead
 from shields.runtime.backup_plans.plan_check import PlanTest, Prediction
 from shields.runtime.backup_plans.planner import Planner, Plans
-from shields.runtime.backup_plans.stored_plan import Lookahead
 
 __all__ = ["Lookahead", "PlanTest", "Planner", "Plans", "Prediction"]

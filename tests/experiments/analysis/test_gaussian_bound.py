@@ -45,7 +45,7 @@ def test_episodes_outside_the_safe_set_are_counted_with_their_exact_interval():
     (sentence,) = gaussian_sentences(summary)
     assert "3 of 5 evaluation episodes [14.66, 94.73 %]" in sentence
     assert "at most 0.25 for an episode of 200 steps" in sentence
-    assert "says nothing" in gaussian_sentences(summary | {"escape_probability": 1.0})[-1]
+    assert "says nothing" in gaussian_sentences(summary | {"bound_violation_probability": 1.0})[-1]
 
 
 @pytest.mark.parametrize(
@@ -72,12 +72,12 @@ def test_comparison_under_gaussian_noise_plays_it_and_states_the_bound(setup):
     arms = arm_summaries(episodes_table([result, replace(result, arm="monitor")]), "project")
     summary = _gaussian_noise(*setup, arms)
     assert (
-        summary["escape_probability"]
+        summary["bound_violation_probability"]
         == bound_violation_probability(PLANT, CHANNEL, STEPS)
         == pytest.approx(STEPS * 2e-3)
     )
     arm = summary["arms"]["shielded"]
-    assert 0.5 < arm["episodes_outside_set"] / arm["episodes"] / summary["escape_probability"] <= 1.0
+    assert 0.5 < arm["episodes_outside_set"] / arm["episodes"] / summary["bound_violation_probability"] <= 1.0
     assert list(summary["arms"]) == ["shielded"]
     assert max(each.largest_level for each in bounded.execute(lambda steps: None).episodes) <= 1.0
 

@@ -240,7 +240,7 @@ def test_counts_of_gaussian_noise_lie_within_the_bound_and_do_not_end_with_an_er
     rows = [line for line in printed.partition("interval")[2].splitlines() if line.startswith("TruckTrailer")]
     assert [row.split()[-1] for row in rows] == ["0.031", "0.041"]
     stored = document(tmp_path)
-    assert stored["escape_probability"][CRUISE] == pytest.approx((200 + 100 + 1) * 1e-4)
+    assert stored["bound_violation_probability"][CRUISE] == pytest.approx((200 + 100 + 1) * 1e-4)
     assert stored["settings"]["noise"] == "gaussian"
     assert stored["settings"]["delta"] == 1e-4
 
@@ -250,7 +250,7 @@ def test_gaussian_noise_makes_a_shielded_state_leave_the_safe_set_and_is_counted
     counts = counts_of(GAUSSIAN, command._certificates({CRUISE: case}, tmp_path)[CRUISE], CRUISE)
     assert counts.broken_episodes > 0
     assert counts.level > 1.0
-    assert case.escape_probability() == 1.0
+    assert case.bound_violation_probability() == 1.0
 
 
 def test_more_exits_than_the_bound_allows_are_an_error():

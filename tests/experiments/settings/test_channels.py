@@ -9,7 +9,7 @@ from experiments.runs.loops import _bursts, changed_channel
 from experiments.settings.learning import SweepSettings
 from ncs_gym import Channel, ChannelContract, GilbertElliott
 from ncs_gym.envs.env import ncs_env
-from ncs_gym.network.packet_transmission import ChannelState
+from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.processes import PendulumProcess
 from shields.runtime.wrapper import certificate_for
 

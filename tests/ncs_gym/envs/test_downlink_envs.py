@@ -43,14 +43,14 @@ def test_vector_equals_scalar_environment_of_an_unstable_plant():
 @pytest.mark.parametrize("name", DOWNLINKS)
 def test_actuator_applies_what_was_committed_and_zero_only_when_the_downlink_is_broken(name):
     env = NCSEnv(downlink=DOWNLINKS[name], **CRUISE)
-    lead = env.downlink_protocol.lead
+    input_delay = env.downlink_protocol.input_delay
     _, info = env.reset(seed=0)
     committed, missing = [], 0
     rng = np.random.default_rng(0)
     for k in range(300):
         *_, info = env.step(rng.uniform(-1, 1, 1))
         committed.append(info["input_committed"])
-        scheduled = committed[k - lead] if k >= lead else np.zeros(1)
+        scheduled = committed[k - input_delay] if k >= input_delay else np.zeros(1)
         missing += info["downlink_broken"]
         np.testing.assert_array_equal(info["input"], 0.0 if info["downlink_broken"] else scheduled)
     assert (missing > 0) == (env.downlink_protocol.contract is None)
@@ -58,19 +58,19 @@ def test_actuator_applies_what_was_committed_and_zero_only_when_the_downlink_is_
 
 def test_estimate_is_the_prediction_with_the_committed_inputs_and_its_error_stays_in_its_shape():
     env = NCSEnv(channel=UPLINK, downlink=DOWNLINKS["overtaking"], disturbance="sphere", **CRUISE)
-    lead, plant = env.downlink_protocol.lead, env.plant
+    input_delay, plant = env.downlink_protocol.input_delay, env.plant
     _, info = env.reset(seed=0)
-    rng, infos, committed, worst = np.random.default_rng(1), [info], [np.zeros(1)] * lead, 0.0
+    rng, infos, committed, worst = np.random.default_rng(1), [info], [np.zeros(1)] * input_delay, 0.0
     for _ in range(400):
         info = env.step(rng.uniform(-1, 1, 1))[4]
         infos.append(info)
         committed.append(info["input_committed"])
-    for k, info in enumerate(infos[: len(infos) - lead]):
+    for k, info in enumerate(infos[: len(infos) - input_delay]):
         predicted = info["state"] + info["estimation_error"]
-        for u in committed[k : k + lead]:
+        for u in committed[k : k + input_delay]:
             predicted = plant.A @ predicted + plant.B @ u
         np.testing.assert_allclose(info["estimate"], predicted, atol=1e-12)
-        error = info["estimate"] - infos[k + lead]["state"]
+        error = info["estimate"] - infos[k + input_delay]["state"]
         worst = max(worst, error @ np.linalg.solve(info["error_shape"], error))
     assert 0.3 < worst <= 1.0
 
@@ -92,7 +92,7 @@ def test_a_perfect_downlink_changes_nothing_but_the_draws():
     one, other = (NCSVectorEnv(3, downlink=each, **CRUISE) for each in (None, Channel()))
     for env in (one, other):
         env.reset(seed=0)
-    assert other.downlink_protocol.lead == 0
+    assert other.downlink_protocol.input_delay == 0
     action = np.full((3, 1), 0.5, np.float32)
     for env in (one, other):
         *_, info = env.step(action)
@@ -130,7 +130,7 @@ def test_certificates_rest_on_both_contracts():
 
 def test_a_contract_that_the_downlink_may_break_is_kept_until_it_does():
     env = NCSEnv(downlink=Channel(loss=0.5), downlink_contract=ChannelContract(2), **CRUISE)
-    assert env.downlink_protocol.lead == 2
+    assert env.downlink_protocol.input_delay == 2
     env.reset(seed=0)
     broken = [env.step(np.ones(1))[4]["downlink_broken"] for _ in range(200)]
     assert 5 < sum(broken) < 60  # three losses in a row: an eighth of the steps
@@ -140,4 +140,4 @@ def test_downlink_is_json():
     env = gym.make("ncs_gym/TruckTrailerCruise-v0", downlink=DOWNLINKS["bursts"], downlink_contract=ChannelContract(5))
     copied = gym.make(gym.envs.registration.EnvSpec.from_json(json.dumps(json.loads(env.spec.to_json()))))
     assert copied.unwrapped.downlink == env.unwrapped.downlink
-    assert copied.unwrapped.downlink_protocol.lead == 5
+    assert copied.unwrapped.downlink_protocol.input_delay == 5

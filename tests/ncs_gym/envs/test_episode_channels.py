@@ -77,7 +77,7 @@ def test_channels_of_a_reset_equal_scalar_ones_and_are_kept_by_episodes_that_beg
 def test_downlinks_for_each_environment_equal_scalar_ones():
     downlinks = [Channel(loss=0.5, delay=1, max_consecutive_losses=2), Channel(loss=0.2, max_consecutive_losses=1)]
     env = NCSVectorEnv(2, plant=PLANT, channel=Channel(delay=1), downlink=downlinks, max_episode_steps=31)
-    assert env.downlink_protocol.lead == 3
+    assert env.downlink_protocol.input_delay == 3
     compare(env, 90)
 
 

@@ -25,7 +25,7 @@ from ncs_gym.estimation import arrival_histories
 from ncs_gym.estimation.arrival_histories import histories_of
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from ncs_gym.estimation.vector_estimator import VectorEstimator
-from ncs_gym.network.packet_transmission import ChannelState
+from ncs_gym.network.packet_loss_and_delay import ChannelState
 from tests import arrays
 from tests.fuzz import channels, examples, plants
 from tests.ncs_gym.estimation.plain_estimator import PlainEstimator

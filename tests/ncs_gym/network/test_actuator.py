@@ -9,7 +9,7 @@ COMMAND = Command(stamp=0, inputs=np.array([[1.0], [2.0], [3.0]]))
 
 
 def actuator_with_a_command():
-    actuator = Actuator(lead=2, inputs=1)
+    actuator = Actuator(input_delay=2, inputs=1)
     actuator.receive([COMMAND])
     return actuator
 

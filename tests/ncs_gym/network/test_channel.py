@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, GilbertElliott
-from ncs_gym.network.packet_transmission import ChannelState
+from ncs_gym.network.packet_loss_and_delay import ChannelState
 
 
 def transmit(channel: Channel, steps: int, seed: int = 0) -> dict[int, list[int]]:

@@ -28,7 +28,7 @@ from ncs_gym.estimation.error_bound import require_error_set
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
 from ncs_gym.estimation.set_membership import SetMembership
-from ncs_gym.network.packet_transmission import ChannelState
+from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.uncertainty.shape_matrices import is_inside
 from shields.verification.rational_matrix import (
     add,

@@ -8,7 +8,7 @@ import pytest
 
 from experiments.commands.channel import broken_contracts
 from ncs_gym import ChannelContract, PacketLog, TraceChannel, contract_of
-from ncs_gym.network.packet_transmission import ChannelState, side_by_side
+from ncs_gym.network.packet_loss_and_delay import ChannelState, side_by_side
 
 PING = """PING host (192.0.2.1) 56(84) bytes of data.
 64 bytes from 192.0.2.1: icmp_seq=1 ttl=64 time=12.3 ms

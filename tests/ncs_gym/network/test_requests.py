@@ -11,9 +11,11 @@ from ncs_gym.network.requests import Requests, spare_samples
 
 # Longest runs of losses, shortest and longest delays, steps that a contract allows beyond what they need, and leads.
 SETTINGS = [
-    (losses, shortest, longest, beyond, lead)
-    for losses, shortest, longest, beyond, lead in product((0, 1, 2), (0, 1, 2), (0, 1, 2), (0, 1, 2, 3), (0, 1, 2))
-    if shortest <= longest and losses + longest + beyond + lead <= 7
+    (losses, shortest, longest, beyond, input_delay)
+    for losses, shortest, longest, beyond, input_delay in product(
+        (0, 1, 2), (0, 1, 2), (0, 1, 2), (0, 1, 2, 3), (0, 1, 2)
+    )
+    if shortest <= longest and losses + longest + beyond + input_delay <= 7
 ]
 
 
@@ -25,7 +27,7 @@ class LaterRequests(Requests):
         self._spare += 1
 
 
-def oldest_age(kind, losses, shortest, longest, beyond, lead):
+def oldest_age(kind, losses, shortest, longest, beyond, input_delay):
     """The largest age over all requests, losses and delays, and how many states were seen; ends beyond the contract.
 
     A state is the age, what was requested of the samples up to k + c, the packets on their way (how old their samples
@@ -33,13 +35,13 @@ def oldest_age(kind, losses, shortest, longest, beyond, lead):
     """
     h = losses + longest + beyond
     channel = Channel(0.5, delay=shortest, jitter=longest - shortest, max_consecutive_losses=losses, on_request=True)
-    first = tuple(kind(channel, ChannelContract(h), lead, 1)._flags[:, 0].tolist())
+    first = tuple(kind(channel, ChannelContract(h), input_delay, 1)._flags[:, 0].tolist())
     seen = frontier = {(0, first, frozenset(), 0)}
     oldest = 0
     while frontier:
         # Each state twice: nobody asks, somebody does.
         states = [state for state in frontier for _ in range(2)]
-        requests = kind(channel, ChannelContract(h), lead, len(states))
+        requests = kind(channel, ChannelContract(h), input_delay, len(states))
         requests._flags = np.array([flags for _, flags, _, _ in states]).T
         requests.ask(np.arange(len(states)) % 2 == 1)
         requests.decide(np.array([age for age, _, _, _ in states]))
@@ -62,20 +64,20 @@ def oldest_age(kind, losses, shortest, longest, beyond, lead):
     return oldest, len(seen)
 
 
-@pytest.mark.parametrize("lead", [0, 1, 2])
-def test_no_requests_losses_and_delays_make_a_sample_older_than_the_contract_allows(lead):
+@pytest.mark.parametrize("input_delay", [0, 1, 2])
+def test_no_requests_losses_and_delays_make_a_sample_older_than_the_contract_allows(input_delay):
     count = 0
-    for setting in (each for each in SETTINGS if each[-1] == lead):
+    for setting in (each for each in SETTINGS if each[-1] == input_delay):
         losses, _, longest, beyond, _ = setting
         oldest, states = oldest_age(Requests, *setting)
         assert oldest == losses + longest + beyond, setting  # and no less: the rule forces no sooner than it has to
         count += states
-    print(f"lead {lead}: {count:,} states")
+    print(f"input delay {input_delay}: {count:,} states")
 
 
-@pytest.mark.parametrize("lead", [0, 1, 2])
-def test_requests_forced_one_step_later_break_every_contract(lead):
-    for setting in (each for each in SETTINGS if each[-1] == lead):
+@pytest.mark.parametrize("input_delay", [0, 1, 2])
+def test_requests_forced_one_step_later_break_every_contract(input_delay):
+    for setting in (each for each in SETTINGS if each[-1] == input_delay):
         losses, _, longest, beyond, _ = setting
         assert oldest_age(LaterRequests, *setting)[0] > losses + longest + beyond, setting
 

@@ -112,7 +112,7 @@ def attack(
     """Runs environments under attack; fails if a shield that knows its downlink ever doubts its proof."""
     certificate = case.certificate
     env = case.env(count, policy, kind=ExtremalVectorNoise if aware else UnawareVectorEnv)
-    lead = env.single.downlink_protocol.lead
+    input_delay = env.single.downlink_protocol.input_delay
     shield = VectorSafetyShield(env, certificate, mode)
     _, info = shield.reset(seed=seed)
     rng, outcome = np.random.default_rng(seed), Outcome()
@@ -133,7 +133,7 @@ def attack(
         outcome.exits += int(np.count_nonzero(levels > 1.0))
         outcome.overridden += float(info["shield_intervened"].sum()) / (count * steps)
         outcome.steps += count
-        if aware and len(expected) >= lead and lead > 0:
+        if aware and len(expected) >= input_delay and input_delay > 0:
             outcome.error = max(outcome.error, _gauge(expected.popleft(), info["state"], inverses))
     return outcome
 

@@ -13,9 +13,9 @@ SLOW_ENVS, SLOW_STEPS = 1112, 100
 UPLINKS = {"late": "overtaking", "runs": "runs", "overtaking": "late"}
 
 
-def case(name, downlink, lead=2):
+def case(name, downlink, input_delay=2):
     """A plant whose uplink is at its edge, too."""
-    return Case(PLANTS[name], edges(2)[UPLINKS[downlink]], edges(lead)[downlink])
+    return Case(PLANTS[name], edges(2)[UPLINKS[downlink]], edges(input_delay)[downlink])
 
 
 def assert_safe(name, downlink, count, steps):
@@ -54,8 +54,8 @@ def test_a_shield_that_ignores_the_downlink_fails_under_the_same_attack(name):
 
 
 def test_runs_of_losses_are_exactly_as_long_as_promised():
-    env = case("cruise", "runs", lead=3).env(5, "random")
-    assert env.downlink_protocol.lead == 3
+    env = case("cruise", "runs", input_delay=3).env(5, "random")
+    assert env.downlink_protocol.input_delay == 3
     env.reset(seed=0)
     newest = []
     for _ in range(40):

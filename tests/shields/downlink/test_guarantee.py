@@ -19,7 +19,7 @@ from ncs_gym import (
     truck_trailer,
 )
 from ncs_gym.network import CommittedInputs
-from ncs_gym.network.packet_transmission import ChannelState
+from ncs_gym.network.packet_loss_and_delay import ChannelState
 from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import (
     EXPLANATIONS,
@@ -153,9 +153,9 @@ def test_no_state_outside_is_guaranteed_wherever_an_episode_starts():
     assert late > 0
 
 
-@pytest.mark.parametrize("lead", [1, 3])
-def test_a_guarantee_that_is_regained_is_one_about_the_present_only_after_c_steps(lead):
-    shield = shielded(downlink=Channel(delay=lead), disturbance="sphere", start=1e-3)
+@pytest.mark.parametrize("input_delay", [1, 3])
+def test_a_guarantee_that_is_regained_is_one_about_the_present_only_after_c_steps(input_delay):
+    shield = shielded(downlink=Channel(delay=input_delay), disturbance="sphere", start=1e-3)
     # Just outside S, drifting back in: known from the estimate of step c on, c steps later for the present.
     direction = np.array([1.0, 0.0]) / np.sqrt(shield.certificate.M[0, 0])
     _, info = shield.reset(seed=0, options={"state": 1.001 * direction})
@@ -168,22 +168,22 @@ def test_a_guarantee_that_is_regained_is_one_about_the_present_only_after_c_step
     begins = next(k for k, (inside, _, _) in enumerate(waited) if inside)
     first = next(k for k, (_, _, guaranteed) in enumerate(waited) if guaranteed)
     assert all(guaranteed == (wait == 0) for _, wait, guaranteed in waited)
-    assert first <= begins + lead
+    assert first <= begins + input_delay
     assert first > 0
 
 
 def test_first_steps_are_known_exactly_where_they_can_leave_the_safe_set():
-    shield, lead = shielded().filter, 3
+    shield, input_delay = shielded().filter, 3
     small, large = (Ellipsoid(scale**2 * shield.certificate.L) for scale in (0.3, 0.999999))
-    assert all(known.in_safe_set for known in starts_known(shield, small, lead))
-    known = starts_known(shield, large, lead)
+    assert all(known.in_safe_set for known in starts_known(shield, small, input_delay))
+    known = starts_known(shield, large, input_delay)
     assert known[0].in_safe_set
     assert not all(each.in_safe_set for each in known)
-    assert [each.in_safe_set for each in starts_known(shield, None, lead)] == [False] * 4
+    assert [each.in_safe_set for each in starts_known(shield, None, input_delay)] == [False] * 4
     rng = np.random.default_rng(0)
     for scale in (0.5, 0.9, *np.linspace(0.95, 0.999, 40)):
         start = large.sample_boundary(rng) * scale
-        found = starts_known(shield, start, lead)
+        found = starts_known(shield, start, input_delay)
         states = np.tile(start, (200, 1))
         for each in found:
             gauges = shield.certificate.safe_set.gauge(states)
@@ -192,14 +192,14 @@ def test_first_steps_are_known_exactly_where_they_can_leave_the_safe_set():
 
 
 def test_a_given_start_is_followed_under_zero_input():
-    plant, certificate, lead, rng = UNSTABLE.plant, UNSTABLE.certificate, 3, np.random.default_rng(0)
+    plant, certificate, input_delay, rng = UNSTABLE.plant, UNSTABLE.certificate, 3, np.random.default_rng(0)
     shield, safe, root = SafetyFilter(certificate, plant), certificate.safe_set, np.linalg.cholesky(certificate.M).T
-    powers = [np.linalg.matrix_power(plant.A, k) for k in range(lead + 1)]
+    powers = [np.linalg.matrix_power(plant.A, k) for k in range(input_delay + 1)]
     spread = [np.linalg.norm(root @ power @ np.linalg.cholesky(plant.disturbance.shape_matrix), 2) for power in powers]
     entered = left = 0
     for _ in range(200):
         start = safe.sample_boundary(rng) * rng.uniform(0.7, 1.3)
-        known = [each.in_safe_set for each in starts_known(shield, start, lead)]
+        known = [each.in_safe_set for each in starts_known(shield, start, input_delay)]
         for k, power in enumerate(powers):
             level = safe.gauge(power @ start)
             assert not known[k] or level + max(spread[:k], default=0.0) <= 1.0
@@ -447,7 +447,7 @@ def run_safe_loop(downlink, steps, contract=None, report=True):
     certificate, rng = certificate_of(PLANT), np.random.default_rng(0)
     settings = {"downlink": downlink, "downlink_contract": contract}
     loop = SafeLoop(certificate, PLANT, UPLINK, **settings)
-    actuator = Actuator(loop.lead, PLANT.m)
+    actuator = Actuator(loop.input_delay, PLANT.m)
     up, down = ChannelState(UPLINK, rng), ChannelState(downlink, rng)
     state = 0.2 * Ellipsoid(certificate.L).sample_boundary(rng)
     loop.start(state + PLANT.sample_initial_error(rng))
@@ -459,14 +459,14 @@ def run_safe_loop(downlink, steps, contract=None, report=True):
         found.append(certificate.safe_set.gauge(state))
         decided.append(loop.decide(rng.uniform(-4, 4, 1)).input)
         command = loop.command()
-        assert command.inputs.shape == (loop.lead + 1, 1)
+        assert command.inputs.shape == (loop.input_delay + 1, 1)
         actuator.receive(down.carry(rng, step, command))
         applied = actuator.apply(step)
         given.append(applied)
         state = PLANT.A @ state + PLANT.B @ applied + PLANT.disturbance.sample_boundary(rng)
         sample = PLANT.H @ state + PLANT.sample_sensor_noise(rng) if up.sends_at(step + 1) else None
         packets = up.exchange(rng, step + 1, sample, loop.episode)
-    return reasons, np.array(found), np.array(given), np.array([np.zeros(1)] * loop.lead + decided)[:steps]
+    return reasons, np.array(found), np.array(given), np.array([np.zeros(1)] * loop.input_delay + decided)[:steps]
 
 
 @pytest.mark.parametrize("downlink", [Channel(delay=2), KEPT, Channel(loss=0.5, jitter=3, max_consecutive_losses=2)])

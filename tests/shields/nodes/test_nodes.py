@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Actuator, Channel, ChannelContract, cart_pole, truck_trailer
-from ncs_gym.network.packet_transmission import first_loss_state, transmit
+from ncs_gym.network.packet_loss_and_delay import first_loss_state, transmit
 from ncs_gym.network.wire import Kind, Message, Wire
 from shields import ActuatorNode, ControllerNode, SafeLoop, SensorNode
 from shields.nodes import Datagram, StepClock
@@ -94,21 +94,21 @@ class World:
     def new_controller(self, x_hat0, known):
         settings = {"downlink": CHANNEL, "echo_age": 10, "on_unproved": "ignore"}
         loop = SafeLoop(self.certificate, self.plant, CHANNEL, **settings)
-        wire = Wire(self.plant, loop.lead, KEY)
+        wire = Wire(self.plant, loop.input_delay, KEY)
         self.at_controller.inbox = []
         self.next_step = None
         return ControllerNode(loop, wire, self.at_controller, StepClock(self.dt), x_hat0, known=known)
 
     def new_sensor(self):
-        wire = Wire(self.plant, self.controller.loop.lead, KEY)
+        wire = Wire(self.plant, self.controller.loop.input_delay, KEY)
         self.at_sensor = Socket(self.air, self.local, self.at_controller)
         return SensorNode(wire, self.at_sensor, self.clock)
 
     def new_actuator(self):
-        lead = self.controller.loop.lead
+        input_delay = self.controller.loop.input_delay
         self.at_actuator = Socket(self.air, self.local, self.at_controller)
-        actuator = Actuator(lead, self.plant.m, self.plant.u_max)
-        return ActuatorNode(Wire(self.plant, lead, KEY), self.at_actuator, self.clock, actuator)
+        actuator = Actuator(input_delay, self.plant.m, self.plant.u_max)
+        return ActuatorNode(Wire(self.plant, input_delay, KEY), self.at_actuator, self.clock, actuator)
 
     def act(self, step):
         """What the board beside the plant does at a step."""
@@ -289,11 +289,11 @@ def test_actuator_without_a_controller_goes_to_zero_when_what_is_committed_ends(
     applied = []
     apply = world.actuator.apply
     world.actuator.apply = lambda step: applied.append(apply(step)) or applied[-1]
-    lead = world.actuator.actuator.lead
-    world.run(PATIENCE + lead + 5)
+    input_delay = world.actuator.actuator.input_delay
+    world.run(PATIENCE + input_delay + 5)
     sizes = [float(np.abs(u).max()) for u in applied]
-    assert any(sizes[:lead])
-    assert not any(sizes[lead + 3 :])
+    assert any(sizes[:input_delay])
+    assert not any(sizes[input_delay + 3 :])
     assert world.actuator.episode == world.sensor.episode == 0
 
 
@@ -345,7 +345,7 @@ def test_messages_of_the_wrong_kind_move_nothing():
 def test_stamp_far_ahead_is_refused_although_it_is_authentic():
     world = World(mischief=0.0)
     world.run(100)
-    wire = Wire(PLANT, world.controller.loop.lead, KEY)
+    wire = Wire(PLANT, world.controller.loop.input_delay, KEY)
     for stamp in (2**61, world.controller.step + PRELUDE + 100):
         fields = {"kind": Kind.SAMPLE, "episode": world.controller.episode, "values": np.full(4, 9.0)}
         world.air.arrive(0, wire.encode(Message(stamp=stamp, **fields)), world.at_sensor, world.at_controller)

@@ -42,9 +42,9 @@ async def run(opened, controller, budget=None):
     """Runs the loop until the controller has made its steps, and returns node, states and inputs that were missing."""
     at_controller, (at_sensor, at_actuator) = await opened()
     loop = SafeLoop(certificate_of(PLANT), PLANT, LATE, downlink=LATE, echo_age=50, on_unproved="ignore")
-    wire, rng = Wire(PLANT, loop.lead, os.urandom(32)), np.random.default_rng(0)
+    wire, rng = Wire(PLANT, loop.input_delay, os.urandom(32)), np.random.default_rng(0)
     node = ControllerNode(loop, wire, at_controller, StepClock(DT), np.zeros(2), known=True)
-    clock, board = StepClock(DT), Actuator(loop.lead, PLANT.m, PLANT.u_max)
+    clock, board = StepClock(DT), Actuator(loop.input_delay, PLANT.m, PLANT.u_max)
     sensor = SensorNode(wire, at_sensor, clock)
     actuator = ActuatorNode(wire, at_actuator, clock, board)
     state, last, history, reasons = np.zeros(2), itertools.count(), [], []

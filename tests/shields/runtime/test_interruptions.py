@@ -197,7 +197,7 @@ def loop_case(mode, downlink):
         x = box_ellipsoid(PLANT, 0.95 if mode == "lookahead" else 0.5).sample(rng)
         loop.start(x, initial_set=x)
         u = loop.decide(policy(mode, {"estimate": x}) * PLANT.u_max).input
-        x = PLANT.A @ x + PLANT.B @ (0.0 * u if loop.lead else u)
+        x = PLANT.A @ x + PLANT.B @ (0.0 * u if loop.input_delay else u)
         loop.receive([Packet(1, PLANT.H @ x, loop.episode)])
         if loop.guaranteed and (mode != "lookahead" or loop.plan_length > 0):
             return loop

@@ -39,7 +39,7 @@ class World:
     def __init__(self, loop, state=None, seed=0):
         self.loop, self.plant, self.rng = loop, loop.filter.plant, np.random.default_rng(seed)
         self.state = np.zeros(self.plant.n) if state is None else state
-        self.actuator = Actuator(loop.lead, self.plant.m, self.plant.u_max)
+        self.actuator = Actuator(loop.input_delay, self.plant.m, self.plant.u_max)
         self.packets, self.echoes, self.step = [], [], 0
 
     def start(self, **settings):
@@ -127,19 +127,19 @@ def test_what_is_no_echo_is_refused(echo):
         loop.receive(echoes=[echo])
 
 
-@pytest.mark.parametrize("lead", [0, 2, 5])
-def test_wild_stamps_and_inputs_do_not_stop_an_actuator(lead):
-    actuator = Actuator(lead, 1, 10.0)
-    inputs = np.ones((lead + 1, 1))
+@pytest.mark.parametrize("input_delay", [0, 2, 5])
+def test_wild_stamps_and_inputs_do_not_stop_an_actuator(input_delay):
+    actuator = Actuator(input_delay, 1, 10.0)
+    inputs = np.ones((input_delay + 1, 1))
     for step in range(100):
-        wild = [Command(stamp, -inputs) for stamp in (10**9, 2**62, step + lead + 2, -(10**9))]
+        wild = [Command(stamp, -inputs) for stamp in (10**9, 2**62, step + input_delay + 2, -(10**9))]
         wild += [Command(step, size * inputs) for size in (1e6, -10.001)]
         actuator.receive([*wild, Command(step, inputs), *wild])
         u = actuator.apply(step)
-        assert u.tolist() == [1.0 if step >= lead else 0.0]
+        assert u.tolist() == [1.0 if step >= input_delay else 0.0]
     assert actuator.echo.missing == 0
     assert actuator.refused == 100 * 10
-    assert len(actuator._committed) <= 2 * lead + 3
+    assert len(actuator._committed) <= 2 * input_delay + 3
 
 
 def test_command_that_comes_early_is_kept_for_its_step():
@@ -174,7 +174,7 @@ def test_controller_that_starts_in_the_middle_claims_nothing_until_samples_tell_
     for _ in range(60):
         x = world.state.copy()
         proved.append(world.move())
-        if loop.reason != UNKNOWN_START and loop.lead == 0:
+        if loop.reason != UNKNOWN_START and loop.input_delay == 0:
             e = loop.estimate - x
             assert e @ np.linalg.solve(loop.error_shape, e) <= 1.0
     assert not proved[0]

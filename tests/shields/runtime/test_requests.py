@@ -33,7 +33,7 @@ def test_loop_requests_what_the_environment_does(downlink):
     env = NCSEnv(PLANT, CHANNEL, contract=CONTRACT, downlink=downlink)
     certificate = certificate_of(PLANT, env.certificate_contract)
     shield, loop = SafetyShield(env, certificate), SafeLoop(certificate, PLANT, CHANNEL, downlink=downlink)
-    actuator, rng = Actuator(loop.lead, PLANT.m, PLANT.u_max), np.random.default_rng(0)
+    actuator, rng = Actuator(loop.input_delay, PLANT.m, PLANT.u_max), np.random.default_rng(0)
     _, info = shield.reset(seed=1, options={"state": np.zeros(PLANT.n)})
     loop.start(env.estimator.belief.mean, np.zeros(PLANT.n))
     tap, forced = Tap(env), 0
@@ -61,13 +61,13 @@ def test_commands_carry_requests_to_the_actuator():
     plant = truck_trailer(mass=4000.0)
     downlink = Channel(delay=1, loss=0.3, max_consecutive_losses=1)
     loop = SafeLoop(certificate_of(plant), plant, Channel(0.2, on_request=True), downlink=downlink)
-    actuator, requested = Actuator(loop.lead, 1), []
+    actuator, requested = Actuator(loop.input_delay, 1), []
     loop.start(np.zeros(2))
     for step in range(7):
         loop.receive()
         loop.decide(0.0, ask=step in (1, 3))
         command = loop.command()
-        assert len(command.requests) == loop.lead + 1 == 3
+        assert len(command.requests) == loop.input_delay + 1 == 3
         actuator.receive([] if step == 1 else [command])
         actuator.apply(step)
         requested.append((loop.request, actuator.requested))

@@ -21,7 +21,7 @@ from ncs_gym import (
     certified_error_set,
     truck_trailer,
 )
-from ncs_gym.network.packet_transmission import ChannelState
+from ncs_gym.network.packet_loss_and_delay import ChannelState
 from shields import CertificateError, SafeLoop, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import ALARM, NOT_KNOWN_INSIDE, OLD_SAMPLE, OTHER_INPUT
 from shields.runtime.safe_loop import NOT_STARTED

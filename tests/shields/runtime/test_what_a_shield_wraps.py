@@ -106,7 +106,7 @@ def test_settings_of_a_shield_cannot_be_changed(shielded, name):
         setattr(shield, name, getattr(shield, name))
 
 
-@pytest.mark.parametrize("name", ["filter", "contract", "lead"])
+@pytest.mark.parametrize("name", ["filter", "contract", "input_delay"])
 def test_settings_of_a_loop_cannot_be_changed(name):
     loop = SafeLoop(certificate_of(PLANT), PLANT, Channel())
     with pytest.raises(AttributeError, match=f"{name} is a setting of SafeLoop"):
