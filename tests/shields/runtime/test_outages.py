@@ -232,6 +232,16 @@ def test_sample_that_contradicts_the_others_leaves_the_state_unknown(plant):
         assert first_estimate(plant, ages, given, inputs, noise) is None
 
 
+def test_slightly_wrong_sample_among_the_newest_leaves_the_state_unknown():
+    """Off by 18 times its largest noise: older samples alone do not tell, what a fit of all leaves of each does."""
+    plant = cart_pole(full_state=False)
+    ages, N = certified_error_set(plant, ChannelContract(5)), plant.sensor_error.shape_matrix
+    inputs, samples = [np.zeros(plant.m)] * 8, {age: np.zeros(plant.p) for age in range(9)}
+    for wrong in range(1, 8):
+        for entry in np.diag(18.0 * np.sqrt(np.diag(N))):
+            assert first_estimate(plant, ages, samples | {wrong: entry}, inputs, N) is None
+
+
 def test_too_few_or_too_coarse_samples_are_no_first_estimate():
     position, contract = cart_pole(full_state=False), ChannelContract(5)
     N, ages = position.sensor_error.shape_matrix, certified_error_set(position, contract)
