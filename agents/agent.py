@@ -201,12 +201,12 @@ class Agent:
 
         Raises:
             AgentError: If the files are missing, damaged, of another format or of an environment that has changed.
-            ModuleNotFoundError: If the algorithm's package is not installed.
+            ModuleNotFoundError: If a package that the algorithm or the environment needs is not installed.
         """
         folder, content, weights = read_files(folder)
         try:
             return _rebuilt(content, weights)
-        except AgentError:
+        except (AgentError, ModuleNotFoundError):  # the second is nothing wrong with the files
             raise
         except Exception as error:  # a forged file may break any part of the libraries that read it
             reason = (str(error).splitlines() or [type(error).__name__])[0]

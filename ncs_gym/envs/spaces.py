@@ -57,7 +57,8 @@ def observation_space(
         observe: What is observed besides; see `read_observed`.
 
     Raises:
-        ValueError: If an entry is beyond float32's range, so that observations would be infinite, or always zero.
+        ValueError: If a bound of the task is no number > 0, or an entry is beyond float32's range, so that observations
+            would be infinite, or always zero.
     """
     powers = [np.eye(plant.n)]
     for _ in range(horizon):
@@ -77,7 +78,10 @@ def observation_space(
         estimate = np.minimum(estimate, known + errors)
     known = {"age": np.array([float(horizon)]), "error": errors}
     more = [known[name] for name in observe]
-    bound = OBSERVATION_MARGIN * np.concatenate([estimate, task.observation_bound(plant, horizon), *more])
+    own = task.observation_bound(plant, horizon)
+    if not (np.isfinite(own) & (np.asarray(own) > 0.0)).all():
+        raise ValueError(f"{type(task).__name__}: observation_bound must be finite numbers > 0, got {shown(own)}")
+    bound = OBSERVATION_MARGIN * np.concatenate([estimate, own, *more])
     numbers = np.finfo(np.float32)
     if not ((bound >= numbers.tiny) & (bound <= numbers.max)).all():
         raise ValueError(

@@ -78,6 +78,9 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
 
     certificate: Certificate = setting("certificate")
     filter: SafetyFilter = setting("filter")
+    mode: str = setting("mode", "_filter.mode")
+    horizon: int | None = setting("horizon", "_filter.horizon")
+    on_unproved: str = setting("on_unproved", "_lost.on_unproved")
 
     def __init__(
         self,

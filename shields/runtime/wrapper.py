@@ -90,6 +90,9 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
 
     certificate: Certificate = setting("certificate")
     filter: SafetyFilter = setting("filter")
+    mode: str = setting("mode", "_filter.mode")
+    horizon: int | None = setting("horizon", "_filter.horizon")
+    on_unproved: str = setting("on_unproved", "_lost.on_unproved")
 
     def __init__(
         self,

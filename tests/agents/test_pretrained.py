@@ -67,3 +67,9 @@ def test_commands_take_pretrained_agents(tmp_path):
     drawn = ncs("render", "--env", "ncs_gym/CSTR-v0", "--policy", "pretrained", "--steps", 3, "--out", out)
     assert drawn.returncode == 0, drawn.stderr
     assert out.exists()
+
+
+def test_missing_package_of_an_environment_is_no_damage(monkeypatch):
+    monkeypatch.setattr("ncs_gym.processes.mujoco_pendulum.find_spec", lambda name: None)
+    with pytest.raises(ModuleNotFoundError, match="InvertedPendulum-v5 needs MuJoCo"):
+        pretrained("ncs_gym/InvertedPendulum-v0")

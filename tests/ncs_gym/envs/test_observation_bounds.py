@@ -110,3 +110,9 @@ def test_runaway_states_are_clipped_in_observations_and_not_in_infos():
         observation, *_, info = env.step([1.0])
     assert observation in env.observation_space
     assert (np.abs(info["estimate"]) > env.observation_space.high).any()
+
+
+@pytest.mark.parametrize("share", [-1.0, 0.0, np.nan, np.inf])
+def test_bounds_that_bound_nothing_are_refused_by_name(share):
+    with pytest.raises(ValueError, match="Far: observation_bound must be finite numbers > 0"):
+        NCSEnv(plant=PLANT, task=Far(share))
