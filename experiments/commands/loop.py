@@ -117,8 +117,8 @@ def _network_loop(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
             ]
             raise ValueError(
                 f"{error}; there and back, what the network promises adds up to max_age: max_consecutive_losses + "
-                f"delay + jitter + --room, now {ages[0]} by --channel NAME=VALUE ... and {ages[1]} by --downlink "
-                "NAME=VALUE ..."
+                f"delay + jitter + --room, now {ages[0]} by --channel and {ages[1]} by --downlink, which "
+                "take NAME=VALUE ... each to change that"
             ) from error
     else:
         certificate = Certificate.load(settings.certificate)

@@ -272,7 +272,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         channel = self.episode_channel
         self._channel_state, self._packets = ChannelState(channel, rng), 0
         if self._requests is not None:
-            self._requests.begin()
+            self._requests.begin(channels=[channel])
         if (channel.delay, channel.jitter) != (self._estimator.channel.delay, self._estimator.channel.jitter):
             self._estimator = self._estimator_for(covering([channel], self._channel))
         self._estimator.reset(self._state + self._process.first_error(rng))

@@ -384,7 +384,7 @@ class NCSVectorEnv(VectorEnv):
         self._estimator.begin(mask, states + first_errors)
         self._downlink_state.begin(rng, mask, downlinks)
         if self._requests is not None:
-            self._requests.begin(mask)
+            self._requests.begin(mask, channels)
         self._packets = np.where(mask, 0, self._packets)
         self.steps[mask], self._violations[mask], self._done[mask] = 0, 0.0, False
         self.episodes[mask] += 1

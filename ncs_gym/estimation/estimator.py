@@ -111,23 +111,27 @@ class Estimator:
         self._histories = self._usual
         self._begin(mean)
 
-    def restart(self, mean: np.ndarray, age: int) -> None:
-        """Begins anew at this step of the episode; samples taken before it are discarded from now on.
+    def restart(self, mean: np.ndarray, inputs: Sequence[np.ndarray]) -> None:
+        """Begins anew with an estimate of an earlier step of the episode: that of the newest sample it was made of.
+
+        Samples taken later can be used when they arrive, the others are discarded from now on.
 
         Args:
-            mean: An estimate, shape (n,), whose error lies in the certified set of an age.
-            age: Steps since the newest sample used was taken.
+            mean: An estimate, shape (n,), whose error lies in the certified set of age 0.
+            inputs: What was applied since then, (m,) each, the newest first.
         """
-        shape = self._error_set.shape_at(age)
+        shape = self._error_set.shape_at(0)
         assert shape is not None
-        first = ErrorStatistics(self._plant.kalman_covariances[2].copy(), shape.copy(), age)
+        first = ErrorStatistics(self._plant.kalman_covariances[2].copy(), shape.copy(), 0)
         coarsens = self._usual.coarsens
         self._histories = histories_of(self._plant, self._channel, self._error_set, coarsens, first=first)
-        self._begin(mean, self.step, age)
+        self._begin(mean, self.step - len(inputs))
+        for u in reversed(inputs):
+            self.advance(u, ())
 
-    def _begin(self, mean: np.ndarray, step: int = 0, age: int = 0) -> None:
+    def _begin(self, mean: np.ndarray, step: int = 0) -> None:
         """Forgets everything but an estimate, shape (n,), at a step."""
-        self.step, self.age = step, age
+        self.step, self.age = step, 0
         self.alarm = False
         self.mean = frozen(np.array(mean, dtype=np.float64))
         self._history = self._histories.root

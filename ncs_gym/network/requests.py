@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,15 +75,25 @@ class Requests:
     def __init__(
         self, channel: Channel, contract: ChannelContract | None, input_delay: int = 0, size: int | None = None
     ) -> None:
-        self._spare, self._input_delay = spare_samples(channel, contract), input_delay
+        self._own_spare, self._contract, self._input_delay = spare_samples(channel, contract), contract, input_delay
         self._shape = () if size is None else (size,)
         # Without a contract it is enough to know which packets may still arrive.
         self._oldest = channel.longest_delay if contract is None else contract.max_age
         self._back = np.arange(input_delay + self._oldest + 1).reshape(-1, *[1] * len(self._shape))
         self.begin()
 
-    def begin(self, chosen: np.ndarray | None = None) -> None:
-        """Starts episodes, in all environments or in those of a mask (N,)."""
+    def begin(self, chosen: np.ndarray | None = None, channels: Sequence[Channel] | None = None) -> None:
+        """Starts episodes, in all environments or in those of a mask (N,).
+
+        Args:
+            chosen: The mask.
+            channels: Those of all environments from now on, the others' being as before; None for that of all. One that
+                loses or delays more leaves less to spare, one that promises nothing leaves nothing.
+        """
+        self._spare: Any = self._own_spare
+        if self._own_spare is not None and channels is not None:
+            spare = np.array([self._spare_with(channel) for channel in channels])
+            self._spare = np.minimum(self._own_spare, spare if self._shape else spare.item())
         # Whether the samples of k + c, k + c - 1, ... were requested.
         first = np.zeros((len(self._back), *self._shape), np.bool_)
         first[: self._input_delay] = True
@@ -94,6 +105,10 @@ class Requests:
             self.requested, self.forced, self._asked = (
                 each & ~chosen for each in (self.requested, self.forced, self._asked)
             )
+
+    def _spare_with(self, channel: Channel) -> int:
+        """Returns how many samples may be left out with the channel of an episode, if the contract is to be kept."""
+        return 0 if channel.most_consecutive_losses is None else spare_samples(channel, self._contract) or 0
 
     def saved(self) -> dict[str, Any]:
         """Returns all that changes, as attributes to be put back; arrays are replaced, never written into."""

@@ -452,11 +452,13 @@ class SafeLoop:
         samples = {stamp: y for stamp, y in samples.items() if 0 <= step - stamp <= len(inputs)}
         self._unknown = samples, inputs
         noise = plant.sensor_error_with(self._estimator.channel.quantization_step).shape_matrix
-        by_age = {step - stamp: y for stamp, y in samples.items()}
-        found = first_estimate(plant, self._estimator.error_set, by_age, inputs, noise)
+        # As of the newest sample: those that are on their way can then be used, and the contract counts on them.
+        newest = max(samples, default=step)
+        by_age, since = {newest - stamp: y for stamp, y in samples.items()}, step - newest
+        found = first_estimate(plant, self._estimator.error_set, by_age, inputs[since:], noise)
         if found is not None:
             self._unknown = None
-            self._estimator.restart(*found)
+            self._estimator.restart(found[0], inputs[:since])
             self._begin(starts_known(self._filter, None, self._input_delay))
 
     def _report(self) -> LoopObservation:

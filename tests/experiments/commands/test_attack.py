@@ -175,7 +175,7 @@ def test_nature_pushes_lookahead_to_the_box_and_out_of_the_safe_set_in_turn(cert
 def test_stored_counts_belong_to_their_mode_and_horizon(monkeypatch):
     chosen = {CRUISE: attack_cases(0, 1)[CRUISE]}
     replace_cases(monkeypatch, chosen)
-    batch = MonteCarloBatch(CAMPAIGN, CRUISE, 0, chosen[CRUISE].certificate)
+    batch = MonteCarloBatch(CAMPAIGN, CRUISE, 0, chosen[CRUISE].certificate())
     given = ({}, {"mode": "project"}, {"mode": "lookahead", "horizon": 6}, {"mode": "lookahead", "horizon": 7})
     keys = [replace(batch, settings=replace(CAMPAIGN, **each)).key for each in given]
     assert len(set(keys)) == 4

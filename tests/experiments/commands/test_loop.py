@@ -167,7 +167,7 @@ def test_networks_of_both_ways_are_chosen_by_name(env, more):
         (["--role", "plant"], "give both the same --key-file"),
         (["--channel", "lag=3"], "--channel lag: a channel has no such setting"),
         (["--downlink", "delay=0"], "--downlink: what is sent at each step arrives at the next at best"),
-        (["--env", "ncs_gym/CSTR-v0"], "by --channel NAME=VALUE ... and 5 + 1 + 0 + 1 by --downlink NAME=VALUE"),
+        (["--env", "ncs_gym/CSTR-v0"], "now 5 + 1 + 0 + 1 by --channel and 5 + 1 + 0 + 1 by --downlink"),
         (["--env", "ncs_gym/Nothing-v0"], "ncs_gym/Nothing-v0"),
         (["--key-file", "/dev/null", "--role", "plant"], "must hold at least 16 bytes"),
     ],

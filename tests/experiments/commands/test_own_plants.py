@@ -138,7 +138,10 @@ def test_plant_of_a_file_is_attacked_behind_channels_that_use_its_contract_up(tm
     random_plant(3, 3, 2).save(tmp_path / "plant.json")
     asked = ("--plant", "plant.json", "--steps", 4 * 3 * 8 * 200, "--envs", 8)
     contract = ("--max-age", 2, "--quantization-step", 0.001)
-    for given, kinds in (((), ("perfect", "blackout", "bursts", "overtaking")), (contract, ("late", "rare"))):
+    for given, kinds in (
+        ((), ("perfect", "blackout", "bursts", "overtaking")),
+        (contract, ("late", "rare", "on request")),
+    ):
         folder = f"of {len(kinds)}"
         run = ncs("attack", *asked, *given, "--out", folder, cwd=tmp_path)
         assert run.returncode == 0, run.stderr

@@ -142,6 +142,7 @@ def test_settings_of_something_else_are_not_replaced(content, tmp_path):
 
 def hold(out, connection):
     """Has a folder until it is told to give it back."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background it may be ignored
     with folder_of("compare", CompareSettings(out=out)):
         connection.send("has it")
         connection.recv()

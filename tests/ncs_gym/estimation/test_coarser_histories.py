@@ -62,7 +62,7 @@ def test_coarse_graph_stays_coarse_where_it_begins_anew_and_where_it_is_full_aga
     assert level <= 1.0
     assert estimator._histories.recursion.sets.shape_step == COARSEST_STEP
     assert estimator._histories.recursion.coarser() is estimator._histories.recursion
-    estimator.restart(np.zeros(3), 0)
+    estimator.restart(np.zeros(3), ())
     assert estimator._histories.coarsens
 
 

@@ -149,6 +149,22 @@ def test_broken_contract_forces_a_request_in_every_step():
     assert infos[-1]["contract_broken"]
 
 
+@pytest.mark.parametrize("kind", [NCSEnv, NCSVectorEnv])
+def test_contract_is_kept_over_an_episode_channel_that_loses_and_delays_more(kind):
+    settings = {"loss": 0.9, "quantization_step": 1e-4, "on_request": True}
+    narrow, wide = Channel(max_consecutive_losses=0, **settings), Channel(delay=3, max_consecutive_losses=3, **settings)
+    many = kind is NCSVectorEnv
+    env = kind(*[4] * many, plant=cart_pole(), channel=narrow, contract=ChannelContract(9, 1e-4))
+    assert env.contract.is_kept_by(wide)
+    actions = np.zeros((4, 1) if many else 1, np.float32)
+    env.reset(seed=0, options={"channel": [wide, narrow, wide, None] if many else wide})
+    ages = np.array([env.step(actions)[-1]["measurement_age"] for _ in range(300)])
+    assert (ages.max(axis=0) == 9).all()
+    env.reset()  # and its own channel again leaves as many samples out as before
+    forced = np.array([env.step(actions)[-1]["request_forced"] for _ in range(10)])
+    assert (forced.sum(axis=0) == 1).all()
+
+
 def test_contract_of_the_plant_alone_has_no_sample_to_spare():
     channel = Channel(0.5, delay=1, max_consecutive_losses=2, on_request=True)
     env = NCSEnv(plant=cart_pole(), channel=channel)

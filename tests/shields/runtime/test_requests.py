@@ -5,7 +5,18 @@ import pickle
 import numpy as np
 import pytest
 
-from ncs_gym import Actuator, Channel, ChannelContract, Command, NCSEnv, NCSVectorEnv, Packet, cart_pole, truck_trailer
+from ncs_gym import (
+    Actuator,
+    Channel,
+    ChannelContract,
+    Command,
+    NCSEnv,
+    NCSVectorEnv,
+    Packet,
+    cart_pole,
+    lane_keeping,
+    truck_trailer,
+)
 from shields import SafeLoop, SafetyShield, VectorSafetyShield
 from tests.certificates import certificate_of
 
@@ -87,6 +98,26 @@ def test_loop_asks_in_every_step_while_the_state_is_not_known():
         asked.append(loop.request)
     assert asked[0]
     assert not asked[-1]
+
+
+@pytest.mark.parametrize(("plant", "contract"), [(PLANT, CONTRACT), (lane_keeping(), ChannelContract(8, 1e-4))])
+def test_contract_is_kept_from_the_first_proof_of_an_unknown_start_on(plant, contract):
+    late = Channel(0.5, delay=4, max_consecutive_losses=1, quantization_step=1e-4, on_request=True)
+    loop = SafeLoop(certificate_of(plant, contract), plant, late, on_unproved="ignore")
+    rng, x, lost, packets, ages = np.random.default_rng(0), np.zeros(plant.n), False, {}, []
+    loop.start(x, known=False)
+    for step in range(60):
+        loop.receive(packets.pop(step, []))
+        if ages or loop.guaranteed:
+            assert loop.guaranteed
+            ages.append(loop.measurement_age)
+        x = plant.A @ x + plant.B @ loop.decide(np.zeros(plant.m)).input
+        if loop.request:
+            lost = not lost and rng.random() < 0.5
+            sample = Packet(step + 1, late.quantize(plant.H @ x), loop.episode)
+            packets |= {} if lost else {step + 1 + late.delay: [sample]}
+    assert max(ages) == contract.max_age
+    assert len(ages) > 50
 
 
 def test_unused_requests_are_refused_in_one_sentence():
