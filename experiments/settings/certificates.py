@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -291,6 +292,9 @@ class ChannelSettings:
     def __post_init__(self) -> None:
         """Raises ValueError if a value is out of range."""
         require_least(self, seed=0)
+        period = self.sampling_period
+        if not (period is None or 0.0 < period < math.inf):
+            raise ValueError(f"--sampling-period must be a number > 0, got {period}")
 
 
 @dataclass(frozen=True, kw_only=True)
