@@ -81,6 +81,7 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
     mode: str = setting("mode", "_filter.mode")
     horizon: int | None = setting("horizon", "_filter.horizon")
     on_unproved: str = setting("on_unproved", "_lost.on_unproved")
+    channel: Channel = setting("channel", "_inner.channel")
 
     def __init__(
         self,

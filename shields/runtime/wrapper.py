@@ -93,6 +93,7 @@ class SafetyShield(gym.Wrapper, RecordConstructorArgs):
     mode: str = setting("mode", "_filter.mode")
     horizon: int | None = setting("horizon", "_filter.horizon")
     on_unproved: str = setting("on_unproved", "_lost.on_unproved")
+    channel: Channel = setting("channel", "_inner.channel")
 
     def __init__(
         self,

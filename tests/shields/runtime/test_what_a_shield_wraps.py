@@ -98,7 +98,7 @@ def test_wrapper_that_changes_a_setting_in_its_reset_is_found_at_the_next_one():
         shield.reset(seed=0)
 
 
-@pytest.mark.parametrize("name", ["certificate", "filter", "mode", "horizon", "on_unproved"])
+@pytest.mark.parametrize("name", ["certificate", "filter", "mode", "horizon", "on_unproved", "channel"])
 @pytest.mark.parametrize("shielded", [scalar, vector])
 def test_settings_of_a_shield_cannot_be_changed(shielded, name):
     shield = shielded()
