@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 
+from ncs_gym import Channel
 from ncs_gym.envs.info import Known
 from ncs_gym.envs.spaces import nearest_action, read_actions
 from ncs_gym.envs.vector_env import NCSVectorEnv
