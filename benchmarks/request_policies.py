@@ -27,7 +27,6 @@ from experiments.baselines.controllers import controller
 from experiments.baselines.regulators import tuned_weights
 from experiments.baselines.requests import (
     Asking,
-    RequestResult,
     RequestsOnly,
     acknowledged,
     at_random,
@@ -51,8 +50,15 @@ PPO_SETTINGS: dict[str, Any] = {
     "gamma": 0.98,
     "policy_kwargs": {"net_arch": [64, 64]},
 }
-HEADER = "policy", "packets", "forced", "return", "less price", "overridden", "violations", "unproved", "oldest"
-COLORS = {"period": "#777777", "random": "#bb8844", "acknowledged": "#2266aa", "slack": "#22884d", "PPO": "#aa3355"}
+STYLES = {
+    "period": ("#777777", "s"),
+    "forced alone": ("#222222", "x"),
+    "random": ("#bb8844", "v"),
+    "acknowledged": ("#2266aa", "^"),
+    "slack": ("#22884d", "D"),
+    "PPO requests": ("#dd6677", "o"),
+    "PPO both": ("#882255", "*"),
+}
 
 
 def environments(env_id: str, count: int, certificate: Certificate, cost: float) -> VectorRequestActions:
@@ -88,15 +94,23 @@ def half_width(returns: np.ndarray) -> float:
     return float(1.96 * returns.std(ddof=1) / np.sqrt(len(returns)))
 
 
-def draw(results: dict[str, RequestResult], env_id: str, out: str) -> None:
+def draw(results: dict[str, tuple[float, float, float]], env_id: str, out: str) -> None:
+    """Draws packets per step, mean return and its half-width of each policy, a line through those of one kind."""
     fig, axis = plt.subplots(figsize=(7.0, 4.2), layout="constrained")
-    for name, result in results.items():
-        kind = next((kind for kind in COLORS if kind in name), "period")
-        mean = result.returns.mean()
-        axis.errorbar(result.packets, mean, half_width(result.returns), fmt="o", color=COLORS[kind], capsize=2)
-        axis.annotate(name, (result.packets, mean), (5, 4), textcoords="offset points", fontsize=7, color=COLORS[kind])
+    for kind, (color, marker) in STYLES.items():
+        mine = {name.removeprefix(kind).strip(" ,"): point for name, point in results.items() if name.startswith(kind)}
+        if mine:
+            x, y, width = np.array(sorted(mine.values())).T
+            line = "none" if kind.startswith("PPO") else "-"
+            axis.errorbar(x, y, width, color=color, marker=marker, ls=line, lw=0.8, capsize=2, label=kind)
+        for value, (packets, mean, _) in mine.items():
+            text = value.partition(",")[0]
+            if not text.startswith("seed"):
+                place = (4, 5) if kind == "period" else (4, -11)
+                axis.annotate(text, (packets, mean), place, textcoords="offset points", fontsize=7, color=color)
     axis.set(xlabel="packets per step", ylabel="return of an episode", title=env_id.removeprefix("ncs_gym/"))
     axis.grid(alpha=0.3)
+    axis.legend(loc="lower right", fontsize=8)
     fig.savefig(out, dpi=120)
 
 
@@ -130,21 +144,22 @@ def main() -> None:
         policies[f"PPO requests, seed {seed}"] = learned_requests(env_id, certificate, control, arguments, seed)
         policies[f"PPO both, seed {seed}"] = learned_both(env_id, certificate, arguments, seed)
         trainings += time.perf_counter() - start
-    results, worth = {}, {}
+    points, worth = {}, {}
     rows = [
         ["policy", "packets", "forced", "return", "", "less price", "overridden", "violations", "unproved", "oldest"]
     ]
     for name, policy_for in policies.items():
         env = environments(env_id, arguments.episodes, certificate, arguments.cost)
-        result = results[name] = played(env, policy_for(env), seed=1)
-        mean, steps = result.returns.mean(), env.unwrapped.max_episode_steps
+        result = played(env, policy_for(env), seed=1)
+        mean, steps = float(result.returns.mean()), env.unwrapped.max_episode_steps
+        points[name] = result.packets, mean, half_width(result.returns)
         worth[name] = mean - arguments.cost * result.packets * steps
         row = [
             name,
             f"{result.packets:.3f}",
             f"{result.forced:.1%}",
             f"{mean:.1f}",
-            f"+- {half_width(result.returns):.1f}",
+            f"+- {points[name][2]:.1f}",
         ]
         row += [f"{worth[name]:.1f}", f"{result.overridden:.1%}", str(result.violations), str(result.unproved)]
         rows.append([*row, str(result.oldest)])
@@ -157,7 +172,7 @@ def main() -> None:
     if arguments.steps:
         print(f"PPO: {arguments.steps:,} steps for each seed and kind, {trainings:.0f} s in all.")
     print(f"{time.perf_counter() - begun:.0f} s in all.")
-    draw(results, env_id, arguments.out)
+    draw(points, env_id, arguments.out)
 
 
 if __name__ == "__main__":
