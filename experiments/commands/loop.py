@@ -28,7 +28,6 @@ from experiments.runs.loops import import_module, module_and_id, registered_env
 from experiments.settings import LoopSettings
 from experiments.terminal import synthesis_status
 from ncs_gym import NCSEnv
-from ncs_gym.network import contract_of, downlink_protocol
 from ncs_gym.network.wire import SHORTEST_KEY
 from shields import Certificate, Infeasible
 from shields.atomic_write import write_atomically
@@ -102,10 +101,7 @@ def _in_process(run: Callable[[NetworkLoop], None], network_loop: NetworkLoop, e
 def _network_loop(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
     """Returns the loop that all processes understand, with its certificate in the folder."""
     given = _given(settings, env)
-    uplink, downlink = given.promised
-    protocol = downlink_protocol(downlink, None)
-    assert protocol is not None
-    contract = None if env.contract is None else protocol.behind(contract_of(uplink))
+    contract = None if env.contract is None else given.contract
     if settings.certificate is None:
         try:
             with synthesis_status() as show:
@@ -129,6 +125,8 @@ def _network_loop(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
 
 def _given(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
     uplink, downlink = network_channels(env, settings.channel, settings.downlink)
+    if settings.ask_age is not None and not uplink.on_request:
+        raise ValueError(f"--ask-age: {settings.env} sends samples by itself; --channel on_request=True makes it ask")
     key = os.urandom(32) if settings.key_file is None else settings.key_file.read_bytes()
     if len(key) < SHORTEST_KEY:
         raise ValueError(f"{settings.key_file} must hold at least {SHORTEST_KEY} bytes")
@@ -153,6 +151,8 @@ def _given(settings: LoopSettings, env: NCSEnv) -> NetworkLoop:
         listen=(here if settings.role == "all" else "0.0.0.0", port),
         out=settings.out,
         steps=settings.steps,
+        ask_age=settings.ask_age,
+        max_age=0 if env.contract is None else env.contract.max_age,
     )
 
 
@@ -229,6 +229,7 @@ def summary_of(folder: Path) -> dict[str, Any]:
         missing, key = int(row["missing"]), (row["episode"], row["step"])
         last_of[row["episode"]] = missing
         counts["plant"] += 1
+        counts["sent"] += row["sent"] == "1"
         counts["outside"] += row["outside"] == "1"
         counts["outside, proved"] += row["outside"] == "1" and proved.get(key) == "1" and missing == 0
         counts["proved, missed"] += proved.get(key) == "1" and missing > 0
@@ -249,6 +250,7 @@ def summary_of(folder: Path) -> dict[str, Any]:
             "steps of the plant": counts["plant"],
             "outside the box": counts["outside"],
             "inputs missing": sum(last_of.values()),
+            "samples sent per step": round(counts["sent"] / counts["plant"], 3),
         }
     if proved and last_of:
         summary["outside although proved"] = counts["outside, proved"]

@@ -21,7 +21,7 @@ from experiments.runs.loops import changed_channel, registered_env
 from experiments.runs.policies import policy_by_name
 from ncs_gym import Actuator, AdversarialDisturbance, Channel, NCSEnv
 from ncs_gym.network import downlink_protocol
-from ncs_gym.network.contract import contract_of
+from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.network.wire import Wire
 from ncs_gym.processes.plant_simulation import PlantSimulation
 from shields import Certificate, SafeLoop
@@ -66,6 +66,9 @@ class NetworkLoop:
         listen: Address at which the controller binds.
         out: Folder of the logs.
         steps: After how many steps the controller ends; None for never.
+        ask_age: Age from which the controller asks for samples, where they are on request; None to leave it to the
+            contract.
+        max_age: Largest age of a sample in use when an input takes effect, where samples are on request.
     """
 
     env: str
@@ -87,6 +90,8 @@ class NetworkLoop:
     listen: tuple[str, int]
     out: Path
     steps: int | None
+    ask_age: int | None
+    max_age: int
 
     @property
     def promised(self) -> tuple[Channel, Channel]:
@@ -101,6 +106,20 @@ class NetworkLoop:
         return protocol.input_delay
 
     @property
+    def contract(self) -> ChannelContract | None:
+        """What is promised of samples and commands together; None if nothing is.
+
+        Samples on request may be left out for as long as `max_age` has room beyond what the network needs.
+        """
+        uplink, downlink = self.promised
+        protocol = downlink_protocol(downlink, None)
+        assert protocol is not None
+        needed = protocol.behind(contract_of(uplink))
+        if needed is None or not uplink.on_request:
+            return needed
+        return replace(needed, max_age=max(needed.max_age, self.max_age))
+
+    @property
     def key(self) -> bytes:
         """Key of the messages: machines that were told other things refuse each other's."""
         told = self.env, self.speed, self.room, self.uplink, self.downlink
@@ -113,7 +132,7 @@ class NetworkLoop:
     def safe_loop(self, env: NCSEnv) -> SafeLoop:
         """Returns the loop."""
         uplink, downlink = self.promised
-        contract = contract_of(uplink)
+        contract = contract_of(uplink)  # echoes are sent at every step, whatever samples are
         age = ECHO_AGE if contract is None else contract.max_age + ECHO_ROOM
         settings = {"downlink": downlink, "echo_age": age, "on_unproved": "ignore"}
         certificate = Certificate.load(self.certificate)
@@ -133,17 +152,15 @@ def network_channels(
         down_changes: Those of the downlink.
 
     Raises:
-        ValueError: If a change is wrong, or is none that a real network can have, or samples are on request.
+        ValueError: If a change is wrong, or is none that a real network can have.
     """
     up = env.channel
-    if up.on_request:
-        raise ValueError("datagrams carry no requests for samples yet: give an environment without on_request")
     down = env.downlink or Channel(loss=up.loss, jitter=up.jitter, max_consecutive_losses=up.max_consecutive_losses)
     if down.most_consecutive_losses is None:  # nothing can be committed ahead without a promise
         down = Channel(loss=down.loss, delay=down.delay, jitter=down.jitter, max_consecutive_losses=2)
 
     def late(channel: Channel) -> Channel:
-        settings = {name: getattr(channel, name) for name in ("loss", "quantization_step", "jitter")}
+        settings = {name: getattr(channel, name) for name in ("loss", "quantization_step", "jitter", "on_request")}
         return Channel(**settings, delay=max(channel.delay, 1), max_consecutive_losses=channel.max_consecutive_losses)
 
     def changed(own: Channel, changes: Mapping[str, Any], flag: str) -> Channel:
@@ -211,7 +228,7 @@ async def _plant(loop: NetworkLoop, is_over: Callable[[], bool]) -> None:
     actuator = Actuator(loop.input_delay, plant.m, plant.u_max)
     node = ActuatorNode(wire, await UdpTransport.open(peer=loop.actuator), clock, actuator)
     names = [*(f"x_{name}" for name in plant.state_names), *(f"u_{name}" for name in plant.input_names)]
-    log = StepLog(loop.out, "plant", ["time", "episode", "step", *names, "missing", "outside", "drift"])
+    log = StepLog(loop.out, "plant", ["time", "episode", "step", *names, "missing", "outside", "sent", "drift"])
     start, episode, last, released = np.zeros(plant.n), 0, 0, False
     state, memory = start, simulation.begin(rng)
 
@@ -225,12 +242,13 @@ async def _plant(loop: NetworkLoop, is_over: Callable[[], bool]) -> None:
             # It is held at the start before the first episode, and again where it left the box without a controller.
             state, memory, last = simulation.start(rng, start, None)[0], simulation.begin(rng), step - 1
         for each in range(last + 1, step + 1):  # what is simulated here was not late
+            sent = sensor.is_requested(each)
             sensor.send(each, loop.uplink.quantize(simulation.measure(rng, state)))
             u = node.apply(each)
             if released:
                 outside = bool((plant.constraint_values(state) > 0.0).any())
                 row = [f"{time.time():.6f}", episode, each, *state.tolist(), *u.tolist(), actuator.echo.missing]
-                log.write([*row, int(outside), f"{clock.drift:.2e}"])
+                log.write([*row, int(outside), int(sent), f"{clock.drift:.2e}"])
                 state = simulation.advance(rng, state, u, each, memory)
         last = step
 
@@ -296,7 +314,10 @@ async def _controller(
             print(waiting_text(node.refused), file=sys.stderr, flush=True)
         return is_over() or (loop.steps is not None and steps >= loop.steps)
 
-    await run_controller(node, propose, on_step, has_ended)
+    def asks(safe: SafeLoop) -> bool:
+        return loop.ask_age is not None and safe.measurement_age >= loop.ask_age
+
+    await run_controller(node, propose, on_step, has_ended, asks=asks)
     log.close()
     packets.close()
 

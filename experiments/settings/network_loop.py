@@ -27,6 +27,8 @@ class LoopSettings:
         speed: How much faster than the plant's own time the loop runs; below 1 for slow machines.
         room: Steps by which samples and commands may be later than the network makes them, because the processes that
             send and receive them are: the certificate counts them on both ways.
+        ask_age: Age from which the controller asks for a sample, where samples are on request; by default it never
+            does, and those are sent that the contract needs.
         mischief: Share of lost datagrams that arrive corrupted, and probability that a datagram is duplicated,
             replayed or forged.
         worst: Lose all the datagrams in a row that the channel's promise allows, whenever one is lost.
@@ -51,6 +53,7 @@ class LoopSettings:
     steps: StepCount = 3000
     speed: float = 1.0
     room: int = 1
+    ask_age: int | None = None
     mischief: float = 0.05
     worst: bool = False
     seed: int = 0
@@ -72,6 +75,8 @@ class LoopSettings:
             raise ValueError(f"--speed must be positive, got {self.speed}")
         if not 0 <= self.room <= 100:
             raise ValueError(f"--room must be between 0 and 100 steps, got {self.room}")
+        if self.ask_age is not None and self.ask_age < 0:
+            raise ValueError(f"--ask-age must be at least 0 steps, got {self.ask_age}")
         if not 0.0 <= self.mischief <= 1.0:
             raise ValueError(f"--mischief must be a probability, got {self.mischief}")
         if not 1 <= self.port <= 65533:

@@ -4,7 +4,7 @@ Every datagram is a header, a body whose length its kind fixes, and a tag, all n
 
     offset  size  field
          0     4  magic, the letters NCSW
-         4     1  version, 1
+         4     1  version, 2
          5     1  kind: 1 sample, 2 command, 3 echo, 4 beacon
          6     2  zero
          8     8  the first 8 bytes of the plant's fingerprint
@@ -12,7 +12,8 @@ Every datagram is a header, a body whose length its kind fixes, and a tag, all n
         24     8  stamp: number of the step since the start of the episode, below 2^62
         32     8  challenge: a random number that a sensor or an actuator drew, and that the controller sends back
         40     .  body: the p values of a sample; the (c+1) m values of a command, step by step, as IEEE 754 doubles;
-                  of an echo the number of missing inputs (8 bytes) and the digest of those applied (16); else nothing
+                  of an echo the number of missing inputs (8 bytes) and the digest of those applied (16); of a beacon
+                  whether the samples of the c+1 steps after it are requested, one byte each, 1 or 0
          .    16  tag: the first 16 bytes of HMAC-SHA256 of all that comes before
 
 Nothing is unpickled, nothing in a datagram says how much memory to take, and what is not exactly this is refused.
@@ -30,7 +31,7 @@ import numpy as np
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.validation import as_count, shown
 
-MAGIC, VERSION = b"NCSW", 1
+MAGIC, VERSION = b"NCSW", 2
 # Where one datagram has to fit into one frame of a usual network.
 LARGEST_BODY, SHORTEST_KEY, TAG_SIZE = 1400, 16, 16
 LARGEST_STAMP = 2**62
@@ -74,6 +75,8 @@ class Message:
         values: Of a sample shape (p,), of a command (c+1, m), else empty.
         missing: Of an echo, how many inputs were missing.
         digest: Of an echo, the digest of the inputs applied.
+        requests: Of a beacon, whether the samples of the c+1 steps after it are requested; all are where samples are
+            not on request.
     """
 
     kind: Kind
@@ -83,6 +86,7 @@ class Message:
     values: np.ndarray | None = None
     missing: int = 0
     digest: bytes = b""
+    requests: tuple[bool, ...] = ()
 
 
 class Wire:
@@ -103,7 +107,9 @@ class Wire:
         self._key, self._fingerprint = key, bytes.fromhex(plant.fingerprint)[:8]
         shapes = {Kind.SAMPLE: (plant.p,), Kind.COMMAND: (as_count(input_delay, "input_delay", low=0) + 1, plant.m)}
         self._shapes = shapes | {Kind.ECHO: (0,), Kind.BEACON: (0,)}
-        sizes = {kind: 8 * int(np.prod(shape)) for kind, shape in self._shapes.items()} | {Kind.ECHO: _ECHO.size}
+        self._ahead = self._shapes[Kind.COMMAND][0]
+        sizes = {kind: 8 * int(np.prod(shape)) for kind, shape in self._shapes.items()}
+        sizes |= {Kind.ECHO: _ECHO.size, Kind.BEACON: self._ahead}
         if max(sizes.values()) > LARGEST_BODY:
             raise ValueError(f"samples and commands of this plant take more than {LARGEST_BODY} bytes: {shapes}")
         self._lengths = {kind: _HEADER.size + size + TAG_SIZE for kind, size in sizes.items()}
@@ -118,7 +124,11 @@ class Wire:
         body = b""
         if kind is Kind.ECHO:
             body = _ECHO.pack(message.missing, message.digest)
-        elif kind is not Kind.BEACON:
+        elif kind is Kind.BEACON:
+            if len(message.requests) != self._ahead:
+                raise ValueError(f"a beacon has {self._ahead} requests, got {shown(message.requests)}")
+            body = bytes(message.requests)
+        else:
             values = np.asarray(message.values, dtype="<f8")
             if values.shape != self._shapes[kind]:
                 raise ValueError(f"values must have shape {self._shapes[kind]}, got {shown(message.values)}")
@@ -145,18 +155,21 @@ class Wire:
             raise WireError("tag")
         if fingerprint != self._fingerprint:
             raise WireError("plant")
-        body, missing, digest = data[_HEADER.size : -TAG_SIZE], 0, b""
+        body, missing, digest, requests = data[_HEADER.size : -TAG_SIZE], 0, b"", b""
         if kind is Kind.ECHO:
             (missing, digest), body = _ECHO.unpack(body), b""
+        elif kind is Kind.BEACON:
+            requests, body = body, b""
         values = np.frombuffer(body, "<f8").astype(np.float64).reshape(self._shapes[kind])
         if (
             stamp >= LARGEST_STAMP
             or missing >= LARGEST_STAMP
             or (kind is Kind.COMMAND and not np.isfinite(values).all())
+            or any(each > 1 for each in requests)
         ):
             raise WireError("value")
         fields = {"challenge": challenge, "values": values, "missing": missing, "digest": digest}
-        return Message(kind=kind, episode=episode, stamp=stamp, **fields)
+        return Message(kind=kind, episode=episode, stamp=stamp, requests=tuple(map(bool, requests)), **fields)
 
     def _tag(self, data: bytes) -> bytes:
         return hmac.digest(self._key, data, "sha256")[:TAG_SIZE]

@@ -94,7 +94,7 @@ class _PlantNode:
 
 
 class SensorNode(_PlantNode):
-    """Samples the plant at every step and sends what it measures.
+    """Samples the plant at every step and sends what it measures; where samples are on request, those requested.
 
     Args:
         wire: Encodes and decodes.
@@ -103,13 +103,29 @@ class SensorNode(_PlantNode):
     """
 
     _hears = (Kind.BEACON,)
+    _requests: dict[int, bool]
+
+    def is_requested(self, step: int) -> bool:
+        """Returns whether the sample of a step is to be sent: if the controller has not said that it is not."""
+        return self.episode == NO_EPISODE or self._requests.get(step, True)
 
     def send(self, step: int, measurement: np.ndarray) -> None:
-        """Sends the sample of a step, shape (p,), taken before the input of that step acts.
+        """Sends the sample of a step, shape (p,), taken before the input of that step acts, if it is requested.
 
         Steps before the start of the episode are below 0; samples of theirs say that the sensor is there.
         """
-        self._send(Kind.SAMPLE, step, values=measurement)
+        if self.is_requested(step):
+            self._send(Kind.SAMPLE, step, values=measurement)
+        if self.episode != NO_EPISODE:
+            self._requests = {ahead: each for ahead, each in self._requests.items() if ahead > step}
+
+    def _join(self, message: Message, time: float) -> None:
+        super()._join(message, time)
+        self._requests = {}
+
+    def _use(self, message: Message) -> None:
+        for ahead, requested in enumerate(message.requests, message.stamp - PRELUDE + 1):
+            self._requests.setdefault(ahead, requested)
 
 
 class ActuatorNode(_PlantNode):
@@ -160,9 +176,9 @@ class ControllerNode:
     """Runs a `SafeLoop` behind a downlink at every step, and numbers the steps of all.
 
     It waits until sensor and actuator are there and belong to no episode, draws a number, tells it to both for
-    `PRELUDE` steps, and then starts the loop at step 0. A
-    sensor or an actuator that is restarted joins the episode again: samples that are missing meanwhile are lost, inputs
-    that are missing end the guarantee, because echoes tell. A controller that is restarted begins another episode.
+    `PRELUDE` steps, and then starts the loop at step 0. A sensor or an actuator that is restarted joins the episode
+    again: samples that are missing meanwhile are lost, inputs that are missing end the guarantee, because echoes tell.
+    A controller that is restarted begins another episode. Where samples are on request, beacons say which.
 
     Args:
         loop: With a downlink, and with `echo_age`.
@@ -181,7 +197,7 @@ class ControllerNode:
         decision: The last one.
 
     Raises:
-        ValueError: If the loop has no downlink or no echoes, or its channel takes samples on request.
+        ValueError: If the loop has no downlink or no echoes.
     """
 
     def __init__(
@@ -189,11 +205,12 @@ class ControllerNode:
     ) -> None:
         if loop.input_delay == 0 or loop.echo_age is None:
             raise ValueError("commands that go over a network need SafeLoop(..., downlink=Channel(...), echo_age=...)")
-        if loop.channel.on_request:
-            raise ValueError("datagrams carry no requests for samples yet: leave out on_request of the loop's channel")
         self.loop, self.wire, self.transport, self.clock = loop, wire, transport, clock
         self.refused: Counter[str] = Counter()
         self.decision: Decision
+        # A sensor that is not asked may be silent for as long as the contract lets it.
+        contract = loop.contract if loop.channel.on_request else None
+        self._patience = (PATIENCE + (0 if contract is None else contract.max_age)) * clock.dt
         self.begin(x_hat0, known=known)
 
     def begin(self, x_hat0: Any, *, known: bool) -> None:
@@ -221,8 +238,8 @@ class ControllerNode:
             self.clock.start(now, -PRELUDE)
         step = self.clock.step_at(now + EARLY * self.clock.dt)
         if step < 0:
-            for heard in self._peers:
-                self._answer(heard, Kind.BEACON, step)
+            for heard in self._peers:  # the first c samples are requested by agreement
+                self._answer(heard, Kind.BEACON, step, requests=(True,) * (self.loop.input_delay + 1))
             self.step = step + 1
             return None
         if self.step <= 0 and not self._is_started:
@@ -247,25 +264,26 @@ class ControllerNode:
         self.missing = max([self.missing, *(echo.missing for echo in echoes)])
         return self.loop.receive(packets, echoes=echoes)
 
-    def decide(self, proposed: Any) -> Decision:
-        """Decides at this step, whatever is proposed, and sends command and beacon."""
-        self.decision = self.loop.decide(proposed)
+    def decide(self, proposed: Any, *, ask: bool = False) -> Decision:
+        """Decides at this step, whatever is proposed, and sends command and beacon; see `SafeLoop.decide`."""
+        self.decision = self.loop.decide(proposed, ask=ask)
         command = self.loop.command()
-        self._answer(Kind.ECHO, Kind.COMMAND, self.step, command.inputs)
-        self._answer(Kind.SAMPLE, Kind.BEACON, self.step)
+        self._answer(Kind.ECHO, Kind.COMMAND, self.step, values=command.inputs)
+        requests = command.requests or (True,) * len(command.inputs)
+        self._answer(Kind.SAMPLE, Kind.BEACON, self.step, requests=requests)
         self.step += 1
         return self.decision
 
-    def _answer(self, heard: Kind, kind: Kind, step: int, values: np.ndarray | None = None) -> None:
+    def _answer(self, heard: Kind, kind: Kind, step: int, **fields: Any) -> None:
         peer = self._peers[heard]
-        fields = {"episode": self.episode, "stamp": step + PRELUDE, "challenge": peer.challenge, "values": values}
-        self.transport.send(self.wire.encode(Message(kind=kind, **fields)), peer.address)
+        common = {"kind": kind, "episode": self.episode, "stamp": step + PRELUDE, "challenge": peer.challenge}
+        self.transport.send(self.wire.encode(Message(**common, **fields)), peer.address)
 
     def _hear(self, message: Message, datagram: Datagram) -> None:
         """Takes in a message, and where its sender is."""
         peer, time = self._peers[message.kind], datagram.time
         if message.episode == NO_EPISODE:  # a node that waits, or was restarted
-            if self.episode == NO_EPISODE or time - peer.heard_at > PATIENCE * self.clock.dt:
+            if self.episode == NO_EPISODE or time - peer.heard_at > self._patience:
                 peer.address, peer.challenge = datagram.sender, message.challenge
             return
         if message.episode != self.episode:
@@ -323,6 +341,7 @@ async def run_controller(
     on_step: Callable[[ControllerNode, Any], None] = lambda node, proposed: None,
     is_over: Callable[[], bool] = lambda: False,
     budget: float | None = None,
+    asks: Callable[[SafeLoop], bool] = lambda loop: False,
 ) -> None:
     """Runs a controller in real time.
 
@@ -335,6 +354,8 @@ async def run_controller(
         on_step: Called after each decision with the node and what was proposed, to write a log.
         is_over: Asked after each step.
         budget: How long the controller may take [s]; half a step by default.
+        asks: Says of the loop, after `receive`, whether to ask for a sample, where samples are on request; otherwise
+            those are requested that the contract needs.
     """
     loop, clock = asyncio.get_running_loop(), node.clock
     budget = 0.5 * clock.dt if budget is None else budget
@@ -352,7 +373,7 @@ async def run_controller(
             running = loop.run_in_executor(thread, controller, estimate)
             await asyncio.wait([running], timeout=budget)
             proposed = running.result() if running.done() and running.exception() is None else None
-        node.decide(proposed)
+        node.decide(proposed, ask=asks(node.loop))
         on_step(node, proposed)
     thread.shutdown(wait=False)
 

@@ -27,7 +27,7 @@ MESSAGES = st.one_of(
     st.builds(Message, kind=st.just(Kind.SAMPLE), values=values(2).map(np.array), **FIELDS),
     st.builds(Message, kind=st.just(Kind.COMMAND), values=values(8).map(lambda v: np.reshape(v, (4, 2))), **FIELDS),
     st.builds(Message, kind=st.just(Kind.ECHO), missing=COUNTS, digest=st.binary(min_size=16, max_size=16), **FIELDS),
-    st.builds(Message, kind=st.just(Kind.BEACON), **FIELDS),
+    st.builds(Message, kind=st.just(Kind.BEACON), requests=st.tuples(*[st.booleans()] * 4), **FIELDS),
 )
 
 
@@ -64,7 +64,7 @@ def test_one_bit_more_or_less_or_another_is_refused(message, data):
 @examples(500)
 def test_noise_is_refused(noise):
     assert reason_of(noise) in {"format", "length", "tag"}
-    assert reason_of(MAGIC + b"\1\1\0\0" + noise) in {"length", "tag"}
+    assert reason_of(MAGIC + b"\2\1\0\0" + noise) in {"length", "tag"}
 
 
 def tagged(wire, head):
@@ -74,13 +74,13 @@ def tagged(wire, head):
 def test_what_has_the_key_and_another_plant_version_or_size_is_refused():
     sample = Message(kind=Kind.SAMPLE, episode=1, stamp=2, values=np.zeros(2))
     data = WIRE.encode(sample)
-    other = Wire(cart_pole(), 3, KEY).encode(Message(kind=Kind.BEACON, episode=1, stamp=2))
+    other = Wire(cart_pole(), 3, KEY).encode(Message(kind=Kind.BEACON, episode=1, stamp=2, requests=(True,) * 4))
     assert reason_of(other) == "plant"
     assert reason_of(Wire(PLANT, 3, KEY + b"!").encode(sample)) == "tag"
-    for place, value, reason in [(4, 2, "format"), (5, 0, "format"), (5, 5, "format"), (6, 1, "format")]:
+    for place, value in [(4, 1), (4, 3), (5, 0), (5, 5), (6, 1)]:
         head = bytearray(data[:-TAG_SIZE])
         head[place] = value
-        assert reason_of(tagged(WIRE, bytes(head))) == reason
+        assert reason_of(tagged(WIRE, bytes(head))) == "format"
     command = Wire(PLANT, 4, KEY).encode(Message(kind=Kind.COMMAND, episode=1, stamp=2, values=np.zeros((5, 2))))
     assert reason_of(command) == "length"
     for place, text in (
@@ -93,6 +93,8 @@ def test_what_has_the_key_and_another_plant_version_or_size_is_refused():
         )
         head[place : place + 8] = text
         assert reason_of(tagged(WIRE, bytes(head))) == "value"
+    beacon = WIRE.encode(Message(kind=Kind.BEACON, episode=1, stamp=2, requests=(True,) * 4))
+    assert reason_of(tagged(WIRE, beacon[: -TAG_SIZE - 1] + b"\2")) == "value"
 
 
 def test_layout_is_the_documented_one():
@@ -103,10 +105,14 @@ def test_layout_is_the_documented_one():
     data = WIRE.encode(Message(kind=Kind.SAMPLE, episode=7, stamp=9, challenge=11, values=np.array([1.5, -2.0])))
     head = (
         b"NCSW"
-        + bytes([1, 1, 0, 0])
+        + bytes([2, 1, 0, 0])
         + bytes.fromhex(PLANT.fingerprint)[:8]
         + struct.pack("<QQQdd", 7, 9, 11, 1.5, -2.0)
     )
+    assert data == head + hmac.new(KEY, head, hashlib.sha256).digest()[:16]
+    data = WIRE.encode(Message(kind=Kind.BEACON, episode=7, stamp=9, challenge=11, requests=(True, False, False, True)))
+    head = b"NCSW" + bytes([2, 4, 0, 0]) + bytes.fromhex(PLANT.fingerprint)[:8]
+    head += struct.pack("<QQQ", 7, 9, 11) + bytes([1, 0, 0, 1])
     assert data == head + hmac.new(KEY, head, hashlib.sha256).digest()[:16]
 
 
@@ -119,9 +125,11 @@ def test_key_is_long_enough(key):
 def test_what_does_not_fit_the_plant_or_a_datagram_is_not_encoded():
     with pytest.raises(ValueError, match="shape"):
         WIRE.encode(Message(kind=Kind.SAMPLE, episode=1, stamp=2, values=np.zeros(3)))
+    with pytest.raises(ValueError, match="has 4 requests"):
+        WIRE.encode(Message(kind=Kind.BEACON, episode=1, stamp=2))
     with pytest.raises(ValueError, match="more than 1400 bytes"):
         Wire(PLANT, 100, KEY)
 
 
 def test_nothing_is_unpickled():
-    assert reason_of(pickle.dumps(Message(kind=Kind.BEACON, episode=1, stamp=2))) == "format"
+    assert reason_of(pickle.dumps(Message(kind=Kind.BEACON, episode=1, stamp=2, requests=(True,) * 4))) == "format"

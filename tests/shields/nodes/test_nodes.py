@@ -2,6 +2,7 @@
 
 import heapq
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,13 +28,15 @@ class Air:
     def __init__(self, dt, seed, mischief=0.1):
         self.now, self.dt, self.rng, self.mischief = 0.0, dt, np.random.default_rng(seed), mischief
         self.order, self.queue, self.states, self.recorded = itertools.count(), [], {}, []
-        self.is_cut, self.channel = False, CHANNEL
+        self.is_cut, self.until_worst, self.channel = False, False, CHANNEL
 
     def carry(self, data, sender, receiver):
         rng, line = self.rng, (sender, receiver, data[5])
-        state, steps = transmit(
-            self.channel, rng, self.states.setdefault(line, first_loss_state(CHANNEL, rng)), sends=True
-        )
+        before = self.states.setdefault(line, first_loss_state(CHANNEL, rng)).consecutive
+        state, steps = transmit(self.channel, rng, self.states[line], sends=True)
+        most = self.channel.max_consecutive_losses
+        if self.until_worst and 0 < before < most:  # a run of losses that began is carried to its end
+            state, steps = state._replace(consecutive=before + 1), -1
         self.states[line] = state
         self.recorded.append((data, sender, receiver))
         if self.is_cut:
@@ -76,11 +79,14 @@ class Socket:
 class World:
     """A plant with sensor and actuator by one clock, a controller by another one, and the air between them."""
 
-    def __init__(self, plant=PLANT, certificate=CERTIFICATE, seed=0, offset=1234.0, drift=0.0, **settings):
-        self.plant, self.certificate, self.dt = plant, certificate, plant.dt
+    def __init__(
+        self, plant=PLANT, certificate=CERTIFICATE, seed=0, offset=1234.0, drift=0.0, uplink=CHANNEL, **settings
+    ):
+        self.plant, self.certificate, self.dt, self.uplink = plant, certificate, plant.dt, uplink
         self.air, self.rng = Air(plant.dt, seed, **settings), np.random.default_rng([seed, 1])
         self.offset, self.drift = offset, drift
         self.state, self.history, self.proved, self.missing = np.zeros(plant.n), [], [], []
+        self.sent, self.ages, self.ask = [], [], lambda: False
         self.at_controller = Socket(self.air, lambda time: time)
         self.controller = self.new_controller(np.zeros(plant.n), known=True)
         self.clock = StepClock(self.dt)
@@ -93,7 +99,7 @@ class World:
 
     def new_controller(self, x_hat0, known):
         settings = {"downlink": CHANNEL, "echo_age": 10, "on_unproved": "ignore"}
-        loop = SafeLoop(self.certificate, self.plant, CHANNEL, **settings)
+        loop = SafeLoop(self.certificate, self.plant, self.uplink, **settings)
         wire = Wire(self.plant, loop.input_delay, KEY)
         self.at_controller.inbox = []
         self.next_step = None
@@ -117,6 +123,7 @@ class World:
             self.state, self.is_moving = np.zeros(plant.n), False
         self.is_moving |= self.held != self.clock.episode != 0 and step >= 0
         if self.sensor is not None:
+            self.sent.append(self.sensor.is_requested(step))
             self.sensor.send(step, plant.H @ self.state + plant.sensor_noise.bound.sample_boundary(rng))
         u = np.zeros(plant.m) if self.actuator is None else self.actuator.apply(step)
         if self.is_moving:
@@ -151,7 +158,8 @@ class World:
                     if estimate is not None:
                         reasons.append(node.loop.reason)
                         self.proved.append(node.loop.guaranteed)
-                        node.decide(propose(estimate))
+                        self.ages.append(node.loop.measurement_age)
+                        node.decide(propose(estimate), ask=self.ask())
                 continue
             now = self.local(self.air.now)
             for each in (self.sensor, self.actuator):
@@ -196,6 +204,61 @@ def test_hour_at_50_hz_with_drift_attacks_and_mischief_is_proved_at_every_step()
     assert reasons == {""}
     assert 0.9 < worst <= 1.0  # the attack comes close
     assert (world.actuator.actuator.echo.missing, world.clock.jumps) == (0, 0)
+
+
+def asking(kind, world):
+    """Whether a sample is asked for: hostile ones know the true state, or what is on its way."""
+    alternating = itertools.cycle([True, False])
+    return {
+        "never": lambda: False,
+        "at random": lambda: bool(world.rng.random() < 0.3),
+        "every second": lambda: next(alternating),
+        "while it is safe": lambda: bool(np.abs(world.plant.box_rows @ world.state).max() < 0.5),
+        "while the network loses": lambda: any(state.consecutive for state in world.air.states.values()),
+    }[kind]
+
+
+@pytest.mark.parametrize("kind", ["never", "at random", "every second", "while it is safe", "while the network loses"])
+def test_samples_on_request_are_never_older_than_the_contract_allows_whoever_asks(kind):
+    """There is room for two steps beyond the four of each way."""
+    world = World(
+        certificate=certificate_of(PLANT, ChannelContract(10)), uplink=replace(CHANNEL, on_request=True), seed=3
+    )
+    world.air.until_worst = True
+    world.ask = asking(kind, world)
+    reasons = world.run(900)
+    assert set(reasons) == {""}
+    assert len(reasons) > 800
+    assert world.worst <= 1.0
+    assert max(world.ages) == 6
+    assert world.actuator.actuator.echo.missing == 0
+    assert 0.3 < np.mean(world.sent) < 0.95
+    assert world.controller.episode == world.sensor.episode != 0
+
+
+def test_sensor_that_hears_nothing_sends_every_sample():
+    world = World(certificate=certificate_of(PLANT, ChannelContract(10)), uplink=replace(CHANNEL, on_request=True))
+    world.run(200)
+    del world.sent[:]
+    world.sensor.listen = lambda now: world.at_sensor.received()
+    world.run(50)
+    assert all(world.sent[8:])
+    assert not all(world.sent)
+
+
+def test_message_recorded_from_a_waiting_sensor_does_not_silence_one_that_is_not_asked():
+    """A sensor that may be silent for longer than others are is not taken over meanwhile."""
+    plant = truck_trailer(mass=4000.0)
+    uplink = replace(CHANNEL, on_request=True)
+    world = World(plant, certificate_of(plant, ChannelContract(30)), uplink=uplink, mischief=0.0)
+    world.run(PRELUDE + 60)
+    waiting = [each for each in world.air.recorded if each[1] is world.at_sensor][:3]
+    episode, push = world.controller.episode, lambda estimate: plant.u_max * (1.0 if estimate[0] < 0 else -1.0)
+    for _ in range(200):
+        world.air.arrive(0, waiting[0][0], Socket(world.air, lambda time: time), world.at_controller)
+        assert set(world.run(1, push)) <= {""}
+    assert world.controller.episode == episode == world.sensor.episode
+    assert max(world.ages) > PATIENCE
 
 
 def test_the_same_without_the_shield_leaves_the_box():
