@@ -61,7 +61,10 @@ def case_of(name: str) -> Case:
 
 def ours(case: Case) -> np.ndarray:
     def predecessor(row: np.ndarray) -> np.ndarray:
-        return row @ case.A / (1.0 - RESERVE - np.abs(row) @ case.W)
+        left = 1.0 - RESERVE - np.abs(row) @ case.W
+        if left <= 0.0:
+            raise Infeasible("disturbances alone leave one of its faces", "P", 0.0)
+        return row @ case.A / left
 
     rows = invariant_rows(case.rows, predecessor, case.A.shape[0])
     return np.concatenate([rows, -rows])
