@@ -76,7 +76,7 @@ def run_of_arm(
         ValueError: If the arm or a scenario is unknown.
     """
     arm, hyperparams = Arm.of(arm_name, settings.mode), settings.all_hyperparams
-    if getattr(settings, "tuned_arms", False):
+    if arm.is_trained and getattr(settings, "tuned_arms", False):
         own = dict(tuned_training(loop.env, arm.name))
         hyperparams = with_changes(hyperparams, own.pop("hyperparams", {}))
         if "lagrangian" in own:
