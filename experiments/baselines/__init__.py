@@ -6,7 +6,8 @@ None of them comes with a proof under estimation errors, so none reports `shield
 from experiments.baselines.controllers import CONTROLLERS, REGULATORS, controller
 from experiments.baselines.estimate_filter import FILTERS, EstimateFilter, EstimateFilterSettings
 from experiments.baselines.margins import MARGINS
-from experiments.baselines.regulators import RegulatorWeights, tuned_weights
+from experiments.baselines.regulators import RegulatorWeights
+from experiments.baselines.tuned import tuned_training, tuned_weights
 
 __all__ = [
     "CONTROLLERS",
@@ -17,5 +18,6 @@ __all__ = [
     "EstimateFilterSettings",
     "RegulatorWeights",
     "controller",
+    "tuned_training",
     "tuned_weights",
 ]

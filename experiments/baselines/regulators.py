@@ -5,11 +5,8 @@ All three minimize the same cost, whose weights are tuned for each by itself.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
-from importlib import resources
 from typing import Any
 
 import clarabel
@@ -47,22 +44,6 @@ class RegulatorWeights:
 
 
 DEFAULT_WEIGHTS = RegulatorWeights()
-
-
-def tuned_weights(env_id: str, arm: str) -> RegulatorWeights:
-    """Returns the weights tuned for an arm in an environment (benchmarks/tune_baselines.py); the defaults for others.
-
-    Args:
-        env_id: Id by which the environment is registered.
-        arm: Name of the arm: the regulator's, and that of the filter that it acts behind.
-    """
-    return RegulatorWeights(**_tuned().get(env_id, {}).get(arm, {}))
-
-
-@cache
-def _tuned() -> dict[str, dict[str, dict[str, float]]]:
-    """Returns the file of weights: by environment id and arm."""
-    return json.loads(resources.files("experiments.baselines").joinpath("tuned.json").read_text("utf-8"))
 
 
 @dataclass(frozen=True)

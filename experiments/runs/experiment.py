@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from agents.hyperparams import with_changes
 from agents.loop import LoopConfig
+from experiments.baselines import tuned_training
 from experiments.runs.arms import Arm
 from experiments.runs.loops import module_and_id, other_scenarios
 from experiments.runs.provenance import versions
@@ -72,7 +75,13 @@ def run_of_arm(
     Raises:
         ValueError: If the arm or a scenario is unknown.
     """
-    arm = Arm.of(arm_name, settings.mode)
+    arm, hyperparams = Arm.of(arm_name, settings.mode), settings.all_hyperparams
+    if arm.is_trained and getattr(settings, "tuned_arms", False):
+        own = dict(tuned_training(loop.env, arm.name))
+        hyperparams = with_changes(hyperparams, own.pop("hyperparams", {}))
+        if "lagrangian" in own:
+            own["lagrangian"] = replace(settings.lagrangian, **own["lagrangian"])
+        settings = replace(settings, **own)
     training_loop, loop = arm.loops(loop, certificate, settings)
     origin = f"synthesized for plant {certificate.fingerprint} under {certificate.contract}"
     origin += "" if certificate.polytope is None else " with a polytope"
@@ -90,7 +99,7 @@ def run_of_arm(
         certificate_basis=origin if settings.certificate is None else "",
         scenarios=other_scenarios(getattr(settings, "scenarios", ())),
         algorithm=settings.algo,
-        settings=settings.all_hyperparams,
+        settings=hyperparams,
         grid_point=grid_point,
     )
 

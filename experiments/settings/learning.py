@@ -201,6 +201,8 @@ class CompareSettings(LearningSettings):
             loss, later packets, within the contract), ideal-channel, attacked (the worst disturbance, noise of full
             size, bursts of losses as long as the contract allows), attacked-on-an-ideal-channel, gaussian (noise
             without a bound).
+        tuned_arms: Whether arms that were tuned by themselves (benchmarks/tune_arms.py) are trained with what was
+            found: hyperparameters of PPO, the price of a violation, settings of PPO-Lagrangian.
         noise: "gaussian" draws noise that the certificate's bounds do not hold for always, and prints next to the
             episodes that left the safe set the bound on their probability.
     """
@@ -217,6 +219,7 @@ class CompareSettings(LearningSettings):
         "proportional+shielded",
     )
     scenarios: tuple[str, ...] = ("as trained",)
+    tuned_arms: bool = False
     noise: Literal["truncated", "gaussian"] = "truncated"
 
 
@@ -278,7 +281,7 @@ class EvaluateSettings:
 NETWORK_ENVS = ("ncs_gym/CSTR-v0", "ncs_gym/Convoy-v0", "ncs_gym/LaneKeeping-v0")
 # What the shield is compared with and needs no training, margins in percent: a regulator alone, with a governor of its
 # references, or behind a filter, and model predictive control. The weights of each are tuned by themselves
-# (benchmarks/tune_baselines.py).
+# (benchmarks/tune_arms.py).
 _MARGINS = ("", *(f":{margin}" for margin in MARGINS))
 REGULATED_ARMS = (
     "lqr",
@@ -289,6 +292,10 @@ REGULATED_ARMS = (
     "lqr+shielded",
     "lqr+lookahead",
 )
+
+
+# Agents, each trained with what was tuned for it by itself.
+TRAINED_ARMS = ("unshielded", "penalized", "lagrangian", "trusting:20", "shielded", "lookahead")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -351,8 +358,7 @@ class StudySettings(BackendSettings):
         arms: Trained arms; see `ncs compare`.
         baselines: Arms in which nothing is trained.
         scenarios: What policies are evaluated under besides "as trained".
-        safe_set: What shields keep: the ellipsoid, which the filters beside them have too, or the polytope that other
-            commands take.
+        safe_set: What shields keep, and the filters beside them end in: the polytope, or the ellipsoid inside it.
         channel_episodes: Episodes per arm and combination of impairments; 0 leaves them out.
         page: Also write the page of Markdown to this file, its figures into the folder images beside it, all tables
             and their numbers into the files with the endings .txt and .json.
@@ -370,10 +376,10 @@ class StudySettings(BackendSettings):
     budget: float = 1.0
     episodes: int = 100
     algo: Algorithm = "PPO"
-    arms: tuple[str, ...] = ("unshielded", "penalized:10", "lagrangian", "trusting:20", "shielded", "lookahead")
+    arms: tuple[str, ...] = TRAINED_ARMS
     baselines: tuple[str, ...] = REGULATED_ARMS
     scenarios: tuple[str, ...] = ("ideal-channel", "worse-channel", "attacked", "attacked-on-an-ideal-channel")
-    safe_set: Literal["polytope", "ellipsoid"] = "ellipsoid"
+    safe_set: Literal["polytope", "ellipsoid"] = "polytope"
     channel_episodes: int = 100
     page: Path | None = None
     quote: tuple[Path, ...] = ()

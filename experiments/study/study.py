@@ -84,6 +84,7 @@ def _comparison_settings(settings: StudySettings, env_id: str) -> CompareSetting
         baselines=settings.baselines,
         scenarios=settings.scenarios,
         safe_set=settings.safe_set,
+        tuned_arms=True,
         force=settings.force,
         **backend,
     )

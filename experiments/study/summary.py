@@ -37,12 +37,13 @@ class Comparison(NamedTuple):
 PRIMARY = Comparison("unshielded", SOUND, ATTACKED)
 SECONDARY = (
     Comparison("trusting:20", SOUND, ATTACKED),
-    Comparison("penalized:10", SOUND, ATTACKED),
+    Comparison("penalized", SOUND, ATTACKED),
     Comparison("lqr+psf:20", f"lqr+{SOUND}", ATTACKED),
 )
 # Families of arms that differ by the margin alone, with the arm that has the proof in their place.
 FAMILIES = {
     "governor": f"lqr+{SOUND}",
+    "mpc": f"lqr+{SOUND}",
     "lqr+psf": f"lqr+{SOUND}",
     "lqr+trusting": "lqr+shielded",
     "lqr+trusting:lookahead": f"lqr+{SOUND}",

@@ -13,7 +13,7 @@ from experiments.baselines.certainty_equivalent import CertaintyEquivalentFilter
 from experiments.baselines.predictive import PredictiveFilter
 from ncs_gym import Channel
 from ncs_gym.envs.env import ncs_env
-from shields import SafetyFilter
+from shields import SafetyFilter, synthesize
 from tests.certificates import certificate_of
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -154,8 +154,12 @@ def test_trusting_filter_still_keeps_the_disturbance_out_if_the_estimate_is_true
     assert levels.max() > 0.99
 
 
-def test_predictive_filter_finds_the_closest_input_with_a_nominal_plan(certificate, loaded):
+@pytest.mark.parametrize("safe_set", ["ellipsoid", "polytope"])
+def test_predictive_filter_finds_the_closest_input_with_a_nominal_plan(safe_set, certificate, loaded):
     """Two steps, by trying inputs on a grid."""
+    if safe_set == "polytope":
+        certificate = synthesize(loaded, contract=certificate.contract)
+        assert certificate.polytope is not None
     predictive, grid = PredictiveFilter(certificate, loaded, horizon=2), np.linspace(-1.0, 1.0, 401) * loaded.u_max
     rng, found = np.random.default_rng(3), 0
     first, second = (each.ravel()[:, None] for each in np.meshgrid(grid, grid, indexing="ij"))
@@ -165,7 +169,7 @@ def test_predictive_filter_finds_the_closest_input_with_a_nominal_plan(certifica
         one = loaded.A @ estimate + first @ loaded.B.T
         two = one @ loaded.A.T + second @ loaded.B.T
         fine = (np.abs(one @ loaded.box_rows.T) <= 1.0).all(axis=1)
-        fine &= np.einsum("ei,ij,ej->e", two, certificate.M, two) <= 1.0
+        fine &= certificate.safe_set.gauge(two) <= 1.0
         if fine.any():
             best = np.abs(first[fine] - proposed).min()
             chosen = predictive(estimate[None], proposed[None], ~NEVER)[0]

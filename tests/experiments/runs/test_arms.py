@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 
+from agents.hyperparams import DEFAULTS, with_changes
 from agents.loop import CostPenalty, LagrangianSettings, LoopConfig, ResidualActions
-from experiments.baselines import EstimateFilter
+from experiments.baselines import EstimateFilter, tuned_training
 from experiments.runs.arms import Arm
 from experiments.runs.experiment import certificate_of, run_of_arm
 from experiments.runs.loops import loop_config
 from experiments.settings import CompareSettings
+from experiments.settings.learning import NETWORK_ENVS, TRAINED_ARMS
 from shields import VectorSafetyShield
 
 
@@ -54,6 +56,24 @@ def test_name_says_which_filter_and_which_policy(name, mode, policy):
     assert (arm.name, arm.mode, arm.policy) == (name, mode, policy)
     assert arm.is_shielded == (mode is not None and mode.partition(":")[0] not in ("trusting", "psf"))
     assert Arm.of(name.replace(" ", "-"), "boundary") == arm
+
+
+@pytest.mark.parametrize("env_id", NETWORK_ENVS)
+@pytest.mark.parametrize("arm", TRAINED_ARMS)
+def test_arm_of_the_study_is_trained_with_what_was_tuned_for_it(env_id, arm):
+    loop = LoopConfig(env=env_id)
+    certificate = certificate_of(loop)
+    own = tuned_training(env_id, arm)
+    assert own
+    common, tuned = (
+        run_of_arm(CompareSettings(env=env_id, tuned_arms=tuned), loop, certificate, arm, 0) for tuned in (False, True)
+    )
+    assert common.settings == DEFAULTS["PPO"]
+    assert tuned.settings == with_changes(DEFAULTS["PPO"], own["hyperparams"])
+    if arm == "penalized":
+        assert tuned.training_loop.violation_penalty == own["violation_penalty"]
+    if arm == "lagrangian":
+        assert tuned.training_loop.lagrangian == LagrangianSettings(**own.get("lagrangian", {}))
 
 
 @pytest.mark.parametrize(
