@@ -16,7 +16,15 @@ from shields.verification import Condition, Report, verify
 
 if TYPE_CHECKING:
     from shields.nodes import ActuatorNode, ControllerNode, SensorNode
-    from shields.synthesis import Network, Requirement, Requirements, certify, requirements, synthesize
+    from shields.synthesis import (
+        Network,
+        Requirement,
+        Requirements,
+        certify,
+        linear_feedback_tolerance,
+        requirements,
+        synthesize,
+    )
 
 __distribution__ = "ncs-gym"
 
@@ -44,6 +52,7 @@ __all__ = [
     "Updates",
     "VectorSafetyShield",
     "certify",
+    "linear_feedback_tolerance",
     "requirements",
     "synthesize",
     "verify",
@@ -52,7 +61,10 @@ __all__ = [
 
 # Imported at first use: these need the solver, or asyncio.
 _NAMES = {
-    "synthesis": ("Network", "Requirement", "Requirements", "certify", "requirements", "synthesize"),
+    "synthesis": (
+        *("Network", "Requirement", "Requirements"),
+        *("certify", "linear_feedback_tolerance", "requirements", "synthesize"),
+    ),
     "nodes": ("ActuatorNode", "ControllerNode", "SensorNode"),
 }
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}

@@ -23,7 +23,8 @@ from experiments.runs.output_folder import claim_folder, prepare_output, write_r
 from experiments.runs.provenance import versions
 from experiments.settings import RequirementsSettings
 from experiments.terminal import text_table, wrapped
-from ncs_gym import LinearPlant
+from ncs_gym import ChannelContract, LinearPlant
+from ncs_gym.network.requests import spare_samples
 from shields import Certificate, Network, Requirement, Requirements
 from shields.atomic_write import write_atomically
 from shields.json_documents import digest
@@ -43,6 +44,12 @@ _AXES = {
     "quantization_steps": ("quantization_step", "quantization step"),
     "disturbances": ("disturbance", "size of disturbances"),
     "noises": ("noise", "size of noise"),
+}
+# What the numbers of a table are.
+_QUANTITIES = {
+    "share": "share of the box [%]",
+    "tolerance": "factor on all radii",
+    "yardstick": "factor that a linear controller bears for 15 steps",
 }
 # Progress is counted in these parts of an age that is searched: workers report a thousand at a time.
 _PARTS = 1000
@@ -66,13 +73,17 @@ def requirements(settings: RequirementsSettings) -> None:
         prepare_output(settings.out)
         store = _Store(settings.out)
         found = shields.requirements(
-            plant, **asked, tolerance=settings.tolerance, execute=lambda searches: _answers(searches, settings, store)
+            plant,
+            **asked,
+            tolerance=settings.tolerance,
+            yardstick=settings.yardstick,
+            execute=lambda searches: _answers(searches, settings, store),
         )
-        tables = [_Table.of(found, asked, "share of the box [%]")]
-        if settings.tolerance:
-            tables.append(_Table.of(found, asked, "factor on all radii"))
+        wanted = {"share": True, "tolerance": settings.tolerance, "yardstick": settings.yardstick}
+        names = [name for name, is_wanted in wanted.items() if is_wanted]
+        tables = [_Table.of(found, asked, name) for name in names]
         figures = {}
-        for name, table in zip(("share", "tolerance"), tables, strict=False):
+        for name, table in zip(names, tables, strict=True):
             figure = table.figure(today)
             figures[name] = (figure.caption, figure.png)
         for point in found.points:
@@ -90,7 +101,7 @@ def requirements(settings: RequirementsSettings) -> None:
         write_results(settings.out, summary, figures=figures)
     for table in tables:
         print(table.text, end="\n\n")
-    sentences = [*map(_boundary_text, found.largest_ages), _today_text(found, today)]
+    sentences = [*map(_boundary_text, found.largest_ages), _today_text(found, today), _requests_text(found, settings)]
     sentences += [_cheapest_text(found, settings.keep, None), _cheapest_text(found, settings.keep, today)]
     for sentence in dict.fromkeys(sentences):
         if sentence:
@@ -214,7 +225,7 @@ class _SearchRun:
     """A search as a `Run`, whose steps are thousandths of an age."""
 
     search: Search
-    parts: tuple[str, ...] = ("certificates, in thousandths",)
+    parts: tuple[str, ...] = ("search",)
     result_type: type = dict
     leaves: tuple[str, ...] = ()
 
@@ -245,7 +256,7 @@ class _Table:
     """A quantity of every network: a block per combination of what rows and columns do not show.
 
     Attributes:
-        quantity: What the numbers are.
+        quantity: What the numbers are, of `_QUANTITIES`.
         rows: Name and values of the rows.
         columns: Name and values of the columns.
         blocks: Numbers by title, shape (rows, columns); NaN where no certificate was found.
@@ -291,7 +302,7 @@ class _Table:
                 [_shown(value), *("-" if np.isnan(number) else f"{number:.3g}" for number in line)]
                 for value, line in zip(self.rows[1], block, strict=True)
             ]
-            parts.append(f"{self.quantity}{', ' if title else ''}{title}\n{text_table([header, *cells])}")
+            parts.append(f"{_QUANTITIES[self.quantity]}{', ' if title else ''}{title}\n{text_table([header, *cells])}")
         return "\n\n".join(parts)
 
     def figure(self, today: Network | None) -> Any:
@@ -304,13 +315,15 @@ class _Table:
             if at[0] in self.rows[1] and at[1] in self.columns[1]:
                 marked = title, list(self.rows[1]).index(at[0]), list(self.columns[1]).index(at[1])
         panels = dict(list(self.blocks.items())[:_MOST_PANELS])
-        return requirements_map(panels, self.rows, self.columns, marked, self.quantity)
+        return requirements_map(panels, self.rows, self.columns, marked, _QUANTITIES[self.quantity])
 
 
 def _number(point: Requirement, quantity: str) -> float:
+    if quantity == "yardstick":
+        return point.yardstick or float("nan")
     if point.certificate is None:
         return float("nan")
-    return 100.0 * point.share if quantity.startswith("share") else point.tolerance or float("nan")
+    return 100.0 * point.share if quantity == "share" else point.tolerance or float("nan")
 
 
 def _index_of(found: Requirements, network: Network) -> int | None:
@@ -343,6 +356,24 @@ def _shown_age(age: float) -> str:
 def _today_text(found: Requirements, today: Network | None) -> str:
     index = None if today is None else _index_of(found, today)
     return "" if index is None else f"Today: {_description(found.points[index])}."
+
+
+def _requests_text(found: Requirements, settings: RequirementsSettings) -> str:
+    """Returns how many samples may be left out where they are on request; empty for other channels."""
+    env = None if settings.plant is not None else registered_env(settings.env or _DEFAULT_ENV)
+    if env is None or not env.channel.on_request or env.contract is None:
+        return ""
+    spare = spare_samples(env.channel, env.contract)
+    text = (
+        f"Samples are on request: of those newer than the newest that arrived, {spare} may be left out under the "
+        f"contract of {_steps(env.contract.max_age)}"
+    )
+    delay = 0 if env.downlink_protocol is None else env.downlink_protocol.input_delay
+    largest = [each.certified for each in found.largest_ages if each.certified not in (None, inf)]
+    if len(largest) == 1 and (oldest := int(largest[0]) - delay) >= env.contract.max_age:
+        longest = spare_samples(env.channel, ChannelContract(oldest, env.contract.quantization_step))
+        text += f", and {longest} under one of {_steps(oldest)}"
+    return f"{text}. Today's line above is that of asking for every sample."
 
 
 def _cheapest_text(found: Requirements, keep: float, bearing: Network | None) -> str:

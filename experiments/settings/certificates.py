@@ -238,6 +238,8 @@ class RequirementsSettings(BackendSettings):
         disturbances: Factors on the radii of the disturbances.
         noises: Factors on the radii of sensor noise and first errors.
         tolerance: Also seek the factor by which all radii may grow in each network.
+        yardstick: Also compute what a linear controller with gains of its own for every step bears over 15 steps: how
+            far from it the tolerances are. It takes seconds for every age, and proves nothing.
         keep: Percentage of the largest share that the cheapest network is to keep.
         force: Replace finished results of other settings in the output folder, which otherwise is refused.
         seed: Accepted by every command; the search is deterministic and does not use it.
@@ -256,6 +258,7 @@ class RequirementsSettings(BackendSettings):
     disturbances: tuple[float, ...] = (1.0,)
     noises: tuple[float, ...] = (1.0,)
     tolerance: bool = False
+    yardstick: bool = False
     keep: float = 90.0
     force: bool = False
     seed: int = 0

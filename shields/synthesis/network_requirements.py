@@ -21,6 +21,7 @@ from ncs_gym.validation import as_count, as_number
 from shields.certificate import Certificate
 from shields.synthesis.certification import carried_over, nearby_certificate
 from shields.synthesis.design_problem import design_problem
+from shields.synthesis.linear_feedback import linear_feedback_tolerance
 from shields.synthesis.max_margin_gain import max_margin_gain
 
 # Ages that one search goes through, each from the certificate of the last; other processes have the others.
@@ -120,6 +121,8 @@ class Requirement:
             harder one.
         tolerance: Factor on all radii for which a certificate verified, too; None if it was not sought.
         bits_per_second: Bits of measurements in a second, without headers; 64 per number that is not quantized.
+        yardstick: Factor on all radii that a linear controller bears over a finite horizon, which proves nothing
+            (`linear_feedback_tolerance`); None if it was not sought.
     """
 
     network: Network
@@ -127,6 +130,7 @@ class Requirement:
     searched: bool
     tolerance: float | None
     bits_per_second: float
+    yardstick: float | None = None
 
     @property
     def share(self) -> float:
@@ -217,6 +221,7 @@ class Requirements:
                     "searched": point.searched,
                     "share": point.share,
                     "tolerance": point.tolerance,
+                    "yardstick": point.yardstick,
                     "packets_per_second": point.network.packets_per_second,
                     "bits_per_second": point.bits_per_second,
                     "certificate_sha256": point.certificate and point.certificate.checksum,
@@ -347,6 +352,7 @@ def requirements(
     disturbances: Sequence[float] = (1.0,),
     noises: Sequence[float] = (1.0,),
     tolerance: bool = False,
+    yardstick: bool = False,
     execute: Executor | None = None,
 ) -> Requirements:
     """Returns which networks leave a plant certifiable, for all combinations of what is given.
@@ -368,6 +374,8 @@ def requirements(
         disturbances: Factors on the radii of the plant's disturbances.
         noises: Factors on the radii of sensor noise and first errors.
         tolerance: Whether to seek, for every network, the factor by which all radii may grow.
+        yardstick: Whether to compute, beside it, what a linear controller bears over a finite horizon
+            (`linear_feedback_tolerance`): some seconds for every age with four states.
         execute: Executes the searches, for instance in parallel; here, one after the other, by default.
 
     Raises:
@@ -403,14 +411,22 @@ def requirements(
     _answer(beyond, execute)
     _never_less(groups)
     ranges = {key: _output_ranges(group.plant) for key, group in groups.items()}
-    points = []
+    points, borne = [], dict[tuple[_Group, float], float]()
     for network in networks:
         key = _group_of(network)
+        if yardstick and (key, network.age) not in borne:
+            contract = _contract(network.age, network.quantization_step)
+            borne[key, network.age] = linear_feedback_tolerance(groups[key].plant, contract)
         certificate, searched, factor = groups[key].answers[network.age]
         bits = network.packets_per_second * _bits_of_sample(ranges[key], network.quantization_step)
         points.append(
             Requirement(
-                network=network, certificate=certificate, searched=searched, tolerance=factor, bits_per_second=bits
+                network=network,
+                certificate=certificate,
+                searched=searched,
+                tolerance=factor,
+                bits_per_second=bits,
+                yardstick=borne.get((key, network.age)),
             )
         )
     return Requirements(points=tuple(points), largest_ages=tuple(group.largest() for group in groups.values()))
