@@ -23,8 +23,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents import SB3VecEnv
 from agents.evaluation import Policy
+from experiments.baselines import tuned_weights
 from experiments.baselines.controllers import controller
-from experiments.baselines.regulators import tuned_weights
 from experiments.baselines.requests import (
     Asking,
     RequestsOnly,
