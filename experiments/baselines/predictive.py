@@ -164,7 +164,7 @@ def _tube(
         supports = np.sqrt(np.maximum([np.einsum("ij,jk,ik->i", rows, each, rows) for each in moved], 0.0))
         return supports.max(axis=0), np.max([end_sizes(each) for each in moved], axis=0)
 
-    power, summed, summed_end, reach = np.eye(plant.n), np.zeros(len(rows)), 0.0, []
+    power, summed, summed_end, reach = np.eye(plant.n), np.zeros(len(rows)), np.zeros(()), []
     for _ in range(horizon):
         for shapes in (pushes, [plant.disturbance.shape_matrix]):
             support, at_end = sizes(shapes, power)

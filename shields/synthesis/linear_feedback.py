@@ -77,9 +77,10 @@ def linear_feedback_tolerance(plant: LinearPlant, contract: ChannelContract | No
             problem.solve(solver=cp.CLARABEL)
     except cp.SolverError as error:
         raise Infeasible(f"no linear controller was found: {error}", "yardstick", 0.0) from error
-    if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) or not largest.value > 0.0:
+    found = float("nan") if largest.value is None else float(largest.value)
+    if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) or not found > 0.0:
         raise Infeasible(f"no linear controller was found: the solver says {problem.status}", "yardstick", 0.0)
-    return float(1.0 / largest.value)
+    return 1.0 / found
 
 
 def _root(shape: np.ndarray) -> np.ndarray:
