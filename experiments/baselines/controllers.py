@@ -53,6 +53,31 @@ def _certified_gain(env: NCSEnv, K: np.ndarray, seed: int) -> Inputs:
     return lambda observations, estimates: estimates @ K.T
 
 
+def _greedy(env: NCSEnv, K: np.ndarray, seed: int) -> Inputs:
+    """Returns inputs that come closest to the task's goal in one step, and ignore the safe box.
+
+    For `SpeedTracking` they remove the error of the speed, for `SetpointTracking` that of the output, with as little
+    input as possible or with the largest input; for other tasks they are the least-squares solution of C x+ = 0.
+    """
+    plant, task, first = env.plant, env.task, env.plant.n
+    moved = np.zeros(first)
+    if isinstance(task, SpeedTracking):
+        effect = plant.dt * np.eye(plant.m)[task.input_index]
+    elif isinstance(task, SetpointTracking):
+        effect, moved = task.output @ plant.B, task.output @ plant.A
+    else:
+        gain = np.linalg.lstsq(plant.box_rows @ plant.B, -plant.box_rows @ plant.A)[0]
+        return lambda observations, estimates: estimates @ gain.T
+    largest = float(np.abs(effect) @ plant.u_max)
+
+    def inputs(observations: np.ndarray, estimates: np.ndarray) -> np.ndarray:
+        missing = observations[:, first].astype(np.float64) - estimates @ moved
+        fractions = np.minimum(1.0, np.abs(missing) / largest) if largest > 0.0 else np.zeros(len(missing))
+        return fractions[:, None] * np.sign(missing[:, None] * effect) * plant.u_max
+
+    return inputs
+
+
 def _proportional(env: NCSEnv, K: np.ndarray, seed: int) -> Inputs:
     """Returns inputs in proportion to the error of the task.
 
@@ -89,6 +114,7 @@ CONTROLLERS: dict[str, Callable[[NCSEnv, np.ndarray, int], Inputs]] = {
     "zero input": _zero,
     "K x_hat": _certified_gain,
     "random": _random,
+    "greedy": _greedy,
     "proportional": _proportional,
 }
 """The policies by name, made from an environment, the certified gain and a seed."""

@@ -8,9 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from agents.agent_file import AgentError, pretrained_folder
-from ncs_gym import NCSEnv, SetpointTracking, SpeedTracking
+from experiments.baselines import REGULATORS, controller, tuned_weights
+from ncs_gym import NCSEnv
 
-UNTRAINED_POLICIES = ("greedy", "zero", "random")
+# Controllers that need neither training nor a certificate, and the short name of one.
+UNTRAINED_POLICIES = ("greedy", "zero", "random", *REGULATORS)
+_SHORT = {"zero": "zero input"}
 # Stands for the agent of the environment that comes with the package.
 PRETRAINED = "pretrained"
 # Agents that a message names.
@@ -24,7 +27,7 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
     """Returns a policy for an environment.
 
     Args:
-        name: "greedy", "zero", "random", "pretrained" for the agent that comes with the package, the folder of a
+        name: One of `UNTRAINED_POLICIES`, "pretrained" for the agent that comes with the package, the folder of a
             trained agent or of the run that left it, or a zip of stable-baselines3.
         env_id: Id of the environment.
         env: The environment.
@@ -34,14 +37,10 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
         AgentError: If there is no agent for this environment.
         ValueError: If the folder of a run holds several agents.
     """
-    size = env.plant.m
-    if name == "zero":
-        return lambda observation, info: np.zeros(size, np.float32)
-    if name == "random":
-        rng = np.random.default_rng(seed)
-        return lambda observation, info: rng.uniform(-1.0, 1.0, size).astype(np.float32)
-    if name == "greedy":
-        return lambda observation, info: _greedy_action(env, observation, info["estimate"])
+    if name in UNTRAINED_POLICIES:
+        no_gain = np.zeros((env.plant.m, env.plant.n))
+        act = controller(_SHORT.get(name, name), env, no_gain, seed, tuned_weights(env_id, name))
+        return lambda observation, info: act(observation[None], {"estimate": info["estimate"][None]})[0].astype("f4")
     from agents.agent import (
         Agent,  # imports torch
         is_sb3_zip,
@@ -77,29 +76,3 @@ def certificate_file(agent: Path) -> Path | None:
     agent = agent.resolve()
     folders = [agent, agent.parent.parent] if agent.parent.name == "models" else [agent]
     return next((file for folder in folders if (file := folder / "certificate.json").is_file()), None)
-
-
-def _greedy_action(env: NCSEnv, observation: np.ndarray, estimate: np.ndarray) -> np.ndarray:
-    """Returns the action, shape (m,), that comes closest to the task's goal in one step and ignores the safe box.
-
-    For `SpeedTracking` it removes the tracking error of the speed, for `SetpointTracking` that of the output, with as
-    little input as possible or with the largest input. For other tasks it is the clipped least-squares solution of
-    C x+ = 0.
-
-    Args:
-        env: Environment with the plant and the task.
-        observation: Observation, whose entry after the estimate belongs to the task.
-        estimate: Estimate x_hat, shape (n,).
-    """
-    plant, task = env.plant, env.task
-    if isinstance(task, SpeedTracking):
-        effect, missing = np.zeros(plant.m), float(observation[plant.n])
-        effect[task.input_index] = plant.dt
-    elif isinstance(task, SetpointTracking):
-        effect, missing = task.output @ plant.B, float(observation[plant.n] - task.output @ plant.A @ estimate)
-    else:
-        u = np.linalg.lstsq(plant.box_rows @ plant.B, -plant.box_rows @ plant.A @ estimate)[0]
-        return np.clip(u / plant.u_max, -1.0, 1.0).astype(np.float32)
-    largest = float(np.abs(effect) @ plant.u_max)
-    fraction = min(1.0, abs(missing) / largest) if largest > 0.0 else 0.0
-    return (fraction * np.sign(missing * effect)).astype(np.float32)

@@ -310,8 +310,8 @@ class RenderSettings:
         out: File to write: .gif, .mp4, or .png for the last frame alone.
         log: Folder of the logs of `ncs loop`: draws the last steps of its newest episode, of the plant that `--env`
             names, into a .png.
-        policy: "greedy" (toward the task's goal as hard as it can), "zero", "random", "pretrained" (the small agent
-            that comes with the package), or the folder of a trained agent.
+        policy: "greedy" (toward the task's goal as hard as it can), "zero", "random", a regulator ("lqr", "governor",
+            "mpc"), "pretrained" (the small agent that comes with the package), or the folder of a trained agent.
         shield: Mode of the shield; "none" for no shield.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
         side_by_side: Draw the same episode without a shield at the left, with it at the right.

@@ -18,8 +18,8 @@ class LoopSettings:
         channel: Changes of what the network does to samples and echoes, by the names that `ncs compare` lists, such as
             loss=0.3 burst_length=2 max_consecutive_losses=3; by default the environment's channel.
         downlink: Changes of what it does to commands; by default the environment's downlink, or else like its channel.
-        policy: "push" (the largest input one way, then the other), "greedy", "zero", "random", or the folder of a
-            trained agent.
+        policy: "push" (the largest input one way, then the other), "greedy", "zero", "random", a regulator ("lqr",
+            "governor", "mpc"), or the folder of a trained agent.
         shield: Mode of the shield.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
         certificate: Certificate file to use instead of synthesizing one; both machines need the same.

@@ -10,7 +10,7 @@ from PIL import Image
 from agents.loop import LoopConfig
 from agents.training import untrained
 from experiments.commands.render import render
-from experiments.runs.policies import _greedy_action, policy_by_name
+from experiments.runs.policies import policy_by_name
 from experiments.settings import RenderSettings
 from ncs_gym import truck_trailer
 from ncs_gym.rendering import theme
@@ -121,10 +121,10 @@ def violations_of_greedy(env_id, certificate=None, shielded=False):
     inner = env.unwrapped
     if shielded:
         env = SafetyShield(env, certificate)
-    observation, info = env.reset(seed=0)
+    policy, (observation, info) = policy_by_name("greedy", env_id, inner, 0), env.reset(seed=0)
     for _ in range(60):
-        action = _greedy_action(inner, observation, info["estimate"])
-        np.testing.assert_array_equal(action, _greedy_action(inner, observation, info["estimate"]))
+        action = policy(observation, info)
+        np.testing.assert_array_equal(action, policy(observation, info))
         observation, _, terminated, _, info = env.step(action)
         if terminated:
             break
@@ -144,25 +144,40 @@ def test_greedy_policy_violates_unless_shielded_on_unstable_plants(env_id):
 
 
 def test_greedy_policy_uses_no_more_input_than_it_takes():
-    env = gym.make(CRUISE).unwrapped
+    policy = policy_by_name("greedy", CRUISE, gym.make(CRUISE).unwrapped, 0)
     for error, action in ((10.0, 1.0), (-10.0, -1.0), (1.0, 0.5), (-0.5, -0.25), (0.0, 0.0)):
-        assert _greedy_action(env, np.array([0.0, 0.0, error]), np.zeros(2)) == pytest.approx([action])
+        assert policy(np.array([0.0, 0.0, error]), {"estimate": np.zeros(2)}) == pytest.approx([action])
 
 
 def test_greedy_policy_regulates_where_nothing_is_tracked():
     env = gym.make("ncs_gym/TruckTrailer-v0").unwrapped
-    action = _greedy_action(env, np.zeros(2), np.array([1.0, 1.0]))
+    policy = policy_by_name("greedy", "ncs_gym/TruckTrailer-v0", env, 0)
+    action = policy(np.zeros(2), {"estimate": np.ones(2)})
     plant = env.plant
     sizes = [np.linalg.norm(plant.A @ [1.0, 1.0] + plant.B @ [4.0 * a]) for a in (action[0], 0.0, 1.0, -1.0)]
     assert sizes[0] <= min(sizes[1:])
 
 
 def test_random_policy_follows_the_seed():
-    env = gym.make(CRUISE).unwrapped
-    first, again, other = (policy_by_name("random", CRUISE, env, seed)(np.zeros(3), {}) for seed in (1, 1, 2))
+    env, info = gym.make(CRUISE).unwrapped, {"estimate": np.zeros(2)}
+    first, again, other = (policy_by_name("random", CRUISE, env, seed)(np.zeros(3), info) for seed in (1, 1, 2))
     assert first == again
     assert first != other
-    assert policy_by_name("zero", CRUISE, env, 0)(np.zeros(3), {}) == [0.0]
+    assert policy_by_name("zero", CRUISE, env, 0)(np.zeros(3), info) == [0.0]
+
+
+def test_tuned_regulator_reaches_its_target():
+    env_id = "ncs_gym/LaneKeeping-v0"
+    env = gym.make(env_id)
+    policy, (observation, info) = policy_by_name("lqr", env_id, env.unwrapped, 0), env.reset(seed=0)
+    weak = strong = 0.0
+    for _ in range(100):
+        observation, reward, _, _, info = env.step(policy(observation, info))
+        strong += reward
+    env.reset(seed=0)
+    for _ in range(100):
+        weak += env.step(np.zeros(1, np.float32))[1]
+    assert strong > weak + 10.0
 
 
 def test_saved_model_acts_as_it_did(model):
