@@ -1,23 +1,23 @@
 """What mode "lookahead" admits and what it costs, against mode "project" and the same program in cvxpy.
 
-    python benchmarks/lookahead.py [--sections beliefs loop ends training] [--safe-set ellipsoid] [--beliefs 2000]
+    python benchmarks/lookahead.py [--sections situations loop ends training] [--safe-set ellipsoid] [--situations 2000]
 
 Plans end in the safe set of the certificate: the polytope or, with `--safe-set ellipsoid`, the ellipsoid in it.
 
 Section "loop" runs 64 environments in both modes with random actions and with actions pushed towards the upper limits,
 and says how often and how far inputs were changed and how long a frame takes. Section "ends" compares plans that end in
-either set on the batch reactor under random actions: in a loop of each, and for the same beliefs, taken from either
+either set on the batch reactor under random actions: in a loop of each, and for the same situations, taken from either
 loop, with nothing stored. "with the solver" asks it for plans that end in P, too, wherever nothing is stored; "outside"
 is the share of states outside the ellipsoid S. Section "training" trains PPO on the
 batch reactor behind both modes and runs every agent behind both. Times are CPU times; what follows is about section
-"beliefs".
+"situations".
 
-Beliefs are a true state drawn uniformly from the box, an error on the boundary of the error ellipsoid that is met in
-the middle of an episode (the one of median size), and the estimate that follows. A belief is admitted if some input is
-certified: by a plan of at most N steps, or for the second column by the one-step test alone. The upper bound plans for
-the true state without disturbance, with N inputs and the same end: no shield with this safe set admits more. "in S" is
-the share of true states that lie in the safe set.
-Times are of beliefs that fail the one-step test, for proposals drawn uniformly from the limits: with nothing stored
+Situations are a true state drawn uniformly from the box, an error on the boundary of the error ellipsoid that is met
+in the middle of an episode (the one of median size), and the estimate that follows. A situation is admitted if some
+input is certified: by a plan of at most N steps, or for the second column by the one-step test alone. The upper bound
+plans for the true state without disturbance, with N inputs and the same end: no shield with this safe set admits more.
+"in S" is the share of true states that lie in the safe set.
+Times are of situations that fail the one-step test, for proposals drawn uniformly from the limits: with nothing stored
 ("search", the solver is called unless a candidate begins with the proposal), and with the plan found stored ("stored").
 "too far" is how much farther from the proposal the input is then than the search with the solver finds, in u_max.
 """
@@ -48,9 +48,9 @@ CASES = {
     "polytope": (("TruckTrailer", 3), ("TruckTrailerCruise", 3), ("CartPole", 6), ("BatchReactor", 6)),
 }
 EPISODES, STEPS = 5, 60
-# So many beliefs are given to cvxpy.
+# So many situations are given to cvxpy.
 CVXPY = 60
-SECTIONS = ("beliefs", "loop", "ends", "training")
+SECTIONS = ("situations", "loop", "ends", "training")
 MODES = ("project", "lookahead")
 # Steps of 64 environments that are measured, and before that.
 ENVS, MEASURED, WARM = 64, 150, 50
@@ -58,7 +58,7 @@ ENVS, MEASURED, WARM = 64, 150, 50
 SEED = 1
 
 
-class Beliefs(NamedTuple):
+class Situations(NamedTuple):
     """States, estimates and proposals, shapes (count, n), (count, n) and (count, m), and one error shape."""
 
     states: np.ndarray
@@ -125,7 +125,7 @@ def solved(problem: cp.Problem) -> bool:
     return problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
 
 
-def drawn(env: gym.Env, count: int) -> Beliefs:
+def drawn(env: gym.Env, count: int) -> Situations:
     inner, rng, shapes = env.unwrapped, np.random.default_rng(0), []
     for seed in range(EPISODES):
         env.reset(seed=seed)
@@ -137,16 +137,16 @@ def drawn(env: gym.Env, count: int) -> Beliefs:
         states = np.concatenate([states, more[(np.abs(more @ inner.plant.box_rows.T) <= 1.0).all(axis=1)]])
     states = states[:count]
     errors = Ellipsoid(shape).sample_boundary(rng, count)
-    return Beliefs(states, states + errors, rng.uniform(-1, 1, (count, inner.plant.m)) * inner.plant.u_max, shape)
+    return Situations(states, states + errors, rng.uniform(-1, 1, (count, inner.plant.m)) * inner.plant.u_max, shape)
 
 
-def timed(decide, beliefs: list[tuple[np.ndarray, ...]]) -> np.ndarray:
+def timed(decide, situations: list[tuple[np.ndarray, ...]]) -> np.ndarray:
     """Microseconds of CPU time per call, each the better of two."""
-    times = np.empty((2, len(beliefs)))
+    times = np.empty((2, len(situations)))
     for row in times:
-        for e, belief in enumerate(beliefs):
+        for e, situation in enumerate(situations):
             start = time.process_time()
-            decide(*belief)
+            decide(*situation)
             row[e] = 1e6 * (time.process_time() - start)
     return times.min(axis=0)
 
@@ -163,13 +163,13 @@ def report(name: str, safe_set: str, horizon: int, count: int) -> str:
     plant = env.unwrapped.plant
     shield = SafetyFilter(certificate, plant, "lookahead", horizon)
     project = SafetyFilter(certificate, plant)
-    beliefs = drawn(env, count)
-    inside = np.mean(certificate.safe_set.gauge(beliefs.states) <= 1.0)
-    cases = [(x_hat, beliefs.shape, u) for x_hat, u in zip(beliefs.estimates, beliefs.proposed, strict=True)]
+    situations = drawn(env, count)
+    inside = np.mean(certificate.safe_set.gauge(situations.states) <= 1.0)
+    cases = [(x_hat, situations.shape, u) for x_hat, u in zip(situations.estimates, situations.proposed, strict=True)]
     one_step = np.mean([project.decide(*each).passed for each in cases])
     admitted = np.mean([shield.decide(*each).passed for each in cases])
     free = FreePlan(plant, shield.test.root, 2 if certificate.polytope is None else np.inf, horizon)
-    bound = np.mean([free.exists(state) for state in beliefs.states[: 4 * CVXPY]])
+    bound = np.mean([free.exists(state) for state in situations.states[: 4 * CVXPY]])
     searched = [each for each in cases if shield.decide(*each).reason != "safe"]
     if not searched:
         return f"{name:20s} {horizon:3d} every proposal passes the one-step test"
@@ -260,13 +260,13 @@ def ends() -> None:
     S, plant = certified(name, "ellipsoid").ellipsoid, gym.make(f"ncs_gym/{name}-v0").unwrapped.plant
     kinds = {"S": "ellipsoid", "P": "polytope", "P, with the solver": "polytope"}
     print(f"{name}, plans end in   {'overridden':>12s}{'correction':>12s}{'outside':>9s}")
-    beliefs = {}
+    situations = {}
     for end, safe_set in kinds.items():
         env, rng, sums = shielded(name, safe_set, "lookahead", horizon), np.random.default_rng(SEED), np.zeros(3)
         if "solver" in end:
             asking(env.filter)
         _, info = env.reset(seed=SEED)
-        taken = beliefs[end] = []
+        taken = situations[end] = []
         for step in range(WARM + MEASURED):
             action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
             if step >= WARM and step % 25 == 0:
@@ -281,10 +281,10 @@ def ends() -> None:
     asking(filters["P, with the solver"])
     for loop_of in ("S", "P"):
         for end, shield in filters.items():
-            found = [shield.decide(*each) for each in beliefs[loop_of]]
-            far = [np.linalg.norm(one.input - each[2]) for one, each in zip(found, beliefs[loop_of], strict=True)]
+            found = [shield.decide(*each) for each in situations[loop_of]]
+            far = [np.linalg.norm(one.input - each[2]) for one, each in zip(found, situations[loop_of], strict=True)]
             share = np.mean([one.intervened for one in found])
-            print(f"beliefs of loop {loop_of}: {end:20s}{share:6.1%}{np.mean(far):12.3f}", flush=True)
+            print(f"situations of loop {loop_of}: {end:20s}{share:6.1%}{np.mean(far):12.3f}", flush=True)
 
 
 def training(safe_set: str, steps: int) -> None:
@@ -318,18 +318,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sections", nargs="+", choices=SECTIONS, default=SECTIONS)
     parser.add_argument("--safe-set", choices=CASES, default="polytope")
-    parser.add_argument("--beliefs", type=int, default=2000)
+    parser.add_argument("--situations", type=int, default=2000)
     parser.add_argument("--steps", type=int, default=150_000)
     options = parser.parse_args()
-    if "beliefs" in options.sections:
-        print(f"{'states':>28s}{'beliefs admitted':>27s}{'us per decision':>35s}{'cvxpy over':>16s}")
+    if "situations" in options.sections:
+        print(f"{'states':>28s}{'situations admitted':>27s}{'us per decision':>35s}{'cvxpy over':>16s}")
         print(
             f"{'environment':18s}{'N':>3s}{'in S':>7s}{'one step':>9s}{'lookahead':>10s}{'bound':>8s}"
             f"{'one step':>9s}{'search':>7s}{'99%':>6s}{'stored':>7s}"
             f"{'cvxpy':>6s}{'search':>8s}{'stored':>8s}{'too far':>8s}"
         )
         for name, horizon in CASES[options.safe_set]:
-            print(report(name, options.safe_set, horizon, options.beliefs), flush=True)
+            print(report(name, options.safe_set, horizon, options.situations), flush=True)
     if "loop" in options.sections:
         loop(options.safe_set)
     if "ends" in options.sections:

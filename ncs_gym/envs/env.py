@@ -380,7 +380,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         """What a shield decides on, as copies: no wrapper stands between."""
         return Known(*(each.copy() if isinstance(each, np.ndarray) else each for each in self._known))
 
-    def beliefs(self) -> list[tuple[np.ndarray, np.ndarray]]:
+    def estimates_ahead(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Returns estimate and error shape of now and of every step until the next decision takes effect."""
         return [self._estimator.predicted(self._pending[:ahead]) for ahead in range(len(self._pending) + 1)]
 
@@ -417,7 +417,7 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         own, more = self._task.observe(task_state), observed_of(self._known, self._observe)
         bounds = self._low, self._high
         within, self._warned = entries_within(
-            self._task, self._belief[0], own, more, *bounds, self._warned, self._horizon
+            self._task, self._estimate[0], own, more, *bounds, self._warned, self._horizon
         )
         return within.astype(np.float32)
 
@@ -426,13 +426,13 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         cost = 1.0 if max(worst.tolist()) > 0.0 else 0.0
         self._violations += cost
         constraints = Constraints(values, worst, cost, self._violations)
-        self._belief = self._predicted_estimate()
+        self._estimate = self._predicted_estimate()
         known, alarm = self._estimator, bool(self._estimator.alarm or self._process.alarm)
-        self._known = Known(*self._belief, known.age, alarm, inputs.applied.copy(), inputs.committed.copy())
+        self._known = Known(*self._estimate, known.age, alarm, inputs.applied.copy(), inputs.committed.copy())
         sampled = Requested(False, False, self._packets)
         if self._requests is not None:
             sampled = Requested(self._requests.requested, self._requests.forced, self._packets)
-        loop = known, self._belief, self._contract, self._state, inputs, arrived, constraints, alarm
+        loop = known, self._estimate, self._contract, self._state, inputs, arrived, constraints, alarm
         return loop_info(*loop, sampled)
 
 

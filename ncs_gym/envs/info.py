@@ -53,7 +53,7 @@ class Constraints(NamedTuple):
 
 def loop_info(
     estimator: Estimator | VectorEstimator,
-    belief: tuple[np.ndarray, np.ndarray],
+    predicted: tuple[np.ndarray, np.ndarray],
     contract: ChannelContract | None,
     state: np.ndarray,
     inputs: Inputs,
@@ -66,7 +66,7 @@ def loop_info(
 
     Args:
         estimator: Gives the present estimate, and age.
-        belief: Estimate, shape (n,) or (n, N), and error shape, (n, n) or as a fresh array (N, n, n), of the time at
+        predicted: Estimate, shape (n,) or (n, N), and error shape, (n, n) or as a fresh array (N, n, n), of the time at
             which the next input takes effect.
         contract: What the channel guarantees, if anything.
         state: x, shape (n,) or (n, N).
@@ -79,7 +79,7 @@ def loop_info(
     values, worst, cost, violations = constraints
     age: Any = estimator.age
     applied, committed, missing = inputs
-    estimate, error_shape = belief
+    estimate, error_shape = predicted
     many = state.ndim > 1
     broken = age > contract.max_age if contract is not None else np.zeros(age.shape, np.bool_) if many else False
     return {

@@ -135,7 +135,7 @@ class NCSVectorEnv(VectorEnv):
             input_delay = 0 if self._protocol is None else self._protocol.input_delay
             self._requests = Requests(self._channel, self._contract, input_delay, self.num_envs)
         self._packets, self._nothing = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, np.bool_)
-        self._belief = self._predicted_estimates()
+        self._estimate = self._predicted_estimates()
         self._state = np.zeros((self._plant.n, self.num_envs))
         self._worst = self._plant.constraint_values(self._state)
         self._violations, self._done = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
@@ -161,7 +161,7 @@ class NCSVectorEnv(VectorEnv):
 
         The table grows; it is another object after shapes were forgotten.
         """
-        return self._estimator.histories.table, self._belief[1]
+        return self._estimator.histories.table, self._estimate[1]
 
     @property
     def known(self) -> Known:
@@ -176,8 +176,8 @@ class NCSVectorEnv(VectorEnv):
         done, known = self._ended
         return done.copy(), Known(*(each.copy() for each in known))
 
-    def beliefs(self, chosen: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Returns what `NCSEnv.beliefs` does for some environments, by index: estimates (n, k), `error_shapes`."""
+    def estimates_ahead(self, chosen: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Returns what `NCSEnv` does for some environments, by index: estimates (n, k), `error_shapes`."""
         pending = self._downlink_state.committed.pending
         return [self._estimator.predicted(pending[:ahead], chosen) for ahead in range(len(pending) + 1)]
 
@@ -434,7 +434,7 @@ class NCSVectorEnv(VectorEnv):
         own, more = self._task.observe_many(task_state), observed_of(self._known, self._single.observe)
         bounds = self._low, self._high
         within, self._warned = entries_within(
-            self._task, self._belief[0], own, more, *bounds, self._warned, self._single.horizon
+            self._task, self._estimate[0], own, more, *bounds, self._warned, self._single.horizon
         )
         return within.astype(np.float32).T
 
@@ -443,16 +443,16 @@ class NCSVectorEnv(VectorEnv):
         values = self._worst if self._plant.between_samples is None else self._plant.constraint_values(self._state)
         cost = (np.maximum.reduce(self._worst) > 0.0).astype(np.float64)
         self._violations = self._violations + (cost if counted is None else cost * counted)
-        self._belief = self._predicted_estimates()
+        self._estimate = self._predicted_estimates()
         table, numbers = self.error_shapes
-        belief = self._belief[0], table.shapes.take(numbers, axis=0)
+        predicted = self._estimate[0], table.shapes.take(numbers, axis=0)
         constraints = Constraints(values, self._worst, cost, self._violations.copy())
         alarm = self._estimator.alarm | self._process.alarm
-        self._known = Known(*belief, self._estimator.age.copy(), alarm.copy(), *(each.copy() for each in inputs[:2]))
+        self._known = Known(*predicted, self._estimator.age.copy(), alarm.copy(), *(each.copy() for each in inputs[:2]))
         asked, forced = self._nothing, self._nothing
         if self._requests is not None:
             asked, forced = self._requests.requested, self._requests.forced
-        loop = self._estimator, belief, self._contract, self._state, inputs, arrived, constraints, alarm
+        loop = self._estimator, predicted, self._contract, self._state, inputs, arrived, constraints, alarm
         return loop_info(*loop, Requested(asked, forced, self._packets))
 
     def _restarted(self, observation: np.ndarray, info: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:

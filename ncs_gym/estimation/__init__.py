@@ -7,13 +7,13 @@ raises an alarm where a measurement contradicts the assumed bounds.
 """
 
 from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlantError, certified_error_set
-from ncs_gym.estimation.estimator import Belief, Estimator
+from ncs_gym.estimation.estimator import Estimate, Estimator
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 
 __all__ = [
-    "Belief",
     "ErrorSet",
     "ErrorSetError",
+    "Estimate",
     "Estimator",
     "UnstablePlantError",
     "VectorEstimator",

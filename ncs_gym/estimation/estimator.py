@@ -22,7 +22,7 @@ from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.validation import frozen, setting
 
 
-class Belief(NamedTuple):
+class Estimate(NamedTuple):
     """What is known about the state at one step.
 
     Attributes:
@@ -147,11 +147,11 @@ class Estimator:
         return histories.table.shape(histories.present.item(self._history))
 
     @property
-    def belief(self) -> Belief:
+    def estimate(self) -> Estimate:
         """What is known about the state now."""
         histories = self._histories
         covariance, shape, _ = histories.table.statistics(histories.present.item(self._history))
-        return Belief(self.mean.copy(), covariance.copy(), shape.copy(), self.step - self.age)
+        return Estimate(self.mean.copy(), covariance.copy(), shape.copy(), self.step - self.age)
 
     def as_filterpy(self) -> Any:
         """Returns the present estimate as a `filterpy.kalman.KalmanFilter` with the model of this estimator, a copy.
@@ -159,7 +159,7 @@ class Estimator:
         The estimator itself looks covariances and gains up by when packets arrived, which an object that is moved step
         by step cannot; between two arrivals the two do the same.
         """
-        mean, covariance, _, _ = self.belief
+        mean, covariance, _, _ = self.estimate
         return filterpy_filter(self._histories.recursion, mean, covariance)
 
     def advance(self, u: np.ndarray, packets: Iterable[Packet]) -> None:
@@ -192,7 +192,7 @@ class Estimator:
     def predicted(self, inputs: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimate, shape (n,), and error shape, (n, n), after the next steps, given their inputs, (m,) each.
 
-        It is what `advance` makes of the present belief with these inputs and without packets: the error then lies in
+        It is what `advance` makes of the present estimate with these inputs and without packets: the error then lies in
         that ellipsoid, whatever packets arrive later.
         """
         mean = self.mean

@@ -57,7 +57,7 @@ class MonitoredFilter:
         report: LoopObservation,
         known: Sequence[StartKnown],
         unmoved: bool = True,
-        beliefs: Sequence[tuple[np.ndarray, np.ndarray]] = (),
+        earlier: Sequence[tuple[np.ndarray, np.ndarray]] = (),
         pending: tuple[np.ndarray, ...] = (),
     ) -> None:
         """Begins an episode, or anew within one.
@@ -66,7 +66,7 @@ class MonitoredFilter:
             report: What is observed.
             known: What is known of x_0 .. x_c (`starts_known`).
             unmoved: Whether the plant has not moved since.
-            beliefs: Estimates and error shapes of x_0 .. x_{c-1}, before the first decision takes effect.
+            earlier: Estimates and error shapes of x_0 .. x_{c-1}, before the first decision takes effect.
             pending: The inputs decided for the next c steps, none of them at the start of an episode.
         """
         self.report = report
@@ -75,7 +75,7 @@ class MonitoredFilter:
         if self._schedule is not None:
             self._schedule.start()
             self._schedule.pending = pending or self._schedule.pending
-            reports = [self.reported(mean.copy(), shape, alarm=False) for mean, shape in beliefs]
+            reports = [self.reported(mean.copy(), shape, alarm=False) for mean, shape in earlier]
             acting = pending or (None,) * len(reports)
             inside = [
                 known_inside(self.filter, start, each.estimate, each.errors, u)

@@ -404,12 +404,12 @@ class SafeLoop:
 
         Behind a downlink it is that of the step at which the next decision takes effect.
         """
-        return self._belief()[0].copy()
+        return self._predicted()[0].copy()
 
     @property
     def error_shape(self) -> np.ndarray:
         """Sigma_k, shape (n, n): x_hat - x lies in E(Sigma_k), at the step of the estimate."""
-        return self._belief()[1].copy()
+        return self._predicted()[1].copy()
 
     @property
     def steps(self) -> int:
@@ -440,7 +440,7 @@ class SafeLoop:
         """Begins to follow whether the state is proved safe, with what is known of x_0 .. x_c."""
         pending = self._inputs.pending
         earlier = [self._estimator.predicted(pending[:ahead]) for ahead in range(self._input_delay)]
-        self._monitored.begin(self._report(), known, beliefs=earlier, pending=pending)
+        self._monitored.begin(self._report(), known, earlier=earlier, pending=pending)
 
     def _find(self, packets: Iterable[Packet]) -> None:
         """Takes in samples of a state that is not known, and begins anew where they prove where it is."""
@@ -463,9 +463,9 @@ class SafeLoop:
 
     def _report(self) -> LoopObservation:
         """Returns what the estimator says now."""
-        return self._monitored.reported(*self._belief(), self._estimator.alarm, self._estimator.age)
+        return self._monitored.reported(*self._predicted(), self._estimator.alarm, self._estimator.age)
 
-    def _belief(self) -> tuple[np.ndarray, np.ndarray]:
+    def _predicted(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimate and error shape of the time at which the next input takes effect."""
         return self._estimator.predicted(self._inputs.pending[: self._input_delay])
 

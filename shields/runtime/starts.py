@@ -160,17 +160,17 @@ def known_inside(
 def first_observations(
     safety_filter: SafetyFilter,
     known: list[tuple[StartKnown, ...]],
-    beliefs: list[tuple[np.ndarray, PredictedErrors]],
+    earlier: list[tuple[np.ndarray, PredictedErrors]],
 ) -> list[tuple[np.ndarray, LoopObservation]]:
     """Returns of x_0 .. x_{c-1} in k environments whether each is known to be inside, (k,), and what is observed.
 
     Args:
         safety_filter: Gives the safe set and the box.
         known: What is known of x_0 .. x_c in each of the environments from where its starts are possible.
-        beliefs: Of x_0 .. x_{c-1}, estimates, shape (n, k), and what is known of the error shapes.
+        earlier: Of x_0 .. x_{c-1}, estimates, shape (n, k), and what is known of the error shapes.
     """
     found = []
-    for ahead, (estimates, errors) in enumerate(beliefs):
+    for ahead, (estimates, errors) in enumerate(earlier):
         each = (errors.of(np.array([e])).single() for e in range(len(known)))
         columns = np.ascontiguousarray(estimates.T)
         inside = [

@@ -274,8 +274,8 @@ class VectorSafetyShield(VectorWrapper, RecordConstructorArgs):
 
     def _cover(self, chosen: np.ndarray, known: list[tuple[StartKnown, ...]]) -> None:
         """Takes in what is known of the steps before the first decisions take effect, where episodes began."""
-        beliefs = [(mean, self._errors_of(numbers)) for mean, numbers in self._inner.beliefs(chosen)[:-1]]
-        earlier = first_observations(self._filter, [known[e] for e in chosen.tolist()], beliefs)
+        ahead = [(mean, self._errors_of(numbers)) for mean, numbers in self._inner.estimates_ahead(chosen)[:-1]]
+        earlier = first_observations(self._filter, [known[e] for e in chosen.tolist()], ahead)
         covered = self._monitor.cover(MonitorState(*(array[chosen] for array in self._state)), earlier)
         for kept, new in zip(self._state, covered, strict=True):
             kept[chosen] = new

@@ -8,7 +8,7 @@ import pytest
 from ncs_gym import Channel, Estimator, NCSEnv, NCSVectorEnv, Packet
 from ncs_gym.estimation import arrival_histories
 from ncs_gym.estimation.arrival_histories import ArrivalHistories
-from ncs_gym.estimation.estimator import Belief
+from ncs_gym.estimation.estimator import Estimate
 
 EPISODE = 300
 # Environments of the vector whose last episodes are computed again.
@@ -59,9 +59,9 @@ class Diary:
                 fresh.advance(u, sorted(arrived, key=lambda packet: packet.stamp))
                 packets += len(arrived)
             statistics = estimator.histories.table.statistics(estimator.statistics[e])
-            np.testing.assert_array_equal(info["error_shape"][e], fresh.belief.shape)
-            np.testing.assert_array_equal(statistics.covariance, fresh.belief.covariance)
-            np.testing.assert_allclose(info["estimate"][e], fresh.belief.mean, rtol=0.0, atol=1e-12)
+            np.testing.assert_array_equal(info["error_shape"][e], fresh.estimate.shape)
+            np.testing.assert_array_equal(statistics.covariance, fresh.estimate.covariance)
+            np.testing.assert_allclose(info["estimate"][e], fresh.estimate.mean, rtol=0.0, atol=1e-12)
             assert info["measurement_age"][e] == fresh.age
             assert info["assumption_violated"][e] == fresh.alarm
         return packets
@@ -112,8 +112,10 @@ def soak_one(plant, steps, warm_up):
     for u, packets in told:
         fresh.advance(u, packets)
     assert sum(len(packets) for _, packets in told) > 50
-    for name in Belief._fields:
-        np.testing.assert_array_equal(getattr(fresh.belief, name), getattr(env.estimator.belief, name), err_msg=name)
+    for name in Estimate._fields:
+        np.testing.assert_array_equal(
+            getattr(fresh.estimate, name), getattr(env.estimator.estimate, name), err_msg=name
+        )
     assert len(env.estimator._priors) <= CHANNEL.longest_delay + 1
     return gained
 

@@ -182,7 +182,7 @@ def compare(many: NCSVectorEnv, steps: int, options: dict[str, Any] | None = Non
                 single.follow(many, index)
                 continue
             statistics = many._estimator.histories.table.statistics(many._estimator.statistics[index])
-            arrays.assert_close(statistics.covariance, single.estimator.belief.covariance, rtol=1e-10)
+            arrays.assert_close(statistics.covariance, single.estimator.estimate.covariance, rtol=1e-10)
             if gain.any():  # an unstable plant makes 1e-17 of rounding 1e-10 in an episode
                 single._state = infos["state"][index].copy()
         estimates = infos["estimate"]

@@ -104,5 +104,5 @@ def test_what_estimators_share_cannot_be_written_to():
     for array in (estimator.shape, estimator.mean, many.error_shapes[0].shapes):
         with pytest.raises(ValueError, match="read-only"):
             array *= 1e-4
-    estimator.belief.mean[:] = 0.0  # a copy
+    estimator.estimate.mean[:] = 0.0  # a copy
     assert estimator.mean.any()

@@ -90,8 +90,8 @@ def test_estimate_equals_batch_least_squares_with_late_and_reordered_packets(see
         estimator.advance(inputs[-1], packets)
         noise_cov = plant.measurement_noise_cov + 0.001**2 / 12 * np.eye(plant.p)
         mean, covariance = batch_estimate(plant, first, inputs, used, noise_cov)
-        np.testing.assert_allclose(estimator.belief.mean, mean, atol=1e-9)
-        np.testing.assert_allclose(estimator.belief.covariance, covariance, atol=1e-10)
+        np.testing.assert_allclose(estimator.estimate.mean, mean, atol=1e-9)
+        np.testing.assert_allclose(estimator.estimate.covariance, covariance, atol=1e-10)
 
 
 def test_order_of_arrival_does_not_matter():
@@ -104,7 +104,7 @@ def test_order_of_arrival_does_not_matter():
         for _ in range(4):
             estimator.advance(np.zeros(1), [])
         estimator.advance(np.array([0.5]), [Packet(stamp, samples[stamp]) for stamp in order])
-        ends.append(estimator.belief)
+        ends.append(estimator.estimate)
     for end in ends:
         np.testing.assert_allclose(end.mean, ends[0].mean, atol=1e-12)
         np.testing.assert_allclose(end.covariance, ends[0].covariance, atol=1e-14)
@@ -115,7 +115,7 @@ def test_mean_predicts_with_the_applied_input():
     estimator = Estimator(plant, Channel())
     estimator.reset(np.array([0.3, -0.2]))
     estimator.advance(np.array([1.5]), [])
-    np.testing.assert_allclose(estimator.belief.mean, plant.A @ [0.3, -0.2] + plant.B @ [1.5])
+    np.testing.assert_allclose(estimator.estimate.mean, plant.A @ [0.3, -0.2] + plant.B @ [1.5])
 
 
 @pytest.mark.parametrize("stamp", [0, -3, 2, 99, 4 - 3])
@@ -128,7 +128,7 @@ def test_packets_from_nowhere_are_discarded(stamp):
     ignoring = copy.deepcopy(estimator)
     estimator.advance(np.zeros(1), [Packet(stamp, np.full(2, 0.02))])
     ignoring.advance(np.zeros(1), [])
-    for value, wanted in zip(estimator.belief, ignoring.belief, strict=True):
+    for value, wanted in zip(estimator.estimate, ignoring.estimate, strict=True):
         np.testing.assert_array_equal(value, wanted)
     assert not estimator.alarm
     # One that could be used does make a difference.
@@ -190,7 +190,7 @@ def drive(plant, channel, seed, steps, push):
     link = ChannelState(channel, rng)
     for step in range(1, steps + 1):
         u = rng.uniform(-1, 1, plant.m) * plant.u_max
-        e = estimator.belief.mean - x
+        e = estimator.estimate.mean - x
         d = -plant.disturbance.farthest_point(plant.A @ e, push(rng)) * (1 - 1e-12)
         x = plant.A @ x + plant.B @ u + d
         sample = plant.H @ x + worst_noise(rng, plant) if link.sends_at(step) else None
@@ -218,8 +218,8 @@ def test_error_stays_in_its_running_ellipsoid_under_adversarial_noise(channel, s
     Sigma = certified_error_set(plant).Sigma
     largest = 0.0
     for estimator, x in drive(plant, channel, seed, 400, push):
-        shape = estimator.belief.shape
-        largest = max(largest, Ellipsoid(shape).gauge(estimator.belief.mean - x))
+        shape = estimator.estimate.shape
+        largest = max(largest, Ellipsoid(shape).gauge(estimator.estimate.mean - x))
         assert np.linalg.eigvalsh(Sigma - shape)[0] >= -1e-15
         assert not estimator.alarm
     assert 0.5 < largest <= 1.0
@@ -235,7 +235,7 @@ def test_partial_measurements_keep_being_used():
 def test_updates_shrink_the_running_ellipsoid():
     plant = truck_trailer(mass=4000.0)
     Sigma = certified_error_set(plant).Sigma
-    ends = [estimator.belief.shape for estimator, _ in drive(plant, Channel(), 0, 200, lambda rng: np.eye(2))]
+    ends = [estimator.estimate.shape for estimator, _ in drive(plant, Channel(), 0, 200, lambda rng: np.eye(2))]
     assert np.trace(ends[-1]) < 0.3 * np.trace(Sigma)
 
 
@@ -246,7 +246,7 @@ def test_guard_rejects_a_gain_that_would_leave_the_certified_set():
     tight.advance(np.zeros(1), [Packet(1, np.zeros(2))])
     for _ in range(30):
         tight.advance(np.zeros(1), [Packet(tight.step + 1, np.zeros(2))])
-        assert np.linalg.eigvalsh(errors.Sigma - tight.belief.shape)[0] >= 0.0
+        assert np.linalg.eigvalsh(errors.Sigma - tight.estimate.shape)[0] >= 0.0
 
 
 def test_forged_packet_raises_a_latched_alarm():
@@ -256,7 +256,7 @@ def test_forged_packet_raises_a_latched_alarm():
     assert not estimator.alarm
     estimator.advance(np.zeros(1), [Packet(2, np.array([0.5, 0.5]))])
     assert estimator.alarm
-    estimator.advance(np.zeros(1), [Packet(3, plant.H @ estimator.belief.mean)])
+    estimator.advance(np.zeros(1), [Packet(3, plant.H @ estimator.estimate.mean)])
     assert estimator.alarm
     estimator.reset(np.zeros(2))
     assert not estimator.alarm
@@ -266,7 +266,7 @@ def test_damaged_packet_is_not_used_and_raises_the_alarm():
     estimator = Estimator(truck_trailer(), Channel())
     estimator.advance(np.zeros(1), [Packet(1, np.array([np.nan, 0.0]))])
     assert estimator.alarm
-    assert np.isfinite(estimator.belief.mean).all()
+    assert np.isfinite(estimator.estimate.mean).all()
 
 
 def test_two_sensors_that_contradict_each_other_raise_the_alarm_where_one_of_them_says_what_was_predicted():
@@ -285,7 +285,7 @@ def test_innovation_at_the_edge_of_both_bounds_is_no_alarm():
     plant = truck_trailer()
     prior = Estimator(plant, Channel())
     prior.advance(np.zeros(1), [])
-    spread = Ellipsoid(plant.H @ prior.belief.shape @ plant.H.T)
+    spread = Ellipsoid(plant.H @ prior.estimate.shape @ plant.H.T)
     direction = np.array([1.0, 0.3])
     noise = Ellipsoid(sets_of(plant).noise)
     edge = spread.extreme_point(direction) + noise.extreme_point(direction)
@@ -293,7 +293,7 @@ def test_innovation_at_the_edge_of_both_bounds_is_no_alarm():
     assert not naive.contains(edge)
     for residual, alarm in ((edge, False), (1.001 * edge, True)):
         estimator = Estimator(plant, Channel())
-        estimator.advance(np.zeros(1), [Packet(1, plant.H @ prior.belief.mean + residual)])
+        estimator.advance(np.zeros(1), [Packet(1, plant.H @ prior.estimate.mean + residual)])
         assert estimator.alarm is alarm
 
 
@@ -309,7 +309,7 @@ def test_a_packet_never_leaves_a_larger_ellipsoid_than_ignoring_it(seed):
         ignoring = copy.deepcopy(estimator)
         estimator.advance(u, [Packet(stamp, np.zeros(1))])
         ignoring.advance(u, [])
-        assert np.vdot(plant.weight, estimator.belief.shape) <= np.vdot(plant.weight, ignoring.belief.shape)
+        assert np.vdot(plant.weight, estimator.estimate.shape) <= np.vdot(plant.weight, ignoring.estimate.shape)
 
 
 def test_computed_shapes_hold_the_exact_ones():
@@ -420,7 +420,7 @@ def test_covariances_and_gains_are_those_of_filterpy(plant):
     estimator = Estimator(plant, Channel(quantization_step=0.01), certified_error_set(plant, ChannelContract(3, 0.01)))
     estimator.reset(0.01 * np.ones(plant.n))
     u, y, theirs = 0.1 * plant.u_max, 0.02 * np.ones(plant.p), estimator.as_filterpy()
-    P = estimator.belief.covariance
+    P = estimator.estimate.covariance
     theirs.predict(u)
     estimator.advance(u, [])
     np.testing.assert_allclose(theirs.x, estimator.mean, rtol=1e-12)

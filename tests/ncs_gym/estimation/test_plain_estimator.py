@@ -69,12 +69,12 @@ def traffic(plant, channel, rng, steps):
 
 
 def assert_equal(estimator, plain, step):
-    belief = estimator.belief
-    arrays.assert_equal(belief.mean, plain.mean, f"mean at step {step}")
-    arrays.assert_equal(belief.covariance, plain.statistics.covariance, f"covariance at step {step}")
-    arrays.assert_equal(belief.shape, plain.statistics.shape, f"shape at step {step}")
+    estimate = estimator.estimate
+    arrays.assert_equal(estimate.mean, plain.mean, f"mean at step {step}")
+    arrays.assert_equal(estimate.covariance, plain.statistics.covariance, f"covariance at step {step}")
+    arrays.assert_equal(estimate.shape, plain.statistics.shape, f"shape at step {step}")
     assert (estimator.age, estimator.alarm) == (plain.age, plain.alarm), step
-    assert belief.newest == estimator.step - plain.age
+    assert estimate.newest == estimator.step - plain.age
 
 
 def compare(plant, channel, error_set, seed, steps):
@@ -187,7 +187,7 @@ def test_duplicates_and_packets_from_nowhere_change_nothing(name):
         one.advance(np.zeros(plant.m), packets)
         other.advance(np.zeros(plant.m), [*packets, *again, *strangers])
         copies += len(again)
-        for value, wanted in zip(other.belief, one.belief, strict=True):
+        for value, wanted in zip(other.estimate, one.estimate, strict=True):
             arrays.assert_equal(value, wanted)
         assert (other.age, other.alarm) == (one.age, one.alarm)
     assert copies > 500
@@ -206,7 +206,7 @@ def test_a_copy_goes_on_like_the_original(name):
         for each in (one, *copies):
             each.advance(u, packets)
         for each in copies:
-            for value, wanted in zip(each.belief, one.belief, strict=True):
+            for value, wanted in zip(each.estimate, one.estimate, strict=True):
                 arrays.assert_equal(value, wanted, f"step {step}")
             assert (each.age, each.alarm) == (one.age, one.alarm)
     assert copies[0]._histories is one._histories is not copies[1]._histories

@@ -64,7 +64,7 @@ class ExtremalNoise(NCSEnv):
 
     def _extreme_sample(self, rng, state):
         bound = self.plant.sensor_noise.bound
-        stubborn = self.plant.H @ (self.estimator.belief.mean - state)
+        stubborn = self.plant.H @ (self.estimator.estimate.mean - state)
         v = bound.extreme_point(stubborn) if rng.random() < 0.5 else bound.sample_boundary(rng)
         self._noise.append(v)
         return self.plant.H @ state + (1 - 1e-12) * v
@@ -79,9 +79,9 @@ class ExtremalNoise(NCSEnv):
         start = (1 - 1e-12) * self.initial_set.sample_boundary(self.np_random)
         _, info = super().reset(options={"state": start})
         self.estimator.reset(start + self.plant.initial_noise.bound.sample_boundary(self.np_random))
-        self._belief = self._predicted_estimate()
-        info["estimate"] = self._belief[0].copy()
-        info["estimation_error"] = self.estimator.belief.mean - start
+        self._estimate = self._predicted_estimate()
+        info["estimate"] = self._estimate[0].copy()
+        info["estimation_error"] = self.estimator.estimate.mean - start
         return self._observation(), info
 
 

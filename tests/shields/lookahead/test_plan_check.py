@@ -38,7 +38,7 @@ def case(request):
     return plant, certificate, PlanTest(Prediction(first, STEPS), MARGIN)
 
 
-def beliefs(plant, certificate, rng, count):
+def situations(plant, certificate, rng, count):
     """Estimates in and around the box, error shapes of all forms inside the certified one, and plans."""
     estimates = rng.uniform(-1, 1, (count, plant.n)) * plant.half_widths * rng.uniform(0.2, 1.5, (count, 1))
     factor = np.linalg.cholesky(certificate.Sigma)
@@ -73,7 +73,7 @@ def extreme_run(plant, x_hat, shape, plan, direction, step):
 def test_tightenings_are_what_extreme_errors_and_disturbances_attain(case):
     plant, certificate, test = case
     rng = np.random.default_rng(0)
-    estimates, shapes, plans = beliefs(plant, certificate, rng, 12)
+    estimates, shapes, plans = situations(plant, certificate, rng, 12)
     rooms = test.tightenings_of(shapes).room
     for x_hat, shape, (plan,), room in zip(estimates, shapes, plans, rooms, strict=True):
         nominal = states(plant, x_hat, plan, np.zeros((STEPS, plant.n)))
@@ -101,7 +101,7 @@ def farthest(plant, certificate, x_hat, shape, plan, step, rng):
 def test_certified_plans_keep_every_possible_state_in_the_box_and_end_in_the_safe_set(case):
     plant, certificate, test = case
     rng = np.random.default_rng(1)
-    estimates, shapes, plans = beliefs(plant, certificate, rng, 40)
+    estimates, shapes, plans = situations(plant, certificate, rng, 40)
     certified = test.certified(estimates, test.tightenings_of(shapes), plans)[:, 0]
     lengths, levels = 0, []
     for x_hat, shape, (plan,), passed in zip(estimates, shapes, plans, certified, strict=True):
@@ -122,7 +122,7 @@ def test_what_is_not_certified_fails_for_a_reason(case):
     # The box part is exact: where it fails, an error and disturbances leave the box; else the end must be close to S.
     plant, certificate, test = case
     rng = np.random.default_rng(2)
-    estimates, shapes, plans = beliefs(plant, certificate, rng, 200)
+    estimates, shapes, plans = situations(plant, certificate, rng, 200)
     certified = test.certified(estimates, test.tightenings_of(shapes), plans)[:, 0]
     left = kept = 0
     for x_hat, shape, (plan,), passed in zip(estimates, shapes, plans, certified, strict=True):
@@ -148,7 +148,7 @@ def test_what_is_not_certified_fails_for_a_reason(case):
 def test_sampled_errors_and_disturbances_stay_inside(case):
     plant, certificate, test = case
     rng = np.random.default_rng(3)
-    estimates, shapes, plans = beliefs(plant, certificate, rng, 30)
+    estimates, shapes, plans = situations(plant, certificate, rng, 30)
     certified = test.certified(estimates, test.tightenings_of(shapes), plans)[:, 0]
     for x_hat, shape, (plan,), passed in zip(estimates, shapes, plans, certified, strict=True):
         for step in np.flatnonzero(passed).tolist()[:1]:
@@ -162,7 +162,7 @@ def test_sampled_errors_and_disturbances_stay_inside(case):
 def test_plans_of_one_input_are_certified_by_the_one_step_test(case):
     plant, certificate, test = case
     shield, rng = SafetyFilter(certificate, plant), np.random.default_rng(4)
-    estimates, shapes, plans = beliefs(plant, certificate, rng, 200)
+    estimates, shapes, plans = situations(plant, certificate, rng, 200)
     certified = test.certified(estimates, test.tightenings_of(shapes), plans)[:, 0, 0]
     safe = [
         shield.decide(x_hat, shape, plan[0, 0]).reason == "safe"
@@ -196,7 +196,7 @@ def test_inputs_beyond_their_limits_are_not_certified(case):
 def test_an_estimate_alone_is_judged_as_in_a_batch(case):
     plant, certificate, test = case
     rng = np.random.default_rng(6)
-    estimates, shapes, _ = beliefs(plant, certificate, rng, 200)
+    estimates, shapes, _ = situations(plant, certificate, rng, 200)
     plans = rng.uniform(-1, 1, (200, 3, STEPS, plant.m)) * plant.u_max * rng.uniform(0.1, 1.0, (200, 3, 1, 1))
     plans[::20, 1, 2, 0] *= 20.0  # beyond the limits
     for values, broken in ((estimates, np.nan), (shapes, np.nan), (plans, np.inf), (estimates, 1e120)):
@@ -414,7 +414,7 @@ def test_end_is_certified_in_rational_arithmetic_where_disturbances_are_long_and
 
 def test_tightenings_are_remembered_and_do_not_depend_on_the_batch(case):
     plant, certificate, test = case
-    _, shapes, _ = beliefs(plant, certificate, np.random.default_rng(5), 6)
+    _, shapes, _ = situations(plant, certificate, np.random.default_rng(5), 6)
     fresh = PlanTest(test.prediction, MARGIN)
     together = fresh.tightenings_of(np.concatenate([shapes, shapes[:2]]))
     for e, shape in enumerate((*shapes, *shapes[:2])):

@@ -25,7 +25,7 @@ def shield_of(name, horizon=None):
     return SafetyFilter(certificate_of(plant, contract), plant, "lookahead", horizon or usual)
 
 
-def beliefs(shield, rng, count):
+def situations(shield, rng, count):
     """Estimates in the box, small error shapes and proposals."""
     plant = shield.plant
     estimates = rng.uniform(-1, 1, (count, plant.n)) * plant.half_widths * rng.uniform(0.3, 1.0, (count, 1))
@@ -76,7 +76,7 @@ def best_distance(shield, x_hat, shape, proposed, length):
 def test_input_applied_is_as_close_to_the_proposal_as_an_independent_solver_gets(name):
     shield, rng = shield_of(name), np.random.default_rng(0)
     reasons, apart = [], []
-    for x_hat, shape, proposed in zip(*beliefs(shield, rng, 30), strict=True):
+    for x_hat, shape, proposed in zip(*situations(shield, rng, 30), strict=True):
         decision = shield.decide(x_hat, shape, proposed)
         reasons.append(decision.reason)
         best = min(best_distance(shield, x_hat, shape, proposed, length) for length in (1, shield.horizon))
@@ -96,7 +96,7 @@ def test_input_applied_is_as_close_to_the_proposal_as_an_independent_solver_gets
 def test_plans_are_what_they_say():
     shield, rng = shield_of("batch reactor"), np.random.default_rng(1)
     test, seen = shield.lookahead.planner.test, set()
-    for x_hat, shape, proposed in zip(*beliefs(shield, rng, 150), strict=True):
+    for x_hat, shape, proposed in zip(*situations(shield, rng, 150), strict=True):
         decision = shield.decide(x_hat, shape, proposed)
         seen.add(decision.reason)
         assert decision.plan.ndim == 2
@@ -210,7 +210,7 @@ def test_other_modes_take_no_horizon_and_keep_no_plan(mode, certificate, loaded)
 def test_horizon_of_one_is_mode_project(name):
     shield, rng = shield_of(name, 1), np.random.default_rng(3)
     project = SafetyFilter(shield.certificate, shield.plant, "project")
-    for x_hat, shape, proposed in zip(*beliefs(shield, rng, 200), strict=True):
+    for x_hat, shape, proposed in zip(*situations(shield, rng, 200), strict=True):
         decision, other = shield.decide(x_hat, shape, proposed), project.decide(x_hat, shape, proposed)
         np.testing.assert_allclose(decision.input, other.input, rtol=2.0**-23)
         assert decision.reason == other.reason
@@ -224,7 +224,7 @@ def decisions(shield, cases, stored=()):
 @pytest.mark.parametrize("name", ["cruise", "batch reactor"])
 def test_decisions_are_the_same_after_pickling_and_do_not_depend_on_what_was_decided_before(name):
     shield, rng = shield_of(name), np.random.default_rng(4)
-    cases = beliefs(shield, rng, 60)
+    cases = situations(shield, rng, 60)
     first, again = decisions(shield, cases), decisions(shield, cases)
     backwards = decisions(pickle.loads(pickle.dumps(shield)), [each[::-1] for each in cases])[::-1]
     for one, two, three in zip(first, again, backwards, strict=True):
@@ -238,7 +238,7 @@ def test_decisions_are_the_same_after_pickling_and_do_not_depend_on_what_was_dec
 def test_decisions_one_by_one_equal_those_of_a_batch(name):
     shield, rng, count = shield_of(name), np.random.default_rng(5), 60
     plant = shield.plant
-    estimates, shapes, proposed = beliefs(shield, rng, count)
+    estimates, shapes, proposed = situations(shield, rng, count)
     stored = np.full((shield.horizon, plant.m, count), np.nan)
     for e in range(0, count, 2):
         length = int(rng.integers(1, shield.horizon))
@@ -260,7 +260,7 @@ def test_decisions_one_by_one_equal_those_of_a_batch(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_a_single_proposal_that_a_gain_continues_is_kept_without_a_batch(name, monkeypatch):
     shield, rng = shield_of(name), np.random.default_rng(7)
-    cases = list(zip(*beliefs(shield, rng, 150), strict=True))
+    cases = list(zip(*situations(shield, rng, 150), strict=True))
     kept = [(case, one) for case in cases if (one := shield.decide(*case)).reason == "planned" and not one.intervened]
     monkeypatch.setattr(SafetyFilter, "decide_columns", None)
     decided = 0
@@ -348,7 +348,7 @@ def break_solver(monkeypatch, how, rng):
 def test_a_solver_that_fails_means_a_certified_plan_or_the_stored_one(how, monkeypatch):
     shield, rng = shield_of("cart-pole"), np.random.default_rng(6)
     test, reasons = shield.lookahead.planner.test, set()
-    cases = beliefs(shield, rng, 60)
+    cases = situations(shield, rng, 60)
     working = decisions(shield, cases)
     break_solver(monkeypatch, how, rng)
     shield = shield_of("cart-pole")

@@ -46,7 +46,7 @@ def test_loop_requests_what_the_environment_does(downlink):
     shield, loop = SafetyShield(env, certificate), SafeLoop(certificate, PLANT, CHANNEL, downlink=downlink)
     actuator, rng = Actuator(loop.input_delay, PLANT.m, PLANT.u_max), np.random.default_rng(0)
     _, info = shield.reset(seed=1, options={"state": np.zeros(PLANT.n)})
-    loop.start(env.estimator.belief.mean, np.zeros(PLANT.n))
+    loop.start(env.estimator.estimate.mean, np.zeros(PLANT.n))
     tap, forced = Tap(env), 0
     loop.receive()
     for step in range(120):
