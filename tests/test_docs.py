@@ -29,7 +29,6 @@ QUICK_PAGES = (
     "docs/shield.md",
     "docs/constrained_rl.md",
     "docs/vector.md",
-    "docs/paper.md",
 )
 # Their programs run in a process of their own; some train an agent, or synthesize certificates that take seconds.
 SLOW_PAGES = (
