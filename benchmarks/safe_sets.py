@@ -1,22 +1,16 @@
 """How much of its box each safe set fills, next to what no controller can exceed; a picture of the sets.
 
     python benchmarks/safe_sets.py [--ids CartPole BatchReactor] [--points 512] [--picture docs/images/safe-sets.png]
-    python benchmarks/safe_sets.py --gains
 
 "bound" is the share of states from which some inputs within the limits keep the plant in the box for `STEPS` steps if
 the state is known and nothing disturbs it: a linear program for each of `--points` states spread over the box. The
 picture shows sections through the origin: states that are not on an axis are zero.
-
-With `--gains` it prints instead what the largest polytope of other gains than the certified one fills: of
-linear-quadratic regulators, by the weight of inputs (in units of their limits) against states (in units of the box).
-The error sets stay, which do not depend on the gain.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -29,16 +23,12 @@ from scipy.stats import qmc
 import ncs_gym  # noqa: F401  (registers the environments)
 from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below, with_unit
 from ncs_gym import LinearPlant
-from shields import Certificate, Infeasible, synthesize
-from shields.runtime.backup_plans.planner import regulator
-from shields.synthesis.invariant_polytope import invariant_polytope, share_in_polytope
+from shields import Certificate, synthesize
 
 IDS = ("TruckTrailerCruise", "CartPole", "BatchReactor", "Pendulum")
 # The two states that are shown where there are more: angle and rate of the pole; the reactor's first and third.
 PLANES = {"CartPole": (2, 3), "BatchReactor": (0, 2)}
 STEPS = 100
-# Weights of inputs against states in the regulators of `--gains`.
-WEIGHTS = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 # Sets, and their colors, apart for color-blind readers (Okabe and Ito).
 COLORS = {"upper bound": "#999999", "polytope": "#0072b2", "ellipsoid": "#d55e00"}
 
@@ -118,32 +108,12 @@ def picture(cases: dict[str, tuple[LinearPlant, Certificate, Viability]]) -> Cap
         return figure
 
 
-def print_shares_of_gains(names: list[str]) -> None:
-    """Prints the shares of the polytopes of several gains, a row for each environment."""
-    print(f"{'share of the box, by gain':28}{'certified':>10}" + "".join(f"{f'LQR {w:g}':>10}" for w in WEIGHTS))
-    for name in names:
-        env = gym.make(f"ncs_gym/{name}-v0").unwrapped
-        certificate = synthesize(env.plant, contract=env.certificate_contract, safe_set="ellipsoid")
-        texts = []
-        for gain in (certificate.K, *(regulator(env.plant, weight) for weight in WEIGHTS)):
-            try:
-                polytope = invariant_polytope(replace(certificate, K=gain), env.plant, lambda line: None)
-                texts.append(f"{share_in_polytope(polytope, env.plant):10.1%}")
-            except Infeasible:
-                texts.append(f"{'none':>10}")
-        print(f"{name:28}{''.join(texts)}", flush=True)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--ids", nargs="*", default=IDS)
     parser.add_argument("--points", type=int, default=512)
     parser.add_argument("--picture", type=Path, default=None, help="PNG file")
-    parser.add_argument("--gains", action="store_true", help="compare gains instead")
     options = parser.parse_args()
-    if options.gains:
-        print_shares_of_gains(options.ids)
-        return
     cases = {}
     print("share of the box    ellipsoid polytope    bound")
     for name in options.ids:

@@ -24,8 +24,12 @@ def size_of(recorded: dict[str, Any]) -> str:
         recorded: The provenance of a certificate.
     """
     unknown = recorded.get("share_of_box_unknown")
+    other = _text(
+        recorded.get("share_with_gain_of_ellipsoid"), " ({:.3g} % with the gain of the largest ellipsoid)", 100.0
+    )
+    polytope = "{:.3g} % of the safe box's volume" + other + "; the ellipsoid "
     shares = (
-        _text(recorded.get("polytope_share_of_box"), "{:.3g} % of the safe box's volume; the ellipsoid ", 100.0)
+        _text(recorded.get("polytope_share_of_box"), polytope, 100.0)
         + _text(recorded.get("share_of_box"), "{:.4g} % of the safe box's volume", 100.0),
         _text(
             recorded.get("share_of_box_at_rest"),

@@ -22,7 +22,12 @@ def synthesize(settings: SynthesizeSettings) -> None:
     try:
         with synthesis_status() as show:
             certificate = shields.synthesize(
-                plant, settings.method, contract=contract, safe_set=settings.safe_set, progress=show
+                plant,
+                settings.method,
+                contract=contract,
+                safe_set=settings.safe_set,
+                several_gains=settings.several_gains,
+                progress=show,
             )
     except SynthesisInterrupted as interrupt:
         if interrupt.certificate is None:

@@ -27,6 +27,8 @@ class SynthesizeSettings:
         safe_set: What a shield with this certificate keeps: the ellipsoid, or the largest polytope that the same gain
             keeps in the safe box, which leaves the policy more room. By default the polytope; the published method has
             an ellipsoid.
+        several_gains: Try regulators as well as the gain of the largest ellipsoid, and keep the largest polytope. Takes
+            some tens of times as long.
         out: File for the certificate (JSON).
         max_age: Largest measurement age of the channel contract [steps]; by default the environment's contract, none
             for the plant of a file.
@@ -39,6 +41,7 @@ class SynthesizeSettings:
     plant: Path | None = None
     method: Literal["certified", "paper"] = "certified"
     safe_set: Literal["polytope", "ellipsoid"] | None = None
+    several_gains: bool = False
     out: Path = Path("certificate.json")
     max_age: int | None = None
     quantization_step: float | None = None

@@ -13,6 +13,7 @@ import numpy as np
 from ncs_gym import ErrorSet, LinearPlant, exact
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import inflated
+from ncs_gym.plants.lqr import lqr_gain
 from ncs_gym.validation import shown
 from shields.certificate import Certificate, Proof, Updates
 from shields.certificate_text import size_of
@@ -22,7 +23,12 @@ from shields.synthesis.design_problem import CandidateDesign, DesignProblem, des
 from shields.synthesis.diagnosis import infeasibility, is_feasible, with_feasible_bounds
 from shields.synthesis.invariant_polytope import grid_in_closed_loop, invariant_polytope, share_in_polytope
 from shields.synthesis.max_margin_gain import max_margin_gain
-from shields.synthesis.multipliers import best_input_multipliers, best_multipliers, with_best_multipliers
+from shields.synthesis.multipliers import (
+    best_input_multipliers,
+    best_multipliers,
+    smallest_invariant_shape,
+    with_best_multipliers,
+)
 from shields.synthesis.round_numbers import in_round_numbers
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from shields.synthesis.share_of_box import share_of_box
@@ -47,6 +53,9 @@ Progress = Callable[[str], object]
 _FEW_ALTERNATIONS = 4
 # Where no certificate is found, these fractions of the input limits are tried: wide limits can mislead the search.
 _LIMIT_FRACTIONS = (0.5, 0.25, 0.1)
+# Weights of the inputs, in units of their limits, against those of the states, in units of the box, in regulators whose
+# polytopes are sought.
+_INPUT_WEIGHTS = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 # Multipliers from which those of a given set and gain are sought.
 _INITIAL_MULTIPLIERS = (0.9, 0.03, 0.07)
 
@@ -57,6 +66,7 @@ def synthesize(
     *,
     contract: ChannelContract | None = None,
     safe_set: str | None = None,
+    several_gains: bool = False,
     progress: Progress | None = None,
     dkappa: float = 0.02,
     drho: float = 0.05,
@@ -76,6 +86,8 @@ def synthesize(
             (docs/shield_proof.md, "Polytopes"), or "ellipsoid". Where there is no polytope within limits of rows and
             time the ellipsoid stays, and the printed certificate says why. None is "polytope" for "certified"; "paper"
             has an ellipsoid.
+        several_gains: Also seek polytopes of linear-quadratic regulators, some tens of times as long, and keep the
+            largest that verifies. Its ellipsoid is the one that proves its gain, which may be small ("certified").
         progress: Called with a line of text per stage: what is sought, and the volume reached so far ("certified").
         dkappa: Grid step of kappa ("paper").
         drho: Grid step of rho ("paper").
@@ -97,8 +109,10 @@ def synthesize(
         raise ValueError(f"safe_set must be 'polytope', 'ellipsoid' or None, got {shown(safe_set)}")
     if not all(isinstance(each, Certificate) and each.method == "certified" for each in candidates):
         raise ValueError("candidates must be certificates of method 'certified'")
-    if method == "paper" and safe_set == "polytope":
-        raise ValueError("method 'paper' has an ellipsoid: safe_set='polytope' is for method 'certified'")
+    if method == "paper" and (safe_set == "polytope" or several_gains):
+        raise ValueError("method 'paper' has an ellipsoid: polytopes are for method 'certified'")
+    if safe_set == "ellipsoid" and several_gains:
+        raise ValueError("several_gains is for polytopes: the search for an ellipsoid finds its gain")
     if method == "paper":
         from shields.paper.certificate import paper_certificate  # nothing else here uses the paper's method
 
@@ -115,7 +129,9 @@ def synthesize(
     report = progress or (lambda line: None)
     known = [each for given in candidates if (each := carried_over(given, plant, contract)) is not None]
     certificate = _largest_certificate(plant, contract, report, known)
-    return certificate if safe_set == "ellipsoid" else with_polytope(certificate, plant, report)
+    if safe_set == "ellipsoid":
+        return certificate
+    return (with_largest_polytope if several_gains else with_polytope)(certificate, plant, report)
 
 
 def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progress = lambda line: None) -> Certificate:
@@ -150,6 +166,50 @@ def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progre
         message = "interrupted while a polytope was sought; the certificate has the ellipsoid"
         raise SynthesisInterrupted(message, certificate) from interrupt
     return replace(certificate, provenance=certificate.provenance | {"no_polytope": reason})
+
+
+def with_largest_polytope(
+    certificate: Certificate, plant: LinearPlant, progress: Progress = lambda line: None
+) -> Certificate:
+    """Returns what `with_polytope` does, with the gain whose polytope is the largest of several.
+
+    Tried are the certificate's own and linear-quadratic regulators, each with an ellipsoid that proves it. What the
+    certificate's own gain would have kept is in the provenance of another one.
+
+    Args:
+        certificate: A verified one of method "certified".
+        plant: Its plant.
+        progress: Called with a line of text now and then.
+
+    Raises:
+        SynthesisInterrupted: A KeyboardInterrupt with a certificate.
+    """
+
+    def share(each: Certificate) -> float:
+        return each.provenance.get("polytope_share_of_box", 0.0)
+
+    own = best = with_polytope(certificate, plant, progress)
+    problem, _ = design_problem(plant, certificate.contract)
+    for effort in _INPUT_WEIGHTS:
+        K = lqr_gain(plant.A, plant.B, plant.weight, effort * np.diag(plant.u_max**-2.0))
+        proved = None if K is None else _with_gain(K, problem, plant, certificate.contract)
+        if proved is not None:
+            progress(f"polytope of a regulator with {effort:g} as the weight of inputs")
+            best = max(best, with_polytope(proved, plant, progress), key=share)
+    if best is own:
+        return own
+    kept = {name: certificate.provenance[name] for name in ("tolerated_scale",) if name in certificate.provenance}
+    return replace(best, provenance=best.provenance | kept | {"share_with_gain_of_ellipsoid": share(own)})
+
+
+def _with_gain(
+    K: np.ndarray, problem: DesignProblem, plant: LinearPlant, contract: ChannelContract | None
+) -> Certificate | None:
+    """Returns a verified certificate with a given gain, shape (m, n), and a small ellipsoid; None if there is none."""
+    K = exact.rounded(K, _DIGITS, axis=1)
+    _, scaled = problem.to_scaled(np.eye(plant.n), K)
+    L = smallest_invariant_shape(problem, scaled)
+    return None if L is None else certify(plant, problem.to_physical(L, scaled)[0], K, contract)
 
 
 def certify(
