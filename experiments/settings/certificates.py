@@ -28,7 +28,7 @@ class SynthesizeSettings:
             keeps in the safe box, which leaves the policy more room. By default the polytope; the published method has
             an ellipsoid.
         several_gains: Try regulators as well as the gain of the largest ellipsoid, and keep the largest polytope. Takes
-            some tens of times as long.
+            several times as long.
         out: File for the certificate (JSON).
         max_age: Largest measurement age of the channel contract [steps]; by default the environment's contract, none
             for the plant of a file.

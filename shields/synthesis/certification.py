@@ -86,8 +86,8 @@ def synthesize(
             (docs/shield_proof.md, "Polytopes"), or "ellipsoid". Where there is no polytope within limits of rows and
             time the ellipsoid stays, and the printed certificate says why. None is "polytope" for "certified"; "paper"
             has an ellipsoid.
-        several_gains: Also seek polytopes of linear-quadratic regulators, some tens of times as long, and keep the
-            largest that verifies. Its ellipsoid is the one that proves its gain, which may be small ("certified").
+        several_gains: Also seek polytopes of linear-quadratic regulators, which takes several times as long, and keep
+            the largest that verifies. Its ellipsoid is the one that proves its gain, which may be small ("certified").
         progress: Called with a line of text per stage: what is sought, and the volume reached so far ("certified").
         dkappa: Grid step of kappa ("paper").
         drho: Grid step of rho ("paper").
