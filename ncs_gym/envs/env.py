@@ -37,8 +37,7 @@ from ncs_gym.processes.process import LinearProcess, Process
 from ncs_gym.rendering import Annotation, Renderer, sent_at
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.tasks.regulation import Regulation
-from ncs_gym.uncertainty.disturbance import Disturbance
-from ncs_gym.uncertainty.disturbance_settings import as_disturbance, as_noise
+from ncs_gym.uncertainty.disturbances import Disturbance, as_disturbance, as_noise
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_count, as_flag, setting, shown
 

@@ -28,7 +28,7 @@ from ncs_gym.processes.plant_simulation import PlantSimulation
 from ncs_gym.processes.process import Process
 from ncs_gym.rendering import Annotation, PacketRecord
 from ncs_gym.tasks.base_task import Task
-from ncs_gym.uncertainty.disturbance import Disturbance
+from ncs_gym.uncertainty.disturbances import Disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_count, setting, shown
 

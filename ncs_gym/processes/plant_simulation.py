@@ -9,8 +9,7 @@ import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import LinearProcess, Process
-from ncs_gym.uncertainty.disturbance import ROUNDING, Disturbance, checked, checked_many
-from ncs_gym.uncertainty.disturbance_settings import stays_inside
+from ncs_gym.uncertainty.disturbances import ROUNDING, Disturbance, checked, checked_many, stays_inside
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import read_only
 
