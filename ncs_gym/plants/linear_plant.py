@@ -12,8 +12,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import MISSING, dataclass, field, fields, replace
-from difflib import get_close_matches
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from textwrap import fill
@@ -25,7 +24,7 @@ from ncs_gym import exact
 from ncs_gym.plants import between_samples, limits, statespace
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.uncertainty.remainder import Remainder, as_remainder
+from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.uncertainty.shape_matrices import outer_sum
 from ncs_gym.uncertainty.truncated_gaussian import (
     SMALLEST_DELTA,
@@ -112,14 +111,10 @@ class NoNoiseWarning(UserWarning):
 Kind = TypeVar("Kind", bound=type)
 
 
-def explains_arguments(kind: Kind) -> Kind:
-    """Makes the constructor of a dataclass explain which arguments are unknown or missing, and what to give for C=.
-
-    C= means two things to two people: limits, and an output matrix.
-    """
+def refuses_output_matrix_as_box(kind: Kind) -> Kind:
+    """Makes a constructor say what to give for C=, which is limits to some people and an output matrix to others."""
     constructor: Any = kind
     construct: Callable[..., None] = constructor.__init__
-    needed = {entry.name: entry.default is MISSING and entry.default_factory is MISSING for entry in fields(kind)}
 
     @functools.wraps(construct)
     def __init__(self: Any, **settings: Any) -> None:
@@ -128,21 +123,13 @@ def explains_arguments(kind: Kind) -> Kind:
                 "C= is not an argument: pass box=... for the limits |c_j x| <= 1 (rows, or half-widths of the states), "
                 "H=... for the output matrix of a state-space model"
             )
-        for name in settings:
-            if name not in needed:
-                close = get_close_matches(name, needed, n=1)
-                hint = f": did you mean {close[0]}=" if close else ""
-                raise TypeError(f"{name}= is not an argument of {kind.__name__}{hint}")
-        missing = [f"{name}=" for name, is_needed in needed.items() if is_needed and name not in settings]
-        if missing:
-            raise TypeError(f"{kind.__name__} needs {' and '.join(missing)}")
         construct(self, **settings)
 
     constructor.__init__ = __init__
     return kind
 
 
-@explains_arguments
+@refuses_output_matrix_as_box
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinearPlant(ReadOnlyArrays):
     """x+ = A x + B u + d, y = H x + v, with limits and bounds (docs/shield_proof.md).
@@ -288,10 +275,13 @@ class LinearPlant(ReadOnlyArrays):
             self._set(covariance, np.zeros((size, size)) if value is None else as_covariance(value, size, covariance))
             if (value := getattr(self, bound)) is not None:
                 self._set(bound, as_bound(value, size, bound))
-        if (remainder := as_remainder(self.remainder, self.n)) is not None:
-            remainder = remainder.of_model({name: getattr(self, name) for name in ("A", "B", "box", "u_max", "dt")})
-        self._set("remainder", remainder)
-        return is_given[0] or self.gamma > 0.0 or remainder is not None, is_given[1], is_given[2]
+        if self.remainder is not None:
+            if not isinstance(self.remainder, Remainder):
+                raise ValueError(f"remainder must be a Remainder, got {shown(self.remainder)}")
+            as_bound(self.remainder.bound, self.n, "remainder")
+            model = {name: getattr(self, name) for name in ("A", "B", "box", "u_max", "dt")}
+            self._set("remainder", self.remainder.of_model(model))
+        return is_given[0] or self.gamma > 0.0 or self.remainder is not None, is_given[1], is_given[2]
 
     def _check_between_samples(self) -> None:
         """Raises ValueError unless the model in continuous time is one, and there if times between samples count."""
@@ -471,17 +461,14 @@ class LinearPlant(ReadOnlyArrays):
         content = document.get("plant") if isinstance(document, dict) and document.get("format") == _FORMAT else None
         if not isinstance(content, dict):
             raise ValueError(f"{shown(path)} is not a plant of format {_FORMAT!r}")
-        names = {entry.name: entry.default is MISSING for entry in fields(cls)}
-        missing = [name for name, is_needed in names.items() if is_needed and name not in content]
-        unknown = [name for name in content if name not in names and name != "C"]
-        if (missing and "C" not in content) or unknown:
-            wrong = f"it lacks {', '.join(missing)}" if missing else f"{shown(unknown)} are no arguments of LinearPlant"
-            raise ValueError(f"{shown(path)} is not the file of a plant: {wrong}")
         arguments = {name: _from_json(value) for name, value in content.items()}
         box = as_setting(arguments.get("box"))
         if box is not None:
             arguments["box"] = box  # an array: `save` wrote computed rows
-        return cls(**arguments)
+        try:
+            return cls(**arguments)
+        except TypeError as error:  # an argument is missing or unknown
+            raise ValueError(f"{shown(path)} is not the file of a plant: {error}") from error
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a JSON file in which every number is exact.
@@ -893,9 +880,11 @@ def _as_json(value: Any) -> Any:
 
 
 def _from_json(value: Any) -> Any:
-    """Returns an argument of `LinearPlant` given as a JSON value; an object is an ellipsoid's shape."""
-    if not isinstance(value, dict) or "proved" in value:  # a remainder's
+    """Returns an argument of `LinearPlant` given as a JSON value; an object is an ellipsoid's shape, or a remainder."""
+    if not isinstance(value, dict):
         return value
+    if set(value) == {entry.name for entry in fields(Remainder)}:
+        return Remainder(_from_json(value["bound"]), value["proved"], value["basis"])
     if set(value) != {"shape"}:
         raise ValueError(
             f'a bound in the file of a plant must be a number, a list or {{"shape": ...}}, got {shown(value)}'
