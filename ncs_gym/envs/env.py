@@ -402,7 +402,6 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         return list(zip(CHANNELS, (self._uplinks, self._downlinks), strict=True))
 
     def _estimator_for(self, channel: Channel) -> Estimator:
-        """Returns an estimator of the episodes to come, for packets of other delays."""
         histories = arrival_histories(self._plant, channel, self._certificate_contract)
         return Estimator(self._plant, channel, histories=histories, after=self._estimator)
 

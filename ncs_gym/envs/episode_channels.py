@@ -171,7 +171,6 @@ class VectorRandomChannel(VectorWrapper, RecordConstructorArgs):
 
 
 def _drawn(channel: Any, downlink: Any) -> dict[str, Callable[[np.random.Generator], Any]]:
-    """Returns the options of `reset` that draw channels."""
     given = {name: each for name, each in {"channel": channel, "downlink": downlink}.items() if each is not None}
     if not given:
         raise ValueError("give channel or downlink: a function (rng) -> Channel, or a list of channels")

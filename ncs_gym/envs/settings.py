@@ -24,12 +24,7 @@ CHANNELS = "channel", "downlink"
 
 
 def _assumed_contract(plant: LinearPlant, channel: Channel, contract: ChannelContract | None) -> ChannelContract | None:
-    """Returns the contract that the estimator's error sets rest on.
-
-    Raises:
-        UnstablePlantError: If an unstable plant has neither a contract nor a channel that keeps one.
-        ValueError: If the channel rounds more coarsely than the contract allows.
-    """
+    """Returns the contract that the estimator's error sets rest on."""
     if contract is None and plant.spectral_radius >= 1.0:
         contract = contract_of(channel)
         if contract is None:
@@ -136,11 +131,7 @@ def vector_reset_options(options: dict[str, Any] | None, count: int, n: int) -> 
 
 
 def _known_options(options: Any, known: set[str]) -> dict[str, Any]:
-    """Returns the options of a reset; an empty dict for None.
-
-    Raises:
-        ValueError: If they are no dict, or have other keys.
-    """
+    """Returns the options of a reset; an empty dict for None."""
     if options is not None and not isinstance(options, dict):
         raise ValueError(f"the options of reset must be a dict, got {shown(options)}")
     if unknown := [key for key in options or {} if key not in known]:

@@ -287,7 +287,6 @@ class NCSVectorEnv(VectorEnv):
         self._single.annotate(annotation)
 
     def _draw(self, info: dict[str, Any], begins: np.ndarray | None, *, moved: bool = True) -> None:
-        """Hands what happened in `rendered_env` to the renderer, if there is one."""
         renderer, e = self._single.renderer, self.rendered_env
         if renderer is None:
             return
@@ -402,11 +401,7 @@ class NCSVectorEnv(VectorEnv):
                 self._estimator.follow(histories)
 
     def _one_each(self, value: Any, name: str) -> list[Channel] | None:
-        """Returns a channel that is given for all environments, or for each, as a list of N; None for None.
-
-        Raises:
-            ValueError: If it is none of these.
-        """
+        """Returns a channel that is given for all environments, or for each, as a list of N; None for None."""
         if value is None:
             return None
         each = list(value) if isinstance(value, (list, tuple)) else [value] * self.num_envs
@@ -421,13 +416,11 @@ class NCSVectorEnv(VectorEnv):
         return self._estimator.predicted(self._downlink_state.committed.pending)
 
     def _first(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns states that episodes start at, and the errors of their first estimates, shape (n, count) each."""
         rng = self.np_random
         states = (1.0 - SAMPLE_ROUNDING) * self._single.initial_set.sample(rng, count)
         return states.T, self._process.first_error(rng, count)
 
     def _observation(self) -> np.ndarray:
-        """Returns the observations, shape (N, n + extra)."""
         task_state = self._task_state
         for u in self._downlink_state.committed.pending:
             task_state = self._task.predict_many(self._plant, task_state, u)
@@ -483,11 +476,7 @@ def _where(mask: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarra
 
 
 def _autoreset_mode(value: AutoresetMode | str) -> AutoresetMode:
-    """Returns a mode given as such or by its name.
-
-    Raises:
-        ValueError: If there is none of that name.
-    """
+    """Returns a mode given as such or by its name."""
     for mode in AutoresetMode:
         if value is mode or (isinstance(value, str) and value == mode.value):
             return mode

@@ -202,7 +202,6 @@ class ErrorTable:
         return H @ shape @ H.T
 
     def _add(self, statistics: ErrorStatistics) -> int:
-        """Returns the number of new statistics."""
         number = self._count
         if number == len(self._ages):
             for name in _BY_NUMBER_LAST:

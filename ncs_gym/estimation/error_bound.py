@@ -186,10 +186,6 @@ def _unconditional_set(plant: LinearPlant) -> ErrorSet:
     Proof of the bound: e_0 lies in E(r0^2 I). The error obeys e+ = A e - d, so with e in E(Sigma) its support
     is at most that of A Sigma A'/rate + D/(1 - rate), which is inside E(Sigma) by (E1); by induction e_k lies
     in E(Sigma) for all k with no packet at all.
-
-    Raises:
-        UnstablePlantError: If the spectral radius of A is 1 or more.
-        ErrorSetError: If the plant is so ill-conditioned that the result fails (E0) or (E1).
     """
     from scipy.optimize import minimize_scalar  # takes long to import
 

@@ -168,11 +168,7 @@ def _steps(number: int) -> str:
 
 
 def _bursts(loss: dict[str, Any]) -> GilbertElliott:
-    """Returns the bursty loss whose fields a dictionary holds, as `dataclasses.asdict` leaves one.
-
-    Raises:
-        ValueError: If a field is unknown or missing, or no probability.
-    """
+    """Returns the bursty loss whose fields a dictionary holds, as `dataclasses.asdict` leaves one."""
     try:
         return GilbertElliott(**loss)
     except TypeError:

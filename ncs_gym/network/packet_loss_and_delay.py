@@ -245,5 +245,4 @@ class VectorChannelState:
 
 
 def _staying(loss: float) -> GilbertElliott:
-    """Returns a chain that never moves and loses packets with a constant probability."""
     return GilbertElliott(p_good_to_bad=0.0, p_bad_to_good=0.0, loss_good=loss, loss_bad=loss)

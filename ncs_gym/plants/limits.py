@@ -126,9 +126,6 @@ def _symmetric_limits(limits: Any, center: np.ndarray, name: str) -> np.ndarray:
         limits: Pair (low, high), each a number or shape (size,), possibly infinite.
         center: Shape (size,).
         name: What the error message calls the limits.
-
-    Raises:
-        ValueError: If they are no such pair, or the center does not lie between them.
     """
     sides = [as_setting(side) for side in limits] if isinstance(limits, (tuple, list)) and len(limits) == 2 else []
     for side in sides:
@@ -157,9 +154,6 @@ def _require_equilibrium(
         offset: c, shape (n,).
         state: x0, shape (n,).
         applied: u0, shape (m,).
-
-    Raises:
-        ValueError: Naming what is missing, and the equilibrium that belongs to u0 where there is a single one.
     """
     missing = A @ state + B @ applied + offset - state
     terms = np.abs(A) @ np.abs(state) + np.abs(B) @ np.abs(applied) + np.abs(offset) + np.abs(state)

@@ -401,9 +401,6 @@ class LinearPlant(ReadOnlyArrays):
 
         Its state is (x, u_{k-d}, .., u_{k-1}), the oldest input first. Disturbances and first errors are those of x
         alone.
-
-        Raises:
-            ValueError: If the delay is no such number, or the first error is given by a covariance.
         """
         delay = as_count(input_delay, "input_delay", low=1, high=LONGEST_INPUT_DELAY)
         if np.any(self.initial_cov):
@@ -871,7 +868,6 @@ def _describe(plant: LinearPlant) -> str:
 
 
 def _as_json(value: Any) -> Any:
-    """Returns a field of a plant as a JSON value."""
     if isinstance(value, Ellipsoid):
         return {"shape": value.shape_matrix.tolist()}
     if isinstance(value, Remainder):
@@ -903,7 +899,6 @@ def _frames_inside() -> int:
 
 
 def _sized(size: float, unit: str) -> str:
-    """Returns a size with its unit."""
     return f"{size:.4g} {unit}".rstrip()
 
 
@@ -926,7 +921,6 @@ def row_limit(plant: LinearPlant, row: np.ndarray) -> str:
 
 
 def _deviation(plant: LinearPlant, i: int) -> str:
-    """Returns the name of a state's deviation from the operating point."""
     center = plant.operating_state[i]
     return f"({plant.state_names[i]} {-center:+.6g})" if center else plant.state_names[i]
 

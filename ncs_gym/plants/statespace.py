@@ -101,11 +101,7 @@ def sampled_arguments(sys: Any, dt: float | None, settings: dict[str, Any]) -> d
 
 
 def _matrices(sys: Any) -> tuple[Any, Any, Any, Any, Any]:
-    """Returns A, B, C, D and the sampling time of a model: 0 or None in continuous time, True if it is unknown.
-
-    Raises:
-        ValueError: If it is no state-space model.
-    """
+    """Returns A, B, C, D and the sampling time of a model: 0 or None in continuous time, True if it is unknown."""
     if isinstance(sys, (tuple, list)) and len(sys) in (4, 5):
         A, B, C, D, *sampling = sys
         return A, B, C, D, sampling[0] if sampling else None

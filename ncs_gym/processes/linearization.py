@@ -115,9 +115,6 @@ def _steps_of(
         common: Box, input limits and step of the plant.
         count: Number of steps.
         rng: Source of randomness.
-
-    Raises:
-        ValueError: If the process cannot be put into a state.
     """
     n, m = len(common["box"]), len(common["u_max"])
     quiet = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.0)
@@ -137,11 +134,7 @@ def _steps_of(
 
 
 def _first_step(moving: Process, frame: LinearPlant) -> np.ndarray:
-    """Returns f(0, 0), shape (n,).
-
-    Raises:
-        ValueError: If the process takes no state of n entries with m inputs.
-    """
+    """Returns f(0, 0), shape (n,)."""
     n, m = frame.n, frame.m
     try:
         return moving.step(frame, moving.write(np.zeros(n)), np.zeros(m))
@@ -177,7 +170,6 @@ def _moved(
 
 
 def _left_out(A: np.ndarray, B: np.ndarray, steps: _Steps) -> np.ndarray:
-    """Returns what a linear model leaves out, shape (N, n)."""
     return (steps.moved - A @ steps.states - B @ steps.inputs).T
 
 
@@ -193,11 +185,7 @@ def _require_function(spread: float) -> None:
 def _from_jacobians(
     bounds: tuple[Any, Any], widths: np.ndarray, limits: np.ndarray, origin: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, Ellipsoid]:
-    """Returns A, B and the proved bound.
-
-    Raises:
-        ValueError: If the bounds are no two matrices, the first below the second.
-    """
+    """Returns A, B and the proved bound."""
     n, size = len(widths), len(widths) + len(limits)
     if not isinstance(bounds, (tuple, list)) or len(bounds) != 2:
         raise ValueError(f"jacobian_bounds must be two arrays of shape ({n}, {size}), got {shown(bounds)}")
@@ -211,11 +199,7 @@ def _from_jacobians(
 
 
 def _confirmed(bound: Ellipsoid, remainders: np.ndarray, widths: np.ndarray) -> float:
-    """Returns the largest size of fresh remainders, shape (N, n), in units of their bound.
-
-    Raises:
-        ValueError: If one lies outside it.
-    """
+    """Returns the largest size of fresh remainders, shape (N, n), in units of their bound."""
     padded = Ellipsoid(bound.shape_matrix + np.diag((ROUNDING * widths) ** 2))
     largest = float(padded.gauge(remainders).max())
     if largest > 1.0:
@@ -227,11 +211,7 @@ def _confirmed(bound: Ellipsoid, remainders: np.ndarray, widths: np.ndarray) -> 
 
 
 def _bearable(remainder: Remainder, widths: np.ndarray) -> Remainder:
-    """Returns a remainder that a step from the middle of the box survives.
-
-    Raises:
-        ValueError: If it does not.
-    """
+    """Returns a remainder that a step from the middle of the box survives."""
     reached = np.sqrt(np.diag(remainder.bound.shape_matrix)) / widths
     worst = int(reached.argmax())
     if reached[worst] >= 1.0:

@@ -127,9 +127,6 @@ class PlantSimulation:
             d: What the disturbance drew.
             noise: Process noise, shape (n,) or (n, count); None if the disturbance replaces it.
             count: Number of environments or of draws; None for arrays without that axis.
-
-        Raises:
-            ValueError: If it lies outside its bound, or is no such array, and that is not allowed.
         """
         if self._trusted:
             return d if noise is None else d + noise
@@ -149,7 +146,6 @@ class PlantSimulation:
         return noise / np.maximum(self.plant.process_noise.bound.gauge(noise.T), 1.0)
 
     def _draw_sensor_noise(self, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Returns sensor noise, shape (p, count)."""
         if self._is_extreme:
             return (1.0 - ROUNDING) * self.plant.nominal_sensor_error.sample_boundary(rng, count).T
         return self.plant.sample_sensor_noise(rng, count, truncated=self._truncated).T
