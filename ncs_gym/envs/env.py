@@ -21,7 +21,7 @@ from ncs_gym.envs.settings import (
     start_option,
     starting_set,
 )
-from ncs_gym.envs.spaces import entries_within, observation_space, observed_of, read_action, read_observed
+from ncs_gym.envs.spaces import Observer, observation_space, read_action, read_observed
 from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
@@ -233,10 +233,10 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._observe = read_observed(observe)
         sets = self._error_set, self._initial_set
         self.observation_space = observation_space(plant, self._task, *sets, steps, input_delay, self._observe)
-        self._low, self._high = self.observation_space.low, self.observation_space.high
+        self._observer = Observer(self._task, self.observation_space, self._observe, self._horizon)
         self.steps = self.episodes = 0
         self.start: Ellipsoid | np.ndarray = self._initial_set
-        self._consistent = self._warned = False
+        self._consistent = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -412,26 +412,22 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         task_state = self._task_state
         for u in self._pending:
             task_state = self._task.predict(self._plant, task_state, u)
-        own, more = self._task.observe(task_state), observed_of(self._known, self._observe)
-        bounds = self._low, self._high
-        within, self._warned = entries_within(
-            self._task, self._estimate[0], own, more, *bounds, self._warned, self._horizon
-        )
-        return within.astype(np.float32)
+        return self._observer.observation(self._known, self._task.observe(task_state))
 
     def _info(self, inputs: Inputs, worst: np.ndarray, *, arrived: bool) -> dict[str, Any]:
         values = worst if self._plant.between_samples is None else self._plant.constraint_values(self._state)
         cost = 1.0 if max(worst.tolist()) > 0.0 else 0.0
         self._violations += cost
         constraints = Constraints(values, worst, cost, self._violations)
-        self._estimate = self._predicted_estimate()
-        known, alarm = self._estimator, bool(self._estimator.alarm or self._process.alarm)
-        self._known = Known(*self._estimate, known.age, alarm, inputs.applied.copy(), inputs.committed.copy())
+        estimator, alarm = self._estimator, bool(self._estimator.alarm or self._process.alarm)
+        self._known = Known(
+            *self._predicted_estimate(), estimator.age, alarm, inputs.applied.copy(), inputs.committed.copy()
+        )
         sampled = Requested(False, False, self._packets)
         if self._requests is not None:
             sampled = Requested(self._requests.requested, self._requests.forced, self._packets)
-        loop = known, self._estimate, self._contract, self._state, inputs, arrived, constraints, alarm
-        return loop_info(*loop, sampled)
+        happened = estimator.mean, self._state, inputs.missing, arrived
+        return loop_info(self._known, *happened, self._contract, constraints, sampled)
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:

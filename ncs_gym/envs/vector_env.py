@@ -14,7 +14,7 @@ from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, SAMPLE_ROUNDING, 
 from ncs_gym.envs.episode_channels import covering, downlinks, uplinks
 from ncs_gym.envs.info import Constraints, Known, loop_info
 from ncs_gym.envs.settings import CHANNELS, vector_reset_options
-from ncs_gym.envs.spaces import entries_within, observed_of, read_actions
+from ncs_gym.envs.spaces import Observer, read_actions
 from ncs_gym.estimation.arrival_histories import ErrorTable, arrival_histories
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.vector_estimator import VectorEstimator
@@ -116,8 +116,7 @@ class NCSVectorEnv(VectorEnv):
         self.single_action_space = single.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        bounds = single.observation_space.low, single.observation_space.high
-        self._low, self._high = (np.asarray(bound, dtype=np.float64)[:, None] for bound in bounds)
+        self._observer = Observer(self._task, single.observation_space, single.observe, single.horizon, many=True)
         allowed = single.allow_assumption_violation
         self._process = PlantSimulation(
             self._plant, single.disturbance, allowed, self.num_envs, noise=single.noise, process=single.process
@@ -141,7 +140,7 @@ class NCSVectorEnv(VectorEnv):
         self._violations, self._done = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
         self.steps, self.episodes = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, np.int64)
         self.starts = np.full((self.num_envs, self._plant.n), np.nan)
-        self.ticks, self._consistent, self._warned = 0, False, False
+        self.ticks, self._consistent = 0, False
         self._known: Known
         self._ended: tuple[np.ndarray, Known] | None = None
 
@@ -424,16 +423,12 @@ class NCSVectorEnv(VectorEnv):
         task_state = self._task_state
         for u in self._downlink_state.committed.pending:
             task_state = self._task.predict_many(self._plant, task_state, u)
-        own, more = self._task.observe_many(task_state), observed_of(self._known, self._single.observe)
-        bounds = self._low, self._high
-        within, self._warned = entries_within(
-            self._task, self._estimate[0], own, more, *bounds, self._warned, self._single.horizon
-        )
-        return within.astype(np.float32).T
+        return self._observer.observation(self._known, self._task.observe_many(task_state)).T
 
     def _info(self, inputs: Inputs, arrived: np.ndarray, counted: np.ndarray | None) -> dict[str, Any]:
         """Returns the infos; the costs of environments that are not `counted`, shape (N,), do not count once more."""
-        values = self._worst if self._plant.between_samples is None else self._plant.constraint_values(self._state)
+        plant = self._plant
+        values = self._worst.copy() if plant.between_samples is None else plant.constraint_values(self._state)
         cost = (np.maximum.reduce(self._worst) > 0.0).astype(np.float64)
         self._violations = self._violations + (cost if counted is None else cost * counted)
         self._estimate = self._predicted_estimates()
@@ -441,12 +436,13 @@ class NCSVectorEnv(VectorEnv):
         predicted = self._estimate[0], table.shapes.take(numbers, axis=0)
         constraints = Constraints(values, self._worst, cost, self._violations.copy())
         alarm = self._estimator.alarm | self._process.alarm
-        self._known = Known(*predicted, self._estimator.age.copy(), alarm.copy(), *(each.copy() for each in inputs[:2]))
+        self._known = Known(*predicted, self._estimator.age.copy(), alarm, *(each.copy() for each in inputs[:2]))
         asked, forced = self._nothing, self._nothing
         if self._requests is not None:
             asked, forced = self._requests.requested, self._requests.forced
-        loop = self._estimator, predicted, self._contract, self._state, inputs, arrived, constraints, alarm
-        return loop_info(*loop, Requested(asked, forced, self._packets))
+        happened = self._estimator.mean, self._state, inputs.missing, arrived
+        sampled = Requested(asked, forced, self._packets)
+        return loop_info(self._known, *happened, self._contract, constraints, sampled)
 
     def _restarted(self, observation: np.ndarray, info: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
         """Returns the first of new episodes where old ones ended, whose last go to final_obs and final_info."""
