@@ -15,9 +15,6 @@ from ncs_gym.network.channel import Channel
 from ncs_gym.network.downlink import DownlinkProtocol, require_fitting_downlink
 from ncs_gym.validation import shown
 
-# A channel, or what draws one at the start of every episode.
-ChannelSource = Channel | Callable[[np.random.Generator], Channel]
-
 
 class EpisodeChannels:
     """The channels of N environments in their present episodes, in one direction.

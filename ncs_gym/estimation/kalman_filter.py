@@ -18,7 +18,7 @@ from ncs_gym.uncertainty.shape_matrices import is_inside
 
 # Covariances grow no further than this, in squared half-widths of the safe box.
 LARGEST_COVARIANCE = 1e12
-# Factors of covariances keep this many bits, so that covariances recur when a pattern of arrivals does.
+# Factors of covariances keep this many bits, so that covariances recur when an arrival history does.
 COVARIANCE_BITS = 6
 
 

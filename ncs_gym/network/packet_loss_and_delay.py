@@ -159,15 +159,12 @@ class ChannelState:
         Returns:
             The packets that arrive at this step, in the order in which they were sent.
         """
-        self._loss_state, delay = transmit(self.channel, rng, self._loss_state, measurement is not None)
-        if delay >= 0 and measurement is not None:
-            packet = Packet(step, self.channel.quantize(measurement), episode)
-            self.in_flight.setdefault(step + int(delay), []).append(packet)
-        return self.in_flight.pop(step, [])
+        sample = None if measurement is None else Packet(step, self.channel.quantize(measurement), episode)
+        return self.carry(rng, step, sample)
 
     def carry(self, rng: np.random.Generator, step: int, packet: Any) -> list[Any]:
-        """Puts a packet of any kind on the channel as it is, and returns those that arrive at this step."""
-        self._loss_state, delay = transmit(self.channel, rng, self._loss_state, sends=True)
+        """Puts a packet of any kind on the channel as it is, None for nothing; returns those that arrive at a step."""
+        self._loss_state, delay = transmit(self.channel, rng, self._loss_state, packet is not None)
         if delay >= 0:
             self.in_flight.setdefault(step + int(delay), []).append(packet)
         return self.in_flight.pop(step, [])

@@ -385,7 +385,7 @@ class LinearPlant(ReadOnlyArrays):
             raise ValueError(f"a step of {self.dt:g} s hides how disturbances act in continuous time: shorten dt")
         G = exact.product(of_constant[0], exact.inverse(of_constant[1]))
         ball = Ellipsoid(self.gamma * np.eye(self.n))
-        bound = _ellipsoid_around_sum(ball, self.disturbance_bound, self.relative_weight)
+        bound = _ellipsoid_around_sum(self.relative_weight, ball, self.disturbance_bound)
         return replace(
             self,
             A=A,
@@ -419,7 +419,7 @@ class LinearPlant(ReadOnlyArrays):
         disturbance = self.disturbance_bound
         if self.gamma > 0.0:  # one bound for both: the ball of gamma would reach the inputs under way
             ball = Ellipsoid(self.gamma * np.eye(n))
-            disturbance = _ellipsoid_around_sum(ball, disturbance, self.relative_weight)
+            disturbance = _ellipsoid_around_sum(self.relative_weight, ball, disturbance)
         # The further states of a model move as they should: inputs under way keep their limits.
         remainder = self.remainder
         if remainder is not None:
@@ -678,16 +678,16 @@ class LinearPlant(ReadOnlyArrays):
         It is larger than `allowed_disturbance` by what holds that plus E(F), F = n diag(r^2), with r the rounding of
         A x + B u + d for x up to SIMULATED_REACH half-widths out: (1+s/4) allowed + (1+4/s) F, s the inflation.
         """
-        return Ellipsoid(inflated(self.nominal_disturbance.shape_matrix) + self._rounding_room)
+        return Ellipsoid(inflated(self.nominal_disturbance.shape_matrix) + self._rounding_margin)
 
     @cached_property
     def allowed_disturbance(self) -> Ellipsoid:
         """What a disturbance may use of D: the rest is for the rounding of a simulation, shape (n, n)."""
         nominal = self.nominal_disturbance.shape_matrix
-        return Ellipsoid(0.5 * (nominal + inflated(nominal)) + 0.5 * self._rounding_room)
+        return Ellipsoid(0.5 * (nominal + inflated(nominal)) + 0.5 * self._rounding_margin)
 
     @cached_property
-    def _rounding_room(self) -> np.ndarray:
+    def _rounding_margin(self) -> np.ndarray:
         """What D gains for rounding, shape (n, n)."""
         reach = SIMULATED_REACH * self.half_widths
         rounding = exact.product(np.abs(self.A), reach) + exact.product(np.abs(self.B), self.u_max) + reach
@@ -698,14 +698,13 @@ class LinearPlant(ReadOnlyArrays):
     def nominal_disturbance(self) -> Ellipsoid:
         """D before inflation: where extremal disturbances are drawn, so that their rounding stays inside E(D)."""
         ball = Ellipsoid(self.gamma * np.eye(self.n))
-        noisy = _ellipsoid_around_sum(ball, self.process_noise.bound, self.relative_weight)
-        declared = _ellipsoid_around_sum(noisy, self.disturbance_bound, self.relative_weight)
-        return _ellipsoid_around_sum(declared, self.remainder_bound, self.relative_weight)
+        others = self.process_noise.bound, self.disturbance_bound, self.remainder_bound
+        return _ellipsoid_around_sum(self.relative_weight, ball, *others)
 
     @cached_property
     def nominal_sensor_error(self) -> Ellipsoid:
         """Holds the sensor noise v before inflation, shape (p, p): the truncated noise plus `sensor_bound`."""
-        return _ellipsoid_around_sum(self.sensor_noise.bound, self.sensor_bound, np.eye(self.p))
+        return _ellipsoid_around_sum(np.eye(self.p), self.sensor_noise.bound, self.sensor_bound)
 
     @cached_property
     def sensor_error(self) -> Ellipsoid:
@@ -715,7 +714,7 @@ class LinearPlant(ReadOnlyArrays):
     def sensor_error_with(self, quantization_step: float) -> Ellipsoid:
         """Returns N, shape (p, p): sensor noise plus the ball of squared radius p q^2/4 around a quantizer's box."""
         ball = Ellipsoid(self.p * quantization_step**2 / 4.0 * np.eye(self.p))
-        return Ellipsoid(inflated(_ellipsoid_around_sum(ball, self.nominal_sensor_error, np.eye(self.p)).shape_matrix))
+        return Ellipsoid(inflated(_ellipsoid_around_sum(np.eye(self.p), ball, self.nominal_sensor_error).shape_matrix))
 
     @cached_property
     def initial_radius_squared(self) -> float:
@@ -726,7 +725,7 @@ class LinearPlant(ReadOnlyArrays):
     def nominal_initial_error(self) -> Ellipsoid:
         """Holds the error of the first estimate before inflation, shape (n, n): the ball of r0 plus `initial_bound`."""
         ball = Ellipsoid(self.initial_radius_squared * np.eye(self.n))
-        return _ellipsoid_around_sum(ball, self.initial_bound, self.relative_weight)
+        return _ellipsoid_around_sum(self.relative_weight, ball, self.initial_bound)
 
     @cached_property
     def initial_error(self) -> Ellipsoid:
@@ -783,13 +782,14 @@ def inflated(shape: np.ndarray) -> np.ndarray:
     return INFLATION * shape + FLAT_INFLATION * np.diag(np.diag(shape))
 
 
-def _ellipsoid_around_sum(first: Ellipsoid, second: Ellipsoid | None, weight: np.ndarray) -> Ellipsoid:
-    """Returns an ellipsoid around the sum, of the smallest tr(W P); where one of them is a point or None, the other."""
-    if second is None or not np.any(second.shape_matrix):
-        return first
-    return (
-        Ellipsoid(outer_sum(first.shape_matrix, second.shape_matrix, weight)) if np.any(first.shape_matrix) else second
-    )
+def _ellipsoid_around_sum(weight: np.ndarray, first: Ellipsoid, *others: Ellipsoid | None) -> Ellipsoid:
+    """Returns an ellipsoid around the sum, one after the other of the smallest tr(W P); points and None add nothing."""
+    total = first
+    for each in others:
+        if each is not None and np.any(each.shape_matrix):
+            shapes = total.shape_matrix, each.shape_matrix
+            total = Ellipsoid(outer_sum(*shapes, weight)) if np.any(shapes[0]) else each
+    return total
 
 
 def _symmetric_product(G: np.ndarray, shape: np.ndarray) -> np.ndarray:

@@ -132,18 +132,16 @@ class PlantSimulation:
             return d if noise is None else d + noise
         excess = None
         if noise is not None:
-            inside = noise if self._truncated else self._pulled_in(noise)
-            excess = None if self._truncated else noise - inside
+            inside = noise
+            if not self._truncated:
+                inside = noise / np.maximum(self.plant.process_noise.bound.gauge(noise.T), 1.0)
+                excess = noise - inside
             d = d + inside
         if count is None:
             total = checked(self.plant, d, allow_assumption_violation=self._allow)
         else:
             total = checked_many(self.plant, d, count, allow_assumption_violation=self._allow)
         return total if excess is None else total + excess
-
-    def _pulled_in(self, noise: np.ndarray) -> np.ndarray:
-        """Returns process noise, shape (n,) or (n, count), with what lies outside its ellipsoid moved onto it."""
-        return noise / np.maximum(self.plant.process_noise.bound.gauge(noise.T), 1.0)
 
     def _draw_sensor_noise(self, rng: np.random.Generator, count: int) -> np.ndarray:
         if self._is_extreme:
