@@ -57,7 +57,7 @@ def _reads_as_two_sides(value: Any, rows: np.ndarray, n: int) -> bool:
     is_computed = not isinstance(value, (tuple, list))
     if rows.shape == (n, 2) and (n != 2 or (not is_computed and all(isinstance(each, tuple) for each in value))):
         return True
-    sides = [rows, rows.T] if rows.shape == (2, 2) and n == 2 else [rows] if len(rows) == 2 else []
+    sides = [rows, rows.T] if rows.shape == (2, 2) else [rows] if len(rows) == 2 else []
     return any(bool((low < high).all()) and (not is_computed or np.array_equal(low, -high)) for low, high in sides)
 
 
