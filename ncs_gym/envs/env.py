@@ -16,7 +16,6 @@ from ncs_gym.envs.settings import (
     CHANNELS,
     expect,
     loop_contracts,
-    require_own_equations,
     require_suitable,
     start_option,
     starting_set,
@@ -198,7 +197,11 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._disturbance = as_disturbance(disturbance, plant, self._allow_assumption_violation)
         self._initial_set = starting_set(initial_set, plant)
         require_suitable(self._task, plant)
-        require_own_equations(process, plant)
+        self._process_given = LinearProcess() if process is None else expect(process, Process, "process")
+        if plant.between_samples is not None and not isinstance(self._process_given, LinearProcess):
+            raise ValueError(
+                "between_samples is about the plant's own equations: beside another process= give a plant without it"
+            )
         if render_mode is not None and not (isinstance(render_mode, str) and render_mode in RENDER_MODES):
             raise RenderModeError(f"render_mode must be None or one of {RENDER_MODES}, got {shown(render_mode)}")
         self.render_mode = render_mode
@@ -222,7 +225,6 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         on_request, input_delay = self._channel.on_request, len(self._pending)
         self._requests = Requests(self._channel, self._contract, input_delay) if on_request else None
         self._noise = as_noise(noise, plant)
-        self._process_given = LinearProcess() if process is None else expect(process, Process, "process")
         allowed = self._allow_assumption_violation
         self._process = PlantSimulation(
             plant, self._disturbance, allowed, noise=self._noise, process=self._process_given

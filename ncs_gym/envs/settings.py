@@ -11,7 +11,6 @@ from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.network.downlink import DownlinkProtocol, downlink_protocol
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.processes.process import LinearProcess, Process
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_numbers, as_vector, shown
@@ -72,14 +71,6 @@ def require_suitable(task: Task, plant: LinearPlant) -> None:
         raise ValueError(
             f"{kind.__name__}: observe is defined, observation_bound is not: it must return the largest absolute value "
             "of each of these entries within the horizon"
-        )
-
-
-def require_own_equations(process: Process | None, plant: LinearPlant) -> None:
-    """Raises ValueError if times between samples are to count of a process whose states there nobody knows."""
-    if plant.between_samples is not None and not (process is None or isinstance(process, LinearProcess)):
-        raise ValueError(
-            "between_samples is about the plant's own equations: beside another process= give a plant without it"
         )
 
 
