@@ -71,7 +71,7 @@ def loop_info(
         sampled: What was requested in the step.
     """
     values, worst, cost, violations = constraints
-    many = state.ndim > 1
+    many, oldest = state.ndim > 1, np.inf if contract is None else contract.max_age
 
     def own(value: Any) -> Any:
         return np.array(value) if many else value
@@ -91,7 +91,7 @@ def loop_info(
         "assumption_violated": own(known.alarm),
         "episode_violations": violations,
         "is_success": (violations == 0.0) * 1.0,
-        "contract_broken": own(False) if contract is None else known.age > contract.max_age,
+        "contract_broken": known.age > oldest,
         "downlink_broken": own(missing),
         "requested": own(sampled.requested),
         "request_forced": own(sampled.forced),
