@@ -64,7 +64,6 @@ def rounded(numbers: np.ndarray | float, digits: int, axis: int | None = None) -
 
 
 def _exponent(size: float) -> int:
-    """Returns the decimal exponent of a size; 0 of zero."""
     return int(f"{size:e}".partition("e")[2])
 
 
@@ -122,11 +121,7 @@ def nearest(balls: Callable[[], list[Any]]) -> list[float]:
 
 
 def _nearest_to_end(end: Any) -> float:
-    """Returns the float64 next to the end of a ball, which as a rational number might fill the memory.
-
-    Raises:
-        OverflowError: If it is too large for one.
-    """
+    """Returns the float64 next to the end of a ball, which as a rational number might fill the memory."""
     if abs(end) < SMALLEST:
         return 0.0
     if abs(end) > LARGEST:
@@ -135,11 +130,7 @@ def _nearest_to_end(end: Any) -> float:
 
 
 def _tie(low: float, high: float) -> float:
-    """Returns the even one of two floats whose midpoint is, as far as any precision tells, the number itself.
-
-    Raises:
-        OverflowError: If they are not next to each other.
-    """
+    """Returns the even one of two floats whose midpoint is, as far as any precision tells, the number itself."""
     if low != high and math.nextafter(low, math.inf) != high:
         raise OverflowError("a number cannot be enclosed closely enough")
     return _nearest_to((_as_rational(low) + _as_rational(high)) / 2)
@@ -158,9 +149,5 @@ def _rounded(matrix: Any) -> np.ndarray:
 
 
 def _nearest_to(number: Any) -> float:
-    """Returns the float64 next to a rational number: Python divides whole numbers with a single rounding.
-
-    Raises:
-        OverflowError: If it is too large for one.
-    """
+    """Returns the float64 next to a rational number: Python divides whole numbers with a single rounding."""
     return int(number.p) / int(number.q) + 0.0  # a zero has no sign

@@ -37,8 +37,7 @@ from ncs_gym.tasks.base_task import Task
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.tasks.setpoint_tracking import SetpointTracking
 from ncs_gym.tasks.speed_tracking import SpeedTracking
-from ncs_gym.uncertainty.bounded_disturbances import BallDisturbance, BoxDisturbance, SinusoidDisturbance
-from ncs_gym.uncertainty.disturbance import Disturbance
+from ncs_gym.uncertainty.disturbances import BallDisturbance, BoxDisturbance, Disturbance, SinusoidDisturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_count, shown
 

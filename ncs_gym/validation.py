@@ -27,7 +27,6 @@ class ReadOnlyArrays:
     """
 
     def _make_arrays_read_only(self) -> None:
-        """Replaces every array attribute by a read-only copy of its own."""
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray):
                 object.__setattr__(self, name, read_only(value))

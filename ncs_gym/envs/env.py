@@ -16,12 +16,11 @@ from ncs_gym.envs.settings import (
     CHANNELS,
     expect,
     loop_contracts,
-    require_own_equations,
     require_suitable,
     start_option,
     starting_set,
 )
-from ncs_gym.envs.spaces import entries_within, observation_space, observed_of, read_action, read_observed
+from ncs_gym.envs.spaces import Observer, observation_space, read_action, read_observed
 from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
@@ -37,8 +36,7 @@ from ncs_gym.processes.process import LinearProcess, Process
 from ncs_gym.rendering import Annotation, Renderer, sent_at
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.tasks.regulation import Regulation
-from ncs_gym.uncertainty.disturbance import Disturbance
-from ncs_gym.uncertainty.disturbance_settings import as_disturbance, as_noise
+from ncs_gym.uncertainty.disturbances import Disturbance, as_disturbance, as_noise
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_count, as_flag, setting, shown
 
@@ -199,7 +197,11 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._disturbance = as_disturbance(disturbance, plant, self._allow_assumption_violation)
         self._initial_set = starting_set(initial_set, plant)
         require_suitable(self._task, plant)
-        require_own_equations(process, plant)
+        self._process_given = LinearProcess() if process is None else expect(process, Process, "process")
+        if plant.between_samples is not None and not isinstance(self._process_given, LinearProcess):
+            raise ValueError(
+                "between_samples is about the plant's own equations: beside another process= give a plant without it"
+            )
         if render_mode is not None and not (isinstance(render_mode, str) and render_mode in RENDER_MODES):
             raise RenderModeError(f"render_mode must be None or one of {RENDER_MODES}, got {shown(render_mode)}")
         self.render_mode = render_mode
@@ -223,7 +225,6 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         on_request, input_delay = self._channel.on_request, len(self._pending)
         self._requests = Requests(self._channel, self._contract, input_delay) if on_request else None
         self._noise = as_noise(noise, plant)
-        self._process_given = LinearProcess() if process is None else expect(process, Process, "process")
         allowed = self._allow_assumption_violation
         self._process = PlantSimulation(
             plant, self._disturbance, allowed, noise=self._noise, process=self._process_given
@@ -234,10 +235,10 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         self._observe = read_observed(observe)
         sets = self._error_set, self._initial_set
         self.observation_space = observation_space(plant, self._task, *sets, steps, input_delay, self._observe)
-        self._low, self._high = self.observation_space.low, self.observation_space.high
+        self._observer = Observer(self._task, self.observation_space, self._observe, self._horizon)
         self.steps = self.episodes = 0
         self.start: Ellipsoid | np.ndarray = self._initial_set
-        self._consistent = self._warned = False
+        self._consistent = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -403,7 +404,6 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         return list(zip(CHANNELS, (self._uplinks, self._downlinks), strict=True))
 
     def _estimator_for(self, channel: Channel) -> Estimator:
-        """Returns an estimator of the episodes to come, for packets of other delays."""
         histories = arrival_histories(self._plant, channel, self._certificate_contract)
         return Estimator(self._plant, channel, histories=histories, after=self._estimator)
 
@@ -414,26 +414,22 @@ class NCSEnv(gym.Env[np.ndarray, np.ndarray]):
         task_state = self._task_state
         for u in self._pending:
             task_state = self._task.predict(self._plant, task_state, u)
-        own, more = self._task.observe(task_state), observed_of(self._known, self._observe)
-        bounds = self._low, self._high
-        within, self._warned = entries_within(
-            self._task, self._estimate[0], own, more, *bounds, self._warned, self._horizon
-        )
-        return within.astype(np.float32)
+        return self._observer.observation(self._known, self._task.observe(task_state))
 
     def _info(self, inputs: Inputs, worst: np.ndarray, *, arrived: bool) -> dict[str, Any]:
         values = worst if self._plant.between_samples is None else self._plant.constraint_values(self._state)
         cost = 1.0 if max(worst.tolist()) > 0.0 else 0.0
         self._violations += cost
         constraints = Constraints(values, worst, cost, self._violations)
-        self._estimate = self._predicted_estimate()
-        known, alarm = self._estimator, bool(self._estimator.alarm or self._process.alarm)
-        self._known = Known(*self._estimate, known.age, alarm, inputs.applied.copy(), inputs.committed.copy())
+        estimator, alarm = self._estimator, bool(self._estimator.alarm or self._process.alarm)
+        self._known = Known(
+            *self._predicted_estimate(), estimator.age, alarm, inputs.applied.copy(), inputs.committed.copy()
+        )
         sampled = Requested(False, False, self._packets)
         if self._requests is not None:
             sampled = Requested(self._requests.requested, self._requests.forced, self._packets)
-        loop = known, self._estimate, self._contract, self._state, inputs, arrived, constraints, alarm
-        return loop_info(*loop, sampled)
+        happened = estimator.mean, self._state, inputs.missing, arrived
+        return loop_info(self._known, *happened, self._contract, constraints, sampled)
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:

@@ -15,9 +15,6 @@ from ncs_gym.network.channel import Channel
 from ncs_gym.network.downlink import DownlinkProtocol, require_fitting_downlink
 from ncs_gym.validation import shown
 
-# A channel, or what draws one at the start of every episode.
-ChannelSource = Channel | Callable[[np.random.Generator], Channel]
-
 
 class EpisodeChannels:
     """The channels of N environments in their present episodes, in one direction.
@@ -171,7 +168,6 @@ class VectorRandomChannel(VectorWrapper, RecordConstructorArgs):
 
 
 def _drawn(channel: Any, downlink: Any) -> dict[str, Callable[[np.random.Generator], Any]]:
-    """Returns the options of `reset` that draw channels."""
     given = {name: each for name, each in {"channel": channel, "downlink": downlink}.items() if each is not None}
     if not given:
         raise ValueError("give channel or downlink: a function (rng) -> Channel, or a list of channels")

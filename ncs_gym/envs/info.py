@@ -6,10 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ncs_gym.estimation.estimator import Estimator
-from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.contract import ChannelContract
-from ncs_gym.network.downlink import Inputs
 from ncs_gym.network.requests import Requested
 
 
@@ -52,54 +49,51 @@ class Constraints(NamedTuple):
 
 
 def loop_info(
-    estimator: Estimator | VectorEstimator,
-    predicted: tuple[np.ndarray, np.ndarray],
-    contract: ChannelContract | None,
+    known: Known,
+    mean: np.ndarray,
     state: np.ndarray,
-    inputs: Inputs,
+    missing: Any,
     arrived: Any,
+    contract: ChannelContract | None,
     constraints: Constraints,
-    alarm: Any,
     sampled: Requested,
 ) -> dict[str, Any]:
     """Returns `info`, every array a fresh copy; the environment is the first axis of what it holds for many.
 
     Args:
-        estimator: Gives the present estimate, and age.
-        predicted: Estimate, shape (n,) or (n, N), and error shape, (n, n) or as a fresh array (N, n, n), of the time at
-            which the next input takes effect.
-        contract: What the channel guarantees, if anything.
+        known: What is known now.
+        mean: The present estimate, shape (n,) or (n, N).
         state: x, shape (n,) or (n, N).
-        inputs: What was applied and what was committed in the step.
+        missing: Whether zero was applied because the input committed had not arrived, a bool or shape (N,).
         arrived: Whether a packet arrived at this step, a bool or a fresh array of shape (N,).
-        constraints: How the safe box is kept.
-        alarm: Whether an assumption was seen to be violated, a bool or a fresh array of shape (N,).
+        contract: What the channel guarantees, if anything.
+        constraints: How the safe box is kept; `values`, `cost` and `violations` are fresh arrays.
         sampled: What was requested in the step.
     """
     values, worst, cost, violations = constraints
-    age: Any = estimator.age
-    applied, committed, missing = inputs
-    estimate, error_shape = predicted
-    many = state.ndim > 1
-    broken = age > contract.max_age if contract is not None else np.zeros(age.shape, np.bool_) if many else False
+    many, oldest = state.ndim > 1, np.inf if contract is None else contract.max_age
+
+    def own(value: Any) -> Any:
+        return np.array(value) if many else value
+
     return {
-        "state": state.copy().T if many else state.copy(),
-        "estimate": estimate.copy().T if many else estimate.copy(),
-        "estimation_error": (estimator.mean - state).T if many else estimator.mean - state,
-        "error_shape": error_shape if many else error_shape.copy(),
-        "input": applied.copy().T if many else applied.copy(),
-        "input_committed": committed.copy().T if many else committed.copy(),
-        "constraint_values": values.T if many else values,
-        "worst_constraint_values": worst.copy().T if many else worst.copy(),
+        "state": state.copy().T,
+        "estimate": known.estimate.copy().T,
+        "estimation_error": (mean - state).T,
+        "error_shape": known.error_shape.copy(),
+        "input": known.applied.copy().T,
+        "input_committed": known.committed.copy().T,
+        "constraint_values": values.T,
+        "worst_constraint_values": worst.copy().T,
         "cost": cost,
-        "measurement_age": age.copy() if many else age,
+        "measurement_age": own(known.age),
         "packet_arrived": arrived,
-        "assumption_violated": alarm,
+        "assumption_violated": own(known.alarm),
         "episode_violations": violations,
         "is_success": (violations == 0.0) * 1.0,
-        "contract_broken": broken,
-        "downlink_broken": np.array(missing) if many else missing,
-        "requested": np.array(sampled.requested) if many else sampled.requested,
-        "request_forced": np.array(sampled.forced) if many else sampled.forced,
-        "packets": np.array(sampled.packets) if many else sampled.packets,
+        "contract_broken": known.age > oldest,
+        "downlink_broken": own(missing),
+        "requested": own(sampled.requested),
+        "request_forced": own(sampled.forced),
+        "packets": own(sampled.packets),
     }

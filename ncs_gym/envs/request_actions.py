@@ -118,11 +118,7 @@ class VectorRequestActions(VectorWrapper, RecordConstructorArgs):
 
 
 def _on_request(env: Any, kind: type) -> Any:
-    """Returns the environment inside all wrappers.
-
-    Raises:
-        ValueError: If it is of another kind, or sends samples by itself.
-    """
+    """Returns the environment inside all wrappers."""
     inner = env.unwrapped
     if not isinstance(inner, kind):
         raise ValueError(f"expected an {kind.__name__} inside, got {type(inner).__name__}")
@@ -140,17 +136,12 @@ def _bounds(env: NCSEnv) -> np.ndarray:
 
 
 def _wider(space: Any, low: Any, high: Any) -> Box:
-    """Returns a space with more entries, within bounds."""
     least, most = (np.concatenate(pair).astype(np.float32) for pair in ((space.low, low), (space.high, high)))
     return Box(least, most, dtype=np.float32)
 
 
 def _parted(actions: Any, shape: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the entries of actions that are inputs, and whether a sample is asked for.
-
-    Raises:
-        ValueError: If the actions are not finite or wrongly shaped.
-    """
+    """Returns the entries of actions that are inputs, and whether a sample is asked for."""
     numbers = as_numbers(actions)
     if numbers is None or numbers.shape != shape or not np.isfinite(numbers).all():
         raise ValueError(f"actions must be finite with shape {shape}, got {shown(actions)}")

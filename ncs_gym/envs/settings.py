@@ -6,13 +6,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ncs_gym.envs.spaces import default_initial_set
 from ncs_gym.estimation.error_bound import UnstablePlantError
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.network.downlink import DownlinkProtocol, downlink_protocol
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.processes.process import LinearProcess, Process
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_numbers, as_vector, shown
@@ -21,27 +19,8 @@ T = TypeVar("T")
 
 # Options of `reset` that give channels.
 CHANNELS = "channel", "downlink"
-
-
-def _assumed_contract(plant: LinearPlant, channel: Channel, contract: ChannelContract | None) -> ChannelContract | None:
-    """Returns the contract that the estimator's error sets rest on.
-
-    Raises:
-        UnstablePlantError: If an unstable plant has neither a contract nor a channel that keeps one.
-        ValueError: If the channel rounds more coarsely than the contract allows.
-    """
-    if contract is None and plant.spectral_radius >= 1.0:
-        contract = contract_of(channel)
-        if contract is None:
-            raise UnstablePlantError(
-                f"the plant is unstable (spectral radius {plant.spectral_radius:.6g}), the channel promises nothing: "
-                "give it max_consecutive_losses, or the environment contract=ChannelContract(max_age=...)"
-            )
-    if contract is not None and not expect(contract, ChannelContract, "contract").is_fine_enough_for(channel):
-        raise ValueError(
-            f"the channel rounds to {channel.quantization_step}, the contract allows {contract.quantization_step}"
-        )
-    return contract
+# The default start covers this fraction of the half-width of the safe box in every direction.
+START_FRACTION = 0.1
 
 
 def loop_contracts(
@@ -55,21 +34,32 @@ def loop_contracts(
         UnstablePlantError: If an unstable plant has neither a contract nor a channel that keeps one.
         ValueError: If the channel rounds more coarsely than the contract allows, or a setting is wrong.
     """
-    assumed = _assumed_contract(plant, channel, contract)
+    if contract is None and plant.spectral_radius >= 1.0:
+        contract = contract_of(channel)
+        if contract is None:
+            raise UnstablePlantError(
+                f"the plant is unstable (spectral radius {plant.spectral_radius:.6g}), the channel promises nothing: "
+                "give it max_consecutive_losses, or the environment contract=ChannelContract(max_age=...)"
+            )
+    if contract is not None and not expect(contract, ChannelContract, "contract").is_fine_enough_for(channel):
+        raise ValueError(
+            f"the channel rounds to {channel.quantization_step}, the contract allows {contract.quantization_step}"
+        )
     protocol = downlink_protocol(downlink, downlink_contract)
-    return assumed, protocol, assumed if protocol is None else protocol.behind(assumed)
+    return contract, protocol, contract if protocol is None else protocol.behind(contract)
 
 
 def starting_set(initial_set: Ellipsoid | None, plant: LinearPlant) -> Ellipsoid:
-    """Returns the ellipsoid that states start in, the default one for None.
+    """Returns the ellipsoid that states start in, by default {x : |C x|^2 <= 0.1^2}; W bounds what C leaves free.
 
     Raises:
         ValueError: If it is none, or of another dimension than the plant.
     """
-    chosen = default_initial_set(plant) if initial_set is None else expect(initial_set, Ellipsoid, "initial_set")
-    if chosen.dim != plant.n:
-        raise ValueError(f"initial_set must have dimension {plant.n}, got {chosen.dim}")
-    return chosen
+    if initial_set is None:
+        return Ellipsoid(START_FRACTION**2 * np.linalg.inv(plant.weight))
+    if expect(initial_set, Ellipsoid, "initial_set").dim != plant.n:
+        raise ValueError(f"initial_set must have dimension {plant.n}, got {initial_set.dim}")
+    return initial_set
 
 
 def require_suitable(task: Task, plant: LinearPlant) -> None:
@@ -81,14 +71,6 @@ def require_suitable(task: Task, plant: LinearPlant) -> None:
         raise ValueError(
             f"{kind.__name__}: observe is defined, observation_bound is not: it must return the largest absolute value "
             "of each of these entries within the horizon"
-        )
-
-
-def require_own_equations(process: Process | None, plant: LinearPlant) -> None:
-    """Raises ValueError if times between samples are to count of a process whose states there nobody knows."""
-    if plant.between_samples is not None and not (process is None or isinstance(process, LinearProcess)):
-        raise ValueError(
-            "between_samples is about the plant's own equations: beside another process= give a plant without it"
         )
 
 
@@ -136,11 +118,7 @@ def vector_reset_options(options: dict[str, Any] | None, count: int, n: int) -> 
 
 
 def _known_options(options: Any, known: set[str]) -> dict[str, Any]:
-    """Returns the options of a reset; an empty dict for None.
-
-    Raises:
-        ValueError: If they are no dict, or have other keys.
-    """
+    """Returns the options of a reset; an empty dict for None."""
     if options is not None and not isinstance(options, dict):
         raise ValueError(f"the options of reset must be a dict, got {shown(options)}")
     if unknown := [key for key in options or {} if key not in known]:

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box
 
+from ncs_gym.envs.info import Known
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_numbers, shown
 
-# The default start covers this fraction of the half-width of the safe box in every direction.
-START_FRACTION = 0.1
 # What can be observed besides estimate and task.
 OBSERVED = "age", "error"
 # Widens the observation box: float32 rounding, and estimates a little off the reachable set.
@@ -25,11 +24,6 @@ OBSERVATION_MARGIN = 1.01
 
 class ClippedObservationWarning(UserWarning):
     """Entries of a task are beyond the observation space, which agents do not see."""
-
-
-def default_initial_set(plant: LinearPlant) -> Ellipsoid:
-    """Returns the starts {x : |C x|^2 <= 0.1^2}, well inside the safe box; W bounds directions C leaves free."""
-    return Ellipsoid(START_FRACTION**2 * np.linalg.inv(plant.weight))
 
 
 def observation_space(
@@ -105,13 +99,6 @@ def read_observed(observe: Any) -> tuple[str, ...]:
     return names
 
 
-def observed_of(known: Any, observe: tuple[str, ...]) -> list[np.ndarray]:
-    """Returns these entries of what is known (`Known`), shape (entries,) each, or (entries, N) of N environments."""
-    entries = {"age": lambda: np.asarray(known.age, dtype=np.float64)[None]}
-    entries["error"] = lambda: np.sqrt(np.diagonal(known.error_shape, axis1=-2, axis2=-1)).T
-    return [entries[name]() for name in observe]
-
-
 def nearest_action(inputs: np.ndarray, limits: np.ndarray) -> np.ndarray:
     """Returns the float32 actions whose inputs are nearest to some, clipped to [-1, 1].
 
@@ -127,52 +114,61 @@ def expressible(inputs: np.ndarray, limits: np.ndarray) -> np.ndarray:
     return limits * nearest_action(inputs, limits)
 
 
-def entries_within(
-    task: Task,
-    estimates: np.ndarray,
-    own: Any,
-    more: list[np.ndarray],
-    low: np.ndarray,
-    high: np.ndarray,
-    warned: bool,
-    horizon: int,
-) -> tuple[np.ndarray, bool]:
-    """Returns observation entries, clipped to the space, and whether it was ever warned of clipping the task's.
+class Observer:
+    """Makes the observations of a control loop, or of N at once.
 
     Args:
-        task: Gives the name.
-        estimates: Shape (n,) or (n, N).
-        own: The task's entries, shape (extra,) or (extra, N).
-        more: What is observed besides.
-        low: Bounds, shape (n + extra,) or (n + extra, 1).
-        high: Bounds, likewise.
-        warned: Whether it was warned before.
-        horizon: Steps that the bounds are about.
-
-    Raises:
-        ValueError: If the task has another number of entries than it has bounds.
+        task: The task, which has entries of its own.
+        space: The observation space of one loop.
+        observe: What is observed besides; see `read_observed`.
+        horizon: Steps that the bounds of the space are about.
+        many: Whether arrays have an axis for the environments, the last one.
     """
-    entries = np.concatenate([estimates, own, *more])
-    if len(entries) != len(low):
-        bounds = len(low) - len(entries) + len(own)
-        raise ValueError(
-            f"{type(task).__name__}: observe returns {len(own)} entries, observation_bound the bounds of {bounds}: it "
-            "must return the largest absolute value of each"
-        )
-    within = np.minimum(np.maximum(entries, low), high)
-    if not warned and len(own):
-        first, last = len(estimates), len(estimates) + len(own)
-        if np.count_nonzero(beyond := within[first:last] != entries[first:last]):
-            entry = int(np.argwhere(beyond)[0][0])
-            bound = float(np.ravel(high)[first + entry])
-            warnings.warn(
-                f"entry {entry} of {type(task).__name__} is beyond its observation_bound of {bound:.6g} and is clipped "
-                f"in observations: bound what {horizon} steps can reach, and give horizon=... if episodes are longer",
-                ClippedObservationWarning,
-                stacklevel=4,
+
+    def __init__(self, task: Task, space: Box, observe: tuple[str, ...], horizon: int, *, many: bool = False) -> None:
+        self._task, self._observe, self._horizon, self._has_warned = task, observe, horizon, False
+        low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+        self._low, self._high = (low[:, None], high[:, None]) if many else (low, high)
+
+    def observation(self, known: Known, own: Any) -> np.ndarray:
+        """Returns entries clipped to the space, shape (entries,) or (entries, N), float32.
+
+        Args:
+            known: What is known now.
+            own: The task's entries, shape (extra,) or (extra, N).
+
+        Raises:
+            ValueError: If the task has another number of entries than it has bounds.
+        """
+        entries = np.concatenate([known.estimate, own, *(self._observed(known, name) for name in self._observe)])
+        if len(entries) != len(self._low):
+            bounds = len(self._low) - len(entries) + len(own)
+            raise ValueError(
+                f"{type(self._task).__name__}: observe returns {len(own)} entries, observation_bound the bounds of "
+                f"{bounds}: it must return the largest absolute value of each"
             )
-            warned = True
-    return within, warned
+        within = np.minimum(np.maximum(entries, self._low), self._high)
+        if not self._has_warned and len(own):
+            first, last = len(known.estimate), len(known.estimate) + len(own)
+            if np.count_nonzero(beyond := within[first:last] != entries[first:last]):
+                self._has_warned = True
+                self._warn(first, int(np.argwhere(beyond)[0][0]))
+        return within.astype(np.float32)
+
+    def _observed(self, known: Known, name: str) -> np.ndarray:
+        if name == "age":
+            return np.asarray(known.age, dtype=np.float64)[None]
+        return np.sqrt(np.diagonal(known.error_shape, axis1=-2, axis2=-1)).T
+
+    def _warn(self, first: int, entry: int) -> None:
+        bound = float(np.ravel(self._high)[first + entry])
+        warnings.warn(
+            f"entry {entry} of {type(self._task).__name__} is beyond its observation_bound of {bound:.6g} and is "
+            f"clipped in observations: bound what {self._horizon} steps can reach, and give horizon=... if episodes "
+            "are longer",
+            ClippedObservationWarning,
+            stacklevel=5,
+        )
 
 
 def read_action(plant: LinearPlant, action: Any) -> tuple[np.ndarray, np.ndarray]:

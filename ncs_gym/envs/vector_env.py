@@ -14,7 +14,7 @@ from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, SAMPLE_ROUNDING, 
 from ncs_gym.envs.episode_channels import covering, downlinks, uplinks
 from ncs_gym.envs.info import Constraints, Known, loop_info
 from ncs_gym.envs.settings import CHANNELS, vector_reset_options
-from ncs_gym.envs.spaces import entries_within, observed_of, read_actions
+from ncs_gym.envs.spaces import Observer, read_actions
 from ncs_gym.estimation.arrival_histories import ErrorTable, arrival_histories
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.vector_estimator import VectorEstimator
@@ -28,7 +28,7 @@ from ncs_gym.processes.plant_simulation import PlantSimulation
 from ncs_gym.processes.process import Process
 from ncs_gym.rendering import Annotation, PacketRecord
 from ncs_gym.tasks.base_task import Task
-from ncs_gym.uncertainty.disturbance import Disturbance
+from ncs_gym.uncertainty.disturbances import Disturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_count, setting, shown
 
@@ -116,8 +116,7 @@ class NCSVectorEnv(VectorEnv):
         self.single_action_space = single.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        bounds = single.observation_space.low, single.observation_space.high
-        self._low, self._high = (np.asarray(bound, dtype=np.float64)[:, None] for bound in bounds)
+        self._observer = Observer(self._task, single.observation_space, single.observe, single.horizon, many=True)
         allowed = single.allow_assumption_violation
         self._process = PlantSimulation(
             self._plant, single.disturbance, allowed, self.num_envs, noise=single.noise, process=single.process
@@ -141,7 +140,7 @@ class NCSVectorEnv(VectorEnv):
         self._violations, self._done = np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
         self.steps, self.episodes = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs, np.int64)
         self.starts = np.full((self.num_envs, self._plant.n), np.nan)
-        self.ticks, self._consistent, self._warned = 0, False, False
+        self.ticks, self._consistent = 0, False
         self._known: Known
         self._ended: tuple[np.ndarray, Known] | None = None
 
@@ -287,7 +286,6 @@ class NCSVectorEnv(VectorEnv):
         self._single.annotate(annotation)
 
     def _draw(self, info: dict[str, Any], begins: np.ndarray | None, *, moved: bool = True) -> None:
-        """Hands what happened in `rendered_env` to the renderer, if there is one."""
         renderer, e = self._single.renderer, self.rendered_env
         if renderer is None:
             return
@@ -402,11 +400,7 @@ class NCSVectorEnv(VectorEnv):
                 self._estimator.follow(histories)
 
     def _one_each(self, value: Any, name: str) -> list[Channel] | None:
-        """Returns a channel that is given for all environments, or for each, as a list of N; None for None.
-
-        Raises:
-            ValueError: If it is none of these.
-        """
+        """Returns a channel that is given for all environments, or for each, as a list of N; None for None."""
         if value is None:
             return None
         each = list(value) if isinstance(value, (list, tuple)) else [value] * self.num_envs
@@ -421,26 +415,20 @@ class NCSVectorEnv(VectorEnv):
         return self._estimator.predicted(self._downlink_state.committed.pending)
 
     def _first(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns states that episodes start at, and the errors of their first estimates, shape (n, count) each."""
         rng = self.np_random
         states = (1.0 - SAMPLE_ROUNDING) * self._single.initial_set.sample(rng, count)
         return states.T, self._process.first_error(rng, count)
 
     def _observation(self) -> np.ndarray:
-        """Returns the observations, shape (N, n + extra)."""
         task_state = self._task_state
         for u in self._downlink_state.committed.pending:
             task_state = self._task.predict_many(self._plant, task_state, u)
-        own, more = self._task.observe_many(task_state), observed_of(self._known, self._single.observe)
-        bounds = self._low, self._high
-        within, self._warned = entries_within(
-            self._task, self._estimate[0], own, more, *bounds, self._warned, self._single.horizon
-        )
-        return within.astype(np.float32).T
+        return self._observer.observation(self._known, self._task.observe_many(task_state)).T
 
     def _info(self, inputs: Inputs, arrived: np.ndarray, counted: np.ndarray | None) -> dict[str, Any]:
         """Returns the infos; the costs of environments that are not `counted`, shape (N,), do not count once more."""
-        values = self._worst if self._plant.between_samples is None else self._plant.constraint_values(self._state)
+        plant = self._plant
+        values = self._worst.copy() if plant.between_samples is None else plant.constraint_values(self._state)
         cost = (np.maximum.reduce(self._worst) > 0.0).astype(np.float64)
         self._violations = self._violations + (cost if counted is None else cost * counted)
         self._estimate = self._predicted_estimates()
@@ -448,12 +436,13 @@ class NCSVectorEnv(VectorEnv):
         predicted = self._estimate[0], table.shapes.take(numbers, axis=0)
         constraints = Constraints(values, self._worst, cost, self._violations.copy())
         alarm = self._estimator.alarm | self._process.alarm
-        self._known = Known(*predicted, self._estimator.age.copy(), alarm.copy(), *(each.copy() for each in inputs[:2]))
+        self._known = Known(*predicted, self._estimator.age.copy(), alarm, *(each.copy() for each in inputs[:2]))
         asked, forced = self._nothing, self._nothing
         if self._requests is not None:
             asked, forced = self._requests.requested, self._requests.forced
-        loop = self._estimator, predicted, self._contract, self._state, inputs, arrived, constraints, alarm
-        return loop_info(*loop, Requested(asked, forced, self._packets))
+        happened = self._estimator.mean, self._state, inputs.missing, arrived
+        sampled = Requested(asked, forced, self._packets)
+        return loop_info(self._known, *happened, self._contract, constraints, sampled)
 
     def _restarted(self, observation: np.ndarray, info: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
         """Returns the first of new episodes where old ones ended, whose last go to final_obs and final_info."""
@@ -483,11 +472,7 @@ def _where(mask: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarra
 
 
 def _autoreset_mode(value: AutoresetMode | str) -> AutoresetMode:
-    """Returns a mode given as such or by its name.
-
-    Raises:
-        ValueError: If there is none of that name.
-    """
+    """Returns a mode given as such or by its name."""
     for mode in AutoresetMode:
         if value is mode or (isinstance(value, str) and value == mode.value):
             return mode

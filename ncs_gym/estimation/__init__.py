@@ -2,7 +2,7 @@
 
 `error_bound` and `error_bounds_by_age` compute the certified error sets offline; `kalman_filter` and
 `set_membership` move covariance and running ellipsoid through predictions and updates; `arrival_histories` looks up
-whatever depends only on when packets arrive; `estimator` and `vector_estimator` carry the means, and `innovation_test`
+whatever depends only on when packets arrive; `estimator` and `vector_estimator` carry the means, and `innovation`
 raises an alarm where a measurement contradicts the assumed bounds.
 """
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.estimation.error_bound import ErrorSet, certified_error_set
-from ncs_gym.estimation.innovation_test import InnovationTest
+from ncs_gym.estimation.innovation import common_axes, quick_test
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
@@ -69,16 +69,14 @@ class ErrorTable:
         oldest: Ages above this make no difference.
 
     Attributes:
-        recursion: The same.
-        test: The innovation test.
+        recursion, oldest: The same.
         gains: Of an update, by number, shape (n, p, capacity); zero until it is worked out.
         quick_tests: W of the quick innovation test, by number, shape (p, p, capacity); zero until it is worked out.
     """
 
     def __init__(self, recursion: ErrorRecursion, oldest: int) -> None:
         n, p, size = recursion.plant.n, recursion.plant.p, _FIRST_CAPACITY
-        self.recursion, self._oldest = recursion, oldest
-        self.test = InnovationTest(recursion.plant.H, recursion.sets.noise)
+        self.recursion, self.oldest = recursion, oldest
         self._count = 0
         self._numbers: dict[bytes, int] = {}
         self._axes: dict[int, tuple[np.ndarray, np.ndarray]] = {}
@@ -118,13 +116,9 @@ class ErrorTable:
         covariance, shape = self._covariances[number].copy(), self._shapes[number].copy()
         return ErrorStatistics(frozen(covariance), frozen(shape), self._ages.item(number))
 
-    def age_matters(self, age: int) -> bool:
-        """Returns whether an age is told apart from all larger ones."""
-        return age < self._oldest
-
     def number_of(self, statistics: ErrorStatistics) -> int:
         """Returns the number of statistics, a new one if they have not occurred."""
-        age = min(statistics.age, self._oldest)
+        age = min(statistics.age, self.oldest)
         whole = b"".join((statistics.covariance.tobytes(), statistics.shape.tobytes(), age.to_bytes(4, "little")))
         key = blake2b(whole, digest_size=_HASH_SIZE).digest()
         number = self._numbers.get(key)
@@ -150,12 +144,13 @@ class ErrorTable:
         after = self._after_update.item(number)
         if after == UNKNOWN:
             statistics, after = self.statistics(number), number
-            quick_test = self.test.inverse_of_bound(self.test.spread(statistics.shape))
+            weight = quick_test(self._spread(statistics.shape), self.recursion.sets.noise)
             if (update := self.recursion.updated(statistics)) is not None:
-                after = self.number_of(update.statistics)
-                self.gains[..., number], self._gains[number] = update.gain, update.gain.ravel(order="K")
-                self._by_columns[number] = not update.gain.flags.c_contiguous
-            self.quick_tests[..., number] = self._quick_tests[number] = quick_test
+                gain, updated = update
+                after = self.number_of(updated)
+                self.gains[..., number], self._gains[number] = gain, gain.ravel(order="K")
+                self._by_columns[number] = not gain.flags.c_contiguous
+            self.quick_tests[..., number] = self._quick_tests[number] = weight
             self._after_update[number] = after  # last: another thread may look it up, and then wants the rest too
         else:
             self._recurs[after] = True
@@ -181,7 +176,7 @@ class ErrorTable:
 
         Those met longest ago come first: what recurs in one table after the other stays.
         """
-        table = ErrorTable(self.recursion, self._oldest)
+        table = ErrorTable(self.recursion, self.oldest)
         kept = np.flatnonzero(self._recurs[1 : self._count])[:most] + 1
         numbers = np.full(self._count + 1, UNKNOWN)  # in the new table; that of UNKNOWN, the last one, is UNKNOWN
         numbers[NO_SAMPLE], numbers[kept] = NO_SAMPLE, np.arange(1, len(kept) + 1)
@@ -199,11 +194,14 @@ class ErrorTable:
     def innovation_axes(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns the axes in which residuals before an update of some statistics are tested exactly."""
         if number not in self._axes:
-            self._axes[number] = self.test.axes(self.test.spread(self.shape(number)))
+            self._axes[number] = common_axes(self._spread(self.shape(number)), self.recursion.sets.noise)
         return self._axes[number]
 
+    def _spread(self, shape: np.ndarray) -> np.ndarray:
+        H = self.recursion.plant.H
+        return H @ shape @ H.T
+
     def _add(self, statistics: ErrorStatistics) -> int:
-        """Returns the number of new statistics."""
         number = self._count
         if number == len(self._ages):
             for name in _BY_NUMBER_LAST:
@@ -380,28 +378,22 @@ class ArrivalHistories:
             for key, shared in list(_shared.items()):
                 if shared is self:
                     _shared[key] = successor
-        numbers = successor._adopted(self, np.unique(histories).tolist())
-        return successor, np.array([numbers[each] for each in histories.tolist()], np.int64)
+        return successor, successor.taking_over(self, histories)
 
     def taking_over(self, other: ArrivalHistories, histories: np.ndarray) -> np.ndarray:
-        """Returns the numbers here of histories, shape (k,), of a graph with fewer delays of the same plant."""
-        numbers = self._adopted(other, np.unique(histories).tolist())
-        return np.array([numbers[each] for each in histories.tolist()], np.int64)
-
-    def _adopted(self, other: ArrivalHistories, histories: list[int]) -> dict[int, int]:
-        """Returns the numbers of another graph's histories."""
+        """Returns the numbers here of histories, shape (k,), of a graph of the same plant with no more delays."""
 
         def same(number: int) -> int:
             return number if number == UNKNOWN else self.table.number_of(other.table.statistics(number))
 
         numbers, older = {}, self.buffer - other.buffer
         with self._lock:
-            for each in histories:
+            for each in np.unique(histories).tolist():
                 present, priors, held, replay_from = other._history(each)
                 known = (*map(same, priors), *[UNKNOWN] * older)
                 numbers[each] = self._number_of(same(present), known, (*held, *[False] * older), replay_from)
-            self._adopted_count, self.is_full = max(self._adopted_count, len(histories)), False
-        return numbers
+            self._adopted_count, self.is_full = max(self._adopted_count, len(numbers)), False
+        return np.array([numbers[each] for each in histories.tolist()], np.int64)
 
     def _history(self, number: int) -> tuple[int, tuple[int, ...], tuple[bool, ...], int]:
         """Returns what a history is: present statistics, priors and samples held by age, and where a replay begins."""
@@ -444,7 +436,7 @@ class ArrivalHistories:
         if accepted:
             present, priors = number, tuple(replayed)
             age = table.statistics(number).age
-            self.new_age[history] = age if table.age_matters(age) else UNKNOWN
+            self.new_age[history] = age if age < table.oldest else UNKNOWN
         target = self._number_of(present, priors, held, NO_REPLAY)
         self.accepted[history], self.used[: oldest + 1, history] = accepted, used
         self.target[history] = target  # last: another thread may look it up, and then wants the rest too

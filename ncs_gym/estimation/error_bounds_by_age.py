@@ -14,12 +14,12 @@ from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, is_inside, j
 from ncs_gym.validation import ReadOnlyArrays
 
 # Digits of sets, relative to their extents, of gains and of rates: what differs between processors beyond them is cut
-# off. It is less than the slack below.
+# off. It is less than the margin below.
 DIGITS = 10
 # The sets are made for noise this much larger than allowed, so that at run time good gains nearly always fit in.
 NOISE_MARGIN = 1.2
 # Strict inequalities at the end.
-SLACK = 1.0 + 1e-7
+MARGIN = 1.0 + 1e-7
 # Growth per iteration; it doubles now and then, which ends cycles between multipliers that are equally good.
 SMALLEST_GROWTH, DOUBLING = 1e-6, 50.0
 # Multipliers mu that gains are chosen from: fine sensors want it close to 1.
@@ -164,7 +164,7 @@ def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsBy
             grown = joined(grown, shape + rounding)
         if not float(np.trace(grown)) < LARGEST:
             return None
-        if is_inside(SLACK * grown, start):
+        if is_inside(MARGIN * grown, start):
             break
         start = (1.0 + SMALLEST_GROWTH * 2.0 ** (turn / DOUBLING)) * grown
     else:
@@ -199,7 +199,7 @@ def _carried(start: np.ndarray, A: np.ndarray, D: np.ndarray, steps: int) -> lis
     """Returns Sigma_0 .. Sigma_steps, each a little more than the trace-smallest ellipsoid the last one moves into."""
     shapes = [start]
     for _ in range(steps):
-        shapes.append(SLACK * _symmetric(outer_sum(A @ shapes[-1] @ A.T, D, np.eye(len(A)))))
+        shapes.append(MARGIN * _symmetric(outer_sum(A @ shapes[-1] @ A.T, D, np.eye(len(A)))))
     return shapes
 
 

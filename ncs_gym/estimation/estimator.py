@@ -16,7 +16,8 @@ from ncs_gym.estimation.arrival_histories import (
     histories_of,
 )
 from ncs_gym.estimation.error_bound import ErrorSet, require_error_set
-from ncs_gym.estimation.kalman_filter import ErrorStatistics, filterpy_filter
+from ncs_gym.estimation.innovation import ALARM_TOLERANCE, outside_sum
+from ncs_gym.estimation.kalman_filter import ErrorStatistics
 from ncs_gym.network.channel import Channel, Packet
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.validation import frozen, setting
@@ -122,7 +123,7 @@ class Estimator:
         """
         shape = self._error_set.shape_at(0)
         assert shape is not None
-        first = ErrorStatistics(self._plant.kalman_covariances[2].copy(), shape.copy(), 0)
+        first = ErrorStatistics(self._plant.kalman_covariances[2], shape, 0)
         coarsens = self._usual.coarsens
         self._histories = histories_of(self._plant, self._channel, self._error_set, coarsens, first=first)
         self._begin(mean, self.step - len(inputs))
@@ -159,8 +160,14 @@ class Estimator:
         The estimator itself looks covariances and gains up by when packets arrived, which an object that is moved step
         by step cannot; between two arrivals the two do the same.
         """
-        mean, covariance, _, _ = self.estimate
-        return filterpy_filter(self._histories.recursion, mean, covariance)
+        from filterpy.kalman import KalmanFilter  # takes long to import; it has no types
+
+        plant, recursion = self._plant, self._histories.recursion
+        kalman: Any = KalmanFilter(dim_x=plant.n, dim_z=plant.p, dim_u=plant.m)
+        kalman.x, kalman.P, _, _ = self.estimate
+        kalman.F, kalman.B, kalman.H = plant.A.copy(), plant.B.copy(), plant.H.copy()
+        kalman.Q, kalman.R = recursion.Q.copy(), recursion.R.copy()
+        return kalman
 
     def advance(self, u: np.ndarray, packets: Iterable[Packet]) -> None:
         """Moves one step on: predicts with the input really applied, then takes in what arrived.
@@ -252,6 +259,6 @@ class Estimator:
 
         The ellipsoid of shape H Sigma H' + N, which the quick test is about, lies inside that sum.
         """
-        table = self._histories.table
-        test, spread = table.test, table.test.spread(table.shape(statistics))
-        self.alarm |= bool(test.are_impossible(residual[None], spread)[0])
+        recursion, H = self._histories.recursion, self._plant.H
+        spread = H @ self._histories.table.shape(statistics) @ H.T
+        self.alarm |= bool(outside_sum(residual[None], spread, recursion.sets.noise, ALARM_TOLERANCE)[0])

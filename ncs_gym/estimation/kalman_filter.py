@@ -1,13 +1,13 @@
 """The Kalman filter without its mean: covariance, gain and error ellipsoid, which do not depend on what is measured.
 
 The recursion of the covariance is two pure functions. filterpy's filter keeps a mean, which there is none of here, and
-changes in place, which what many estimators share must not; `filterpy_filter` makes one of an estimate.
+changes in place, which what many estimators share must not; `Estimator.as_filterpy` makes one of an estimate.
 """
 
 from __future__ import annotations
 
 from math import ceil, isfinite, log2
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from ncs_gym.uncertainty.shape_matrices import is_inside
 
 # Covariances grow no further than this, in squared half-widths of the safe box.
 LARGEST_COVARIANCE = 1e12
-# Factors of covariances keep this many bits, so that covariances recur when a pattern of arrivals does.
+# Factors of covariances keep this many bits, so that covariances recur when an arrival history does.
 COVARIANCE_BITS = 6
 
 
@@ -56,18 +56,6 @@ class ErrorStatistics(NamedTuple):
     age: int
 
 
-class Update(NamedTuple):
-    """What using a sample does to an estimate.
-
-    Attributes:
-        gain: T, shape (n, p), of x_hat + T (y - H x_hat).
-        statistics: Those of the error afterwards.
-    """
-
-    gain: np.ndarray
-    statistics: ErrorStatistics
-
-
 class ErrorRecursion:
     """Moves error statistics through predictions and updates, with gains that keep the error in its certified set.
 
@@ -78,7 +66,12 @@ class ErrorRecursion:
         covariance_bits: Bits that are kept of the factors of covariances (a gain's optimality is of second order in
             them).
         shape_step: What shapes are rounded up to, as a fraction of the certified set's square extent.
-        first: The statistics at the start; by default those of a first estimate.
+        first: The statistics at the start; by default those of a first estimate, whose error lies in E(r0^2 I).
+
+    Attributes:
+        plant, error_set, first: The same.
+        sets: Moves the error shapes.
+        Q, R: Covariances that the gains are picked from, shapes (n, n) and (p, p).
     """
 
     def __init__(
@@ -94,22 +87,17 @@ class ErrorRecursion:
         self._quantization_step = quantization_step
         self.sets = SetMembership(plant, quantization_step, error_set, shape_step)
         self.Q, self.R = plant.kalman_covariances[0], _sensor_covariance(plant, quantization_step)
-        self._first = first
+        if first is None:
+            first = ErrorStatistics(plant.kalman_covariances[2], plant.initial_error.shape_matrix, 0)
+        self.first = first
 
     def coarser(self) -> ErrorRecursion:
         """Returns a recursion that rounds shapes up more coarsely, so that fewer differ; itself if it is coarse."""
         coarser = min(COARSER * self.sets.shape_step, COARSEST_STEP)
         if coarser <= self.sets.shape_step:
             return self
-        settings = self._bits, coarser, self._first
+        settings = self._bits, coarser, self.first
         return ErrorRecursion(self.plant, self._quantization_step, self.error_set, *settings)
-
-    @property
-    def first(self) -> ErrorStatistics:
-        """The statistics at the start: by default those of a first estimate, whose error lies in E(r0^2 I)."""
-        if self._first is not None:
-            return self._first
-        return ErrorStatistics(self.plant.kalman_covariances[2].copy(), self.plant.initial_error.shape_matrix.copy(), 0)
 
     def predicted(self, statistics: ErrorStatistics) -> ErrorStatistics:
         """Returns the statistics one step later, without a sample."""
@@ -120,18 +108,19 @@ class ErrorRecursion:
             covariance = grown
         return ErrorStatistics(_rounded(covariance, self._bits), self.sets.predicted(shape, age), age + 1)
 
-    def updated(self, statistics: ErrorStatistics) -> Update | None:
-        """Returns what an update does, with the first gain whose ellipsoid lies inside the certified set of age 0.
+    def updated(self, statistics: ErrorStatistics) -> tuple[np.ndarray, ErrorStatistics] | None:
+        """Returns the gain T, shape (n, p), of x_hat + T (y - H x_hat), and the statistics after that update.
 
-        After the Kalman and the set-membership gain comes the certified one of the estimate's age, which (C2) maps into
-        that set. Without a contract there is none, and None says that the sample must not be used.
+        It is the first gain whose ellipsoid lies inside the certified set of age 0. After the Kalman and the
+        set-membership gain comes the certified one of the estimate's age, which (C2) maps into that set. Without a
+        contract there is none, and None says that the sample must not be used.
         """
         covariance, shape, age = statistics
         newest, ages = self.error_set.shape_at(0), self.error_set.ages
         kalman = self._kalman_update(covariance)
         covariance = covariance if kalman is None else kalman[1]
         if kalman is not None and is_inside(updated := self.sets.updated(shape, kalman[0]), newest):
-            return Update(kalman[0], ErrorStatistics(covariance, updated, 0))
+            return kalman[0], ErrorStatistics(covariance, updated, 0)
         gain = self.sets.gain(shape)
         updated = self.sets.updated(shape, gain)
         if not is_inside(updated, newest):
@@ -140,7 +129,7 @@ class ErrorRecursion:
             certified = self.error_set.shape_at(age)
             if certified is not None and is_inside(shape, certified):
                 gain, updated = ages.gains[age - 1], newest  # by (C2)
-        return Update(gain, ErrorStatistics(covariance, updated, 0))
+        return gain, ErrorStatistics(covariance, updated, 0)
 
     def prefers(self, replayed: ErrorStatistics, present: ErrorStatistics) -> bool:
         """Returns whether a replayed history is better than the present one.
@@ -180,20 +169,3 @@ def _sensor_covariance(plant: LinearPlant, quantization_step: float) -> np.ndarr
     if np.linalg.eigvalsh(R)[0] <= 0.0:  # perfect sensors: keep the innovation covariance invertible
         R = R + FLAT_INFLATION * np.diag((np.abs(plant.H) @ plant.half_widths) ** 2)
     return R
-
-
-def filterpy_filter(recursion: ErrorRecursion, mean: np.ndarray, covariance: np.ndarray) -> Any:
-    """Returns filterpy's `KalmanFilter`, which has no types, with every matrix of the model and an estimate.
-
-    Args:
-        recursion: Gives the plant, Q and R.
-        mean: x_hat, shape (n,).
-        covariance: P, shape (n, n).
-    """
-    from filterpy.kalman import KalmanFilter  # takes long to import
-
-    plant = recursion.plant
-    kalman: Any = KalmanFilter(dim_x=plant.n, dim_z=plant.p, dim_u=plant.m)
-    kalman.x, kalman.P, kalman.Q, kalman.R = mean.copy(), covariance.copy(), recursion.Q.copy(), recursion.R.copy()
-    kalman.F, kalman.B, kalman.H = plant.A.copy(), plant.B.copy(), plant.H.copy()
-    return kalman

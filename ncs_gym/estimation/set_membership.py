@@ -11,13 +11,13 @@ from ncs_gym.uncertainty.shape_matrices import is_inside, outer_sum
 # Per dimension, the growth of computed shapes that covers the rounding of F S F' (see `enlarged_by_rounding`).
 ROUNDING = 1e-13
 # Shapes are rounded up to multiples of this in coordinates where the certified set of age 0 is the unit ball: then they
-# recur when a pattern of arrivals does, and can be looked up.
+# recur when an arrival history does, and can be looked up.
 SHAPE_STEP = 2.0**-13
 # Where histories hardly recur so, the step becomes so many times larger, up to the coarsest one: beyond it shapes soon
 # reach the certified set.
 COARSER, COARSEST_STEP = 16.0, 2.0**-7
-# Room for the rounding of an eigenvalue, in steps.
-EIGENVALUE_ROOM = 1e-6
+# Margin for the rounding of an eigenvalue, in steps.
+EIGENVALUE_MARGIN = 1e-6
 # Multipliers mu that the set-membership gain is chosen from; any of them is sound.
 MULTIPLIERS = np.linspace(0.01, 0.99, 99)[:, None]
 
@@ -114,7 +114,11 @@ class SetMembership:
         traces = (weights / (MULTIPLIERS + (1.0 - MULTIPLIERS) * np.maximum(gains, 0.0))).sum(axis=1)
         mu = float(MULTIPLIERS[int(np.argmin(traces)), 0])
         spread = shape @ H.T / mu
-        return solved(H @ spread + self.noise / (1.0 - mu), spread.T).T
+        innovation = H @ spread + self.noise / (1.0 - mu)
+        try:
+            return np.linalg.solve(innovation, spread.T).T
+        except np.linalg.LinAlgError:  # singular in float64, after long outages
+            return (np.linalg.pinv(innovation) @ spread.T).T
 
     def rounded_up(self, shape: np.ndarray) -> np.ndarray:
         """Returns a shape rounded up to multiples of a step where the certified set of age 0 is the unit ball.
@@ -131,7 +135,7 @@ class SetMembership:
         given = inner / self.shape_step
         steps = np.rint(given)
         if is_coarse:
-            missing = EIGENVALUE_ROOM - np.linalg.eigvalsh(steps - given)[0]
+            missing = EIGENVALUE_MARGIN - np.linalg.eigvalsh(steps - given)[0]
             steps.flat[:: size + 1] += max(np.ceil(missing), 0.0)
         inner = self.shape_step * steps
         reach = self._abs_ball.dot(np.sqrt(inner.diagonal()))
@@ -157,11 +161,3 @@ def enlarged_by_rounding(product: np.ndarray, extent: np.ndarray) -> np.ndarray:
     product = 0.5 * (product + product.T)
     product.flat[:: size + 1] += ROUNDING * size * extent**2
     return product
-
-
-def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Returns matrix^-1 right, by the pseudo-inverse where the matrix is singular in float64 (after long outages)."""
-    try:
-        return np.linalg.solve(matrix, right)
-    except np.linalg.LinAlgError:
-        return np.linalg.pinv(matrix) @ right

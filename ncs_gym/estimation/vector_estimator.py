@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.estimation.arrival_histories import NO_REPLAY, NO_SAMPLE, UNKNOWN, ArrivalHistories
-from ncs_gym.estimation.innovation_test import ALARM_TOLERANCE
+from ncs_gym.estimation.innovation import ALARM_TOLERANCE, outside_sum_in_axes
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.uncertainty.minkowski_sum import outside_sum_in_axes
 from ncs_gym.validation import frozen
 
 

@@ -129,7 +129,7 @@ class Channel:
     @property
     def description(self) -> str:
         """What the channel does to samples, in sentences."""
-        every = "every step" if self.send_period == 1 else f"every {_steps(self.send_period)}"
+        every = "every step" if self.send_period == 1 else f"every {in_steps(self.send_period)}"
         every = "on request" if self.on_request else every
         rounded = f"quantized with step {self.quantization_step:g}" if self.quantization_step else "not quantized"
         if isinstance(self.loss, GilbertElliott):
@@ -138,7 +138,7 @@ class Channel:
             lost = f"A packet is lost with probability {self.loss:g}"
         if self.max_consecutive_losses is not None:
             lost += f", never more than {self.max_consecutive_losses} in a row"
-        late = f"{self.delay} to {self.longest_delay} steps" if self.jitter else _steps(self.delay)
+        late = f"{self.delay} to {self.longest_delay} steps" if self.jitter else in_steps(self.delay)
         arrives = f"What is not lost arrives {late} late" if self.longest_delay else "What is not lost arrives at once"
         return f"A sample is taken and sent {every}, {rounded}. {lost}. {arrives}."
 
@@ -163,16 +163,13 @@ def widest(channels: Sequence[Channel]) -> Channel:
     return replace(max(channels, key=oldest), quantization_step=coarsest)
 
 
-def _steps(number: int) -> str:
+def in_steps(number: int) -> str:
+    """Returns a number of steps in words."""
     return "1 step" if number == 1 else f"{number} steps"
 
 
 def _bursts(loss: dict[str, Any]) -> GilbertElliott:
-    """Returns the bursty loss whose fields a dictionary holds, as `dataclasses.asdict` leaves one.
-
-    Raises:
-        ValueError: If a field is unknown or missing, or no probability.
-    """
+    """Returns the bursty loss whose fields a dictionary holds, as `dataclasses.asdict` leaves one."""
     try:
         return GilbertElliott(**loss)
     except TypeError:

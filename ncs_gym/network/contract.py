@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 
-from ncs_gym.network.channel import Channel
+from ncs_gym.network.channel import Channel, in_steps
 from ncs_gym.validation import as_count, as_number
 
 # There is an error set for every age.
@@ -83,28 +83,26 @@ def warn_of_broken_contract(
             lost.
         stacklevel: As for `warnings.warn`.
     """
-    promised = contract_of(channel) if counts_losses else None
-    if contract is not None and counts_losses and promised is None and channel.most_consecutive_losses is None:
+    if contract is None:
+        return
+    if counts_losses and channel.most_consecutive_losses is None:
         warnings.warn(
             "the channel may lose any number of packets in a row, but the certificate's contract allows the newest "
-            f"sample to be {_steps(contract.max_age)} old in all, so that the guarantee is likely to be lost: say what "
-            "the network promises by max_consecutive_losses",
+            f"sample to be {in_steps(contract.max_age)} old in all, so that the guarantee is likely to be lost: say "
+            "what the network promises by max_consecutive_losses",
             BrokenContractWarning,
             stacklevel=stacklevel,
         )
         return
+    promised = contract_of(channel) if counts_losses else None
     age = channel.send_period - 1 + channel.delay if promised is None else promised.max_age
-    if contract is None or age + input_delay <= contract.max_age:
+    if age + input_delay <= contract.max_age:
         return
-    later = f", and what is decided takes effect {_steps(input_delay)} later" if input_delay else ""
+    later = f", and what is decided takes effect {in_steps(input_delay)} later" if input_delay else ""
     warnings.warn(
-        f"the channel lets the newest sample become {_steps(age)} old{later}, but the certificate's contract allows "
-        f"{_steps(contract.max_age)} in all, so that the guarantee is likely to be lost: give a certificate of "
+        f"the channel lets the newest sample become {in_steps(age)} old{later}, but the certificate's contract allows "
+        f"{in_steps(contract.max_age)} in all, so that the guarantee is likely to be lost: give a certificate of "
         f"ChannelContract(max_age={age + input_delay}), or of a larger max_age where packets are lost",
         BrokenContractWarning,
         stacklevel=stacklevel,
     )
-
-
-def _steps(number: int) -> str:
-    return "1 step" if number == 1 else f"{number} steps"

@@ -259,12 +259,7 @@ class Actuator:
 
 
 def _as_command(value: Any, shape: tuple[int, int]) -> Command:
-    """Returns a command whose inputs have a shape, (c+1, m).
-
-    Raises:
-        ValueError: If stamp or episode is no whole number, the inputs are not finite numbers of that shape, or the
-            requests are no bools of c+1 samples.
-    """
+    """Returns a command whose inputs have a shape, (c+1, m)."""
     stamp = episode = 0
     requests: tuple[bool, ...] = ()
     try:

@@ -132,7 +132,7 @@ class PacketLog(ReadOnlyArrays):
 
     @classmethod
     def _of_ping(cls, lines: Iterable[str], period: float) -> Self:
-        answers: dict[int, tuple[float | None, float]] = {}
+        answers: dict[int, float] = {}
         stamps: dict[int, float] = {}
         last, wraps = 0, 0
         for line in lines:
@@ -143,18 +143,18 @@ class PacketLog(ReadOnlyArrays):
                 wraps, number = wraps + 1, number + 65536
             last = max(last, number)
             if found["time"] is not None and number not in answers:  # a second answer is a duplicate
-                answers[number] = None, float(found["time"]) / 1000.0
+                answers[number] = float(found["time"]) / 1000.0
                 if found["stamp"] is not None:
-                    stamps[number] = float(found["stamp"]) - answers[number][1]
+                    stamps[number] = float(found["stamp"]) - answers[number]
             else:
-                answers.setdefault(number, (None, np.nan))
+                answers.setdefault(number, np.nan)
         if not answers:
             raise ValueError("no packet of ping has a number")
         numbers = np.arange(min(answers), max(answers) + 1)
-        delays = np.array([answers.get(number, (None, np.nan))[1] for number in numbers.tolist()])
+        delays = np.array([answers.get(number, np.nan) for number in numbers.tolist()])
         if len(stamps) > 1:
-            sent = np.interp(numbers, sorted(stamps), np.maximum.accumulate([stamps[each] for each in sorted(stamps)]))
             known = sorted(stamps)
+            sent = np.interp(numbers, known, np.maximum.accumulate([stamps[each] for each in known]))
             slope = (stamps[known[-1]] - stamps[known[0]]) / (known[-1] - known[0])
             sent[numbers > known[-1]] = stamps[known[-1]] + slope * (numbers[numbers > known[-1]] - known[-1])
             sent[numbers < known[0]] = stamps[known[0]] - slope * (known[0] - numbers[numbers < known[0]])

@@ -159,15 +159,12 @@ class ChannelState:
         Returns:
             The packets that arrive at this step, in the order in which they were sent.
         """
-        self._loss_state, delay = transmit(self.channel, rng, self._loss_state, measurement is not None)
-        if delay >= 0 and measurement is not None:
-            packet = Packet(step, self.channel.quantize(measurement), episode)
-            self.in_flight.setdefault(step + int(delay), []).append(packet)
-        return self.in_flight.pop(step, [])
+        sample = None if measurement is None else Packet(step, self.channel.quantize(measurement), episode)
+        return self.carry(rng, step, sample)
 
     def carry(self, rng: np.random.Generator, step: int, packet: Any) -> list[Any]:
-        """Puts a packet of any kind on the channel as it is, and returns those that arrive at this step."""
-        self._loss_state, delay = transmit(self.channel, rng, self._loss_state, sends=True)
+        """Puts a packet of any kind on the channel as it is, None for nothing; returns those that arrive at a step."""
+        self._loss_state, delay = transmit(self.channel, rng, self._loss_state, packet is not None)
         if delay >= 0:
             self.in_flight.setdefault(step + int(delay), []).append(packet)
         return self.in_flight.pop(step, [])
@@ -245,5 +242,4 @@ class VectorChannelState:
 
 
 def _staying(loss: float) -> GilbertElliott:
-    """Returns a chain that never moves and loses packets with a constant probability."""
     return GilbertElliott(p_good_to_bad=0.0, p_bad_to_good=0.0, loss_good=loss, loss_bad=loss)

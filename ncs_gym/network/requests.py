@@ -107,7 +107,6 @@ class Requests:
             )
 
     def _spare_with(self, channel: Channel) -> int:
-        """Returns how many samples may be left out with the channel of an episode, if the contract is to be kept."""
         return 0 if channel.most_consecutive_losses is None else spare_samples(channel, self._contract) or 0
 
     def saved(self) -> dict[str, Any]:

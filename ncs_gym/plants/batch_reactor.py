@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.statespace import arguments_with_noise
+from ncs_gym.plants.statespace import noise_in_proportion, sampled_model
 
 # Bounds on disturbance and sensor noise as fractions of the half-widths of the box.
 DISTURBANCE_FRACTION = 5e-3
@@ -35,5 +35,7 @@ def batch_reactor(dt: float = 0.05, **bounds: Any) -> LinearPlant:
     )
     B = np.array([[0.0, 0.0], [5.679, 0.0], [1.136, -3.146], [1.136, 0.0]])
     H = np.array([[1.0, 0.0, 1.0, -1.0], [0.0, 1.0, 0.0, 0.0]])
-    fractions, arguments = (DISTURBANCE_FRACTION, SENSOR_FRACTION), {"error_gain": ERROR_GAIN} | bounds
-    return LinearPlant(**arguments_with_noise(A, B, H, np.ones(4), 2.0, dt, fractions, arguments))
+    half_widths = np.ones(4)
+    noise = noise_in_proportion(half_widths, H, DISTURBANCE_FRACTION, SENSOR_FRACTION, bounds.get("delta", 0.05))
+    defaults = {"box": half_widths, "u_max": 2.0, "H": H, "error_gain": ERROR_GAIN}
+    return LinearPlant(**sampled_model(A, B, dt) | defaults | noise | bounds)

@@ -19,7 +19,7 @@ MOST_POINTS = 64
 SAME_MODEL = 1e-9
 # What the bound between grid points is enlarged by, relative to itself and to what a row reaches: for the rounding of
 # the rows, which the verification of a certificate bounds.
-SLACK, ROUNDING = 0.01, 1e-12
+MARGIN, ROUNDING = 0.01, 1e-12
 
 
 class GridRows(NamedTuple):
@@ -77,7 +77,7 @@ def grid_rows(model: np.ndarray, box_rows: np.ndarray, u_max: np.ndarray, dt: fl
     bends = [exact.product(np.abs(exact.product(each, G, G)), W) for each in onward]
     sizes = [exact.product(np.abs(each), W) for each in onward]
     growth = float(exact.exponential(np.array([[logarithmic_norm(G, W)]]), h)[0, 0])
-    remainder = (1.0 + SLACK) * (h * h / 8.0) * growth * np.max(bends, axis=0) + ROUNDING * np.max(sizes, axis=0)
+    remainder = (1.0 + MARGIN) * (h * h / 8.0) * growth * np.max(bends, axis=0) + ROUNDING * np.max(sizes, axis=0)
     stacked = np.array(onward)
     return GridRows(read_only(stacked[..., :n]), read_only(stacked[..., n:]), read_only(remainder))
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.statespace import arguments_with_noise
+from ncs_gym.plants.statespace import noise_in_proportion, sampled_model
 
 GRAVITY = 9.81
 # Bounds on disturbance and sensor noise as fractions of the half-widths of the box; no gamma, so that every state has
@@ -45,11 +45,15 @@ def cart_pole(
     B = np.array([[0.0], [1.0 / cart_mass], [0.0], [-1.0 / (cart_mass * length)]])
     half_widths = np.array([2.4, 3.0, 0.2, 2.0])
     H = np.eye(4) if full_state else np.eye(4)[[0, 2]]
-    names = {
+    disturbance = DISTURBANCE_FRACTION if full_state else 0.4 * DISTURBANCE_FRACTION
+    noise = noise_in_proportion(half_widths, H, disturbance, SENSOR_FRACTION, bounds.get("delta", 0.05))
+    defaults = {
+        "box": half_widths,
+        "u_max": 10.0,
+        "H": H,
         "state_names": ("position", "speed", "angle", "angular rate"),
         "state_units": ("m", "m/s", "rad", "rad/s"),
         "input_names": ("force",),
         "input_units": ("N",),
     }
-    fractions = (DISTURBANCE_FRACTION if full_state else 0.4 * DISTURBANCE_FRACTION, SENSOR_FRACTION)
-    return LinearPlant(**arguments_with_noise(A, B, H, half_widths, 10.0, dt, fractions, names | bounds))
+    return LinearPlant(**sampled_model(A, B, dt) | defaults | noise | bounds)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.statespace import zero_order_hold
+from ncs_gym.plants.statespace import sampled_model, zero_order_hold
 
 
 def convoy(dt: float = 0.1, lag: float = 0.3, **bounds: Any) -> LinearPlant:
@@ -24,13 +24,11 @@ def convoy(dt: float = 0.1, lag: float = 0.3, **bounds: Any) -> LinearPlant:
         bounds: Other arguments of `LinearPlant`, in the place of these.
     """
     motion = np.array([[0.0, -1.0], [0.0, -1.0 / lag]])
-    drive_and_leader = np.array([[0.0, 1.0], [1.0 / lag, 0.0]])
-    A, both = zero_order_hold(motion, drive_and_leader, dt)
+    drive, leader = np.array([[0.0], [1.0 / lag]]), np.array([[1.0], [0.0]])
     defaults = {
         "box": [1.0, 2.0],
         "u_max": 2.0,
-        "continuous_model": np.concatenate([motion, drive_and_leader[:, :1]], axis=1),
-        "disturbance_bound": (both[:, 1:], 0.45),
+        "disturbance_bound": (zero_order_hold(motion, leader, dt)[1], 0.45),
         "sensor_bound": 1e-3,
         "initial_bound": 0.02,
         "error_gain": ((1.5, -0.25),),
@@ -39,4 +37,4 @@ def convoy(dt: float = 0.1, lag: float = 0.3, **bounds: Any) -> LinearPlant:
         "input_names": ("speed asked for",),
         "input_units": ("m/s",),
     }
-    return LinearPlant(**({"A": A, "B": both[:, :1], "dt": dt} | defaults | bounds))
+    return LinearPlant(**sampled_model(motion, drive, dt) | defaults | bounds)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.statespace import zero_order_hold
+from ncs_gym.plants.statespace import sampled_model, zero_order_hold
 
 
 def lane_keeping(dt: float = 0.05, speed: float = 20.0, **bounds: Any) -> LinearPlant:
@@ -23,13 +23,11 @@ def lane_keeping(dt: float = 0.05, speed: float = 20.0, **bounds: Any) -> Linear
         bounds: Other arguments of `LinearPlant`, in the place of these.
     """
     motion = np.array([[0.0, speed], [0.0, 0.0]])
-    turn_and_push = np.array([[0.0, 1.0], [1.0, 0.0]])
-    A, both = zero_order_hold(motion, turn_and_push, dt)
+    turn, push = np.array([[0.0], [1.0]]), np.array([[1.0], [0.0]])
     defaults = {
         "box": [0.5, 0.1],
         "u_max": 0.4,
-        "continuous_model": np.concatenate([motion, turn_and_push[:, :1]], axis=1),
-        "disturbance_bound": (both[:, 1:], 0.4),
+        "disturbance_bound": (zero_order_hold(motion, push, dt)[1], 0.4),
         "sensor_bound": [1e-3, 2e-4],
         "initial_bound": [1e-2, 2e-3],
         "error_gain": ((-0.55, -3.9),),
@@ -38,4 +36,4 @@ def lane_keeping(dt: float = 0.05, speed: float = 20.0, **bounds: Any) -> Linear
         "input_names": ("yaw rate",),
         "input_units": ("rad/s",),
     }
-    return LinearPlant(**({"A": A, "B": both[:, :1], "dt": dt} | defaults | bounds))
+    return LinearPlant(**sampled_model(motion, turn, dt) | defaults | bounds)

@@ -25,9 +25,13 @@ def as_box_rows(value: Any, n: int) -> np.ndarray:
     numbers = as_setting(value)
     if numbers is None or numbers.ndim > 2:
         raise ValueError(f"box must be half-widths of shape ({n},) or rows of shape (any, {n}), got {shown(value)}")
-    is_computed = not isinstance(value, (tuple, list))
-    if _reads_as_pairs(value, numbers, n) or (numbers.ndim == 2 and _reads_as_two_sides(numbers, is_computed)):
-        raise ValueError(_two_sides(value))
+    if numbers.ndim == 2 and _reads_as_two_sides(value, numbers, n):
+        raise ValueError(
+            "box looks like lower and upper limits, but must be half-widths, or rows c_j with |c_j x| <= 1: if these "
+            "are limits, give their half-widths or, where they are not symmetric, LinearPlant.around(state_limits="
+            "(low, high), ...); if these are rows, no two of them the same but for their signs, give them as an array, "
+            f"got {shown(value)}"
+        )
     if numbers.ndim == 2:
         rows = as_matrix(numbers, (None, n), "box")
     else:
@@ -44,41 +48,17 @@ def as_box_rows(value: Any, n: int) -> np.ndarray:
     return rows
 
 
-def _two_sides(value: Any) -> str:
-    """Returns what is wrong with a box that can be read as lower and upper limits, and how to say what is meant."""
-    return (
-        "box looks like lower and upper limits, but must be half-widths, or rows c_j with |c_j x| <= 1: if these are "
-        "limits, give their half-widths or, where they are not symmetric, LinearPlant.around(state_limits=(low, high), "
-        "...); if these are rows, no two of them the same but for their signs, give them as an array, got "
-        f"{shown(value)}"
-    )
+def _reads_as_two_sides(value: Any, rows: np.ndarray, n: int) -> bool:
+    """Returns whether a box, as it was given and as rows (k, n), reads as (low, high), or as such a pair per state.
 
-
-def _reads_as_pairs(value: Any, numbers: np.ndarray, n: int) -> bool:
-    """Returns whether a box reads as a pair (low, high) per state: always but of two states, there as tuples.
-
-    Args:
-        value: The box as it was given.
-        numbers: The same as an array.
-        n: Number of states.
+    Pairs of two states are told from rows by being tuples. Of an array, which is computed, only low = -high is refused,
+    as rows the same limit twice.
     """
-    are_tuples = isinstance(value, (tuple, list)) and all(isinstance(each, tuple) for each in value)
-    return numbers.shape == (n, 2) and (n != 2 or are_tuples)
-
-
-def _reads_as_two_sides(rows: np.ndarray, is_computed: bool) -> bool:
-    """Returns whether a box reads as (low, high), or as a pair (low, high) per state.
-
-    Args:
-        rows: The box read as rows, shape (k, n).
-        is_computed: Whether it is an array. Only low = -high is refused then, as rows the same limit twice.
-    """
-    k, n = rows.shape
-    sides = [(rows[0], rows[1])] if k == 2 else []
-    pairs = [(rows[:, 0], rows[:, 1])] if k == n == 2 else []
-    return any(
-        bool((low < high).all()) and (not is_computed or np.array_equal(low, -high)) for low, high in sides + pairs
-    )
+    is_computed = not isinstance(value, (tuple, list))
+    if rows.shape == (n, 2) and (n != 2 or (not is_computed and all(isinstance(each, tuple) for each in value))):
+        return True
+    sides = [rows, rows.T] if rows.shape == (2, 2) else [rows] if len(rows) == 2 else []
+    return any(bool((low < high).all()) and (not is_computed or np.array_equal(low, -high)) for low, high in sides)
 
 
 def as_input_limits(value: Any, size: int) -> np.ndarray:
@@ -126,9 +106,6 @@ def _symmetric_limits(limits: Any, center: np.ndarray, name: str) -> np.ndarray:
         limits: Pair (low, high), each a number or shape (size,), possibly infinite.
         center: Shape (size,).
         name: What the error message calls the limits.
-
-    Raises:
-        ValueError: If they are no such pair, or the center does not lie between them.
     """
     sides = [as_setting(side) for side in limits] if isinstance(limits, (tuple, list)) and len(limits) == 2 else []
     for side in sides:
@@ -157,9 +134,6 @@ def _require_equilibrium(
         offset: c, shape (n,).
         state: x0, shape (n,).
         applied: u0, shape (m,).
-
-    Raises:
-        ValueError: Naming what is missing, and the equilibrium that belongs to u0 where there is a single one.
     """
     missing = A @ state + B @ applied + offset - state
     terms = np.abs(A) @ np.abs(state) + np.abs(B) @ np.abs(applied) + np.abs(offset) + np.abs(state)

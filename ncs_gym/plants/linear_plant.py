@@ -12,8 +12,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import MISSING, dataclass, field, fields, replace
-from difflib import get_close_matches
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from textwrap import fill
@@ -25,7 +24,7 @@ from ncs_gym import exact
 from ncs_gym.plants import between_samples, limits, statespace
 from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.uncertainty.remainder import Remainder, as_remainder
+from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.uncertainty.shape_matrices import outer_sum
 from ncs_gym.uncertainty.truncated_gaussian import (
     SMALLEST_DELTA,
@@ -112,14 +111,10 @@ class NoNoiseWarning(UserWarning):
 Kind = TypeVar("Kind", bound=type)
 
 
-def explains_arguments(kind: Kind) -> Kind:
-    """Makes the constructor of a dataclass explain which arguments are unknown or missing, and what to give for C=.
-
-    C= means two things to two people: limits, and an output matrix.
-    """
+def refuses_output_matrix_as_box(kind: Kind) -> Kind:
+    """Makes a constructor say what to give for C=, which is limits to some people and an output matrix to others."""
     constructor: Any = kind
     construct: Callable[..., None] = constructor.__init__
-    needed = {entry.name: entry.default is MISSING and entry.default_factory is MISSING for entry in fields(kind)}
 
     @functools.wraps(construct)
     def __init__(self: Any, **settings: Any) -> None:
@@ -128,21 +123,13 @@ def explains_arguments(kind: Kind) -> Kind:
                 "C= is not an argument: pass box=... for the limits |c_j x| <= 1 (rows, or half-widths of the states), "
                 "H=... for the output matrix of a state-space model"
             )
-        for name in settings:
-            if name not in needed:
-                close = get_close_matches(name, needed, n=1)
-                hint = f": did you mean {close[0]}=" if close else ""
-                raise TypeError(f"{name}= is not an argument of {kind.__name__}{hint}")
-        missing = [f"{name}=" for name, is_needed in needed.items() if is_needed and name not in settings]
-        if missing:
-            raise TypeError(f"{kind.__name__} needs {' and '.join(missing)}")
         construct(self, **settings)
 
     constructor.__init__ = __init__
     return kind
 
 
-@explains_arguments
+@refuses_output_matrix_as_box
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinearPlant(ReadOnlyArrays):
     """x+ = A x + B u + d, y = H x + v, with limits and bounds (docs/shield_proof.md).
@@ -288,10 +275,13 @@ class LinearPlant(ReadOnlyArrays):
             self._set(covariance, np.zeros((size, size)) if value is None else as_covariance(value, size, covariance))
             if (value := getattr(self, bound)) is not None:
                 self._set(bound, as_bound(value, size, bound))
-        if (remainder := as_remainder(self.remainder, self.n)) is not None:
-            remainder = remainder.of_model({name: getattr(self, name) for name in ("A", "B", "box", "u_max", "dt")})
-        self._set("remainder", remainder)
-        return is_given[0] or self.gamma > 0.0 or remainder is not None, is_given[1], is_given[2]
+        if self.remainder is not None:
+            if not isinstance(self.remainder, Remainder):
+                raise ValueError(f"remainder must be a Remainder, got {shown(self.remainder)}")
+            as_bound(self.remainder.bound, self.n, "remainder")
+            model = {name: getattr(self, name) for name in ("A", "B", "box", "u_max", "dt")}
+            self._set("remainder", self.remainder.of_model(model))
+        return is_given[0] or self.gamma > 0.0 or self.remainder is not None, is_given[1], is_given[2]
 
     def _check_between_samples(self) -> None:
         """Raises ValueError unless the model in continuous time is one, and there if times between samples count."""
@@ -395,7 +385,7 @@ class LinearPlant(ReadOnlyArrays):
             raise ValueError(f"a step of {self.dt:g} s hides how disturbances act in continuous time: shorten dt")
         G = exact.product(of_constant[0], exact.inverse(of_constant[1]))
         ball = Ellipsoid(self.gamma * np.eye(self.n))
-        bound = _ellipsoid_around_sum(ball, self.disturbance_bound, self.relative_weight)
+        bound = _ellipsoid_around_sum(self.relative_weight, ball, self.disturbance_bound)
         return replace(
             self,
             A=A,
@@ -411,9 +401,6 @@ class LinearPlant(ReadOnlyArrays):
 
         Its state is (x, u_{k-d}, .., u_{k-1}), the oldest input first. Disturbances and first errors are those of x
         alone.
-
-        Raises:
-            ValueError: If the delay is no such number, or the first error is given by a covariance.
         """
         delay = as_count(input_delay, "input_delay", low=1, high=LONGEST_INPUT_DELAY)
         if np.any(self.initial_cov):
@@ -432,7 +419,7 @@ class LinearPlant(ReadOnlyArrays):
         disturbance = self.disturbance_bound
         if self.gamma > 0.0:  # one bound for both: the ball of gamma would reach the inputs under way
             ball = Ellipsoid(self.gamma * np.eye(n))
-            disturbance = _ellipsoid_around_sum(ball, disturbance, self.relative_weight)
+            disturbance = _ellipsoid_around_sum(self.relative_weight, ball, disturbance)
         # The further states of a model move as they should: inputs under way keep their limits.
         remainder = self.remainder
         if remainder is not None:
@@ -471,17 +458,14 @@ class LinearPlant(ReadOnlyArrays):
         content = document.get("plant") if isinstance(document, dict) and document.get("format") == _FORMAT else None
         if not isinstance(content, dict):
             raise ValueError(f"{shown(path)} is not a plant of format {_FORMAT!r}")
-        names = {entry.name: entry.default is MISSING for entry in fields(cls)}
-        missing = [name for name, is_needed in names.items() if is_needed and name not in content]
-        unknown = [name for name in content if name not in names and name != "C"]
-        if (missing and "C" not in content) or unknown:
-            wrong = f"it lacks {', '.join(missing)}" if missing else f"{shown(unknown)} are no arguments of LinearPlant"
-            raise ValueError(f"{shown(path)} is not the file of a plant: {wrong}")
         arguments = {name: _from_json(value) for name, value in content.items()}
         box = as_setting(arguments.get("box"))
         if box is not None:
             arguments["box"] = box  # an array: `save` wrote computed rows
-        return cls(**arguments)
+        try:
+            return cls(**arguments)
+        except TypeError as error:  # an argument is missing or unknown
+            raise ValueError(f"{shown(path)} is not the file of a plant: {error}") from error
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a JSON file in which every number is exact.
@@ -694,16 +678,16 @@ class LinearPlant(ReadOnlyArrays):
         It is larger than `allowed_disturbance` by what holds that plus E(F), F = n diag(r^2), with r the rounding of
         A x + B u + d for x up to SIMULATED_REACH half-widths out: (1+s/4) allowed + (1+4/s) F, s the inflation.
         """
-        return Ellipsoid(inflated(self.nominal_disturbance.shape_matrix) + self._rounding_room)
+        return Ellipsoid(inflated(self.nominal_disturbance.shape_matrix) + self._rounding_margin)
 
     @cached_property
     def allowed_disturbance(self) -> Ellipsoid:
         """What a disturbance may use of D: the rest is for the rounding of a simulation, shape (n, n)."""
         nominal = self.nominal_disturbance.shape_matrix
-        return Ellipsoid(0.5 * (nominal + inflated(nominal)) + 0.5 * self._rounding_room)
+        return Ellipsoid(0.5 * (nominal + inflated(nominal)) + 0.5 * self._rounding_margin)
 
     @cached_property
-    def _rounding_room(self) -> np.ndarray:
+    def _rounding_margin(self) -> np.ndarray:
         """What D gains for rounding, shape (n, n)."""
         reach = SIMULATED_REACH * self.half_widths
         rounding = exact.product(np.abs(self.A), reach) + exact.product(np.abs(self.B), self.u_max) + reach
@@ -714,14 +698,13 @@ class LinearPlant(ReadOnlyArrays):
     def nominal_disturbance(self) -> Ellipsoid:
         """D before inflation: where extremal disturbances are drawn, so that their rounding stays inside E(D)."""
         ball = Ellipsoid(self.gamma * np.eye(self.n))
-        noisy = _ellipsoid_around_sum(ball, self.process_noise.bound, self.relative_weight)
-        declared = _ellipsoid_around_sum(noisy, self.disturbance_bound, self.relative_weight)
-        return _ellipsoid_around_sum(declared, self.remainder_bound, self.relative_weight)
+        others = self.process_noise.bound, self.disturbance_bound, self.remainder_bound
+        return _ellipsoid_around_sum(self.relative_weight, ball, *others)
 
     @cached_property
     def nominal_sensor_error(self) -> Ellipsoid:
         """Holds the sensor noise v before inflation, shape (p, p): the truncated noise plus `sensor_bound`."""
-        return _ellipsoid_around_sum(self.sensor_noise.bound, self.sensor_bound, np.eye(self.p))
+        return _ellipsoid_around_sum(np.eye(self.p), self.sensor_noise.bound, self.sensor_bound)
 
     @cached_property
     def sensor_error(self) -> Ellipsoid:
@@ -731,7 +714,7 @@ class LinearPlant(ReadOnlyArrays):
     def sensor_error_with(self, quantization_step: float) -> Ellipsoid:
         """Returns N, shape (p, p): sensor noise plus the ball of squared radius p q^2/4 around a quantizer's box."""
         ball = Ellipsoid(self.p * quantization_step**2 / 4.0 * np.eye(self.p))
-        return Ellipsoid(inflated(_ellipsoid_around_sum(ball, self.nominal_sensor_error, np.eye(self.p)).shape_matrix))
+        return Ellipsoid(inflated(_ellipsoid_around_sum(np.eye(self.p), ball, self.nominal_sensor_error).shape_matrix))
 
     @cached_property
     def initial_radius_squared(self) -> float:
@@ -742,7 +725,7 @@ class LinearPlant(ReadOnlyArrays):
     def nominal_initial_error(self) -> Ellipsoid:
         """Holds the error of the first estimate before inflation, shape (n, n): the ball of r0 plus `initial_bound`."""
         ball = Ellipsoid(self.initial_radius_squared * np.eye(self.n))
-        return _ellipsoid_around_sum(ball, self.initial_bound, self.relative_weight)
+        return _ellipsoid_around_sum(self.relative_weight, ball, self.initial_bound)
 
     @cached_property
     def initial_error(self) -> Ellipsoid:
@@ -799,13 +782,14 @@ def inflated(shape: np.ndarray) -> np.ndarray:
     return INFLATION * shape + FLAT_INFLATION * np.diag(np.diag(shape))
 
 
-def _ellipsoid_around_sum(first: Ellipsoid, second: Ellipsoid | None, weight: np.ndarray) -> Ellipsoid:
-    """Returns an ellipsoid around the sum, of the smallest tr(W P); where one of them is a point or None, the other."""
-    if second is None or not np.any(second.shape_matrix):
-        return first
-    return (
-        Ellipsoid(outer_sum(first.shape_matrix, second.shape_matrix, weight)) if np.any(first.shape_matrix) else second
-    )
+def _ellipsoid_around_sum(weight: np.ndarray, first: Ellipsoid, *others: Ellipsoid | None) -> Ellipsoid:
+    """Returns an ellipsoid around the sum, one after the other of the smallest tr(W P); points and None add nothing."""
+    total = first
+    for each in others:
+        if each is not None and np.any(each.shape_matrix):
+            shapes = total.shape_matrix, each.shape_matrix
+            total = Ellipsoid(outer_sum(*shapes, weight)) if np.any(shapes[0]) else each
+    return total
 
 
 def _symmetric_product(G: np.ndarray, shape: np.ndarray) -> np.ndarray:
@@ -884,7 +868,6 @@ def _describe(plant: LinearPlant) -> str:
 
 
 def _as_json(value: Any) -> Any:
-    """Returns a field of a plant as a JSON value."""
     if isinstance(value, Ellipsoid):
         return {"shape": value.shape_matrix.tolist()}
     if isinstance(value, Remainder):
@@ -893,9 +876,11 @@ def _as_json(value: Any) -> Any:
 
 
 def _from_json(value: Any) -> Any:
-    """Returns an argument of `LinearPlant` given as a JSON value; an object is an ellipsoid's shape."""
-    if not isinstance(value, dict) or "proved" in value:  # a remainder's
+    """Returns an argument of `LinearPlant` given as a JSON value; an object is an ellipsoid's shape, or a remainder."""
+    if not isinstance(value, dict):
         return value
+    if set(value) == {entry.name for entry in fields(Remainder)}:
+        return Remainder(_from_json(value["bound"]), value["proved"], value["basis"])
     if set(value) != {"shape"}:
         raise ValueError(
             f'a bound in the file of a plant must be a number, a list or {{"shape": ...}}, got {shown(value)}'
@@ -914,7 +899,6 @@ def _frames_inside() -> int:
 
 
 def _sized(size: float, unit: str) -> str:
-    """Returns a size with its unit."""
     return f"{size:.4g} {unit}".rstrip()
 
 
@@ -937,7 +921,6 @@ def row_limit(plant: LinearPlant, row: np.ndarray) -> str:
 
 
 def _deviation(plant: LinearPlant, i: int) -> str:
-    """Returns the name of a state's deviation from the operating point."""
     center = plant.operating_state[i]
     return f"({plant.state_names[i]} {-center:+.6g})" if center else plant.state_names[i]
 

@@ -35,51 +35,31 @@ def zero_order_hold(A: np.ndarray, B: np.ndarray, dt: float) -> tuple[np.ndarray
     return sampled[:n, :n], sampled[:n, n:]
 
 
-def arguments_with_noise(
-    A: np.ndarray,
-    B: np.ndarray,
-    H: np.ndarray,
-    half_widths: np.ndarray,
-    u_max: float,
-    dt: float,
-    noise_fractions: tuple[float, float],
-    arguments: dict[str, Any],
+def sampled_model(A: np.ndarray, B: np.ndarray, dt: float) -> dict[str, Any]:
+    """Returns A, B, dt and continuous_model of `LinearPlant` for a model in continuous time, A (n, n) and B (n, m)."""
+    sampled_A, sampled_B = zero_order_hold(A, B, dt)
+    return {"A": sampled_A, "B": sampled_B, "dt": dt, "continuous_model": np.concatenate([A, B], axis=1)}
+
+
+def noise_in_proportion(
+    half_widths: np.ndarray, H: np.ndarray, disturbance: float, sensor: float, delta: float = 0.05
 ) -> dict[str, Any]:
-    """Returns the arguments of `LinearPlant` for a continuous-time model, with noise in proportion to its safe box.
+    """Returns covariances of `LinearPlant` whose truncated noise is in proportion to the safe box.
 
     Args:
-        A: Continuous-time state matrix, shape (n, n) [1/s].
-        B: Continuous-time input matrix, shape (n, m).
-        H: Output matrix, shape (p, n).
         half_widths: Of the safe box, shape (n,).
-        u_max: Limit of every input.
-        dt: Duration of a step [s].
-        noise_fractions: Bounds of process noise and of sensor noise, as fractions of the half-widths.
-        arguments: Other arguments of `LinearPlant`, which take precedence.
+        H: Output matrix, shape (p, n).
+        disturbance: Bound of process noise, as a fraction of the half-widths.
+        sensor: Bound of sensor noise, as a fraction of what the box allows the outputs.
+        delta: Probability mass that the truncation of each Gaussian removes.
     """
-    n = len(A)
-    sampled_A, sampled_B = zero_order_hold(A, B, dt)
-    disturbance, sensor = noise_fractions
-    delta = arguments.get("delta", 0.05)
-    outputs = exact.product(np.abs(H), half_widths)
-    smallest = np.full(n, half_widths.min())
-    defaults = {
-        "gamma": 0.0,
+    n = len(half_widths)
+    outputs, smallest = exact.product(np.abs(H), half_widths), np.full(n, half_widths.min())
+    return {
         "process_noise_cov": np.diag(np.square(disturbance * half_widths)) / truncation_energy(delta, n),
         "measurement_noise_cov": np.diag(np.square(sensor * outputs)) / truncation_energy(delta, len(H)),
         "initial_cov": np.diag(np.square(sensor * smallest)) / truncation_energy(delta, n),
     }
-    model = np.concatenate([A, B], axis=1)
-    common = {
-        "A": sampled_A,
-        "B": sampled_B,
-        "continuous_model": model,
-        "box": half_widths,
-        "H": H,
-        "u_max": u_max,
-        "dt": dt,
-    }
-    return common | defaults | arguments
 
 
 def sampled_arguments(sys: Any, dt: float | None, settings: dict[str, Any]) -> dict[str, Any]:
@@ -113,21 +93,15 @@ def sampled_arguments(sys: Any, dt: float | None, settings: dict[str, Any]) -> d
             raise ValueError("the model has no sampling time: give dt, the duration of a step in seconds")
         dt = own
     dt = as_number(dt, "dt", low=0.0, low_open=True)
-    model = {}
     if is_continuous:
-        model = {"continuous_model": np.concatenate([A, B], axis=1)}
-        A, B = zero_order_hold(A, B, dt)
-    elif own is not True and abs(as_number(own, "dt of the model", low=0.0) - dt) > SAME_STEP * dt:
+        return sampled_model(A, B, dt) | {"H": H} | settings
+    if own is not True and abs(as_number(own, "dt of the model", low=0.0) - dt) > SAME_STEP * dt:
         raise ValueError(f"dt must be that of the model in discrete time, {own}, or be left out, got {dt}")
-    return {"A": A, "B": B, "H": H, "dt": dt} | model | settings
+    return {"A": A, "B": B, "H": H, "dt": dt} | settings
 
 
 def _matrices(sys: Any) -> tuple[Any, Any, Any, Any, Any]:
-    """Returns A, B, C, D and the sampling time of a model: 0 or None in continuous time, True if it is unknown.
-
-    Raises:
-        ValueError: If it is no state-space model.
-    """
+    """Returns A, B, C, D and the sampling time of a model: 0 or None in continuous time, True if it is unknown."""
     if isinstance(sys, (tuple, list)) and len(sys) in (4, 5):
         A, B, C, D, *sampling = sys
         return A, B, C, D, sampling[0] if sampling else None

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.statespace import zero_order_hold
+from ncs_gym.plants.statespace import sampled_model, zero_order_hold
 
 
 def stirred_tank(dt: float = 3.0, **bounds: Any) -> LinearPlant:
@@ -24,14 +24,13 @@ def stirred_tank(dt: float = 3.0, **bounds: Any) -> LinearPlant:
         dt: Step [s].
         bounds: Other arguments of `LinearPlant`, in the place of these.
     """
-    per_minute = np.array([[-2.0, -3.57], [2.092, 4.38]])
-    coolant_and_feed = np.array([[0.0, 0.0], [2.092, 1.0]])
-    A, both = zero_order_hold(per_minute / 60.0, coolant_and_feed / 60.0, dt)
+    # Given per minute.
+    reaction = np.array([[-2.0, -3.57], [2.092, 4.38]]) / 60.0
+    coolant, feed = np.array([[0.0], [2.092]]) / 60.0, np.array([[0.0], [1.0]]) / 60.0
     defaults = {
         "box": [10.0, 5.0],
         "u_max": 20.0,
-        "continuous_model": np.concatenate([per_minute, coolant_and_feed[:, :1]], axis=1) / 60.0,
-        "disturbance_bound": (both[:, 1:], 2.0),
+        "disturbance_bound": (zero_order_hold(reaction, feed, dt)[1], 2.0),
         "sensor_bound": 0.02,
         "initial_bound": 0.1,
         "error_gain": ((-0.6, -3.0),),
@@ -40,4 +39,4 @@ def stirred_tank(dt: float = 3.0, **bounds: Any) -> LinearPlant:
         "input_names": ("coolant temperature",),
         "input_units": ("K",),
     }
-    return LinearPlant(**({"A": A, "B": both[:, :1], "dt": dt} | defaults | bounds))
+    return LinearPlant(**sampled_model(reaction, coolant, dt) | defaults | bounds)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.statespace import zero_order_hold
+from ncs_gym.plants.statespace import sampled_model
 from ncs_gym.validation import as_matrix, as_number
 
 
@@ -35,8 +35,7 @@ def truck_trailer(
     stiffness = as_number(stiffness, "stiffness", low=0.0, low_open=True)
     damping = as_number(damping, "damping", low=0.0)
     dt = as_number(dt, "dt", low=0.0, low_open=True)
-    model = np.array([[0.0, 1.0, 0.0], [-stiffness / mass, -damping / mass, 1.0]])
-    A, B = zero_order_hold(model[:, :2], model[:, 2:], dt)
+    coupling, push = np.array([[0.0, 1.0], [-stiffness / mass, -damping / mass]]), np.array([[0.0], [1.0]])
     given = {name: value for name, value in bounds.items() if value is not None}
     p = len(as_matrix(given["H"], (None, 2), "H")) if "H" in given else 2
     defaults = {
@@ -51,4 +50,4 @@ def truck_trailer(
         "input_names": ("truck acceleration",),
         "input_units": ("m/s^2",),
     }
-    return LinearPlant(**({"A": A, "B": B, "dt": dt, "continuous_model": model} | defaults | given))
+    return LinearPlant(**sampled_model(coupling, push, dt) | defaults | given)

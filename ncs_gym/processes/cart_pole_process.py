@@ -80,7 +80,6 @@ class CartPoleProcess(Process):
         return state
 
     def _rate(self, state: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Returns the time derivative of the state."""
         _, speed, angle, rate = state
         sine, cosine = np.sin(angle), np.cos(angle)
         push = u[0] + self.pole_mass * sine * (self.length * rate**2 - GRAVITY * cosine)

@@ -99,11 +99,7 @@ class OpenedEnv(Process):
             raise
 
     def _action_form(self, space: Any, plant: LinearPlant) -> tuple[Any, tuple[int, ...]]:
-        """Returns dtype and shape of actions.
-
-        Raises:
-            ValueError: If inputs cannot be actions.
-        """
+        """Returns dtype and shape of actions."""
         if not isinstance(space, Box):
             raise ValueError(
                 f"GymProcess needs an environment with a Box of actions, got {type(space).__name__}: wrap it in a "
@@ -155,11 +151,6 @@ class OpenedEnv(Process):
         self.env.close()
 
     def _read_state(self) -> np.ndarray:
-        """Returns the state.
-
-        Raises:
-            ValueError: If it cannot be read.
-        """
         try:
             value = self._read(self.env)
         except Exception as error:

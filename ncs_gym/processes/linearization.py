@@ -91,7 +91,11 @@ def linear_model(
     rng = np.random.default_rng(as_count(seed, "seed", low=0))
     drawn, fresh, origin, spread = _steps_of(moving, common, as_count(samples, "samples", low=100), rng)
     if jacobian_bounds is not None:
-        _require_function(spread)
+        if spread > ROUNDING:
+            raise ValueError(
+                f"steps from the same state with the same input differ by {spread:.3g} half-widths of the box: noise, "
+                "or memory beyond the state, of which bounds on a Jacobian prove nothing"
+            )
         A, B, bound = _from_jacobians(jacobian_bounds, widths, limits, origin)
         basis = "from bounds on its Jacobian"
     else:
@@ -101,8 +105,14 @@ def linear_model(
         basis = f"from {samples:,} samples with safety factor {factor:g}"
     largest, count = _confirmed(bound, _left_out(A, B, fresh), widths), fresh.states.shape[1]
     basis = f"{basis}, with at most {largest:.0%} of the bound in {count:,} fresh samples"
+    reached = np.sqrt(np.diag(bound.shape_matrix)) / widths
+    if reached.max() >= 1.0:
+        raise ValueError(
+            f"the remainder of the linear model alone moves state {reached.argmax() + 1} by {reached.max():.3g} "
+            "half-widths of the box in one step: shrink the box, the input limits or dt"
+        )
     remainder = Remainder(bound, jacobian_bounds is not None, basis)
-    return LinearPlant(A=A, B=B, remainder=_bearable(remainder, widths), **common, **settings)
+    return LinearPlant(A=A, B=B, remainder=remainder, **common, **settings)
 
 
 def _steps_of(
@@ -115,9 +125,6 @@ def _steps_of(
         common: Box, input limits and step of the plant.
         count: Number of steps.
         rng: Source of randomness.
-
-    Raises:
-        ValueError: If the process cannot be put into a state.
     """
     n, m = len(common["box"]), len(common["u_max"])
     quiet = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.0)
@@ -137,11 +144,7 @@ def _steps_of(
 
 
 def _first_step(moving: Process, frame: LinearPlant) -> np.ndarray:
-    """Returns f(0, 0), shape (n,).
-
-    Raises:
-        ValueError: If the process takes no state of n entries with m inputs.
-    """
+    """Returns f(0, 0), shape (n,)."""
     n, m = frame.n, frame.m
     try:
         return moving.step(frame, moving.write(np.zeros(n)), np.zeros(m))
@@ -177,27 +180,13 @@ def _moved(
 
 
 def _left_out(A: np.ndarray, B: np.ndarray, steps: _Steps) -> np.ndarray:
-    """Returns what a linear model leaves out, shape (N, n)."""
     return (steps.moved - A @ steps.states - B @ steps.inputs).T
-
-
-def _require_function(spread: float) -> None:
-    """Raises ValueError if repeated steps differ, by `spread` half-widths of the box."""
-    if spread > ROUNDING:
-        raise ValueError(
-            f"steps from the same state with the same input differ by {spread:.3g} half-widths of the box: noise, "
-            "or memory beyond the state, of which bounds on a Jacobian prove nothing"
-        )
 
 
 def _from_jacobians(
     bounds: tuple[Any, Any], widths: np.ndarray, limits: np.ndarray, origin: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, Ellipsoid]:
-    """Returns A, B and the proved bound.
-
-    Raises:
-        ValueError: If the bounds are no two matrices, the first below the second.
-    """
+    """Returns A, B and the proved bound."""
     n, size = len(widths), len(widths) + len(limits)
     if not isinstance(bounds, (tuple, list)) or len(bounds) != 2:
         raise ValueError(f"jacobian_bounds must be two arrays of shape ({n}, {size}), got {shown(bounds)}")
@@ -211,11 +200,7 @@ def _from_jacobians(
 
 
 def _confirmed(bound: Ellipsoid, remainders: np.ndarray, widths: np.ndarray) -> float:
-    """Returns the largest size of fresh remainders, shape (N, n), in units of their bound.
-
-    Raises:
-        ValueError: If one lies outside it.
-    """
+    """Returns the largest size of fresh remainders, shape (N, n), in units of their bound."""
     padded = Ellipsoid(bound.shape_matrix + np.diag((ROUNDING * widths) ** 2))
     largest = float(padded.gauge(remainders).max())
     if largest > 1.0:
@@ -224,22 +209,6 @@ def _confirmed(bound: Ellipsoid, remainders: np.ndarray, widths: np.ndarray) -> 
             "safety_factor, or correct the jacobian_bounds"
         )
     return largest
-
-
-def _bearable(remainder: Remainder, widths: np.ndarray) -> Remainder:
-    """Returns a remainder that a step from the middle of the box survives.
-
-    Raises:
-        ValueError: If it does not.
-    """
-    reached = np.sqrt(np.diag(remainder.bound.shape_matrix)) / widths
-    worst = int(reached.argmax())
-    if reached[worst] >= 1.0:
-        raise ValueError(
-            f"the remainder of the linear model alone moves state {worst + 1} by {reached[worst]:.3g} half-widths of "
-            "the box in one step: shrink the box, the input limits or dt"
-        )
-    return remainder
 
 
 def fitted_matrices(

@@ -9,8 +9,7 @@ import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import LinearProcess, Process
-from ncs_gym.uncertainty.disturbance import ROUNDING, Disturbance, checked, checked_many
-from ncs_gym.uncertainty.disturbance_settings import stays_inside
+from ncs_gym.uncertainty.disturbances import ROUNDING, Disturbance, checked, checked_many, stays_inside
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import read_only
 
@@ -128,16 +127,15 @@ class PlantSimulation:
             d: What the disturbance drew.
             noise: Process noise, shape (n,) or (n, count); None if the disturbance replaces it.
             count: Number of environments or of draws; None for arrays without that axis.
-
-        Raises:
-            ValueError: If it lies outside its bound, or is no such array, and that is not allowed.
         """
         if self._trusted:
             return d if noise is None else d + noise
         excess = None
         if noise is not None:
-            inside = noise if self._truncated else self._pulled_in(noise)
-            excess = None if self._truncated else noise - inside
+            inside = noise
+            if not self._truncated:
+                inside = noise / np.maximum(self.plant.process_noise.bound.gauge(noise.T), 1.0)
+                excess = noise - inside
             d = d + inside
         if count is None:
             total = checked(self.plant, d, allow_assumption_violation=self._allow)
@@ -145,12 +143,7 @@ class PlantSimulation:
             total = checked_many(self.plant, d, count, allow_assumption_violation=self._allow)
         return total if excess is None else total + excess
 
-    def _pulled_in(self, noise: np.ndarray) -> np.ndarray:
-        """Returns process noise, shape (n,) or (n, count), with what lies outside its ellipsoid moved onto it."""
-        return noise / np.maximum(self.plant.process_noise.bound.gauge(noise.T), 1.0)
-
     def _draw_sensor_noise(self, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Returns sensor noise, shape (p, count)."""
         if self._is_extreme:
             return (1.0 - ROUNDING) * self.plant.nominal_sensor_error.sample_boundary(rng, count).T
         return self.plant.sample_sensor_noise(rng, count, truncated=self._truncated).T

@@ -22,11 +22,6 @@ _Point = Sequence[float] | np.ndarray
 
 
 def _require_pygame() -> Any:
-    """Returns the module pygame.
-
-    Raises:
-        gymnasium.error.DependencyNotInstalled: If it is not installed.
-    """
     try:
         import pygame
         import pygame.font

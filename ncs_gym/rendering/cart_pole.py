@@ -75,7 +75,6 @@ class CartPoleDrawing:
         canvas.text(text, place, theme.load_color(value / limit), size, align=0.5 - 0.5 * side, bold=True)
 
     def _x(self, position: float) -> float:
-        """Returns where a position of the cart is [pixels]."""
         return theme.WIDTH / 2 + _LIMIT_LENGTH * float(np.clip(position / self._limit, -_MAX_POSITION, _MAX_POSITION))
 
 
@@ -92,6 +91,5 @@ def _draw_cart(canvas: Canvas, x: float) -> None:
 
 
 def _draw_flag(canvas: Canvas, x: float) -> None:
-    """Draws the reference position."""
     canvas.line([(x, _TRACK - 2), (x, _TRACK - 44)], theme.SAFE, 2.0)
     canvas.polygon([(x, _TRACK - 44), (x + 20, _TRACK - 37), (x, _TRACK - 30)], theme.SAFE)

@@ -91,7 +91,6 @@ class ConstraintBarsDrawing:
         draw_packets(canvas, frame, 130.0, theme.WIDTH - 130.0)
 
     def _bar(self, index: int) -> theme.Rect:
-        """Returns where a bar is."""
         count = len(self._constraints)
         y = _TOP + _SPACING * (index % _COLUMN) + 0.5 * _SPACING * (_COLUMN - min(count, _COLUMN))
         if count <= _COLUMN:

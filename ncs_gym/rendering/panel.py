@@ -156,7 +156,6 @@ def _draw_input(canvas: Canvas, frame: FrameRecord, index: int, y: float) -> Non
 
 
 def _draw_correction(canvas: Canvas, start: float, end: float, y: float) -> None:
-    """Draws an arrow from the proposed input to the applied one."""
     canvas.circle((start, y), 5.0, theme.PAPER)
     canvas.circle((start, y), 5.0, theme.SHIELD, width=2.0)
     if abs(end - start) > 14:
@@ -166,7 +165,6 @@ def _draw_correction(canvas: Canvas, start: float, end: float, y: float) -> None
 
 
 def _draw_tracked_output(canvas: Canvas, frame: FrameRecord, y: float) -> None:
-    """Draws the quantity that the task tracks, and its reference."""
     tracked = frame.tracked
     assert tracked is not None
     low, high = tracked.low, tracked.high

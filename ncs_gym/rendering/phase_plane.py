@@ -98,7 +98,6 @@ class PhasePlane:
         _draw_interventions(canvas, points, frame)
 
     def _outline(self, safe_set: Ellipsoid | OutlinedSet) -> np.ndarray:
-        """Returns points around the projection of the safe set onto the two coordinates, shape (k, 2)."""
         if isinstance(safe_set, Ellipsoid):
             return self._projection(safe_set.shape_matrix)
         return safe_set.outline(self._pair)
@@ -178,22 +177,18 @@ class TimePlot:
         canvas.clip(None)
 
     def _fill_band(self, canvas: Canvas, limit: float, color: theme.Color) -> None:
-        """Fills where the absolute value of the state is within a limit."""
         top, bottom = self._y(limit), self._y(-limit)
         canvas.rect(theme.Rect(self._rect.x, top, self._rect.w, bottom - top), color)
 
     def _x(self, age: float) -> float:
-        """Returns where a state that many steps ago is [pixels]."""
         return self._rect.right - 12 - (self._rect.w - 24) * age / RECENT_STEPS
 
     def _y(self, value: float) -> float:
-        """Returns where a value is [pixels]."""
         half = self._rect.h / 2
         return self._rect.y + half - (half - 2) * float(np.clip(value / (_AXIS_REACH * self._limit), -1.0, 1.0))
 
 
 def _axis_title(name: str, unit: str) -> str:
-    """Returns the title of an axis: the name of a quantity and its unit in brackets."""
     return f"{name} [{theme.unit_label(unit)}]" if unit else name
 
 
@@ -203,7 +198,6 @@ def _draw_titles(canvas: Canvas, rect: theme.Rect, horizontal: str, vertical: st
 
 
 def _draw_interventions(canvas: Canvas, points: list, frame: FrameRecord) -> None:
-    """Marks the points of the path that the shield led to."""
     for point, intervened in zip(points, frame.interventions, strict=True):
         if intervened:
             canvas.circle(point, 3.0, theme.SHIELD)

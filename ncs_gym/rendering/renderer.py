@@ -106,7 +106,6 @@ class Renderer:
         return self._episode.frame()
 
     def _show(self) -> None:
-        """Shows the present frame in the window, in mode "human"."""
         if self._render_mode != "human":
             return
         canvas = self._draw()
@@ -130,9 +129,6 @@ class _Picture:
         plant: The plant. The names of its states decide whether it is drawn as truck and trailer, as cart and pole, or
             with a bar for every constraint.
         scale: Pixels of a frame per unit of its layout.
-
-    Raises:
-        gymnasium.error.DependencyNotInstalled: If pygame is missing.
     """
 
     def __init__(self, plant: LinearPlant, scale: int) -> None:

@@ -64,7 +64,6 @@ class TruckTrailerDrawing:
         draw_packets(canvas, frame, sensor, controller)
 
     def _hitch(self, stretch: float) -> float:
-        """Returns where the truck's hitch is at a stretch [m]."""
         return _FRONT + _REST_LENGTH + _LIMIT_LENGTH * float(np.clip(stretch / self._limit, -1.5, _MAX_STRETCH))
 
 
@@ -96,7 +95,6 @@ def _draw_trailer(canvas: Canvas) -> None:
 
 
 def _draw_truck_outline(canvas: Canvas, hitch: float) -> None:
-    """Draws where the truck is according to the estimate."""
     front, top, bottom = hitch + _TRUCK_LENGTH, _ROAD - 82, _ROAD - 14
     corners = [(hitch, bottom), (hitch, top), (front, top), (front, bottom), (hitch, bottom)]
     canvas.dashed(corners, theme.ESTIMATE, 1.75, dash=5.0)

@@ -50,7 +50,6 @@ class Regulation(Task):
 
 @lru_cache(maxsize=64)
 def _costs(task: Regulation, plant: LinearPlant) -> tuple[np.ndarray, np.ndarray]:
-    """Returns Q and R."""
     Q = plant.box_rows.T @ plant.box_rows if task.state_cost is None else task.state_cost
     R = np.diag(0.01 / plant.u_max**2) if task.input_cost is None else task.input_cost
     return Q, R

@@ -5,11 +5,10 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
-from ncs_gym.uncertainty.declared_bound import as_bound
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_flag, shown
 
@@ -69,21 +68,3 @@ class Remainder:
         """What a certificate says about it."""
         kind = "bounded by proof" if self.proved else "assumed to lie in its bound"
         return f"What the linear model leaves out is {kind} while the state is in the box: {self.basis}."
-
-
-def as_remainder(value: Any, n: int) -> Remainder | None:
-    """Returns a remainder given as such or by the JSON value that the file of a plant holds; None for none.
-
-    Raises:
-        ValueError: If it is neither, or not of dimension n.
-    """
-    if value is None:
-        return None
-    if isinstance(value, dict) and set(value) == {"bound", "proved", "basis"}:
-        bound = value["bound"]
-        shape = bound["shape"] if isinstance(bound, dict) and set(bound) == {"shape"} else None
-        value = Remainder(Ellipsoid(shape), value["proved"], value["basis"])  # pyright: ignore[reportArgumentType]
-    if not isinstance(value, Remainder):
-        raise ValueError(f"remainder must be a Remainder, got {shown(value)}")
-    as_bound(value.bound, n, "remainder")
-    return value

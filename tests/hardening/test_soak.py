@@ -124,7 +124,7 @@ def restored(env):
     """A fresh estimator, with a graph of its own, in the state of an environment's."""
     old, new = env.estimator, Estimator(env.plant, env.channel, env.error_set)
     new.step, new.age, new.alarm, new.mean = old.step, old.age, old.alarm, old.mean
-    new._history = new._histories._adopted(old._histories, [old._history])[old._history]
+    new._history = new._histories.taking_over(old._histories, np.array([old._history])).item()
     new._priors, new._inputs, new._samples = old._priors.copy(), old._inputs.copy(), old._samples.copy()
     return new
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym import Channel, Packet
-from ncs_gym.estimation.innovation_test import InnovationTest
+from ncs_gym.estimation.innovation import ALARM_TOLERANCE, outside_sum
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
 from ncs_gym.plants.linear_plant import LinearPlant
 
@@ -31,7 +31,6 @@ class PlainEstimator:
 
     def __init__(self, plant: LinearPlant, channel: Channel, recursion: ErrorRecursion) -> None:
         self.plant, self.buffer, self.recursion = plant, channel.longest_delay, recursion
-        self.test = InnovationTest(plant.H, recursion.sets.noise)
         self.reset(np.zeros(plant.n))
 
     def reset(self, mean: np.ndarray) -> None:
@@ -73,11 +72,12 @@ class PlainEstimator:
             priors[step] = Prior(mean, statistics)
             if step in self.samples:
                 residual = self.samples[step] - self.plant.H.dot(mean)
-                spread = self.test.spread(statistics.shape)
-                self.alarm |= bool(self.test.are_impossible(residual[None], spread)[0])
+                spread, noise = self.plant.H @ statistics.shape @ self.plant.H.T, self.recursion.sets.noise
+                self.alarm |= bool(outside_sum(residual[None], spread, noise, ALARM_TOLERANCE)[0])
                 update = self.recursion.updated(statistics)
                 if update is not None:
-                    mean, statistics = mean + update.gain.dot(residual), update.statistics
+                    gain, statistics = update
+                    mean = mean + gain.dot(residual)
             if step < self.step:
                 mean, statistics = self._predicted(mean, statistics, step)
         if self.recursion.prefers(statistics, self.statistics):

@@ -12,7 +12,7 @@ from ncs_gym import (
     certified_error_set,
     truck_trailer,
 )
-from ncs_gym.estimation.error_bound import _check, require_error_set
+from ncs_gym.estimation.error_bound import require_error_set
 from shields.verification.rational_matrix import add, congruence, is_positive_semidefinite, rational, scale, subtract
 from tests.plants import random_plant
 
@@ -126,25 +126,27 @@ def test_set_that_holds_by_no_more_than_rounding_is_an_error(growth):
     settings = {"disturbance_bound": 0.1, "sensor_bound": 0.1, "initial_bound": 0.0}
     plant = LinearPlant(A=[[0.5]], B=[[1.0]], box=[1.0], u_max=1.0, dt=0.1, **settings)
     Sigma = growth * 4.0 * plant.disturbance.shape_matrix
-    checks = [
-        lambda: _check(Sigma, plant.A, plant.disturbance.shape_matrix, plant.initial_error.shape_matrix, 0.5),
-        lambda: require_error_set(ErrorSet(Sigma=Sigma, rate=0.5), plant),
-    ]
-    for check in checks:
-        if growth > 1.0 + 1e-12:
-            check()
-        else:
-            with pytest.raises(ErrorSetError, match=r"\(E1\)"):
-                check()
+    errors = ErrorSet(Sigma=Sigma, rate=0.5)
+    if growth > 1.0 + 1e-12:
+        require_error_set(errors, plant)
+    else:
+        with pytest.raises(ErrorSetError, match=r"\(E1\)"):
+            require_error_set(errors, plant)
 
 
 def test_set_that_fails_a_condition_in_one_direction_is_an_error():
-    # With A = I/2 and a rate of 1/2, (E1) says Sigma >= 2 D/(1/2) = 4.
-    A, D, first = 0.5 * np.eye(2), np.eye(2), np.diag([2.0, 1.0])
-    _check(4.01 * np.eye(2), A, D, first, 0.5)
+    # With A = I/2, D = I and a rate of 1/2, (E1) says Sigma >= 2 D/(1/2) = 4.
+    bounds = {"disturbance_bound": 1.0, "sensor_bound": 0.0}
+
+    def check(Sigma, first):
+        initial = Ellipsoid(np.diag(first))
+        plant = LinearPlant(A=0.5 * np.eye(2), B=np.eye(2), box=1.0, u_max=1.0, dt=0.1, initial_bound=initial, **bounds)
+        require_error_set(ErrorSet(Sigma=Sigma, rate=0.5), plant)
+
+    check(4.01 * np.eye(2), [2.0, 1.0])
     with pytest.raises(ErrorSetError, match=r"\(E1\)"):
-        _check(np.diag([4.01, 3.99]), A, D, first, 0.5)
+        check(np.diag([4.01, 3.99]), [2.0, 1.0])
     with pytest.raises(ErrorSetError, match=r"\(E0\)"):
-        _check(4.01 * np.eye(2), A, D, np.diag([5.0, 1.0]), 0.5)
+        check(4.01 * np.eye(2), [5.0, 1.0])
     with pytest.raises(ErrorSetError), np.errstate(invalid="ignore"):
-        _check(np.full((2, 2), np.inf), A, D, first, 0.5)
+        check(np.full((2, 2), np.inf), [2.0, 1.0])

@@ -312,13 +312,13 @@ def test_certified_gain_proves_nothing_for_an_error_outside_the_certified_set(mo
 
     oldest = contract.max_age + 1
     for age in (1, oldest):
-        inside = updated(sets.ages.shapes[age], age)
-        np.testing.assert_array_equal(inside.gain, sets.ages.gains[age - 1])
-        np.testing.assert_array_equal(inside.statistics.shape, sets.ages.shapes[0])
-        outside = updated(1.1 * sets.ages.shapes[age], age)
-        assert not is_inside(outside.statistics.shape, sets.ages.shapes[0])
-    late = updated(sets.ages.shapes[0], oldest + 1)  # beyond the contract there is no set
-    assert not is_inside(late.statistics.shape, sets.ages.shapes[0])
+        gain, inside = updated(sets.ages.shapes[age], age)
+        np.testing.assert_array_equal(gain, sets.ages.gains[age - 1])
+        np.testing.assert_array_equal(inside.shape, sets.ages.shapes[0])
+        _, outside = updated(1.1 * sets.ages.shapes[age], age)
+        assert not is_inside(outside.shape, sets.ages.shapes[0])
+    _, late = updated(sets.ages.shapes[0], oldest + 1)  # beyond the contract there is no set
+    assert not is_inside(late.shape, sets.ages.shapes[0])
 
 
 def test_sets_by_age_that_fail_a_condition_are_an_error():

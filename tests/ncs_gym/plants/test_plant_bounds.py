@@ -13,7 +13,7 @@ import ncs_gym
 from ncs_gym import BoxDisturbance, Ellipsoid, Estimator, LinearPlant, NoNoiseWarning, truck_trailer
 from ncs_gym.plants import linear_plant
 from ncs_gym.processes import inverted_pendulum, nonlinear_cart_pole, pendulum
-from ncs_gym.uncertainty.disturbance_settings import BY_NAME, as_disturbance
+from ncs_gym.uncertainty.disturbances import BY_NAME, as_disturbance
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
 
 BOUNDS = {"disturbance_bound": 0.01, "sensor_bound": 0.02, "initial_bound": 0.03}

@@ -8,7 +8,7 @@ from scipy import signal
 from scipy.integrate import solve_ivp
 
 from ncs_gym import LinearPlant, truck_trailer
-from ncs_gym.uncertainty.disturbance_settings import BY_NAME, as_disturbance
+from ncs_gym.uncertainty.disturbances import BY_NAME, as_disturbance
 
 A, B, C, D = np.array([[0.0, 1.0], [-2.0, -3.0]]), np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]]), np.zeros((1, 1))
 REST = {"box": [1.0, 2.0], "u_max": 3.0, "disturbance_bound": 0.001, "sensor_bound": 0.001, "initial_bound": 0.01}

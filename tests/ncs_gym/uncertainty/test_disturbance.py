@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import AdversarialDisturbance, BoxDisturbance, SinusoidDisturbance
-from ncs_gym.uncertainty.disturbance import checked
-from ncs_gym.uncertainty.disturbance_settings import BY_NAME, as_disturbance
+from ncs_gym.uncertainty.disturbances import BY_NAME, as_disturbance, checked
 from tests.plants import random_plant
 
 

@@ -5,8 +5,8 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from ncs_gym import Ellipsoid
+from ncs_gym.estimation.innovation import outside_sum
 from ncs_gym.uncertainty.ellipsoid import _farthest_coordinates, sum_gauge
-from ncs_gym.uncertainty.minkowski_sum import outside_sum
 from ncs_gym.uncertainty.shape_matrices import is_inside, joined, outer_sum
 from shields.verification.rational_matrix import is_positive_semidefinite, rational, subtract
 

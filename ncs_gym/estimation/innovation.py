@@ -1,4 +1,7 @@
-"""Which points lie outside the sum of two ellipsoids, for many points at once."""
+"""The innovation test: whether an error and a noise within their bounds explain a residual.
+
+While the assumptions hold, a residual r = y - H x_hat lies in the Minkowski sum E(H Sigma_k H') + E(N).
+"""
 
 from __future__ import annotations
 
@@ -6,8 +9,34 @@ import numpy as np
 
 from ncs_gym.uncertainty.ellipsoid import sum_gauge
 
+# An innovation this far beyond its exact bound counts as rounding, not as an alarm.
+ALARM_TOLERANCE = 1e-9
+# Up to this condition number, in the norm of Frobenius, an inverse says which residuals are possible to within 1e-3.
+MAX_CONDITION_NUMBER = 1e7
 # Halvings of the multiplier nu after which the point at which both parts are equally long is known to float64.
 HALVINGS = 60
+
+
+def quick_test(spread: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Returns the matrix W, shape (p, p), of the quick test: a residual with r'Wr <= 1 is possible.
+
+    The ellipsoid of shape H Sigma_k H' + N lies inside the Minkowski sum. Where its inverse would be too inexact to
+    vouch for anything, W is infinite on the diagonal: no residual passes then.
+
+    Args:
+        spread: H Sigma_k H', shape (p, p).
+        noise: N, shape (p, p).
+    """
+    bound = spread + noise
+    extent = np.sqrt(bound.diagonal())
+    units = extent[:, None] * extent
+    try:
+        scaled = bound / units  # in units of its own
+        inverse = np.linalg.inv(scaled)
+        is_sure = np.vdot(scaled, scaled) * np.vdot(inverse, inverse) <= MAX_CONDITION_NUMBER**2  # NaN is not
+    except np.linalg.LinAlgError:
+        is_sure = False
+    return inverse / units if is_sure else np.diag(np.full(len(bound), np.inf))
 
 
 def outside_sum(points: np.ndarray, first: np.ndarray, second: np.ndarray, tolerance: float) -> np.ndarray:

@@ -1,0 +1,385 @@
+"""What acts on the plant inside the bound that the certificates assume: the base class, the kinds, and the checks.
+
+Ball, box and sinusoid stay within d'd <= gamma plus the declared bound, and truncated process noise is added to them.
+Sphere and adversary use the whole of E(D), process noise included.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.uncertainty.declared_bound import diagonal_inside, sample_box
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid, sum_gauge
+from ncs_gym.validation import (
+    LARGEST_NUMBER,
+    ReadOnlyArrays,
+    as_covariance,
+    as_matrix,
+    as_number,
+    as_setting,
+    as_vector,
+    shown,
+)
+
+# Extreme points are pulled in, and points out by rounding pushed in, by this much.
+ROUNDING = 1e-12
+# A disturbance outside E(D) by no more than this is taken for rounding and scaled back onto it.
+TOLERANCE = 1e-9
+# How the noise of a plant may be drawn: inside the bounds that its covariances are truncated at, without a bound, or
+# with sensor noise and first errors on their bounds.
+NOISES = ("truncated", "gaussian", "extreme")
+
+
+class Disturbance(ReadOnlyArrays, ABC):
+    """A disturbance in the ball d'd <= gamma plus `disturbance_bound`; truncated process noise is added to it.
+
+    `begin` draws what stays fixed for an episode, `draw` the disturbance of one step; neither stores anything in the
+    settings, so that one object serves any number of environments. The class attributes below are never inherited: a
+    subclass that overrides a method without declaring them anew is called for one environment at a time.
+
+    Attributes:
+        replaces_process_noise: Whether the whole of E(D) is used, process noise included. The environment checks what
+            does not come from this package at every step.
+        vectorized: Whether the methods also take arrays whose last axis is the environment.
+        memoryless: Whether d depends on nothing but chance, so that many steps can be drawn at once; `draw` is then
+            called with an array of the right shape, without state, step and memory.
+    """
+
+    replaces_process_noise: ClassVar[bool] = False
+    vectorized: ClassVar[bool] = False
+    memoryless: ClassVar[bool] = False
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        """Keeps a subclass from inheriting a promise about methods that it may override."""
+        super().__init_subclass__(**keywords)
+        for name in ("vectorized", "memoryless"):
+            setattr(cls, name, vars(cls).get(name, False))
+
+    def begin(self, rng: np.random.Generator, plant: LinearPlant, size: int | None = None) -> Any:
+        """Returns what stays fixed for one episode (nothing unless overridden); last axis `size` if vectorized."""
+        return np.zeros((0,) if size is None else (0, size))
+
+    @abstractmethod
+    def draw(
+        self, rng: np.random.Generator, plant: LinearPlant, nominal_next: np.ndarray, step: Any, memory: Any
+    ) -> np.ndarray:
+        """Returns d, shape (n,); shape (n, N) if vectorized and called for N environments.
+
+        Args:
+            rng: Source of randomness.
+            plant: The plant.
+            nominal_next: A x + B u, shape (n,) or (n, N).
+            step: Number of steps taken before this one, an int or shape (N,).
+            memory: What `begin` returned.
+        """
+
+    def begin_many(self, rng: np.random.Generator, plant: LinearPlant, count: int) -> np.ndarray:
+        """Returns the memories of `count` episodes along the last axis."""
+        if self.vectorized:
+            return self.begin(rng, plant, count)
+        memories = np.empty(count, dtype=object)
+        for episode in range(count):
+            memories[episode] = self.begin(rng, plant)
+        return memories
+
+    def draw_many(
+        self, rng: np.random.Generator, plant: LinearPlant, nominal_next: np.ndarray, steps: np.ndarray, memory: Any
+    ) -> np.ndarray:
+        """Returns d for N environments, shape (n, N), given A x + B u, shape (n, N), and steps, shape (N,)."""
+        if self.vectorized:
+            return self.draw(rng, plant, nominal_next, steps, memory)
+        each = zip(nominal_next.T, steps.tolist(), memory, strict=True)
+        drawn = np.array([self.draw(rng, plant, nominal, step, own) for nominal, step, own in each])
+        return drawn.T
+
+    def check(self, plant: LinearPlant) -> str:
+        """Returns why this disturbance does not fit the plant, or an empty string."""
+        return ""
+
+    def excess(self, plant: LinearPlant) -> str:
+        """Returns why it may go beyond the plant's bound (which can be allowed), or an empty string."""
+        return ""
+
+
+@dataclass(frozen=True, eq=False)
+class BallDisturbance(Disturbance):
+    """Uniform in the ball of squared radius gamma, plus uniform in the plant's `disturbance_bound`."""
+
+    vectorized: ClassVar[bool] = True
+    memoryless: ClassVar[bool] = True
+
+    def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
+        count = None if nominal_next.ndim == 1 else nominal_next.shape[1]
+        d = np.zeros(nominal_next.shape)
+        if plant.gamma > 0.0:
+            d = np.sqrt(plant.gamma) * Ellipsoid(np.eye(plant.n)).sample(rng, count).T
+        bound = _declared(plant)
+        return d if bound is None else d + bound.sample(rng, count).T
+
+
+@dataclass(frozen=True, eq=False)
+class BoxDisturbance(Disturbance):
+    """Uniform in a box (Liu et al. Section 5).
+
+    Attributes:
+        half_widths: Shape (n,); the box must lie in the ball d'd <= gamma plus the plant's `disturbance_bound`. None:
+            sqrt(gamma / n) each, plus uniform in the box inside that bound: where it was given by half-widths, these.
+
+    Raises:
+        ValueError: If a half-width is negative or not finite.
+    """
+
+    half_widths: Sequence[float] | np.ndarray | None = None
+
+    vectorized: ClassVar[bool] = True
+    memoryless: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if self.half_widths is None:
+            return
+        widths = as_vector(self.half_widths, None, "half_widths")
+        if (widths < 0.0).any():
+            raise ValueError(f"half_widths must be >= 0, got {widths.tolist()}")
+        object.__setattr__(self, "half_widths", widths)
+        self._make_arrays_read_only()
+
+    def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
+        widths = np.sqrt(plant.gamma / plant.n) if self.half_widths is None else np.asarray(self.half_widths)
+        d = (rng.uniform(-1.0, 1.0, nominal_next.shape).T * widths).T
+        bound = _declared(plant)
+        if self.half_widths is not None or bound is None:
+            return d
+        return d + sample_box(bound, rng, None if nominal_next.ndim == 1 else nominal_next.shape[1])
+
+    def check(self, plant):  # noqa: D102
+        if self.half_widths is None:
+            return ""
+        widths = np.asarray(self.half_widths)
+        if widths.shape != (plant.n,):
+            return f"half_widths must have {plant.n} entries, got {widths.size}"
+        return ""
+
+    def excess(self, plant):  # noqa: D102
+        if self.half_widths is None:
+            return ""
+        bound, corner = _declared(plant), np.asarray(self.half_widths)
+        if bound is None:
+            length = float(np.sum(np.square(corner)))
+            if length > plant.gamma * (1.0 + ROUNDING):
+                return f"the corner of the box has squared length {length:g} > gamma = {plant.gamma:g}"
+            return ""
+        # Of sets with the coordinates as axes, all corners lie equally far out.
+        size = sum_gauge(corner, plant.gamma * np.eye(plant.n), diagonal_inside(bound))
+        if size > 1.0 + ROUNDING:
+            return f"the box is {size:.6g} times as large as one in the ball of gamma plus disturbance_bound may be"
+        return ""
+
+
+@dataclass(frozen=True, eq=False)
+class SinusoidDisturbance(Disturbance):
+    """a sin(2 pi k / period + phase), with a random extreme disturbance a and phase each episode.
+
+    a is a boundary point of the ball of squared radius gamma plus one of the plant's `disturbance_bound`.
+
+    Attributes:
+        period: In steps.
+
+    Raises:
+        ValueError: If the period is not positive.
+    """
+
+    period: float = 20.0
+
+    vectorized: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "period", as_number(self.period, "period", low=0.0, low_open=True))
+
+    def begin(self, rng, plant, size=None):  # noqa: D102
+        axes = np.sqrt(plant.gamma) * Ellipsoid(np.eye(plant.n)).sample_boundary(rng, size)
+        bound = _declared(plant)
+        if bound is not None:
+            axes = axes + bound.sample_boundary(rng, size)
+        return np.concatenate([axes.T, rng.uniform(0.0, 2.0 * np.pi, (1,) if size is None else (1, size))])
+
+    def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
+        axis, phase = memory[:-1], memory[-1]
+        return axis * np.sin(2.0 * np.pi * step / self.period + phase)
+
+
+def _declared(plant: LinearPlant) -> Ellipsoid | None:
+    """Returns the plant's declared bound of disturbances; None if there is none or it is a point."""
+    bound = plant.disturbance_bound
+    return bound if bound is not None and np.any(bound.shape_matrix) else None
+
+
+@dataclass(frozen=True, eq=False)
+class SphereDisturbance(Disturbance):
+    """A random boundary point of E(D): always as large as allowed."""
+
+    replaces_process_noise: ClassVar[bool] = True
+    vectorized: ClassVar[bool] = True
+    memoryless: ClassVar[bool] = True
+
+    def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
+        count = None if nominal_next.ndim == 1 else nominal_next.shape[1]
+        return (1.0 - ROUNDING) * plant.nominal_disturbance.sample_boundary(rng, count).T
+
+
+@dataclass(frozen=True, eq=False)
+class AdversarialDisturbance(Disturbance):
+    """The point of E(D) that does the most harm to the next state.
+
+    Attributes:
+        M: Shape (n, n): maximize (x+)' M (x+). None: maximize the largest |c_j x+| of those it can move.
+        rows: Shape (r, n), in place of the rows c_j of the safe box, where M is None.
+
+    Raises:
+        ValueError: If M is not symmetric positive semidefinite, or rows are no matrix.
+    """
+
+    M: np.ndarray | None = None
+    rows: np.ndarray | None = None
+    replaces_process_noise: ClassVar[bool] = True
+    vectorized: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if self.M is not None:
+            object.__setattr__(self, "M", as_covariance(self.M, None, "M"))
+        if self.rows is not None:
+            object.__setattr__(self, "rows", as_matrix(self.rows, (None, None), "rows"))
+        self._make_arrays_read_only()
+
+    def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
+        bound = plant.nominal_disturbance
+        if self.M is not None:
+            return (1.0 - ROUNDING) * bound.farthest_point(nominal_next.T, self.M).T
+        rows = plant.box_rows if self.rows is None else self.rows
+        values = rows @ nominal_next
+        reach = np.asarray(bound.support(rows))
+        movable = reach > 0.0 if np.any(reach > 0.0) else np.ones(len(reach), np.bool_)
+        worst = np.argmax(np.where(movable, np.abs(values).T + reach, -1.0).T, axis=0)
+        extremes = np.stack([bound.extreme_point(row) for row in rows], axis=1)
+        signs = np.where(np.take_along_axis(values, worst[None], axis=0)[0] >= 0.0, 1.0, -1.0)
+        return (1.0 - ROUNDING) * signs * extremes[:, worst]
+
+    def check(self, plant):  # noqa: D102
+        if self.M is not None and self.M.shape != (plant.n, plant.n):
+            return f"M must have shape ({plant.n}, {plant.n}), got {self.M.shape}"
+        if self.rows is not None and self.rows.shape[1] != plant.n:
+            return f"rows must have {plant.n} columns, got {self.rows.shape[1]}"
+        return ""
+
+
+@dataclass(frozen=True, eq=False)
+class CallableDisturbance(Disturbance):
+    """A user's function (rng, plant, nominal_next) -> d, shape (n,).
+
+    Attributes:
+        function: Called once a step.
+    """
+
+    function: Callable[[np.random.Generator, LinearPlant, np.ndarray], np.ndarray]
+    replaces_process_noise: ClassVar[bool] = True
+
+    def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
+        return self.function(rng, plant, nominal_next.copy())
+
+
+BY_NAME: dict[str, type[Disturbance]] = {
+    "ball": BallDisturbance,
+    "box": BoxDisturbance,
+    "sinusoid": SinusoidDisturbance,
+    "sphere": SphereDisturbance,
+    "adversarial": AdversarialDisturbance,
+}
+
+
+def stays_inside(source: Disturbance) -> bool:
+    """Returns whether a disturbance lies in E(D) by construction: that of the classes with a name does."""
+    return type(source) in BY_NAME.values()
+
+
+def as_disturbance(value: Any, plant: LinearPlant, allow_assumption_violation: bool) -> Disturbance:
+    """Returns the settings for a name, a `Disturbance` or a callable (rng, plant, nominal_next) -> d.
+
+    Raises:
+        ValueError: If the name is unknown, the value is none of these, or it does not suit the plant.
+    """
+    if isinstance(value, str) and value in BY_NAME:
+        value = BY_NAME[value]()
+    elif not isinstance(value, Disturbance | type) and callable(value):
+        function: Any = value
+        value = CallableDisturbance(function)
+    if not isinstance(value, Disturbance):
+        raise ValueError(
+            f"disturbance must be one of {sorted(BY_NAME)}, a Disturbance or a callable, got {shown(value)}"
+        )
+    problem = value.check(plant)
+    if not problem and not allow_assumption_violation:
+        problem = value.excess(plant)
+    if problem:
+        raise ValueError(f"{type(value).__name__}: {problem}")
+    return value
+
+
+def as_noise(value: Any, plant: LinearPlant) -> str:
+    """Returns "truncated", "gaussian" or "extreme", checked.
+
+    "gaussian" draws what a covariance describes, which is process noise, sensor noise and first error, from the
+    Gaussian itself. What is bounded by declaration (`gamma`, `disturbance_bound`, `sensor_bound`, `initial_bound`) has
+    no distribution beyond its bound and stays inside. "extreme" draws sensor noise and first errors in random
+    directions on the boundary of what is assumed of them.
+
+    Raises:
+        ValueError: If it is another value, or "gaussian" for a plant without any covariance.
+    """
+    if not (isinstance(value, str) and value in NOISES):
+        raise ValueError(f"noise must be one of {list(NOISES)}, got {shown(value)}")
+    covariances = plant.process_noise_cov, plant.measurement_noise_cov, plant.initial_cov
+    if value == "gaussian" and not any(np.any(each) for each in covariances):
+        raise ValueError(
+            'noise="gaussian" needs a covariance of process noise, sensor noise or first error: this plant declares '
+            "bounds only, beyond which nothing says how likely anything is"
+        )
+    return value
+
+
+def checked(plant: LinearPlant, d: Any, *, allow_assumption_violation: bool) -> np.ndarray:
+    """Returns a disturbance as an array of shape (n,) inside E(D), scaled back to leave room for rounding.
+
+    Raises:
+        ValueError: If it is not finite, wrongly shaped, or further outside than TOLERANCE and that is not allowed.
+    """
+    d = as_vector(d, plant.n, "the disturbance")
+    if allow_assumption_violation:
+        return d
+    if (size := plant.disturbance.gauge(d)) > 1.0 + TOLERANCE:
+        raise ValueError(
+            f"the disturbance {d.tolist()} lies outside its bound E(D): sqrt(d' D^-1 d) = {size:.6g} > 1 "
+            "(allow_assumption_violation=True lets it pass)"
+        )
+    size = plant.allowed_disturbance.gauge(d)
+    return d if size <= 1.0 - ROUNDING else d * ((1.0 - ROUNDING) / size)
+
+
+def checked_many(plant: LinearPlant, d: Any, count: int, *, allow_assumption_violation: bool) -> np.ndarray:
+    """Returns disturbances of many environments as `checked` does, shape (n, count).
+
+    Raises:
+        ValueError: If one is not finite, wrongly shaped, or further outside than TOLERANCE and that is not allowed.
+    """
+    given, d = d, as_setting(d)
+    if d is None or d.shape != (plant.n, count) or not (np.abs(d) < LARGEST_NUMBER).all():
+        raise ValueError(f"the disturbances must be finite with shape ({plant.n}, {count}), got {shown(given)}")
+    if allow_assumption_violation:
+        return d
+    for each in np.flatnonzero(plant.allowed_disturbance.gauge(d.T) > 1.0 - ROUNDING):
+        d[:, each] = checked(plant, d[:, each], allow_assumption_violation=False)
+    return d
