@@ -14,9 +14,8 @@ from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.estimation.set_membership import enlarged_by_rounding
 from ncs_gym.uncertainty.shape_matrices import outer_sum
 from shields.certificate import Certificate
-from shields.runtime.between_samples import grid_test
-from shields.runtime.guarantee import LoopObservation
 from shields.runtime.one_step import PredictedErrors
+from shields.runtime.polytope_step import grid_test
 from shields.runtime.safety_filter import MARGIN, SafetyFilter
 from shields.verification.rational_matrix import (
     is_positive_semidefinite,
@@ -74,7 +73,6 @@ def starts_in_box(plant: LinearPlant, initial: Ellipsoid | np.ndarray) -> bool:
 
 
 def _between(bounds: np.ndarray, initial: Ellipsoid | np.ndarray) -> bool:
-    """Returns whether |g x| <= 1 for all rows g, shape (r, n), and all possible starts."""
     if not isinstance(initial, Ellipsoid) and (verdict := _surely_between(bounds, initial)) is not None:
         return verdict  # a thousand times faster than in rational arithmetic
     rows = rational(bounds)
@@ -94,14 +92,6 @@ def _surely_between(bounds: np.ndarray, state: np.ndarray) -> bool | None:
     return False if (products - room > 1.0).any() else None
 
 
-def start_known(safety_filter: SafetyFilter, initial: Ellipsoid | np.ndarray | None) -> StartKnown:
-    """Returns what is known of starts in an ellipsoid E(P), of one state, shape (n,), or of any (None)."""
-    if initial is None:
-        return StartKnown(False, False)
-    inside = starts_inside(safety_filter.certificate, initial)
-    return StartKnown(inside, inside or starts_in_box(safety_filter.plant, initial))
-
-
 def starts_known(
     safety_filter: SafetyFilter, initial: Ellipsoid | np.ndarray | None, input_delay: int
 ) -> tuple[StartKnown, ...]:
@@ -116,10 +106,10 @@ def starts_known(
         initial: An ellipsoid, one state, shape (n,), or None for any start.
         input_delay: c.
     """
-    known = [start_known(safety_filter, initial)]
     if initial is None:
-        return tuple(known * (input_delay + 1))
-    plant = safety_filter.plant
+        return (StartKnown(False, False),) * (input_delay + 1)
+    plant, inside = safety_filter.plant, starts_inside(safety_filter.certificate, initial)
+    known = [StartKnown(inside, inside or starts_in_box(plant, initial))]
     if isinstance(initial, Ellipsoid):
         center, shape = np.zeros(plant.n), initial.shape_matrix
     else:
@@ -157,31 +147,6 @@ def known_inside(
     return bool(safety_filter.test.knows_inside(estimate, errors, MARGIN)) or _in_box(safety_filter, estimate, errors)
 
 
-def first_observations(
-    safety_filter: SafetyFilter,
-    known: list[tuple[StartKnown, ...]],
-    earlier: list[tuple[np.ndarray, PredictedErrors]],
-) -> list[tuple[np.ndarray, LoopObservation]]:
-    """Returns of x_0 .. x_{c-1} in k environments whether each is known to be inside, (k,), and what is observed.
-
-    Args:
-        safety_filter: Gives the safe set and the box.
-        known: What is known of x_0 .. x_c in each of the environments from where its starts are possible.
-        earlier: Of x_0 .. x_{c-1}, estimates, shape (n, k), and what is known of the error shapes.
-    """
-    found = []
-    for ahead, (estimates, errors) in enumerate(earlier):
-        each = (errors.of(np.array([e])).single() for e in range(len(known)))
-        columns = np.ascontiguousarray(estimates.T)
-        inside = [
-            known_inside(safety_filter, start[ahead], estimate, own)
-            for start, estimate, own in zip(known, columns, each, strict=True)
-        ]
-        no_alarm = np.zeros(len(known), np.bool_)
-        found.append((np.array(inside, np.bool_), LoopObservation(estimates, errors, no_alarm)))
-    return found
-
-
 def first_store(
     safety_filter: SafetyFilter, estimate: np.ndarray, errors: PredictedErrors, known: StartKnown
 ) -> tuple[np.ndarray, bool]:
@@ -206,7 +171,6 @@ def first_store(
 
 
 def _in_box(safety_filter: SafetyFilter, center: np.ndarray, errors: PredictedErrors) -> bool:
-    """Returns whether {center} + E(shape) lies in the box; only mode "lookahead" asks."""
     return safety_filter.lookahead is not None and safety_filter.lookahead.knows_in_box(center, errors)
 
 

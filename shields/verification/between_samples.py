@@ -9,8 +9,8 @@ import numpy as np
 
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
-from shields.verification.conditions import Condition, flag, scalar_condition
-from shields.verification.polytope_conditions import ACTION_ROUNDING, half_widths, reach, root_above
+from shields.verification.conditions import ACTION_ROUNDING, Condition, flag, scalar_condition
+from shields.verification.polytope_conditions import half_widths, reach, root_above
 from shields.verification.rational_matrix import Matrix, add, congruence, multiply, quadratic, rational, scale
 
 # A series ends where what is left of it is below this, next to what a row reaches; one that is longer is not summed.

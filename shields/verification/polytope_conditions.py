@@ -11,11 +11,9 @@ import numpy as np
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
 from shields.polytope import Polytope
-from shields.verification.conditions import Condition, flag, scalar_condition
+from shields.verification.conditions import ACTION_ROUNDING, Condition, flag, scalar_condition
 from shields.verification.rational_matrix import Matrix, add, congruence, multiply, quadratic, rational, transpose
 
-# Rounding an action in [-1, 1] to float32 changes it by at most this.
-ACTION_ROUNDING = Fraction(1, 2**24)
 # Binary digits behind the point of an upper bound of a root.
 _ROOT_DIGITS = 128
 

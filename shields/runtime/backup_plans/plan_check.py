@@ -12,9 +12,8 @@ import numpy as np
 
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
 from ncs_gym.validation import read_only
-from shields.runtime.between_samples import GridTest, grid_test
-from shields.runtime.one_step import SMALLEST_RADIUS, OneStepTest, judged_shapes, predicted_errors
-from shields.runtime.polytope_step import PolytopeTest
+from shields.runtime.one_step import SMALLEST_RADIUS, OneStepTest, judged_shapes
+from shields.runtime.polytope_step import GridTest, PolytopeTest, grid_test
 
 # Error shapes whose tightenings are remembered; they recur, since they depend only on what arrived when. Fewer where
 # those of one are many numbers.
@@ -260,7 +259,7 @@ class EndTest(OneStepTest):
     """The one-step test of the plant that takes j+1 steps at once: A^{j+1}, and what disturbances add up to.
 
     E(Q_0) + ... + E(Q_j) lies inside E(sum_i Q_i / w_i) for weights w_i > 0 of sum 1; w_i proportional to sqrt(tr Q_i)
-    makes the trace smallest, also together with the estimation error that `predicted_errors` adds.
+    makes the trace smallest, also together with the estimation error that `predicted` adds.
 
     Args:
         first: The one-step test.
@@ -339,11 +338,10 @@ def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
         ones = np.where(usable, 1.0, np.nan)[:, None] * np.ones(prediction.steps)
         none = np.empty((len(shapes), prediction.steps, 0, plant.n))
         return Tightening(ones[..., None] - reach - pushed, none, ones, between)
-    errors = [predicted_errors(end, shapes, nothing) for end in prediction.ends]
+    errors = [end.predicted(shapes, nothing) for end in prediction.ends]
     radius = np.stack([each.radius for each in errors], axis=1)
     unusable = np.where(np.isnan(radius).any(axis=1), np.nan, 0.0)
     weightings = np.stack([each.weighting.transpose(2, 0, 1) for each in errors], axis=1) @ prediction.ends[0].root
-    between = np.empty((len(shapes), prediction.steps, 0)) if grid is None else grid.room(symmetric)
     return Tightening(1.0 - reach - pushed + unusable[:, None, None], weightings, radius, between)
 
 

@@ -11,8 +11,18 @@ from flint import arb, ctx, fmpq, fmpq_mat
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
 from shields.verification.conditions import Condition
-from shields.verification.flint.bounds import PRECISION, keeps_enough
-from shields.verification.flint.exact import at_least_zero, definite, form, identity, is_so, mapped, matrix, number
+from shields.verification.flint.bounds import keeps_enough
+from shields.verification.flint.exact import (
+    PRECISION,
+    at_least_zero,
+    definite,
+    form,
+    identity,
+    is_so,
+    mapped,
+    matrix,
+    number,
+)
 
 # Where 1 - kappa rho is smaller, Theorem 2 bounds nothing.
 _SMALLEST_GAP = 1e-9
