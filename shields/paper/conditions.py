@@ -71,5 +71,5 @@ def _smallest_eigenvalue(L: np.ndarray) -> Fraction:
 
 def _blocks(top: Matrix, corner: Matrix, bottom: Matrix) -> Matrix:
     """Returns the matrix [top, corner'; corner, bottom]."""
-    upper = [left + right for left, right in zip(top, transpose(corner), strict=True)]
-    return upper + [left + right for left, right in zip(corner, bottom, strict=True)]
+    rows = zip([*top, *corner], [*transpose(corner), *bottom], strict=True)
+    return [left + right for left, right in rows]
