@@ -117,12 +117,7 @@ class OneStepTest:
         )
 
     def reachable(self, estimates: np.ndarray, errors: PredictedErrors) -> ReachableSets:
-        """Returns the sets of next states that N estimates allow.
-
-        Args:
-            estimates: x_hat, shape (n, N).
-            errors: What is known of the Sigma_k of each.
-        """
+        """Returns the sets of next states that N estimates allow, shape (n, N)."""
         reach = self.columns @ np.abs(estimates)
         radius = errors.radius - self.rounding * reach
         near, small = reach < FARTHEST, radius < SMALLEST_RADIUS
@@ -143,10 +138,7 @@ class OneStepTest:
     def knows_inside(self, estimates: np.ndarray, errors: PredictedErrors, margin: float) -> np.ndarray:
         """Returns whether |x_hat|_M + sqrt(lambda_max(M Sigma_k)) <= 1 - margin, which proves that x is in S.
 
-        Args:
-            estimates: x_hat, shape (n, N) or (n,).
-            errors: What is known of the Sigma_k of each.
-            margin: In units of S.
+        Of estimates of shape (n, N), or of one of shape (n,).
         """
         level = norms(self.root.dot(estimates)) + errors.own[0]
         return level <= 1.0 - margin - self.rounding * self.own_columns.dot(np.abs(estimates))

@@ -83,12 +83,7 @@ class PolytopeTest:
 
     @np.errstate(all="ignore")  # what overflows leaves no room, what underflows does not count
     def predicted(self, shapes: np.ndarray, certified_shapes: np.ndarray) -> PredictedErrors:
-        """Returns what the test and the guarantee need of error shapes.
-
-        Args:
-            shapes: Sigma_k, shape (k, n, n).
-            certified_shapes: Shapes of the certified error sets, shape (l, n, n).
-        """
+        """Returns what the test and the guarantee need of error shapes; see `OneStepTest.predicted`."""
         symmetric, usable, inside = judged_shapes(shapes, certified_shapes)
         half_widths = np.sqrt(np.diagonal(symmetric, axis1=1, axis2=2))
         spread, own_spread = half_widths @ self.columns, half_widths @ self.own_columns
@@ -108,12 +103,7 @@ class PolytopeTest:
         )
 
     def reachable(self, estimates: np.ndarray, errors: PredictedErrors) -> Any:
-        """Returns the `PolytopeSets` of next states that N estimates allow.
-
-        Args:
-            estimates: x_hat, shape (n, N).
-            errors: What is known of the Sigma_k of each.
-        """
+        """Returns the `PolytopeSets` of next states that N estimates allow, shape (n, N)."""
         reach = self.columns @ np.abs(estimates)
         rounding = np.where(reach < FARTHEST, self.rounding * reach, np.nan)  # what is too far out is unknown
         return PolytopeSets(self, estimates, errors.room, rounding, errors.radius - rounding)
@@ -127,13 +117,7 @@ class PolytopeTest:
 
     @np.errstate(all="ignore")
     def knows_inside(self, estimates: np.ndarray, errors: PredictedErrors, margin: float) -> np.ndarray:
-        """Returns whether |g x_hat| + sqrt(g Sigma_k g') <= 1 - margin for all rows, which proves that x is in P.
-
-        Args:
-            estimates: x_hat, shape (n, N) or (n,).
-            errors: What is known of the Sigma_k of each.
-            margin: In units of P.
-        """
+        """Returns whether |g x_hat| + sqrt(g Sigma_k g') <= 1 - margin for all rows, which proves that x is in P."""
         level = (np.abs(self.root.dot(estimates)) + errors.own).max(axis=0)
         return level <= 1.0 - margin - self.rounding * self.own_columns.dot(np.abs(estimates))
 
@@ -141,14 +125,7 @@ class PolytopeTest:
     def keeps_between(
         self, estimate: np.ndarray, errors: PredictedErrors, margin: float, u: np.ndarray | None = None
     ) -> bool:
-        """Returns whether the box is kept between this sample and the next one, if that counts.
-
-        Args:
-            estimate: x_hat, shape (n,).
-            errors: What is known of its Sigma_k.
-            margin: In units of the box.
-            u: The input until then, within the limits, shape (m,); none by default.
-        """
+        """Returns whether the box is kept between this sample and the next, if that counts, with input u or none."""
         first = len(self.root)
         rounding = self.rounding * float(self.columns.dot(np.abs(estimate)))
         values = self.moved[first:].dot(estimate)
@@ -178,10 +155,7 @@ class PolytopeSets(NamedTuple):
         return PolytopeSets(self.test, *(array.take(chosen, axis=-1) for array in self[1:]))
 
     def slack(self, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns slack and margin of inputs u, shape (m, N); each has shape (N,), NaN where nothing is known.
-
-        Both are the least room - |g (A x_hat + B u)| over the rows: x+ is in P unless it is negative.
-        """
+        """Returns what `ReachableSets.slack` does, twice: the least room - |g (A x_hat + B u)| over the rows, (N,)."""
         joint, least = np.concatenate([self.estimates, inputs]), np.empty(inputs.shape[1])
         block = max(1, BLOCK // len(self.test.moved))
         for start in range(0, len(least), block):
@@ -200,10 +174,7 @@ class PolytopeSets(NamedTuple):
         return (self.room - center - worst[:, None]).min(axis=0) - self.rounding
 
     def closest(self, inputs: np.ndarray, margin: float) -> np.ndarray:
-        """Returns the inputs within the limits, shape (m, N), closest to given ones with a slack of `margin`.
-
-        NaN where there is none.
-        """
+        """Returns the closest inputs with a slack of `margin`, as `ReachableSets.closest` does."""
         limits, count = self.test.plant.u_max, inputs.shape[1]
         block = max(1, BLOCK // (len(self.test.moved) * len(limits)))
         if len(limits) > 1 and count > block:

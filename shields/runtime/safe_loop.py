@@ -24,8 +24,14 @@ from shields.certificate import Certificate
 from shields.certificate_text import contract_text, counted, size_of, table
 from shields.errors import GuaranteeLostError, GuaranteeLostWarning
 from shields.runtime.decisions import Decision
-from shields.runtime.guarantee import LATE_INPUT, NOT_CONFIRMED, OTHER_INPUT, UNKNOWN_START, LoopObservation
-from shields.runtime.lost_guarantee import LostGuarantee
+from shields.runtime.guarantee import (
+    LATE_INPUT,
+    NOT_CONFIRMED,
+    OTHER_INPUT,
+    UNKNOWN_START,
+    LoopObservation,
+    LostGuarantee,
+)
 from shields.runtime.monitored_filter import MonitoredFilter
 from shields.runtime.safety_filter import SafetyFilter
 from shields.runtime.starts import StartKnown, starts_known
@@ -459,7 +465,6 @@ class SafeLoop:
             self._begin(starts_known(self._filter, None, self._input_delay))
 
     def _report(self) -> LoopObservation:
-        """Returns what the estimator says now."""
         return self._monitored.reported(*self._predicted(), self._estimator.alarm, self._estimator.age)
 
     def _predicted(self) -> tuple[np.ndarray, np.ndarray]:

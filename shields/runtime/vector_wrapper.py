@@ -190,7 +190,6 @@ class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
         return observation, rewards, terminated, truncated, info
 
     def _observed(self, known: Known) -> LoopObservation:
-        """Returns what decisions and the guarantee need of what the innermost environment knows."""
         errors = self._errors_of(self._inner.error_shapes[1])
         return LoopObservation(np.array(known.estimate, order="C"), errors, known.alarm, known.age)
 
@@ -275,7 +274,6 @@ class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
             return sets.slack(np.zeros((self._filter.plant.m, len(chosen))))[1]
 
     def _read_clock(self) -> Clock:
-        """Returns how often the environments moved until now."""
         inner = self._inner
         return Clock(inner.episodes.copy(), inner.steps.copy(), inner.ticks)
 

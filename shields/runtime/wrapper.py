@@ -20,8 +20,7 @@ from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.validation import as_number, setting, shown
 from shields.certificate import Certificate
 from shields.runtime.decisions import NO_PLAN
-from shields.runtime.guarantee import LoopObservation
-from shields.runtime.lost_guarantee import LostGuarantee
+from shields.runtime.guarantee import LoopObservation, LostGuarantee
 from shields.runtime.monitored_filter import MonitoredFilter
 from shields.runtime.safety_filter import SafetyFilter
 from shields.runtime.starts import StartKnown, starts_known
@@ -110,7 +109,6 @@ class BaseShield(RecordConstructorArgs, Generic[E]):
         return {"environment": inner} | premises | of_vector
 
     def _require_same(self) -> None:
-        """Raises ValueError unless what is wrapped is what the shield was made for."""
         now = self._premises(self._environment_in(self.env))
         for name, value in self._made_for.items():
             if now[name] is not value:
@@ -266,11 +264,9 @@ class SafetyShield(gym.Wrapper, BaseShield[NCSEnv]):
         return observation, float(reward) - self.penalty * decision.intervened, terminated, truncated, info
 
     def _observed(self, known: Known) -> LoopObservation:
-        """Returns what the decision and the guarantee need of what the innermost environment knows."""
         return self._monitored.reported(known.estimate, known.error_shape, known.alarm, known.age)
 
     def _read_clock(self) -> tuple[int, int]:
-        """Returns the number of episodes begun and of steps taken in this one."""
         return self._inner.episodes, self._inner.steps
 
     def _info(self, proposed: np.ndarray, applied: np.ndarray, margin: float, *, intervened: bool) -> dict[str, Any]:

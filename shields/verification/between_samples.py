@@ -92,12 +92,8 @@ def _remainder(row: list[Fraction], grid: Matrix, G: Matrix, sizes: list[Fractio
     """
     points = len(grid) - 1
     h, error, bend, square = dt / points, Fraction(0), Fraction(0), multiply(G, G)
-    norm = max(sum((abs(g) * w for g, w in zip(line, sizes, strict=True)), Fraction(0)) / sizes[i]
-               for i, line in enumerate(G))  # fmt: skip
-    drift = max(
-        sum((abs(g) * w for g, w in zip(line, sizes, strict=True)), Fraction(0)) / sizes[i] + line[i] - abs(line[i])
-        for i, line in enumerate(G)
-    )
+    norm = max(_size(line, sizes) / sizes[i] for i, line in enumerate(G))
+    drift = max(_size(line, sizes) / sizes[i] + line[i] - abs(line[i]) for i, line in enumerate(G))
     growth = _moved([Fraction(1)], [[max(drift, Fraction(0))]], [Fraction(1)], h, max(drift, Fraction(0)))
     if growth is None:
         return None
@@ -117,14 +113,7 @@ def _moved(
 ) -> tuple[list[Fraction], Fraction] | None:
     """Returns row exp(G t) by its series, and a bound of what is left of that; None if it is too long.
 
-    After the term of power p that is at most |row| (t |G|)^(p+1) / (p+1)! / (1 - t |G| / (p+2)).
-
-    Args:
-        row: Shape (n + m,).
-        G: The generator.
-        sizes: W of the norm |q| = sum |q_j| W_j.
-        time: t.
-        norm: |G|.
+    After the term of power p that is at most |row| (t |G|)^(p+1) / (p+1)! / (1 - t |G| / (p+2)), with norm = |G|.
     """
     term, total, step = row, row, scale(time, G)
     left = size = _size(row, sizes)
