@@ -259,9 +259,9 @@ class PredictedErrors(NamedTuple):
         """Returns those of environments that have the shapes with these numbers, shape (N,)."""
         return self._make(array.take(numbers, axis=-1) for array in self)
 
-    def single(self) -> Self:
-        """Returns the first without a last axis."""
-        return self._make(array.item(0) if array.ndim == 1 else array[..., 0].copy() for array in self)
+    def single(self, number: int = 0) -> Self:
+        """Returns one of them without a last axis."""
+        return self._make(array.item(number) if array.ndim == 1 else array[..., number].copy() for array in self)
 
     def batch(self) -> Self:
         """Returns a single one as a batch of one."""

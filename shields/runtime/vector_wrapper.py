@@ -213,7 +213,7 @@ class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
         if len(self._stored):
             self._stored[..., restarted] = np.nan
             for e in np.flatnonzero(restarted & ~is_safe).tolist():
-                estimate, errors = self._report.estimate[:, e].copy(), self._report.errors.of(np.array([e])).single()
+                estimate, errors = self._report.estimate[:, e].copy(), self._report.errors.single(e)
                 plan, is_safe[e] = first_store(self._filter, estimate, errors, known[e][-1])
                 self._stored[: len(plan), :, e] = plan
         started = self._monitor.start(is_safe, begun, self._report)
@@ -230,7 +230,7 @@ class VectorSafetyShield(VectorWrapper, BaseShield[NCSVectorEnv]):
         for ahead, (means, numbers) in enumerate(self._inner.estimates_ahead(chosen)[:-1]):
             errors = self._errors_of(numbers)
             inside = [
-                known_inside(self._filter, known[e][ahead], means[:, k].copy(), errors.of(np.array([k])).single())
+                known_inside(self._filter, known[e][ahead], means[:, k].copy(), errors.single(k))
                 for k, e in enumerate(chosen.tolist())
             ]
             earlier.append((np.array(inside, np.bool_), LoopObservation(means, errors, no_alarm)))
