@@ -121,8 +121,7 @@ class GuaranteeMonitor:
         """Returns the state at the start of an episode.
 
         Args:
-            known_inside: Whether every possible start lies in S (`starts_inside`), or in the box with a certified plan
-                stored.
+            known_inside: Whether every possible start lies in S, or in the box with a certified plan stored.
             unmoved: Whether the environment has not moved since.
             report: What is observed.
         """
@@ -132,10 +131,7 @@ class GuaranteeMonitor:
     def cover(self, state: MonitorState, earlier: Iterable[tuple[Any, LoopObservation]]) -> MonitorState:
         """Returns the state at the start with what is known of the steps before the first decision takes effect.
 
-        Args:
-            state: What `start` returned.
-            earlier: Of x_0 .. x_{c-1}, whether it is known to be in S, or in the box in mode "lookahead", and what is
-                observed of it.
+        That is of x_0 .. x_{c-1} whether it is known to be in S (`known_inside`), and what is observed of it.
         """
         broken, wait = state.broken, state.wait
         for ahead, (inside, report) in enumerate(earlier):
@@ -176,9 +172,7 @@ class GuaranteeMonitor:
     def reasons(self, state: MonitorState, age: Any = 0) -> Any:
         """Returns why the proof does not hold now, as indices of `EXPLANATIONS`: 0 while it does.
 
-        Args:
-            state: What is known.
-            age: Steps since the newest sample used was taken, which tells a broken contract from other large errors.
+        The age of the newest sample used tells a broken contract from other large errors.
         """
         reason = state.broken
         if not self._has_error_set:

@@ -192,10 +192,7 @@ class ReachableSets(NamedTuple):
         return worst
 
     def closest(self, inputs: np.ndarray, margin: float) -> np.ndarray:
-        """Returns the inputs within the limits, shape (m, N), closest to given ones with a slack of `margin`.
-
-        NaN where there is none.
-        """
+        """Returns the inputs within the limits, (m, N), closest to given ones with a slack of `margin`, else NaN."""
         effect = (self.weighting[:, :, None] * self.test.effect[:, :, None]).sum(axis=1)
         offset = (self.weighting * self.offset).sum(axis=1)
         return closest_admissible(inputs, offset, effect, self.radius - margin, self.test.plant.u_max)

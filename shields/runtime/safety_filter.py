@@ -13,7 +13,7 @@ from ncs_gym import LinearPlant
 from ncs_gym.envs.spaces import expressible
 from ncs_gym.validation import ReadOnlyArrays, as_count, as_numbers, read_only, shown
 from shields.certificate import Certificate
-from shields.runtime.decisions import FALLBACK, INVALID, PROJECTED, REASONS, SAFE, UNSAFE, Decision
+from shields.runtime.decisions import FALLBACK, INVALID, PLANNED, PROJECTED, REASONS, SAFE, UNSAFE, Decision
 from shields.runtime.one_step import (
     MOST_INPUTS_WITH_VERTICES,
     OneStepTest,
@@ -153,7 +153,10 @@ class SafetyFilter(ReadOnlyArrays):
         if slack >= MARGIN:
             return Decision(proposed.copy(), False, True, False, margin, REASONS[SAFE], self._no_plan)
         if self.lookahead is not None:
-            return self.lookahead.keep_alone(estimate, errors, proposed, margin)
+            plan = self.lookahead.planner.beginning_alone(estimate, errors.shape, proposed)
+            if plan is None:
+                return None
+            return Decision(plan[0], False, True, False, margin, REASONS[PLANNED], plan[1:])
         if self.mode != "project" or self.plant.m > 1:
             return None
         closest = self._expressible(np.array([alone.closest(proposed.item(), self.projection_margin)]))

@@ -61,13 +61,10 @@ def starts_inside(certificate: Certificate, initial: Ellipsoid | np.ndarray) -> 
 
 
 def starts_in_box(plant: LinearPlant, initial: Ellipsoid | np.ndarray) -> bool:
-    """Returns whether all possible starts lie in the safe box, decided in exact arithmetic.
+    """Returns whether all starts in an ellipsoid, or one state, shape (n,), lie in the safe box, in exact arithmetic.
 
-    Where the box counts between samples, they have to lie in a smaller one, in which disturbances cannot leave it.
-
-    Args:
-        plant: Gives the rows c_i.
-        initial: An ellipsoid E(P), in the box exactly if c_i P c_i' <= 1 for all rows; or a single state, shape (n,).
+    E(P) does exactly if c_i P c_i' <= 1 for all rows. Where the box counts between samples, they have to lie in a
+    smaller one, in which disturbances cannot leave it.
     """
     return _between(grid_test(plant).at_samples, initial)
 
@@ -95,16 +92,11 @@ def _surely_between(bounds: np.ndarray, state: np.ndarray) -> bool | None:
 def starts_known(
     safety_filter: SafetyFilter, initial: Ellipsoid | np.ndarray | None, input_delay: int
 ) -> tuple[StartKnown, ...]:
-    """Returns what is known of x_0 .. x_c, given where starts are possible.
+    """Returns what is known of x_0 .. x_c, given possible starts: an ellipsoid, one state, shape (n,), or None for any.
 
     x_0 is decided in exact arithmetic. With x_0 in {z} + E(P), x_1 lies in {A z} + E(A P A'/nu + D/(1-nu)) for every nu
     in (0, 1), and so on; whether that lies in the safe set, or in the box, is decided by the tests that judge
     estimates, with their margins for rounding.
-
-    Args:
-        safety_filter: Gives the safe set, the box and the plant.
-        initial: An ellipsoid, one state, shape (n,), or None for any start.
-        input_delay: c.
     """
     if initial is None:
         return (StartKnown(False, False),) * (input_delay + 1)
@@ -133,12 +125,8 @@ def known_inside(
 ) -> bool:
     """Returns whether one of the states x_0 .. x_{c-1} is known to be in the safe set; in mode "lookahead" in the box.
 
-    Args:
-        safety_filter: Gives both.
-        known: What is known of it from where starts are possible.
-        estimate: Its estimate, shape (n,).
-        errors: What is known of the error shape of that.
-        u: The input that acts then, decided before, shape (m,); none at the start of an episode.
+    Either from where starts are possible, or from its estimate, shape (n,), and from the input u that acts then, shape
+    (m,), decided before; there is none at the start of an episode.
     """
     if known.in_safe_set or (known.in_box and safety_filter.lookahead is not None):
         return True
@@ -152,16 +140,9 @@ def first_store(
 ) -> tuple[np.ndarray, bool]:
     """Returns what is stored before the first decision, shape (k, m), and whether the state is proved safe.
 
-    The state is that at which the first decision takes effect, without a downlink the start.
-
-    It is where it is known to be in the safe set; in mode "lookahead" also where it is known to be in the box, by what
-    starts are possible or by the estimate, and a first plan is certified.
-
-    Args:
-        safety_filter: Decides.
-        estimate: x_hat_0, shape (n,).
-        errors: What is known of Sigma_0.
-        known: What is known of the start.
+    The state is that at which the first decision takes effect, without a downlink the start. It is proved safe where it
+    is known to be in the safe set; in mode "lookahead" also where it is known to be in the box, by what starts are
+    possible or by the estimate, shape (n,), and a first plan is certified.
     """
     lookahead = safety_filter.lookahead
     if lookahead is None or known.in_safe_set or safety_filter.test.knows_inside(estimate, errors, MARGIN):

@@ -8,7 +8,7 @@ import numpy as np
 
 from ncs_gym.validation import as_numbers
 from shields.runtime.backup_plans.planner import Planner, Plans
-from shields.runtime.decisions import INVALID, PLANNED, PROJECTED, REASONS, SAFE, STORED, Decision
+from shields.runtime.decisions import INVALID, PLANNED, PROJECTED, SAFE, STORED, Decision
 from shields.runtime.one_step import OneStepTest, PredictedErrors, ReachableSets, norms
 from shields.runtime.polytope_step import PolytopeTest
 
@@ -39,15 +39,6 @@ class Lookahead:
     def __init__(self, test: OneStepTest | PolytopeTest, gain: np.ndarray, horizon: int, margin: float) -> None:
         self._test, self._margin = test, margin
         self.planner = Planner(test, gain, horizon, margin)
-
-    def keep_alone(
-        self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray, margin: float
-    ) -> Decision | None:
-        """Returns the decision of `keep` about one proposal of a margin, if its first candidates are enough."""
-        plan = self.planner.beginning_alone(estimate, errors.shape, proposed)
-        if plan is None:
-            return None
-        return Decision(plan[0], False, True, False, margin, REASONS[PLANNED], plan[1:])
 
     def keep(
         self, decided: Decision, some: np.ndarray, estimates: np.ndarray, errors: PredictedErrors, stored: np.ndarray

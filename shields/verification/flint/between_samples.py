@@ -20,6 +20,7 @@ from shields.verification.flint.exact import (
     mapped,
     matrix,
     number,
+    reach_of,
 )
 from shields.verification.flint.polytope import box_extents
 
@@ -96,7 +97,7 @@ def _gain_conditions(certificate: Certificate, plant: LinearPlant, widths: list[
             push = matrix(pushed[j])
             image = matrix(state[j]) + push * K
             rest = 1 - number(grid.remainder[j])
-            rest -= FLOAT32 * sum((abs(push[0, a]) * limits[a] for a in range(plant.m)), fmpq(0))
+            rest -= FLOAT32 * reach_of(push, limits)
             left = arb(rest) - arb(form(matrix(plant.box_rows[j]), D)).sqrt()
             left -= arb(max(form(push, error) for error in errors)).sqrt()
             where = f"tau_{i} of row {j + 1}"
@@ -105,6 +106,5 @@ def _gain_conditions(certificate: Certificate, plant: LinearPlant, widths: list[
                 given = polytope.multipliers[len(polytope.rows) + plant.m + i * k + j]
                 used = [(int(index), number(given[index])) for index in np.flatnonzero(given)]
                 over = image - sum((value * fmpq_mat([G[index]]) for index, value in used), fmpq_mat(1, n))
-                reach = sum((abs(value) for _, value in used), fmpq(0))
-                reach += sum((abs(over[0, a]) * widths[a] for a in range(n)), fmpq(0))
+                reach = sum((abs(value) for _, value in used), reach_of(over, widths))
                 yield ball_at_least_zero(f"(PB) |c x| + rho <= 1 - eta on the polytope at {where}", left - arb(reach))

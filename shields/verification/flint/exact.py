@@ -42,6 +42,11 @@ def form(row: Any, shape: Any) -> Any:
     return mapped(row, shape)[0, 0]
 
 
+def reach_of(row: Any, sizes: list[Any]) -> Any:
+    """Returns the largest |row @ x| for |x_j| <= sizes_j, of a matrix with one row."""
+    return sum((abs(row[0, j]) * size for j, size in enumerate(sizes)), fmpq(0))
+
+
 def is_semidefinite(symmetric: Any, *, strictly: bool = False) -> bool:
     """Returns whether a rational matrix is symmetric and has no negative eigenvalue (only positive ones if `strictly`).
 

@@ -21,6 +21,7 @@ from shields.verification.flint.exact import (
     mapped,
     matrix,
     number,
+    reach_of,
 )
 
 
@@ -55,7 +56,7 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
         for i in range(r):
             row = fmpq_mat([G.tolist()[i]])
             largest = max(form(row, image) for image in images)
-            rounding = sum((abs((row * B)[0, j]) * u_max[j] for j in range(plant.m)), fmpq(0)) * FLOAT32
+            rounding = reach_of(row * B, u_max) * FLOAT32
             left = arb(1 - bounds[i] - rounding) - arb(largest).sqrt() - arb(form(row, D)).sqrt()
             yield ball_at_least_zero(f"(P) sum |lambda| + |r| w + s + d <= 1 of row {i + 1}", left)
         for i in range(plant.m):
