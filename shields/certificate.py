@@ -385,6 +385,15 @@ def _content_of(certificate: Certificate) -> dict[str, Any]:
     Under a contract the arrays of all ages stand in `ages`, and those of the largest age are repeated before.
     """
     c, last = certificate, certificate.multipliers
+    ages = None
+    if (updates := c.updates) is not None:
+        sets = {
+            "shapes": [*c.error_shapes.tolist(), updates.last.tolist()],
+            "rates": [proof.rate for proof in c.proofs],
+            **{name: getattr(updates, name).tolist() for name in ("gains", "shares", "noise")},
+        }
+        by_age = {name: [getattr(proof, name).tolist() for proof in c.proofs] for name in ("shares", "inputs")}
+        ages = {"contract": asdict(updates.contract), "sets": sets, **by_age}
     optional = {} if c.polytope is None else {"polytope": polytope_content(c.polytope)}
     optional |= {} if c.between_samples is None else {"between_samples": c.between_samples}
     return optional | {
@@ -393,7 +402,7 @@ def _content_of(certificate: Certificate) -> dict[str, Any]:
         "Sigma": None if c.Sigma is None else c.Sigma.tolist(),
         "D": None if c.D is None else c.D.tolist(),
         "multipliers": None if last is None else asdict(last),
-        "ages": None if c.updates is None else _content_by_age(c.proofs, c.updates),
+        "ages": ages,
         "method": c.method,
         "fingerprint": c.fingerprint,
         "kappa": c.kappa,
@@ -401,21 +410,6 @@ def _content_of(certificate: Certificate) -> dict[str, Any]:
         "epsilon": c.epsilon,
         "epsilon_up": c.epsilon_up,
         "provenance": c.provenance,
-    }
-
-
-def _content_by_age(proofs: tuple[Proof, ...], updates: Updates) -> dict[str, Any]:
-    return {
-        "contract": asdict(updates.contract),
-        "sets": {
-            "shapes": [*(proof.Sigma.tolist() for proof in proofs), updates.last.tolist()],
-            "rates": [proof.rate for proof in proofs],
-            "gains": updates.gains.tolist(),
-            "shares": updates.shares.tolist(),
-            "noise": updates.noise.tolist(),
-        },
-        "shares": [proof.shares.tolist() for proof in proofs],
-        "inputs": [proof.inputs.tolist() for proof in proofs],
     }
 
 

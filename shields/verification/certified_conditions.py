@@ -184,10 +184,7 @@ def _sum_bound(first: Matrix, second: Matrix, weight: Matrix) -> Matrix:
 
 def _smallest_trace_multiplier(first: Matrix, second: Matrix, weight: Matrix) -> Fraction:
     """Returns a rational nu near the minimizer of tr(W P); every nu in (0, 1) proves containment."""
-    a, b = (math.sqrt(_trace(multiply(weight, matrix))) for matrix in (first, second))
+    traces = (sum(row[i] for i, row in enumerate(multiply(weight, matrix))) for matrix in (first, second))
+    a, b = map(math.sqrt, traces)
     nu = Fraction(a) / (Fraction(a) + Fraction(b)) if a + b > 0.0 else Fraction(1, 2)
     return min(max(nu, Fraction(SMALLEST_MULTIPLIER)), 1 - Fraction(SMALLEST_MULTIPLIER))
-
-
-def _trace(matrix: Matrix) -> Fraction:
-    return sum((matrix[i][i] for i in range(len(matrix))), Fraction(0))
